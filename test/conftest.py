@@ -1,4 +1,4 @@
-"""What every test shares: checked ROS message fields, helper modules, tests in real time."""
+"""Set-up of all tests: checked ROS message fields, helper modules, tests in real time."""
 
 import os
 from pathlib import Path
@@ -11,8 +11,8 @@ import pytest
 
 # Jazzy writes a scalar field of a wrong type as garbage unless this is set before the import.
 os.environ.setdefault('ROS_PYTHON_CHECK_FIELDS', '1')
-# A shell starts its background jobs with interrupts ignored, and programs that tests start inherit
-# that: none could then be interrupted.
+# A shell starts background jobs with interrupts ignored. Programs started by tests would inherit
+# this and could not be interrupted.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 WORKER = 'PYTEST_XDIST_WORKER' in os.environ
@@ -25,12 +25,11 @@ for folder in sorted(Path(__file__).parent.iterdir()):
         sys.path.append(str(folder))
 sys.path.append(str(Path(__file__).parent))
 
-# What runs by the system clock is marked real_time: nodes, buses, devices, some with limits of
-# milliseconds. Flights in simulated time wait for who is late and are marked so. A computer that
-# stops for a moment, as shared ones do, fails the former for no fault of the code. They get a
-# second chance with nothing beside them, which the summary names (R); what is broken fails twice.
-# Where the computer was seen to stand still in the second chance too, the test is skipped with
-# the length of the stall: it could not be judged. On a computer that keeps time, nothing is.
+# Tests that depend on the system clock have the mark real_time: nodes, buses and devices, some
+# with limits of milliseconds. Flights in simulated time have another mark, because they wait for
+# late nodes. A short stall of a shared computer fails the former without a defect of the code.
+# They are repeated alone, which the summary shows (R); a defect fails twice. If the computer
+# stalls in the repetition too, the test is skipped with the length of the stall.
 RERUNS = 1
 STALL = 0.05        # s; the limits of silence in these tests are 50 to 80 ms
 MARKS = {'alone': re.compile(r'\bmark\.alone\b'),      # part of the suite -> in a file of it
@@ -39,7 +38,7 @@ BEAT, BEGIN = pytest.StashKey(), pytest.StashKey[float]()
 
 
 def pytest_ignore_collect(collection_path, config):
-    """Do not load files without a test of the part that is asked for: that takes seconds."""
+    """Do not load files without a test of the requested part, which saves seconds."""
     part = config.getoption('markexpr').partition(' ')[0]
     if part in MARKS and collection_path.match('test_*.py') \
             and not _says_so(collection_path, part):
@@ -53,7 +52,7 @@ def _says_so(path, part):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config, items):
-    """Mark who has a ROS domain, give a second chance, watch the computer meanwhile."""
+    """Mark tests with a ROS domain, permit a repetition, and watch for stalls."""
     waiting = [item for item in items if item.get_closest_marker('simulated_time')]
     real_time = [item for item in items if item.get_closest_marker('alone')
                  or item.get_closest_marker('real_time')
@@ -65,11 +64,11 @@ def pytest_collection_modifyitems(config, items):
     for item in real_time:
         item.add_marker(pytest.mark.real_time)
     if config.getoption('markexpr').startswith('real_time'):
-        # Devices, which wait, with each other; then processes of nodes, which compute.
+        # First devices, which mostly wait; then processes of nodes, which compute.
         items.sort(key=lambda item: item.path.parent.name == 'nodes')
-    else:       # The longest file first: a worker that takes it last leaves the others idle.
+    else:       # The longest file first: at the end it would leave other workers idle.
         items.sort(key=lambda item: item.path.parent.name != 'tutorials')
-    # In real time a second chance is worth little beside others; .ci/test gives it alone.
+    # A repetition beside other tests is of little use in real time; .ci/test repeats alone.
     for item in [*waiting, *(() if WORKER else real_time)]:
         item.add_marker(pytest.mark.flaky(reruns=RERUNS))
     if real_time and not WORKER and config.getoption('markexpr') != 'not real_time' \
@@ -86,7 +85,7 @@ def pytest_unconfigure(config):
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item):
-    """Devices answer from threads, by the clock: a test that uses them has to say so."""
+    """Require the mark real_time of tests with devices, whose threads use the clock."""
     if item.get_closest_marker('real_time'):
         return (yield)
     from beetle_omni_ros.sim.emulated.pseudo_terminal import PseudoTerminal
@@ -101,7 +100,7 @@ def _refuse(_):
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item, call):
-    """Skip what failed in real time on a computer that stood still, with the reason."""
+    """Skip a real-time test that failed during a stall, with the reason."""
     if call.when == 'setup':
         item.stash[BEGIN] = call.start
     report = yield

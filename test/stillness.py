@@ -1,4 +1,4 @@
-"""Whether the computer stood still: processes that note when they were woken too late."""
+"""Detection of stalls of the computer, by processes that record late wake-ups."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import sys
 import tempfile
 import time
 
-PERIOD = 0.005      # s that each sleeps at a time
-NOTED = 0.02        # s, later than this is written down
-MOST = 16           # cores that are watched
+PERIOD = 0.005      # s of each sleep
+NOTED = 0.02        # s; later wake-ups are recorded
+MOST = 16           # watched cores
 
-# Needs nothing but Python, and ends with the process that started it.
+# Needs Python only, and ends with its parent process.
 BEAT = f"""
 import os, sys, time
 os.sched_setaffinity(0, [int(sys.argv[2])])
@@ -30,10 +30,10 @@ with open(sys.argv[1], 'a', buffering=1) as file:
 
 class Heartbeat:
     """
-    Notes while it runs when a core did not let a process run that only sleeps.
+    Records times at which a core did not run a process that only sleeps.
 
-    A computer shared with others stops for tenths of a second; what must answer within
-    milliseconds cannot be judged on it then.
+    A shared computer may stall for tenths of a second. Tests with limits of milliseconds are not
+    valid then.
     """
 
     def __init__(self):
@@ -46,8 +46,8 @@ class Heartbeat:
             for core in sorted(os.sched_getaffinity(0))[:MOST]]
 
     def stalls(self, start: float, end: float) -> list[float]:
-        """Lengths [s] of the stalls between two times of the monotonic clock."""
-        time.sleep(2 * PERIOD)      # one that ends now is written down yet
+        """Durations [s] of the stalls between two times of the monotonic clock."""
+        time.sleep(2 * PERIOD)      # a stall that ends now is recorded soon
         found = []
         for line in self._file.read_text().splitlines():
             begun, ended = map(float, line.split())
@@ -56,7 +56,7 @@ class Heartbeat:
         return found
 
     def close(self) -> None:
-        """End them."""
+        """End the processes."""
         for process in self._processes:
             process.kill()
             process.wait()

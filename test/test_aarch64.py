@@ -1,4 +1,4 @@
-"""benchmarks/aarch64.py asks for what setup.py asks for, and runs tests that exist."""
+"""benchmarks/aarch64.py has the requirements of setup.py, and runs existing tests."""
 
 import importlib.util
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Unusable input of each subcommand: one line that says what, where and what was expected."""
+"""Unusable input of each subcommand: one line with the error, its place and the expectation."""
 
 from pathlib import Path
 
@@ -83,7 +83,7 @@ RUNS = [('none', 'none: no such bag'), ('folder', 'folder: no .mcap file in this
 
 
 def rows():
-    """(arguments, what the line says) of each case."""
+    """(arguments, expected words of the line) of each case."""
     for command, controller in ((EVALUATE, '--controllers'), (FLY, '--controller')):
         base = command if command is EVALUATE else [*FLY, '--task', 'good.csv']
         for option, cases in (('--task', TASKS), ('--robot', ROBOTS), ('--seed', SEEDS),
@@ -221,7 +221,7 @@ def inputs(tmp_path_factory):
 
 
 def refused(arguments, said, inputs, monkeypatch, capsys):
-    """Hold one case: status 2, one line, what it says, and nothing that was made."""
+    """Check one case: status 2, one line with its words, and no written file."""
     monkeypatch.chdir(inputs)
     before = sorted(Path().rglob('*'))
     status = cli.main(arguments)

@@ -1,4 +1,4 @@
-"""The installer of the onboard computer, the images and the container say what they should."""
+"""The installer of the onboard computer, the images and the container."""
 
 import json
 import os
@@ -145,7 +145,7 @@ def test_the_image_with_ros_contains_the_commands_of_the_page():
 @pytest.mark.parametrize('image', ['Dockerfile', 'Dockerfile.python'])
 def test_the_images_can_draw_without_a_screen(image):
     text = (DEPLOY / image).read_text()
-    assert 'ENV MUJOCO_GL=egl' in text      # then MuJoCo is not even imported without these
+    assert 'ENV MUJOCO_GL=egl' in text      # MuJoCo cannot be imported without these
     assert {'libegl1', 'libgl1-mesa-dri', 'libopengl0'} <= set(commands(DEPLOY / image).split())
 
 
@@ -154,7 +154,7 @@ def test_hadolint_accepts_the_images(image):
     linter = shutil.which('hadolint', path=f"{Path(sys.executable).parent}:{os.environ['PATH']}")
     if linter is None:
         pytest.skip('no hadolint here')
-    # DL3008: the newest packages of the distribution are wanted.
+    # DL3008: the newest packages of the distribution are intended.
     done = subprocess.run([linter, '--ignore', 'DL3008', str(DEPLOY / image)],
                           capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stdout

@@ -1,4 +1,4 @@
-"""Every example runs as its first lines say, and the public module does what it offers."""
+"""Every example runs by its documented command, and the public functions work."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -31,7 +31,7 @@ def poses(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def bags(tmp_path_factory):
-    """Two short flights in a wind that the robot file does not know."""
+    """Two short flights in a wind that is not in the robot file."""
     windy = replace(beetle_omni_ros.robot(), effects={'wind': {'force': (1.2, -0.8, 0.0)}})
     flown = [[0.8, 0.4, 1.2, 40, 20, 90], [-0.6, 0.8, 0.9, -30, 35, -120]]
     folder = tmp_path_factory.mktemp('bags')
@@ -107,7 +107,7 @@ def test_robot_is_a_class_and_a_subpackage():
 
 
 class Still:
-    """Holds its joints, and its rotors near hover: a command that never changes is refused."""
+    """Constant tilts and nearly constant hover thrusts; a constant command would be refused."""
 
     period = 0.01
 

@@ -1,4 +1,4 @@
-"""A small run of benchmarks/fuzz_packets.py: no packet and no message breaks its reader."""
+"""A small run of benchmarks/fuzz_packets.py: readers accept or refuse every message."""
 
 import importlib.util
 from pathlib import Path

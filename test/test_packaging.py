@@ -1,4 +1,4 @@
-"""What colcon, pip, ros2 and rosdep read about the package is complete and agrees."""
+"""The metadata for colcon, pip, ros2 and rosdep are complete and consistent."""
 
 import ast
 from importlib import import_module
@@ -63,7 +63,7 @@ PARAMETER_CLASSES = {
 
 @pytest.fixture(scope='module')
 def setup_arguments():
-    """Keyword arguments that setup.py gives to setuptools."""
+    """Keyword arguments of setuptools in setup.py."""
     code = ('import json, runpy, setuptools; setuptools.setup = '
             'lambda **given: print(json.dumps(given)); runpy.run_path("setup.py")')
     pytest.importorskip('setuptools')
@@ -86,7 +86,7 @@ def third_party_imports():
 
 
 def is_ros(module):
-    """Tell whether a module comes with ROS."""
+    """Whether a module is part of ROS."""
     return module in ('rclpy', 'launch', 'launch_ros', 'ament_index_python',
                       'builtin_interfaces') or module.endswith(('_msgs', '_srvs', '_interfaces'))
 
@@ -102,7 +102,7 @@ def test_manifest_is_format_3_for_ament_python():
 
 
 def test_maintainer_has_an_address_that_colcon_accepts(setup_arguments):
-    # With one that it refuses, colcon silently builds a plain Python package.
+    # With an address that it refuses, colcon silently builds a plain Python package.
     address = MANIFEST.find('maintainer').get('email')
     assert re.fullmatch(r'[-\w.+]+@[-\w]+(\.[-\w]+)*\.[a-zA-Z]{2,}', address)
     assert setup_arguments['maintainer_email'] == address
@@ -174,8 +174,8 @@ def test_every_import_is_a_declared_requirement(setup_arguments):
             assert module in keys, f'{module}: not in package.xml'
             continue
         assert DISTRIBUTION.get(module, module) in declared, f'{module}: not in setup.py'
-        # rosdep knows no key for the viewer's. The last two go unused where they are not
-        # there: slower, and no MP4.
+        # rosdep has no key for the modules of the viewer. The last two are optional: without
+        # them the code is slower, and films have no MP4.
         if module not in ('torch', 'tensordict', 'onnx', 'rsl_rl', 'ray', 'viser', 'trimesh',
                           'threadpoolctl', 'imageio_ffmpeg'):
             candidates = {KEY.get(module), f'python3-{module}', f'python3-{module}-pip', module}

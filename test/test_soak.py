@@ -1,4 +1,4 @@
-"""The numbers of benchmarks/soak.py: what counts as growth."""
+"""The growth criteria of benchmarks/soak.py."""
 
 import importlib.util
 import os

@@ -1,4 +1,4 @@
-"""Executables end quietly when they are interrupted while their modules load."""
+"""Executables end without a traceback if interrupted while their modules load."""
 
 from pathlib import Path
 import random
@@ -18,7 +18,7 @@ INTERRUPTED = 'def main():\n    raise KeyboardInterrupt\n'
 
 
 def launch(tmp_path, text, before=''):
-    """Begin a module of this text in a process of its own."""
+    """Start a process that runs a module with this text."""
     (tmp_path / 'program.py').write_text(text)
     return subprocess.Popen(
         [sys.executable, '-c', f'import sys, signal\n{before}\nsys.path.insert(0, "{tmp_path}")\n'

@@ -1,4 +1,4 @@
-"""What the suite does with tests in real time: judged where the computer keeps time, else not."""
+"""Treatment of real-time tests by the suite: skipped only after a stall of the computer."""
 
 import os
 from pathlib import Path
@@ -75,7 +75,7 @@ def test_only_failures_during_a_stall_of_the_computer_are_skipped(outcomes):
     failed = ' '.join(line for kind, line in kinds if kind == 'FAILED')
     assert 'robot.py::test_held_up' in failed and 'robot.py::test_broken' in failed
     assert 'nodes.py::test_held_up' not in failed
-    # Only a true stall, just then, excuses it.
+    # Only a true stall at that time skips the test.
     assert ('nodes.py::test_broken' in failed) != (len(skipped) == 2)
 
 

@@ -1,4 +1,4 @@
-"""Every Python file keeps the style of pyproject.toml, and the core its types."""
+"""Every Python file has the style of pyproject.toml, and the core is typed."""
 
 import importlib.util
 import os

@@ -28,10 +28,10 @@ def named(findings):
 
 def patiently(look, condition, attempts=8):
     """
-    Look again until ``condition(found)``, at most so often; return what was found last.
+    Repeat a check until ``condition(found)``, with a limit; return the last findings.
 
-    Emulated devices live in threads of this process: on a busy machine they may have had no
-    turn while one look lasted.
+    Emulated devices are threads of this process. On a busy machine they may not run during one
+    check.
     """
     for _ in range(attempts):
         found = look()

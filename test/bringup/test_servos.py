@@ -50,7 +50,7 @@ def test_the_check_writes_no_register():
 
 def test_torque_that_was_on_before_stays_on_and_is_reported():
     with running() as (bus, emulated):
-        bus._link.close()       # the driver is gone, the guard is not in use
+        bus._link.close()       # the driver has ended, and the guard is not used
         found = servos(emulated.port)
         assert emulated.torque_enabled.all()
     assert levels(found) == {f'{name} torque': 'warn' for name in NAMES}
@@ -114,7 +114,7 @@ def test_a_servo_that_has_shut_down_is_reported():
 def test_a_hot_servo_is_reported():
     bad = {'gimbal4': 'fail', 'gimbal4 temperature': 'warn'}
     with EmulatedServoBus(motion=JOINTS) as emulated:
-        emulated.servos[3]['Temperature Limit'] = 50    # and so it is at 60
+        emulated.servos[3]['Temperature Limit'] = 50    # also at 60
         emulated.faults.overheated = {4}
         found = patiently(lambda: servos(emulated.port), lambda found: levels(found) == bad)
     assert levels(found) == bad

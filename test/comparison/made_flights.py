@@ -1,4 +1,4 @@
-"""Results as a sweep gives them, of motions made up in a moment instead of flown."""
+"""Results of a sweep with artificial motions instead of flights."""
 
 import json
 

@@ -32,7 +32,7 @@ def written(folder, flown, tasks=TASKS, controllers=CONTROLLERS, skipped=()):
 
 @pytest.fixture(scope='module')
 def whole(tmp_path_factory):
-    """Folder, page, JSON and Markdown of a whole comparison; coarse pictures are soon drawn."""
+    """Folder, page, JSON and Markdown of a whole comparison, with coarse pictures to save time."""
     folder = tmp_path_factory.mktemp('comparison')
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(comparison_page, 'DOTS', 50)
@@ -48,12 +48,12 @@ class Page(HTMLParser):
         self.feed(text)
 
     def handle_starttag(self, tag, attrs):
-        """Note tags, and the key of a number."""
+        """Store tags, and the key of a number."""
         self.tags.append((tag, dict(attrs)))
         self._key = dict(attrs).get('data-key')
 
     def handle_data(self, data):
-        """Note the text of a number."""
+        """Store the text of a number."""
         if self._key:
             self.numbers.append((self._key, data))
             self._key = None

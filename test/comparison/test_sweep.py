@@ -1,4 +1,4 @@
-"""Flights of a comparison: planned, flown by either backend, kept, and honest when they fail."""
+"""Flights of a comparison: plan, both backends, cache, failures."""
 
 import importlib.util
 import io
@@ -25,21 +25,21 @@ HAS_RAY = importlib.util.find_spec('ray') is not None
 
 @pytest.fixture
 def poses(tmp_path):
-    """A pose file of one near pose, so that a flight is short."""
+    """A pose file with one near pose, for a short flight."""
     path = tmp_path / 'poses.csv'
     path.write_text('x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg\n0.2,0.1,1.1,10,-20,40\n')
     return str(path)
 
 
 def without_times(result):
-    """Return what a flight gives, less what the computer's load decides."""
+    """Return the result of a flight without times that depend on the computer's load."""
     metrics = {key: value for key, value in result['metrics'].items() if key != 'compute_ms'}
     return json.dumps(metrics), {name: values.tolist() for name, values in
                                  result['trace'].items()}
 
 
 def never(*arguments):
-    """Stand in for a flight that must not take place."""
+    """Replacement of a flight that must not happen."""
     raise AssertionError('flown again')
 
 

@@ -1,10 +1,9 @@
 """
-A policy that flies, written down instead of trained: PD on the pose, then allocation.
+A hand-written policy: PD control of the pose, then allocation.
 
-Made of ONNX operators from nothing but the observation, so that tests of everything around a
-policy need neither training nor the shipped file. It is slow, and without the estimated
-disturbance it leaves a steady error; all the geometry is in the axes of base_link, rows of
-matrices are x, y and z axis.
+It consists of ONNX operators on the observation, so that tests need neither training nor the
+shipped file. It is slow, and has a steady error without the estimated disturbance. All vectors are
+in base_link axes; rows of matrices are the x, y and z axes.
 """
 
 import numpy as np
@@ -81,7 +80,7 @@ def write_hover_policy(path, memory=False, blind_above=None):
     Args:
         path: file to write.
         memory: whether it cancels the estimated disturbance.
-        blind_above: with a target so much higher [m] it answers with NaN, as a broken one.
+        blind_above: height of the target above the robot [m] at which the actions become NaN.
 
     """
     robot = RobotParameters.load()
@@ -99,7 +98,7 @@ def write_hover_policy(path, memory=False, blind_above=None):
     torque = g('Mul', robot.inertia[None], g(
         'Sub', g('Mul', g.shortened(turn(g, body, goal)), kp), g('Mul', rate, kd)))
     wrench = g('Concat', force, torque, axis=1)
-    if memory:      # what the estimate says is cancelled
+    if memory:      # the estimated disturbance is cancelled
         wrench = g('Sub', wrench, g.columns(seen, 33, 39))
     components = g('MatMul', wrench, Allocator(robot).inverse.T)
     tilt, thrust = targets(g, components, g.columns(seen, 21, 25), g.columns(seen, 25, 29),
@@ -127,7 +126,7 @@ def turn(g, body, goal):
 
 
 def targets(g, components, measured, previous, contract, limit):
-    """Tilts that turn at a limited speed the short legal way, and thrusts as far as they help."""
+    """Tilts by the shortest permitted turn at limited rate, and thrusts along the wanted force."""
     along = g('Gather', components, np.arange(0, 8, 2), axis=1)
     across = g('Gather', components, np.arange(1, 8, 2), axis=1)
 

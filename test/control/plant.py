@@ -27,13 +27,13 @@ class Plant:
         self.time, self.queue, self.executed = 0.0, deque(), None
 
     def state(self, in_force):
-        """What a perfect estimator says."""
+        """The state of a perfect estimator."""
         return State(self.time, self.position.copy(), self.velocity.copy(),
                      self.quaternion.copy(), self.rate.copy(), self.tilt.copy(),
                      self.tilt_rate.copy(), self.time, in_force)
 
     def advance(self, command, duration):
-        """Give a command, then integrate for ``duration``."""
+        """Apply a command, then integrate for ``duration``."""
         self.queue.append((self.time + DELAY, command))
         for _ in range(round(duration / STEP)):
             while self.queue and self.queue[0][0] <= self.time + 1e-9:
@@ -62,7 +62,7 @@ class Plant:
 
 
 def fly(plant, controller, target, duration, in_force=None):
-    """Close the loop; returns per-step (position error, attitude error, command)."""
+    """Close the loop; return (position error, attitude error, command) of each step."""
     log = []
     for _ in range(round(duration / controller.period)):
         in_force = controller.step(plant.state(in_force), target)

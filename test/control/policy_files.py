@@ -18,18 +18,18 @@ def write(path, *, robot=None, memory=False, metadata=None, drop=(), weights=Non
 
     Args:
         path: file to write.
-        robot: that it claims to be for; default the shipped one.
-        memory: whether it takes the estimated disturbance.
-        metadata: entries in place of the right ones.
+        robot: robot in the metadata; default the shipped one.
+        memory: whether the estimated disturbance is an input.
+        metadata: entries that replace the correct ones.
         drop: entries to leave out.
         weights: (n, 8) of an affine policy; default zero.
         bias: (8,); default zero.
         hidden: sizes of hidden layers of a random ELU network.
-        seed: of the random network.
-        inputs: input size in place of the contract's.
+        seed: seed of the random network.
+        inputs: input size, if not the specified one.
         outputs: output size.
-        names: of input and output.
-        dtype: of input and output.
+        names: names of input and output.
+        dtype: type of input and output.
         checksum: whether the file has one.
         poison: whether the first action becomes NaN when the reference is above 1.2 m.
 

@@ -1,4 +1,4 @@
-"""The contract's targets."""
+"""Targets of the controller protocol."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The state that the controller plans from: where the robot will be when its command acts."""
+"""Prediction of the state at which a command acts."""
 
 from dataclasses import replace
 
@@ -30,7 +30,7 @@ def test_each_command_within_the_delay_acts_from_its_own_time(delay):
     estimator = DisturbanceEstimator(ROBOT, p.disturbance, p.model.command_delay, advance)
     now, rest = 12, State(0.0, np.zeros(3), np.zeros(3), np.array([0.0, 0, 0, 1]), np.zeros(3),
                           np.zeros(4), np.zeros(4), 0.0)
-    for k in range(now + 1):    # the robot stands still; only the last prediction is looked at
+    for k in range(now + 1):    # the robot is at rest; only the last prediction is tested
         estimator.disturbance[:] = 0.0
         predicted = estimator.update(replace(rest, stamp=k * PERIOD, tilt_stamp=k * PERIOD,
                                              command=command(k - 1) if k else None))

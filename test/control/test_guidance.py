@@ -1,4 +1,4 @@
-"""Guidance is a room of its own: any controller may fly inside it, and it says what it does."""
+"""Guidance as a wrapper of any controller: targets, trim, reach, description."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 
 
 class Keeper:
-    """Keeps what it is shown."""
+    """A controller that stores its targets."""
 
     period = 0.01
 

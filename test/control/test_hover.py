@@ -62,7 +62,7 @@ def test_approach_is_well_damped():
 
 
 def test_hovers_with_thrust_along_an_arm_where_one_rotor_is_unloaded():
-    """Gravity along arm 1: rotors 1 and 3 have no thrust and no defined direction."""
+    """With gravity along arm 1, rotors 1 and 3 have no thrust and no defined direction."""
     arm = ROBOT.tilt_axes[0]
     axis = np.cross(arm, [0, 0, 1.0])
     attitude = rotations.exp(np.pi / 2 * axis / np.linalg.norm(axis))
@@ -103,7 +103,7 @@ def test_takes_over_without_a_jump_from_any_command_in_force():
 
 
 def test_the_disturbance_estimate_converges_while_another_controller_is_active():
-    """A hand-over in the presence of a wrong mass starts without a droop."""
+    """A handover with a wrong mass starts without a loss of height."""
     level = np.array([0, 0, 0, 1.0])
     plant, in_force = start(level, mass_scale=1.1)
     flying, standby = HoverController(ROBOT), HoverController(ROBOT)

@@ -1,4 +1,4 @@
-"""The NMPC in closed loop with the CasADi model as plant, delay and all."""
+"""The NMPC in closed loop with the CasADi model as plant, with its delay."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The observation against an independent formula, and what it does not depend on."""
+"""The observation against an independent formula, and its invariances."""
 
 import numpy as np
 import pytest
@@ -65,7 +65,7 @@ def test_the_sign_of_a_quaternion_changes_nothing(seed):
 
 
 def moved(turn, shift, state, reference, disturbance):
-    """Give the same flight in a room that is turned and shifted."""
+    """The same flight with a turned and shifted world frame."""
     def turned(quaternion):
         return (turn * Rotation.from_quat(quaternion)).as_quat()
     return (State(0.0, turn.apply(state.position) + shift, turn.apply(state.velocity),

@@ -1,4 +1,4 @@
-"""The policy as a controller: what it loads, what it refuses, what it does with bad numbers."""
+"""The policy as a controller: accepted and refused files, commands, bad numbers."""
 
 from dataclasses import replace
 import os
@@ -122,7 +122,7 @@ def test_a_state_that_is_not_finite_repeats_the_last_command(tmp_path, memory, f
     assert np.array_equal(command.tilt, last.tilt)
     assert np.array_equal(command.thrust, last.thrust)
     assert policy.diagnostics()['rejected_states'] == 1
-    # and nothing of it stays
+    # and it has no later effect
     fresh = controller(path)
     fresh.step(state(1.0), TARGET)
     after, expected = (p.step(state(1.02, command=last), TARGET) for p in (policy, fresh))
@@ -193,7 +193,7 @@ def test_preview_applies_to_trajectories_and_not_to_poses(tmp_path):
 
 
 def refusal(path, robot=ROBOT, **changed):
-    """The one line about a file that is not loaded."""
+    """The one-line refusal of a file."""
     with pytest.raises(ParameterError) as caught:
         controller(path, robot, **changed)
     text = str(caught.value)
@@ -245,7 +245,7 @@ def test_a_policy_of_another_robot_needs_permission(tmp_path, caplog):
     assert 'robot_hash' in refusal(path, robot=other)
     policy = controller(path, robot=other, allow_other_robot=True)
     assert 'robot_hash' in caplog.text
-    # The offset of training stays: the network knows no other.
+    # The offset of training is kept, because the network was trained with it.
     assert np.allclose(policy.step(state(), TARGET).thrust, ROBOT.hover_thrust)
 
 
@@ -270,7 +270,7 @@ def test_metadata_written_by_the_trainer_load(tmp_path):
 
 def test_wound_joints_lead_through_level_for_a_pose_but_not_for_a_trajectory(
         tmp_path):
-    # the last two tilts asked for are z of the target's x and z axes in world
+    # the last two tilt commands are z of the target's x and z axes in world
     policy = controller(write(tmp_path / 'p.onnx', weights=selecting([0, 1, 17, 20, 4, 5, 6, 7])),
                         routing=RoutingParameters(tilt=100.0))
     scale = policy.contract.action_scale[3]

@@ -1,4 +1,4 @@
-"""A policy whose weights are not those that were exported does not fly."""
+"""A policy with other weights than the exported ones is refused."""
 
 import numpy as np
 import onnx

@@ -1,4 +1,4 @@
-"""The contract in a policy's metadata: written, read, and refused by the name of what differs."""
+"""Metadata of a policy: written, read, and refused with the differing entry."""
 
 from dataclasses import replace
 import json
@@ -37,7 +37,7 @@ def test_scales_and_offsets_are_the_published_ones():
 
 
 def refusal(**metadata):
-    """One line about a contract with other metadata."""
+    """The one-line refusal of other metadata."""
     given = {**PolicyContract.default(ROBOT).to_metadata(), **metadata}
     with pytest.raises(ParameterError) as caught:
         PolicyContract.from_metadata({k: v for k, v in given.items() if v is not None}

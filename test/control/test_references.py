@@ -1,4 +1,4 @@
-"""The reference over the horizon: what it holds, where joints unwind, what leads what."""
+"""The reference over the horizon: held poses, unwinding joints, lead of commands."""
 
 import casadi as ca
 import numpy as np

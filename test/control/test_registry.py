@@ -1,4 +1,4 @@
-"""One list of controllers: how names and classes become controllers, and what is refused."""
+"""The registry: controllers by names and classes, and refusals."""
 
 import ast
 from importlib import metadata
@@ -111,7 +111,7 @@ number = 3
 
 @pytest.fixture
 def module(tmp_path, monkeypatch):
-    """Stand in a folder with a module of controllers; return its name."""
+    """Change to a folder with a module of controllers; return its name."""
     name = f'own_{tmp_path.name}'.replace('-', '_')
     (tmp_path / f'{name}.py').write_text(MODULE)
     (tmp_path / 'tuned.yaml').write_text('gain: 3.0\n')
@@ -138,7 +138,7 @@ def test_a_class_is_found_by_module_and_by_file_under_its_own_name(module, tmp_p
         assert (entry.name, entry.description, entry.period) == ('my_controller', 'Holds still.',
                                                                  0.02)
         assert entry.make(ROBOT).step(SimpleNamespace(stamp=1.0), None).stamp == 1.0
-        # what another process is told leads there from any folder
+        # the reference for other processes is valid in any folder
         assert registry.find(entry.reference).name == 'my_controller'
     assert Path(registry.find(f'./{module}.py:MyController').reference).is_absolute()
 
@@ -242,7 +242,7 @@ def test_entry_points_of_other_packages_are_registered(module, monkeypatch):
     assert 'theirs' in registry.names() and registry.names().count('nmpc') == 1
     entry = registry.find('theirs')
     assert (entry.name, entry.reference) == ('theirs', 'theirs')
-    assert registry.find('nmpc') is registry.SHIPPED['nmpc']    # stays the package's own
+    assert registry.find('nmpc') is registry.SHIPPED['nmpc']    # the shipped one has precedence
 
 
 def test_controllers_of_an_installed_package_are_registered(module, tmp_path):

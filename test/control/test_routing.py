@@ -1,4 +1,4 @@
-"""The way round joint stops: when it is taken, that it winds the joints less, and that it ends."""
+"""Detours around joint stops: their condition, their winding, and their end."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ P = RoutingParameters()
 AXES = RobotParameters.load().tilt_axes
 STEPS = np.linspace(-0.5, 0.5, 101)[:, None]
 PLACE = np.array([0.5, -0.5, 1.5])
-# Upside down with two joints wound by half a turn, and a target for which they would go on.
+# Inverted with two joints wound by half a turn; the target would wind them further.
 START, TILT = rotations.from_rpy(np.pi - 0.2, 0.3, 0.0), np.array([-3.0, -2.9, 3.0, 2.9])
 quaternions = st.tuples(*[st.floats(-1, 1)] * 4).filter(
     lambda q: sum(v * v for v in q) > 0.01).map(rotations.normalized)
@@ -25,9 +25,9 @@ quaternions = st.tuples(*[st.floats(-1, 1)] * 4).filter(
 
 def winding(attitudes, tilt):
     """
-    Largest tilts on a slow turn through attitudes, and the least part of a thrust that can lift.
+    Largest tilts in a slow rotation through attitudes, and the least usable part of a thrust.
 
-    Step by step each joint turns, by at most half a radian, to where its thrust points up most.
+    In each step each joint turns by at most half a radian to the most upward thrust direction.
     """
     largest, least = np.abs(tilt).max(), 1.0
     for before, after in zip(attitudes, attitudes[1:]):
@@ -58,13 +58,13 @@ def test_a_detour_is_taken_where_the_shortest_rotation_exceeds_the_travel(start,
         for joint in (wound, (wound + 2) % 4):
             other = tilt[joint] - 2 * np.pi * np.sign(tilt[joint])
             tilt[joint] = other if abs(other) < 3.9 else tilt[joint]
-    assume(np.allclose(tilt[:2], -tilt[2:], atol=1e-6))     # not so: no way unwinds them
+    assume(np.allclose(tilt[:2], -tilt[2:], atol=1e-6))     # otherwise no route unwinds them
     angle = rotations.geodesic_angle(start, end)
     direct, use = winding([start, end], tilt)
-    assume(angle < 3.0 and use > 0.35)      # else which way the joints go is left to chance
+    assume(angle < 3.0 and use > 0.35)      # otherwise the direction of the joints is arbitrary
     found = Routing(P, AXES).between(start, end, tilt)
     if found is None:
-        assert direct < P.tilt + 1.5        # little to gain, or nothing better is there
+        assert direct < P.tilt + 1.5        # no route is better by much
         return
     assert direct > P.tilt - 0.15
     by_way, use = winding([start, found, end], tilt)

@@ -1,4 +1,4 @@
-"""The steady error at a target ends; what is no steady error moves nothing."""
+"""The steady error at a target is removed; other errors do not change the trim."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ SMALL = st.tuples(*[st.floats(-0.03, 0.03)] * 3).map(np.array)
 
 
 def state(stamp, way=(0, 0, 0), turn=(0, 0, 0), target=TARGET, **changed):
-    """A robot short of a target by a way in world and a turn."""
+    """State of a robot with an offset from a target, a vector in world and a rotation."""
     values = {'position': target.position - np.array(way), 'velocity': np.zeros(3),
               'quaternion': rotations.multiply(target.quaternion, rotations.conjugate(
                   rotations.exp(np.array(turn, dtype=float)))),
@@ -38,7 +38,7 @@ def wait(trimming, seconds, begin=0.0, target=TARGET, **where):
 @settings(max_examples=20, deadline=None)
 @given(SMALL, SMALL)
 def test_a_constant_tracking_error_is_trimmed_to_zero(way, turn):
-    """Its answer is quick against the integral: it follows with 0.3 s."""
+    """The robot follows with a time constant of 0.3 s, much faster than the integral."""
     trimming = Trimming(P)
     position, lag = np.zeros(3), np.zeros(3)
     for k in range(700):
@@ -100,7 +100,7 @@ def test_a_rate_of_zero_leaves_targets_unchanged():
 
 
 def hovering(mass_scale, **changed):
-    """A policy's steady error of position [m] on a plant of another mass."""
+    """The steady position error [m] of a policy on a plant of another mass."""
     pytest.importorskip('onnx')
     from hover_policy import write_hover_policy
     parameters = PolicyParameters.load()
@@ -122,7 +122,7 @@ def test_a_policy_carries_unknown_payload_without_a_steady_height_error(tmp_path
 
 
 def test_a_policy_on_standby_does_not_trim_the_error_of_another_controller(tmp_path):
-    """Where its own command is not the one in force, the error is none of its own."""
+    """Without its own command in force, an error must not change the trim."""
     controller, targets = PolicyController(ROBOT), []
     others = Command(0.0, np.zeros(4), np.full(4, ROBOT.hover_thrust))
     for k in range(300):

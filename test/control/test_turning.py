@@ -1,4 +1,4 @@
-"""Where targets are shown while there is far to turn, and that nothing else changes."""
+"""Raised targets during large rotations; other targets pass unchanged."""
 
 from dataclasses import replace
 
@@ -59,14 +59,14 @@ def test_an_inverted_far_target_passes_unchanged_once_the_rotation_is_small():
 
 
 @pytest.mark.parametrize('attitude, height, sinking, begin, caught', [
-    (FAR, 1.25, 0.0, 1.3, False),        # above where it began, less the depth
+    (FAR, 1.25, 0.0, 1.3, False),        # above its start, less the depth
     (FAR, 1.15, 0.0, 1.3, True),
     (FAR, 1.3, 0.5, 1.3, True),          # it will be
     (FAR, 1.3, 0.3, 1.3, False),
     (FAR, 1.3, 0.5, 1.1, False),         # it began lower
     (FAR, 1.45, 0.1, 2.0, False),        # the target is lower than where it began
     (FAR, 1.35, 0.5, 2.0, True),
-    (NEAR, 1.15, 0.5, 1.3, False),       # hardly anything to turn
+    (NEAR, 1.15, 0.5, 1.3, False),       # a small rotation
 ], ids=str)
 def test_a_predicted_descent_below_start_and_target_raises_the_target(attitude, height, sinking,
                                                                       begin, caught):
@@ -107,7 +107,7 @@ def test_for_a_state_that_is_not_finite_the_target_passes_unchanged(broken):
 
 @pytest.mark.parametrize('angle, climbs', [(2.0, True), (0.5, False)])
 def test_the_policy_turns_above_a_low_target(angle, climbs):
-    """At the target's place already: what differs is whether it asks for lift."""
+    """At the position of the target, the results differ by the required lift only."""
     robot, lift = RobotParameters.load(), []
     for height in (0.3, 1.5):
         controller = PolicyController(robot, PolicyParameters.load())

@@ -1,4 +1,4 @@
-"""The way off a joint's stop: when it is taken, where it leads, and that it ends."""
+"""Leaving a joint stop: the condition, the intermediate targets, and the end."""
 
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
@@ -34,7 +34,7 @@ def stuck(stamp, **changed):
 
 
 def fly(unwinding, seconds, begin=0.0, target=TARGET, **changed):
-    """Targets shown over a time, every 10 ms."""
+    """Targets of the guidance over a time, every 10 ms."""
     return [unwinding.target(stuck(begin + 0.01 * k, **changed), target)
             for k in range(round(seconds * 100))]
 
@@ -69,7 +69,7 @@ def test_the_cost_of_a_rotation_is_its_angle_weighted_by_arm_capacity(start, end
     weighted = angle * np.mean(np.maximum(uses(start, end), 0.2) ** -2)
     cost = turning_cost(Rotation.from_quat(start), Rotation.from_quat(end), AXES)
     assert cost.shape == (1,) and cost[0] >= angle - 1e-6
-    assert cost[0] == pytest.approx(weighted, rel=0.35)    # 16 points of what peaks sharply
+    assert cost[0] == pytest.approx(weighted, rel=0.35)    # 16 points of a sharp peak
 
 
 @settings(max_examples=50, deadline=None)
@@ -215,7 +215,7 @@ UPSIDE_DOWN = PoseTarget(np.array([0.0, 0.0, 1.5]), rotations.from_rpy(2.98, 0.0
 
 
 def missed(target, seconds=1.0):
-    """An unwinding that has just begun its way through level, the attitude, and what it shows."""
+    """An unwinding at the start of its route through level, the attitude, and its target."""
     unwinding = Unwinding(PARAMETERS, AXES)
     off = rotations.multiply(target.quaternion, rotations.exp(np.array([0.0, 0.3, 0.0])))
     return unwinding, fly(unwinding, seconds, target=target, position=target.position,
@@ -259,7 +259,7 @@ def test_a_new_target_is_followed_at_once_and_resets_the_attempts():
     shown = fly(unwinding, 5.0, 30.0, other)
     assert shown[0] is other and unwinding.attempts > PARAMETERS.attempts
     unwinding = Unwinding(PARAMETERS, AXES)
-    assert fly(unwinding, 1.0)[-1] is not TARGET     # on its way through level
+    assert fly(unwinding, 1.0)[-1] is not TARGET     # on its route through level
     assert fly(unwinding, 0.1, 1.0, other)[0] is other
 
 

@@ -20,7 +20,7 @@ from beetle_omni_ros.runs.bag import BagWriter, read_messages
 from beetle_omni_ros.runs.tasks import make_task
 
 VIEWERS = share_path('viewers')
-# What viewer_node adds to the topics of a flight.
+# Topics of viewer_node beside those of a flight.
 SHOWN = {'markers': 'visualization_msgs/msg/MarkerArray',
          'robot_description': 'std_msgs/msg/String'}
 TYPES = {**{name: topic.type for name, topic in ALL.items()}, **SHOWN}
@@ -123,7 +123,7 @@ def test_the_aggregator_has_a_group_for_each_node(node):
     assert len(found) == 1, node
 
 
-# What the programs' own sources declare: display class -> properties, and so on.
+# Declarations in the sources of the programs: display class -> properties, and so on.
 DISPLAY = {'Class', 'Name', 'Enabled', 'Value'}
 RVIZ = {
     'rviz_default_plugins/Grid': {
@@ -150,8 +150,8 @@ RVIZ_TOOLS = {f'rviz_default_plugins/{name}' for name in (
 RVIZ_ORBIT = {'Class', 'Name', 'Target Frame', 'Distance', 'Enable Stereo Rendering',
               'Focal Point', 'Focal Shape Fixed Size', 'Focal Shape Size', 'Near Clip Distance',
               'Invert Z Axis', 'Pitch', 'Yaw', 'Value'}
-# Of Foxglove Studio 1.48 (@foxglove/studio-base) and Lichtblick 1.10, which continues its source.
-# Only showLine and lineSize are younger than 1.48, which ignores them.
+# Foxglove Studio 1.48 (@foxglove/studio-base) and its successor Lichtblick 1.10.
+# Only showLine and lineSize are newer than 1.48, which ignores them.
 TITLE = {'foxglovePanelTitle'}
 FOXGLOVE = {
     '3D': {'cameraState', 'followMode', 'followTf', 'layers', 'publish', 'scene', 'topics',
@@ -260,7 +260,7 @@ def test_a_bag_contains_the_frames_and_topics_of_all_layouts(tmp_path):
               if 'frameId' in layer)} <= frames
     links = {link.get('name') for link in ElementTree.fromstring(urdf).findall('link')}
     assert links <= frames
-    for link in links:      # each leads to the world
+    for link in links:      # each has world as its root
         while link != 'world':
             link = parents[link]
     told = {split(curve.get('name'))[0] for curve in
@@ -269,7 +269,7 @@ def test_a_bag_contains_the_frames_and_topics_of_all_layouts(tmp_path):
              for path in panel.get('paths', ())}
     told |= {'robot_description'}
     missing = {name for name in told if f'/{name}' not in held}
-    # Nodes tell these to each other; a flight in one process has none of them.
+    # Topics between nodes, which a flight in one process does not have.
     assert missing <= {name for name in told if name.endswith('/state')}, missing
     for name in told - missing:
         assert held[f'/{name}'] == TYPES[name]

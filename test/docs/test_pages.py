@@ -1,4 +1,4 @@
-"""The pages can be read: links lead somewhere, sentences and lines are short, code agrees."""
+"""Pages: links exist, sentences and lines are short, and pages from code are up to date."""
 
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path

@@ -3,7 +3,7 @@ MAVLink 2 packets written by hand, and a parser small enough to check by eye.
 
 Sources: mavlink.io "Packet Serialization" (header, truncation of zeros, CRC-16/MCRF4XX over
 header and payload and then the message's CRC_EXTRA) and the common message set. The checksums
-at the ends of the packets were worked out with :func:`crc` below, bit by bit.
+at the ends of the packets were computed with :func:`crc` below, bit by bit.
 """
 
 import struct

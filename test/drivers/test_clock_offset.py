@@ -50,5 +50,5 @@ def test_the_offset_is_undefined_before_the_first_answer():
     assert not clock.known
     assert math.isnan(clock.offset())
     assert clock.uncertainty(5) == math.inf
-    assert not clock.add(2.0, 1.0, 1.9)     # an answer before its question is none
+    assert not clock.add(2.0, 1.0, 1.9)     # an answer before its request is ignored
     assert not clock.known

@@ -13,7 +13,7 @@ from beetle_omni_ros.drivers.mavlink_receiver import MavlinkReceiver
 from beetle_omni_ros.drivers.motor_board_watch import restarted
 
 FRAMES = strategies.sampled_from(reference.BY_BOARD)
-# Markers and lengths more often than chance has them.
+# Markers and lengths are more frequent than in random bytes.
 NOISE = strategies.lists(strategies.one_of(
     strategies.binary(max_size=40), strategies.just(b'\xfd'),
     FRAMES.flatmap(lambda frame: strategies.integers(1, len(frame) - 1).map(
@@ -107,7 +107,7 @@ def test_a_restart_of_the_sender_is_not_counted_as_loss():
 
 
 def test_signed_frames_are_refused():
-    """The contract excludes them; their additional bytes are not data."""
+    """The protocol excludes them; their additional bytes are not data."""
     frame = bytearray(reference.ACCEPTED)
     frame[2] = 1
     for receiver in receivers():

@@ -131,7 +131,7 @@ def test_the_clock_offset_of_the_board_is_within_its_bound():
 
 
 def test_an_independent_parser_accepts_all_output_of_the_driver():
-    """Sequence numbers without gaps, from the right sender, all of the contract's messages."""
+    """Sequence numbers without gaps, the right sender, all messages of the protocol."""
     device, other = pty.openpty()
     received = bytearray()
     board = driver(os.ttyname(other))
@@ -237,7 +237,7 @@ if sys.argv[4] == 'fail':
 
 
 def process(emulated, seconds=60, end=''):
-    """A process that flies for some seconds and leaves without closing."""
+    """A process that flies for some seconds and ends without closing."""
     folder = Path(__file__).parent
     child = subprocess.Popen(
         [sys.executable, '-c', CHILD, emulated.port, str(folder), str(seconds), end],
@@ -253,7 +253,7 @@ def test_a_process_disarms_at_exit_and_after_an_exception(end):
         child = process(emulated, 0.2, end)
         child.wait(20)
         assert not emulated.armed
-        assert emulated._firmware._stop_reason == 1         # asked by the host
+        assert emulated._firmware._stop_reason == 1         # requested by the host
 
 
 @pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGTERM, signal.SIGSTOP])

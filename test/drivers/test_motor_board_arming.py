@@ -145,7 +145,7 @@ def test_a_board_that_stopped_in_flight_is_lost_until_the_supervisor_is_disarmed
     board.status = status
     arming.update(CYCLE)
     assert arming.text == f'lost: {why}' and board.asked is False
-    board.status = ARMED        # an old message, or somebody else: it is disarmed again
+    board.status = ARMED        # by another program: it is disarmed again
     board.answer()
     board.status = ARMED
     asked = len(board.commands)
@@ -170,7 +170,7 @@ def test_a_silent_board_is_reported_after_a_timeout_that_excludes_own_pauses(
         bench, connected, text):
     board, arming = in_flight(bench)
     board.connected = connected
-    for _ in range(20):     # held up again and again, but heard in between
+    for _ in range(20):     # delayed repeatedly, with messages in between
         board.ready = 'nothing heard of the board'
         arming.update(10.0)
         assert arming.phase == 'flies'

@@ -1,4 +1,4 @@
-"""State from the board's messages, for any numbers in them."""
+"""State of the board for any numbers in its messages."""
 
 import time
 
@@ -43,7 +43,7 @@ def test_valid_frames_with_arbitrary_content_are_tolerated(payloads):
         board.tick(time.monotonic(), True)
         restarted(message)
     assert board.voltage is None or 15.0 <= board.voltage <= 26.4
-    assert not board.clock.known        # nobody asked
+    assert not board.clock.known        # without a request
     assert all(len(text.splitlines()) == 1 for _, text in board.take()['events'])
 
 

@@ -43,7 +43,7 @@ class Trajectory:
         self._angles = Waves(rng, 4.0, 2.0 * agility)
 
     def __call__(self, times):
-        """Return a dict of arrays over ``times``: what is true of base_link."""
+        """Return a dict of arrays over ``times`` with the true motion of base_link."""
         position, velocity, acceleration = self._position(times)
         angles, d, dd = self._angles(times)
         (sa, sb, _), (ca, cb, _) = np.sin(angles).T, np.cos(angles).T
@@ -60,7 +60,7 @@ class Trajectory:
 
 @dataclass
 class Sensors:
-    """How the flight is measured."""
+    """Sensors of a flight."""
 
     accelerometer_noise: float = 0.05
     gyroscope_noise: float = 0.005
@@ -127,7 +127,7 @@ class Sensors:
 
 @dataclass
 class Flight:
-    """One measured flight: what arrives, in the order of its arrival."""
+    """One measured flight: samples in the order of arrival."""
 
     trajectory: Trajectory
     imu: list
@@ -157,7 +157,7 @@ def fly(seed, duration, sensors=None, agility=1.0, start=0.0, delay=MOCAP_DELAY,
 
 
 def feed(ekf, sample):
-    """Give one sample to its entrance."""
+    """Give one sample to the filter."""
     return ekf.imu(sample) if isinstance(sample, ImuReading) else ekf.pose(sample)
 
 

@@ -39,7 +39,7 @@ def test_nees_is_inside_its_95_percent_band(flights, instant):
 
 @pytest.mark.parametrize('block', range(5))
 def test_each_block_of_states_is_consistent_by_itself(flights, block):
-    """Position, velocity, attitude and each bias: none is over- or underestimated."""
+    """The uncertainty of each block of states is neither over- nor underestimated."""
     part = slice(3 * block, 3 * block + 3)
     nees = [error[part] @ np.linalg.solve(covariance[part, part], error[part])
             for error, covariance in (rows[-1] for rows in flights)]
@@ -85,7 +85,7 @@ def test_after_reset_the_filter_equals_a_new_one():
 
 
 def test_absolute_ros_time_does_not_change_the_estimate():
-    """At 1.8e9 s a double resolves 0.2 us; the estimate must not feel it."""
+    """At 1.8e9 s a double resolves 0.2 us, which must not change the estimate."""
     flight, late = fly(9, 2.0), fly(9, 2.0)
     shift = 1.8e9
     late.imu = [replace(s, stamp=s.stamp + shift) for s in late.imu]

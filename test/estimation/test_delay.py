@@ -1,4 +1,4 @@
-"""Poses count at their capture time, whenever they arrive."""
+"""Poses are used at their capture time, for any time of arrival."""
 
 from dataclasses import replace
 
@@ -11,14 +11,14 @@ from beetle_omni_ros.estimation.mounting import Mounting
 
 
 def estimate_of(flight, parameters=None):
-    """Fly through; the last estimate."""
+    """Feed a flight; return the last estimate."""
     return run(ErrorStateEkf(parameters or EkfParameters.load(), GRAVITY), flight).estimate
 
 
 @pytest.mark.parametrize('delay', [0.003, 0.01, 0.037, 0.15])
 @pytest.mark.parametrize('capture', [0.0, 0.0017])
 def test_replay_equals_processing_in_order(delay, capture):
-    """However late poses come and wherever they fall between IMU samples."""
+    """For any latency of poses and any phase relative to the IMU samples."""
     flight = fly(1, 1.5)
     poses = flight.trajectory(np.array([s.stamp + capture for s in flight.poses]))
     flight.poses = [PoseReading(s.stamp + capture, p, q) for s, p, q in
@@ -44,7 +44,7 @@ def test_a_pose_newer_than_the_imu_waits_for_it():
 
 
 def test_capture_time_beats_time_of_arrival():
-    """The same late poses, once at their capture time and once taken for current."""
+    """The same late poses, once at their capture time and once as current ones."""
     parameters = EkfParameters.load()
     parameters = replace(parameters, initial=replace(parameters.initial, time_offset_std=0.0),
                          mocap=replace(parameters.mocap, gate_probability=0.9999999999))
@@ -72,7 +72,7 @@ def test_latency_in_imu_stamps_is_estimated_and_compensated(age):
     assert np.linalg.norm(error[:3]) > 0.5 * age * np.linalg.norm(truth['velocity'][0])
 
     trusting = replace(parameters, initial=replace(parameters.initial, time_offset_std=0.0),
-                       doubt=replace(parameters.doubt, poses=1000))    # it follows the poses else
+                       doubt=replace(parameters.doubt, poses=1000))    # else it follows poses
     blind = run(ErrorStateEkf(trusting, GRAVITY), flight)
     assert (np.linalg.norm(blind.estimate.position - truth['position'][0])
             > 3 * np.linalg.norm(ekf.estimate.position - truth['position'][0]))
@@ -80,7 +80,7 @@ def test_latency_in_imu_stamps_is_estimated_and_compensated(age):
 
 @pytest.mark.parametrize('age', [0.015, 0.025])
 def test_a_late_angular_rate_is_extrapolated_linearly(age):
-    """Its error in motion is less than half of what holding the last reading leaves."""
+    """The error in motion is less than half of that of holding the last reading."""
     shipped = EkfParameters.load()
     held = replace(shipped, time_offset=replace(shipped.time_offset, trend_samples=1))
     errors = {}
@@ -107,7 +107,7 @@ def test_an_impact_is_not_extrapolated():
 
 
 def test_late_stamps_of_the_mocap_do_not_shift_the_estimate_in_time():
-    """Poses stamped on arrival look later than they are; the IMU's clock is then the right one."""
+    """Poses stamped on arrival seem too late, so that the clock of the IMU is the right one."""
     flight = fly(5, 6.0, agility=0.5)
     flight.poses = [replace(s, stamp=s.stamp + 0.012) for s in flight.poses]
     flight.delay = 0.0
@@ -118,7 +118,7 @@ def test_late_stamps_of_the_mocap_do_not_shift_the_estimate_in_time():
 
 
 def test_in_hover_no_time_offset_is_estimated():
-    """At rest nothing is known of the offset, and noise must not pass for it."""
+    """At rest the offset is unobservable, and noise must not be taken for it."""
     flight = fly(6, 10.0, Sensors(), agility=0.0)
     ekf = run(ErrorStateEkf(EkfParameters.load(), GRAVITY), flight)
     error = error_state(ekf.estimate, flight)

@@ -11,7 +11,7 @@ from beetle_omni_ros.robot import rotations
 
 
 def new_ekf(**status):
-    """With the shipped parameters, but for those of the status that are given."""
+    """Filter with the shipped parameters, except the given ones of the status."""
     shipped = EkfParameters.load()
     return ErrorStateEkf(replace(shipped, status=replace(shipped.status, **status)), GRAVITY)
 
@@ -87,7 +87,7 @@ def test_single_outliers_are_refused_and_leave_no_trace(shift, turn):
     refused = [sample.stamp for accepted, sample in results if not accepted]
     assert refused == [flight.poses[k].stamp for k in outliers]
     assert ekf.rejected == {'outlier': len(outliers)}
-    # only the noise seen around the outliers may weigh the good poses differently
+    # only the noise estimated around the outliers may change the weight of the good poses
     np.testing.assert_allclose(ekf.estimate.position, reference.estimate.position, atol=5e-4)
     assert ekf.status == 'tracking'
 
@@ -126,7 +126,7 @@ def test_random_poses_never_start_the_filter():
 @pytest.mark.parametrize('fault', [lambda force: -force, lambda force: force / 9.80665,
                                    lambda force: force[:, [1, 2, 0]], lambda force: 0 * force])
 def test_an_imu_that_contradicts_gravity_never_starts_the_filter(fault):
-    """Upside down, in units of g, with swapped axes, with gravity removed."""
+    """The IMU is inverted, in units of g, with swapped axes, or without gravity."""
     flight = fly(8, 2.0, agility=0.3)
     forces = fault(np.array([sample.specific_force for sample in flight.imu]))
     flight.imu = [replace(sample, specific_force=f) for sample, f in zip(flight.imu, forces)]
@@ -136,7 +136,7 @@ def test_an_imu_that_contradicts_gravity_never_starts_the_filter(fault):
 
 
 def test_mocap_noisier_than_its_parameter_is_detected_and_weighted_less():
-    """Six times the claimed noise, as in the published randomisation."""
+    """The noise is six times its parameter, as in the published randomisation."""
     sensors = Sensors(position_noise=0.006, orientation_noise=0.006)
     flight = fly(9, 5.0, sensors)
     ekf = new_ekf()
@@ -152,7 +152,7 @@ def test_mocap_noisier_than_its_parameter_is_detected_and_weighted_less():
 
 
 def struck(flight, time, impulse, samples):
-    """Let the robot be struck: ``samples`` readings from ``time`` on show the blow."""
+    """Add an impact to ``samples`` readings from ``time`` on."""
     period, trajectory = 0.005, flight.trajectory
     start = next(k for k, s in enumerate(flight.imu) if s.stamp >= time - 1e-9)
     blow = np.array(impulse) / (len(samples) * period)
@@ -169,7 +169,7 @@ def struck(flight, time, impulse, samples):
 
 @pytest.mark.parametrize('seen', [0.3, 1.0, 3.0])
 def test_an_impact_with_a_poor_imu_measurement_keeps_the_track(seen):
-    """A hard landing: readings aliased, or beyond the range and refused."""
+    """The readings of a hard landing are aliased, or beyond the range and refused."""
     flight = struck(fly(10, 3.0, agility=0.3), 2.0, (0.0, 0.5, 1.2), [seen] * 2)
     ekf = new_ekf()
     rows = history(ekf, flight)
@@ -194,7 +194,7 @@ def test_a_frozen_pose_is_refused_and_the_filter_dead_reckons():
 
 
 def test_an_attitude_that_contradicts_the_gyroscope_is_refused():
-    """Markers confused from 4 s on: turned by 90 deg about the body's z axis, for good."""
+    """Markers are confused from 4 s on: poses are turned by 90 deg about the body z axis."""
     ekf, flight = new_ekf(), fly(3, 9.0)
     turn = rotations.exp(np.array([0.0, 0.0, np.pi / 2]))
     for time, sample in flight.arrivals():

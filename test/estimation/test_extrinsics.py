@@ -41,7 +41,7 @@ def final_error(mounting, parameters, imu_period):
 
 @pytest.mark.parametrize('name', MOUNTINGS)
 def test_a_noise_free_flight_is_recovered_up_to_the_integration_error(name):
-    """The error left is that of the trapezoidal rule: small, and gone with a finer step."""
+    """The remaining error is that of the trapezoidal rule, which falls with the step."""
     mounting = MOUNTINGS[name]
     error = final_error(mounting, parameters_for(mounting), 0.005)
     fine = final_error(mounting, parameters_for(mounting), 0.00125)
@@ -53,7 +53,7 @@ def test_a_noise_free_flight_is_recovered_up_to_the_integration_error(name):
 
 @pytest.mark.parametrize('name', MOUNTINGS)
 def test_ignoring_a_mounting_is_much_worse(name):
-    """So that the test above would fail if a mounting were not used."""
+    """Without the mounting, the test above would fail."""
     mounting = MOUNTINGS[name]
     flight = fly(1, 2.0, Sensors.perfect(**mounting))
     ekf = run(ErrorStateEkf(parameters_for({}), GRAVITY), flight)

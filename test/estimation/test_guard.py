@@ -1,4 +1,4 @@
-"""Bad input is refused, counted by its reason, and the state stays as it was."""
+"""Bad input is refused, counted by its reason, and does not change the state."""
 
 from dataclasses import replace
 import warnings
@@ -14,7 +14,7 @@ NAN, INF, HUGE = np.nan, np.inf, 1e200
 
 @pytest.fixture
 def flying():
-    """Give a filter in the middle of a flight, and the flight."""
+    """A filter in the middle of a flight, and the flight."""
     flight = fly(1, 4.0)
     ekf = ErrorStateEkf(EkfParameters.load(), GRAVITY)
     run(ekf, flight, until=1.5)
@@ -67,7 +67,7 @@ def refused(ekf, sample, reason):
 
 
 def continued(ekf, flight, after):
-    """Finish the flight; the filter must track as if nothing had happened."""
+    """Finish the flight; the filter must track as without the refused input."""
     undisturbed = run(ErrorStateEkf(EkfParameters.load(), GRAVITY), flight)
     for time, sample in flight.arrivals():
         if time > after:
@@ -153,7 +153,7 @@ def test_missing_imu_samples_within_the_gap_limit_are_bridged():
 
 @pytest.mark.parametrize('jump', [-1000.0, 7.0])
 def test_a_permanent_clock_jump_reinitialises_the_filter(jump):
-    """Simulated time starts anew, or the IMU was silent for long."""
+    """Simulated time restarts, or the IMU was silent for long."""
     flight = fly(7, 4.0)
     flight.imu = [replace(s, stamp=s.stamp + jump) if s.stamp > 2.0 else s for s in flight.imu]
     flight.poses = [replace(s, stamp=s.stamp + jump) if s.stamp > 2.0 else s

@@ -1,4 +1,4 @@
-"""A gyroscope that hides a turn: the poses of the MoCap give the rate."""
+"""If the gyroscope misses a rotation, MoCap poses give the rate."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The noise of the MoCap, seen from its poses."""
+"""The noise of the MoCap, estimated from its poses."""
 
 from ekf_flights import fly, Sensors
 import numpy as np
@@ -9,7 +9,7 @@ from beetle_omni_ros.estimation.parameters import MocapParameters
 
 
 def scale_after(poses):
-    """Feed poses to a monitor with the default claim."""
+    """Feed poses to a monitor with the default noise."""
     monitor = NoiseMonitor(MocapParameters())
     for pose in poses:
         monitor.add(pose.stamp, pose.position, pose.quaternion)

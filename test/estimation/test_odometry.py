@@ -11,7 +11,7 @@ DRAWS, GYROSCOPE_NOISE = 200_000, 2e-3
 
 @pytest.fixture(scope='module')
 def drawn():
-    """Give an estimate at an odd attitude, and draws of the truth from its covariance."""
+    """An estimate at a general attitude, and draws of the truth from its covariance."""
     rng = np.random.default_rng(2)
     mix = rng.standard_normal((15, 15)) * 1e-3
     estimate = Estimate(0.0, np.array([1.0, 2.0, 3.0]), np.array([2.0, -1.0, 0.5]),

@@ -18,7 +18,7 @@ DURATION, HEIGHT, POSE_TIME = 8.0, 2.0, 2.0
 
 
 def fly(conditions, seed, drop=lambda time: False, true=None, nominal=None):
-    """Fly random poses on the true state; the estimator listens. Yield it with the truth."""
+    """Fly random poses on the true state; yield the estimator with the truth."""
     robot = true or RobotParameters.load()
     simulator = Simulator(robot, conditions=conditions, seed=seed)
     hover = HoverController(robot, HoverParameters.load())
@@ -55,7 +55,7 @@ def errors(ekf, truth):
 
 @pytest.mark.parametrize('conditions, position, velocity, angle', [
     ('nominal', 0.002, 0.015, np.deg2rad(0.15)),
-    # bias of the MoCap itself, which no filter can see: 0.01 m and 0.01 rad an axis
+    # bias of the MoCap, which is unobservable: 0.01 m and 0.01 rad an axis
     ('published', 0.025, 0.1, np.deg2rad(1.5)),
 ])
 def test_flight_is_tracked_all_the_way(conditions, position, velocity, angle):
@@ -80,7 +80,7 @@ def test_half_a_second_without_mocap_in_simulated_flight():
 
 
 def test_the_covariance_is_consistent_on_the_multibody_plant():
-    """NEES of position, velocity and attitude; jolts of the modules spoil an exact chi-square."""
+    """NEES of position, velocity and attitude; module reactions prevent an exact chi-square."""
     nees = []
     for seed in range(4):
         for k, (ekf, truth) in enumerate(fly('nominal', seed)):
@@ -94,17 +94,17 @@ def test_the_covariance_is_consistent_on_the_multibody_plant():
     assert 5.5 < np.mean(nees) < 12.5   # 9 for an exact filter; point-sampled IMU: 24
 
 
-HIDDEN = {     # values, seconds of flight that count, columns of the errors, how much better
+HIDDEN = {     # values, compared seconds of flight, columns of the errors, improvement
     'imu_misalignment': ({'rotation': (0.03, -0.02, 0.025)}, (0.5, 4.0), (0, 1, 2), 2.0),
     'mocap_misalignment': ({'rotation': (0.02, -0.02, 0.01)}, (0.5, 4.0), (0, 1, 2), 3.0),
     'imu_lever_arm': ({'offset': (0.06, -0.04, 0.05)}, (0.5, 4.0), (0, 1, 2), 1.5),
     'mocap_time_offset': ({'delay': 0.02}, (0.5, 4.0), (0, 1, 2), 1.2),
-    # what the filter finds by itself helps at the start
+    # biases that the filter estimates matter at the start only
     'imu_filter_lag': ({'delay': 0.015}, (0.0, 1.0), (1,), 1.2)}
 
 
 def flown(true, nominal, duration):
-    """Rows of time and errors in units of what a sound flight has, and the last estimate."""
+    """Rows of time and errors relative to a flight without fault, and the last estimate."""
     rows = []
     for ekf, truth in fly('nominal', 3, true=true, nominal=nominal):
         if ekf.status == 'tracking':

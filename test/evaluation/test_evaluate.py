@@ -1,4 +1,4 @@
-"""The in-process flight: deterministic, complete, honest about what went wrong."""
+"""The in-process flight: determinism, complete results, reported failures."""
 
 from dataclasses import replace
 import io
@@ -29,7 +29,7 @@ def evaluate(task, controllers=('nmpc',), **options):
 
 @pytest.fixture(scope='module')
 def poses(tmp_path_factory):
-    """A pose file of one near pose, so that a flight is short."""
+    """A pose file with one near pose, for a short flight."""
     path = tmp_path_factory.mktemp('task') / 'poses.csv'
     path.write_text('x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg\n0.3,0.2,1.1,30,-20,40\n')
     return path
@@ -129,7 +129,7 @@ def test_a_force_task_ends_with_the_level_of_lost_control():
     assert any(str(level) in json.dumps(lost) for level in levels)
 
 
-@pytest.mark.parametrize('charge', [0.3, 0.0])      # 0: by the supervisor's warning alone
+@pytest.mark.parametrize('charge', [0.3, 0.0])      # 0: by the warning of the supervisor only
 def test_an_empty_pack_is_swapped_at_the_next_target(charge, tmp_path, monkeypatch):
     monkeypatch.setattr(loop, 'SWAP_CHARGE', charge)
     small = SimulatorParameters.load()
@@ -165,7 +165,7 @@ def test_a_task_beyond_the_declared_reach_of_a_controller_is_refused(
                    'class Own(HoverController):\n'
                    f'    name = "own"\n    {f"reach = {reach}" if reach else "pass"}\n')
     task = make_task(str(far))
-    monkeypatch.setattr(loop.FlightLoop, 'fly', lambda *_: False)   # what is flown is no matter
+    monkeypatch.setattr(loop.FlightLoop, 'fly', lambda *_: False)   # any flight
     if not reach:
         assert command.fly(f'{own}:Own', task, robot=ROBOT, plant=ROBOT).meta['crashed']
         return

@@ -15,19 +15,19 @@ STATE = State(1.0, np.ones(3), np.zeros(3), np.array([0, 0, 0, 1.0]), np.zeros(3
 
 
 class Ear:
-    """A supervisor that only listens."""
+    """Stand-in for the supervisor that stores messages."""
 
     def __init__(self):
         self.heard = []
 
     def __getattr__(self, method):
-        """Note every message."""
+        """Store every message."""
         return lambda *message: self.heard.append((method, *message))
 
 
 @pytest.fixture
 def struck():
-    """Make processes with faults, begun at 0 s; beside them the ear."""
+    """Make processes with faults that begin at 0 s; return them and the stand-in."""
     def make(*faults):
         ear = Ear()
         processes = Processes(TICK, ear)

@@ -1,4 +1,4 @@
-"""The learnt controller in the whole loop: switched in flight, broken in flight."""
+"""The policy in the whole loop: switched in flight, and with faults in flight."""
 
 from dataclasses import replace
 
@@ -50,7 +50,7 @@ def flight(policy):
 
 
 class Switching(LogRecorder):
-    """A recorder in whose place the operator sits: selects the other one at given times."""
+    """Stand-in for the recorder that selects the other controller at given times."""
 
     def __init__(self, supervisor, times):
         super().__init__()
@@ -67,7 +67,7 @@ class Switching(LogRecorder):
 
 
 def fly_switching(policy, seed):
-    """Both controllers in one loop, changed at moments drawn from ``seed``."""
+    """Both controllers in one loop, switched at times drawn from ``seed``."""
     estimator = EkfParameters.load()
     supervisor = Supervisor(SupervisorParameters.load(), ROBOT, HoverController(ROBOT))
     times = np.sort(np.random.default_rng(seed).uniform(4.0, 3.8 + 8 * POSES, SWITCHES))
@@ -85,7 +85,7 @@ def test_twenty_switches_at_random_times_of_random_poses(flight):
     stayed, recorder, task = flight
     log = recorder.log()
     assert stayed and len(recorder.switched) == SWITCHES
-    # every switch takes effect at its moment, and nothing else changes the state
+    # every switch takes effect at its time, and nothing else changes the state
     flown = [(t, name) for t, name in zip(log.state_t, log.states) if name.startswith('flying')]
     assert [name for _, name in flown] == ['flying:nmpc'] + [
         f'flying:{name}' for _, name in recorder.switched]
@@ -93,8 +93,8 @@ def test_twenty_switches_at_random_times_of_random_poses(flight):
     assert not {'fallback', 'landing', 'emergency_stop'} & {
         state.partition(':')[0] for state in log.states}
     assert all(pose['reached'] for pose in metrics(log, task)['poses'])
-    # The executed command is that of the selected controller, once it has caught up: the time
-    # of a hand-over counts in stamps and ends with the command that crosses it.
+    # After the handover the executed command is that of the selected controller. The time of a
+    # handover is measured in stamps and ends with the first command beyond it.
     settled = HANDOVER.time + 2 * PERIOD
     for (start, name), (end, _) in zip(flown, [*flown[1:], (log.end, '')]):
         asked = log.requests[name.partition(':')[2]]
@@ -120,7 +120,7 @@ def test_no_switch_makes_the_command_jump(flight):
             own = np.searchsorted(asked.t, log.command_t[k + 1])
             if own == len(asked.t) or np.allclose(asked.tilt[own], log.command_tilt[k + 1]) \
                     and np.allclose(asked.thrust[own], log.command_thrust[k + 1]):
-                break       # it has caught up, and has its way
+                break       # the handover is over, and its commands are executed
 
 
 def test_switched_flights_are_the_same_every_time(policy, flight):
@@ -149,7 +149,7 @@ def test_nan_commands_lead_to_hover_and_good_ones_regain_control(tmp_path):
         log.state_t[log.states.index('fallback:controller_silent')]
     up = log.truth_t > begin
     assert log.truth_position[up, 2].min() > 0.8
-    # within the supervisor's patience of the first refusal, and on the second target
+    # within the timeout after the first refusal, and on the second target
     assert begin + 8.0 < fell < begin + 8.2
     assert np.isfinite(log.command_tilt).all() and np.isfinite(log.command_thrust).all()
     assert np.isnan(log.requests['rl'].thrust).any()

@@ -1,4 +1,4 @@
-"""The campaign: repeatable flights, sums that add up, tables that match the list."""
+"""The campaign: repeatable flights, correct counts, tables that match the list."""
 
 from dataclasses import replace
 import io
@@ -36,7 +36,7 @@ def quick(listed):
 
 @pytest.fixture(scope='module')
 def soft(quick, tmp_path_factory):
-    """A flight with a fault that does not matter, twice, the first with a bag."""
+    """Two equal flights with a harmless fault, the first with a bag."""
     bags = tmp_path_factory.mktemp('bags')
     trial = Trial('commands_lost_for_a_moment')
     return fly_trial(trial, quick, bags), fly_trial(trial, quick)

@@ -1,4 +1,4 @@
-"""Judging a flight: by the truth, one word for each way to end."""
+"""The outcome of a flight from the truth, with one word for each kind of end."""
 
 import numpy as np
 import pytest

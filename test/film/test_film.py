@@ -1,4 +1,4 @@
-"""Films: the flight is in the picture, wrong models drift, files can be played."""
+"""Films: the view contains the flight, wrong models drift, files can be played."""
 
 import os
 import subprocess

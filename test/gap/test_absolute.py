@@ -1,4 +1,4 @@
-"""Residuals above the noise ceiling, and named effects that held-out flights must confirm."""
+"""Residuals above the noise ceiling, and confirmation of named effects by held-out flights."""
 
 from types import SimpleNamespace
 

@@ -170,7 +170,7 @@ def test_play_behind_the_encoder_turns_the_true_tilt_only():
 
 
 def test_the_gyroscopic_load_on_a_joint_agrees_with_euler():
-    """Turning the momentum takes a torque, which the servo gives about its axis."""
+    """Turning the angular momentum needs a torque, which the servo gives about its axis."""
     made = model(MOTION.flight())
     load, t = spin_load(made.signals, {}), made.signals.t
     speed = np.sqrt(MOTION.thrust / (ROBOT.mass * ROBOT.gravity / 4))
@@ -186,7 +186,7 @@ def test_a_torque_limit_is_recovered_from_samples_at_the_limit():
     tried = [start[0] for start in begin]
     rest = [np.square(made.residual(theta, 'J')['J']).mean()
             for theta in ({}, *({key: x} for x in tried))]
-    # Every start has a slope, one is nearer than no limit at all, and none is at a bound.
+    # Every start has a derivative and is not at a bound; one fits better than no limit.
     assert all(x != rest[0] for x in rest[1:]) and min(rest[1:]) < rest[0]
     assert all(KEYS[key].low < x for x in tried)
     found = solved(made, [key], 'J', None, {key: tried[int(np.argmin(rest[1:]))]}, 6)

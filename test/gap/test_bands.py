@@ -1,4 +1,4 @@
-"""Closed-loop bias: a parameter is the same in slow and in fast motion, a bias by gusts is not."""
+"""Closed-loop bias by gusts differs between slow and fast motion; a parameter does not."""
 
 from itertools import product
 from types import SimpleNamespace
@@ -87,7 +87,7 @@ def test_the_bands_add_up_to_the_signal(groups, channels):
 @pytest.mark.parametrize('gusts, wanted, true, passes', [
     (0.3, 0.0, 0.0, False),      # closed-loop bias: gusts look like an inertia
     (0.3, 0.2, 0.0, False),
-    (0.0, 0.5, 0.3, True),       # an inertia that is there
+    (0.0, 0.5, 0.3, True),       # a true change of inertia
     (0.1, 0.5, 0.3, True)])
 def test_closed_loop_bias_is_separated_from_an_inertia(gusts, wanted, true, passes):
     p = problem(3)

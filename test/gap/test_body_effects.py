@@ -174,7 +174,7 @@ def test_every_body_effect_is_tested():
 
 @pytest.mark.parametrize('name', [n for n, e in CATALOGUE.items() if e.apply])
 def test_a_mirrored_robot_gives_mirrored_results(name):
-    """Mirrored at the x-z plane: vectors change y, rates and torques change x and z."""
+    """At the x-z plane, vectors change the sign of y, rates and torques that of x and z."""
     places = np.array([[1, 1, -0.02], [-1, 1, -0.02], [-1, -1, -0.02], [1, -1, -0.02]]) * 0.2
     robot = replace(ROBOT, rotors=replace(ROBOT.rotors, positions=places))
     rng = np.random.default_rng(4)

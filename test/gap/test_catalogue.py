@@ -1,4 +1,4 @@
-"""Every name of the interfaces is in the catalogue, with a complete description."""
+"""Every name of INTERFACES is in the catalogue, with a complete description."""
 
 import math
 

@@ -146,7 +146,7 @@ def flight_model():
 def gap(name):
     """Whether a key of the effect changes the residual."""
     made = flight_model()
-    limit = isinstance(CATALOGUE[name].starts, LimitStarts)     # far above this calm flight
+    limit = isinstance(CATALOGUE[name].starts, LimitStarts)     # beyond this calm flight
     theta = {key.name: np.log(0.05 if limit else 1 - key.typical) if key.relative
              else key.typical for key in KEYS.values() if key.effect == name and not key.form}
     before, after = made.residual({}), made.residual(theta)

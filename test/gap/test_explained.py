@@ -39,7 +39,7 @@ class Straight(Problem):
 
 
 class Curved(Straight):
-    """The same with slopes that are twice too steep: each step goes half the way."""
+    """The same with derivatives that are too large by two, so that each step is halved."""
 
     def learn_noise(self, wide, rounds=3):
         theta = getattr(self, 'at', {})
@@ -66,7 +66,7 @@ def test_a_slowly_converging_fit_leaves_no_gain_for_other_candidates():
 
 
 class Rough(Straight):
-    """Two linear tolerances beside a friction whose slope is misleading."""
+    """Two linear tolerances and a friction with a wrong derivative."""
 
     FRICTION = 'joint_friction.coulomb'
 
@@ -80,7 +80,7 @@ class Rough(Straight):
         return made
 
     def start(self):
-        """State with the right friction and a slope that points away from it."""
+        """State with the right friction and a derivative of the wrong sign."""
         theta, names = {self.FRICTION: 0.005}, [LAG, OTHER, self.FRICTION]
         slopes = self.slopes(theta, names)
         slopes[:2000, :2] = self.columns
@@ -111,7 +111,7 @@ def before(truth, overlap=0.0):
 
 def test_a_lag_far_beyond_tolerance_is_not_absorbed_by_the_tolerance():
     fitted, believable = before(0.25)
-    # The tolerance's own price is eight deviations: 70 of chi2. The data say thousands.
+    # The prior of the tolerance costs eight deviations, 70 of chi2; the data give thousands.
     assert fitted < 2300 and believable > fitted + 1000 * 30**2 * (0.25 - 0.09)**2
 
 
@@ -250,7 +250,7 @@ class Capped(Problem):
 
 def test_without_the_only_block_at_a_limit_the_limit_is_open():
     problem = Capped()
-    point, without = problem.at(0.019), problem.at(3.0)     # where bad readings pull it
+    point, without = problem.at(0.019), problem.at(3.0)     # the value given by bad readings
     trial = Trial(Candidate('joint_velocity_limit', (problem.KEY,), label='limit'), 1.0,
                   dict(point.theta))
     cross_validate(problem, trial, point, without, [], frozenset())

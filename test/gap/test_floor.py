@@ -43,7 +43,7 @@ def test_every_flight_has_its_own_gusts():
     assert spread(storm) / spread(calm[0]) == pytest.approx(4, rel=0.3)
     assert spread(calm[1]) / spread(calm[0]) == pytest.approx(1, rel=0.3)
     calm, storm = (replace(noise, seen={'B': noise.seen['B'] * ([1] * 3 + [0] * 3)})
-                   for noise in (calm[0], storm))     # turns are not what this motion is about
+                   for noise in (calm[0], storm))     # this motion does not test rotations
     assert noise_floor(windy, storm)[HALF, 1] > 2 * noise_floor(windy, calm)[HALF, 1]
 
 
@@ -90,7 +90,7 @@ def test_unknown_torques_tilt_the_thrust():
                   {'B': np.array([0, 0, 0, *[size] * 3]), 'J': np.zeros(4)})
     floor = noise_floor(made(np.zeros(3)), noise)[HALF]
     rng, reached = np.random.default_rng(5), []
-    for _ in range(400):    # a body that hovers and is turned, in plain steps
+    for _ in range(400):    # a hovering body that rotates, in plain steps
         attitude, (rate, velocity, place) = Rotation.identity(), np.zeros((3, 3))
         for _ in range(round(HORIZONS[HALF] / step)):
             rate = rate + step * size * rng.standard_normal(3)

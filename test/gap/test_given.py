@@ -1,4 +1,4 @@
-"""Names of recordings, and recordings that are given twice."""
+"""Names of recordings, and duplicate recordings."""
 
 from pathlib import Path
 

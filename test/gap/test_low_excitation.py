@@ -1,4 +1,4 @@
-"""Low excitation: closed-loop bias by gusts must not pass for an effect."""
+"""Low excitation: closed-loop bias by gusts must not be taken for an effect."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -56,7 +56,7 @@ def hovering(push=0.0):
     kernel = np.hanning(100)
     gust = np.stack([np.convolve(x, kernel / np.linalg.norm(kernel), 'same')
                      for x in rng.standard_normal((6, len(MOTION.t)))], axis=1)
-    gust[:, 3:] *= 0.1      # rad/s, whose slope is what counts
+    gust[:, 3:] *= 0.1      # rad/s, of which only the derivative is used
     flight = MOTION.flight(imu=push * gust + [0, 0, 9.80665, 0, 0, 0])
     pose = flight.pose.copy()
     pose[:] = [0, 0, 1, 0, 0, 0, 1]
@@ -139,4 +139,4 @@ def test_low_excitation_is_explained_once(monkeypatch, lively, expected):
     monkeypatch.setattr(Search, '_select', lambda self, trials, *rest: next(iter(trials), None))
     found = search.run()
     assert (len(found.accepted), found.low_excitation) == (expected, lively < 1)
-    assert len(search.candidates) == 2      # all of them are tried as rivals
+    assert len(search.candidates) == 2      # all of them are fitted as rivals

@@ -31,7 +31,7 @@ NOTHING = Remainder(0.0, 0.0, [], [], 'body', {})
 def problem(push):
     """Problem of a flight with a force that causes the acceleration ``push`` (N, 3) in world."""
     made = Problem([model(pushed(MOTION, push))], KEYS, tolerances(P), P)
-    # Turns are not those that the thrusts make: only forces are looked at.
+    # Rotations do not follow from the thrusts, because only forces are tested.
     made.models[0]._mask = np.ones(len(made.models[0]._mask))
     made.noise = Noise.of([made.models[0].residual({})], P)
     made._label()
@@ -135,5 +135,5 @@ def test_a_name_is_withdrawn_if_a_pattern_explains_as_much(gain, verdict):
     (SWINGING, 1.1, 'unknown'), (SWINGING, 0.9, 'named'), ('the place', 2.0, 'named')])
 def test_a_swinging_mass_is_unknown_even_if_its_weight_explains_much(text, size, verdict):
     swing = Pattern(text, 2 * P.least_pattern, 5.0, 1.0, (size * P.swinging_force, 0.0))
-    winds = [wind() for _ in range(4)]      # they explain nine times what is left
+    winds = [wind() for _ in range(4)]      # they explain nine times the remaining variance
     assert decided(winds, [swing]).verdict == verdict

@@ -147,7 +147,7 @@ def silent_clock(made):
     return made
 
 
-# name -> damage, topic, words of which one must be in the cause, moment [s] or None
+# name -> damage, topic, words of which the cause must contain one, time [s] or None
 KINDS = {
     'quaternion w first': (lambda m: columns(m, POSE, 3, 7, lambda v: v[:, [3, 0, 1, 2]]),
                            POSE, ['(w, x, y, z)'], None),
@@ -276,8 +276,8 @@ def test_a_sound_recording_has_no_damage(conditions):
 @pytest.mark.parametrize('seed', range(4))
 @pytest.mark.parametrize('swapped', [False, True])
 def test_rotors_of_different_strength_in_hover_are_not_taken_for_swapped(swapped, seed):
-    # Two weak neighbours: they are commanded more, which looks like a torque that is not there.
-    # In another order it would look like less.
+    # Two weak neighbours get larger commands, which looks like an unmodelled torque. With
+    # exchanged rotors the torque would be smaller.
     rng, count = np.random.default_rng(seed), 600
     share = np.array([0.94, 0.94, 1.06, 1.06])
     wanted = ROBOT.hover_thrust * (1 + 0.03 * rng.normal(size=(count, 4)))

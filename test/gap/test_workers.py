@@ -48,7 +48,7 @@ def columns(big, k, add=0.0):
 
 
 def process(subject, k):
-    time.sleep(0.05)        # so that nobody is done before the others have begun
+    time.sleep(0.05)        # so that no worker ends before the others have begun
     return os.getpid()
 
 

@@ -1,4 +1,4 @@
-"""The kinds of damage lie beside the benchmarks."""
+"""Make the kinds of damage in benchmarks/ importable."""
 
 from pathlib import Path
 import sys

@@ -1,4 +1,4 @@
-"""Every kind of damage does what it says, and nothing else."""
+"""Every kind of damage has its described effect and no other."""
 
 from gap_damage_kinds.catalogue import KINDS
 from gap_damage_kinds.kind import HARMLESS

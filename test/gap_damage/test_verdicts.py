@@ -1,4 +1,4 @@
-"""Answers are judged by verdict, exit status, names and words."""
+"""Answers are scored by verdict, exit status, names and words."""
 
 from pathlib import Path
 

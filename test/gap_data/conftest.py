@@ -1,4 +1,4 @@
-"""The campaign's generator lies beside the benchmarks."""
+"""Make the generator of the campaign in benchmarks/ importable."""
 
 from pathlib import Path
 import sys

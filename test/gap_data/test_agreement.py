@@ -1,4 +1,4 @@
-"""Generator and baselines, written apart from each other, agree about the described robot."""
+"""Generator and baselines, written independently, agree about the described robot."""
 
 from gap_data.baselines.answer import fit
 from gap_data.baselines.logs import load
@@ -19,7 +19,7 @@ def quiet(tmp_path_factory):
     return start, (slopes / scale[:, None]).reshape(-1, SIZE), (start / scale).ravel()
 
 
-# what an effect's estimate may be on a flight without any [unit of the effect]
+# largest estimate of an effect in a flight without effects [unit of the effect]
 BOUNDS = {'mass': 0.003, 'centre_of_mass': 1e-4, 'thrust_coefficient': 1e-3,
           'torque_coefficient': 1e-4, 'rotor_lag': 0.0015, 'command_latency': 5e-4,
           'joint_command_latency': 3e-4, 'joint_feedback_delay': 5e-4, 'mocap_time_offset': 1e-3,

@@ -1,4 +1,4 @@
-"""The campaign from cases to report, with stand-ins for the workflow."""
+"""The campaign from cases to report, with replacements of the workflow."""
 
 from collections import Counter
 from dataclasses import replace

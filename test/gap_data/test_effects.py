@@ -1,4 +1,4 @@
-"""Every hidden effect appears with the right sign and the size that its label says."""
+"""Every hidden effect has the sign and the size of its label."""
 
 from gap_data.cases import Case, load_settings
 from gap_data.effects import CATALOGUE, inject, OUTSIDE, SHAPES
@@ -263,5 +263,5 @@ def test_a_large_inertia_change_is_physically_possible():
         inject('inertia', robot, Hidden(), 0.3, 'plain', rng)
         assert np.abs(robot.inertia[:2] / before[:2] - 1).max() <= 0.3 + 1e-9
         assert np.abs(robot.inertia / nominal - 1).max() > 0.2
-        for multibody in (False, True):     # what no bodies can have is refused here
+        for multibody in (False, True):     # an inertia that no body can have is refused
             mujoco.MjModel.from_xml_string(model_xml(robot, multibody=multibody))

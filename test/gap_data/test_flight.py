@@ -1,4 +1,4 @@
-"""The blind flights themselves: flown well, lively enough, and lost ones said so."""
+"""The blind flights: tracking, excitation, and reports of lost flights."""
 
 from gap_data.controller import PoseController
 from gap_data.courses import make_course, RATE
@@ -41,7 +41,7 @@ def test_references_are_smooth_and_pass_near_the_ground():
     courses = [make_course('poses', 60.0, np.random.default_rng(k)) for k in range(4)]
     for course in courses:
         assert np.abs(np.diff(course.velocity, axis=0)).max() * RATE < 15.0
-        assert course.position[:, 2].min() < 0.36  # where the ground is felt
+        assert course.position[:, 2].min() < 0.36  # within the ground effect
         step = course.rotation[:-1].transpose(0, 2, 1) @ course.rotation[1:]
         turned = np.stack([step[:, 2, 1], step[:, 0, 2], step[:, 1, 0]], axis=1) * RATE
         middle = 0.5 * (course.rate[1:] + course.rate[:-1])
@@ -69,7 +69,7 @@ def test_a_robot_that_cannot_fly_gives_a_lost_flight():
 
 
 def test_a_hidden_effect_appears_in_flight_with_its_size():
-    # the accelerometer tells the thrust along the body's axes, whatever the controller does
+    # the accelerometer gives the thrust along the body axes for any controller
     robot = Robot.nominal()
     robot.thrust_scale = np.full(4, 0.92)
     truth = flown('poses', 6.0, CLEAN, robot=robot)

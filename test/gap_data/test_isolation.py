@@ -1,4 +1,4 @@
-"""The blind flights share nothing with the package that is judged on them."""
+"""The blind flights share no code with the tested package."""
 
 import ast
 from pathlib import Path

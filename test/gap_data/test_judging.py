@@ -1,4 +1,4 @@
-"""The score counts what the issue asks, and nothing else."""
+"""The score follows its definition."""
 
 import copy
 

@@ -1,4 +1,4 @@
-"""The blind flights' robot against closed forms."""
+"""The robot of the blind flights against closed forms."""
 
 from gap_data.gusts import draw_gust
 from gap_data.hidden import Hidden
@@ -133,7 +133,7 @@ def test_two_lags_in_series_have_the_delay_of_one():
     lost = 0.0
     for _ in range(2000):
         lost += 0.001 * (1.0 - rotors.advance([1.0] * 4)[0])
-    assert lost == pytest.approx(0.0942, abs=1e-3)  # the area above the answer is the delay
+    assert lost == pytest.approx(0.0942, abs=1e-3)  # the area above the response is the delay
 
 
 def test_pack_voltage_falls_with_the_load():
@@ -151,7 +151,7 @@ def test_a_command_acts_after_its_age_and_delay():
     assert body.rotors.thrust[0] == pytest.approx(body.robot.hover_thrust)
     body.step()
     assert body.rotors.thrust[0] > body.robot.hover_thrust
-    assert body.data.qpos[body._q[0]] > 0.005  # the tilt was under way 20 ms before
+    assert body.data.qpos[body._q[0]] > 0.005  # the tilt had begun to move 20 ms before
 
 
 def test_gusts_have_their_strength_and_spectrum():

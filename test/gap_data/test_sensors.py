@@ -1,4 +1,4 @@
-"""What the blind sensors report, and the bags that hold it."""
+"""Readings of the blind sensors, and their bags."""
 
 from pathlib import Path
 
@@ -19,7 +19,7 @@ SILENT = {'accelerometer': 0, 'gyroscope': 0, 'position': 0, 'orientation': 0, '
 
 
 def made_up(seconds=4.0):
-    """A truth of smooth waves, as good as a flight for sensors."""
+    """A true motion of smooth waves, which replaces a flight."""
     t = np.arange(int(seconds * 1000)) * 0.001
     columns = {name: np.sin(2 * np.pi * 0.7 * t[:, None] + np.arange(size))
                for name, size in COLUMNS.items()}

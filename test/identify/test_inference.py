@@ -1,4 +1,4 @@
-"""Inference against independent oracles; it is independent of the robot."""
+"""Inference against independent references; it does not depend on the robot."""
 
 import ast
 from pathlib import Path

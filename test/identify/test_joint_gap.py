@@ -128,7 +128,7 @@ def test_limits_that_a_log_does_not_reach_are_listed_as_undetectable():
 
 @pytest.mark.parametrize('zeros', [(0.015, 0.0), (0.0, -0.015), (-0.012, 0.018)])
 def test_zeros_that_moved_are_named_with_joint_and_sign(zeros):
-    # the encoder shows so much more than the command: the true tilt is so much less than it
+    # the reading exceeds the command by the offset, so that the true tilt is less than the reading
     result = judged(made(4, *({'offset': -zero} for zero in zeros)))
     moved = [(j + 1, zero) for j, zero in enumerate(zeros) if zero]
     assert sorted(names(result)) == [(['joint_offset'], joint) for joint, _ in moved]
@@ -203,7 +203,7 @@ def test_changes_between_two_logs_are_reported_with_valid_intervals():
         low, high = row['interval']
         assert low < row['difference'] < high
         assert row['difference'] == pytest.approx(row['after'] - row['before'])
-        wide = 1.6 * (high - low) / 2       # 99.8 %: fourteen rows are looked at
+        wide = 1.6 * (high - low) / 2       # 99.8 %, because fourteen rows are tested
         if row['parameter'] not in ('coulomb',):
             assert abs(row['difference'] - true.get((row['joint'], row['parameter']), 0.0)) < wide
         if row['parameter'] in ('kp', 'kd', 'delay', 'ramp_lag'):
@@ -259,7 +259,7 @@ def test_the_command_line_writes_a_file_that_explains_the_log(tmp_path, capsys):
     assert cli.main([str(a) for a in ('gap', log, '--robot', new, '--json', second)]) == 0
     again = json.loads(second.read_text())
     assert again['verdict'] == 'no_gap' and again['effects'] == []
-    for joint in again['joints']:       # the file's effects count, and so does its held command
+    for joint in again['joints']:       # effects of the file apply, and so does its held command
         assert joint['published_heldout_rms_rad'] == pytest.approx(joint['file_heldout_rms_rad'])
 
 

@@ -18,9 +18,9 @@ def identified(tmp_path, rows, header=HEADER):
 
 def relative_error(row, true, lowest=2.0):
     """
-    Largest error of the thrust that a duty gives, relative to thrust.
+    Largest error of the thrust at a duty, relative to thrust.
 
-    Below ``lowest`` [N] relative to that: 200 rows with a noise of 0.03 N tell no more.
+    Below ``lowest`` [N] it is relative to that, the resolution of 200 rows with 0.03 N of noise.
     """
     thrust = np.linspace(0.3, min(row.thrust_max, true.thrust_max), 200)
     error = row.thrust(np.polyval(true.coefficients[::-1], thrust / 10)) - thrust

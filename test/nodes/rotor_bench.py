@@ -21,18 +21,18 @@ NODE = 'rotor_bridge_node'
 QUICK = replace(EmulatedBoardParameters.load(), boot_time=0.05, throttle_low_time=0.2,
                 reception_rate=10.0)
 HOVER = np.array([7.0, 7.5, 8.0, 8.5])
-START, SOON = 60, 10    # s; a busy test machine must not look like a fault
+START, SOON = 60, 10    # s; a busy test machine must not cause a fault
 
 
 class Commander(Operator):
     """
-    Stands for the supervisor, and hears what the bridge says.
+    Stand-in for the supervisor, which stores the messages of the bridge.
 
     Attributes:
-        thrust: what a thread of its own commands; None: nothing.
-        period: between two commands [s].
-        age: of their stamps [s].
-        stamps: of the commands sent.
+        thrust: thrusts that a thread commands; None: no commands.
+        period: time between two commands [s].
+        age: age of their stamps [s].
+        stamps: stamps of the sent commands.
 
     """
 

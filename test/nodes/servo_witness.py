@@ -19,7 +19,7 @@ from beetle_omni_ros.nodes.operator import Operator
 from beetle_omni_ros.robot.parameters import JOINT_NAMES
 
 NODE = 'joint_bridge_node'
-WITHIN = 20     # [s] what must happen, on a busy machine
+WITHIN = 20     # [s] timeout of expected events on a busy machine
 # Answers come from a thread of the test: wait longer for them than on a robot.
 PATIENT = {'timing': {'reply': 0.03, 'probe_first': 0.02, 'probe_longest': 0.1, 'health': 0.04,
                       'reconnect': 0.02}}
@@ -103,7 +103,7 @@ class ServoWitness(Operator):
         while (here := path[self.stage]) != path[stage]:
             name = ('configure', 'activate')[here] if here < path[stage] \
                 else ('cleanup', 'deactivate')[here - 1]
-            # An answer may come too late where the machine is busy.
+            # An answer may be late on a busy machine.
             assert self.change(name) or time.monotonic() < end, f'{name}: {self.now}'
 
     def numbers(self, name):

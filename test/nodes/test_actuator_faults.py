@@ -1,9 +1,9 @@
 """
-Faults of servos and motor board in flight: what the robot does, who says why, what is left on.
+Faults of servos and motor board in flight: reaction of the robot, report, final actuator state.
 
-The whole graph flies through both bridges. Faults are switched on in the emulated devices by
-sim_node's parameters; what the rotors and servos really do is read from the simulator. A test that
-leaves the robot sound and in the air passes it on to the next one.
+The whole graph flies through both bridges. Parameters of sim_node switch faults of the emulated
+devices on. The true state of rotors and servos is read from the simulator. A robot that still
+flies without fault at the end of a test is used by the next one.
 """
 
 from contextlib import contextmanager, ExitStack

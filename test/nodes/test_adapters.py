@@ -1,4 +1,4 @@
-"""Behaviour of the nodes beyond the pure code: triggering, holding, selecting, refusing."""
+"""Behaviour of the nodes themselves: triggering, holding, selecting, refusing."""
 
 from types import SimpleNamespace
 
@@ -98,7 +98,7 @@ def test_the_controller_steps_once_a_period_and_stamps_with_the_state(make):
     sent = [conversions.seconds(m.header.stamp) for m in node._publisher]
     assert len(sent) == 100
     assert np.allclose(sent, stamps[::2])
-    fly(node, [95.0, 95.005, 95.01])    # the clock was set back: on with it
+    fly(node, [95.0, 95.005, 95.01])    # the clock was set back, and the new time is used
     assert len(node._publisher) == 102
 
 
@@ -122,7 +122,7 @@ def test_a_controller_on_standby_steps_between_the_steps_of_the_one_that_flies(m
     if rate > 100:
         assert np.all(np.abs((standby - 101.0) / 0.01 % 1.0 - 0.5) < 0.26)
         assert np.allclose(np.diff(standby), 0.01, atol=1e-6)
-    else:       # no estimate lies between: half as often, still in time for the supervisor
+    else:       # no estimate in between: half the rate, within the timeout
         assert np.allclose(np.diff(standby), 0.02, atol=1e-6)
     node._on_mode('flying:nmpc')
     assert np.allclose(np.diff(steps_from(102.0)), 0.01, atol=1e-6)
@@ -237,7 +237,7 @@ def test_the_estimator_publishes_only_valid_estimates(make):
             node._on_pose(PoseReading(stamp - 0.01, np.array([0, 0, 0.3]), LEVEL))
         node._on_imu(ImuReading(stamp, at_rest, np.zeros(3)))
         if k == 3:
-            assert not node._publisher      # too few poses to believe
+            assert not node._publisher      # too few poses for an estimate
     message = node._publisher[-1]
     covariance = np.reshape(message.pose.covariance, (6, 6))
     assert message.pose.pose.position.z == pytest.approx(0.3, abs=0.01)

@@ -65,12 +65,12 @@ def bench(ros_domain, tmp_path):
 
 def test_a_volatile_target_is_recorded_without_an_incompatible_offer(bench, tmp_path):
     assert bench.publish(bench.publisher(wire.profile(EVENT)), 1.25) == 1
-    bench.spin(1.2)     # two looks at what is offered
+    bench.spin(1.2)     # two checks of the offered topics
     assert not bench.incompatible
     bench.recorder.close()
     log = read_bag(tmp_path / 'bag')
     assert [target.position[2] for target in log.targets] == [1.25]
-    assert log.targets[0].stamp == pytest.approx(time.time(), abs=60)   # unstamped: as it came
+    assert log.targets[0].stamp == pytest.approx(time.time(), abs=60)   # time of receipt
 
 
 def test_a_target_latched_before_the_start_is_recorded(bench):
@@ -86,7 +86,7 @@ def test_a_target_latched_before_the_start_is_recorded(bench):
 @pytest.mark.parametrize('profile', [wire.profile(EVENT), wire.profile(LATCHED), BEST_EFFORT])
 def test_each_target_is_recorded_once_with_any_quality_of_service(bench, profile):
     publisher = bench.publisher(profile)
-    bench.spin(1.2)     # the subscriptions that it needs are there
+    bench.spin(1.2)     # the required subscriptions exist
     assert [bench.publish(publisher, height) for height in (1.0, 1.1, 1.2)] == [1, 1, 1]
     bench.spin(0.3)
     assert bench.written() == 3

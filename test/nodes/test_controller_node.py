@@ -1,4 +1,4 @@
-"""Any registered controller as a node: by name, by class, in a whole graph."""
+"""Nodes of registered controllers: by name, by class, in a whole graph."""
 
 import math
 import os

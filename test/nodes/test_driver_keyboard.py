@@ -132,7 +132,7 @@ def test_ctrl_c_restores_the_terminal(driven):
 
 def test_a_terminal_that_closes_ends_the_driver(driven):
     witness, _, terminal = driven
-    terminal.press('\x04')      # no end of input where keys come one by one
+    terminal.press('\x04')      # Ctrl-D is no end of input if keys are read one by one
     witness.spin(0.5)
     assert terminal.process.poll() is None
     os.close(terminal.mine)

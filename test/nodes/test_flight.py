@@ -1,8 +1,8 @@
 """
-Real flights of real processes, and what happens when one of them is killed.
+Flights of real processes, and consequences of a killed process.
 
-Each test has a ROS domain, lock files and folders of its own, so tests may run at the
-same time. The robot is watched through ground_truth/odom, which no node can colour.
+Each test has its own ROS domain, lock files and folders, so that tests can run at the same
+time. The robot is observed through ground_truth/odom, which does not depend on other nodes.
 """
 
 import json
@@ -105,7 +105,7 @@ def test_the_loss_of_the_supervisor_stops_the_rotors_within_100_ms(flight):
     assert not graph.stop()
     log = read_bag(bag)
     last = log.command_received[-1]
-    # The rotors run down with 0.094 s; from 0.1 s after the last command nothing drives them.
+    # From 0.1 s after the last command the rotors slow down with a time constant of 0.094 s.
     falling = (log.imu_t > last + 0.1) & (log.imu_t < last + 0.6)
     force = np.linalg.norm(log.imu_specific_force[falling], axis=1)
     before = (log.imu_t > last - 0.5) & (log.imu_t < last)
@@ -191,7 +191,7 @@ def test_one_call_flies_and_the_bag_gives_the_printed_numbers(tmp_path):
     output, error = process.communicate(timeout=READY)
     assert process.returncode == 0, error
     results = json.loads(result.read_text())
-    # On a computer that is too slow for it, simulated time, in which latencies mean nothing.
+    # A slow computer flies in simulated time, in which latencies have no meaning.
     real = results['meta']['clock'] == 'system'
     assert 'CPU' in output and ('latency' if real else 'of real time') in output
     assert results['nmpc']['success_rate'] == 1.0 and len(results['nmpc']['poses']) == 1
@@ -211,7 +211,7 @@ def test_a_killed_node_is_named_and_all_processes_end(tmp_path):
             assert process.poll() is None and time.monotonic() < deadline
             time.sleep(0.2)
         nodes = children(process.pid)
-        assert set(NODES) <= set(nodes)     # and rl_node, where there is a policy
+        assert set(NODES) <= set(nodes)     # and rl_node, if a policy exists
         os.kill(nodes['nmpc_node'], signal.SIGKILL)
         _, error = process.communicate(timeout=60)
     finally:

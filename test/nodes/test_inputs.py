@@ -39,7 +39,7 @@ from beetle_omni_ros.nodes.viewer_node import ViewerNode
 from beetle_omni_ros.runs.bag import read_messages
 
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
-SOON = 10       # s; a busy test machine must not look like a fault
+SOON = 10       # s; a busy test machine must not cause a fault
 
 
 class StillNode(ControllerNode):
@@ -168,7 +168,7 @@ def test_a_target_beyond_the_reach_of_the_active_controller_is_refused_and_not_t
     node._position = np.array([0.0, 0.0, 1.0])
     poses = bench.publisher(PoseStamped, 'target_pose')
     poses.publish(pose(x=12.0))
-    assert bench.wait(lambda: node._target is not None)     # on standby: another may get there
+    assert bench.wait(lambda: node._target is not None)     # others may reach it
     node._on_mode('flying:nmpc')
     assert node._target is None and 'the present pose is held' in node.refusals[-1]
     poses.publish(pose(x=3.0))
@@ -234,7 +234,7 @@ def _fly_with_an_intruder(bench, node):
     def answer(source):
         before = entry.received, entry.rejected.total()
         end = time.monotonic() + SOON
-        # A message older than 0.1 s would be refused for that: send again where it was late.
+        # A message older than 0.1 s is refused as late, and is sent again.
         while (entry.received, entry.rejected.total()) == before and time.monotonic() < end:
             commands.publish(wire.message(
                 'command', Command(time.time(), np.zeros(4), np.full(4, 7.0)), source))

@@ -55,7 +55,7 @@ def active(bench):
 
 
 def torque_is_back(emulated, witness, goal):
-    """Whether the state is as before the fault."""
+    """Whether the state is that before the fault."""
     return witness.now == 'ready' and emulated.torque_enabled.all() and witness.stands_at(goal)
 
 
@@ -98,7 +98,7 @@ def test_angles_come_at_200_hz_with_the_time_of_their_reading(bench):
     cycles, missed, torn = (int(last[key]) - int(first[key])
                             for key in ('cycles', 'missed_cycles', 'incomplete'))
     assert cycles + missed == pytest.approx(200 * seconds, rel=0.25)
-    # Best effort: a busy reader loses some.
+    # With best effort, a busy reader loses some.
     assert 0.5 * cycles < received <= cycles + 60
     stamps = np.array([conversions.seconds(message.header.stamp) for message in witness.joints])
     assert (np.diff(stamps) > 0).all()
@@ -119,7 +119,7 @@ def test_a_command_moves_the_joints_and_its_latency_is_reported(active):
     servo = witness.numbers('gimbal2')
     assert servo['id'] == '2' and servo['errors'] == 'none' and servo['torque'] == 'True'
     assert float(servo['voltage_v']) == 12.0 and float(servo['temperature_c']) > 20
-    # Without torque nothing moves, and the command is received all the same.
+    # Without torque nothing moves, but the command is received.
     witness.go_to('inactive')
     witness.goal = HOME
     witness.spin(0.3)

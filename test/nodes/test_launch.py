@@ -1,4 +1,4 @@
-"""The launch file: processes of its arguments (launch itself is replaced by stand-ins)."""
+"""Processes of the launch file by its arguments; launch itself is replaced."""
 
 from importlib.util import module_from_spec, spec_from_file_location
 import os
@@ -36,7 +36,7 @@ def bringup(monkeypatch):
             setattr(module, member, type(member, (Recorded,), {}))
         monkeypatch.setitem(sys.modules, name, module)
     monkeypatch.setenv(discovery.RANGE, 'LOCALHOST')        # put back afterwards
-    monkeypatch.setattr(plan, 'unfit', lambda *_: '')    # a policy that fits is there
+    monkeypatch.setattr(plan, 'unfit', lambda *_: '')    # a compatible policy exists
     spec = spec_from_file_location('bringup', share_path('launch/bringup.launch.py'))
     module = module_from_spec(spec)
     spec.loader.exec_module(module)

@@ -54,7 +54,7 @@ class Drivers:
         self.thread = threading.Thread(target=self.run, daemon=True)
 
     def run(self):
-        """Publish at 200 and 100 Hz until told to stop."""
+        """Publish at 200 and 100 Hz until the exit."""
         rng, due = np.random.default_rng(0), time.monotonic()
         for k in range(10**6):
             if self.stop.is_set():
@@ -78,7 +78,7 @@ class Drivers:
         return self
 
     def __exit__(self, *_):
-        """Leave the graph."""
+        """Destroy the publishers."""
         self.stop.set()
         self.thread.join()
         self.twin.destroy_node()
@@ -88,7 +88,7 @@ class Drivers:
 
 def test_messages_of_real_publishers_are_recorded_and_checked(ros_domain):
     with Drivers(ros_domain):
-        for _ in range(5):      # discovery takes its time on a busy machine
+        for _ in range(5):      # discovery is slow on a busy machine
             graph = listen(3.0)
             if graph.streams['imu/data_raw'].rate and graph.of_bridge('joint_bridge'):
                 break

@@ -83,7 +83,7 @@ def test_messages_become_a_row(graph, listener):
 def test_a_target_arrives_latched_and_unchanged(graph, listener):
     target = PoseTarget(np.array([0.4, -0.2, 1.5]), TURNED, 12.25)
     listener.publish_target(target)
-    received = []      # of a subscriber that comes later
+    received = []      # of a later subscriber
     wire.subscribe(graph, 'target_pose', received.append)
     assert wait(lambda: received)
     found = received[0]

@@ -62,7 +62,7 @@ def test_jitter_loses_no_ticks(pacing, clock):
 
 def test_a_stall_loses_ticks_without_lasting_delay(pacing, clock):
     run(pacing, clock, 0.5)
-    clock.now += 3.0                        # everything stood still
+    clock.now += 3.0                        # all processes stalled
     assert pacing.due() == CATCH_UP_TICKS
     clock.now += TICK
     assert np.abs(run(pacing, clock, 0.5)).max() < 1e-4
@@ -84,7 +84,7 @@ def test_a_preemption_between_the_clock_readings_changes_no_stamp(clock):
     readings = SimpleNamespace(hold=0.0)
 
     def ros():
-        clock.now += readings.hold          # held up in the middle of the comparison
+        clock.now += readings.hold          # preempted between the two clock readings
         return clock.now + ROS
 
     pacing = RealTimePacing(TICK, lambda: clock.now, ros)

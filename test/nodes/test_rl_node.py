@@ -90,7 +90,7 @@ def test_the_node_publishes_the_commands_of_the_controller(process):
         found = {round(a.stamp, 4): np.concatenate((a.tilt, a.thrust)) for a in answers}
         return [(found[stamp], answer) for stamp, answer in requested.items() if stamp in found]
 
-    # A busy machine delivers the target when it likes; from then on every answer is the same.
+    # On a busy machine the target arrives late; the answers are compared after its arrival.
     assert witness.wait(
         lambda: any(np.allclose(*pair, atol=1e-5) for pair in answered(dict([ask(0)]))), 30)
     pairs = answered(dict(ask(k) for k in range(20)))
@@ -165,7 +165,7 @@ class Pilot(Witness):
         return result.successful, result.reason
 
     def select_when_good(self, name):
-        """As :meth:`select`; repeated for a controller that was delayed by a busy computer."""
+        """Like :meth:`select`, repeated while a busy computer delays the controller."""
         for _ in range(20):
             accepted, reason = self.select(name)
             if accepted or 'good for only' not in reason:
@@ -177,10 +177,10 @@ class Pilot(Witness):
 @pytest.fixture
 def flight(ros_domain, tmp_path):
     """
-    The composed graph with both controllers in the air, on its way through random poses.
+    The composed graph in flight through random poses with both controllers.
 
-    The policy is the shipped one, or made by hand where that does not fit; in one process
-    test_switching.py flies both.
+    The policy is the shipped one, or a hand-written one if that is incompatible. test_switching.py
+    flies both in one process.
     """
     policy = ''
     if unfit(DEFAULT):
@@ -250,6 +250,6 @@ def test_one_call_flies_the_policy_and_the_bag_holds_both_controllers(tmp_path):
     assert results['rl']['poses'][0]['U_position_m'] < 0.5
     log = read_bag(bag)
     assert 'flying:rl' in log.states and 'flying:nmpc' not in log.states
-    for name in ('nmpc', 'rl'):     # 8 s at 100 Hz; the climb is for what a busy machine skips
+    for name in ('nmpc', 'rl'):     # 8 s at 100 Hz; the climb compensates skipped steps
         assert len(log.requests[name].t) > 800
         assert log.compute[name]['count'] > 800

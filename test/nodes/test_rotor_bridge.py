@@ -142,7 +142,7 @@ def test_a_lost_board_stays_disarmed_until_the_supervisor_is_disarmed(flying, fa
     assert commander.reaches(why.format(port=board.port)), commander.bridge_states
     assert commander.wait(lambda: not board.armed and not board.commands.any(), SOON)
     board.plug()
-    commander.spin(0.3)         # the supervisor goes on, and the board could be armed again
+    commander.spin(0.3)         # the supervisor continues, and the board could be armed again
     assert commander.bridge.startswith('lost') and not board.armed
     commander.supervise('emergency_stop')
     commander.spin(0.1)
@@ -237,7 +237,7 @@ def test_after_a_killed_bridge_no_rotor_turns_and_a_new_one_does_not_arm(tmp_pat
         while board.commands.any():
             turning, looked = looked, time.monotonic()
             time.sleep(0.001)
-        # They turned when asked at `turning` or later, however busy this computer is.
+        # They turned at `turning` or later, also on a busy computer.
         assert turning < arrivals[-1] + QUICK.target_timeout
         assert commander.wait(lambda: not board.armed, SOON)
         commander.supervise('flying:nmpc')
@@ -267,7 +267,7 @@ def test_the_bridge_waits_for_a_missing_port_and_names_it(tmp_path):
         assert commander.reaches(f'waiting: {port}: cannot be opened (no such port', START)
         assert commander.told_in_diagnostics('board', 'phase', lambda phase: phase == 'rests')
         commander.supervise('takeoff')
-        # Whether it has heard of 'disarmed' before is for the middleware to decide.
+        # Whether 'disarmed' arrived before depends on the middleware.
         assert commander.reaches('lost: '), commander.bridge_states
         commander.supervise('disarmed')
         os.symlink(made.board.port, port)
@@ -314,7 +314,7 @@ def test_without_autostart_it_arms_only_after_it_was_configured_and_activated(tm
         assert not commander.batteries and not commander.change(ACTIVATE)
         assert commander.change(CONFIGURE)
         assert commander.reaches('waiting: not activated')
-        assert commander.wait(lambda: commander.batteries, SOON)       # it is heard, not armed
+        assert commander.wait(lambda: commander.batteries, SOON)       # received, but not armed
         commander.supervise('takeoff')
         assert commander.reaches('lost: not activated')
         commander.supervise('disarmed')

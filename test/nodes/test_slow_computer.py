@@ -61,7 +61,7 @@ def test_a_computer_that_is_too_slow_is_detected_before_arming(nodes, named):
     with pytest.raises(TooSlowError, match=named):
         flown(Nodes(**nodes), may_be_slow=False)
     with pytest.raises(FlightError, match='refuses to arm: not level') as raised:
-        flown(Nodes(**nodes))               # with may_be_slow, it tries
+        flown(Nodes(**nodes))               # with may_be_slow, it is attempted
     assert raised.type is FlightError
 
 
@@ -117,7 +117,7 @@ def attempts(monkeypatch):
         graphs.append((graph, dict(meta), may_be_slow))
         if not may_be_slow and not graph.simulated:
             raise TooSlowError('the nodes use 99% of a core before the start')
-        return 1        # flown, but no bag of it is there
+        return 1        # flown, but without a bag
 
     monkeypatch.setattr(fly, '_fly', one)
     return graphs

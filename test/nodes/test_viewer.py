@@ -43,7 +43,7 @@ def test_thrust_arrows_point_along_the_tilted_rotors(viewer):
     rotation = rotations.from_rpy(0.4, -0.2, 1.0)
     position, tilt = np.array([1.0, 2.0, 3.0]), np.array([0.0, np.pi / 2, 0.0, -0.3])
     viewer._draw()
-    assert not viewer._markers              # nothing known yet
+    assert not viewer._markers              # without any message
     viewer._odom = Odom(5.0, position, np.zeros(3), rotation, np.zeros(3))
     viewer._joints = JointReading(5.0, tilt, np.zeros(4))
     viewer._command = Command(5.0, tilt, np.array([8.0, 4.0, 0.0, 20.0]))

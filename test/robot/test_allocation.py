@@ -1,4 +1,4 @@
-"""Allocation by its properties: residual, minimum norm, nearest legal turn, symmetry."""
+"""Allocation by its properties: residual, minimum norm, nearest permitted turn, symmetry."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Allocation with what is left: residual, limits, idle and stuck actuators, agreement with all."""
+"""Allocation with lost and stuck actuators: residual, limits, agreement with the healthy one."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Which attitudes can be held: shares, singular places, the nearest firm one, heading."""
+"""Attitudes that can be held: shares, singularities, the nearest one with margin, heading."""
 
 import numpy as np
 import pytest
@@ -108,8 +108,8 @@ def test_leaning_is_the_shortest_rotation():
 
 
 @pytest.mark.parametrize('lost, up_now, rate, tilt', [
-    # Two random flights, as the rotor was named. By angle and travel alone the choice was an
-    # attitude upside down, from which level cannot be reached but by falling; they fell by 2 m.
+    # States of two random flights when the rotor was named. By angle and travel only, an inverted
+    # attitude would be chosen, from which level is reached only with a fall of 2 m.
     (3, (0.99, 0.14, -0.04), -1.9, (1.6, 1.6, -1.6, -1.5)),
     (2, (-0.97, 0.24, -0.07), 1.8, (-1.6, -1.6, 1.6, 1.7))])
 def test_from_the_side_the_escape_leads_towards_level(lost, up_now, rate, tilt):
@@ -127,4 +127,4 @@ def test_less_thrust_reduces_all_margins_and_level_keeps_the_largest(holdings):
     assert np.all(weak.margins[on_its_side] == 0.0)
     got = weak.quickest(rotations.from_rpy(np.radians(170.0), 0, 0), np.zeros(3), np.zeros(4),
                         2.0, 0.8)
-    assert up(got)[2] > 0.9     # upside down it could not turn on
+    assert up(got)[2] > 0.9     # in the inverted attitude it could not turn further

@@ -1,4 +1,4 @@
-"""Functions as machine code: the same numbers, built once, and never a must."""
+"""Compiled functions: equal results, one build, optional use."""
 
 import shutil
 

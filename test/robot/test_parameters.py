@@ -1,4 +1,4 @@
-"""The robot file: consistent by itself, and refused where it is not."""
+"""The robot file: its consistency, and refusals."""
 
 import numpy as np
 import pytest

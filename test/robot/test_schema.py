@@ -1,4 +1,4 @@
-"""Parameter files: every mistake is refused in one line that names file and key."""
+"""Parameter files: every error is refused in one line with file and key."""
 
 from dataclasses import dataclass
 

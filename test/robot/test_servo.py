@@ -122,5 +122,5 @@ def test_a_joint_effect_changes_controller_model_and_training_step(effects):
 
     trained, modelled = (a - b for a, b in zip(tilting(changed), tilting(ROBOT), strict=True))
     assert np.abs(modelled).max() > 1
-    # The step's mean of the change, while damping takes some of it back.
+    # The mean of the change in the step, reduced by damping.
     np.testing.assert_allclose(trained, modelled, rtol=0.35, atol=0.1 * np.abs(modelled).max())

@@ -17,15 +17,15 @@ def fly(recorder, task, *, start=1.0, controller='nmpc', offset=0.02, angle=3.0,
 
     Args:
         recorder: LogRecorder, BagWriter or Tee.
-        task: what to fly.
-        start: when the first target is issued [s].
-        controller: who flies.
+        task: task to fly.
+        start: time of the first target [s].
+        controller: name of the active controller.
         offset: steady position error along x [m].
         angle: steady orientation error about the body's z [deg].
         approach: time constant of the approach [s].
-        seed: of the noise of commands and estimate.
+        seed: seed of the noise of commands and estimate.
         duration: cut the flight after this time [s].
-        after: how long the recording goes on after the task [s].
+        after: time of recording after the task [s].
 
     """
     rng = np.random.default_rng(seed)

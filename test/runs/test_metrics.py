@@ -1,4 +1,4 @@
-"""Metrics against cases that can be worked out by hand, and bag against memory."""
+"""Metrics against cases with known results, and bag against memory."""
 
 import json
 
@@ -275,7 +275,7 @@ def test_the_level_at_which_control_was_lost_is_reported():
     fly(recorder, task, start=0.0, duration=13.0, after=0.0)
     result = metrics(recorder.log(), task)['force']
     assert result['withstood_N'] == 20
-    assert result['lost_at_N'] == 30  # the flight ended in the middle of it
+    assert result['lost_at_N'] == 30  # the flight ended during it
     assert result['levels'][0]['peak_position_m'] == pytest.approx(0.02, abs=1e-3)
     complete = metrics(flown(task), task)['force']
     assert complete['lost_at_N'] is None

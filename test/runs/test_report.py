@@ -91,7 +91,7 @@ def test_a_fault_of_the_supervisor_is_on_the_page(tmp_path):
         writer.write_diagnostic(13.0, 'supervisor_node: supervisor', {
             'fault.joint3_slipped': '12.5', 'nmpc.refused.stale stamp': '7'}, 1, 'landing')
     log = read_bag(tmp_path / 'bag')
-    assert log.controllers() == ['nmpc']        # a fallback counts for the one that it replaced
+    assert log.controllers() == ['nmpc']        # a fallback counts for the replaced controller
     assert [name for _, name in log.active_controller()] == ['nmpc', None]
     assert list(log.named_faults().items()) == [
         ('joint1_astray', 11.5), ('rotor2_lost', 12.0), ('joint3_slipped', 13.0),

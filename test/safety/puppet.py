@@ -1,4 +1,4 @@
-"""A vehicle on strings for tests of the state machine: it goes where the test puts it."""
+"""A kinematic vehicle for tests of the state machine, which the test moves."""
 
 from copy import deepcopy
 from functools import cache
@@ -21,13 +21,13 @@ ALL = ('estimate', 'joints', 'imu', 'mocap', 'nmpc', 'rl')
 
 
 def hover_command(stamp, quaternion=LEVEL):
-    """A command that any controller might give, never the same to the last digit."""
+    """A plausible command with noise, so that no two are equal."""
     hover = ALLOCATOR.hover(quaternion, np.zeros(4))
     return Command(stamp, hover.tilt, hover.thrust + 1e-9 * np.sin(1e3 * stamp))
 
 
 class Puppet:
-    """Supervisor plus everything that talks to it; ``alive`` holds the sources that do."""
+    """Supervisor with all its message sources; those in ``alive`` publish."""
 
     def __init__(self, parameters=PARAMETERS, start=100.0):
         self.supervisor = Supervisor(parameters, ROBOT, HoverController(ROBOT))
@@ -42,7 +42,7 @@ class Puppet:
         self.sent = []
 
     def run(self, duration):
-        """Let time pass; returns the commands that were sent meanwhile."""
+        """Simulate a time; return the sent commands."""
         sent = []
         for _ in range(round(duration / TICK)):
             self.now += TICK
@@ -70,7 +70,7 @@ class Puppet:
         return [e.text for e in self.supervisor.events if severity in (None, e.severity)]
 
     def _felt(self, tilt):
-        """Specific force: that of the rotors in the air, of the ground on it."""
+        """Specific force: of the rotors in the air, of the ground on the floor."""
         asked = self.command.thrust if self.command is not None else np.zeros(4)
         self.thrust += -np.expm1(-TICK / ROBOT.rotors.time_constant) * (asked - self.thrust)
         if self.supervisor.airborne:
@@ -81,7 +81,7 @@ class Puppet:
         supervisor, alive = self.supervisor, self.alive
         tilt = self.command.tilt if self.command is not None else np.zeros(4)
         if 'imu' in alive:
-            noise = 1e-6 * np.sin(1e3 * self.now + np.arange(6))   # no sensor repeats itself
+            noise = 1e-6 * np.sin(1e3 * self.now + np.arange(6))   # readings have noise
             supervisor.on_imu(self.now, self._felt(tilt) + noise[:3], self.rate + noise[3:])
         if 'mocap' in alive:
             noise = 1e-6 * np.array([round(self.now / TICK) % 2, 0, 0])
@@ -99,7 +99,7 @@ class Puppet:
 
 
 def flown():
-    """A puppet of its own in state 'flying'; the take-off is simulated once."""
+    """A copy of a vehicle in state 'flying'; the take-off is simulated once."""
     return deepcopy(_flown())
 
 

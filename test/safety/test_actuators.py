@@ -1,4 +1,4 @@
-"""What the bridges to servos and motor board say, and what the supervisor makes of it."""
+"""Reactions of the supervisor to states of the bridges to servos and motor board."""
 
 from puppet import flown, Puppet, TICK
 import pytest
@@ -7,7 +7,7 @@ from beetle_omni_ros.safety.actuators import Actuators
 
 
 def report(puppet, name, text):
-    """Let a bridge say something, and the supervisor look at it."""
+    """Give a bridge state to the supervisor, and one step."""
     assert puppet.supervisor.on_actuators(name, text, puppet.now)
     puppet.run(TICK)
 

@@ -1,4 +1,4 @@
-"""Whatever comes in, in whatever order: nothing unsafe goes out."""
+"""No sequence of inputs leads to an unsafe command."""
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -29,17 +29,17 @@ actions = st.lists(st.one_of(
 
 
 def perform(puppet, action):
-    """Do one thing to the supervisor."""
+    """Apply one event to the supervisor."""
     supervisor, (kind, *rest) = puppet.supervisor, action
     if kind == 'jump':
-        # Held up: the clock runs on before the messages that wait are read.
+        # A delay: the clock advances before the waiting messages are read.
         puppet.now += rest[0] if np.isfinite(rest[0]) else 0.0
         supervisor.update(puppet.now if np.isfinite(rest[0]) else rest[0])
     elif kind == 'command':
         supervisor.on_command(rest[0], Command(puppet.now + rest[1], np.array(rest[2]),
                                                np.array(rest[3])), puppet.now)
     elif kind == 'spoil':
-        # One wrong number in a command that is otherwise good, and newer than any other.
+        # One wrong number in a new, otherwise good command.
         values = np.concatenate([np.zeros(4), np.full(4, ROBOT.hover_thrust)])
         values[rest[1]] = rest[0]
         supervisor.on_command(supervisor.active, Command(puppet.now + 0.01, values[:4],
@@ -65,7 +65,7 @@ def perform(puppet, action):
 
 
 def watch(puppet, command):
-    """What must hold of everything that goes out."""
+    """Invariants of every sent command."""
     supervisor = puppet.supervisor
     if command is None:
         return

@@ -1,4 +1,4 @@
-"""The estimator of last resort against motions that are known in closed form."""
+"""The estimator of the descent against motions in closed form."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The command's change when another controller takes over."""
+"""The change of the command at a handover."""
 
 from dataclasses import replace
 
@@ -72,7 +72,7 @@ def test_a_state_gets_one_command_only():
 
 
 def switching(puppet, far):
-    """Run with rl asking for something else, select it, and return the commands from then on."""
+    """Run with different commands of rl, select it, and return the commands after that."""
     original = puppet._talk
 
     def talk():

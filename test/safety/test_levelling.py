@@ -1,4 +1,4 @@
-"""The way to level: the joints follow it without passing their stops, from any winding."""
+"""The route to level: joints stay within their stops, from any winding."""
 
 import numpy as np
 import pytest
@@ -17,13 +17,13 @@ UPSIDE_DOWN = [rotations.from_rpy(np.pi, 0.0, yaw) for yaw in (0.0, 0.4, 1.6, 3.
 
 
 def held(attitude):
-    """Tilts of hovering; upside down, those of having come from one side."""
+    """Tilts of hovering; inverted, those after a rotation from one side."""
     beside = rotations.multiply(attitude, rotations.exp(np.array([2e-4, 5e-4, 0.0])))
     return ALLOCATOR.upright(rotations.matrix(beside)[2][None])[0][0]
 
 
 def followed(way, tilt):
-    """Tilts (P, 4) that the allocation takes along a way, and the largest loss of thrust."""
+    """Tilts (P, 4) of the allocation along a route, and the largest loss of thrust."""
     present, tilts, jumps = np.array(tilt), [], []
     for elapsed in np.linspace(0, way.duration, 200):
         goal = ALLOCATOR.hover(way.at(elapsed)[0], present)

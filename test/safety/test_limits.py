@@ -1,4 +1,4 @@
-"""Every reason for which a command is refused, and what is not refused."""
+"""Every reason for the refusal of a command, and accepted commands."""
 
 from types import SimpleNamespace
 
@@ -21,7 +21,7 @@ def command(stamp=NOW, tilt=(0.1, 0.2, 0.3, 0.4), thrust=(7.0, 7.5, 8.0, 8.5)):
 
 
 def lively(stamp, *numbers):
-    """As a controller that answers measurements: never the same to the last digit."""
+    """Commands with noise, like those of a controller that uses measurements."""
     given = command(stamp, *numbers)
     return Command(stamp, given.tilt + 1e-9 * np.sin(1e3 * stamp), given.thrust)
 
@@ -83,7 +83,7 @@ def test_a_small_overstep_is_executed_at_the_limits_for_half_a_second_and_no_lon
     assert all(one is not None for one in executed[:until - 1])
     assert executed[until + 1:] == [None] * (99 - until)
     for k, one in enumerate(executed[:until - 1], 1):
-        assert one.stamp == NOW + 0.01 * k      # each as soon as it came, not the last good one
+        assert one.stamp == NOW + 0.01 * k      # each at its arrival, not the last good one
         assert one.thrust.tolist() == [7.0, 0.0, 7.0, top]
         assert one.tilt[3] == ROBOT.joints.position_limit
     assert not checked.good

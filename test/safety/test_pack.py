@@ -18,7 +18,7 @@ LAG = ROBOT.rotors.time_constant
 
 
 class Flight:
-    """A simulated pack under four rotors, and the watch that hears its readings."""
+    """A simulated pack with four rotors, and the watch of its readings."""
 
     def __init__(self, seed=0):
         self.battery = Battery(ROBOT, PACK)
@@ -28,7 +28,7 @@ class Flight:
         self.thrust, self.seen = np.zeros(4), ROBOT.battery.full_voltage
 
     def fly(self, duration, command, faster=1.0):
-        """Go on; ``command`` (4,) [N] or a function of time. Charge is drawn ``faster``."""
+        """Fly with ``command`` (4,) [N] or a function of time; charge falls ``faster``."""
         for _ in range(round(duration / TICK)):
             time = self.ticks * TICK
             asked = command(time) if callable(command) else command
@@ -58,7 +58,7 @@ def manoeuvres(time):
 
 
 def all_together(extra):
-    """Thrust of four saturated rotors [N], by the simulated pack alone."""
+    """Thrust of four saturated rotors [N] with the simulated pack."""
     battery = Battery(ROBOT, PACK)
     battery.extra_resistance = extra
     thrust = np.full(4, ROBOT.hover_thrust)
@@ -79,7 +79,7 @@ def test_a_worn_contact_is_reported_within_half_a_second_with_the_remaining_thru
     flight.fly(2.0, command)
     assert flight.watch.limit is not None
     assert (flight.ticks - start) * TICK <= 0.5
-    for _ in range(150):        # the watch goes on, the loop of fly() stops at a limit
+    for _ in range(150):        # the watch continues; the loop of fly() stops at a limit
         flight.fly(0.01, command)
     assert flight.watch.limit == pytest.approx(all_together(extra), rel=0.1)
 

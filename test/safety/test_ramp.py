@@ -1,4 +1,4 @@
-"""The moving target: its velocity is the derivative of its pose, and it ends where it should."""
+"""The moving target: its velocity is the derivative of its pose; its end pose."""
 
 import numpy as np
 import pytest

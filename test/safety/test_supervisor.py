@@ -1,4 +1,4 @@
-"""Each transition of the state machine, with a vehicle on strings."""
+"""Each transition of the state machine, with a kinematic vehicle."""
 
 from dataclasses import replace
 
@@ -242,7 +242,7 @@ def test_a_fault_before_lift_off_stops_the_motors():
 
 
 def test_low_battery_warns_then_lands():
-    # By the voltage alone: no resistance makes a pack sag that suddenly and recover.
+    # Without the resistance: only the voltage falls suddenly and recovers.
     detection = replace(PARAMETERS.detection, battery=replace(
         PARAMETERS.detection.battery, time=10.0))
     puppet = Puppet(replace(PARAMETERS, detection=detection)).fly()
@@ -517,7 +517,7 @@ def test_one_frozen_axis_of_the_imu_is_named_and_the_flight_goes_on():
     puppet.run(3 * TICK)
     assert 'imu_axis_frozen' in puppet.supervisor.faults
     assert puppet.supervisor.state == 'flying' and not puppet.supervisor.vehicle.imu_lost
-    puppet.alive.discard('estimate')    # the descent on raw sensors goes without the IMU
+    puppet.alive.discard('estimate')    # the descent on raw sensors works without the IMU
     puppet.run(0.5)
     assert puppet.supervisor.state == 'landing' and puppet.supervisor.vehicle.imu_lost
     assert 'imu_lost' not in puppet.supervisor.faults

@@ -1,4 +1,4 @@
-"""A joint wound the wrong way turns over with its rotor at rest, and the robot lands softly."""
+"""An adversely wound joint turns with its rotor at rest, and the robot lands softly."""
 
 import itertools
 
@@ -58,7 +58,7 @@ def test_lands_softly_from_inverted_attitude_with_all_joints_wound_adversely(sig
 
 
 def wind(flight, signs):
-    """Turn joints by whole turns, with all that is known of them: readings, commands, targets."""
+    """Turn joints by whole turns, with their readings, commands and targets."""
     plant, supervisor = flight.sim._plant, flight.supervisor
     turns = np.where(np.sign(plant._tilt) != signs, 2 * np.pi * signs, 0.0)
     plant._tilt += turns

@@ -1,4 +1,4 @@
-"""Detectors: what is named, how soon, and what healthy motion never names."""
+"""Detectors: named faults, detection times, and no false alarms in healthy motion."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ LAG = ROBOT.rotors.time_constant
 
 
 class Body:
-    """A body in space that turns as its thrusts push; the IMU is noisy as in the simulator."""
+    """A free body moved by its thrusts; the IMU has the noise of the simulator."""
 
     def __init__(self, attitude, seed=0):
         self.hover = ALLOCATOR.hover(attitude, np.zeros(4))
@@ -32,7 +32,7 @@ class Body:
         self.command = Command(0.0, self.hover.tilt, self.hover.thrust)
 
     def feed(self, watch, duration, works=np.ones(4), turn=np.zeros(4), push=np.zeros(3)):
-        """Let the watch see so much time; returns when it first named a fault [s], or None."""
+        """Feed the watch for a time; return the time of the first named fault [s], or None."""
         for k in range(round(duration / TICK)):
             self.time += TICK
             self.thrust += -np.expm1(-TICK / LAG) * (works * self.hover.thrust - self.thrust)
@@ -62,7 +62,7 @@ def test_a_lost_rotor_is_named_within_a_sixth_of_a_second(attitude, rotor):
     assert body.feed(watch, 2.0) is None
     works = np.ones(4)
     works[rotor] = 0.0
-    watch.supported = np.arange(4) == rotor     # as its ESC soon says
+    watch.supported = np.arange(4) == rotor     # which its ESC reports soon
     assert body.feed(watch, 0.5, works) <= 0.16
     assert watch.lost == rotor and watch.slipped is None
 
@@ -115,7 +115,7 @@ def test_contact_is_detected_by_impact_or_by_a_push_near_the_ground():
 
 
 def follow(watch, asked, follows, duration=2.0, delay=0.03, start=0.0, noise=0.05):
-    """A joint set that follows ``asked(t)``; ``follows(t, tilt)`` spoils it."""
+    """Joints that follow ``asked(t)``; ``follows(t, tilt)`` adds a fault."""
     random, tilt = np.random.default_rng(1), np.zeros(4)
     lag = ROBOT.joints.kd / ROBOT.joints.kp
     first = None
@@ -250,7 +250,7 @@ def test_a_fault_stays_named_and_the_health_follows():
 @pytest.mark.parametrize('pause', [0.03, 0.3, 1.0])
 @pytest.mark.parametrize('spacing', [TICK, 1e-4, 1e-7, 0.0])
 def test_a_burst_of_samples_after_a_pause_is_neither_crash_nor_fault(pause, spacing):
-    """A process that was held up finds its samples at once, however they are stamped."""
+    """After a delay of the process many samples arrive at once, with any stamps."""
     body, watch = Body(ATTITUDES[1]), wrench_watch()
     contact = ContactWatch(P.contact, ROBOT.gravity)
     assert body.feed(watch, 1.0) is None

@@ -1,4 +1,4 @@
-"""The emulated firmware's state machine against the contract, without port or clock."""
+"""The state machine of the emulated firmware against the protocol, without port or clock."""
 
 from hypothesis import given, settings, strategies
 import pytest

@@ -171,7 +171,7 @@ def test_answers_take_the_transmission_time_if_requested():
         port.setBaudRate(9600)
         start = time.monotonic()
         assert handler.ping(port, 1)[1] == sdk.COMM_SUCCESS
-        # Ten bytes out, fourteen back, ten bits each: it cannot be faster than the wire.
+        # Ten bytes sent and fourteen received, ten bits each: the least time on the wire.
         assert time.monotonic() - start > 24 * 10 / 9600
         port.closePort()
 

@@ -1,4 +1,4 @@
-"""Faults of the simulated robot: each has its stated effect at its time, and no other."""
+"""Faults of the simulated robot: each has its stated effect at its time only."""
 
 from dataclasses import replace
 from math import inf

@@ -1,4 +1,4 @@
-"""To be imported first: without the extra 'train' the importing test module skips."""
+"""Import this first: without the extra 'train' the test module is skipped."""
 
 import pytest
 

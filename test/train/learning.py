@@ -7,7 +7,7 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.train.environment import TiltableQuadrotorEnv
 from beetle_omni_ros.train.run_folder import read_parameters
 
-torch.set_num_threads(1)    # more would only disturb each other on so small batches
+torch.set_num_threads(1)    # more threads would be slower on such small batches
 ROBOT = RobotParameters.load()
 SMALL = {'ppo.robots': 16, 'ppo.steps': 6, 'ppo.epochs': 2, 'ppo.minibatches': 2,
          'network.hidden': [16, 16], 'iterations': 4, 'log_every': 1, 'save_every': 2}
@@ -23,7 +23,7 @@ QUIET = {f'random.{name}': 0.0 for name in (
 
 
 def small(changes=None, **more):
-    """Shipped parameters at a tiny size; dotted names -> values on top of them."""
+    """Shipped parameters at a tiny size, with changes by dotted names."""
     return read_parameters(None, {**SMALL, **(changes or {}), **more})
 
 
@@ -34,7 +34,7 @@ def environment(changes=None, robots=64, seed=0, robot=ROBOT, **more):
 
 
 def quiet(changes=None, **more):
-    """:func:`environment` in which everything is known, all episodes at their begin."""
+    """:func:`environment` without randomness, with all episodes at their start."""
     env = environment({**QUIET, **(changes or {})}, **more)
     env.state['age'].zero_()
     return env

@@ -12,7 +12,7 @@ from beetle_omni_ros.train import command
 
 
 def checksum(tensors):
-    """Equal for equal tensors, to the last bit."""
+    """Number that is equal for bitwise equal tensors."""
     return [value.detach().double().sum().item() for value in tensors]
 
 
@@ -22,14 +22,14 @@ def networks(made):
 
 
 class Runner(command.Runner):
-    """The training's, kept to be looked at."""
+    """Runner of the training that is kept for inspection."""
 
     def __init__(self, *arguments):
         super().__init__(*arguments)
         Runner.made, self.begin, self.rows = self, networks(self), []
 
     def train(self, progress, stop_after):
-        """As it is, with the rows kept."""
+        """Train, and store the progress rows."""
         def both(row):
             self.rows.append(row)
             progress(row)
@@ -40,7 +40,7 @@ def main(folder):
     """Train by the command and print the result."""
     rank = os.environ['RANK']
     command.Runner = Runner
-    # Only the first process has had enough after its first iteration.
+    # Only the first process stops after its first iteration.
     status = cli.main(['train', '--smoke', '--device', 'cpu', '--output', str(folder / 'run'),
                        '--set', 'iterations=1000', '--stop-after', '0' if rank == '0' else '1e9'])
     made = Runner.made

@@ -1,4 +1,4 @@
-"""The figures of the assessment, for robots that are held where the figures are known."""
+"""The metrics of the assessment, for prescribed states with known metrics."""
 
 import itertools
 
@@ -17,7 +17,7 @@ HOLD = torch.zeros(1, 8)
 
 
 class Held:
-    """In place of the environment: each robot at an offset from its present target."""
+    """Replacement of the environment: each robot has an offset from its present target."""
 
     offset, lost = None, None
 
@@ -32,7 +32,7 @@ class Held:
                       'target_attitude': torch.nn.functional.normalize(torch.randn(count, 4))}
 
     def advance(self, action):
-        """Put the robots where they shall be after this step."""
+        """Set the states after this step."""
         s = self.state
         distance, angle = self.offset(self.step % 800)
         s['x'][:, :3] = s['target_position']
@@ -54,7 +54,7 @@ def still(seen):
 
 @pytest.fixture
 def held(monkeypatch):
-    """Let ``assess`` fly held robots."""
+    """Call ``assess`` with prescribed states."""
     def run(offset, mean=still, robots=20, segments=2, lost=0):
         monkeypatch.setattr(module, 'TiltableQuadrotorEnv', Held)
         monkeypatch.setattr(Held, 'offset', staticmethod(offset))

@@ -1,4 +1,4 @@
-"""Batched rotations against scipy, and random numbers that are what they claim."""
+"""Batched rotations against scipy, and distributions of random numbers."""
 
 import extra_train  # noqa: F401
 import numpy as np

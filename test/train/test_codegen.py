@@ -1,4 +1,4 @@
-"""The written-out functions are the CasADi functions."""
+"""The generated functions agree with the CasADi functions."""
 
 import ast
 from dataclasses import replace
@@ -64,7 +64,7 @@ def test_torch_agrees_with_casadi(robot):
 def test_the_precision_is_that_of_the_inputs():
     step = codegen.torch_function(model.substep(ROBOT, 0.0025))
     inputs = states(50)
-    inputs[0][:, 13:17] *= 0.95     # away from the stops, where rounding decides who is held
+    inputs[0][:, 13:17] *= 0.95     # away from the stops, where rounding decides
     single = step(*(value.float() for value in inputs))
     assert single.dtype == torch.float32
     np.testing.assert_allclose(single.numpy(), step(*inputs).numpy(), atol=1e-5)
@@ -150,7 +150,7 @@ def store(pointer, value, mask):
 
 @pytest.fixture
 def triton(monkeypatch):
-    """Stand in for the package triton, with the few words that the kernel uses."""
+    """Replacement of the package triton with the functions that the kernel uses."""
     language = SimpleNamespace(
         constexpr=int, float32=torch.float32, program_id=lambda axis: Program.index,
         arange=torch.arange, load=load, store=store, where=torch.where, sin=torch.sin,

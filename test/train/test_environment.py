@@ -1,4 +1,4 @@
-"""What happens in a step: commands and their delays, targets, ends, resets, disturbances."""
+"""A step: commands and their delays, targets, ends, resets, disturbances."""
 
 from dataclasses import replace
 
@@ -131,7 +131,7 @@ def test_actions_beyond_the_actuators_act_and_are_observed_as_their_limits():
 # ---- ends
 
 def pair(changes=None, **more):
-    """Two equal environments, to change something in the second."""
+    """Two equal environments, of which the second one is changed."""
     return quiet(changes, **more), quiet(changes, **more)
 
 
@@ -266,7 +266,7 @@ def test_the_estimate_approaches_the_disturbance():
 
 
 def test_a_late_rate_enters_the_estimate_as_a_torque():
-    """The estimator holds the change of the rate of two steps ago against that of now."""
+    """The estimator compares the change of the rate two steps ago with that of now."""
     env = quiet({**only('hold'), 'memory': True}, robots=2)
     s, n = env.state, env.num_envs
     history = torch.randn(n, 6, 3, generator=torch.Generator().manual_seed(0))    # newest first
@@ -306,7 +306,7 @@ def test_extreme_actions_never_give_nan(memory):
     tally = env.read_tally()
     assert tally['steps'] == 250 * 256 and tally['deaths'] > 0
     assert all(np.isfinite(value) for value in tally.values())
-    assert env.read_tally()['deaths'] == 0     # it begins anew
+    assert env.read_tally()['deaths'] == 0     # it is reset
 
 
 def test_the_tally_counts_targets_and_reached_targets():

@@ -22,7 +22,7 @@ VARIANTS = [(False, 0.5), (False, 0.0), (True, 0.5), (True, 0.0)]
 
 
 def actor(memory=False, carry=0.5):
-    """A network whose every weight matters."""
+    """A network in which every weight has an effect."""
     parameters = small({'memory': memory, 'network.carry': carry, 'network.hidden': [32, 16]})
     made = Runner(parameters, ROBOT).alg.actor
     generator = torch.Generator().manual_seed(0)
@@ -33,7 +33,7 @@ def actor(memory=False, carry=0.5):
 
 
 def observations(memory, count=64):
-    """What robots really see, and random numbers."""
+    """Observations of simulated robots, and random ones."""
     seen = environment({'memory': memory}, robots=count).observation
     return torch.cat((seen, torch.randn(seen.shape, generator=torch.Generator().manual_seed(1))))
 

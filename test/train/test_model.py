@@ -218,7 +218,7 @@ def test_training_physics_are_those_of_the_multibody_plant(tilt_step, thrust_ste
     x, u = hovering(40, 6, tilt_step, thrust_step)
     true = flown(x, u, 0.05)
     with_modules, without = (trained(robot, x, u, 0.05) for robot in (ROBOT, RIGID))
-    # In MuJoCo the body's motion also pulls at the servos, which costs the tilts a degree.
+    # In MuJoCo the motion of the body also loads the servos, which changes tilts by a degree.
     assert_close(with_modules, true, position=1e-3, velocity=0.01, rate=0.1, tilt=0.05,
                  thrust=1e-6)
     assert angle(with_modules[:, 6:10], true[:, 6:10]).max() < 0.01

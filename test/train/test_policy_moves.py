@@ -1,4 +1,4 @@
-"""The benchmark that counts rare dives: many rows at once, fair counts, guided robots."""
+"""The benchmark of rare losses of height: batches, counts, guidance."""
 
 import importlib.util
 from pathlib import Path

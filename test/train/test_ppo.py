@@ -1,4 +1,4 @@
-"""The captured arithmetic of PPO is that of rsl-rl and of textbooks."""
+"""The captured arithmetic of PPO agrees with rsl-rl and with textbooks."""
 
 from learning import ROBOT, small
 import numpy as np
@@ -30,7 +30,7 @@ def randomised(made, seed=0):
 
 
 def rollout_of_rsl_rl(made):
-    """As OnPolicyRunner.learn collects."""
+    """Collect samples like OnPolicyRunner.learn."""
     alg, observations = made.alg, made.env.get_observations()
     with torch.inference_mode():
         for _ in range(made.parameters.ppo.steps):
@@ -202,5 +202,5 @@ def test_repeated_updates_fit_the_same_batch():
     for _ in range(15):
         made.alg.learn_batch()
         losses.append(made.alg.losses.clone())
-    assert losses[-1][0] < 0.5 * losses[0][0]     # the critic finds the returns
-    assert losses[-1][1] < losses[0][1]           # the actor prefers what did better
+    assert losses[-1][0] < 0.5 * losses[0][0]     # the critic converges to the returns
+    assert losses[-1][1] < losses[0][1]           # the actor prefers actions with larger returns

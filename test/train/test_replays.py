@@ -1,4 +1,4 @@
-"""Situations that were missed are stored, flown again as they were, and forgotten when flown."""
+"""Missed situations are stored, repeated unchanged, and dropped when reached."""
 
 from dataclasses import replace
 

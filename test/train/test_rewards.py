@@ -1,4 +1,4 @@
-"""Each reward term at moments made by hand; the published ones against the paper's table."""
+"""Each reward term for prescribed states; the published ones against the paper's table."""
 
 from dataclasses import fields
 import itertools
@@ -16,7 +16,7 @@ NOT_TERMS = {'termination', 'scale'}
 
 
 def moment(**changes):
-    """One robot at rest at its target, level, as a moment of arrays."""
+    """State of one level robot at rest at its target, as arrays."""
     four, up = np.zeros((1, 4)), np.array([[0.0, 0.0, 1.0]])
     values = {
         **dict.fromkeys(('position_error', 'attitude_error', 'speed', 'rate', 'depth'),
@@ -33,7 +33,7 @@ def moment(**changes):
 
 
 def moments(count, seed):
-    """Random moments over the whole range, many of them close to the target."""
+    """Random states over the whole range, many of them close to the target."""
     rng = np.random.default_rng(seed)
     near = rng.choice([0.01, 0.05, 1.0], (count, 1))[:, 0]
 

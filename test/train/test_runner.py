@@ -1,4 +1,4 @@
-"""The training loop: schedule, rows, checkpoints, resume, what stops it."""
+"""The training loop: schedule, rows, checkpoints, resume, stop conditions."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ def parameters_of(made):
 
 
 def assert_same_state(one, other):
-    """Everything that an optimisation continues from."""
+    """Assert equal weights, optimiser state and counters."""
     for name, value in parameters_of(one).items():
         torch.testing.assert_close(value, parameters_of(other)[name], rtol=0, atol=0)
     ours, theirs = one.alg.optimizer.state_dict(), other.alg.optimizer.state_dict()
@@ -157,7 +157,7 @@ def test_a_checkpoint_of_a_captured_training_continues_without_capture(tmp_path)
     path = tmp_path / 'model_1.pt'
     saved = torch.load(path)
     for group in saved['optimizer_state_dict']['param_groups']:
-        # as the optimiser of CUDA graphs keeps it
+        # as in the optimiser with CUDA graphs
         group.update(capturable=True, fused=True, lr=torch.tensor(float(group['lr'])))
     torch.save(saved, path)
     other = runner(iterations=2)

@@ -1,4 +1,4 @@
-"""Training in several processes: here two on the CPU in place of two GPUs."""
+"""Training in several processes, here two on the CPU instead of two GPUs."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Where robots start and fly to, and what is random about them."""
+"""Random initial states, targets and robots."""
 
 from learning import environment, only, quiet, ROBOT
 import numpy as np

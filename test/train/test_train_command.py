@@ -1,4 +1,4 @@
-"""`beetle_omni train` as it is called: a smoke run, resume, one line for what is unusable."""
+"""`beetle_omni train`: a smoke run, resume, one-line refusals."""
 
 import json
 from pathlib import Path
@@ -26,7 +26,7 @@ TINY = ['--smoke', '--device', 'cpu', '--set', 'ppo.robots=8', '--set', 'ppo.ste
 
 @pytest.fixture(autouse=True)
 def one_thread():
-    """More would only disturb each other on so small batches."""
+    """Use one thread, which is fastest on such small batches."""
     torch.set_num_threads(1)
 
 
@@ -95,7 +95,7 @@ def test_the_policy_of_a_run_flies_in_the_loop(run, tmp_path):
     task = tmp_path / 'pose.csv'
     task.write_text('x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg\n0,0,1,0,0,0\n')
     result = tmp_path / 'result.json'
-    # The policy is untrained; the supervisor must end the flight for any behaviour of it.
+    # The policy is untrained; the supervisor must end the flight for any of its commands.
     assert cli.main(['evaluate', '--controllers', 'rl', '--policy', str(run / 'policy.onnx'),
                      '--task', str(task), '--json', str(result)]) in (0, 1)
 

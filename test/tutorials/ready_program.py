@@ -1,9 +1,9 @@
 """
-A `beetle_omni` that has its modules loaded: each call is a process of its own, forked from it.
+A `beetle_omni` with loaded modules: each call is a process that is forked from it.
 
-``python ready_program.py SOCKET`` loads the modules once and serves. ``CLIENT`` is the program
-that a shell starts instead: it hands over its streams, folder, environment and arguments, and ends
-with the status of the call. Loading the modules takes 2 s of CPU time, a short flight takes 4 s.
+``python ready_program.py SOCKET`` loads the modules once and serves. A shell starts the program
+``CLIENT`` instead. It passes on its streams, folder, environment and arguments, and ends with the
+status of the call. Loading the modules takes 2 s of CPU time, a short flight takes 4 s.
 """
 
 from importlib import import_module
@@ -36,7 +36,7 @@ def serve(address):
             call, _ = server.accept()
             while calls and os.waitpid(-1, os.WNOHANG)[0]:
                 calls -= 1
-            if not os.fork():       # its parent takes the next call
+            if not os.fork():       # its parent serves the next call
                 server.close()
                 return _answer(call)
             call.close()
@@ -44,7 +44,7 @@ def serve(address):
 
 
 def _answer(call):
-    """Run one call in a process, wait for its end and tell the status."""
+    """Run one call in a process, wait for its end and send its status."""
     _, streams, *_ = socket.recv_fds(call, 1, 3)
     folder, environment, arguments = json.loads(b''.join(iter(lambda: call.recv(65536), b'')))
     child = os.fork()

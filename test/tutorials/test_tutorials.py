@@ -1,10 +1,10 @@
 """
-Each tutorial runs from its own text: its files are written, its commands run in one folder.
+Each tutorial runs from its text: its files are written, its commands run in one folder.
 
-A comment before a block says how the test differs from what a reader does:
+A comment before a block states a difference between the test and a reader:
 ``<!-- test: skip -->``, ``OLD -> NEW`` in the commands, ``prints TEXT``, ``fails STATUS``,
-``background NAME`` until a block that ``ends NAME`` or the page's end, and ``waits FILE`` for what
-that makes.
+``background NAME`` until a block that ``ends NAME`` or the page's end, and ``waits FILE`` for a
+file of that program.
 """
 
 from dataclasses import dataclass, field
@@ -23,7 +23,7 @@ import ready_program
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted((ROOT / 'docs' / 'tutorials').glob('*.md'))
 NAMES = ('beetle_omni', 'sim_node')
-STARTED = 'first_flight'    # the page whose commands load their modules, as a reader's do
+STARTED = 'first_flight'    # the page whose commands load their modules, as for a reader
 TIMEOUT = 1000       # s of one block
 BLOCK = re.compile(r'(?P<before>[^\n]*)\n(?:\n<!-- test: (?P<told>[^\n]*) -->\n)?\n'
                    r'```(?P<language>\w+)\n(?P<text>.*?)^```$', re.DOTALL | re.MULTILINE)
@@ -31,7 +31,7 @@ BLOCK = re.compile(r'(?P<before>[^\n]*)\n(?:\n<!-- test: (?P<told>[^\n]*) -->\n)
 
 @dataclass
 class Block:
-    """A fenced block: its language and text, the file that it is, what the test is told."""
+    """A fenced block: its language and text, its file name, instructions for the test."""
 
     language: str
     text: str
@@ -39,13 +39,13 @@ class Block:
     told: list[str] = field(default_factory=list)
 
     def one(self, word):
-        """What is told behind a word; '' where it is not."""
+        """The argument of an instruction; '' without it."""
         return next((told.removeprefix(word).strip() for told in self.told
                      if told.split(' ')[0] == word), '')
 
     @property
     def commands(self):
-        """The text with what the test replaces."""
+        """The text with the replacements of the test."""
         text = self.text
         for told in self.told:
             old, arrow, new = told.partition(' -> ')
@@ -56,7 +56,7 @@ class Block:
 
 
 def blocks(page):
-    """Blocks of a page that are run or written, in their order."""
+    """Executed and written blocks of a page, in order."""
     found = []
     for match in BLOCK.finditer(page.read_text(encoding='utf-8')):
         told = [part.strip() for part in (match['told'] or '').split(', ') if part]
@@ -73,7 +73,7 @@ def variables():
 
 @pytest.fixture(scope='module')
 def client(tmp_path_factory):
-    """Text of a `beetle_omni` that need not load its modules."""
+    """Text of a `beetle_omni` that does not load its modules."""
     address = tmp_path_factory.mktemp('ready') / 'socket'
     process = subprocess.Popen([sys.executable, ready_program.__file__, str(address)],
                                env=variables(), start_new_session=True)
@@ -84,7 +84,7 @@ def client(tmp_path_factory):
             time.sleep(0.05)
         yield ready_program.CLIENT.format(python=sys.executable, address=str(address))
     finally:
-        os.killpg(process.pid, signal.SIGKILL)      # with calls that a test gave up
+        os.killpg(process.pid, signal.SIGKILL)      # with calls after the timeout of a test
         process.wait()
 
 
@@ -107,7 +107,7 @@ def shell(tmp_path, page, client):
 
 
 def run(block, folder, environment):
-    """Run one block as a reader would paste it."""
+    """Run one block like a reader who pastes it."""
     if block.one('waits'):
         end = time.monotonic() + 60
         while not (folder / block.one('waits')).exists() and time.monotonic() < end:
@@ -121,7 +121,7 @@ def run(block, folder, environment):
 
 
 def stop(process):
-    """End a program as Ctrl-C does."""
+    """End a program like Ctrl-C."""
     process.send_signal(signal.SIGINT)
     process.wait(20)
 

@@ -110,7 +110,7 @@ def test_a_recording_is_rendered_and_moves_with_the_slider(bag, drawn):
             assert player.time == 14.0
             second = at_rest(browser)
             assert 0.003 < changed(first, second) < 0.5
-            # It plays by itself.
+            # The playback runs.
             player._play.value = True
             until(lambda: player.time > 14.5, 'a time that runs')
             assert all(url.startswith((page.url, page.url.replace('localhost', '127.0.0.1'),
@@ -128,14 +128,14 @@ def test_a_target_that_is_dragged_with_the_mouse_arrives(drawn):
     with opened(page.url) as (browser, _):
         rendered(browser)
         client = until(lambda: list(page.server.get_clients().values()), 'a client')[0]
-        # The arrow of the gizmo along world x, and where the mouse takes it.
+        # The arrow of the gizmo along world x, and the end of the drag.
         shaft, there = (pixel(client, np.array([x, 0.0, 1.0])) for x in (0.33, 0.93))
         browser.mouse.move(*shaft)
         browser.mouse.down()
         for part in np.linspace(0.1, 1.0, 10):
             browser.mouse.move(*(shaft + part * (there - shaft)))
             browser.wait_for_timeout(100)
-        assert not graph.targets        # not before the hand lets go
+        assert not graph.targets        # not before the mouse button is released
         browser.mouse.up()
         until(lambda: graph.targets, 'a target')
         target, = graph.targets
@@ -151,7 +151,7 @@ def test_a_refused_target_is_reported_and_reset(drawn):
     live = drawn(page, Live(page, graph, ROBOT, allow_targets=True))
     with opened(page.url, 400, 800) as (browser, _):
         until(lambda: page.server.get_clients(), 'a client')
-        live._send(np.array([0.0, 0.0, -5.0]), UP)      # below the floor: not even sent
+        live._send(np.array([0.0, 0.0, -5.0]), UP)      # below the floor: not sent
         until(lambda: browser.get_by_text('target not sent').count(), 'a note')
         assert not graph.targets
         live._send(np.array([9.0, 0.0, 1.0]), UP)

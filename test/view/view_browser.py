@@ -11,7 +11,7 @@ from PIL import Image
 import pytest
 
 NAMES = ('chromium', 'chromium-browser', 'google-chrome', 'google-chrome-stable')
-# Drawn by the processor; nothing asks the network.
+# Drawn without a GPU and without network.
 FLAGS = ('--headless', '--no-sandbox', '--disable-gpu', '--disable-quic', '--no-first-run',
          '--disable-background-networking', '--disable-component-update', '--disable-sync',
          '--use-gl=angle', '--use-angle=swiftshader', '--enable-unsafe-swiftshader')
