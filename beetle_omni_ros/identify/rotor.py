@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beetle_omni_ros.identify.csv_table import LogError
 from beetle_omni_ros.identify.inference.least_squares import (
     differences,
     minimise,
@@ -19,6 +18,7 @@ from beetle_omni_ros.identify.inference.least_squares import (
 from beetle_omni_ros.identify.inference.prior import UNKNOWN
 from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.rotor_log import Plateau, RotorLog
+from beetle_omni_ros.runs.csv_table import LogError
 
 UNIT_THRUST = 10.0      # [N] for g = 1
 P = shipped().rotor

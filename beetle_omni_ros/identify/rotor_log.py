@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from beetle_omni_ros.identify.csv_table import LogError, missing, read_table
 from beetle_omni_ros.identify.parameters import shipped
+from beetle_omni_ros.runs.csv_table import LogError, missing, read_table
 
 HEADER = 'pwm_us (or duty_percent),force_N,torque_N_m,voltage_V'
 ALTERNATIVES = {'force_N': ('force_N', 'thrust_N'), 'torque_N_m': ('torque_N_m', 'torque_Nm'),

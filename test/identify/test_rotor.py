@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from rotor_logs import bench, HEADER, RATIO, ROWS, write
 
-from beetle_omni_ros.identify.csv_table import LogError
 from beetle_omni_ros.identify.rotor import crossings, fit_row, identify_rotor
 from beetle_omni_ros.identify.rotor_log import Plateau, read_rotor_log
 from beetle_omni_ros.identify.rotor_results import rotor_results, write_rotor_file
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.runs.csv_table import LogError
 
 
 def identified(tmp_path, rows, header=HEADER):

@@ -1,0 +1,117 @@
+"""CSV tables with units in the column names, and errors with row and column."""
+
+from collections.abc import Callable
+import csv
+from dataclasses import dataclass
+from math import isfinite
+from pathlib import Path
+
+import numpy as np
+
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.yaml_file import quoted
+
+
+class LogError(ParameterError):
+    """A measured log is unusable; the text states file, row or column, and expectation."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """
+    Columns of numbers.
+
+    Attributes:
+        path: path of the file.
+        columns: name -> (N,) values of the read columns.
+        rows: (N,) line number of each row in the file.
+
+    """
+
+    path: Path
+    columns: dict[str, np.ndarray]
+    rows: np.ndarray
+
+    def __len__(self):
+        return len(self.rows)
+
+
+def read_table(path: str | Path, wanted: Callable[[list[str]], list[str]], expected: str, *,
+               rows: str = '', comment: str | None = '#', error: type[ParameterError] = LogError,
+               check: Callable[[list[float]], str] = lambda values: '') -> Table:
+    """
+    Read columns of a CSV file; blank lines, comments and further columns are ignored.
+
+    Args:
+        path: path of the file.
+        wanted: header -> names of the columns to read; may raise ``error`` without the path.
+        expected: example of a header, for messages.
+        rows: expected content below the header, for the message about an empty file.
+        comment: first character of a comment; None: a file has no comments.
+        error: class of the raised errors.
+        check: values of a row -> text about an unusable row after its number, or ''.
+
+    Raises:
+        LogError: no such file, no header, a missing or repeated column, or a field without a
+        number.
+
+    """
+    path = Path(path)
+    try:
+        with open(path, newline='', encoding='utf-8-sig') as file:
+            reader = csv.reader(file)
+            lines = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
+    except FileNotFoundError:
+        raise error(f'{path}: no such file') from None
+    except (OSError, UnicodeDecodeError, csv.Error) as cause:
+        reason = f"not a CSV text file ({getattr(cause, 'strerror', None) or cause})"
+        raise error(f'{path}: {reason}') from None
+    lines = [(number, row) for number, row in lines
+             if any(row) and (comment is None or not row[0].startswith(comment))]
+    if not lines:
+        raise error(f'{path}: empty; expected the header {expected}{rows}')
+    number, header = lines.pop(0)
+    if all(map(_is_number, header)):
+        raise error(f'{path}: row {number}: the header is missing; expected {expected}')
+    try:
+        names = wanted(header)
+    except error as cause:
+        raise error(f'{path}: row {number}: {cause}; expected {expected}') from None
+    for name in names:
+        if header.count(name) > 1:
+            raise error(f"{path}: row {number}: column '{name}' stands there twice")
+    index, values = [header.index(name) for name in names], []
+    for line, row in lines:
+        reason = _unusable(row, header, index)
+        if not reason:
+            values.append([float(row[k]) for k in index])
+            reason = check(values[-1])
+        if reason:
+            raise error(f'{path}: row {line}{reason}')
+    table = np.array(values).reshape(len(lines), len(names))
+    return Table(path, {name: table[:, k] for k, name in enumerate(names)},
+                 np.array([line for line, _ in lines], dtype=int))
+
+
+def _unusable(row, header, index):
+    if len(row) != len(header):
+        return f': expected {len(header)} values, found {len(row)}'
+    bad = next((k for k in index if not _is_number(row[k]) or not isfinite(float(row[k]))), None)
+    return '' if bad is None else \
+        f', column {header[bad]}: expected a finite number, found {quoted(row[bad])}'
+
+
+def _is_number(text):
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def missing(name: str, header: list[str]) -> LogError:
+    """Error about a missing column; it mentions a column of the same name with another unit."""
+    stem = name.rpartition('_')[0]
+    other = [cell for cell in header if stem and cell.rpartition('_')[0] == stem]
+    hint = f" ('{other[0]}' has another unit)" if other else ''
+    return LogError(f"column '{name}' is missing{hint}")
