@@ -46,8 +46,7 @@ def run_check(*, listen: Callable[[float], ObservedGraph], servo_port: str | Non
     for part in skip:
         if part not in PARTS:
             raise ParameterError(f"--skip '{part}': expected {', '.join(PARTS)}")
-    if json_path:
-        check_writable(json_path)
+    check_writable(json_path)
     console, limits = console or Console(), CheckLimits.load()
     bus, link = ServoBusParameters.load(servo_bus), MotorBoardParameters.load(motor_board)
     robot_parameters = RobotParameters.load(robot)
@@ -69,9 +68,8 @@ def run_check(*, listen: Callable[[float], ObservedGraph], servo_port: str | Non
         reported = frozenset(bridge for bridge in BRIDGES if f'{bridge} state' in items)
         found[ROS] = check_topics(graph, limits, robot_parameters.gravity, reported)
     _print(console, found, skip)
-    if json_path:
-        write_json(json_path, results(found, servo_port=bus.port, board_port=link.port,
-                                      seconds=seconds, skipped=list(skip)))
+    write_json(json_path, results(found, servo_port=bus.port, board_port=link.port,
+                                  seconds=seconds, skipped=list(skip)))
     return 1 if any(f.level == FAIL for rows in found.values() for f in rows) else 0
 
 

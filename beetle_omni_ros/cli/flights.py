@@ -186,8 +186,7 @@ def compare(controllers: Annotated[Optional[str], typer.Option(
                  'seeds': numbers('--seeds', seeds)}
     if policy and not policy.is_file():
         raise ParameterError(f'{policy}: no such file')
-    if json_path:
-        check_writable(json_path)
+    check_writable(json_path)
     from beetle_omni_ros.comparison.command import run_compare
     from beetle_omni_ros.comparison.sweep import SweepError
     try:
@@ -282,8 +281,7 @@ def report(runs: Annotated[list[Path], typer.Argument(
     """
     from beetle_omni_ros.runs.json_file import check_writable
     check_writable(output, 'report')
-    if json_path:
-        check_writable(json_path)
+    check_writable(json_path)
     from beetle_omni_ros.runs.report import run_report
     run_report(runs, output, json_path=json_path)
 
@@ -342,8 +340,7 @@ def controllers(json_path: JsonOption = None):
     from rich.table import Table
 
     from beetle_omni_ros.runs.json_file import check_writable, write_json
-    if json_path:
-        check_writable(json_path)
+    check_writable(json_path)
     found = {name: _known(name) for name in registry.names()}
     table = Table(box=None, header_style='dim', padding=(0, 2, 0, 0))
     for column in ('name', 'what', 'rate [Hz]', 'parameters', 'policy', 'actuators lost',
@@ -357,8 +354,7 @@ def controllers(json_path: JsonOption = None):
                       known['parameters_file'] or '–', known['policy_file'] or '–',
                       'flies' if known['flies_degraded'] else '–', known['guidance'])
     Console().print(table)
-    if json_path:
-        write_json(json_path, found)
+    write_json(json_path, found)
 
 
 def _known(name):

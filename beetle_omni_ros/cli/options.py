@@ -106,8 +106,7 @@ def check_flight(*, task, seed, conditions, bag, compression, json_path, files):
         if file is not None and not file.is_file():
             raise ParameterError(f'{file}: no such file')
     make_task(task, seed)
-    if json_path:
-        check_writable(json_path)
+    check_writable(json_path)
     if bag:
         from beetle_omni_ros.runs.bag import check_new
         check_new(bag, compression)

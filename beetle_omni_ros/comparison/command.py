@@ -82,8 +82,7 @@ def run_compare(*, output: Path, controllers: list[str] | None = None,
     results = _results(flown, arguments, [entry.name for entry in available], skipped, policy)
     results['meta']['guidance'] = {entry.name: text for entry, text in available.items()}
     _write(results, flown, output, console)
-    if json_path:
-        write_json(json_path, results)
+    write_json(json_path, results)
     return results
 
 

@@ -134,8 +134,7 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
                               style='yellow', highlight=False)
                 results[name]['ended'] = log.meta['ended']
     table.print_results(results, console)
-    if json_path:
-        write_json(json_path, results)
+    write_json(json_path, results)
     return results
 
 

@@ -102,8 +102,7 @@ def _check(starts, output, json_path, docs, bags):
             raise ParameterError(f"--from '{start}': expected {', '.join(ALL_STARTS)}")
     if bags and output is None:
         raise ParameterError('--bags: expected --output DIR to record to')
-    if json_path:
-        check_writable(json_path)
+    check_writable(json_path)
     if docs and page.BEGIN not in _text(docs):
         raise ParameterError(f"{docs}: no line '{page.BEGIN}'")
     if output:

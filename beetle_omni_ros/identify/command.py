@@ -10,12 +10,12 @@ from beetle_omni_ros.identify import rotor_results as of_rotor
 from beetle_omni_ros.identify.joint import identify_joints
 from beetle_omni_ros.identify.joint_log import read_joint_log
 from beetle_omni_ros.identify.joint_servos import file_servos
-from beetle_omni_ros.identify.robot_file import check_not_base, write_text
+from beetle_omni_ros.identify.robot_file import check_outputs
 from beetle_omni_ros.identify.rotor import identify_rotor
 from beetle_omni_ros.identify.rotor_log import read_rotor_log
 from beetle_omni_ros.pages.table import print_grids
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.runs.json_file import check_writable, write_json
+from beetle_omni_ros.runs.json_file import write_json, write_text
 
 
 def run_identify_joint(path: Path, *, validate: Sequence[Path] = (), robot: Path | None = None,
@@ -34,7 +34,7 @@ def run_identify_joint(path: Path, *, validate: Sequence[Path] = (), robot: Path
 
     """
     console = console or Console()
-    _check_outputs(json_path, report, params, robot)
+    check_outputs(params, robot, json_path, report, 'report')
     robot_parameters = RobotParameters.load(robot)
     published = robot_parameters.joints
     log = read_joint_log(path)
@@ -46,8 +46,7 @@ def run_identify_joint(path: Path, *, validate: Sequence[Path] = (), robot: Path
     if robot:
         results['meta']['robot'] = str(robot)
     _print(console, of_joints.grids(results, brief=True), results['text'])
-    if json_path:
-        write_json(json_path, results)
+    write_json(json_path, results)
     if report:
         write_text(report, of_joints.joint_page(log, validations, models, servos, results),
                    'report')
@@ -72,7 +71,7 @@ def run_identify_rotor(path: Path, *, robot: Path | None = None, json_path: Path
 
     """
     console = console or Console()
-    _check_outputs(json_path, report, params, robot)
+    check_outputs(params, robot, json_path, report, 'report')
     robot_parameters = RobotParameters.load(robot)
     log = read_rotor_log(path)
     rows, ratio = identify_rotor(log)
@@ -80,23 +79,13 @@ def run_identify_rotor(path: Path, *, robot: Path | None = None, json_path: Path
     if robot:
         results['meta']['robot'] = str(robot)
     _print(console, of_rotor.grids(results), [f'warning: {w}' for w in results['warnings']])
-    if json_path:
-        write_json(json_path, results)
+    write_json(json_path, results)
     if report:
         write_text(report, of_rotor.rotor_page(log, rows, ratio, robot_parameters, results),
                    'report')
     if params:
         of_rotor.write_rotor_file(params, results, robot)
     return results
-
-
-def _check_outputs(json_path, report, params, robot):
-    if params:
-        check_not_base(params, robot)
-    for path, what in ((json_path, 'result file'), (report, 'report'),
-                       (params, 'parameter file')):
-        if path:
-            check_writable(path, what)
 
 
 def _print(console, tables, notes):

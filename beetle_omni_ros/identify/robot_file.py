@@ -6,21 +6,26 @@ import yaml
 
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.runs.json_file import check_writable, write_text
 
 SHIPPED = 'robot.yaml'
 
 
-def check_not_base(path: Path, base: Path | None) -> None:
+def check_outputs(path: Path | None, base: Path | None, json_path: Path | None,
+                  page: Path | None, page_name: str) -> None:
     """
-    Refuse to overwrite the file that the new one extends.
+    Check that robot file, results and page can be written, before they are computed.
 
     Raises:
-        ParameterError: both are the same file.
+        ParameterError: one cannot, or the robot file would replace the one that it extends.
 
     """
-    if base and path.resolve() == base.resolve():
+    if path and base and path.resolve() == base.resolve():
         raise ParameterError(f'{path}: --params cannot replace the file of --robot, which it '
                              'extends')
+    check_writable(json_path)
+    check_writable(page, page_name)
+    check_writable(path, 'parameter file')
 
 
 def write_robot_file(path: Path, head: str, content: dict, base: Path | None) -> None:
@@ -48,22 +53,6 @@ def write_robot_file(path: Path, head: str, content: dict, base: Path | None) ->
     text = yaml.safe_dump({'extends': extends, **content}, sort_keys=False,
                           default_flow_style=None, width=99)
     write_text(path, head + text, 'parameter file')
-
-
-def write_text(path: Path, text: str, what: str) -> None:
-    """
-    Write a file atomically.
-
-    Raises:
-        ParameterError: it cannot be written.
-
-    """
-    try:
-        temporary = path.with_name(path.name + '.tmp')
-        temporary.write_text(text, encoding='utf-8')
-        temporary.replace(path)
-    except OSError as error:
-        raise ParameterError(f'{path}: cannot write the {what} ({error.strerror})') from None
 
 
 def rounded(value: float, digits: int = 5) -> float:

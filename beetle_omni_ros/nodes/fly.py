@@ -67,8 +67,7 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix='beetle_omni_')))
             bag = Path(bag).absolute() if bag else folder / 'bag'
             check_new(bag)
-            if json_path:
-                check_writable(json_path)
+            check_writable(json_path)
             flown_task = make_task(task, seed, registry.find(controller).reach(
                 RobotParameters.load(robot)))
             RobotParameters.load(plant or robot)
@@ -260,8 +259,7 @@ def _report(bag, controller, task, meta, json_path, console) -> int:
     results = {'meta': meta, controller: metrics(log, task)}
     table.print_results(results, console)
     _print_measured(meta, console)
-    if json_path:
-        write_json(json_path, results)
+    write_json(json_path, results)
     return runner.OK if not results[controller].get('crashed') else runner.FAILED
 
 

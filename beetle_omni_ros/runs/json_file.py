@@ -8,14 +8,16 @@ from pathlib import Path
 from beetle_omni_ros.robot.schema import ParameterError
 
 
-def check_writable(path: str | Path, what: str = 'result file') -> None:
+def check_writable(path: str | Path | None, what: str = 'result file') -> None:
     """
-    Check that a file can be written, before its content is computed.
+    Check that a file can be written, before its content is computed; None: none is wanted.
 
     Raises:
         ParameterError: it cannot; names the file and the reason.
 
     """
+    if path is None:
+        return
     path = Path(path)
     folder = path.absolute().parent
     if path.is_dir():
@@ -29,15 +31,16 @@ def check_writable(path: str | Path, what: str = 'result file') -> None:
     raise ParameterError(f'{path}: cannot write the {what} there ({reason})')
 
 
-def write_json(path: str | Path, results: dict) -> None:
+def write_json(path: str | Path | None, results: dict) -> None:
     """
-    Write results as strict JSON: non-finite numbers become null.
+    Write results as strict JSON: non-finite numbers become null; None: no file is wanted.
 
     Raises:
         ParameterError: the file cannot be written.
 
     """
-    write_text(path, json.dumps(_strict(results), indent=1) + '\n')
+    if path is not None:
+        write_text(path, json.dumps(_strict(results), indent=1) + '\n')
 
 
 def write_text(path: str | Path, text: str, what: str = 'result file') -> None:

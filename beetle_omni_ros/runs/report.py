@@ -51,8 +51,7 @@ def run_report(paths: list[Path], output: Path, *, json_path: Path | None = None
     table.print_results(results, console)
     page = make_page(runs, results)
     write_text(output, page, 'report')
-    if json_path:
-        write_json(json_path, results)
+    write_json(json_path, results)
     console.print(f'{output}: {len(page) / 1e6:.1f} MB', highlight=False)
     return results
 

@@ -87,8 +87,7 @@ def run_train(*, output: Path | None, config: Path | None = None, robot: Path | 
 
     """
     console = console or Console(quiet=not is_rank_zero())
-    if json_path:
-        check_writable(json_path)
+    check_writable(json_path)
     if output is None and resume is None:
         raise ParameterError('--output: missing; expected a folder for the training')
     where = choose_device(device)
@@ -150,8 +149,7 @@ def _finish(runner, robot, output, device, smoke, json_path, console):
                   f'evaluate --controllers rl --policy {path} --task random100', soft_wrap=True)
     result = {'policy': str(path), 'iterations': runner.current_learning_iteration,
               'seconds': runner.trained_seconds, 'metrics': metrics, 'onnx_difference': difference}
-    if json_path:
-        write_json(json_path, result)
+    write_json(json_path, result)
     return result
 
 

@@ -22,10 +22,10 @@ from beetle_omni_ros.identify.gap.page import gap_page
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.results import grids, headline, results
 from beetle_omni_ros.identify.gap.workers import Workers
-from beetle_omni_ros.identify.robot_file import check_not_base, write_text
+from beetle_omni_ros.identify.robot_file import check_outputs
 from beetle_omni_ros.pages.table import print_grids
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.runs.json_file import check_writable, write_json
+from beetle_omni_ros.runs.json_file import write_json, write_text
 
 BAD_DATA = 3        # exit status
 LEAST_FITTED = 2    # with more flights, the last one is held out if none is given
@@ -58,7 +58,7 @@ def gap_results(runs, holdout=(), robot=None, apply=None, json_path=None, page=N
     """As :func:`run_gap`, but return the results that it writes as JSON."""
     console = console or Console()
     runs, holdout = [Path(r) for r in runs], [Path(h) for h in holdout]
-    _check_outputs(apply, robot, json_path, page)
+    check_outputs(apply, robot, json_path, page, 'page')
     check_apart([*runs, *holdout])
     robot_parameters, p = RobotParameters.load(robot), GapParameters.load(parameters)
     if any(run.suffix.lower() == '.csv' for run in runs):
@@ -78,8 +78,7 @@ def gap_results(runs, holdout=(), robot=None, apply=None, json_path=None, page=N
             a.damaged = read_recording(path), a.damages[0]
         html = gap_page(a, result) if page else ''
     _print(console, result)
-    if json_path:
-        write_json(json_path, result)
+    write_json(json_path, result)
     if page:
         write_text(page, html, 'page')
     if apply:
@@ -118,14 +117,6 @@ def _loaded(_, named, robot, p, fix):
         return error
 
 
-
-
-def _check_outputs(apply, robot, json_path, page):
-    if apply:
-        check_not_base(apply, robot)
-    for path, what in ((json_path, 'result file'), (page, 'page'), (apply, 'parameter file')):
-        if path:
-            check_writable(path, what)
 
 
 def _print(console, result):
