@@ -19,6 +19,7 @@ from beetle_omni_ros.safety.vehicle import Vehicle
 from beetle_omni_ros.safety.watch.faults import FaultWatch
 
 TILT_AGE = 0.05     # [s] older joint angles are not used for thrust directions
+VOLTAGE_END = 1000.0    # [V] from which a reading is refused
 LATEST = 0.1    # [s] between a MoCap pose and the estimate for its check
 IMU_AXES = (*(f'specific force along {axis}' for axis in 'xyz'),
             *(f'angular rate about {axis}' for axis in 'xyz'))
@@ -83,8 +84,8 @@ class Inputs:
 
     def on_joints(self, stamp: float, position: np.ndarray, velocity: np.ndarray) -> bool:
         """Receive raw joint feedback (4,), nan where unknown."""
-        good = not self._ahead(stamp) and self.vehicle.on_joints(
-            stamp, self.watch.health.true(position), velocity)
+        good = np.shape(position) == (4,) and not self._ahead(stamp) \
+            and self.vehicle.on_joints(stamp, self.watch.health.true(position), velocity)
         if good:
             self._watch_joints(stamp, np.asarray(position, dtype=float))
         return good
@@ -199,8 +200,8 @@ class Inputs:
         return False
 
     def on_battery(self, voltage: float) -> bool:
-        """Receive the pack voltage under load [V]; refused if not finite or negative."""
-        if not (isfinite(voltage) and voltage >= 0):
+        """Receive the pack voltage under load [V]; refused if not finite, negative or absurd."""
+        if not 0 <= voltage < VOLTAGE_END:
             return False
         self.vehicle.voltage = float(voltage)
         if self._now is not None:

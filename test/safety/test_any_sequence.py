@@ -1,6 +1,6 @@
 """No sequence of inputs leads to an unsafe command."""
 
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 import numpy as np
 from puppet import flown, LEVEL, PARAMETERS, Puppet, ROBOT
@@ -80,6 +80,8 @@ def watch(puppet, command):
 
 @settings(max_examples=40, deadline=None, derandomize=True)
 @given(airborne=st.booleans(), sequence=actions)
+@example(airborne=True, sequence=[('battery', 1e300)])
+@example(airborne=True, sequence=[('raw', 0.0, [0.0, 0.0, 0.0, 1.0], []), ('raw', 0.0, [], [])])
 def test_no_unsafe_command_is_sent(airborne, sequence):
     puppet = flown() if airborne else Puppet()
     inner = puppet.supervisor.update
