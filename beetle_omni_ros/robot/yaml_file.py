@@ -1,5 +1,7 @@
 """Reader of untrusted YAML files: limits of size, depth and aliases, errors of one line."""
 
+from copy import deepcopy
+from functools import lru_cache
 from pathlib import Path
 import reprlib
 from typing import Any
@@ -76,6 +78,11 @@ def parse_yaml(data: bytes | str) -> Any:
         YamlError: as :func:`read_yaml`.
 
     """
+    return deepcopy(_parsed(data))
+
+
+@lru_cache(maxsize=32)      # one flight reads the same files several times, each in 40 ms
+def _parsed(data):
     loader = None
     try:
         loader = yaml.SafeLoader(data)

@@ -41,12 +41,13 @@ class Motion:
         self.position, self.velocity, acceleration = waves(t, seed, 3, 0.8)
         self.position = self.position + [0, 0, 1.2]
         self.rate, self.turning, _ = waves(t, seed + 1, 3, 1.0)
-        turns, attitude = Rotation.from_rotvec(STEP * (self.rate[:-1] + self.rate[1:]) / 2), []
-        now = Rotation.identity()
-        for turn in turns:
-            attitude.append(now.as_quat())
-            now = now * turn
-        self.attitude = Rotation.from_quat([*attitude, now.as_quat()])
+        turns = Rotation.from_rotvec(STEP * (self.rate[:-1] + self.rate[1:]) / 2)
+        attitude = [(0.0, 0.0, 0.0, 1.0)]
+        for a, b, c, d in turns.as_quat().tolist():     # a product of Rotations takes 10 us
+            x, y, z, w = attitude[-1]
+            attitude.append((w * a + x * d + y * c - z * b, w * b - x * c + y * d + z * a,
+                             w * c + x * b - y * a + z * d, w * d - x * a - y * b - z * c))
+        self.attitude = Rotation.from_quat(attitude)
         self.specific_force = self.attitude.inv().apply(acceleration + [0, 0, ROBOT.gravity])
         self.tilt, self.tilt_rate, self.tilt_acceleration = waves(t, seed + 2, 4, 0.9)
         self.thrust, self.thrust_rate, _ = waves(t, seed + 3, 4, 3.0)
