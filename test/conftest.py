@@ -41,12 +41,12 @@ def pytest_ignore_collect(collection_path, config):
     """Do not load files without a test of the requested part, which saves seconds."""
     part = config.getoption('markexpr').partition(' ')[0]
     if part in MARKS and collection_path.match('test_*.py') \
-            and not _says_so(collection_path, part):
+            and not _has_mark(collection_path, part):
         return True
     return None
 
 
-def _says_so(path, part):
+def _has_mark(path, part):
     return MARKS[part].search(Path(path).read_text(encoding='utf-8')) is not None
 
 
@@ -59,7 +59,7 @@ def pytest_collection_modifyitems(config, items):
                  or ('ros_domain' in item.fixturenames and item not in waiting)]
     for path, part in {(item.path, 'alone' if item.get_closest_marker('alone') else 'real_time')
                        for item in real_time}:
-        if not _says_so(path, part):      # it would be in neither part
+        if not _has_mark(path, part):      # it would be in neither part
             raise pytest.UsageError(f'{path}: has tests in real time: name the mark in the file')
     for item in real_time:
         item.add_marker(pytest.mark.real_time)

@@ -1,4 +1,4 @@
-"""Imports point one way, and heavy or special libraries stay in their room."""
+"""Imports point one way, and heavy or special libraries stay in their subpackage."""
 
 import ast
 from pathlib import Path
@@ -10,7 +10,7 @@ from beetle_omni_ros.robot.resources import PACKAGE
 
 SOURCE = Path(sys.modules[PACKAGE].__file__).parent
 
-# Room -> what it may import of the package beside itself. A new room needs a line here.
+# Subpackage -> permitted imports of the package beside itself. A new one needs a line here.
 ALLOWED = {
     'robot': (),
     'start': (),
@@ -38,7 +38,7 @@ ALLOWED = {
             'faults', 'film', 'nodes', 'train', 'identify', 'bringup', 'view'),
 }
 
-# Library -> the only room that imports it.
+# Library -> the only subpackage that imports it.
 KEPT_IN = {'mujoco': 'sim', 'rclpy': 'nodes', 'launch': 'nodes', 'torch': 'train',
            'rsl_rl': 'train', 'tensordict': 'train', 'dynamixel_sdk': 'drivers',
            'pymavlink': 'drivers', 'serial': 'drivers', 'viser': 'view', 'trimesh': 'view'}
@@ -51,12 +51,12 @@ def imports(path):
             yield from ((alias.name, node.lineno) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f'{path}:{node.lineno}: relative import'
-            # `from package import room` names the room only in the alias.
+            # `from package import subpackage` names the subpackage only in the alias.
             yield from ((f'{node.module}.{alias.name}', node.lineno) for alias in node.names)
 
 
-def room_of(path):
-    """Return the room that a file of the package belongs to."""
+def subpackage_of(path):
+    """Return the subpackage that a file of the package belongs to."""
     parts = path.relative_to(SOURCE).with_suffix('').parts
     return parts[0]
 
@@ -70,34 +70,34 @@ FILES = sorted(path for path in SOURCE.rglob('*.py') if path.parent != SOURCE
                or path.stem != '__init__')
 
 
-def wrong_rooms(room, names):
-    """List the package's own names that ``room`` must not import."""
+def forbidden_imports(subpackage, names):
+    """List the package's own names that ``subpackage`` must not import."""
     own = [name.removeprefix(PACKAGE + '.') for name in names if name.startswith(PACKAGE + '.')]
-    legal = (room, *ALLOWED[room])
+    legal = (subpackage, *ALLOWED[subpackage])
     return [name for name in own if name != '__version__'
             and not any(is_below(name, place) for place in legal)]
 
 
 @pytest.mark.parametrize('path', FILES, ids=lambda path: str(path.relative_to(SOURCE)))
 def test_a_subpackage_imports_only_lower_subpackages(path):
-    room = room_of(path)
-    assert room in ALLOWED, f'{path}: room {room} has no line in ALLOWED'
-    wrong = wrong_rooms(room, [name for name, _ in imports(path)])
-    assert not wrong, f'{path}: {room} must not import {wrong}'
+    subpackage = subpackage_of(path)
+    assert subpackage in ALLOWED, f'{path}: subpackage {subpackage} has no line in ALLOWED'
+    wrong = forbidden_imports(subpackage, [name for name, _ in imports(path)])
+    assert not wrong, f'{path}: {subpackage} must not import {wrong}'
 
 
 @pytest.mark.parametrize('path', FILES, ids=lambda path: str(path.relative_to(SOURCE)))
 def test_special_libraries_are_imported_in_their_subpackage_only(path):
-    room = room_of(path)
+    subpackage = subpackage_of(path)
     for name, line in imports(path):
         top = name.split('.')[0]
-        home = 'nodes' if top.endswith(('_msgs', '_srvs')) else KEPT_IN.get(top, room)
-        assert room == home, f'{path}:{line}: {top} is imported only in {home}/'
+        home = 'nodes' if top.endswith(('_msgs', '_srvs')) else KEPT_IN.get(top, subpackage)
+        assert subpackage == home, f'{path}:{line}: {top} is imported only in {home}/'
 
 
 def test_the_import_rule_detects_violations():
-    assert wrong_rooms('control', [f'{PACKAGE}.sim.plant.Plant']) == ['sim.plant.Plant']
-    assert wrong_rooms('safety', [f'{PACKAGE}.control.nmpc.NmpcController'])
-    assert wrong_rooms('runs', [f'{PACKAGE}.estimation'])
-    assert not wrong_rooms('safety', [f'{PACKAGE}.control.base.Command', 'numpy'])
-    assert not wrong_rooms('nodes', [f'{PACKAGE}.sim.simulator.Simulator'])
+    assert forbidden_imports('control', [f'{PACKAGE}.sim.plant.Plant']) == ['sim.plant.Plant']
+    assert forbidden_imports('safety', [f'{PACKAGE}.control.nmpc.NmpcController'])
+    assert forbidden_imports('runs', [f'{PACKAGE}.estimation'])
+    assert not forbidden_imports('safety', [f'{PACKAGE}.control.base.Command', 'numpy'])
+    assert not forbidden_imports('nodes', [f'{PACKAGE}.sim.simulator.Simulator'])

@@ -7,7 +7,7 @@ import pytest
 pytest.importorskip('pymavlink')
 pytest.importorskip('dynamixel_sdk')
 
-from looks import board, levels, patiently, QUICK
+from check_helpers import board, levels, QUICK, repeated
 
 from beetle_omni_ros.drivers import motor_board_messages
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
@@ -28,7 +28,7 @@ def emulated():
 
 def board_with(emulated, bad, **changes):
     """Check until exactly the items of ``bad`` (item -> level) are not ok; return the findings."""
-    found = patiently(lambda: board(emulated.port, **changes), lambda f: levels(f) == bad)
+    found = repeated(lambda: board(emulated.port, **changes), lambda f: levels(f) == bad)
     assert levels(found) == bad
     return found
 

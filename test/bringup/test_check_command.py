@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip('dynamixel_sdk')
 pytest.importorskip('pymavlink')
 
-from looks import patiently, QUICK
+from check_helpers import QUICK, repeated
 from servo_bench import JOINTS
 
 from beetle_omni_ros import cli
@@ -49,7 +49,7 @@ def checked(arguments, path):
 @pytest.mark.real_time
 def test_a_good_robot_ends_with_status_0(robot, tmp_path, capsys):
     _, _, arguments = robot
-    status, result = patiently(
+    status, result = repeated(
         lambda: checked([*arguments, '--skip', 'ros'], tmp_path / 'result.json'),
         lambda answer: answer[0] == 0)
     assert status == 0 and result['ok']
@@ -113,12 +113,12 @@ def test_a_port_in_use_by_the_bridge_is_not_opened(robot, tmp_path):
     assert rows['joint_bridge gimbal2']['part'] == 'servos'
 
 
-@pytest.mark.parametrize(('arguments', 'named'), [
+@pytest.mark.parametrize(('arguments', 'by_item'), [
     (['--skip', 'rotors'], 'servos, board, ros'), (['--servo-bus', 'none.yaml'], 'none.yaml'),
     (['--motor-board', 'none.yaml'], 'none.yaml'), (['--robot', 'none.yaml'], 'none.yaml'),
     (['--seconds', '0'], '--seconds'), (['--json', 'no/folder.json'], 'folder.json'),
     (['--nonsense'], '--nonsense')])
-def test_unusable_input_ends_with_status_2_and_one_line(capsys, arguments, named):
+def test_unusable_input_ends_with_status_2_and_one_line(capsys, arguments, by_item):
     assert cli.main(['check', *arguments]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert named in line
+    assert by_item in line

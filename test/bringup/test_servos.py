@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip('dynamixel_sdk')
 pytest.importorskip('pymavlink')
 
-from looks import levels, patiently, servos
+from check_helpers import levels, repeated, servos
 from servo_bench import JOINTS, running
 
 from beetle_omni_ros.bringup import servos as room
@@ -97,7 +97,7 @@ def test_a_wrong_supply_voltage_is_reported(volts, level):
     bad = {f'{name} supply': level for name in NAMES}
     with EmulatedServoBus(motion=JOINTS) as emulated:
         emulated.faults.supply_voltage = volts
-        found = patiently(lambda: servos(emulated.port), lambda found: levels(found) == bad)
+        found = repeated(lambda: servos(emulated.port), lambda found: levels(found) == bad)
     assert levels(found) == bad
 
 
@@ -116,7 +116,7 @@ def test_a_hot_servo_is_reported():
     with EmulatedServoBus(motion=JOINTS) as emulated:
         emulated.servos[3]['Temperature Limit'] = 50    # also at 60
         emulated.faults.overheated = {4}
-        found = patiently(lambda: servos(emulated.port), lambda found: levels(found) == bad)
+        found = repeated(lambda: servos(emulated.port), lambda found: levels(found) == bad)
     assert levels(found) == bad
 
 

@@ -1,6 +1,6 @@
 """Check of the topics: rates, ages, clocks, units, several publishers, bridges."""
 
-from looks import levels, LIMITS, named, ROBOT
+from check_helpers import by_item, levels, LIMITS, ROBOT
 import numpy as np
 import pytest
 
@@ -26,7 +26,7 @@ def graph(**streams):
 
 
 def judged(**streams):
-    return named(check_topics(graph(**streams), LIMITS, ROBOT.gravity))
+    return by_item(check_topics(graph(**streams), LIMITS, ROBOT.gravity))
 
 
 def test_good_sensors_without_bridges_pass():
@@ -111,12 +111,12 @@ def running(state='ready', level=0):
 
 
 def test_a_running_bridge_is_judged_by_its_reports():
-    found = named(check_topics(running(level=2), LIMITS, ROBOT.gravity))
+    found = by_item(check_topics(running(level=2), LIMITS, ROBOT.gravity))
     assert levels(found) == {'joint_bridge gimbal1': 'fail'}
     assert found['joint_bridge gimbal1'].values == {'voltage': '11.9'}
     assert found['joint_states rate'].level == 'ok'
     for state, level in (('waiting: turn lost', 'warn'), ('lost: port away', 'fail')):
-        found = named(check_topics(running(state), LIMITS, ROBOT.gravity))
+        found = by_item(check_topics(running(state), LIMITS, ROBOT.gravity))
         assert levels(found) == {'joint_bridge state': level}
         assert found['joint_bridge state'].found == state
 
@@ -126,7 +126,7 @@ def test_a_port_in_use_by_a_bridge_is_not_opened():
     port, state, gimbal = bridge_findings(busy, 'joint_bridge', running())
     assert [port.level, state.level, gimbal.level] == ['ok'] * 3
     assert 'joint_bridge_node reports' in port.found
-    told = named(check_topics(running(), LIMITS, ROBOT.gravity, frozenset({'joint_bridge'})))
+    told = by_item(check_topics(running(), LIMITS, ROBOT.gravity, frozenset({'joint_bridge'})))
     assert 'joint_bridge state' not in told
     for nobody in (None, graph()):
         assert bridge_findings(busy, 'joint_bridge', nobody) == [busy]

@@ -13,7 +13,7 @@ AXES = RobotParameters.load().tilt_axes
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 
 
-class Keeper:
+class TargetRecorder:
     """A controller that stores its targets."""
 
     period = 0.01
@@ -45,20 +45,20 @@ def rest(guided, command_of, steps=200):
 
 
 def test_guidance_removes_the_steady_error_of_any_controller():
-    keeper = Keeper()
+    keeper = TargetRecorder()
     rest(Guided(keeper, Guidance(GuidanceParameters(), AXES)), lambda given: given)
     assert keeper.shown[-1].position[0] < -0.01         # against the error, by its integral
 
 
 def test_the_trim_does_not_change_while_another_controller_is_active():
-    keeper = Keeper()
+    keeper = TargetRecorder()
     other = Command(0.0, np.full(4, 0.1), np.full(4, 7.0))
     rest(Guided(keeper, Guidance(GuidanceParameters(), AXES)), lambda given: other)
     assert np.array_equal(keeper.shown[-1].position, [0.0, 0.0, 1.0])
 
 
 def test_a_low_target_is_raised_during_a_large_rotation():
-    keeper = Keeper()
+    keeper = TargetRecorder()
     guided = Guided(keeper, Guidance(GuidanceParameters(), AXES))
     target = PoseTarget(np.array([0.0, 0.0, 0.5]), rotations.exp(np.array([1.5, 0.0, 0.0])))
     guided.step(state_at(0.0, (0, 0, 0.5), None), target)
@@ -66,7 +66,7 @@ def test_a_low_target_is_raised_during_a_large_rotation():
 
 
 def test_trajectories_pass_unchanged_and_actuator_health_is_forwarded():
-    keeper = Keeper()
+    keeper = TargetRecorder()
     guided = Guided(keeper, Guidance(GuidanceParameters(), AXES))
     way = TrajectoryTarget(np.array([0.0, 1.0]), np.zeros((2, 3)), np.tile(LEVEL, (2, 1)),
                            np.zeros((2, 3)), np.zeros((2, 3)))
@@ -79,7 +79,7 @@ def test_trajectories_pass_unchanged_and_actuator_health_is_forwarded():
 
 
 def test_guidance_reports_the_reach_of_its_controller():
-    keeper = Keeper()
+    keeper = TargetRecorder()
     assert Guided(keeper, Guidance(GuidanceParameters(), AXES)).reach == np.inf
     keeper.reach = 3.0
     assert Guided(keeper, Guidance(GuidanceParameters(), AXES)).reach == 3.0

@@ -48,7 +48,7 @@ class Pilot:
             due += 0.005
             time.sleep(max(0.0, due - time.monotonic()))
 
-    def heard(self, text):
+    def has_event(self, text):
         """Whether an event with this text arrived."""
         self.events += self.board.poll().events
         return any(text in event for _, event in self.events)

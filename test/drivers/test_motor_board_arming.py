@@ -25,7 +25,7 @@ class Command:
     result: CommandResult | None = None
 
 
-class Cardboard:
+class BoardStub:
     """A board whose answers are set by the test."""
 
     def __init__(self):
@@ -57,7 +57,7 @@ class Cardboard:
 
 @pytest.fixture
 def bench():
-    board = Cardboard()
+    board = BoardStub()
     return board, Arming(board)
 
 

@@ -80,19 +80,19 @@ def test_delayed_targets_are_refused_and_the_rotors_stop():
         assert until(lambda: not emulated.commands.any())
         assert stays_stopped(emulated)
         assert emulated.refused['stale stamp'] > 10
-        assert pilot.heard('targets timed out')
+        assert pilot.has_event('targets timed out')
         assert until(lambda: not emulated.armed)
-        assert until(lambda: pilot.heard('disarmed (no target for too long)'))
+        assert until(lambda: pilot.has_event('disarmed (no target for too long)'))
 
 
 def test_a_board_that_does_not_transmit_is_reported_and_still_follows_targets():
     with flying() as (emulated, board, pilot):
         emulated.faults.mute = True
-        assert until(lambda: pilot.heard('nothing heard for 0.3 s'))
+        assert until(lambda: pilot.has_event('nothing heard for 0.3 s'))
         assert keeps_flying(emulated, 0.3)
         assert not board.armed and board.ready == 'nothing heard of the board'
         emulated.faults.mute = False
-        assert until(lambda: pilot.heard('heard again'))
+        assert until(lambda: pilot.has_event('heard again'))
         assert board.armed
 
 
@@ -107,7 +107,7 @@ def test_voltage_sag_is_compensated_or_reported_as_saturation():
         pilot.thrust = np.full(4, 20.0)
         assert until(lambda: pilot.results[-1].saturated.all())
         emulated.faults.voltage_sag = 5.0
-        assert until(lambda: pilot.heard('battery low'))
+        assert until(lambda: pilot.has_event('battery low'))
         assert keeps_flying(emulated, 0.2)
 
 
@@ -115,19 +115,19 @@ def test_an_implausible_voltage_is_ignored():
     with flying() as (emulated, board, pilot):
         before = emulated.commands
         emulated.set_battery(3.0, 0.0)
-        assert until(lambda: pilot.heard('3.0 V not plausible'))
+        assert until(lambda: pilot.has_event('3.0 V not plausible'))
         np.testing.assert_array_equal(emulated.commands, before)
 
 
 def test_a_short_disconnection_stops_the_rotors_briefly():
     with flying() as (emulated, board, pilot):
         emulated.unplug()
-        assert until(lambda: pilot.heard('device is gone'))
+        assert until(lambda: pilot.has_event('device is gone'))
         assert until(lambda: pilot.results[-1].reason == 'port is away')
         assert until(lambda: not emulated.commands.any())
         emulated.plug()
         assert until(lambda: emulated.commands.all(), 0.4)
-        assert pilot.heard('port opened again') and board.poll().link.connections == 2
+        assert pilot.has_event('port opened again') and board.poll().link.connections == 2
 
 
 def test_a_long_disconnection_disarms_and_reconnecting_does_not_arm():
@@ -135,9 +135,9 @@ def test_a_long_disconnection_disarms_and_reconnecting_does_not_arm():
         emulated.unplug()
         assert until(lambda: not emulated.armed)
         emulated.plug()
-        assert until(lambda: pilot.heard('port opened again'))
+        assert until(lambda: pilot.has_event('port opened again'))
         assert stays_stopped(emulated)
-        assert until(lambda: pilot.heard('disarmed (heartbeat of the host lost)'))
+        assert until(lambda: pilot.has_event('disarmed (heartbeat of the host lost)'))
         pilot.thrust = np.zeros(4)
         time.sleep(QUICK.throttle_low_time)
         assert until(lambda: board.arm().accepted)
@@ -147,7 +147,7 @@ def test_a_hung_board_is_reset_by_its_watchdog_and_stays_disarmed():
     with flying() as (emulated, board, pilot):
         emulated.hang()
         assert until(lambda: not emulated.commands.any(), 0.15)
-        assert until(lambda: pilot.heard('restarted (watchdog reset)'))
+        assert until(lambda: pilot.has_event('restarted (watchdog reset)'))
         assert stays_stopped(emulated) and not board.armed
 
 
@@ -155,7 +155,7 @@ def test_a_reboot_in_flight_stops_and_needs_arming_again():
     with flying() as (emulated, board, pilot):
         emulated.reboot()
         assert not emulated.commands.any()
-        assert until(lambda: pilot.heard('restarted'))
+        assert until(lambda: pilot.has_event('restarted'))
         assert stays_stopped(emulated)
         assert board.poll().link.received.lost == 0
         pilot.thrust = np.zeros(4)
@@ -168,8 +168,8 @@ def test_a_reboot_in_flight_stops_and_needs_arming_again():
 def test_a_failed_esc_is_named_and_the_other_rotors_continue():
     with flying() as (emulated, board, pilot):
         emulated.faults.failed_escs = (3,)
-        assert until(lambda: pilot.heard('ESC of rotor 3 offline'))
-        assert until(lambda: pilot.heard('ESC failure'))
+        assert until(lambda: pilot.has_event('ESC of rotor 3 offline'))
+        assert until(lambda: pilot.has_event('ESC failure'))
         assert emulated.thrust_targets[2] == 0
         assert np.all(emulated.thrust_targets[[0, 1, 3]] > 5)
         rotors = None

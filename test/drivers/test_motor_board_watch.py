@@ -78,20 +78,20 @@ def test_the_voltage_filter_depends_on_time_and_not_on_message_count():
 def test_changes_are_reported_once_and_severe_ones_as_errors():
     board = watch()
 
-    def beat(state, reason=0, conditions=0):
+    def heartbeat(state, reason=0, conditions=0):
         mode = state | reason << 8 | conditions << 16 | 1 << 24
         board.message(received(emulated.HEARTBEAT, (mode, 2, 0, 1, 4, 3)), time.monotonic())
         return board.take()['events']
 
-    assert beat(1) == (('info', 'motor board: found, disarmed, contract 1'),)
-    assert beat(3) == (('info', 'motor board: armed'),)
-    assert beat(3) == ()
-    assert beat(2, 0, 32) == (('error', 'motor board: targets timed out'),)
-    assert beat(2, 0, 32 | 8) == (('warning', 'motor board: battery low'),)
-    assert beat(1, 3) == (('error', 'motor board: disarmed (no target for too long)'),)
-    assert beat(3) == (('info', 'motor board: armed'),)
-    assert beat(1, 1) == (('info', 'motor board: disarmed (asked by the host)'),)
-    assert beat(0, 4)[0] == ('warning', 'motor board: restarted (watchdog reset)')
+    assert heartbeat(1) == (('info', 'motor board: found, disarmed, contract 1'),)
+    assert heartbeat(3) == (('info', 'motor board: armed'),)
+    assert heartbeat(3) == ()
+    assert heartbeat(2, 0, 32) == (('error', 'motor board: targets timed out'),)
+    assert heartbeat(2, 0, 32 | 8) == (('warning', 'motor board: battery low'),)
+    assert heartbeat(1, 3) == (('error', 'motor board: disarmed (no target for too long)'),)
+    assert heartbeat(3) == (('info', 'motor board: armed'),)
+    assert heartbeat(1, 1) == (('info', 'motor board: disarmed (asked by the host)'),)
+    assert heartbeat(0, 4)[0] == ('warning', 'motor board: restarted (watchdog reset)')
 
 
 def test_offline_escs_are_reported():

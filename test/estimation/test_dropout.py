@@ -151,7 +151,7 @@ def test_mocap_noisier_than_its_parameter_is_detected_and_weighted_less():
     assert run(ErrorStateEkf(stubborn, GRAVITY), flight).status != 'tracking'
 
 
-def struck(flight, time, impulse, samples):
+def with_impact(flight, time, impulse, samples):
     """Add an impact to ``samples`` readings from ``time`` on."""
     period, trajectory = 0.005, flight.trajectory
     start = next(k for k, s in enumerate(flight.imu) if s.stamp >= time - 1e-9)
@@ -170,7 +170,7 @@ def struck(flight, time, impulse, samples):
 @pytest.mark.parametrize('seen', [0.3, 1.0, 3.0])
 def test_an_impact_with_a_poor_imu_measurement_keeps_the_track(seen):
     """The readings of a hard landing are aliased, or beyond the range and refused."""
-    flight = struck(fly(10, 3.0, agility=0.3), 2.0, (0.0, 0.5, 1.2), [seen] * 2)
+    flight = with_impact(fly(10, 3.0, agility=0.3), 2.0, (0.0, 0.5, 1.2), [seen] * 2)
     ekf = new_ekf()
     rows = history(ekf, flight)
     assert {status for time, status, _ in rows if time > 2.0} == {'tracking'}

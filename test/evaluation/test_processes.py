@@ -14,26 +14,26 @@ STATE = State(1.0, np.ones(3), np.zeros(3), np.array([0, 0, 0, 1.0]), np.zeros(3
               np.zeros(4), 1.0)
 
 
-class Ear:
+class SupervisorStub:
     """Stand-in for the supervisor that stores messages."""
 
     def __init__(self):
-        self.heard = []
+        self.received = []
 
     def __getattr__(self, method):
         """Store every message."""
-        return lambda *message: self.heard.append((method, *message))
+        return lambda *message: self.received.append((method, *message))
 
 
 @pytest.fixture
-def struck():
+def make_faulty():
     """Make processes with faults that begin at 0 s; return them and the stand-in."""
     def make(*faults):
-        ear = Ear()
-        processes = Processes(TICK, ear)
+        stub = SupervisorStub()
+        processes = Processes(TICK, stub)
         processes.set_faults(faults, 0.0)
         processes.frame(frame(0.0))
-        return processes, ear
+        return processes, stub
     return make
 
 
@@ -46,33 +46,33 @@ def command(stamp):
     return Command(stamp, np.full(4, 0.1), np.full(4, 8.0))
 
 
-def test_without_a_fault_all_messages_pass_unchanged(struck):
-    processes, ear = struck()
+def test_without_a_fault_all_messages_pass_unchanged(make_faulty):
+    processes, stub = make_faulty()
     one, state = frame(1.0), command(1.0)
     assert processes.frame(one) is one
     assert processes.estimate(STATE) is STATE
     assert processes.requests(state, 1.0) == [state] and processes.requests(None, 1.0) == []
     assert processes.target(PoseTarget(np.zeros(3), STATE.quaternion)) is None
     processes.send('on_battery', 24.0)
-    assert ear.heard == [('on_battery', 24.0)]
+    assert stub.received == [('on_battery', 24.0)]
 
 
-def test_a_paused_supervisor_receives_the_newest_messages_of_its_queues(struck):
-    processes, ear = struck(Fault('supervisor_waits', duration=0.1))
+def test_a_paused_supervisor_receives_the_newest_messages_of_its_queues(make_faulty):
+    processes, stub = make_faulty(Fault('supervisor_waits', duration=0.1))
     assert processes.supervisor_waits
     for k in range(20):
         processes.send('on_battery', k)
     processes.send('on_imu', 0)
-    assert ear.heard == []
+    assert stub.received == []
     processes.frame(frame(0.1))
     assert not processes.supervisor_waits
-    assert [value for method, value in ear.heard if method == 'on_battery'] \
+    assert [value for method, value in stub.received if method == 'on_battery'] \
         == list(range(20 - QUEUE, 20))
-    assert ('on_imu', 0) in ear.heard
+    assert ('on_imu', 0) in stub.received
 
 
-def test_a_clock_step_shifts_every_stamp_and_is_reversible(struck):
-    processes, _ = struck(Fault('clock_jumps', at=0.1, duration=0.2, step=-3.0))
+def test_a_clock_step_shifts_every_stamp_and_is_reversible(make_faulty):
+    processes, _ = make_faulty(Fault('clock_jumps', at=0.1, duration=0.2, step=-3.0))
     for time, step in ((0.05, 0), (0.15, -3), (0.35, 0)):
         shifted = processes.frame(frame(time))
         assert processes.clock_step == step
@@ -82,8 +82,8 @@ def test_a_clock_step_shifts_every_stamp_and_is_reversible(struck):
 @pytest.mark.parametrize(('kind', 'numbers'), [
     ('controller_nan', {}), ('controller_rubbish', {}), ('controller_noisy', {'tilt': 0.1}),
     ('controller_constant', {})])
-def test_a_controller_with_invalid_numbers_keeps_its_stamps(struck, kind, numbers):
-    processes, _ = struck(Fault(kind, **numbers))
+def test_a_controller_with_invalid_numbers_keeps_its_stamps(make_faulty, kind, numbers):
+    processes, _ = make_faulty(Fault(kind, **numbers))
     first, = processes.requests(command(1.0), 1.0)
     second, = processes.requests(Command(1.01, np.zeros(4), np.ones(4)), 1.01)
     assert (first.stamp, second.stamp) == (1.0, 1.01)
@@ -91,34 +91,35 @@ def test_a_controller_with_invalid_numbers_keeps_its_stamps(struck, kind, number
     assert same == (kind == 'controller_constant')
 
 
-def test_a_silent_controller_sends_nothing_and_a_slow_one_sends_late(struck):
-    silent, _ = struck(Fault('controller_silent'))
+def test_a_silent_controller_sends_nothing_and_a_slow_one_sends_late(make_faulty):
+    silent, _ = make_faulty(Fault('controller_silent'))
     assert silent.requests(command(1.0), 1.0) == []
-    slow, _ = struck(Fault('controller_slow', delay=0.08))
+    slow, _ = make_faulty(Fault('controller_slow', delay=0.08))
     assert slow.requests(command(1.0), 1.0) == []
     assert slow.requests(None, 1.075) == []
     late, = slow.requests(None, 1.08)
     assert late.stamp == 1.0
 
 
-def test_faults_of_estimates(struck):
-    assert struck(Fault('estimator_dead'))[0].estimate(STATE) is None
-    assert np.isnan(struck(Fault('estimator_nan'))[0].estimate(STATE).position).all()
-    frozen, _ = struck(Fault('estimator_frozen'))
+def test_faults_of_estimates(make_faulty):
+    assert make_faulty(Fault('estimator_dead'))[0].estimate(STATE) is None
+    assert np.isnan(make_faulty(Fault('estimator_nan'))[0].estimate(STATE).position).all()
+    frozen, _ = make_faulty(Fault('estimator_frozen'))
     frozen.estimate(STATE)
     later = State(**{**vars(STATE), 'stamp': 2.0, 'position': np.zeros(3)})
     estimate = frozen.estimate(later)
     assert estimate.stamp == 2.0 and estimate.position[0] == 1.0
-    away, _ = struck(Fault('estimator_diverges', acceleration=2.0))
+    away, _ = make_faulty(Fault('estimator_diverges', acceleration=2.0))
     for _ in range(200):
         estimate = away.estimate(STATE)
     assert np.isclose(estimate.position[0] - 1.0, 1.0) and np.isclose(estimate.velocity[0], 2.0)
-    random, _ = struck(Fault('estimator_rubbish'))
+    random, _ = make_faulty(Fault('estimator_rubbish'))
     assert np.isclose(np.linalg.norm(random.estimate(STATE).quaternion), 1.0)
 
 
-def test_foreign_targets_and_faults_of_bridge_states(struck):
-    processes, _ = struck(Fault('target', z=-5.0, roll=np.pi), Fault('motor_board_lost', at=0.0))
+def test_foreign_targets_and_faults_of_bridge_states(make_faulty):
+    processes, _ = make_faulty(Fault('target', z=-5.0, roll=np.pi),
+                               Fault('motor_board_lost', at=0.0))
     target = processes.target(PoseTarget(np.zeros(3), STATE.quaternion, 4.0))
     assert target.position[2] == -5.0 and target.stamp == 4.0
     assert processes.bridges == {'rotor': 'lost: motor board silent'}

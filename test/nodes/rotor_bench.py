@@ -86,7 +86,7 @@ class Commander(Operator):
         """Wait for a state of the bridge."""
         return self.wait(lambda: self.bridge.startswith(state), timeout)
 
-    def told_in_diagnostics(self, status, key, condition, timeout=SOON):
+    def wait_for_diagnostics(self, status, key, condition, timeout=SOON):
         """Wait until a value of the bridge's diagnostics meets a condition."""
         return self.wait(lambda: condition(self.values(f'{NODE}: {status}').get(key, '')),
                          timeout)

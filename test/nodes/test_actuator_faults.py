@@ -26,7 +26,7 @@ FLYING = 'flying:nmpc'
 DEVICES = 'sim_node: devices'
 
 
-class Mechanic(Witness):
+class FaultOperator(Witness):
     """Witness that sets faults of the simulated devices; ``sound`` if there are none."""
 
     sound = False
@@ -68,46 +68,46 @@ class Mechanic(Witness):
 
 
 @contextmanager
-def airborne(folder):
-    """Graph and mechanic of a flying robot, in a separate ROS domain."""
+def flying_graph(folder):
+    """Graph and operator of a flying robot, in a separate ROS domain."""
     parameters = {'sim_node': {}, 'ekf_node': {}, 'nmpc_node': {}, 'supervisor_node': PATIENT}
     for node, values in bridge_parameters(folder, {}).items():
         parameters[node] = {**parameters.get(node, {}), **values}
     with discovery.reserved_domain() as number, pytest.MonkeyPatch.context() as patch:
         patch.setenv('ROS_DOMAIN_ID', str(number))
-        graph, mechanic = Graph(parameters, folder, number), None
+        graph, operator = Graph(parameters, folder, number), None
         try:
             graph.start()
-            mechanic = Mechanic(number)
-            assert mechanic.wait(lambda: mechanic.ready, READY), graph.dead()
-            mechanic.can_judge(graph)
-            mechanic.start()
-            yield graph, mechanic
+            operator = FaultOperator(number)
+            assert operator.wait(lambda: operator.ready, READY), graph.dead()
+            operator.can_judge(graph)
+            operator.start()
+            yield graph, operator
         finally:
             stubborn = graph.stop()
-            if mechanic:
-                mechanic.close()
+            if operator:
+                operator.close()
         assert not stubborn
 
 
 @pytest.fixture(scope='module')
-def hangar():
+def shared_flight():
     """Keeps a flying robot from one test to the next."""
     with ExitStack() as stack:
         yield SimpleNamespace(stack=stack, robot=None)
 
 
 @pytest.fixture
-def robot(hangar, tmp_path):
-    """Graph and mechanic of a flying robot, if possible those of the last test."""
-    if hangar.robot is None:
-        hangar.robot = hangar.stack.enter_context(airborne(tmp_path))
-    graph, mechanic = hangar.robot
-    mechanic.sound = False
-    yield graph, mechanic
-    if not mechanic.sound or mechanic.state != FLYING:
-        hangar.robot = None
-        hangar.stack.close()
+def robot(shared_flight, tmp_path):
+    """Graph and operator of a flying robot, if possible those of the last test."""
+    if shared_flight.robot is None:
+        shared_flight.robot = shared_flight.stack.enter_context(flying_graph(tmp_path))
+    graph, operator = shared_flight.robot
+    operator.sound = False
+    yield graph, operator
+    if not operator.sound or operator.state != FLYING:
+        shared_flight.robot = None
+        shared_flight.stack.close()
 
 
 # parameters of sim_node, set and reset; bridge, status and counter of the fault
@@ -133,20 +133,20 @@ BEARABLE = [
 
 
 def test_faults_with_recovery_in_the_drivers_do_not_end_a_flight(robot):
-    graph, mechanic = robot
+    graph, operator = robot
     for switched, mended, bridge, status, counter in BEARABLE:
         where = f'{bridge}_bridge_node', status, counter
-        before = mechanic.count(*where)
+        before = operator.count(*where)
         for name, value in switched.items():
-            mechanic.set(name, value)
-        assert mechanic.stays_in_the_air(1.0), switched
-        assert mechanic.wait(lambda w=where, n=before: mechanic.count(*w) > n, 10), switched
+            operator.set(name, value)
+        assert operator.stays_in_the_air(1.0), switched
+        assert operator.wait(lambda w=where, n=before: operator.count(*w) > n, 10), switched
         for name, value in mended.items():
-            mechanic.set(name, value)
-        assert mechanic.state == FLYING, (switched, mechanic.states)
-    assert mechanic.wait(lambda: np.linalg.norm(mechanic.truth.velocity) < 0.1, 10)
+            operator.set(name, value)
+        assert operator.state == FLYING, (switched, operator.states)
+    assert operator.wait(lambda: np.linalg.norm(operator.truth.velocity) < 0.1, 10)
     assert not graph.dead()
-    mechanic.sound = True
+    operator.sound = True
 
 
 # fault, value without fault; state of the bridge; whether it needs a reboot
@@ -160,49 +160,49 @@ LANDING = [
 
 
 def test_a_failed_or_silent_actuator_ends_the_flight_with_a_landing(robot):
-    graph, mechanic = robot
+    graph, operator = robot
     for name, value, mended, text, reboot in LANDING:
         states = []
-        mechanic.set(name, value)
-        assert mechanic.wait(lambda s=states: s.extend(mechanic.bridges.values())
-                             or mechanic.state == 'landing', 5), (name, mechanic.states)
+        operator.set(name, value)
+        assert operator.wait(lambda s=states: s.extend(operator.bridges.values())
+                             or operator.state == 'landing', 5), (name, operator.states)
         assert any(line.startswith(text) for line in states), (name, set(states))
         sinking = []
-        assert mechanic.wait(lambda s=sinking: s.append(mechanic.truth.velocity[2])
-                             or mechanic.state in ('disarmed', 'emergency_stop'), 30), name
-        assert mechanic.state == 'disarmed' and min(sinking) > -1.0, (name, min(sinking))
-        assert mechanic.wait(lambda: mechanic.device('armed') == 'False', 5), name
-        mechanic.set(name, mended)
+        assert operator.wait(lambda s=sinking: s.append(operator.truth.velocity[2])
+                             or operator.state in ('disarmed', 'emergency_stop'), 30), name
+        assert operator.state == 'disarmed' and min(sinking) > -1.0, (name, min(sinking))
+        assert operator.wait(lambda: operator.device('armed') == 'False', 5), name
+        operator.set(name, mended)
         if reboot:
-            assert mechanic.ask('reboot')
-        mechanic.start()
+            assert operator.ask('reboot')
+        operator.start()
     assert not graph.dead()
-    mechanic.sound = True
+    operator.sound = True
 
 
-def rests(mechanic):
+def rests(operator):
     """Whether no rotor is commanded to turn, and none may."""
-    return mechanic.device('armed') == 'False' and not np.any(mechanic.last_command[1].thrust)
+    return operator.device('armed') == 'False' and not np.any(operator.last_command[1].thrust)
 
 
 @pytest.mark.parametrize('fault', ['reboot', 'hang', 'unplugged'])
 def test_a_board_that_stopped_is_not_armed_again_in_the_fall_or_after_it(robot, fault):
-    graph, mechanic = robot
+    graph, operator = robot
     before = len(graph.log('composed').read_text())
-    mechanic.set(f'board_faults.{fault}', True)
-    assert mechanic.wait(lambda: mechanic.state == 'emergency_stop', 5), mechanic.states
+    operator.set(f'board_faults.{fault}', True)
+    assert operator.wait(lambda: operator.state == 'emergency_stop', 5), operator.states
     if fault == 'unplugged':
-        mechanic.set('board_faults.unplugged', False)
+        operator.set('board_faults.unplugged', False)
     assert 'rotor_bridge_node lost' in graph.log('composed').read_text()[before:]
-    assert mechanic.wait(lambda: rests(mechanic), 10)
-    mechanic.spin(1.5)
-    assert rests(mechanic)
+    assert operator.wait(lambda: rests(operator), 10)
+    operator.spin(1.5)
+    assert rests(operator)
     assert not graph.dead()
 
 
 def test_rotors_and_torque_are_off_after_the_bridges_are_killed(robot):
-    graph, mechanic = robot
+    graph, operator = robot
     graph.kill(BRIDGES_COMPOSED)
-    assert mechanic.wait(lambda: mechanic.device('armed') == 'False', 10)
-    assert mechanic.wait(lambda: 'True' not in mechanic.device('torque'), 10)
-    assert mechanic.wait(lambda: mechanic.state in ('landing', 'disarmed', 'emergency_stop'), 5)
+    assert operator.wait(lambda: operator.device('armed') == 'False', 10)
+    assert operator.wait(lambda: 'True' not in operator.device('torque'), 10)
+    assert operator.wait(lambda: operator.state in ('landing', 'disarmed', 'emergency_stop'), 5)

@@ -66,9 +66,9 @@ def test_thrusts_are_produced_with_a_sagging_battery(flying):
     board, commander = flying.board, flying.commander
     board.set_battery(22.7, 40.0)
     assert commander.wait(lambda: flying.follows(), SOON)
-    assert commander.told_in_diagnostics('board', 'voltage_V', lambda v: v == '22.7')
+    assert commander.wait_for_diagnostics('board', 'voltage_V', lambda v: v == '22.7')
     commander.thrust = np.array([7.0, 7.0, 7.0, 22.0])
-    assert commander.told_in_diagnostics('rotor4', 'saturated', lambda n: n and int(n) > 0)
+    assert commander.wait_for_diagnostics('rotor4', 'saturated', lambda n: n and int(n) > 0)
     assert commander.values(f'{NODE}: rotor1')['saturated'] == '0'
 
 
@@ -119,8 +119,8 @@ def test_old_commands_are_not_sent(flying):
     board.on_target = lambda now, values: arrivals.append(values)
     commander.spin(0.2)
     assert not arrivals and not board.commands.any()
-    assert commander.told_in_diagnostics('inputs', 'command rejected: stale stamp',
-                                         lambda n: n and int(n) > 5)
+    assert commander.wait_for_diagnostics('inputs', 'command rejected: stale stamp',
+                                          lambda n: n and int(n) > 5)
 
 
 def test_a_missing_stream_disarms_for_the_rest_of_the_flight(flying):
@@ -175,10 +175,10 @@ def test_a_poor_link_is_tolerated(flying, faults):
         setattr(board.faults, name, value)
     if 'corrupt_in' in faults:
         for key in ('bad_crc', 'board bad_crc'):
-            assert commander.told_in_diagnostics('board', key, lambda n: n and int(n) > 0)
+            assert commander.wait_for_diagnostics('board', key, lambda n: n and int(n) > 0)
     elif 'drop_in' in faults:
         for key in ('lost', 'board lost'):
-            assert commander.told_in_diagnostics('board', key, lambda n: n and int(n) > 0)
+            assert commander.wait_for_diagnostics('board', key, lambda n: n and int(n) > 0)
     else:
         commander.spin(0.5)
     assert board.armed and commander.wait(lambda: flying.follows(), SOON)
@@ -211,10 +211,10 @@ def test_battery_and_rotor_speeds_are_published_in_ros_units_and_signs(bridge):
 def test_diagnostics_contain_link_clock_latency_and_a_failed_esc(flying):
     board, commander = flying.board, flying.commander
     board.faults.failed_escs = (3,)
-    assert commander.told_in_diagnostics('rotor3', 'failures', lambda text: 'offline' in text)
+    assert commander.wait_for_diagnostics('rotor3', 'failures', lambda text: 'offline' in text)
     assert commander.diagnostics[f'{NODE}: rotor3'].level == 2
     assert commander.diagnostics[f'{NODE}: rotor1'].level == 0
-    assert commander.told_in_diagnostics('latency', 'count', lambda n: n and int(n) > 20)
+    assert commander.wait_for_diagnostics('latency', 'count', lambda n: n and int(n) > 20)
     assert commander.diagnostics[f'{NODE}: latency'].message.startswith(
         'from the publication of the command')
     assert 0 < float(commander.values(f'{NODE}: latency')['median_ms']) < 1000
@@ -265,7 +265,7 @@ def test_the_bridge_waits_for_a_missing_port_and_names_it(tmp_path):
     with bench(tmp_path, port=str(port)) as made:
         commander = made.commander
         assert commander.reaches(f'waiting: {port}: cannot be opened (no such port', START)
-        assert commander.told_in_diagnostics('board', 'phase', lambda phase: phase == 'rests')
+        assert commander.wait_for_diagnostics('board', 'phase', lambda phase: phase == 'rests')
         commander.supervise('takeoff')
         # Whether 'disarmed' arrived before depends on the middleware.
         assert commander.reaches('lost: '), commander.bridge_states

@@ -3,7 +3,7 @@
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 import numpy as np
-from puppet import flown, LEVEL, PARAMETERS, Puppet, ROBOT
+from vehicle_rig import flown, LEVEL, PARAMETERS, ROBOT, VehicleRig
 
 from beetle_omni_ros.control.base import Command, State
 
@@ -28,45 +28,45 @@ actions = st.lists(st.one_of(
         ['arm', 'disarm', 'land', 'emergency_stop', 'nmpc', 'rl', 'x']))), max_size=12)
 
 
-def perform(puppet, action):
+def perform(rig, action):
     """Apply one event to the supervisor."""
-    supervisor, (kind, *rest) = puppet.supervisor, action
+    supervisor, (kind, *rest) = rig.supervisor, action
     if kind == 'jump':
         # A delay: the clock advances before the waiting messages are read.
-        puppet.now += rest[0] if np.isfinite(rest[0]) else 0.0
-        supervisor.update(puppet.now if np.isfinite(rest[0]) else rest[0])
+        rig.now += rest[0] if np.isfinite(rest[0]) else 0.0
+        supervisor.update(rig.now if np.isfinite(rest[0]) else rest[0])
     elif kind == 'command':
-        supervisor.on_command(rest[0], Command(puppet.now + rest[1], np.array(rest[2]),
-                                               np.array(rest[3])), puppet.now)
+        supervisor.on_command(rest[0], Command(rig.now + rest[1], np.array(rest[2]),
+                                               np.array(rest[3])), rig.now)
     elif kind == 'spoil':
         # One wrong number in a new, otherwise good command.
         values = np.concatenate([np.zeros(4), np.full(4, ROBOT.hover_thrust)])
         values[rest[1]] = rest[0]
-        supervisor.on_command(supervisor.active, Command(puppet.now + 0.01, values[:4],
-                                                         values[4:]), puppet.now)
+        supervisor.on_command(supervisor.active, Command(rig.now + 0.01, values[:4],
+                                                         values[4:]), rig.now)
     elif kind == 'state':
-        supervisor.on_state(State(puppet.now + rest[0], np.array(rest[1][:3]),
+        supervisor.on_state(State(rig.now + rest[0], np.array(rest[1][:3]),
                                   np.array(rest[2][:3]), LEVEL, np.array(rest[3][:3]),
-                                  np.array(rest[3]), np.array(rest[2]), puppet.now + rest[0]))
+                                  np.array(rest[3]), np.array(rest[2]), rig.now + rest[0]))
     elif kind == 'raw':
-        supervisor.on_imu(puppet.now + rest[0], rest[1][:3], rest[2][:3])
-        supervisor.on_mocap(puppet.now + rest[0], rest[1][:3], rest[2])
-        supervisor.on_joints(puppet.now + rest[0], rest[1], rest[2])
+        supervisor.on_imu(rig.now + rest[0], rest[1][:3], rest[2][:3])
+        supervisor.on_mocap(rig.now + rest[0], rest[1][:3], rest[2])
+        supervisor.on_joints(rig.now + rest[0], rest[1], rest[2])
     elif kind == 'battery':
         supervisor.on_battery(rest[0])
     elif kind == 'bridge':
-        supervisor.on_actuators(*rest, puppet.now)
+        supervisor.on_actuators(*rest, rig.now)
     elif kind == 'toggle':
-        puppet.alive ^= {rest[0]}
+        rig.alive ^= {rest[0]}
     elif rest[0] in ('nmpc', 'rl', 'x'):
         supervisor.select(rest[0])
     else:
-        getattr(supervisor, rest[0])(puppet.now)
+        getattr(supervisor, rest[0])(rig.now)
 
 
-def watch(puppet, command):
+def watch(rig, command):
     """Invariants of every sent command."""
-    supervisor = puppet.supervisor
+    supervisor = rig.supervisor
     if command is None:
         return
     assert np.isfinite(command.tilt).all() and np.isfinite(command.thrust).all()
@@ -83,19 +83,19 @@ def watch(puppet, command):
 @example(airborne=True, sequence=[('battery', 1e300)])
 @example(airborne=True, sequence=[('raw', 0.0, [0.0, 0.0, 0.0, 1.0], []), ('raw', 0.0, [], [])])
 def test_no_unsafe_command_is_sent(airborne, sequence):
-    puppet = flown() if airborne else Puppet()
-    inner = puppet.supervisor.update
+    rig = flown() if airborne else VehicleRig()
+    inner = rig.supervisor.update
 
     def watched(now):
         command = inner(now)
-        watch(puppet, command)
+        watch(rig, command)
         return command
 
-    puppet.supervisor.update = watched
+    rig.supervisor.update = watched
     for action in sequence:
         if action[0] == 'wait':
-            puppet.run(action[1])
+            rig.run(action[1])
         else:
-            perform(puppet, action)
-            puppet.run(0.02)
-    assert puppet.supervisor.diagnostics()['state'] == puppet.supervisor.state
+            perform(rig, action)
+            rig.run(0.02)
+    assert rig.supervisor.diagnostics()['state'] == rig.supervisor.state

@@ -31,7 +31,7 @@ class Flight:
     def run(self, until):
         while self.sim.time < until - 1e-9:
             frame = self.sim.step()
-            self._talk(frame)
+            self._publish(frame)
             before = self.supervisor.state
             if not self.armed and self.sim.time >= ARM_AT:
                 assert self.supervisor.arm(self.sim.time)
@@ -46,7 +46,7 @@ class Flight:
     def off(self):
         return self.supervisor.state in ('disarmed', 'emergency_stop')
 
-    def _talk(self, frame):
+    def _publish(self, frame):
         supervisor, truth, self.joints = self.supervisor, frame.truth, frame.joints or self.joints
         if frame.imu and 'imu' in self.alive:
             supervisor.on_imu(frame.imu.stamp, frame.imu.specific_force,

@@ -3,8 +3,8 @@
 from dataclasses import replace
 
 import numpy as np
-from puppet import flown, PARAMETERS, TICK
 import pytest
+from vehicle_rig import flown, PARAMETERS, TICK
 
 from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.safety.handover import Handover
@@ -71,28 +71,28 @@ def test_a_state_gets_one_command_only():
         assert handover.limit(command(stamp, 1.0, 9.0), before) is before
 
 
-def switching(puppet, far):
+def switching(rig, far):
     """Run with different commands of rl, select it, and return the commands after that."""
-    original = puppet._talk
+    original = rig._publish
 
-    def talk():
-        puppet.alive.discard('rl')
+    def publish():
+        rig.alive.discard('rl')
         original()
-        lively = far.thrust + 1e-9 * np.sin(1e3 * puppet.now)
-        puppet.supervisor.on_command('rl', replace(far, stamp=puppet.now, thrust=lively),
-                                     puppet.now)
+        lively = far.thrust + 1e-9 * np.sin(1e3 * rig.now)
+        rig.supervisor.on_command('rl', replace(far, stamp=rig.now, thrust=lively),
+                                  rig.now)
 
-    puppet._talk = talk
-    puppet.run(1.0)
-    before = puppet.command
-    assert puppet.supervisor.select('rl')
-    return [before, *puppet.run(0.5)]
+    rig._publish = publish
+    rig.run(1.0)
+    before = rig.command
+    assert rig.supervisor.select('rl')
+    return [before, *rig.run(0.5)]
 
 
 def test_the_supervisor_hands_over_at_the_limited_rate():
-    puppet = flown()
-    sent = switching(puppet, command(0.0, 0.4, 3.0))
-    assert puppet.supervisor.source == 'rl' and puppet.supervisor.state == 'flying'
+    rig = flown()
+    sent = switching(rig, command(0.0, 0.4, 3.0))
+    assert rig.supervisor.source == 'rl' and rig.supervisor.state == 'flying'
     tilt = np.array([c.tilt for c in sent])
     thrust = np.array([c.thrust for c in sent])
     assert np.abs(np.diff(tilt, axis=0)).max() <= LIMITS.tilt_rate * TICK + 1e-9
@@ -101,10 +101,10 @@ def test_the_supervisor_hands_over_at_the_limited_rate():
 
 
 def test_a_clock_that_goes_back_does_not_hold_an_old_command():
-    puppet = flown()
-    switching(puppet, command(0.0, 0.4, 3.0))
-    assert puppet.supervisor.select('nmpc')
-    puppet.now -= 5.0
-    sent = puppet.run(1.0)
-    assert puppet.supervisor.state in ('flying', 'fallback')
-    assert max(abs(c.stamp - puppet.now) for c in sent[-10:] if c is not None) < 0.2
+    rig = flown()
+    switching(rig, command(0.0, 0.4, 3.0))
+    assert rig.supervisor.select('nmpc')
+    rig.now -= 5.0
+    sent = rig.run(1.0)
+    assert rig.supervisor.state in ('flying', 'fallback')
+    assert max(abs(c.stamp - rig.now) for c in sent[-10:] if c is not None) < 0.2

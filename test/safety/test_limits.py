@@ -20,7 +20,7 @@ def command(stamp=NOW, tilt=(0.1, 0.2, 0.3, 0.4), thrust=(7.0, 7.5, 8.0, 8.5)):
     return Command(stamp, np.array(tilt), np.array(thrust))
 
 
-def lively(stamp, *numbers):
+def noisy(stamp, *numbers):
     """Commands with noise, like those of a controller that uses measurements."""
     given = command(stamp, *numbers)
     return Command(stamp, given.tilt + 1e-9 * np.sin(1e3 * stamp), given.thrust)
@@ -116,7 +116,7 @@ def test_a_step_to_a_new_target_keeps_the_controller_selectable():
     for k in range(200):
         checked.tick(0.01)
         now = NOW + 0.01 * k
-        checked.offer(lively(now, near.tilt if k < 100 else far), now)
+        checked.offer(noisy(now, near.tilt if k < 100 else far), now)
         assert checked.good == (k >= 50)
     assert checked.refused == {limits.JUMP: 1}
 
@@ -135,7 +135,7 @@ def test_a_stream_of_repeated_numbers_is_refused_until_they_change():
     reasons = [checked.offer(command(NOW + 0.01 * k), NOW + 0.01 * k) for k in range(20)]
     assert reasons[:limits.SAME] == [''] * limits.SAME
     assert set(reasons[limits.SAME + 1:]) == {limits.FROZEN}
-    assert checked.offer(lively(NOW + 0.2), NOW + 0.2) == ''
+    assert checked.offer(noisy(NOW + 0.2), NOW + 0.2) == ''
 
 
 def test_accepted_command_does_not_change_with_the_callers_arrays():
@@ -154,7 +154,7 @@ def test_good_means_half_a_second_without_gap_or_refusal():
         for _ in range(round(duration / 0.01)):
             now += 0.01
             checked.tick(0.01)
-            checked.offer(command(now, thrust=(np.nan,) * 4) if spoil else lively(now), now)
+            checked.offer(command(now, thrust=(np.nan,) * 4) if spoil else noisy(now), now)
 
     now = NOW
     run(0.4)

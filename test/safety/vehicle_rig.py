@@ -26,7 +26,7 @@ def hover_command(stamp, quaternion=LEVEL):
     return Command(stamp, hover.tilt, hover.thrust + 1e-9 * np.sin(1e3 * stamp))
 
 
-class Puppet:
+class VehicleRig:
     """Supervisor with all its message sources; those in ``alive`` publish."""
 
     def __init__(self, parameters=PARAMETERS, start=100.0):
@@ -46,7 +46,7 @@ class Puppet:
         sent = []
         for _ in range(round(duration / TICK)):
             self.now += TICK
-            self._talk()
+            self._publish()
             self.command = self.supervisor.update(self.now)
             sent.append(self.command)
             if self.supervisor.state == 'takeoff' and self.lifts \
@@ -69,7 +69,7 @@ class Puppet:
         """All event texts, of one severity."""
         return [e.text for e in self.supervisor.events if severity in (None, e.severity)]
 
-    def _felt(self, tilt):
+    def _specific_force(self, tilt):
         """Specific force: of the rotors in the air, of the ground on the floor."""
         asked = self.command.thrust if self.command is not None else np.zeros(4)
         self.thrust += -np.expm1(-TICK / ROBOT.rotors.time_constant) * (asked - self.thrust)
@@ -77,12 +77,13 @@ class Puppet:
             return ALLOCATOR.wrench(tilt, self.thrust)[0] / ALLOCATOR.mass
         return np.array([0, 0, ROBOT.gravity])
 
-    def _talk(self):
+    def _publish(self):
         supervisor, alive = self.supervisor, self.alive
         tilt = self.command.tilt if self.command is not None else np.zeros(4)
         if 'imu' in alive:
             noise = 1e-6 * np.sin(1e3 * self.now + np.arange(6))   # readings have noise
-            supervisor.on_imu(self.now, self._felt(tilt) + noise[:3], self.rate + noise[3:])
+            supervisor.on_imu(self.now, self._specific_force(tilt) + noise[:3],
+                              self.rate + noise[3:])
         if 'mocap' in alive:
             noise = 1e-6 * np.array([round(self.now / TICK) % 2, 0, 0])
             supervisor.on_mocap(self.now - 0.01, self.position + noise, self.quaternion)
@@ -105,4 +106,4 @@ def flown():
 
 @cache
 def _flown():
-    return Puppet().fly()
+    return VehicleRig().fly()

@@ -16,7 +16,7 @@ LIMITS, ROBOT = CheckLimits.load(), RobotParameters.load()
 __all__ = ['QUICK', 'LIMITS', 'ROBOT']
 
 
-def named(findings):
+def by_item(findings):
     """Item -> finding; each item is unique, and each finding that is not ok has a remedy."""
     found = {finding.item: finding for finding in findings}
     assert len(found) == len(findings), [finding.item for finding in findings]
@@ -26,7 +26,7 @@ def named(findings):
     return found
 
 
-def patiently(look, condition, attempts=8):
+def repeated(look, condition, attempts=8):
     """
     Repeat a check until ``condition(found)``, with a limit; return the last findings.
 
@@ -48,10 +48,10 @@ def levels(found, *, without='ok'):
 def servos(port, graph=None, **changes):
     """Check a bus; item -> finding."""
     parameters = replace(ServoBusParameters.load(), port=port, timing=PATIENT, **changes)
-    return named(check_servos(parameters, ROBOT.joints, LIMITS, graph))
+    return by_item(check_servos(parameters, ROBOT.joints, LIMITS, graph))
 
 
 def board(port, graph=None, seconds=1.2, **changes):
     """Check a motor board; item -> finding."""
     parameters = replace(MotorBoardParameters.load(), port=port, **changes)
-    return named(check_board(parameters, ROBOT, LIMITS, seconds, graph))
+    return by_item(check_board(parameters, ROBOT, LIMITS, seconds, graph))
