@@ -17,8 +17,7 @@ from beetle_omni_ros.estimation.model import ErrorStateModel, MEASUREMENTS
 from beetle_omni_ros.estimation.mounting import Mounting
 from beetle_omni_ros.estimation.noise import NoiseMonitor
 from beetle_omni_ros.estimation.parameters import EkfParameters
-from beetle_omni_ros.estimation.propagation import TIME_OFFSET
-from beetle_omni_ros.estimation.samples import ATTITUDE, Estimate
+from beetle_omni_ros.estimation.samples import ATTITUDE, Estimate, POSITION
 from beetle_omni_ros.estimation.track import interpolate, SAME_INSTANT, Track
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.readings import ImuReading, PoseReading
@@ -44,7 +43,7 @@ class ErrorStateEkf:
         """
         self._parameters = parameters
         self._model = ErrorStateModel(parameters, gravity)
-        self._mounting = Mounting(parameters.imu, gravity, parameters.time_offset.trend_samples)
+        self._mounting = Mounting(self._model)
         self.reset()
 
     def reset(self) -> None:
@@ -77,7 +76,7 @@ class ErrorStateEkf:
         age = newest.stamp - self._track.last_fix
         if age <= limits.dead_reckoning_after:
             return 'tracking'
-        variance = max(newest.covariance[0, 0], newest.covariance[1, 1], newest.covariance[2, 2])
+        variance = max(np.diag(self._model.covariance(newest))[POSITION])
         if age > limits.lost_after or not variance <= limits.lost_position_std ** 2:
             return 'lost'
         return 'dead_reckoning'
@@ -238,7 +237,7 @@ class ErrorStateEkf:
 
     def _attitude_jumped(self, track: Track, candidate: Track) -> bool:
         """Whether the gyroscope rules out the candidate's attitude."""
-        deviation = sqrt(np.trace(track.newest.covariance[ATTITUDE, ATTITUDE]))
+        deviation = sqrt(np.trace(self._model.covariance(track.newest)[ATTITUDE, ATTITUDE]))
         return geodesic_angle(track.newest.quaternion, candidate.newest.quaternion) \
             > self._parameters.status.jump_attitude + SURE * deviation
 
@@ -249,7 +248,7 @@ class ErrorStateEkf:
         force, rate = interpolate(stamp, before, later[0]) if later else (before[1], before[2])
         first = self._model.start(stamp, force, rate, position, quaternion, known)
         time_deviation = (self._parameters.initial.time_offset_std if known is None else
-                          sqrt(known.covariance[TIME_OFFSET, TIME_OFFSET]))
+                          self._model.time_deviation(known))
         track = Track(self._model, first, self._parameters.mocap.delay_limit, time_deviation)
         for reading in later:
             track.predict(*reading)

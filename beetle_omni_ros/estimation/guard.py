@@ -48,10 +48,11 @@ class InputGuard:
         stamp = float(sample.stamp)
         force = np.array(sample.specific_force, dtype=float)
         rate = np.array(sample.angular_velocity, dtype=float)
-        if not _finite(stamp, force, rate):
+        values = (*force.tolist(), *rate.tolist())
+        if not all(map(isfinite, (stamp, *values))):
             return self._refuse('not_finite')
-        if (_squared_norm(force) > self._imu.specific_force_limit ** 2
-                or _squared_norm(rate) > self._imu.angular_velocity_limit ** 2):
+        if (_squared_norm(*values[:3]) > self._imu.specific_force_limit ** 2
+                or _squared_norm(*values[3:]) > self._imu.angular_velocity_limit ** 2):
             self._out_of_range = True
             return self._refuse('out_of_range')
         self.clock_jumped = False
@@ -64,7 +65,7 @@ class InputGuard:
                 self.clock_jumped = True
                 self._last_pose = -inf
                 self._spikes.reset()
-        if self._reading_frozen((*force.tolist(), *rate.tolist())):
+        if self._reading_frozen(values):
             return self._refuse('frozen')
         if not self._spikes.passes(force, rate):
             return self._refuse('spike')
@@ -105,11 +106,12 @@ class InputGuard:
         stamp = float(sample.stamp) + self._mocap.time_offset
         position = np.array(sample.position, dtype=float)
         quaternion = np.array(sample.quaternion, dtype=float)
-        if not _finite(stamp, position, quaternion):
+        values = (*position.tolist(), *quaternion.tolist())
+        if not all(map(isfinite, (stamp, *values))):
             return self._refuse('not_finite')
-        if max(map(abs, position.tolist())) > self._mocap.position_limit:
+        if max(map(abs, values[:3])) > self._mocap.position_limit:
             return self._refuse('out_of_range')
-        norm = sqrt(_squared_norm(quaternion))
+        norm = sqrt(_squared_norm(*values[3:]))
         if not abs(norm - 1) <= self._mocap.quaternion_tolerance:
             return self._refuse('quaternion_norm')
         if self._last_reading is None:
@@ -121,7 +123,7 @@ class InputGuard:
         if stamp > self._last_reading + self._imu.gap_limit:
             return self._refuse('future')
         self._last_pose = stamp
-        if self._pose_frozen((*position.tolist(), *quaternion.tolist())):
+        if self._pose_frozen(values):
             return self._refuse('frozen')
         return stamp, position, quaternion / norm
 
@@ -140,12 +142,6 @@ class InputGuard:
         return None
 
 
-def _finite(stamp, *vectors) -> bool:
-    """Whether stamp and all elements are finite."""
-    return isfinite(stamp) and all(
-        isfinite(number) for vector in vectors for number in vector.tolist())
-
-
-def _squared_norm(vector) -> float:
+def _squared_norm(x, y, z, w=0.0) -> float:
     """Sum of squares in plain floats, which become infinite without a warning."""
-    return sum(number * number for number in vector.tolist())
+    return x * x + y * y + z * z + w * w

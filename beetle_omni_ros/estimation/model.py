@@ -7,6 +7,7 @@ state.
 """
 
 from dataclasses import replace
+from math import sqrt
 
 from filterpy.kalman import KalmanFilter
 import numpy as np
@@ -58,6 +59,7 @@ class ErrorStateModel:
         self._no_error = np.zeros(STATES)
         self._transition = identity()
         self._process = _process_noise(parameters)
+        self._time_walk = float(self._process[TIME_OFFSET, TIME_OFFSET])
         self._period = 1 / imu.rate
         # a missing reading was at the limit of the sensor's range or beyond, in any direction
         self._shock = np.zeros(STATES)
@@ -116,7 +118,7 @@ class ErrorStateModel:
                                          + [first.gyroscope_bias_std ** 2] * 3 + [0.0])
         else:
             known = biases.accelerometer_bias, biases.gyroscope_bias, biases.time_offset
-            covariance[9:15, 9:15] = biases.covariance[9:15, 9:15]
+            covariance[9:15, 9:15] = self.covariance(biases)[9:15, 9:15]
         return Node(stamp, force, rate, position - rotation @ self._lever, np.zeros(3), attitude,
                     rotation, *known, covariance=covariance)
 
@@ -138,7 +140,7 @@ class ErrorStateModel:
         change[POSITION], change[VELOCITY] = -node.velocity, -acceleration
         change[ATTITUDE] = node.gyroscope_bias - node.rate
         change[TIME_OFFSET] = 1.0
-        node.covariance = node.covariance + deviation ** 2 * np.outer(change, change)
+        node.covariance = self.covariance(node) + deviation ** 2 * np.outer(change, change)
 
     def doubt(self, node: Node, span: float) -> Node:
         """
@@ -147,7 +149,7 @@ class ErrorStateModel:
         A gyroscope bias that was wrong for ``span`` [s] has turned the attitude by ``span`` times
         its error. Both errors are therefore correlated, and a pose corrects the rate at once.
         """
-        covariance = node.covariance + self._doubt
+        covariance = self.covariance(node) + self._doubt
         change = np.zeros((STATES, 3))
         change[GYROSCOPE_BIAS], change[ATTITUDE] = np.eye(3), -span * np.eye(3)
         covariance += self.parameters.doubt.gyroscope_bias_std ** 2 * change @ change.T
@@ -157,7 +159,7 @@ class ErrorStateModel:
                          rate: np.ndarray) -> Node:
         """Move a state across an unknown time; only the biases remain known."""
         limits = self.parameters
-        covariance = node.covariance.copy()
+        covariance = self.covariance(node).copy()
         covariance[0:9, :] = covariance[:, 0:9] = 0.0
         covariance[POSITION, POSITION] = limits.mocap.position_limit ** 2 * np.eye(3)
         covariance[VELOCITY, VELOCITY] = limits.initial.velocity_std ** 2 * np.eye(3)
@@ -168,29 +170,49 @@ class ErrorStateModel:
 
     def predict(self, node: Node, stamp: float, force: np.ndarray, rate: np.ndarray,
                 after_impact: bool = False) -> Node:
-        """Predict ``node`` and its covariance to the next IMU reading."""
-        after = propagate(node, stamp, force, rate, self.gravity)
-        dt = stamp - node.stamp
-        # Missing samples are interpolated, and the error grows with each of them.
-        missing = max(1.0, dt / self._period)
-        kalman = self.filter
-        kalman.x = self._no_error
-        kalman.P = node.covariance
-        kalman.predict(F=transition(node, after, self._transition),
-                       Q=self._process * (dt * missing ** 3))
-        after.covariance = kalman.P
-        change = force - node.force
-        squared_change = float(change @ change)
-        if after_impact or squared_change > self._impact:
-            self._add_impulse_uncertainty(after, dt, squared_change, after_impact)
-        return after
+        """Predict ``node`` to the next IMU reading, its covariance only on demand."""
+        return propagate(node, stamp, force, rate, self.gravity, after_impact)
 
-    def _add_impulse_uncertainty(self, node, dt, squared_change, after_impact) -> None:
-        """Add the uncertainty of an impulse, after missing readings also to the attitude."""
-        node.after_impact = after_impact
-        density = self._shock.copy() if after_impact else np.zeros(STATES)
+    def covariance(self, node: Node) -> np.ndarray:
+        """Covariance (16, 16) of a node, predicted now if it is pending."""
+        for before, after in node.pending():
+            after.covariance = self._predicted_covariance(before, after)
+            after.before = None
+        return node.covariance
+
+    def time_deviation(self, node: Node) -> float:
+        """
+        Standard deviation of a node's time offset [s].
+
+        A prediction adds only the random walk to its variance. No pending covariance is needed.
+        """
+        steps = node.pending()
+        known = steps[0][0] if steps else node
+        variance, walk = known.covariance[TIME_OFFSET, TIME_OFFSET], self._time_walk
+        for before, after in steps:
+            variance += walk * self._noise_time(after.stamp - before.stamp)
+        return sqrt(variance)
+
+    def _noise_time(self, dt) -> float:
+        """Time [s] over which the process noise of a step acts."""
+        # Missing samples are interpolated, and the error grows with each of them.
+        return dt * max(1.0, dt / self._period) ** 3
+
+    def _predicted_covariance(self, before: Node, after: Node) -> np.ndarray:
+        """Covariance (16, 16) after one step of :func:`propagate`."""
+        dt, kalman = after.stamp - before.stamp, self.filter
+        kalman.x = self._no_error
+        kalman.P = before.covariance
+        kalman.predict(F=transition(before, after, self._transition),
+                       Q=self._process * self._noise_time(dt))
+        change = after.force - before.force
+        squared_change = float(change.dot(change))
+        if not (after.after_impact or squared_change > self._impact):
+            return kalman.P
+        # an impulse, after missing readings also of the attitude
+        density = self._shock.copy() if after.after_impact else np.zeros(STATES)
         density[VELOCITY] += squared_change
-        node.covariance = node.covariance + np.diag(density * dt ** 2)
+        return kalman.P + np.diag(density * dt ** 2)
 
     def correct(self, prior: Node, position: np.ndarray, quaternion: np.ndarray) -> Node | None:
         """
@@ -208,18 +230,18 @@ class ErrorStateModel:
         kalman = self.filter
         residual = np.empty(MEASUREMENTS)
         residual[:3] = position - prior.position
-        residual[3:] = rotations.log(rotations.multiply(
-            rotations.conjugate(prior.quaternion),
-            rotations.multiply(quaternion, self.marker_to_base)))
+        x, y, z, w = prior.quaternion.tolist()
+        measured = rotations.product(*quaternion.tolist(), *self.marker_to_base.tolist())
+        residual[3:] = rotations.log(rotations.product(-x, -y, -z, w, *measured))
         if self._has_lever:
             residual[:3] -= prior.rotation @ self._lever
             kalman.H[0:3, ATTITUDE] = -prior.rotation @ rotations.skew(self._lever)
         self._linearise_time(prior)
+        kalman.P = self.covariance(prior)
         kalman.x = self._no_error
-        kalman.P = prior.covariance
         kalman.update(residual, H=kalman.H)
         # The innovation is filterpy's y with inverse covariance SI; not <= also catches NaN.
-        if not float(kalman.y @ kalman.SI @ kalman.y) <= self.gate:
+        if not kalman.y.dot(kalman.SI).dot(kalman.y) <= self.gate:
             return None
         return self._inject(prior, kalman.x, kalman.P)
 
@@ -239,20 +261,21 @@ class ErrorStateModel:
         rate = prior.rate - prior.gyroscope_bias
         velocity = prior.velocity
         if self._has_lever:
-            velocity = velocity + prior.rotation @ np.cross(rate, self._lever)
-        jacobian[0:3, TIME_OFFSET] = velocity if velocity @ velocity > least.speed ** 2 else 0.0
-        jacobian[3:6, TIME_OFFSET] = rate if rate @ rate > least.rate ** 2 else 0.0
+            velocity = velocity + prior.rotation @ rotations.cross(rate, self._lever)
+        jacobian[0:3, TIME_OFFSET] = velocity if velocity.dot(velocity) > least.speed ** 2 else 0.0
+        jacobian[3:6, TIME_OFFSET] = rate if rate.dot(rate) > least.rate ** 2 else 0.0
 
     def _inject(self, prior: Node, error: np.ndarray, covariance: np.ndarray) -> Node:
         """Add the estimated error to the state; the remaining error has mean zero."""
-        turn = error[ATTITUDE]
+        turn = error[ATTITUDE].tolist()
         quaternion = rotations.normalized(
-            rotations.multiply(prior.quaternion, rotations.exp(turn.tolist())))
+            rotations.multiply(prior.quaternion, rotations.exp(turn)))
         # The remaining attitude error refers to the corrected attitude: right Jacobian of SO(3),
         # first order.
-        shift = -0.5 * rotations.skew(turn.tolist())
-        covariance[ATTITUDE, :] += shift @ covariance[ATTITUDE, :]
-        covariance[:, ATTITUDE] += covariance[:, ATTITUDE] @ shift.T
+        shift = -0.5 * rotations.skew(turn)
+        rows, columns = covariance[ATTITUDE, :], covariance[:, ATTITUDE]
+        rows += shift.dot(rows)
+        columns += columns.dot(shift.T)
         limit = self.parameters.time_offset.limit
         return Node(prior.stamp, prior.force, prior.rate,
                     prior.position + error[POSITION], prior.velocity + error[VELOCITY],

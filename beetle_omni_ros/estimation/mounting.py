@@ -5,12 +5,10 @@ The filter estimates the motion of the IMU at the IMU's stamps, the estimate tha
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
-from math import sqrt
 
 import numpy as np
 
-from beetle_omni_ros.estimation.parameters import ImuParameters
+from beetle_omni_ros.estimation.model import ErrorStateModel
 from beetle_omni_ros.estimation.propagation import Node, STATES, TIME_OFFSET
 from beetle_omni_ros.estimation.samples import (
     ACCELEROMETER_BIAS,
@@ -29,18 +27,12 @@ SIGNIFICANT = 4.0  # standard deviations of a significant time offset
 class Mounting:
     """Rotation and lever arm of the IMU in base_link, and its known biases."""
 
-    def __init__(self, imu: ImuParameters, gravity: float, trend_samples: int = 1):
-        """
-        Copy rotation, position and noise from the IMU's parameters.
-
-        Args:
-            imu: parameters of the IMU.
-            gravity: [m/s^2].
-            trend_samples: number of readings in the trend of a delayed rate.
-
-        """
-        self._trend_samples = trend_samples
-        self._gravity = np.array([0.0, 0.0, gravity])
+    def __init__(self, model: ErrorStateModel):
+        """Copy rotation, position and noise of the IMU from the parameters of ``model``."""
+        imu = model.parameters.imu
+        self._model = model
+        self._trend_samples = model.parameters.time_offset.trend_samples
+        self._gravity = np.array([0.0, 0.0, model.gravity])
         turned = np.any(imu.rotation)
         self._axes = rotations.matrix(rotations.exp(imu.rotation)) if turned else None
         self._arm = imu.position.copy() if np.any(imu.position) else None
@@ -64,17 +56,19 @@ class Mounting:
 
         """
         age, delayed = node.time_offset, node
-        late = age > SIGNIFICANT * sqrt(node.covariance[TIME_OFFSET, TIME_OFFSET])
+        late = age > SIGNIFICANT * self._model.time_deviation(node)
         if late:
             node = self._extrapolated(delayed, age, self.trend(readings))
         rate = node.rate - node.gyroscope_bias
         position, velocity = node.position, node.velocity
         if self._arm is not None:
             position = position - node.rotation @ self._arm
-            velocity = velocity - node.rotation @ np.cross(rate, self._arm)
+            velocity = velocity - node.rotation @ rotations.cross(rate, self._arm)
 
         def covariance():
-            found = self._extrapolated_covariance(delayed, node, age) if late else node.covariance
+            found = self._model.covariance(delayed)
+            if late:
+                found = self._extrapolated_covariance(delayed, node, age, found)
             found = found[:ERROR_STATES, :ERROR_STATES]
             return found if self._arm is None else \
                 self._covariance_at_base(node, rate, found, self._arm)
@@ -89,8 +83,8 @@ class Mounting:
         if len(last) < max(count, 2) or any(reading[3] for reading in last):
             return np.zeros(3)
         times = np.array([reading[0] for reading in last])
-        times -= times.mean()
-        return times @ np.array([reading[2] for reading in last]) / (times @ times)
+        times -= times.sum() / len(last)
+        return times.dot(np.array([reading[2] for reading in last])) / times.dot(times)
 
     def _extrapolated(self, node, age, trend) -> Node:
         """
@@ -102,15 +96,14 @@ class Mounting:
         continues its trend. Without the trend, 25 ms are a phase lag of 18 deg at 2 Hz.
         """
         rate = node.rate - node.gyroscope_bias + 0.5 * age * trend
-        acceleration = (node.rotation @ (node.force - node.accelerometer_bias) - self._gravity)
+        acceleration = node.rotation.dot(node.force - node.accelerometer_bias) - self._gravity
         quaternion = rotations.multiply(node.quaternion, rotations.exp(age * rate))
-        return replace(
-            node, rate=node.rate + age * trend,
-            position=node.position + age * node.velocity + 0.5 * age ** 2 * acceleration,
-            velocity=node.velocity + age * acceleration, quaternion=quaternion,
-            rotation=rotations.matrix(quaternion))
+        return Node(node.stamp, node.force, node.rate + age * trend,
+                    node.position + age * node.velocity + 0.5 * age ** 2 * acceleration,
+                    node.velocity + age * acceleration, quaternion, rotations.matrix(quaternion),
+                    node.accelerometer_bias, node.gyroscope_bias, node.time_offset)
 
-    def _extrapolated_covariance(self, before, after, age) -> np.ndarray:
+    def _extrapolated_covariance(self, before, after, age, covariance) -> np.ndarray:
         """(16, 16) covariance of ``after``, the extrapolation of ``before``."""
         acceleration = before.rotation @ (before.force - before.accelerometer_bias) - self._gravity
         # the mean rate, which includes half of the trend
@@ -124,7 +117,7 @@ class Mounting:
         jacobian[ATTITUDE, ATTITUDE] = after.rotation.T @ before.rotation
         jacobian[ATTITUDE, GYROSCOPE_BIAS] = -age * np.eye(3)
         jacobian[ATTITUDE, TIME_OFFSET] = rate
-        return jacobian @ before.covariance @ jacobian.T
+        return jacobian @ covariance @ jacobian.T
 
     def _covariance_at_base(self, node, rate, covariance, lever: np.ndarray) -> np.ndarray:
         """
@@ -133,7 +126,7 @@ class Mounting:
         With arm r and rate w, p = p_imu - R r and v = v_imu - R (w x r). The noise of the rate
         sample affects the velocity through the arm.
         """
-        swing = np.cross(rate, lever)
+        swing = rotations.cross(rate, lever)
         arm = node.rotation @ rotations.skew(lever)
         jacobian = np.eye(ERROR_STATES)
         jacobian[POSITION, ATTITUDE] = arm

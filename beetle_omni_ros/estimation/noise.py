@@ -67,8 +67,8 @@ class NoiseMonitor:
         last, self._last = self._last, (stamp, position, quaternion)
         if last is None:
             return
-        turn = rotations.log(rotations.multiply(
-            rotations.conjugate(last[2]).tolist(), quaternion.tolist()))
+        x, y, z, w = last[2].tolist()
+        turn = rotations.log(rotations.product(-x, -y, -z, w, *quaternion.tolist()))
         self._moves.append((position - last[1], turn, stamp - last[0]))
         if len(self._moves) < POSES - 1:
             return
@@ -77,4 +77,4 @@ class NoiseMonitor:
             return
         for (first, second, third), median in zip((moves, turns), self._medians):
             excess = third - 2 * second + first
-            median.add(float(excess @ excess))
+            median.add(float(excess.dot(excess)))

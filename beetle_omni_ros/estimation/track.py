@@ -61,6 +61,7 @@ class Track:
         nodes.append(self._model.predict(nodes[-1], stamp, force, rate, after_impact))
         while nodes[1].stamp < stamp - self._history:
             del nodes[0]
+            self._model.covariance(nodes[0])    # otherwise it would keep its predecessors
 
     def correct(self, stamp: float, position: np.ndarray, quaternion: np.ndarray,
                 doubt_span: float = 0.0) -> bool:

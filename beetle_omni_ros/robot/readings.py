@@ -17,7 +17,6 @@ class ImuReading:
         stamp: time of measurement [s].
         specific_force: (3,) acceleration minus gravity [m/s^2]; +g upward at rest.
         angular_velocity: (3,) [rad/s].
-        angular_velocity: (3,) [rad/s].
 
     """
 
@@ -107,9 +106,10 @@ class SpikeFilter:
 
     def passes(self, force: np.ndarray, rate: np.ndarray) -> bool:
         """Whether a reading (3,) [m/s^2], (3,) [rad/s] is used; False holds it back."""
-        far = self._last is not None and any(
-            float(change @ change) > limit for change, limit in zip(
-                (force - self._last[0], rate - self._last[1]), self._limits))
+        far = False
+        if self._last is not None:
+            push, turn = force - self._last[0], rate - self._last[1]
+            far = bool(push.dot(push) > self._limits[0] or turn.dot(turn) > self._limits[1])
         self.lasted = far and self._held
         self._held = far and not self._held
         if not self._held:

@@ -8,6 +8,8 @@ import pytest
 from scipy.stats import chi2
 
 from beetle_omni_ros.estimation.ekf import EkfParameters, ErrorStateEkf
+from beetle_omni_ros.estimation.model import ErrorStateModel
+from beetle_omni_ros.estimation.track import Track
 
 FLIGHTS, DURATION, STATES = 50, 3.0, 15
 CHECKED = (0.5, 1.0, 2.0, 3.0)  # [s] instants of each flight
@@ -65,6 +67,28 @@ def test_covariance_stays_symmetric_and_positive():
             covariance = ekf.estimate.covariance
             assert np.allclose(covariance, covariance.T, rtol=0, atol=1e-12)
     assert np.linalg.eigvalsh(covariance)[0] > 0
+
+
+def test_covariance_does_not_depend_on_when_it_is_read():
+    often, once = (ErrorStateEkf(EkfParameters.load(), GRAVITY) for _ in range(2))
+    pairs = []
+    for _, sample in fly(5, 2.0).arrivals():
+        feed(often, sample), feed(once, sample)
+        if often.estimate is not None:
+            pairs.append((often.estimate.covariance, once.estimate))
+    assert len(pairs) > 300
+    assert all(np.array_equal(early, late.covariance) for early, late in pairs)
+
+
+def test_pending_covariances_do_not_reach_beyond_the_history():
+    model = ErrorStateModel(EkfParameters.load(), GRAVITY)
+    force, still, history = np.array([0.0, 0.0, GRAVITY]), np.zeros(3), 0.2
+    first = model.start(0.0, force, still, still, np.array([0.0, 0.0, 0.0, 1.0]), None)
+    track = Track(model, first, history)
+    for k in range(1, 200):
+        track.predict(0.005 * k, force, still, False)
+        steps = track.newest.pending()
+        assert len(steps) < len(track.nodes) and steps[0][0].stamp >= track.nodes[0].stamp
 
 
 def test_same_input_gives_the_same_numbers():

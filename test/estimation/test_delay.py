@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.estimation.ekf import EkfParameters, ErrorStateEkf, PoseReading
+from beetle_omni_ros.estimation.model import ErrorStateModel
 from beetle_omni_ros.estimation.mounting import Mounting
 
 
@@ -99,7 +100,7 @@ def test_a_late_angular_rate_is_extrapolated_linearly(age):
 
 
 def test_an_impact_is_not_extrapolated():
-    mounting = Mounting(EkfParameters.load().imu, GRAVITY, 3)
+    mounting = Mounting(ErrorStateModel(EkfParameters.load(), GRAVITY))
     readings = [(0.005 * i, np.zeros(3), np.array([float(i), 0, 0]), False) for i in range(3)]
     np.testing.assert_allclose(mounting.trend(readings), [200, 0, 0])
     readings[1] = (*readings[1][:3], True)
