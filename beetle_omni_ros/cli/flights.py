@@ -106,7 +106,8 @@ def evaluate(controllers: Annotated[str, typer.Option(
              plant: PlantOption = None,
              nmpc_file: Annotated[Optional[Path], typer.Option(
                  '--nmpc', metavar='FILE',
-                 help=f"Other parameters for the controller '{owner('--nmpc')}'.")] = None,
+                 help=f"Parameters of the controller '{owner('--nmpc')}'. Default: the shipped "
+                      'params/nmpc.yaml.')] = None,
              policy: PolicyOption = None,
              allow_other_robot: OtherRobotOption = False,
              bag: Annotated[Optional[Path], typer.Option(
@@ -144,15 +145,16 @@ def evaluate(controllers: Annotated[str, typer.Option(
 
 def compare(controllers: Annotated[Optional[str], typer.Option(
                 '--controllers', metavar='NAME,...',
-                help=f'Of {KNOWN}. Default: the policies and NMPCs that are shipped, as far as '
-                     'there.')] = None,
+                help=f'Controllers: {KNOWN}. Default: the shipped policies that exist, and '
+                     'both NMPCs.')] = None,
             tasks: Annotated[Optional[str], typer.Option(
                 '--tasks', metavar='TASK,...', help='Names or pose files. Default: all.')] = None,
             conditions: Annotated[str, typer.Option(
-                '--conditions', metavar='NAME,...')] = ','.join(CONDITIONS),
+                '--conditions', metavar='NAME,...',
+                help='nominal, published, or both.')] = ','.join(CONDITIONS),
             seeds: Annotated[Optional[str], typer.Option(
                 '--seeds', metavar='N,...',
-                help='Default: 0,1, and 0 for tasks of more than 50 s.')] = None,
+                help='Default: 0,1; only 0 for tasks of more than 50 s.')] = None,
             policy: PolicyOption = None,
             jobs: Annotated[Optional[int], typer.Option(
                 '--jobs', '-j', min=1, help='Parallel flights. Default: one on each core.')]
@@ -202,7 +204,7 @@ def faults(faults: Annotated[Optional[Path], typer.Option(
            only: Annotated[Optional[str], typer.Option(
                '--only', metavar='NAME,...', help='Faults of the list. Default: all.')] = None,
            starts: Annotated[Optional[str], typer.Option(
-               '--from', metavar='NAME,...', help='Start of the fault: hover, moving, '
+               '--from', metavar='NAME,...', help='Flight before the fault: hover, moving, '
                                                   'upside_down, or random (a random time of '
                                                   'random100). Default: the first three.')] = None,
            seeds: Annotated[int, typer.Option(
@@ -230,7 +232,7 @@ def faults(faults: Annotated[Optional[Path], typer.Option(
                '--jobs', '-j', min=1, help='Parallel flights. Default: one on each core.')]
             = None,
            bags: Annotated[bool, typer.Option(
-               '--bags', help='Record each flight below --output, and read it back.')] = False,
+               '--bags', help='Record each flight in --output, and read its bag.')] = False,
            output: Annotated[Optional[Path], typer.Option(
                '--output', '-o', metavar='DIR', help='Folder for page, Markdown and JSON.')]
            = None,
@@ -313,7 +315,7 @@ def film(runs: Annotated[list[Path], typer.Argument(
     """
     Render recorded flights as a film: robot, target, path, errors and thrusts.
 
-    Needs an OpenGL for off-screen rendering; without it, a message names the packages to install.
+    Needs OpenGL for off-screen rendering; without it, a message names the packages to install.
     Example: beetle_omni film my_run/rl my_run/nmpc --output flight.gif
     """
     from beetle_omni_ros.runs.json_file import check_writable
@@ -343,7 +345,7 @@ def controllers(json_path: JsonOption = None):
     check_writable(json_path)
     found = {name: _known(name) for name in registry.names()}
     table = Table(box=None, header_style='dim', padding=(0, 2, 0, 0))
-    for column in ('name', 'what', 'rate [Hz]', 'parameters', 'policy', 'actuators lost',
+    for column in ('name', 'description', 'rate [Hz]', 'parameters', 'policy', 'actuators lost',
                    'guidance'):
         table.add_column(column)
     for name, known in found.items():

@@ -29,7 +29,7 @@ def check(servo_port: Annotated[Optional[str], typer.Option(
                                                 'ROS.')]
           = 3.0,
           skip: Annotated[Optional[list[str]], typer.Option(
-              '--skip', metavar='servos|board|ros', help='Leave a part out; may be '
+              '--skip', metavar='servos|board|ros', help='Skip a part; may be '
                                                          'repeated.')] = None,
           namespace: Annotated[str, typer.Option(
               '--namespace', metavar='NAME', help="Namespace of the robot's topics.")] = '',

@@ -11,9 +11,9 @@ from beetle_omni_ros.cli.options import fail, FAILED, JsonOption, PublishedOptio
 from beetle_omni_ros.robot.schema import ParameterError
 
 PageOption = Annotated[Optional[Path], typer.Option(
-    '--report', metavar='FILE', help='Write a self-contained HTML page with plots there.')]
+    '--report', metavar='FILE', help='Write a self-contained HTML page with plots.')]
 ParamsOption = Annotated[Optional[Path], typer.Option(
-    '--params', metavar='FILE', help='Write a robot file with the result there.')]
+    '--params', metavar='FILE', help='Write a robot file with the result.')]
 HOLDOUT = '--holdout'
 
 
@@ -27,10 +27,9 @@ def gap(runs: Annotated[list[Path], typer.Argument(
                                             'Default: the shipped params/robot.yaml.')] = None,
         apply: Annotated[Optional[Path], typer.Option(
             '--apply', metavar='FILE', help='Write a robot file with the named effects.')] = None,
-        page: Annotated[Optional[Path], typer.Option(
-            '--report', metavar='FILE', help='Write an HTML page with the plots.')] = None,
+        page: PageOption = None,
         parameters: Annotated[Optional[Path], typer.Option(
-            '--gap', metavar='FILE', help='Changes to params/gap.yaml.')] = None,
+            '--gap', metavar='FILE', help='File with changes to params/gap.yaml.')] = None,
         fix: Annotated[bool, typer.Option(
             '--fix', help='Correct damaged recordings if the correction is certain; the bags stay '
                           'unchanged.')] = False,
@@ -109,7 +108,8 @@ def train(output: Annotated[Path, typer.Option(
               '--output', metavar='DIR', help='Folder for checkpoints, TensorBoard log and '
                                               'policy.onnx. Default: that of --resume.')] = None,
           config: Annotated[Optional[Path], typer.Option(
-              '--config', metavar='FILE', help='Other parameters than params/train.yaml.')] = None,
+              '--config', metavar='FILE', help='Training parameters. Default: the shipped '
+                                               'params/train.yaml.')] = None,
           changes: Annotated[Optional[list[str]], typer.Option(
               '--set', metavar='KEY=VALUE', help='Replace a parameter, e.g. iterations=5000 or '
                                                  'ppo.robots=8192; may be repeated.')] = None,
@@ -123,9 +123,10 @@ def train(output: Annotated[Path, typer.Option(
               '--resume', metavar='DIR', help='Continue from the last checkpoint of a run, or '
                                               'from a model_N.pt.')] = None,
           smoke: Annotated[bool, typer.Option(
-              '--smoke', help='A test of all parts with tiny sizes.')] = False,
+              '--smoke', help='Test all parts with tiny sizes.')] = False,
           stop_after: Annotated[Optional[float], typer.Option(
-              '--stop-after', min=0, metavar='SECONDS', help='Stop training early.')] = None,
+              '--stop-after', min=0, metavar='SECONDS',
+              help='End the training after this time.')] = None,
           robot: Annotated[Optional[Path], typer.Option(
               '--robot', metavar='FILE', help='Robot file for the training, with its effects. '
                                               'Default: the shipped params/robot.yaml.')] = None,

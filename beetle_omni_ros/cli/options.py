@@ -30,13 +30,13 @@ RobotOption = Annotated[Optional[Path], typer.Option(
     '--robot', metavar='FILE', help='Robot file of estimator and controller. Default: the shipped '
                                     'params/robot.yaml.')]
 PublishedOption = Annotated[Optional[Path], typer.Option(
-    '--robot', metavar='FILE', help='The present robot file. Default: the shipped '
-                                    'params/robot.yaml.')]
+    '--robot', metavar='FILE', help='Robot file. Default: the shipped params/robot.yaml.')]
 PlantOption = Annotated[Optional[Path], typer.Option(
     '--plant', metavar='FILE', help='Robot file of the simulated plant. Default: as --robot.')]
 PolicyOption = Annotated[Optional[Path], typer.Option(
     '--policy', metavar='FILE',
-    help=f"Another policy (ONNX) for the controller '{registry.owner('--policy')}'.")]
+    help=f"Policy (ONNX) for the controller '{registry.owner('--policy')}'. Default: the shipped "
+         'one.')]
 OtherRobotOption = Annotated[bool, typer.Option(
     '--allow-other-robot', help='Fly a policy although it was trained for other robot '
                                 'parameters.')]

@@ -119,26 +119,26 @@ TABLE = (
           c.take_trajectory),
     *map(command_topic, registry.standing_by()),      # topic_of() makes those of other controllers
     Topic('command', JOINT_STATE, COMMAND, Command, c.read_command, c.write_command,
-          'the selected and checked command that the actuators execute', c.take_command,
+          'selected and checked command, which the actuators execute', c.take_command,
           required=True),
     _text('supervisor/identity',
-          'identity of the supervisor; actuators execute its commands only'),
+          'identity of the supervisor; the actuators execute commands with this identity only'),
     Topic('supervisor/target', TRAJECTORY, LATCHED, TargetOverride, c.take_override,
           c.write_override,
-          'target that controllers fly to instead of the target of the operator; none if it has '
-          'no points', in_flight=False),
+          'target of the supervisor, which replaces that of the operator; without points: no '
+          'replacement', in_flight=False),
     Topic('supervisor/actuators', JOINT_STATE, LATCHED, HealthReport, c.read_health,
           c.write_health,
-          '`gimbal1..4`, `rotor1..4`, `gimbal1_zero..4_zero`: `position` holds true angles of '
-          'stuck joints (NaN: the joint moves) and the zeros of encoders that jumped, reading '
-          'minus true tilt; `effort` is NaN for a rotor that follows its command, 0 for a lost '
-          'one, else the thrust at which it is stuck', in_flight=False),
+          'health of `gimbal1..4` and `rotor1..4`, and `gimbal1_zero..4_zero`: `position` is the '
+          'true angle of a stuck joint (NaN: the joint moves), or the zero of an encoder that '
+          'jumped, reading minus true tilt; `effort` is NaN for a rotor that follows its command, '
+          '0 for a lost one, else the thrust at which it is stuck', in_flight=False),
     _text('reference/state', '`waiting`, `flying 3/15`, `done`, `done: control lost at level 60`, '
           'or `aborted` if the flight ended before the task'),
     _text('joint_bridge/state', '`ready`, `waiting: WHY` or `lost: WHY`'),
     _text('rotor_bridge/state', '`ready`, `waiting: WHY`, `silent: WHY` or `lost: WHY`'),
     Topic('ground_truth/odom', 'nav_msgs/msg/Odometry', ESTIMATE, Odom, c.read_odom, c.write_odom,
-          'the simulated truth', c.take_odom),
+          'true state of the simulated robot', c.take_odom),
     Topic('disturbance', 'geometry_msgs/msg/WrenchStamped', EVENT, Wrench, c.read_wrench,
           c.write_wrench, 'external wrench on the simulated robot until the next message: force '
           'in world, torque in base_link; a user or an experiment publishes it', c.take_wrench),
