@@ -48,7 +48,7 @@ TASKS = [
     ('no_header.csv', 'row 1: the header is missing; expected x_m'),
     ('unknown.csv', "row 1: unknown column 'x'; expected x_m"),
     ('missing.csv', "row 1: column 'yaw_deg' is missing; expected"),
-    ('twice.csv', "column 'x_m' stands there twice; expected"),
+    ('twice.csv', "column 'x_m' occurs twice; expected"),
     ('text.csv', "row 3, column roll_deg: expected a finite number, found 'east'"),
     ('nan.csv', "row 2, column y_m: expected a finite number, found 'nan'"),
     ('short.csv', 'row 2: expected 6 values, found 5'),

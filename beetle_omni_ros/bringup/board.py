@@ -92,7 +92,7 @@ def _of_board(update, receptions, parameters, robot, limits):
     receives = NO_HOST_HEARTBEAT not in status.conditions
     return [
         _of_firmware(status),
-        Finding('board hears us', OK if receives else FAIL,
+        Finding('board receives host', OK if receives else FAIL,
                 'yes' if receives else NO_HOST_HEARTBEAT,
                 '' if receives else "check the computer's TX wire, and host_system and "
                 'host_component in params/motor_board.yaml'),
@@ -106,7 +106,7 @@ def _of_board(update, receptions, parameters, robot, limits):
 
 def _remedy_of_silence(received, parameters):
     if received.foreign:
-        return (f'another device sends MAVLink there; expected is system '
+        return (f'another device sends MAVLink; expected system '
                 f'{parameters.board_system}, component {parameters.board_component}: '
                 'params/motor_board.yaml')
     if received.bytes:
@@ -182,7 +182,7 @@ def _of_link(received, receptions, limits: LinkLimits):
     if len(receptions) < 2:
         return [*findings, Finding('link to the board', WARN, f'{len(receptions)} reports of the '
                                    "board's reception, two are needed",
-                                   'listen longer: --seconds 4')]
+                                   'increase the time: --seconds 4')]
     (before, first), (after, last) = receptions[0], receptions[-1]
     lost, bad_crc = last.lost - first.lost, last.bad_crc - first.bad_crc
     return [*findings, _of_direction('link to the board', lost, bad_crc,

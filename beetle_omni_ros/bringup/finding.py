@@ -78,7 +78,7 @@ def reported(bridge: str, graph: ObservedGraph) -> list[Finding]:
                                 '' if level == OK else FAULT_PAGES[bridge], status.values))
     if len(findings) == 1:
         findings.append(Finding(f'{bridge} diagnostics', WARN, f'none within {graph.seconds:g} s',
-                                'listen longer: --seconds 5'))
+                                'increase the time: --seconds 5'))
     return findings
 
 

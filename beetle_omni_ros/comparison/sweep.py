@@ -142,8 +142,9 @@ def _fly_all(flights: list[Flight]) -> Iterator[tuple[Flight, dict]]:
                                         'RayActorError', 'ActorDiedError', 'OutOfMemoryError'):
             raise
         raise SweepError(
-            f'a worker was lost, perhaps for lack of memory; {finished} of {len(flights)} flights '
-            'are kept, the same command continues from there, --jobs 1 needs the least') from None
+            f'a worker was lost, possibly for lack of memory; {finished} of {len(flights)} '
+            'flights are kept and the same command continues; --jobs 1 needs the least '
+            'memory') from None
 
 
 def _fly_numbered(k, flight, task, code):

@@ -363,7 +363,7 @@ def _module(place, spec):
     except ModuleNotFoundError as error:
         if error.name and (name == error.name or name.startswith(error.name + '.')):
             raise ParameterError(f"controller '{spec}': no module '{error.name}' in "
-                                 f'{folder} or where Python looks') from None
+                                 f'{folder} or on the Python path') from None
         raise ParameterError(f"controller '{spec}': {place} needs the module '{error.name}', "
                              'which is not installed') from error
     except Exception as error:

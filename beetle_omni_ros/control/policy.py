@@ -47,7 +47,7 @@ class PolicyParameters(GuidanceParameters, ParameterFile, file='rl.yaml'):
                              low=0.5, high=1000, read_only=True)
     model: EstimateParameters = group(EstimateParameters, 'for the estimate')
     disturbance: DisturbanceParameters = group(
-        DisturbanceParameters, 'what a policy with memory sees')
+        DisturbanceParameters, 'disturbance estimate in the input of a policy with memory')
 
 
 class PolicyController:

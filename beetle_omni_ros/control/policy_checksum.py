@@ -149,7 +149,7 @@ def _number(value):
 
 
 def _unreadable():
-    return ParameterError('not a readable ONNX file, truncated perhaps')
+    return ParameterError('not a readable ONNX file, possibly truncated')
 
 
 def main(paths: list[str]) -> int:

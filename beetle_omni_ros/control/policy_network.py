@@ -143,7 +143,7 @@ def _session(data):
         return onnxruntime.InferenceSession(data, options,
                                             providers=['CPUExecutionProvider'])
     except Exception as error:      # its exceptions have no common base class
-        raise ParameterError(f'not a readable ONNX file, truncated perhaps '
+        raise ParameterError(f'not a readable ONNX file, possibly truncated '
                              f'({_reason(error)})') from None
 
 

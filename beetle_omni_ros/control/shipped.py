@@ -29,7 +29,7 @@ rl = ControllerEntry(
 
 rl_memory = ControllerEntry(
     name='rl_memory', label='RL, memory',
-    description='the learned policy that also sees the estimated disturbance',
+    description='the learned policy with the estimated disturbance as input',
     controller='beetle_omni_ros.control.policy:PolicyController',
     parameters='beetle_omni_ros.control.policy:PolicyParameters',
     parameters_file='params/rl.yaml', policy_file='policies/rl_memory.onnx',

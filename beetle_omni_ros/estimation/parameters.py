@@ -109,7 +109,7 @@ class InitialParameters:
         0.0, doc='stamps of the IMU minus stamps of the MoCap at one instant', unit='s',
         low=-0.2, high=0.2)
     time_offset_std: float = parameter(
-        0.01, doc='standard deviation of the offset between the clocks; 0 if there is none',
+        0.01, doc='standard deviation of the offset between the clocks; 0: no offset',
         unit='s', low=0, high=0.1)
 
 

@@ -240,8 +240,8 @@ def read_bag_response(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     edges = np.flatnonzero(np.diff(np.r_[False, driven, False].astype(int)))
     stretches = edges.reshape(-1, 2)
     if not len(stretches):
-        raise LogError(f'{path}: no joint_states while commands came; were stamps and clock those '
-                       'of one computer?')
+        raise LogError(f'{path}: no joint_states during the commands; expected stamps of both by '
+                       'one clock')
     first, end = stretches[np.argmax(stretches[:, 1] - stretches[:, 0])]
     first, end = _most_motion(t, tilt[last], first, end)
     chosen = slice(first, end)

@@ -177,7 +177,7 @@ class Flight:
             if operator.state in ('disarmed', 'emergency_stop'):
                 raise FlightError(f"the flight ended early, supervisor in '{operator.state}'")
             if next(left, None) is None:
-                raise FlightError(f"the task hangs at '{operator.progress}'")
+                raise FlightError(f"the task does not continue at '{operator.progress}'")
 
     def _inject_faults(self):
         """Set the faults as the task begins, so that their times count from there."""

@@ -41,7 +41,7 @@ def lock_name(node: Node):
         raise StartError(f'{name} runs already (process {str(error) or "unknown"}, ROS domain '
                          f'{domain}); stop it first') from None
     except OSError as error:    # the graph check still stands
-        node.get_logger().warning(f'a second {name} on this computer may go unnoticed: {error}')
+        node.get_logger().warning(f'a second {name} on this computer cannot be detected: {error}')
         return None
 
 

@@ -62,7 +62,7 @@ class Lock:
                 break
             self._file.close()      # its last holder has just removed it
         else:
-            raise OSError(f'{folder() / name}: comes and goes, cannot be used as a lock')
+            raise OSError(f'{folder() / name}: was removed repeatedly, cannot be used as a lock')
         self._file.truncate(0)
         self._file.write(str(os.getpid()))
         self._file.flush()

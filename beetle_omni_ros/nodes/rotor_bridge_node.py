@@ -145,7 +145,7 @@ class RotorBridgeNode(LifecycleFlightNode):
         except SerialPortError as error:
             if str(error) != self._port_error:
                 self._port_error = str(error)
-                self.get_logger().warning(f'{error}; looking for it')
+                self.get_logger().warning(f'{error}; searching for it')
         else:
             self._port_error = None
 

@@ -167,8 +167,8 @@ class SimNode(FlightNode):
         faults = parse_faults(given.faults)
         for fault in faults:
             if given.actuators == 'emulated' and fault.changes(*DEVICES):
-                raise ParameterError(f"faults: '{fault.kind}': the emulated devices measure and "
-                                     'listen; use servo_faults and board_faults, or '
+                raise ParameterError(f"faults: '{fault.kind}': the emulated devices handle this "
+                                     'signal; use servo_faults and board_faults, or '
                                      'actuators:=direct')
         self._simulator.set_faults(faults)
 

@@ -205,7 +205,7 @@ def _links(root, held, path):
         following = {name: Link(name, joint, visuals[name]) for name, joint in by_child.items()
                      if joint.parent in links and name not in links}
         if not following:
-            raise ValueError('links that hang on nothing')
+            raise ValueError('links without a connection to the root')
         links.update(following)
     return links
 

@@ -72,7 +72,7 @@ def _columns(header):
         raise TaskError(f"column '{missing[0]}' is missing")
     if len(header) != len(COLUMNS):
         twice = next(name for name in header if header.count(name) > 1)
-        raise TaskError(f"column '{twice}' stands there twice")
+        raise TaskError(f"column '{twice}' occurs twice")
     return list(COLUMNS)
 
 

@@ -66,7 +66,7 @@ class Vehicle:
 
         """
         if self.state is None:
-            raise RuntimeError('no estimate has come yet')
+            raise RuntimeError('no estimate received yet')
         return self.state
 
     def tick(self, dt: float) -> None:

@@ -135,7 +135,7 @@ class Simulator:
         """
         for fault in faults:
             if fault.is_process:
-                raise ParameterError(f"fault '{fault.kind}': strikes a process, not the simulated "
+                raise ParameterError(f"fault '{fault.kind}': affects a process, not the simulated "
                                      'robot')
         self._schedule.set(faults, self.time, self._world())
         self._apply_wrench()

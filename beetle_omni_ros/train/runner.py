@@ -229,8 +229,8 @@ class Runner(OnPolicyRunner):
     def _check_finite(self):
         if not torch.isfinite(self.alg.losses).all():
             raise FloatingPointError(
-                f'iteration {self.current_learning_iteration}: the loss is not finite; lower '
-                'ppo.learning_rate perhaps, and resume from the last checkpoint'
+                f'iteration {self.current_learning_iteration}: the loss is not finite; try a '
+                'lower ppo.learning_rate, and resume from the last checkpoint'
                 + (f' in {self.folder}' if self.folder else ''))
 
     def _row(self, seconds, iterations):

@@ -14,7 +14,7 @@ from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 
 pytestmark = pytest.mark.real_time
 
-ALL = ['board port', 'board port latency timer', 'board firmware', 'board hears us',
+ALL = ['board port', 'board port latency timer', 'board firmware', 'board receives host',
        'board ready to arm', 'battery', *(f'ESC of rotor {k}' for k in (1, 2, 3, 4)),
        'board clock', 'link from the board', 'link to the board']
 
@@ -78,9 +78,9 @@ def test_firmware_with_another_protocol_version_is_refused(emulated, monkeypatch
 
 
 def test_a_difference_in_settings_of_the_computer_is_reported(emulated):
-    found = board_with(emulated, {'board hears us': 'fail', 'board clock': 'fail'},
+    found = board_with(emulated, {'board receives host': 'fail', 'board clock': 'fail'},
                        host_component=190)
-    assert 'host_component' in found['board hears us'].remedy
+    assert 'host_component' in found['board receives host'].remedy
 
 
 def test_a_silent_or_foreign_board_ends_the_checks(emulated):

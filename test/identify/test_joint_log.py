@@ -69,7 +69,7 @@ CASES = {
     'wrong sign': (lambda r: scaled(r, 1, -1.0), HEADER, 'against its command'),
     'ragged': (lambda r: [*r[:30], r[30][:3]], HEADER, 'expected 4 values, found 3'),
     'column twice': (lambda r: r, ['t_s', 'q1_rad', 'q1_rad', 'command_rad'],
-                     'stands there twice'),
+                     'occurs twice'),
 }
 
 

@@ -71,7 +71,7 @@ def test_faults_are_switched_in_flight_and_reported(make):
     node._simulator.step()
     assert node._simulator.faults == ['mocap_lost', 'rotor_stops']
     for text, named in (('rotor_stops', "'rotor' is missing"), ('wings', 'rotor_stops'),
-                        ('controller_nan', 'strikes a process')):
+                        ('controller_nan', 'affects a process')):
         answer = put(node, faults=text)
         assert not answer.successful and named in answer.reason
     assert node._simulator.faults == ['mocap_lost', 'rotor_stops']
@@ -113,7 +113,7 @@ def test_ports_have_the_requested_names_and_end_with_the_node(make, tmp_path):
 def test_an_existing_path_is_refused_and_unchanged(make, tmp_path):
     servos, taken = tmp_path / 'servos', tmp_path / 'notes.txt'
     taken.write_text('keep')
-    with pytest.raises(OSError, match=r'notes.txt: cannot be made a port, it exists and is no li'):
+    with pytest.raises(OSError, match=r'notes.txt: cannot be used as a port, it exists'):
         make(f'servo_port:={servos}', f'board_port:={taken}')
     assert taken.read_text() == 'keep' and not os.path.lexists(servos)
 

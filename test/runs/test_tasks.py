@@ -184,7 +184,7 @@ def test_a_pose_file_is_read_with_blank_lines_spaces_and_columns_in_any_order(tm
     (HEADER + '0,0,-1,0,0,0\n', 'row 2, column z_m: expected a height above the floor'),
     ('x_m,y_m,z_m,roll_rad,pitch_deg,yaw_deg\n', "row 1: unknown column 'roll_rad'"),
     ('x_m,y_m,z_m,roll_deg,pitch_deg\n', "row 1: column 'yaw_deg' is missing"),
-    (HEADER.replace('y_m', 'x_m,y_m'), "column 'x_m' stands there twice"),
+    (HEADER.replace('y_m', 'x_m,y_m'), "column 'x_m' occurs twice"),
 ])
 def test_a_bad_pose_file_is_refused_with_file_and_row(tmp_path, content, expected):
     file = tmp_path / 'poses.csv'

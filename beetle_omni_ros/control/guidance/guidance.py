@@ -41,7 +41,7 @@ class GuidanceParameters:
     routing: RoutingParameters = group(
         RoutingParameters, 'round where the shortest turn ends at joint stops')
     turning: TurningParameters = group(
-        TurningParameters, 'where targets are shown while there is far to turn')
+        TurningParameters, 'positions of targets during large rotations')
     trimming: TrimmingParameters = group(
         TrimmingParameters, 'the steady error at a target is taken off')
 

@@ -236,7 +236,7 @@ class GapParameters:
     agreement: float = _factor('Largest error over noise floor for the verdict no gap.')
     most_hidden: float = _share('Largest undetectable share of the catalogue for that verdict.')
     crowd: int = _count('Number of members from which a set is not decidable.', 2, 100)
-    at_floor: float = _factor('Error over noise floor below which there is no gap to close.')
+    at_floor: float = _factor('Error over noise floor below which no gap remains.')
     run_every: float = _time('Time between starts of free runs.', 0.01)
     run_floors: np.ndarray = _several(
         'Least noise floor of position [m], velocity [m/s], orientation [rad], rate [rad/s] and '

@@ -67,7 +67,7 @@ class PseudoTerminal:
             return
         link = Path(self.port)
         if os.path.lexists(link) and not link.is_symlink():
-            raise OSError(f'{link}: cannot be made a port, it exists and is no link')
+            raise OSError(f'{link}: cannot be used as a port, it exists and is no link')
         # The driver's end is kept open, because a serial device cannot detect its driver.
         device, line = os.openpty()
         try:
@@ -80,7 +80,7 @@ class PseudoTerminal:
         except OSError as error:
             os.close(device)
             os.close(line)
-            raise OSError(f'{link}: cannot be made a port ({error.strerror})') from None
+            raise OSError(f'{link}: cannot be used as a port ({error.strerror})') from None
         self._device, self._line = device, line
         self.interrupt()
 
