@@ -187,7 +187,7 @@ class MotorBoard:
         if not self._link.connected:
             return f'{self.parameters.port}: port is away'
         if self._watch.silent(now):
-            return 'nothing heard of the board'
+            return 'no message from the board'
         if status is None:
             return 'no heartbeat of the board'
         if status.contract != CONTRACT_VERSION:

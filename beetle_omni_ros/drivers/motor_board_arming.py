@@ -102,7 +102,7 @@ class Arming:
         missing = self._board.ready or self._disarm and 'disarming is not confirmed yet'
         blocking = missing or ', '.join(text for text in self._board.status.conditions
                                         if text in BLOCKS_ARMING)
-        return blocking or ('' if self._supervisor else 'nothing heard of the supervisor')
+        return blocking or ('' if self._supervisor else 'no message from the supervisor')
 
     def _check_answer(self, elapsed):
         answer, status = self._command.result, self._board.status

@@ -12,7 +12,7 @@ from beetle_omni_ros.robot.readings import BatteryReading
 # docs/reference/firmware.md: the bytes of HEARTBEAT.custom_mode and COMMAND_ACK.result_param2.
 CONTRACT_VERSION = 1
 STATES = {0: 'boot', 1: 'disarmed', 2: 'armed', 3: 'running'}
-STOP_REASONS = {0: 'none', 1: 'asked by the host', 2: 'heartbeat of the host lost',
+STOP_REASONS = {0: 'none', 1: 'requested by the host', 2: 'heartbeat of the host lost',
                 3: 'no target for too long', 4: 'watchdog reset'}
 NO_HOST_HEARTBEAT, THROTTLE = 'no heartbeat of the host', 'throttle not low'
 CONDITIONS = {1: 'booting', 2: NO_HOST_HEARTBEAT, 4: THROTTLE,

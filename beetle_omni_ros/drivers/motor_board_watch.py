@@ -84,8 +84,8 @@ class BoardWatch:
         if silent != self._was_silent and connected:
             self._was_silent = silent
             self._event('error' if silent else 'info',
-                        f'nothing heard for {self._parameters.silence:g} s' if silent
-                        else 'heard again')
+                        f'no message for {self._parameters.silence:g} s' if silent
+                        else 'messages again')
         uncertainty = self.clock.uncertainty(now)
         uncertain = self.clock.known and uncertainty > self._parameters.clock_uncertainty_limit
         if uncertain != self._was_uncertain:
@@ -139,7 +139,7 @@ class BoardWatch:
             self._event('info', f'found, {new.state}, contract {new.contract}')
             return
         if old.armed != new.armed:
-            asked = new.stop_reason == 'asked by the host'
+            asked = new.stop_reason == 'requested by the host'
             self._event('info' if new.armed or asked else 'error',
                         'armed' if new.armed else f'disarmed ({new.stop_reason})')
         for condition in new.conditions if new.armed else ():

@@ -17,11 +17,11 @@ class Actuators:
     def __init__(self):
         self._reported: dict[str, str] = {}
 
-    def tell(self, name: str, text: str) -> bool:
+    def update(self, name: str, text: str) -> bool:
         """Store the state of bridge 'joint' or 'rotor'; False for another name."""
         if name not in NODES:
             return False
-        self._reported[name] = ' '.join(text.split()) or 'says nothing'
+        self._reported[name] = ' '.join(text.split()) or 'empty state'
         return True
 
     def fault(self, name: str) -> str:

@@ -70,18 +70,18 @@ class Silence:
         """``limit``: longer silence is a fault [s]."""
         self.limit = limit
         self.elapsed = float('inf')   # no message yet
-        self._just_heard = False
+        self._just_reset = False
 
-    def heard(self) -> None:
+    def reset(self) -> None:
         """A message arrived within the present tick."""
         self.elapsed = 0.0
-        self._just_heard = True
+        self._just_reset = True
 
     def tick(self, dt: float) -> None:
         """``dt`` seconds passed; the tick with the message is not counted."""
-        if not self._just_heard:
+        if not self._just_reset:
             self.elapsed += dt
-        self._just_heard = False
+        self._just_reset = False
 
     @property
     def silent(self) -> bool:
@@ -90,7 +90,7 @@ class Silence:
 
     @property
     def text(self) -> str:
-        """For messages: 'silent for 52 ms', or 'never heard'."""
+        """For messages: 'silent for 52 ms', or 'silent since the start'."""
         if self.elapsed == float('inf'):
-            return 'never heard'
+            return 'silent since the start'
         return f'silent for {1000 * self.elapsed:.0f} ms'

@@ -105,7 +105,7 @@ class Inputs:
         good = not self._ahead(stamp) and self._is_real(specific_force, angular_velocity) \
             and self.vehicle.backup.on_imu(stamp, specific_force, angular_velocity)
         if good:
-            self.vehicle.imu.heard()
+            self.vehicle.imu.reset()
             if self.airborne:
                 known = stamp - self.vehicle.tilt_stamp < TILT_AGE
                 self.watch.on_imu(stamp, np.asarray(specific_force, dtype=float),
@@ -183,7 +183,7 @@ class Inputs:
         if good and self.airborne and vehicle.imu.silent:
             self.watch.without_imu(stamp, position, self._height)
         if good:
-            vehicle.mocap.heard()
+            vehicle.mocap.reset()
         return good
 
     def _agrees(self, stamp, position, quaternion):
@@ -221,7 +221,7 @@ class Inputs:
             whether there is such a bridge.
 
         """
-        known = self.actuators.tell(name, text)
+        known = self.actuators.update(name, text)
         self.vehicle.stuck = self.actuators.joints_lost
         if not known:
             self._say(now, WARNING, f"unknown bridge '{name}'", 'unknown bridge')

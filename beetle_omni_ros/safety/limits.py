@@ -105,10 +105,10 @@ class CommandStream:
                 self.good_for = 0.0
             if reason in (THRUST, TILT) and self._slightly(command, clean):
                 self.cut = clean
-                self._overstepping.heard()
+                self._overstepping.reset()
             return reason
         self.accepted, self.last_refusal = clean, ''
-        self.silence.heard()
+        self.silence.reset()
         return ''
 
     def tick(self, dt: float) -> None:

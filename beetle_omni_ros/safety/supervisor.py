@@ -176,7 +176,7 @@ class Supervisor(Inputs):
         """State, sources and refusals, flat, for operators and logs."""
         values: dict[str, float | int | str] = {
             'state': self.state, 'controller': self.active, 'source': self.source,
-            'estimator': self.vehicle.status or 'never heard',
+            'estimator': self.vehicle.status or 'no message yet',
             'on_backup_estimator': int(self.vehicle.backup.running)}
         values.update({f'fault.{name}': at for name, at in self.faults.items()})
         values.update(self.actuators.diagnostics())

@@ -94,7 +94,7 @@ class Vehicle:
             self.last_refusal = reason
             return reason
         self.state, self.status, self.last_refusal = state, status, ''
-        self.estimate.heard()
+        self.estimate.reset()
         self.on_joints(state.tilt_stamp, state.tilt, state.tilt_velocity)
         self.backup.learn(state)
         return ''
@@ -117,7 +117,7 @@ class Vehicle:
         self.tilt_velocity = np.array([rate if there and isfinite(rate) else 0.0
                                        for rate, there in zip(rates, known)])
         if all(known):
-            self.joints.heard()
+            self.joints.reset()
         return True
 
     def seen(self, in_force: Command | None, state: State | None = None) -> State:

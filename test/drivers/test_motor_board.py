@@ -186,8 +186,8 @@ def test_pymavlink_accepts_all_output_of_the_emulated_board():
 def test_without_a_board_every_call_times_out_soon_with_a_message():
     device, other = pty.openpty()
     with driver(os.ttyname(other), acknowledge_timeout=0.02) as board:
-        assert board.wait_ready(0.1) == 'nothing heard of the board'
-        assert board.arm().reason == 'nothing heard of the board'
+        assert board.wait_ready(0.1) == 'no message from the board'
+        assert board.arm().reason == 'no message from the board'
         assert board.disarm().reason == 'no acknowledgement to 5 attempts'
         assert not board.send(HOVER, time.time()).sent
         assert not board.armed

@@ -85,7 +85,7 @@ def test_arming_waits_for_board_and_supervisor_and_names_which(bench):
                                                 ('battery low', 'saturated'), 1)
     assert arming.text == 'waiting: battery low'
     board.status = DISARMED
-    assert arming.text == 'waiting: nothing heard of the supervisor'
+    assert arming.text == 'waiting: no message from the supervisor'
     arming.follow('disarmed')
     assert arming.text == 'waiting: disarming is not confirmed yet'
     board.answer()
@@ -165,18 +165,18 @@ def test_a_board_that_stopped_in_flight_is_lost_until_the_supervisor_is_disarmed
 
 
 @pytest.mark.parametrize(('connected', 'text'), [
-    (True, 'silent: nothing heard of the board'), (False, 'lost: nothing heard of the board')])
+    (True, 'silent: no message from the board'), (False, 'lost: no message from the board')])
 def test_a_silent_board_is_reported_after_a_timeout_that_excludes_own_pauses(
         bench, connected, text):
     board, arming = in_flight(bench)
     board.connected = connected
     for _ in range(20):     # delayed repeatedly, with messages in between
-        board.ready = 'nothing heard of the board'
+        board.ready = 'no message from the board'
         arming.update(10.0)
         assert arming.phase == 'flies'
         board.ready = ''
         arming.update(CYCLE)
-    board.ready = 'nothing heard of the board'
+    board.ready = 'no message from the board'
     for _ in range(round(PATIENCE / STEP) - 1):
         arming.update(10.0)
     assert arming.phase == 'flies'

@@ -90,7 +90,7 @@ def test_changes_are_reported_once_and_severe_ones_as_errors():
     assert heartbeat(2, 0, 32 | 8) == (('warning', 'motor board: battery low'),)
     assert heartbeat(1, 3) == (('error', 'motor board: disarmed (no target for too long)'),)
     assert heartbeat(3) == (('info', 'motor board: armed'),)
-    assert heartbeat(1, 1) == (('info', 'motor board: disarmed (asked by the host)'),)
+    assert heartbeat(1, 1) == (('info', 'motor board: disarmed (requested by the host)'),)
     assert heartbeat(0, 4)[0] == ('warning', 'motor board: restarted (watchdog reset)')
 
 

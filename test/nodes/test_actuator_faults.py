@@ -155,7 +155,7 @@ LANDING = [
     ('servo_faults.overload', [1], [], 'lost: gimbal1', True),
     ('servo_faults.overheated', [3], [], 'lost: gimbal3', True),
     ('servo_faults.unplugged', True, False, 'lost: ', False),
-    ('board_faults.mute', True, False, 'silent: nothing heard', False),
+    ('board_faults.mute', True, False, 'silent: no message', False),
 ]
 
 

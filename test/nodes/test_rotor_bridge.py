@@ -75,7 +75,7 @@ def test_thrusts_are_produced_with_a_sagging_battery(flying):
 def test_an_emergency_stop_disarms(flying):
     flying.commander.supervise('emergency_stop')
     assert flying.commander.wait(lambda: not flying.board.armed, SOON)
-    assert flying.board._firmware._stop_reason == 1     # asked by the host
+    assert flying.board._firmware._stop_reason == 1     # requested by the host
 
 
 def test_a_low_battery_refuses_arming_with_the_reason(bridge):
@@ -156,7 +156,7 @@ def test_a_lost_board_stays_disarmed_until_the_supervisor_is_disarmed(flying, fa
 def test_targets_are_sent_to_a_silent_board_until_the_supervisor_has_landed(flying):
     board, commander = flying.board, flying.commander
     board.faults.mute = True
-    assert commander.reaches('silent: nothing heard of the board'), commander.bridge_states
+    assert commander.reaches('silent: no message from the board'), commander.bridge_states
     commander.spin(0.3)
     assert board.armed and board.commands.all()
     commander.thrust = None
@@ -256,7 +256,7 @@ def test_a_bridge_disarms_at_its_end_and_reports_it(tmp_path):
         assert commander.reaches('lost: the bridge has stopped')
         assert process.wait(SOON) == 0
         assert not board.armed and not board.commands.any()
-        assert board._firmware._stop_reason == 1        # asked by the host
+        assert board._firmware._stop_reason == 1        # requested by the host
         assert '[ERROR]' not in made.log[0], made.log
 
 

@@ -33,8 +33,8 @@ def test_a_bridge_that_is_not_ready_prevents_arming_with_its_reason(name, text):
 
 def test_both_reasons_are_given_on_one_line():
     actuators = Actuators()
-    actuators.tell('rotor', 'waiting: battery low')
-    actuators.tell('joint', 'waiting: gimbal2\nstands at -3.48 or +2.80 rad')
+    actuators.update('rotor', 'waiting: battery low')
+    actuators.update('joint', 'waiting: gimbal2\nstands at -3.48 or +2.80 rad')
     assert actuators.why_not_arm == ('joint_bridge_node waiting: gimbal2 stands at -3.48 or +2.80 '
                                      'rad; rotor_bridge_node waiting: battery low')
 
@@ -70,9 +70,9 @@ def test_a_lost_motor_board_in_flight_stops_everything_until_disarmed(landing):
 
 def test_a_silent_motor_board_leads_to_a_powered_landing():
     rig = flown()
-    report(rig, 'rotor', 'silent: nothing heard of the board')
+    report(rig, 'rotor', 'silent: no message from the board')
     assert rig.supervisor.state == 'landing' and rig.command.thrust.any()
-    assert any('silent: nothing heard of the board: landing' in said
+    assert any('silent: no message from the board: landing' in said
                for said in rig.texts('error'))
     report(rig, 'rotor', 'lost: restarted')
     assert rig.supervisor.state == 'emergency_stop'

@@ -32,10 +32,10 @@ def test_takes_off_by_hover_and_hands_over():
 
 
 @pytest.mark.parametrize('spoil, text', [
-    (lambda p: p.alive.discard('estimate'), 'ekf_node never heard'),
+    (lambda p: p.alive.discard('estimate'), 'ekf_node silent since the start'),
     (lambda p: setattr(p, 'status', 'dead_reckoning'), "'dead_reckoning', not 'tracking'"),
     (lambda p: setattr(p, 'status', 'lost'), 'no fresh state estimate'),
-    (lambda p: p.alive.discard('joints'), 'joint_bridge_node never heard'),
+    (lambda p: p.alive.discard('joints'), 'joint_bridge_node silent since the start'),
     (lambda p: setattr(p, 'quaternion', rotations.from_rpy(1.0, 0, 0)), 'inclined by 57 deg'),
     (lambda p: setattr(p, 'velocity', np.array([0.5, 0, 0])), 'moving at 0.50 m/s'),
     (lambda p: setattr(p, 'rate', np.array([0, 0, 1.0])), 'turning at 1.00 rad/s'),
@@ -124,7 +124,7 @@ def test_selecting_in_flight_needs_a_good_controller():
     rig.alive.discard('rl')
     rig.fly()
     answer = rig.supervisor.select('rl')
-    assert not answer and 'rl_node never heard; nmpc stays selected' in answer.text
+    assert not answer and 'rl_node silent since the start; nmpc stays selected' in answer.text
     assert rig.supervisor.active == 'nmpc'
     rig.alive.add('rl')
     rig.run(0.2)

@@ -127,8 +127,8 @@ class FaultWatch:
             self._lose_rotor(self._wrench.lost, stamp, 'the wrench')
         if self._wrench.slipped is not None:
             joint, angle = self._wrench.slipped
-            text = f'the thrust of rotor {joint + 1} points {angle:+.2f} rad from where ' \
-                   f'gimbal{joint + 1} says'
+            text = f'the thrust of rotor {joint + 1} points {angle:+.2f} rad from the reading ' \
+                   f'of gimbal{joint + 1}'
             known = {f'joint{joint + 1}_encoder_jump', f'joint{joint + 1}_astray'}
             if not known & self.faults.keys():
                 self._name(f'joint{joint + 1}_slipped', stamp, text)
@@ -234,7 +234,7 @@ class FaultWatch:
     def _lose_rotor(self, rotor, stamp, by):
         rotors = self.health.rotors
         if self._name(f'rotor{rotor + 1}_lost', stamp, f'rotor {rotor + 1} gives less thrust than '
-                      f'asked, by {by}'):
+                      f'commanded, by {by}'):
             self.health = replace(self.health, rotors=tuple(
                 works and k != rotor for k, works in enumerate(rotors)))
 
