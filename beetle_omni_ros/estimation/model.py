@@ -272,7 +272,7 @@ class ErrorStateModel:
             rotations.multiply(prior.quaternion, rotations.exp(turn)))
         # The remaining attitude error refers to the corrected attitude: right Jacobian of SO(3),
         # first order.
-        shift = -0.5 * rotations.skew(turn)
+        shift = rotations.skew([-0.5 * angle for angle in turn])
         rows, columns = covariance[ATTITUDE, :], covariance[:, ATTITUDE]
         rows += shift.dot(rows)
         columns += columns.dot(shift.T)

@@ -32,7 +32,7 @@ class Mounting:
         imu = model.parameters.imu
         self._model = model
         self._trend_samples = model.parameters.time_offset.trend_samples
-        self._gravity = np.array([0.0, 0.0, model.gravity])
+        self._gravity = model.gravity
         turned = np.any(imu.rotation)
         self._axes = rotations.matrix(rotations.exp(imu.rotation)) if turned else None
         self._arm = imu.position.copy() if np.any(imu.position) else None
@@ -95,17 +95,24 @@ class Mounting:
         not delayed. The acceleration is constant over these few milliseconds, and the rate
         continues its trend. Without the trend, 25 ms are a phase lag of 18 deg at 2 Hz.
         """
-        rate = node.rate - node.gyroscope_bias + 0.5 * age * trend
-        acceleration = node.rotation.dot(node.force - node.accelerometer_bias) - self._gravity
-        quaternion = rotations.multiply(node.quaternion, rotations.exp(age * rate))
-        return Node(node.stamp, node.force, node.rate + age * trend,
-                    node.position + age * node.velocity + 0.5 * age ** 2 * acceleration,
-                    node.velocity + age * acceleration, quaternion, rotations.matrix(quaternion),
+        velocity0, rate0, slopes = node.velocity.tolist(), node.rate.tolist(), trend.tolist()
+        turn = [age * (w - bias + 0.5 * age * slope)
+                for w, bias, slope in zip(rate0, node.gyroscope_bias.tolist(), slopes)]
+        quaternion = rotations.multiply(node.quaternion, rotations.exp(turn))
+        acceleration = node.rotation.dot(node.force - node.accelerometer_bias).tolist()
+        acceleration[2] -= self._gravity
+        position = [p + age * v + 0.5 * age ** 2 * a
+                    for p, v, a in zip(node.position.tolist(), velocity0, acceleration)]
+        velocity = [v + age * a for v, a in zip(velocity0, acceleration)]
+        rate = [w + age * slope for w, slope in zip(rate0, slopes)]
+        return Node(node.stamp, node.force, np.array(rate), np.array(position),
+                    np.array(velocity), quaternion, rotations.matrix(quaternion),
                     node.accelerometer_bias, node.gyroscope_bias, node.time_offset)
 
     def _extrapolated_covariance(self, before, after, age, covariance) -> np.ndarray:
         """(16, 16) covariance of ``after``, the extrapolation of ``before``."""
-        acceleration = before.rotation @ (before.force - before.accelerometer_bias) - self._gravity
+        acceleration = before.rotation @ (before.force - before.accelerometer_bias)
+        acceleration[2] -= self._gravity
         # the mean rate, which includes half of the trend
         rate = 0.5 * (before.rate + after.rate) - before.gyroscope_bias
         jacobian = np.eye(STATES)

@@ -91,10 +91,8 @@ def propagate(node: Node, stamp: float, force: np.ndarray, rate: np.ndarray,
 
     """
     dt = stamp - node.stamp
-    rate0 = node.rate - node.gyroscope_bias
-    rate1 = rate - node.gyroscope_bias
-    ax, ay, az = rate0.tolist()
-    bx, by, bz = rate1.tolist()
+    ax, ay, az = (node.rate - node.gyroscope_bias).tolist()
+    bx, by, bz = (rate - node.gyroscope_bias).tolist()
     h, c = 0.5 * dt, dt * dt / 12
     turn = rotations.exp((h * (ax + bx) + c * (ay * bz - az * by),
                           h * (ay + by) + c * (az * bx - ax * bz),
@@ -116,7 +114,7 @@ def propagate(node: Node, stamp: float, force: np.ndarray, rate: np.ndarray,
     position[2] -= 0.5 * gravity * dt * dt
     return Node(stamp, force, rate, np.array(position), np.array(velocity), np.array(unit),
                 rotation, node.accelerometer_bias, node.gyroscope_bias, node.time_offset,
-                after_impact, before=node)
+                after_impact, UNKNOWN, before=node)
 
 
 def transition(before: Node, after: Node, out: np.ndarray) -> np.ndarray:
