@@ -66,7 +66,7 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
                                   seed=seed, faults=faults)
         simulator, stayed = loop.simulator, loop.fly(task, progress)
         recorder.write_meta({'crashed': not stayed, 'ended': loop.ending,
-                             'broken': simulator.broken})
+                             'broken': simulator.truth.broken})
         if simulator.truth.impact is not None:
             recorder.write_meta({'impact': asdict(simulator.truth.impact)})
     return memory.log()

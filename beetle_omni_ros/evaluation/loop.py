@@ -162,8 +162,9 @@ class FlightLoop:
             moment = player.update(self.simulator.time, truth.position, truth.quaternion)
             if moment.target is not None:
                 self.aim(moment.target)
-                if self.simulator.charge < SWAP_CHARGE or self.supervisor.vehicle.battery_low:
-                    self.simulator.swap_battery()
+                battery = self.simulator.battery
+                if battery.charge < SWAP_CHARGE or self.supervisor.vehicle.battery_low:
+                    battery.reset()
             if moment.changed:
                 self.simulator.set_wrench(moment.force_world, moment.torque_body)
                 self.simulator.set_payload(moment.payload)
@@ -178,7 +179,7 @@ class FlightLoop:
                 progress(min(1.0, (self.simulator.time - player.start) / task.duration))
         self._report_compute()
         progress(1.0)
-        return not (self._crashed or moment.lost or self.simulator.broken)
+        return not (self._crashed or moment.lost or self.simulator.truth.broken)
 
     def start_faults(self) -> None:
         """Start the time of the faults."""

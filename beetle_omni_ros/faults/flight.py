@@ -111,7 +111,7 @@ class Watcher:
         simulator, supervisor = flight.simulator, flight.supervisor
         self.seen.step(simulator.truth, float(simulator.thrust_command.sum()), simulator.tick)
         self._check_events(supervisor, simulator.time - self._start)
-        ended = supervisor.state in OFF or simulator.broken
+        ended = supervisor.state in OFF or simulator.truth.broken
         self._still = self._still + simulator.tick if ended else 0.0
         return self.seen.flyaway or self._still >= self._end_time
 

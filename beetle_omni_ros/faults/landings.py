@@ -128,8 +128,8 @@ def _fly_on(trial, listed, result):
     start = flight.simulator.time
     while flight.simulator.time - start < plan.flight_time \
             and flight.supervisor.state in ('flying', 'fallback'):
-        if flight.simulator.charge < FRESH:
-            flight.simulator.swap_battery()
+        if flight.simulator.battery.charge < FRESH:
+            flight.simulator.battery.reset()
         flight.aim_randomly(listed.flight)
         flight.fly(plan.pose_time)
     flight.supervisor.land(flight.loop.now)

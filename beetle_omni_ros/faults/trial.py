@@ -136,10 +136,10 @@ def observed(flight: Flight, watcher: Watcher, *, asked: bool) -> dict:
                                 refused=bool(flight.loop.refusals)),
         'impact_m_s': worst.speed if worst else None,
         'inclination_deg': None if inclined is None else float(np.degrees(inclined)),
-        'broken': flight.simulator.broken, 'overrun_s': seen.overrun, 'flyaway': seen.flyaway,
-        'takeoffs': seen.takeoffs, 'named': watcher.named, 'named_s': watcher.named_after,
-        'said': watcher.said, 'said_s': watcher.said_after, 'state': supervisor.state,
-        'farthest_m': seen.farthest}
+        'broken': flight.simulator.truth.broken, 'overrun_s': seen.overrun,
+        'flyaway': seen.flyaway, 'takeoffs': seen.takeoffs, 'named': watcher.named,
+        'named_s': watcher.named_after, 'said': watcher.said, 'said_s': watcher.said_after,
+        'state': supervisor.state, 'farthest_m': seen.farthest}
 
 
 def _is_lost(folder):

@@ -255,11 +255,11 @@ class SimNode(FlightNode):
     def _robot_status(self):
         simulator = self._simulator
         faults, impact = simulator.faults, simulator.truth.impact
-        values = {'faults': ', '.join(faults), 'broken': int(simulator.broken)}
+        values = {'faults': ', '.join(faults), 'broken': int(simulator.truth.broken)}
         if impact is not None:
             values.update(impact_m_s=impact.speed, impact_s=impact.stamp,
                           inclination_deg=degrees(impact.inclination))
-        if simulator.broken:
+        if simulator.truth.broken:
             return health.ERROR, 'broken by a crash', values
         return health.WARN if faults else health.OK, values['faults'] or 'whole', values
 

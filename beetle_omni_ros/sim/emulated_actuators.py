@@ -38,7 +38,7 @@ class EmulatedActuators:
         truth = simulator.truth
         bus.set_state(truth.tilt, truth.tilt_velocity, np.zeros(4))
         board.set_rotors(truth.thrust)
-        board.set_battery(simulator.voltage, simulator.current)
+        board.set_battery(simulator.battery.voltage, simulator.battery.current)
 
     def __enter__(self) -> EmulatedActuators:
         return self
@@ -81,9 +81,9 @@ class EmulatedActuators:
 
     def _update_devices(self, frame, powered):
         """Set the sensors of the devices; the current of a servo without torque is zero."""
-        joints, pack, simulator = frame.joints, frame.battery, self._simulator
+        joints, pack, battery = frame.joints, frame.battery, self._simulator.battery
         self.bus.set_state(joints.position, joints.velocity, joints.effort * powered)
-        voltage, current = simulator.voltage, simulator.current
+        voltage, current = battery.voltage, battery.current
         self.board.set_battery(voltage, current,
                                (pack.voltage - voltage, -pack.current - current))
         self.board.set_rotors(frame.truth.thrust)

@@ -38,6 +38,7 @@ class Simulator:
         time: time since reset [s].
         tick: duration of one step [s].
         conditions: biases, latencies and variation of the robot, drawn from the seed.
+        battery: true battery; its reset() inserts a new one, also in flight.
 
     Raises:
         ParameterError: the plant lacks an effect, impossible mass properties, unknown conditions,
@@ -56,7 +57,7 @@ class Simulator:
         self.conditions = draw(conditions, self._parameters,
                                np.random.default_rng(np.random.SeedSequence(seed).spawn(1)[0]))
         self._plant = Plant(robot, self._parameters.plant, self.conditions.variation)
-        self._battery = Battery(robot, self._parameters.battery)
+        self.battery = Battery(robot, self._parameters.battery)
         self._crash = CrashWatch(self._parameters.crash, self.tick)
         self._wrench, self._payload = np.zeros(6), 0.0
         self.reset()
@@ -83,7 +84,7 @@ class Simulator:
         self._ticks = 0
         self.time = 0.0
         self._plant.reset(position, quaternion)
-        self._battery.reset()
+        self.battery.reset()
         self._crash.reset()
         self._wrench, self._payload = np.zeros(6), 0.0
         self._link = CommandLink(self._robot, self._parameters.actuators, self.conditions)
@@ -155,13 +156,8 @@ class Simulator:
         """Delays of tilt and thrust commands from their stamps [s], effects included."""
         return self.conditions.command_delays(self._robot)
 
-    @property
-    def broken(self) -> bool:
-        """Whether a crash broke the robot."""
-        return self._crash.broken
-
     def _world(self):
-        return World(self.truth, self._battery, self._link.tilt)
+        return World(self.truth, self.battery, self._link.tilt)
 
     def _apply_wrench(self):
         """Set wrench and payload of the plant: those of the task and those of the faults."""
@@ -207,25 +203,6 @@ class Simulator:
         self._payload = float(mass)
         self._apply_wrench()
 
-    @property
-    def charge(self) -> float:
-        """Charge of the battery as a fraction of a full one."""
-        return self._battery.charge
-
-    @property
-    def voltage(self) -> float:
-        """True battery voltage under load [V]."""
-        return self._battery.voltage
-
-    @property
-    def current(self) -> float:
-        """True current drawn from the battery [A], positive."""
-        return self._battery.current
-
-    def swap_battery(self) -> None:
-        """Insert a new battery, also in flight, for tasks longer than one charge."""
-        self._battery.reset()
-
     def step(self, drive: Drive | None = None) -> Frame:
         """
         Advance one tick; return the readings that arrive in it.
@@ -235,7 +212,7 @@ class Simulator:
                 servos and rotors follow :meth:`command`.
 
         """
-        plant, link, battery = self._plant, self._link, self._battery
+        plant, link, battery = self._plant, self._link, self.battery
         if not self._schedule.empty:
             self._switch_faults()
         if drive is None:

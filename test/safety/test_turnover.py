@@ -53,7 +53,7 @@ def test_lands_softly_from_inverted_attitude_with_all_joints_wound_adversely(sig
     wind(flight, np.array(signs, dtype=float))
     assert flight.supervisor.land(flight.sim.time)
     flight.run(32.0)
-    assert flight.off() and not flight.sim.broken
+    assert flight.off() and not flight.sim.truth.broken
     assert abs(flight.touchdown_speed) < 0.6
 
 

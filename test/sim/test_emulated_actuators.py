@@ -136,8 +136,9 @@ def test_the_board_receives_pack_and_rotor_states():
     for _ in range(400):
         actuators.step()
         errors.append(actuators.board.error)
-    assert actuators.board.pack == (simulator.voltage, simulator.current)
-    assert simulator.current > 10 and simulator.voltage < ROBOT.battery.full_voltage
+    battery = simulator.battery
+    assert actuators.board.pack == (battery.voltage, battery.current)
+    assert battery.current > 10 and battery.voltage < ROBOT.battery.full_voltage
     np.testing.assert_array_equal(actuators.board.rotors, simulator.truth.thrust)
     deviation = np.std(errors, axis=0)
     expected = [WORLD.battery.voltage_noise, WORLD.battery.current_noise]

@@ -116,8 +116,9 @@ def test_thrusts_and_tilts_act_and_are_measured(flight):
     np.testing.assert_allclose(flight.truth.thrust, HOVER, rtol=0.01)
     np.testing.assert_allclose(flight.truth.tilt, flight.tilt, atol=0.07)   # bent by the module
     np.testing.assert_allclose(flight.readings.position, flight.truth.tilt, atol=0.05)
-    assert flight.told['battery'].voltage == pytest.approx(flight.simulator.voltage, abs=0.1)
-    assert -flight.told['battery'].current == pytest.approx(flight.simulator.current, abs=1.0)
+    told, battery = flight.told['battery'], flight.simulator.battery
+    assert told.voltage == pytest.approx(battery.voltage, abs=0.1)
+    assert -told.current == pytest.approx(battery.current, abs=1.0)
     rpm = QUICK.rpm_at_1_newton * np.sqrt(ROBOT.hover_thrust)
     np.testing.assert_allclose(flight.told['rotors'].rpm, rpm, rtol=0.02)
 
