@@ -15,7 +15,6 @@ from scipy.stats import chi2 as chi_square
 
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.inference.blocks import block_masks, HeldOut
-from beetle_omni_ros.identify.inference.selection import grow, prune
 from beetle_omni_ros.identify.joint_log import JointLog
 from beetle_omni_ros.identify.joint_servos import GROUPS, Servos
 from beetle_omni_ros.identify.parameters import shipped
@@ -220,9 +219,8 @@ class Search:
         kept: list[Entry] = []
         point = self.servos.file_point.copy()
         for _ in range(MOST_PASSES):
-            accepted, point = grow(kept, point, self._best_entry, self._with_entry,
-                                   self.p.log_effects)
-            kept, point = prune(accepted, point, self._weakest_entry, self._refitted)
+            accepted, point = self._grow(kept, point)
+            kept, point = self._prune(accepted, point)
             noise = self._noise(point)
             if (noise.sigma > FIT.nearly * self.noise.sigma).all():
                 break
@@ -231,16 +229,27 @@ class Search:
         return self._found(kept, point, self._others if kept == accepted
                            else self._trials_with(kept, point))
 
+    def _grow(self, accepted, point):
+        """Add the best entry while one is acceptable."""
+        while (best := self._best_entry(accepted, point)) is not None \
+                and len(accepted) < self.p.log_effects:
+            free, point = self._free([best.entry]), best.point
+            outside = [e for e in accepted if (self._free([e]) & ~free).any()]
+            accepted = [*outside, best.entry]
+        return accepted, point
+
+    def _prune(self, accepted, point):
+        """Drop the weakest entry while one is superfluous."""
+        while accepted and (weakest := self._weakest_entry(accepted, point)) is not None:
+            accepted = [entry for entry in accepted if entry is not weakest]
+            point = self._refitted(accepted, point)
+        return accepted, point
+
     def _best_entry(self, accepted, point):
         self._others = self._trials_with(accepted, point)
         # The largest excess over the required gain, so that few parameters have an advantage.
         return max((t for t in self._others if t.significant and self._is_relevant(t)),
                    key=lambda t: t.gain - t.needed, default=None)
-
-    def _with_entry(self, accepted, best):
-        free = self._free([best.entry])
-        outside = [e for e in accepted if (self._free([e]) & ~free).any()]
-        return [*outside, best.entry], best.point
 
     def _trials_with(self, accepted, point):
         """A trial of each other entry beside the accepted ones."""
@@ -294,7 +303,7 @@ class Search:
                 if not (t.significant and t.confirmed and self._is_relevant(t))]
         return min(weak, key=lambda t: t.gain).entry if weak else None
 
-    def _refitted(self, accepted, point, _=None):
+    def _refitted(self, accepted, point):
         """The model with these entries only, all else as in the file."""
         start = self._restricted(accepted, point)
         return self._solve([start], [accepted]).points[0] if accepted else start

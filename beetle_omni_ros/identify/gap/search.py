@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
@@ -27,7 +26,6 @@ from beetle_omni_ros.identify.gap.gates import (
     significant_in_prior,
 )
 from beetle_omni_ros.identify.gap.proposals import Proposals
-from beetle_omni_ros.identify.inference.selection import grow, prune
 
 
 class Search:
@@ -57,9 +55,7 @@ class Search:
         start = self._fit_with_noise({}, [])
         found.base = dict(start[0].theta)
         found.low_excitation = excitation(problem) < self.p.least_liveliness
-        found.accepted, (state, cost) = grow(
-            [], start, partial(self._best_candidate, found), partial(self._with_candidate, found),
-            self.p.most_effects)
+        state, cost = self._grow(found, *start)
         state, cost = self._prune(found, state, cost)
         found.theta, found.state = dict(state.theta), state
         base_state, before = self._refit(State(found.base, problem.residual(found.base),
@@ -73,11 +69,22 @@ class Search:
         self._find_rivals(found, state, cost)
         return found
 
-    def _best_candidate(self, found, accepted, model):
+    def _grow(self, found, state, cost):
+        """Add the best trial while one is acceptable; return the fit with all of them."""
+        while (best := self._best_candidate(found, state, cost)) is not None \
+                and len(found.accepted) < self.p.most_effects:
+            if found.low_excitation and best.candidate.acts_on_body_only(self.problem.keys):
+                # With low excitation, a second body force would be closed-loop bias.
+                self.candidates = [c for c in self.candidates
+                                   if not c.acts_on_body_only(self.problem.keys)]
+            found.accepted.append(best)
+            state, cost = self._fit_with_noise(best.theta, [t.candidate for t in found.accepted])
+        return state, cost
+
+    def _best_candidate(self, found, state, cost):
         """The trial to accept beside the accepted ones, or None."""
-        self.progress(f'step {len(accepted) + 1}')
-        state, cost = model
-        floor, named = self._cost_of_all(state), [t.candidate for t in accepted]
+        self.progress(f'step {len(found.accepted) + 1}')
+        floor, named = self._cost_of_all(state), [t.candidate for t in found.accepted]
         trials = self._propose(state, cost, named)
         for trial in trials:
             found.trials[trial.candidate.label] = trial
@@ -86,14 +93,6 @@ class Search:
             best = self._select(more, cost, floor, named)
             found.trials |= {trial.candidate.label: trial for trial in more}
         return best
-
-    def _with_candidate(self, found, accepted, best):
-        if found.low_excitation and best.candidate.acts_on_body_only(self.problem.keys):
-            # With low excitation, a second body force would be closed-loop bias.
-            self.candidates = [c for c in self.candidates
-                               if not c.acts_on_body_only(self.problem.keys)]
-        accepted = [*accepted, best]
-        return accepted, self._fit_with_noise(best.theta, [t.candidate for t in accepted])
 
     def _free(self, accepted):
         return frozenset(name for c in accepted for name in c.keys)
@@ -225,18 +224,16 @@ class Search:
 
     def _prune(self, found, state, cost):
         """Drop entries that later steps or the noise after the last step made superfluous."""
-        found.accepted, model = prune(found.accepted, (state, cost), self._weakest,
-                                      self._without_candidate)
-        return model
-
-    def _weakest(self, accepted, model):
-        return self._first_impossible(accepted, model[0]) \
-            or self._first_superfluous(accepted, *model)
-
-    def _without_candidate(self, accepted, model, dropped):
-        theta = {n: v for n, v in model[0].theta.items()
-                 if n not in dropped.candidate.keys or n in self.problem.priors}
-        return self._fit_with_noise(theta, [t.candidate for t in accepted])
+        while found.accepted:
+            dropped = self._first_impossible(found.accepted, state) \
+                or self._first_superfluous(found.accepted, state, cost)
+            if dropped is None:
+                break
+            found.accepted = [trial for trial in found.accepted if trial is not dropped]
+            theta = {n: v for n, v in state.theta.items()
+                     if n not in dropped.candidate.keys or n in self.problem.priors}
+            state, cost = self._fit_with_noise(theta, [t.candidate for t in found.accepted])
+        return state, cost
 
     def _first_impossible(self, accepted, state):
         """An accepted entry that is physically impossible in the joint fit, or None."""
