@@ -100,6 +100,16 @@ def _split_number(file):
     return (int(number) if number.isdigit() else -1, file.name)
 
 
+def names_of(runs: list[Path]) -> list[str]:
+    """Shortest endings of the paths that are all different."""
+    paths = [run.absolute().parts for run in runs]
+    for depth in range(1, max((len(parts) for parts in paths), default=1) + 1):
+        names = ['/'.join(parts[-depth:]) for parts in paths]
+        if len(set(names)) == len(names):
+            break
+    return names
+
+
 def read_messages(path: str | Path, warnings: list[str] | None = None) -> Iterator[RawMessage]:
     """
     Yield the messages of a bag in the order of recording, up to a truncation.

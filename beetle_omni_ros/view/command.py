@@ -7,6 +7,7 @@ from rich.console import Console
 
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.urdf import Model
+from beetle_omni_ros.runs.bag_files import names_of
 from beetle_omni_ros.view.recording import Recording
 
 FIRST_ROWS = 60.0       # [s] timeout for the first rows of a run
@@ -14,12 +15,10 @@ FIRST_ROWS = 60.0       # [s] timeout for the first rows of a run
 
 def names(paths: list[Path]) -> list[str]:
     """Return distinct names of runs: their folders, if necessary with the folders above."""
-    parts = [path.absolute().parts for path in paths]
-    for depth in range(1, max(map(len, parts)) + 1):
-        found = ['/'.join(part[-depth:]) for part in parts]
-        if len(set(found)) == len(found):
-            return found
-    return [f'{found[k]} ({k + 1})' for k in range(len(found))]
+    found = names_of(paths)
+    if len(set(found)) == len(found):
+        return found
+    return [f'{name} ({k + 1})' for k, name in enumerate(found)]
 
 
 def run_view(runs: list[Path], *, robot: Path | None = None, urdf: Path | None = None,

@@ -13,7 +13,6 @@ from beetle_omni_ros.identify.gap.ingest import (
     check_apart,
     check_flights,
     load_flight,
-    names_of,
     UnusableFlight,
 )
 from beetle_omni_ros.identify.gap.joint_changes import change_grids
@@ -25,6 +24,7 @@ from beetle_omni_ros.identify.gap.workers import Workers
 from beetle_omni_ros.identify.robot_file import check_outputs
 from beetle_omni_ros.pages.table import print_grids
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.runs.bag_files import names_of
 from beetle_omni_ros.runs.json_file import write_json, write_text
 
 BAD_DATA = 3        # exit status

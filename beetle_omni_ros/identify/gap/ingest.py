@@ -236,16 +236,6 @@ def check_apart(runs: list[Path]) -> None:
         known[size, digest] = run
 
 
-def names_of(runs: list[Path]) -> list[str]:
-    """Shortest endings of the paths that are all different."""
-    paths = [run.absolute().parts for run in runs]
-    for depth in range(1, max((len(parts) for parts in paths), default=1) + 1):
-        names = ['/'.join(parts[-depth:]) for parts in paths]
-        if len(set(names)) == len(names):
-            break
-    return names
-
-
 def check_flights(runs: list[Path], flights: list[Flight], same: float) -> None:
     """
     Refuse one flight in two different files: cut, converted or recorded twice.
