@@ -11,12 +11,7 @@ from beetle_omni_ros.pages.figures import panels, WIDTH
 from beetle_omni_ros.runs import lemniscate as curve
 from beetle_omni_ros.runs import published
 from beetle_omni_ros.runs.body import roll_pitch_yaw
-from beetle_omni_ros.runs.metrics import (
-    L_WINDOW,
-    REACHED_ORIENTATION,
-    REACHED_POSITION,
-    U_WINDOW,
-)
+from beetle_omni_ros.runs.metrics import L_WINDOW, REACHED_ORIENTATION, REACHED_POSITION, U_WINDOW
 from beetle_omni_ros.runs.tasks import make_task, POSE_DURATION, WAYPOINTS
 
 FLOOR = {'position': 2e-4, 'orientation': 1e-2}  # of logarithmic errors [m], [deg]

@@ -9,12 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beetle_omni_ros.identify.inference.least_squares import (
-    differences,
-    minimise,
-    soft_l1,
-    Steps,
-)
+from beetle_omni_ros.identify.inference.least_squares import differences, minimise, soft_l1, Steps
 from beetle_omni_ros.identify.inference.prior import UNKNOWN
 from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.rotor_log import Plateau, RotorLog

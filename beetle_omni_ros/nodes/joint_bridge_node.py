@@ -12,12 +12,7 @@ from beetle_omni_ros.drivers.servo_loop import Goal, ServoLoop
 from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
 from beetle_omni_ros.nodes import health
 from beetle_omni_ros.nodes.command_source import CommandSource
-from beetle_omni_ros.nodes.lifecycle_node import (
-    ACTIVE,
-    AUTOSTART,
-    INACTIVE,
-    LifecycleFlightNode,
-)
+from beetle_omni_ros.nodes.lifecycle_node import ACTIVE, AUTOSTART, INACTIVE, LifecycleFlightNode
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters
 from beetle_omni_ros.robot.readings import JointReading
 from beetle_omni_ros.robot.schema import parameter

@@ -8,12 +8,7 @@ from beetle_omni_ros.pages.figures import INK, PARTS
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.yaml_file import shortened
 from beetle_omni_ros.runs.body import EDGE, errors, estimate_errors, hold, inside, roll_pitch_yaw
-from beetle_omni_ros.runs.metrics import (
-    L_WINDOW,
-    REACHED_ORIENTATION,
-    REACHED_POSITION,
-    U_WINDOW,
-)
+from beetle_omni_ros.runs.metrics import L_WINDOW, REACHED_ORIENTATION, REACHED_POSITION, U_WINDOW
 from beetle_omni_ros.runs.report_runs import error_series, Run, target_poses, TimeAxis
 from beetle_omni_ros.runs.tasks import POSE_DURATION
 

@@ -10,12 +10,7 @@ import pytest
 from beetle_omni_ros.identify.gap.candidates import Candidate, Trial
 from beetle_omni_ros.identify.gap.fit import Problem, State
 from beetle_omni_ros.identify.gap.gates import at_bound, confirmed, cross_validate
-from beetle_omni_ros.identify.gap.keys import (
-    all_keys,
-    THRUST_BUS,
-    TILT_BUS,
-    tolerances,
-)
+from beetle_omni_ros.identify.gap.keys import all_keys, THRUST_BUS, TILT_BUS, tolerances
 from beetle_omni_ros.identify.gap.search import Search
 from beetle_omni_ros.identify.inference.prior import Prior
 

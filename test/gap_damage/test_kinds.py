@@ -2,15 +2,7 @@
 
 from gap_damage_kinds.catalogue import KINDS
 from gap_damage_kinds.kind import HARMLESS
-from gap_damage_kinds.recording import (
-    BATTERY,
-    COMMAND,
-    IMU,
-    JOINTS,
-    MEASURED,
-    MOCAP,
-    Recording,
-)
+from gap_damage_kinds.recording import BATTERY, COMMAND, IMU, JOINTS, MEASURED, MOCAP, Recording
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -6,11 +6,7 @@ import pytest
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
 from beetle_omni_ros.robot.allocation import Allocation, Allocator
-from beetle_omni_ros.robot.degraded_allocation import (
-    allocator,
-    DegradedAllocator,
-    LocalWeights,
-)
+from beetle_omni_ros.robot.degraded_allocation import allocator, DegradedAllocator, LocalWeights
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 ROBOT = RobotParameters.load()

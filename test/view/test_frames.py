@@ -10,16 +10,7 @@ from beetle_omni_ros.runs.bag import BagError, BagWriter, read_bag
 from beetle_omni_ros.runs.tasks import make_task
 from beetle_omni_ros.view import plots
 from beetle_omni_ros.view.command import names
-from beetle_omni_ros.view.frames import (
-    COLUMNS,
-    known,
-    pose,
-    Rows,
-    Sampler,
-    state_at,
-    T,
-    WIDTH,
-)
+from beetle_omni_ros.view.frames import COLUMNS, known, pose, Rows, Sampler, state_at, T, WIDTH
 from beetle_omni_ros.view.recording import parts, Recording, STEP
 
 UP = np.array([0.0, 0, 0, 1])

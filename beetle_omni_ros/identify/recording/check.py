@@ -3,10 +3,7 @@
 import numpy as np
 
 from beetle_omni_ros.identify.gap.bags import NEEDED, Recording
-from beetle_omni_ros.identify.recording.actuator_conventions import (
-    joint_damages,
-    thrust_damages,
-)
+from beetle_omni_ros.identify.recording.actuator_conventions import joint_damages, thrust_damages
 from beetle_omni_ros.identify.recording.clocks import clock_damages
 from beetle_omni_ros.identify.recording.conventions import body_damages
 from beetle_omni_ros.identify.recording.damage import Damage
