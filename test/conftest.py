@@ -34,16 +34,25 @@ RERUNS = 1
 STALL = 0.05        # s; the limits of silence in these tests are 50 to 80 ms
 MARKS = {'alone': re.compile(r'\bmark\.alone\b'),      # part of the suite -> in a file of it
          'real_time': re.compile(r'\bmark\.(real_time|alone)\b|\bros_domain\b')}
+# Files of tests that wait for other processes, with timeouts; all others only compute.
+PROCESSES = re.compile(r'/(nodes|tutorials|view|pages)/test_\w+\.py$'
+                       r'|/test_(start|stillness|workers)\.py$')
+LANES = 'processes', 'computing'
 BEAT, BEGIN = pytest.StashKey(), pytest.StashKey[float]()
 
 
 def pytest_ignore_collect(collection_path, config):
     """Do not load files without a test of the requested part, which saves seconds."""
     part = config.getoption('markexpr').partition(' ')[0]
-    if part in MARKS and collection_path.match('test_*.py') \
-            and not _has_mark(collection_path, part):
+    if collection_path.match('test_*.py') and (
+            part in MARKS and not _has_mark(collection_path, part)
+            or part in LANES and part != _lane(collection_path)):
         return True
     return None
+
+
+def _lane(path):
+    return LANES[PROCESSES.search(Path(path).as_posix()) is None]
 
 
 def _has_mark(path, part):
@@ -63,6 +72,8 @@ def pytest_collection_modifyitems(config, items):
             raise pytest.UsageError(f'{path}: has tests in real time: name the mark in the file')
     for item in real_time:
         item.add_marker(pytest.mark.real_time)
+    for item in set(items).difference(real_time):
+        item.add_marker(_lane(item.path))
     if config.getoption('markexpr').startswith('real_time'):
         # First devices, which mostly wait; then processes of nodes, which compute.
         items.sort(key=lambda item: item.path.parent.name == 'nodes')
@@ -71,7 +82,7 @@ def pytest_collection_modifyitems(config, items):
     # A repetition beside other tests is of little use in real time; .ci/test repeats alone.
     for item in [*waiting, *(() if WORKER else real_time)]:
         item.add_marker(pytest.mark.flaky(reruns=RERUNS))
-    if real_time and not WORKER and config.getoption('markexpr') != 'not real_time' \
+    if real_time and not WORKER and not config.getoption('markexpr').endswith('not real_time') \
             and not config.getoption('numprocesses', None):
         from stillness import Heartbeat
         config.stash[BEAT] = Heartbeat()
