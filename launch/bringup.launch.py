@@ -32,8 +32,8 @@ ARGUMENTS = {
                   'else configure'),
     'servo_bus_file': ('', None, 'parameters of joint_bridge_node; empty: the shipped ones'),
     'motor_board_file': ('', None, 'parameters of rotor_bridge_node; empty: the shipped ones'),
-    'controller': ('nmpc', None, 'the active controller: a registered name, or '
-                                 'package.module:Class'),
+    'controller': ('nmpc', None, 'the active controller: a registered name, '
+                                 'FILE.py:Class or package.module:Class'),
     'standby': ('true', ['true', 'false'], 'the controllers that stand by run too, to be '
                                            'selected in flight; a policy only if it fits '
                                            'the robot'),

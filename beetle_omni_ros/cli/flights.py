@@ -335,7 +335,7 @@ def controllers(json_path: JsonOption = None):
     """
     List the registered controllers.
 
-    Others fly as package.module:Class or path/to/file.py:Class, see docs/how-to/own_controller.md.
+    Others fly as FILE.py:Class or package.module:Class, see docs/how-to/own_controller.md.
     Example: beetle_omni controllers --json controllers.json
     """
     from rich.console import Console

@@ -13,7 +13,7 @@ UNUSABLE, FAILED, INTERRUPTED = 2, 1, 130
 CONDITIONS = ('nominal', 'published')
 
 # Without controllers of other packages, because --help does not search installed packages.
-KNOWN = f"{', '.join(registry.SHIPPED)}, any registered one, or package.module:Class"
+KNOWN = f"{', '.join(registry.SHIPPED)}, any registered one, {registry.CLASS}"
 
 ControllerOption = Annotated[str, typer.Option(
     '--controller', metavar='NAME', help=f'The active controller: {KNOWN}.')]

@@ -25,6 +25,7 @@ if TYPE_CHECKING:       # imports CasADi, which a list of names does not need
 PERIOD = 0.01               # [s] of a controller whose class has no period
 LONGEST_PERIOD = 1.0        # [s]
 METHODS = {'step': ('state', 'target'), 'reset': ()}     # and their arguments
+CLASS = 'FILE.py:Class or package.module:Class'    # reference to an unregistered controller
 NAME = re.compile(r'[a-z][a-z0-9_]*')
 # Names whose `<name>_node` or `<name>/command` exists, and words of results and states.
 RESERVED = ('controller', 'ekf', 'joint_bridge', 'meta', 'none', 'operator', 'recorder',
@@ -322,14 +323,16 @@ def loaded(reference: str, spec: str) -> Any:
 
     """
     place, _, name = reference.rpartition(':')
-    if not place or not name.isidentifier():
-        raise ParameterError(f"controller '{spec}': expected package.module:Class or "
-                             'path/to/file.py:Class')
+    if reference.endswith('.py'):       # a file without a class
+        place, name = reference, ''
+    elif not place or not name.isidentifier():
+        raise ParameterError(f"controller '{spec}': expected {CLASS}")
     module = _module(place, spec)
-    if not hasattr(module, name):
+    if not name or not hasattr(module, name):
         there = [key for key, value in vars(module).items() if inspect.isclass(value)
                  and value.__module__ == module.__name__]
-        raise ParameterError(f"controller '{spec}': no '{name}' in {place}; its classes: "
+        problem = f"no '{name}' in {place}" if name else f'expected {place}:Class'
+        raise ParameterError(f"controller '{spec}': {problem}; its classes: "
                              f"{', '.join(there) or 'none'}")
     return getattr(module, name)
 

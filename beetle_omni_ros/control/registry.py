@@ -18,6 +18,7 @@ from beetle_omni_ros.control import shipped
 from beetle_omni_ros.control.base import Controller
 from beetle_omni_ros.control.entry import (
     absolute,
+    CLASS,
     ControllerEntry,
     ControllerOptions,
     entry_of,
@@ -80,14 +81,14 @@ def find(reference: str) -> ControllerEntry:
     """
     if reference in SHIPPED:
         return SHIPPED[reference]
-    if ':' in reference:
+    if ':' in reference or reference.endswith('.py'):
         return _named(absolute(reference))
     if reference in _ADDED:
         return _ADDED[reference]
     if reference in _points():
         return _registered(reference)
     raise ParameterError(f"controller '{reference}': expected one of {', '.join(names())}, or "
-                         'package.module:Class')
+                         + CLASS)
 
 
 def find_all(references: Iterable[str]) -> list[ControllerEntry]:
@@ -165,5 +166,5 @@ def owner(option: str) -> str:
     return next(name for name, entry in SHIPPED.items() if entry.option == option)
 
 
-__all__ = ['add', 'compared', 'ControllerEntry', 'ControllerOptions', 'DEFAULT', 'find',
+__all__ = ['add', 'CLASS', 'compared', 'ControllerEntry', 'ControllerOptions', 'DEFAULT', 'find',
            'find_all', 'GROUP', 'make', 'names', 'owner', 'pilot', 'SHIPPED', 'standing_by']

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
-from time import time
+from time import monotonic, time
 from types import MappingProxyType
 
 from rich.console import Console
@@ -124,11 +124,15 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
             name = entry.name
             bar = bars.add_task(f'{name}: {task}, {conditions}', total=1.0)
             folder = bag / name if bag and len(controllers) > 1 else bag
+            begin = monotonic()
             log = fly(entry.reference, flown, robot=nominal, plant=true, conditions=conditions,
                       seed=seed, options=options, bag=folder, compression=compression,
                       meta=meta, faults=injected,
                       progress=lambda part, bar=bar: bars.update(bar, completed=part))
             results[name] = metrics_of_runs.metrics(log, flown)
+            if not console.is_terminal:     # which shows no progress bar
+                console.print(f'{name}: {task} flown in {monotonic() - begin:.0f} s',
+                              highlight=False)
             if log.meta['ended']:
                 console.print(f'{name}: the flight ended early, {log.meta["ended"]}',
                               style='yellow', highlight=False)

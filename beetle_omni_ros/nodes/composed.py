@@ -1,7 +1,7 @@
 """
 Several nodes in one process: ``python -m beetle_omni_ros.start composed NODE...``.
 
-NODE is an executable, a registered controller name, or ``package.module:Class`` of a controller.
+NODE is an executable, a registered controller name, or the reference of a controller's class.
 """
 
 import sys
@@ -19,7 +19,7 @@ def main(args=None):
     argv = list(sys.argv if args is None else args)
     names = runner.own_arguments(argv, COMMAND)
     usage = ('usage: composed NODE... [--discovery RANGE] [--ros-args -p NODE:KEY:=VALUE ...]; '
-             f"NODE: {', '.join(NODES)}, a controller's name, or package.module:Class")
+             f"NODE: {', '.join(NODES)}, a controller's name, {registry.CLASS}")
     if names and names[0] in ('-h', '--help'):
         print(usage)
         sys.exit(runner.OK)

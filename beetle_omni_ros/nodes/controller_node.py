@@ -224,4 +224,4 @@ def _requested_controller() -> str:
     if name != NAME:
         return name.removesuffix('_node')
     raise ParameterError("key 'controller': missing; expected a registered controller "
-                         f"({', '.join(registry.names())}) or package.module:Class")
+                         f"({', '.join(registry.names())}) or {registry.CLASS}")

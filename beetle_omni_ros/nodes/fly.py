@@ -234,7 +234,7 @@ def _fly(graph: Graph, controller: str, task: Task, meta: dict, console: Console
                 status = runner.FAILED
             flight.land()
         meta['graph'] = flight.measured
-        operator.report('fly: run', 'what is flown_task', {k: v for k, v in meta.items()
+        operator.report('fly: run', 'what is flown', {k: v for k, v in meta.items()
                                                       if not isinstance(v, dict)})
         operator.report('fly: graph', 'CPU of all nodes, latency of commands', flight.measured)
         operator.spin(0.2)
@@ -266,8 +266,9 @@ def _report(bag, controller, task, meta, json_path, console) -> int:
 def _print_measured(meta, console):
     measured = meta.get('graph', {})
     if 'cpu_percent' in measured:
-        console.print(f"graph: {'composed' if meta['composed'] else 'separate processes'}, CPU "
-                      f"{measured['cpu_percent']:.0f} % of one core while the task was flown_task"
+        nodes = 'composed (all nodes in one process)' if meta['composed'] else 'separate processes'
+        console.print(f"graph: {nodes}, CPU {measured['cpu_percent']:.0f} % of one core while the "
+                      'task was flown'
                       + (f", of it {measured['bridges_cpu_percent']:.0f} % in the bridges"
                          if 'bridges_cpu_percent' in measured else ''))
     if 'real_time_factor' in measured:

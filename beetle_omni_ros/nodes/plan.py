@@ -45,7 +45,7 @@ class GraphOptions:
     Options of a graph.
 
     Attributes:
-        controller: active controller: a name, or ``package.module:Class``.
+        controller: active controller: a name, or a reference to a class.
         standby: whether the standby controllers run too, so that they can be selected in flight.
         policy: policy file of the controller that has the option `--policy`; '': the shipped one.
         allow_other_robot: whether a policy trained for other robot parameters may fly.

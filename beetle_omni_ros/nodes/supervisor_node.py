@@ -30,7 +30,7 @@ class SupervisorNodeParameters(SupervisorParameters):
 
     controllers: NAMES = parameter(
         tuple(registry.standing_by()), read_only=True,
-        doc='controllers that may be active: registered names, or package.module:Class')
+        doc='controllers that may be active: registered names, or FILE.py:Class')
     robot_file: str = parameter('', doc='robot file; empty: the shipped one', read_only=True)
     supervisor_file: str = parameter(
         '', doc='supervisor file; empty: the shipped params/supervisor.yaml', read_only=True)

@@ -157,8 +157,8 @@ def test_parameters_options_and_attributes_of_a_class_are_used(module, tmp_path)
 
 
 @pytest.mark.parametrize('spec, message', [
-    ('nmpx', 'expected one of nmpc, rl, .*package.module:Class'),
-    ('{}:', 'expected package.module:Class'),
+    ('nmpx', 'expected one of nmpc, rl, .*FILE.py:Class or package.module:Class'),
+    ('{}:', 'expected FILE.py:Class or package.module:Class'),
     ('{}:Absent', "no 'Absent' in .*its classes: .*MyController"),
     ('{}:number', 'a int, expected a class'),
     ('{}:Needs', r"cannot be built from \(robot, gain\).*'gain'"),
@@ -171,7 +171,8 @@ def test_parameters_options_and_attributes_of_a_class_are_used(module, tmp_path)
     ('{}:Taken', "'ekf': not usable as a name"),
     ('{}_absent:My', "no module '.*_absent'"),
     ('{}_absent.py:My', 'no such file'),
-    ('absent.{}:My', "no module 'absent'")])
+    ('{}.py', 'expected .*[.]py:Class; its classes: MyController, .*Tuned'),
+    ('{}_absent.py', 'no such file'), ('absent.{}:My', "no module 'absent'")])
 def test_an_unusable_class_is_refused_in_one_line(module, spec, message):
     with pytest.raises(ParameterError, match=message) as caught:
         registry.make(spec.format(module), ROBOT)

@@ -43,6 +43,15 @@ def flown(poses, tmp_path_factory):
                     json_path=folder / 'result.json'), folder
 
 
+def test_a_finished_flight_is_one_line_if_the_output_is_no_terminal(poses, monkeypatch):
+    monkeypatch.setattr(loop.FlightLoop, 'fly', lambda *_: True)    # any flight
+    for terminal in (False, True):
+        text = io.StringIO()
+        command.run_evaluate(controllers=['hover'], task=str(poses), console=Console(
+            file=text, width=200, force_terminal=terminal))
+        assert (f'hover: {poses} flown in 0 s' in text.getvalue()) != terminal
+
+
 def without_times(results):
     return {name: {key: value for key, value in result.items() if key != 'compute_ms'}
             for name, result in results.items()}
