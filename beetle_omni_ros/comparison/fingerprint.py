@@ -22,16 +22,17 @@ LENGTH = 16  # hexadecimal digits kept
 
 
 @cache
-def code_fingerprint(policy: bool = True) -> str:
+def code_fingerprint(policy: bool = True, beside: tuple[str, ...] = ()) -> str:
     """
     Digest of code, parameters and libraries of flights and their metrics.
 
     Args:
         policy: whether to include the code and parameters that only policies use.
+        beside: further folders of the package.
 
     """
     package = Path(__file__).resolve().parents[1]
-    files = [path for room in ROOMS for path in (package / room).rglob('*.*')
+    files = [path for room in (*ROOMS, *beside) for path in (package / room).rglob('*.*')
              if path.suffix in ('.py', '.c', '.h')]
     files += [package / 'comparison' / 'flight.py']
     files += [path for path in share_path('params').glob('*.yaml') if path.name not in NOT_FLOWN]

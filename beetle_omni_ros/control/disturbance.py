@@ -127,17 +127,20 @@ class DisturbanceEstimator:
                                state.angular_velocity, state.tilt, state.tilt_velocity, thrust])
 
     def _measured(self, state, predicted):
-        present = predicted.copy()
-        present[:13] = np.concatenate([state.position, state.velocity, state.quaternion,
-                                       state.angular_velocity])
-        return present
+        return np.concatenate([state.position, state.velocity, state.quaternion,
+                               state.angular_velocity, predicted[13:]])
 
     def _flown(self, state, start, duration):
         """(25,) state after a time span, in which commands may change."""
         end = start + duration
-        changes = [at for command in self._commands
-                   if start + SHORT < (at := command.stamp + self._delay) < end - SHORT]
-        for until in (*changes, end):
+        changes = [end]
+        for command in reversed(self._commands):    # newest first
+            at = command.stamp + self._delay
+            if at <= start + SHORT:
+                break
+            if at < end - SHORT:
+                changes.append(at)
+        for until in reversed(changes):
             state = self._advance(state, self._acting(self._input(start, until - start)),
                                   self.disturbance, until - start)
             start = until

@@ -133,8 +133,7 @@ class NmpcController:
             return self._command(state.stamp)
         state = redated(state, self._robot)
         full = self._estimator.update(state)
-        x0 = full[:13]
-        x0 = np.concatenate([x0, full[model.TILT], full[model.THRUST]])[:self._state_size]
+        x0 = np.concatenate([full[:13], full[model.TILT], full[model.THRUST]])[:self._state_size]
         start = state.stamp + self._parameters.model.command_delay
         disturbance = self._estimator.disturbance
         references = self._planner.plan(target, start, full[model.TILT], disturbance)
@@ -197,6 +196,6 @@ def with_delays(robot: RobotParameters, parameters: NmpcParameters) -> NmpcParam
 
 
 def _finite(state):
-    return all(np.isfinite(part).all() for part in (
+    return bool(np.isfinite(np.concatenate([
         state.position, state.velocity, state.quaternion, state.angular_velocity, state.tilt,
-        state.tilt_velocity))
+        state.tilt_velocity])).all())

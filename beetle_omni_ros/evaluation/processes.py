@@ -64,7 +64,7 @@ class Processes:
 
     def send(self, method: str, *message) -> None:
         """Call one of the supervisor's ``on_`` methods, or queue the message."""
-        if self.supervisor_waits:
+        if not self._schedule.empty and self.supervisor_waits:
             self._waiting.setdefault(method, deque(maxlen=QUEUE)).append(message)
         else:
             getattr(self._supervisor, method)(*message)
@@ -101,6 +101,8 @@ class Processes:
     @property
     def bridges(self) -> dict[str, str]:
         """Bridge -> its reported state, if that has changed."""
+        if self._schedule.empty:
+            return {}
         states = {name: text for effect in self._schedule.active
                   for name, text in effect.bridges.items()}
         new = {name: text for name, text in states.items() if self._reported.get(name) != text}

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from dataclasses import asdict
 import json
 from math import ceil
 from pathlib import Path
@@ -12,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from beetle_omni_ros import __version__
+from beetle_omni_ros.comparison.fingerprint import code_fingerprint, file_digest
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import guidance_of
 from beetle_omni_ros.faults import campaign, page
@@ -62,7 +64,7 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
     meta = {'command': _described(faults, only, starts, seeds, seed, conditions, controller,
                                   landings, without_mocap, healthy, bool(through_ros)),
             'version': __version__, 'guidance': guidance}
-    fly = _Flyer(console, jobs, output)
+    fly = _Flyer(console, jobs, output, file_digest(faults) if faults else '')
     results: dict = {'meta': meta}
     if landings:
         flown = fly('landings', fly_landing, [
@@ -135,27 +137,65 @@ def _described(faults, only, starts, seeds, seed, conditions, controller, landin
 
 
 class _Flyer:
-    """Flies trials with a progress bar; each finished result is stored at once."""
+    """
+    Flies trials with a progress bar; each finished result is stored at once.
 
-    def __init__(self, console, jobs, output):
-        self._console, self._jobs, self._output = console, jobs, output
+    Stored results of the same code, parameters and list are not flown again, so that an
+    interrupted campaign continues, and further seeds extend it.
+    """
+
+    def __init__(self, console, jobs, output, listed):
+        """``listed``: digest of an own list of faults, '' for the shipped one."""
+        self._console, self._jobs, self._listed = console, jobs, listed
+        self._file = output / 'flights.jsonl' if output else None
 
     def __call__(self, title: str, function: Callable, trials: list, *arguments) -> list[dict]:
-        """Fly; returns results in the order of completion."""
+        """Fly; returns the stored results, then the new ones in the order of completion."""
         columns = (TextColumn('{task.description}'), BarColumn(), MofNCompleteColumn(),
                    TimeRemainingColumn())
-        results = []
         with ExitStack() as stack:
+            stored, kind, results = None, dict[str, str](), list[dict]()
+            if self._file:
+                kind = {'code': code_fingerprint(beside=('faults',)), 'list': self._listed,
+                        'flown': title + ' with bags' * any(
+                            isinstance(argument, Path) for argument in arguments)}
+                lines, results = self._stored(kind, trials)
+                stored = stack.enter_context(open(self._file, 'w', encoding='utf-8'))
+                print(*lines, sep='', end='', file=stored, flush=True)
+            if results:
+                self._console.print(f'{len(results)} of {len(trials)} {title} are in '
+                                    f'{self._file} already', markup=False, highlight=False)
+            done = [_trial(result, trials[0]) for result in results]
+            left = [trial for trial in trials if asdict(trial) not in done]
             bars = stack.enter_context(Progress(*columns, console=self._console, transient=True))
-            bar = bars.add_task(title, total=len(trials))
-            kept = stack.enter_context(open(self._output / 'flights.jsonl', 'w')) \
-                if self._output else None
-            for result in campaign.fly_all(function, trials, *arguments, jobs=self._jobs):
+            bar = bars.add_task(title, total=len(trials), completed=len(results))
+            for result in campaign.fly_all(function, left, *arguments, jobs=self._jobs):
                 results.append(result)
                 bars.advance(bar)
-                if kept:
-                    print(json.dumps(result), file=kept, flush=True)
+                if stored:
+                    print(json.dumps({**kind, 'result': result}), file=stored, flush=True)
         return results
+
+    def _stored(self, kind, trials):
+        """Stored lines of the same code and list, and the results of ``trials`` among them."""
+        lines, results = [], []
+        wanted = [asdict(trial) for trial in trials]
+        for line in _text(self._file).splitlines(keepends=True) if self._file.exists() else ():
+            try:
+                entry = json.loads(line)
+                result, own = entry['result'], {key: entry[key] for key in kind}
+            except (ValueError, KeyError, TypeError):
+                continue        # the rest of a line that was interrupted
+            if (own['code'], own['list']) == (kind['code'], kind['list']):
+                lines.append(line)
+                if own == kind and _trial(result, trials[0]) in wanted:
+                    results.append(result)
+        return lines, results
+
+
+def _trial(result, like):
+    """Fields of the trial that gave a result, a trial as ``like``."""
+    return {name: result.get(name) for name in asdict(like)}
 
 
 def _write(results, output, json_path, docs):

@@ -102,17 +102,20 @@ class LogRecorder(Recorder):
                 self._take(entry)
 
     def _add(self, series, rows, value, received):
-        if np.ndim(value.stamp):
+        stamp = value.stamp
+        if isinstance(stamp, np.ndarray) and stamp.ndim:
             self._add_all(series, rows, value, received)
             return
-        row = [value.stamp]
+        row = [stamp]
         for channel, width in SERIES[series].items():
             part = getattr(value, channel) if channel != 'received' else \
-                value.stamp if received is None else received
-            if width:
-                row.extend([np.nan] * width if part is None else part)
-            else:
+                stamp if received is None else received
+            if not width:
                 row.append(part)
+            elif isinstance(part, np.ndarray):
+                row += part.tolist()    # floats are added faster than numpy's numbers
+            else:
+                row += [np.nan] * width if part is None else part
         if len(row) != WIDTHS[series]:
             raise ValueError(f'{series}: expected {WIDTHS[series]} values, found {len(row)}')
         rows.extend(row)

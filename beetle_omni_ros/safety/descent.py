@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import replace
-from math import sqrt
+from math import isfinite, sqrt
 
 import numpy as np
 
@@ -28,6 +28,7 @@ KEPT_BIASES, BIAS_EVERY = 4, 0.5    # [s] biases of up to 2 s ago, before an est
 KEPT_POSES = 24        # stored states for late MoCap frames: 0.12 s at 200 Hz
 LONGEST_STEP = 0.1     # [s] longest integrated gap in the samples
 ABSURD = 1e4           # [m, m/s^2, rad/s] beyond any sensor of this robot
+Timed = tuple[float, np.ndarray, np.ndarray]    # stamp [s] and two vectors
 LARGEST_BIASES = (1.0, 0.2)   # [m/s^2], [rad/s] largest learnt biases of an IMU
 
 
@@ -72,43 +73,55 @@ class BackupEstimator:
     def on_imu(self, stamp: float, specific_force: np.ndarray,
                angular_velocity: np.ndarray) -> bool:
         """Store one raw sample; False when it is not finite or not newer than the last."""
-        force, rate = _vector(specific_force, 3), _vector(angular_velocity, 3)
-        if force is None or rate is None or not np.isfinite(stamp) \
-                or (self._samples and stamp <= self._samples[-1][0]):
-            return False
-        self._samples.append((stamp, force, rate))
-        if self.running:
-            self._use(stamp, force, rate)
-        return True
+        sample = checked_sample(stamp, specific_force, angular_velocity)
+        return sample is not None and self.add(sample)
 
-    def is_pose(self, stamp: float, position: np.ndarray, quaternion: np.ndarray) -> bool:
-        """Whether it is a valid pose, and newer than the last."""
-        position, quaternion = _vector(position, 3), _vector(quaternion, 4)
-        return position is not None and quaternion is not None and bool(np.isfinite(stamp)) \
-            and stamp > self._mocap_stamp and abs(quaternion @ quaternion - 1) <= 0.02
+    def add(self, sample: Timed) -> bool:
+        """Store a sample of :func:`checked_sample`; False when it is not newer than the last."""
+        if self._samples and sample[0] <= self._samples[-1][0]:
+            return False
+        self._samples.append(sample)
+        if self.running:
+            self._use(*sample)
+        return True
 
     def on_mocap(self, stamp: float, position: np.ndarray, quaternion: np.ndarray) -> bool:
         """Use one pose, captured at ``stamp``; False when it is not usable."""
-        if not self.is_pose(stamp, position, quaternion):
-            return False
-        position, quaternion = _vector(position, 3), _vector(quaternion, 4)
-        dt = min(stamp - self._mocap_stamp, LONGEST_STEP)
-        self._mocap_stamp = stamp
-        if self.running and self._past:
-            self._correct(stamp, position, rotations.normalized(quaternion), dt)
-        return True
+        pose = self.checked_pose(stamp, position, quaternion)
+        if pose is not None:
+            self.use(pose)
+        return pose is not None
 
-    def remember(self, stamp: float, position: np.ndarray, quaternion: np.ndarray) -> None:
-        """Store a pose (see :meth:`is_pose`) for a start without an estimate."""
-        if not self._poses or stamp > self._poses[-1][0]:
-            self._poses.append((stamp, _vector(position, 3),
-                                rotations.normalized(_vector(quaternion, 4))))
+    def checked_pose(self, stamp: float, position: np.ndarray,
+                     quaternion: np.ndarray) -> Timed | None:
+        """Stamp, position and unit quaternion of a valid pose newer than the last, else None."""
+        place, attitude = vector(position, 3), vector(quaternion, 4)
+        if place is None or attitude is None or not isfinite(stamp) \
+                or stamp <= self._mocap_stamp or not abs(attitude @ attitude - 1) <= 0.02:
+            return None
+        return stamp, place, rotations.normalized(attitude)
+
+    def use(self, pose: Timed) -> None:
+        """Use a pose of :meth:`checked_pose`."""
+        dt = min(pose[0] - self._mocap_stamp, LONGEST_STEP)
+        self._mocap_stamp = pose[0]
+        if self.running and self._past:
+            self._correct(*pose, dt)
+
+    def remember(self, pose: Timed) -> None:
+        """Store a pose of :meth:`checked_pose` for a start without an estimate."""
+        if not self._poses or pose[0] > self._poses[-1][0]:
+            self._poses.append(pose)
 
     def learn(self, state: State) -> None:
         """Update the biases from a valid estimate and the IMU sample of the same time."""
         before, self._learnt = self._learnt, state
-        sample = next((s for s in reversed(self._samples) if s[0] <= state.stamp + 1e-6), None)
-        if before is None or sample is None:
+        for sample in reversed(self._samples):
+            if sample[0] <= state.stamp + 1e-6:
+                break
+        else:
+            return
+        if before is None:
             return
         dt = state.stamp - before.stamp
         if not 0 < dt <= LONGEST_STEP or state.stamp - sample[0] > LONGEST_STEP:
@@ -265,8 +278,15 @@ class BackupEstimator:
                             for t, q, a in self._past), maxlen=KEPT_POSES)
 
 
-def _vector(value, size):
-    """``value`` as finite floats (size,) within plausible limits, or None."""
+def checked_sample(stamp: float, specific_force: np.ndarray,
+                   angular_velocity: np.ndarray) -> Timed | None:
+    """Stamp and copies (3,), (3,) of an IMU sample; None when a number is not plausible."""
+    force, rate = vector(specific_force, 3), vector(angular_velocity, 3)
+    return None if force is None or rate is None or not isfinite(stamp) else (stamp, force, rate)
+
+
+def vector(value, size: int) -> np.ndarray | None:
+    """Copy of ``value`` as finite floats (size,) within plausible limits, or None."""
     try:
         array = np.array(value, dtype=float)
     except (TypeError, ValueError):
@@ -274,7 +294,7 @@ def _vector(value, size):
     if array.shape != (size,):
         return None
     for number in array.tolist():
-        if not abs(number) < ABSURD:    # nan, too
+        if not -ABSURD < number < ABSURD:   # nan, too
             return None
     return array
 

@@ -84,6 +84,11 @@ class Silence:
         self._just_reset = False
 
     @property
+    def from_the_start(self) -> bool:
+        """Whether no message has arrived yet."""
+        return self.elapsed == float('inf')
+
+    @property
     def silent(self) -> bool:
         """Whether the silence is a fault, with a tolerance for rounding."""
         return self.elapsed >= self.limit - 1e-9
@@ -91,6 +96,6 @@ class Silence:
     @property
     def text(self) -> str:
         """For messages: 'silent for 52 ms', or 'silent since the start'."""
-        if self.elapsed == float('inf'):
+        if self.from_the_start:
             return 'silent since the start'
         return f'silent for {1000 * self.elapsed:.0f} ms'

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from math import isfinite
+from operator import eq
 
 import numpy as np
 
@@ -11,11 +12,12 @@ from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import SpikeFilter
 from beetle_omni_ros.safety.actuators import Actuators
+from beetle_omni_ros.safety.descent import checked_sample
 from beetle_omni_ros.safety.events import EventLog, INFO, WARNING
 from beetle_omni_ros.safety.limits import JUMP
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.selection import Selection
-from beetle_omni_ros.safety.vehicle import Vehicle
+from beetle_omni_ros.safety.vehicle import numbers, Vehicle
 from beetle_omni_ros.safety.watch.faults import FaultWatch
 
 TILT_AGE = 0.05     # [s] older joint angles are not used for thrust directions
@@ -23,6 +25,7 @@ VOLTAGE_END = 1000.0    # [V] from which a reading is refused
 LATEST = 0.1    # [s] between a MoCap pose and the estimate for its check
 IMU_AXES = (*(f'specific force along {axis}' for axis in 'xyz'),
             *(f'angular rate about {axis}' for axis in 'xyz'))
+NONE_SAME = [0] * len(IMU_AXES)
 
 
 class Inputs:
@@ -48,8 +51,8 @@ class Inputs:
         self._in_force: Command | None = None
         imu = parameters.detection.imu
         self._spikes = SpikeFilter(imu.force_change, imu.rate_change)
-        self._sample: tuple[float, ...] = ()
-        self._same = [0] * len(IMU_AXES)    # samples for which an axis has kept its value
+        self._sample: list[float] = []
+        self._same = NONE_SAME      # samples for which each axis has kept its value
         self._floor = 0.0       # height of base_link on the ground before the flight [m]
         self.events = EventLog(parameters.quiet_time)
         self._now: float | None = None
@@ -62,12 +65,13 @@ class Inputs:
     def on_state(self, state: State, status: str = 'tracking') -> bool:
         """Receive the estimator's state and status; False when it is refused."""
         before = self.vehicle.status
-        true = corrected(state, self.watch.health)
+        reading = numbers(state.tilt, 4)
+        true = state if reading is None else corrected(state, self.watch.health)
         reason = self.vehicle.on_state(true, status, self._now)
         if reason:
             self._say(self._now, WARNING, f'ekf_node: estimate refused: {reason}', reason)
-        else:
-            self._watch_joints(state.tilt_stamp, state.tilt)
+        elif reading is not None:
+            self._watch_joints(state.tilt_stamp, reading)
         if not reason and status != before and status != 'tracking':
             self._say(self._now, WARNING, f"ekf_node reports '{status}'")
         return not reason
@@ -84,50 +88,53 @@ class Inputs:
 
     def on_joints(self, stamp: float, position: np.ndarray, velocity: np.ndarray) -> bool:
         """Receive raw joint feedback (4,), nan where unknown."""
-        good = np.shape(position) == (4,) and not self._ahead(stamp) \
-            and self.vehicle.on_joints(stamp, self.watch.health.true(position), velocity)
+        reading = numbers(position, 4)
+        if reading is None or self._ahead(stamp):
+            return False
+        good = self.vehicle.on_joints(stamp, self.watch.health.true(reading), velocity)
         if good:
-            self._watch_joints(stamp, np.asarray(position, dtype=float))
+            self._watch_joints(stamp, reading)
         return good
 
     def _watch_joints(self, stamp, reading):
         """Pass a reading (4,) to the detectors; a changed zero also applies to this reading."""
-        if not (isfinite(stamp) and all(map(isfinite, reading.tolist()))):
+        if stamp <= self.watch.joint_stamp or not (
+                isfinite(stamp) and all(map(isfinite, reading.tolist()))):
             return
-        zeros = self.watch.health.zeros
+        before = self.watch.health
         self.watch.on_joints(stamp, reading, self.airborne)
-        if self.watch.health.zeros != zeros:
+        if self.watch.health is not before and self.watch.health.zeros != before.zeros:
             self.vehicle.tilt = self.watch.health.true(reading)
 
     def on_imu(self, stamp: float, specific_force: np.ndarray,
                angular_velocity: np.ndarray) -> bool:
         """Receive a raw IMU sample (3,), (3,) in base_link, for the descent without estimator."""
-        good = not self._ahead(stamp) and self._is_real(specific_force, angular_velocity) \
-            and self.vehicle.backup.on_imu(stamp, specific_force, angular_velocity)
-        if good:
-            self.vehicle.imu.reset()
-            if self.airborne:
-                known = stamp - self.vehicle.tilt_stamp < TILT_AGE
-                self.watch.on_imu(stamp, np.asarray(specific_force, dtype=float),
-                                  np.asarray(angular_velocity, dtype=float),
-                                  self.vehicle.tilt if known else None, self._in_force,
-                                  self._height)
-        return good
+        sample = checked_sample(stamp, specific_force, angular_velocity)
+        if sample is None or self._ahead(stamp):
+            return False
+        _, force, rate = sample
+        airborne = self.airborne
+        if not self._is_real(force, rate, airborne) or not self.vehicle.backup.add(sample):
+            return False
+        self.vehicle.imu.reset()
+        if airborne:
+            known = stamp - self.vehicle.tilt_stamp < TILT_AGE
+            self.watch.on_imu(stamp, force, rate, self.vehicle.tilt if known else None,
+                              self._in_force, self._height)
+        return True
 
-    def _is_real(self, specific_force, angular_velocity):
+    def _is_real(self, force, rate, airborne):
         """Whether a sample is neither a single spike nor one of many equal samples."""
-        try:
-            force, rate = (np.asarray(vector, dtype=float).reshape(3)
-                           for vector in (specific_force, angular_velocity))
-        except (TypeError, ValueError):
-            return False
-        values = (*force.tolist(), *rate.tolist())
-        if not all(map(isfinite, values)):
-            return False
-        self._same = [count + 1 if value == before else 0 for count, value, before in zip(
-            self._same, values, self._sample or (None,) * len(values))]
+        values, before = force.tolist() + rate.tolist(), self._sample
         self._sample = values
-        return not (self.airborne and self._is_frozen()) and self._spikes.passes(force, rate)
+        if any(map(eq, values, before)):
+            self._same = [count + 1 if value == last else 0
+                          for count, value, last in zip(self._same, values, before)]
+            if airborne and self._is_frozen():
+                return False
+        else:
+            self._same = NONE_SAME
+        return self._spikes.passes(force, rate)
 
     def _is_frozen(self):
         """
@@ -174,17 +181,18 @@ class Inputs:
     def on_mocap(self, stamp: float, position: np.ndarray, quaternion: np.ndarray) -> bool:
         """Receive a raw MoCap pose (3,), (4,) of base_link, for the descent without estimator."""
         vehicle = self.vehicle
-        if self._ahead(stamp) or not vehicle.backup.is_pose(stamp, position, quaternion):
+        pose = vehicle.backup.checked_pose(stamp, position, quaternion)
+        if pose is None or self._ahead(stamp):
             return False
-        vehicle.backup.remember(stamp, position, quaternion)
-        if self.airborne and not self._agrees(stamp, position, quaternion):
+        vehicle.backup.remember(pose)
+        airborne = self.airborne
+        if airborne and not self._agrees(*pose):
             return False
-        good = vehicle.backup.on_mocap(stamp, position, quaternion)
-        if good and self.airborne and vehicle.imu.silent:
-            self.watch.without_imu(stamp, position, self._height)
-        if good:
-            vehicle.mocap.reset()
-        return good
+        vehicle.backup.use(pose)
+        if airborne and vehicle.imu.silent:
+            self.watch.without_imu(stamp, pose[1], self._height)
+        vehicle.mocap.reset()
+        return True
 
     def _agrees(self, stamp, position, quaternion):
         """Whether a MoCap pose is consistent with estimate and gyroscope."""

@@ -113,6 +113,8 @@ class CommandStream:
 
     def tick(self, dt: float) -> None:
         """``dt`` seconds passed."""
+        if self.silence.from_the_start and self._overstepping.from_the_start:
+            return
         self.silence.tick(dt)
         self._overstepping.tick(dt)
         self.good_for = 0.0 if self.silence.silent else self.good_for + dt
@@ -141,7 +143,7 @@ class CommandStream:
             return NOT_A_COMMAND, None
         if tilt.shape != (ROTORS,) or thrust.shape != (ROTORS,):
             return SHAPE, None
-        if not all(map(isfinite, (stamp, *tilt.tolist(), *thrust.tolist()))):
+        if not (isfinite(stamp) and all(map(isfinite, tilt.tolist() + thrust.tolist()))):
             return NOT_FINITE, None
         clean = Command(stamp, _cut(tilt, -self._tilt_limit, self._tilt_limit),
                         _cut(thrust, self._rotors.thrust_min, self._rotors.thrust_max))
@@ -163,8 +165,8 @@ class CommandStream:
         if _farthest(tilt, clean.tilt) > tolerance:
             return TILT
         before, self._offered = self._offered, clean
-        same = before is not None and np.array_equal(before.tilt, clean.tilt) \
-            and np.array_equal(before.thrust, clean.thrust)
+        same = before is not None and before.tilt.tolist() == clean.tilt.tolist() \
+            and before.thrust.tolist() == clean.thrust.tolist()
         self._same = self._same + 1 if same else 0
         if self._same >= SAME:
             return FROZEN
@@ -188,12 +190,15 @@ def within_limits(command: Command, robot: RobotParameters, stopped: bool = Fals
         stopped: whether zero thrust is intended, below the smallest thrust in flight.
 
     """
-    if not all(map(isfinite, (*command.tilt.tolist(), *command.thrust.tolist()))):
+    tilt, thrust = command.tilt.tolist(), command.thrust.tolist()
+    if not all(map(isfinite, tilt + thrust)):
         return None
     limit = robot.joints.position_limit
-    low = 0.0 if stopped else robot.rotors.thrust_min
+    low, high = 0.0 if stopped else robot.rotors.thrust_min, robot.rotors.thrust_max
+    if max(map(abs, tilt)) <= limit and low <= min(thrust) and max(thrust) <= high:
+        return command
     return Command(command.stamp, _cut(command.tilt, -limit, limit),
-                   _cut(command.thrust, low, robot.rotors.thrust_max))
+                   _cut(command.thrust, low, high))
 
 
 def _cut(values, low, high):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
-from itertools import chain
 from math import dist, isfinite, nan, sqrt
 
 import numpy as np
@@ -42,7 +41,8 @@ class Vehicle:
         self._parameters, self._cells = parameters, robot.battery.cells
         limits = parameters.state
         self.state: State | None = None
-        self._offered: State | None = None      # the estimate before, accepted or not
+        # stamp, position and quaternion of the estimate before, accepted or not
+        self._offered: tuple[float, list[float], list[float]] | None = None
         self.status = ''
         self.tilt, self.tilt_velocity, self.tilt_stamp = np.zeros(4), np.zeros(4), -np.inf
         self.modelled_tilt: np.ndarray | None = None    # (4,) of silent joints [rad]
@@ -107,17 +107,19 @@ class Vehicle:
         """
         if not (isfinite(stamp) and stamp > self.tilt_stamp):
             return False
-        angles, rates = _numbers(position, 4) or [], _numbers(velocity, 4) or [nan] * 4
-        known = [isfinite(angle) for angle in angles]
-        if not any(known) or any(abs(angle) >= ABSURD for angle in angles if isfinite(angle)):
+        angles, rates = _numbers(position, 4) or [nan] * 4, _numbers(velocity, 4) or [nan] * 4
+        complete = all(map(isfinite, angles))
+        known = angles if complete else list(filter(isfinite, angles))
+        if not known or max(map(abs, known)) >= ABSURD:
             return False
-        self.tilt = np.array([new if there else old for new, there, old in zip(
-            angles, known, self.tilt.tolist())])
-        self.tilt_stamp = float(stamp)
-        self.tilt_velocity = np.array([rate if there and isfinite(rate) else 0.0
-                                       for rate, there in zip(rates, known)])
-        if all(known):
+        if complete:
             self.joints.reset()
+        else:
+            rates = [rate if isfinite(angle) else nan for rate, angle in zip(rates, angles)]
+            angles = [new if isfinite(new) else old
+                      for new, old in zip(angles, self.tilt.tolist())]
+        self.tilt, self.tilt_stamp = np.array(angles), float(stamp)
+        self.tilt_velocity = np.array([rate if isfinite(rate) else 0.0 for rate in rates])
         return True
 
     def seen(self, in_force: Command | None, state: State | None = None) -> State:
@@ -126,8 +128,9 @@ class Vehicle:
         if self.joints.silent and in_force is not None and not self.stuck:
             tilt = in_force.tilt if self.modelled_tilt is None else self.modelled_tilt
             return replace(state, tilt=tilt, tilt_velocity=np.zeros(4), command=in_force)
-        return replace(state, tilt=self.tilt, tilt_velocity=self.tilt_velocity,
-                       tilt_stamp=self.tilt_stamp, command=in_force)
+        return State(state.stamp, state.position, state.velocity, state.quaternion,
+                     state.angular_velocity, self.tilt, self.tilt_velocity, self.tilt_stamp,
+                     in_force)
 
     def backup_state(self, now: float) -> State:
         """The backup estimate at ``now``."""
@@ -147,7 +150,7 @@ class Vehicle:
     def specific_force_up(self) -> float | None:
         """Latest specific force along world up by the estimator's attitude [m/s^2]."""
         force = self.backup.last_specific_force
-        if self.imu.silent or force is None or self.state is None:
+        if force is None or self.state is None or self.imu.silent:
             return None
         return float(rotations.up(self.state.quaternion) @ force)
 
@@ -225,15 +228,15 @@ class Vehicle:
 
     def _check_state(self, state, status, now):
         limits = self._parameters.state
-        motion = [_numbers(v, 3) or [nan] for v in (state.position, state.velocity,
-                                                    state.angular_velocity)]
-        quaternion = _numbers(state.quaternion, 4)
-        if not (quaternion and isfinite(state.stamp)
-                and all(map(isfinite, chain(quaternion, *motion)))):
+        position, quaternion = _numbers(state.position, 3), _numbers(state.quaternion, 4)
+        velocity, rate = _numbers(state.velocity, 3), _numbers(state.angular_velocity, 3)
+        if not (position and quaternion and velocity and rate and isfinite(state.stamp)
+                and all(map(isfinite, position + velocity + rate + quaternion))):
             return 'not finite'
-        if max(map(abs, chain(*motion))) > ABSURD:
+        if max(map(abs, position + velocity + rate)) > ABSURD:
             return 'absurdly large'
-        if abs(sum(part * part for part in quaternion) - 1) > UNIT_TOLERANCE:
+        x, y, z, w = quaternion
+        if abs(x * x + y * y + z * z + w * w - 1) > UNIT_TOLERANCE:
             return 'no unit quaternion'
         if now is not None and now - state.stamp > limits.stale_after:
             return 'stale stamp'
@@ -243,19 +246,24 @@ class Vehicle:
             return 'repeated or older stamp'
         if status not in TRACKING:
             return f"status '{status}'"
-        before, self._offered = self._offered, state
-        if before is not None and 0 < state.stamp - before.stamp <= limits.timeout and (
-                dist(before.position, state.position) > limits.jump_position
-                or rotations.geodesic_angle(before.quaternion, state.quaternion)
-                > limits.jump_attitude):
+        before, self._offered = self._offered, (state.stamp, position, quaternion)
+        if before is not None and 0 < state.stamp - before[0] <= limits.timeout and (
+                dist(before[1], position) > limits.jump_position
+                or rotations.geodesic_angle(before[2], quaternion) > limits.jump_attitude):
             return JUMP
         return ''
 
 
-def _numbers(value, size) -> list[float] | None:
-    """``value`` as so many floats, finite or not; None where it is something else."""
+def numbers(value, size: int) -> np.ndarray | None:
+    """``value`` as floats (size,), finite or not; None where it is something else."""
     try:
         array = np.asarray(value, dtype=float)
     except (TypeError, ValueError):
         return None
-    return array.tolist() if array.shape == (size,) else None
+    return array if array.shape == (size,) else None
+
+
+def _numbers(value, size):
+    """List of :func:`numbers`, or None."""
+    array = numbers(value, size)
+    return None if array is None else array.tolist()

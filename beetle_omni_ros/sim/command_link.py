@@ -54,8 +54,9 @@ class CommandLink:
             return False
         self.accepted += 1
         self._last_stamp, self._last_arrival = command.stamp, now
-        tilt = np.clip(np.asarray(command.tilt, dtype=float), -self._limit, self._limit)
-        thrust = np.clip(np.asarray(command.thrust, dtype=float), *self._thrust_range)
+        low, high = self._thrust_range
+        tilt = np.minimum(np.maximum(command.tilt, -self._limit), self._limit)
+        thrust = np.minimum(np.maximum(command.thrust, low), high)
         for queue, delay, value in zip(self._pending, self._delays, (tilt, thrust)):
             queue.append((max(command.stamp + delay, now), value))
         return True

@@ -202,17 +202,20 @@ class Plant:
         drop = self._reach + 2 * self._tick * abs(self._qvel[2]) + 0.01
         if self._qpos[2] < drop:
             return True
-        stop = self._robot.joints.position_limit - 0.01
-        return any(abs(tilt) + 2 * self._tick * abs(rate) > stop
-                   for tilt, rate in zip(self._tilt.tolist(), self._rate.tolist()))
+        stop, ahead = self._robot.joints.position_limit - 0.01, 2 * self._tick
+        for tilt, rate in zip(self._tilt.tolist(), self._rate.tolist()):
+            if abs(tilt) + ahead * abs(rate) > stop:
+                return True
+        return False
 
     def _may_reach_rate_limit(self):
         """Whether a servo could reach the rate limit within the next tick."""
         limit, gain = 0.9 * self._robot.joints.velocity_limit, self._rate_gain
-        return any(powered and abs(rate) + gain * abs(target - tilt) > limit
-                   for tilt, rate, target, powered in zip(
-                       self._tilt.tolist(), self._rate.tolist(), self._target.tolist(),
-                       self._powered))
+        for tilt, rate, target, powered in zip(self._tilt.tolist(), self._rate.tolist(),
+                                               self._target.tolist(), self._powered):
+            if powered and abs(rate) + gain * abs(target - tilt) > limit:
+                return True
+        return False
 
     def _limit_rates(self):
         """Limit each servo's torque so that its joint does not exceed the rate limit."""

@@ -128,6 +128,34 @@ def test_the_command_writes_page_markdown_and_json(listed, tmp_path, monkeypatch
     assert 'old' not in docs.read_text() and '| impact |' in docs.read_text()
 
 
+def test_an_interrupted_campaign_continues_and_more_seeds_extend_it(tmp_path, monkeypatch):
+    flown, code = [], 'one'
+
+    def fly_all(function, trials, *rest, jobs):
+        flown.append([(trial.case, trial.seed) for trial in trials])
+        yield from (result(trial.case, start=trial.start, seed=trial.seed) for trial in trials)
+
+    monkeypatch.setattr('beetle_omni_ros.faults.command.campaign.fly_all', fly_all)
+    monkeypatch.setattr('beetle_omni_ros.faults.command.code_fingerprint', lambda **_: code)
+
+    def run(seeds, **options):
+        return run_faults(**{'only': ['gust', 'impact'], **options}, starts=['hover'], seeds=seeds,
+                          output=tmp_path, console=Console(file=io.StringIO()))['flights']
+
+    run(1)
+    with open(tmp_path / 'flights.jsonl', 'r+') as stored:
+        stored.truncate(stored.seek(0, 2) - 5)      # interrupted while it was written
+    both = run(2)
+    assert flown == [[('gust', 0), ('impact', 0)], [('gust', 1), ('impact', 0), ('impact', 1)]]
+    assert both == run(2) and flown[-1] == []
+    assert len(run(1, only=['gust'])) == 1 and flown[-1] == []      # the others are kept
+    run(1, bags=True)
+    assert len(flown[-1]) == 2
+    code = 'another'
+    run(1)
+    assert len(flown[-1]) == 2
+
+
 def test_the_table_in_the_docs_agrees_with_the_list(listed):
     table = (ROOT / 'docs' / 'safety.md').read_text().split(page.BEGIN)[1].split(page.END)[0]
     rows = [[cell.strip() for cell in line.strip('| ').split(' | ')[:3]]

@@ -78,10 +78,13 @@ def watch(rig, command):
         assert not command.thrust.any()
 
 
+# Found once: readings of a wrong length after the zero of an encoder has moved, and a voltage
+# whose square overflows.
+@example(airborne=True, sequence=[('raw', 0.0, [0.0, 0.0, 0.0, 1.0], []), ('raw', 0.0, [], []),
+                                  ('state', 0.0, LEVEL, LEVEL, [0.0, 0.0, 0.0])])
+@example(airborne=True, sequence=[('battery', 1e300)])
 @settings(max_examples=40, deadline=None, derandomize=True)
 @given(airborne=st.booleans(), sequence=actions)
-@example(airborne=True, sequence=[('battery', 1e300)])
-@example(airborne=True, sequence=[('raw', 0.0, [0.0, 0.0, 0.0, 1.0], []), ('raw', 0.0, [], [])])
 def test_no_unsafe_command_is_sent(airborne, sequence):
     rig = flown() if airborne else VehicleRig()
     inner = rig.supervisor.update

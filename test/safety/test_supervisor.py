@@ -471,6 +471,27 @@ def test_limits_hold_while_landing(spoil):
     assert rig.supervisor.state == 'emergency_stop'
 
 
+@pytest.mark.parametrize('reports', [False, True], ids=['reports stall, too', 'reports go on'])
+def test_no_rotor_is_suspected_after_two_stalls_in_which_the_actuators_stopped(reports):
+    rig = flown()
+
+    def fly(duration):
+        for _ in range(round(duration / 0.02)):
+            rig.run(0.02)
+            rig.supervisor.on_rotors(rig.now, 300.0 * np.sqrt(rig.thrust))
+
+    fly(2.0)
+    for _ in range(2):      # each is too short for a pause of the supervisor
+        rig.now += 0.8 * PARAMETERS.commands.age_limit
+        rig.command = rig.supervisor.update(rig.now)
+    assert rig.command is None      # too old
+    rig.thrust[:] = 0.0             # the motor board stopped the rotors
+    for ago in (0.06, 0.04, 0.02) if reports else ():
+        rig.supervisor.on_rotors(rig.now - ago, 200.0 * np.sqrt(np.full(4, 7.0)))
+    fly(0.6)
+    assert not any('rotor' in name for name in rig.supervisor.faults), rig.supervisor.faults
+
+
 def test_a_landing_from_the_highest_place_inside_the_limits_ends_before_its_time_limit():
     envelope, landing = PARAMETERS.envelope, PARAMETERS.landing
     turns = np.pi / landing.level.rate + landing.turnover.time_limit

@@ -196,6 +196,24 @@ def test_a_rotor_that_does_not_follow_its_commands_is_detected_by_the_slope(answ
     assert told == deaf
 
 
+@pytest.mark.parametrize('stall', [0.1, 0.15, 0.3])
+def test_no_rotor_is_suspected_after_a_stall_of_the_motor_board(stall):
+    watch, thrust = SpeedWatch(P.rotor, ROBOT), np.full(4, 7.0)
+    asked = np.full(4, 7.0)
+    for n in range(2000):
+        t = 0.005 * n
+        stalled = 3.0 < t % 4.0 < 3.0 + stall       # commands and reports wait
+        # Just before the stall one pair of rotors is raised, in the stall the other.
+        wanted = 7.0 + np.where(2.95 < t % 4.0 < 3.05, 5.0, -5.0) * np.array([1, -1, 1, -1])
+        if not stalled:
+            asked = wanted
+        thrust = thrust - np.expm1(-0.005 / LAG) * (asked - thrust)
+        watch.on_command(t, wanted)
+        if n % 4 == 0 and not stalled:
+            watch.on_speeds(t, 300.0 * np.sqrt(np.maximum(thrust, 0.0)))
+            assert watch.lost is None and watch.deaf is None
+
+
 def test_the_zero_of_an_encoder_that_jumps_moves_and_the_joint_is_not_stuck():
     watch = FaultWatch(P, ROBOT, Allocator(ROBOT))
     for n in range(200):

@@ -98,7 +98,8 @@ class FaultWatch:
 
     def _possible(self, thrust):
         """Thrusts (4,) [N] that the present voltage allows."""
-        return np.minimum(thrust, self._limit_now)
+        return thrust if max(thrust.tolist()) <= self._limit_now \
+            else np.minimum(thrust, self._limit_now)
 
     def on_imu(self, stamp: float, force: np.ndarray, rate: np.ndarray, tilt: np.ndarray | None,
                command: Command | None, height: float | None) -> None:
@@ -141,6 +142,11 @@ class FaultWatch:
         if self._pack is not None:
             self._pack.on_command(command.stamp, thrust)
 
+    @property
+    def joint_stamp(self) -> float:
+        """Time of the last reading of the joints [s]."""
+        return self._joints.stamp
+
     def on_joints(self, stamp: float, tilt: np.ndarray, trusted: bool) -> None:
         """
         Receive a complete reading.
@@ -181,7 +187,7 @@ class FaultWatch:
 
     def without_imu(self, stamp: float, position: np.ndarray, height: float | None) -> None:
         """Check a MoCap position (3,) [m] for a crash, see :meth:`ContactWatch.on_pose`."""
-        self._contact.on_pose(stamp, np.asarray(position, dtype=float), height)
+        self._contact.on_pose(stamp, position, height)
 
     def on_mocap(self, stamp: float, position: np.ndarray, quaternion: np.ndarray,
                  attitude: np.ndarray | None, rate: np.ndarray | None,

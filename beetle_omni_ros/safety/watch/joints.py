@@ -31,6 +31,7 @@ class JointWatch:
         jump: (4,) [rad] jump of the last reading relative to the motion before it, if it is larger
             than a joint can turn, else 0.
         model: (4,) readings by the servo model [rad], None before the first.
+        stamp: time of the last reading, or of the model without readings [s].
 
     """
 
@@ -43,7 +44,7 @@ class JointWatch:
     def reset(self) -> None:
         """Reset; start again at the next reading."""
         self._commands: deque = deque(maxlen=KEPT)
-        self._stamp, self._change = -np.inf, np.zeros(ROTORS)
+        self.stamp, self._change = -np.inf, np.zeros(ROTORS)
         self.model: np.ndarray | None = None
         self._for = np.zeros(ROTORS)
         self._low = self._high = np.zeros(ROTORS)
@@ -63,11 +64,11 @@ class JointWatch:
 
     def on_joints(self, stamp: float, tilt: np.ndarray) -> bool:
         """Receive a complete reading (4,) [rad] of the time ``stamp`` [s]; False if it is old."""
-        dt = stamp - self._stamp
+        dt = stamp - self.stamp
         if dt <= 0:
             self.jump = NO_JUMP
             return False
-        before, self._stamp = getattr(self, '_tilt', tilt), stamp
+        before, self.stamp = getattr(self, '_tilt', tilt), stamp
         self._tilt = tilt
         asked = self._asked(stamp - self._p.delay)
         if dt > LONGEST or asked is None or self.model is None:
@@ -76,22 +77,23 @@ class JointWatch:
             return True
         change = tilt - before
         step = self._step(asked, dt)
-        jumped = np.abs(change) > self._rate_limit * dt + self._p.jump
-        if jumped.any():
+        furthest = self._rate_limit * dt + self._p.jump
+        if max(map(abs, change.tolist())) > furthest:
+            jumped = np.abs(change) > furthest
             self.jump = np.where(jumped, change - self._change, 0.0)
             self._change = np.where(jumped, self._change, change)
             self.model = np.where(jumped, tilt, self.model + step)
         else:
             self.jump, self._change, self.model = NO_JUMP, change, self.model + step
-        self._judge(tilt, dt, np.abs(step) / dt)
+        self._judge(tilt, dt, step)
         return True
 
     def advance(self, stamp: float) -> None:
         """Continue with the model to ``stamp`` [s], without readings."""
-        dt, asked = stamp - self._stamp, self._asked(stamp - self._p.delay)
+        dt, asked = stamp - self.stamp, self._asked(stamp - self._p.delay)
         if self.model is None or asked is None or dt <= 0:
             return
-        self._stamp = stamp
+        self.stamp = stamp
         self.model = self.model + self._step(asked, min(dt, LONGEST))
 
     def _step(self, asked, dt):
@@ -100,11 +102,13 @@ class JointWatch:
         step = (asked - self.model) * -expm1(-dt / self._lag)
         return np.minimum(np.maximum(step, -reach), reach)
 
-    def _judge(self, tilt, dt, rate):
+    def _judge(self, tilt, dt, step):
         p = self._p
-        off = np.abs(tilt - self.model) > p.error + p.spread * rate
-        if not self._suspects and not off.any():
+        each = [abs(error) > p.error + p.spread * (abs(motion) / dt) for error, motion in zip(
+            (tilt - self.model).tolist(), step.tolist())]
+        if not self._suspects and not any(each):
             return
+        off = np.array(each)
         began = off & (self._for == 0)
         self._low = np.where(began, tilt, np.minimum(self._low, tilt))
         self._high = np.where(began, tilt, np.maximum(self._high, tilt))

@@ -36,9 +36,9 @@ class MocapWatch:
     def reset(self) -> None:
         """Reset the detector."""
         self._stamp = -np.inf
-        self._quaternion: np.ndarray | None = None
+        self._quaternion: list[float] | None = None
         self._position: np.ndarray | None = None
-        self._values: tuple[float, ...] | None = None
+        self._values: list[float] | None = None
         self._moved = False
         self._same = self._off = self._far = 0
         self.good, self.jumped, self.contradicts, self.displaced = True, False, False, False
@@ -57,19 +57,18 @@ class MocapWatch:
         Args:
             stamp: of its capture [s].
             position: (3,) in world [m].
-            quaternion: (4,) xyzw.
+            quaternion: (4,) xyzw, unit.
             attitude: (4,) of the estimate of about that time, None: there is none.
             rate: (3,) measured body rate [rad/s], None: there is none.
             place: (3,) of the estimate of about that time [m], None: there is none.
             velocity: (3,) likewise [m/s].
 
         """
-        values = (*np.asarray(position, dtype=float).tolist(),
-                  *np.asarray(quaternion, dtype=float).tolist())
+        values = position.tolist() + quaternion.tolist()
         self._same = self._same + 1 if values == self._values else 0
         self._values = values
         dt, before = stamp - self._stamp, self._quaternion
-        now = rotations.normalized(quaternion)
+        now = quaternion.tolist()
         self._stamp, self._quaternion = stamp, now
         turning = 0.0 if rate is None else _length(rate)
         if before is not None and 0 < dt < LONGEST and rotations.geodesic_angle(
@@ -77,7 +76,7 @@ class MocapWatch:
             self.jumped = True
         off = attitude is not None and rotations.geodesic_angle(
             attitude, now) > self._p.attitude + turning * AGE
-        far = self._is_far(dt, np.asarray(position, dtype=float), place, velocity)
+        far = self._is_far(dt, position, place, velocity)
         self._off = self._off + 1 if off or far else 0
         self._far = self._far + 1 if far and self._moved else 0
         self.jumped &= off

@@ -14,8 +14,9 @@ from beetle_omni_ros.safety.watch.parameters import RotorLimits
 LEARNT = 1.0            # [s] time constant of the learnt factor between speed and thrust
 DELAY = 0.01            # [s] from a command's stamp until it acts
 KEPT = 64               # commands, 0.3 s at 200 Hz
-ONES = np.ones(ROTORS)
 LONGEST = 0.2           # [s] longest time between two reports of one sequence
+STALLED, SHORTEST = 2.5, 0.05   # [intervals], [s]: a longer pause of the reports is a stall
+SETTLED = 0.3           # [s] after a stall, three time constants of a rotor
 
 
 class SpeedWatch:
@@ -27,6 +28,9 @@ class SpeedWatch:
     less for a weak rotor, and 0 for a rotor that holds its thrust. It is used if the modelled
     thrust has varied enough. A rotor that gives clearly more thrust than commanded is detected at
     once, because neither lag nor weakness causes this.
+
+    If the reports of the motor board pause, its commands were probably late, too. For SETTLED
+    seconds the thrusts then differ from the model, and no rotor is suspected.
 
     Args:
         limits: thresholds.
@@ -46,7 +50,7 @@ class SpeedWatch:
 
     def reset(self) -> None:
         """Reset all learnt factors."""
-        self._stamp = -np.inf
+        self._stamp, self._interval, self._settled_at = -np.inf, np.inf, -np.inf
         self._commands: deque = deque(maxlen=KEPT)
         self._thrust = np.zeros(ROTORS)
         self._factor = np.zeros(ROTORS)     # [N s^2/rad^2]
@@ -66,6 +70,7 @@ class SpeedWatch:
         """Suspect no rotor."""
         self._for, self._deaf_for, self._more_for = np.zeros((3, ROTORS))
         self._sums[:] = 0.0
+        self.slow = np.zeros(ROTORS, dtype=bool)
         self.lost = self.deaf = None
 
     def _follow(self, start, end):
@@ -92,11 +97,16 @@ class SpeedWatch:
         if dt <= 0:
             return
         self._stamp = stamp
+        if dt > max(SHORTEST, STALLED * self._interval):
+            self._settled_at = stamp + SETTLED
+        self._interval = dt
         if dt > LONGEST:
             if self._commands:
                 self._thrust = np.array(self._commands[-1][1], dtype=float)
             return self.forget()
         self._follow(before, stamp)
+        if stamp < self._settled_at:
+            return self.forget()
         square = np.asarray(speed, dtype=float)**2
         judged = np.isfinite(square) & (self._thrust > self._p.least_thrust)
         known = judged & (self._learnt_for >= LEARNT)
@@ -116,8 +126,8 @@ class SpeedWatch:
     def _judge(self, known, dt):
         """Rotor whose measured thrust does not follow the modelled thrust, or None."""
         x, y = np.where(known, [self._thrust, self.thrust], 0.0)
-        self._sums *= np.where(known, exp(-dt / self._p.slope_window), 0.0)
-        self._sums += np.where(known, dt * np.array([ONES, x, y, x * x, x * y]), 0.0)
+        self._sums *= known * exp(-dt / self._p.slope_window)
+        self._sums += dt * np.array([known, x, y, x * x, x * y])
         weight, sum_x, sum_y, sum_xx, sum_xy = self._sums
         full = weight > 0.5 * self._p.slope_window
         count = np.where(full, weight, 1.0)
