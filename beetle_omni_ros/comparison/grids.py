@@ -80,35 +80,40 @@ class Task:
             return Cell([self.number(name, *keys, 'mean', digits=digits)], small)
         return cell
 
+    def cells(self, *main, small=()):
+        """Cells of texts and numbers (*keys, digits); empty where the first number is absent."""
+        def parts(name, given):
+            return [part if isinstance(part, str) else
+                    self.number(name, *part[:-1], digits=part[-1]) for part in given]
+
+        return lambda name: Cell(parts(name, main), parts(name, small)) \
+            if self.value(name, *main[0][:-1]) is not None else Cell()
+
     def mean_std(self, *keys, digits):
         """Cells of a mean with its standard deviation."""
-        def cell(name):
-            if self.value(name, *keys, 'mean') is None:
-                return Cell()
-            return Cell([self.number(name, *keys, 'mean', digits=digits)],
-                        ['± ', self.number(name, *keys, 'std', digits=digits)])
-        return cell
+        return self.cells((*keys, 'mean', digits), small=['± ', (*keys, 'std', digits)])
 
     def plain(self, *keys, digits=None, unit=''):
         """Cells of one number."""
-        return lambda name: Cell([self.number(name, *keys, digits=digits), unit]) \
-            if self.value(name, *keys) is not None else Cell()
+        return self.cells((*keys, digits), unit)
+
+    def seeds(self):
+        """Seeds of the table's flights."""
+        return sorted({seed for name in self.ours
+                       for seed in self.numbers[self.conditions][name]['seeds']})
 
     def commands(self):
         """Shell lines that fly the table's flights."""
-        seeds = sorted({seed for name in self.ours for seed in
-                        self.numbers[self.conditions][name]['seeds']})
         meta = self.results['meta']
         policy = meta['policy_file'] if registry.owner('--policy') in self.ours else None
         ours = [meta.get('specs', {}).get(name, name) for name in self.ours]
         return [f"beetle_omni evaluate --controllers {','.join(ours)} --task {self.task} "
                 f'--conditions {self.conditions} --seed {seed}'
-                + (f' --policy {policy}' if policy else '') for seed in seeds]
+                + (f' --policy {policy}' if policy else '') for seed in self.seeds()]
 
     def grid(self, title, rows, notes=()):
         """Grid of these rows."""
-        seeds = sorted({seed for name in self.ours for seed in
-                        self.numbers[self.conditions][name]['seeds']})
+        seeds = self.seeds()
         text = f"Seed{'s' if len(seeds) > 1 else ''} {', '.join(map(str, seeds))}."
         return Grid(f'{title}, {self.conditions} conditions', self.columns, rows,
                     [text, *notes], self.commands())
@@ -116,21 +121,7 @@ class Task:
 
 def reached(task: Task):
     """Cells of the number of reached poses."""
-    def cell(name):
-        if task.value(name, 'reached') is None:
-            return Cell()
-        return Cell([task.number(name, 'reached', digits=0), ' of ',
-                     task.number(name, 'poses', digits=0)])
-    return cell
-
-
-def _crashed(task):
-    def cell(name):
-        if task.value(name, 'crashed') is None:
-            return Cell()
-        return Cell([task.number(name, 'crashed', digits=0), ' of ',
-                     task.number(name, 'flights', digits=0)])
-    return cell
+    return task.cells(('reached', 0), ' of ', ('poses', 0))
 
 
 def poses(results: dict, name: str, conditions: str) -> Grid:
@@ -154,7 +145,8 @@ def poses(results: dict, name: str, conditions: str) -> Grid:
                  task.plain('command_change_rms', 'joint_rad', digits=4),
                  best=('command_change_rms', 'joint_rad')),
         task.row('poses reached', reached(task)),
-        task.row('flights that touched the ground', _crashed(task))]
+        task.row('flights that touched the ground',
+                 task.cells(('crashed', 0), ' of ', ('flights', 0)))]
     notes = ['U: mean over 7.0 to 7.5 s of the 8 s of a pose; L: over 1.0 to 7.0 s; both '
              'averaged over the poses. Reached: U below 0.10 m and 10 deg. Bold: least of ours.']
     if name.startswith('random'):
@@ -181,14 +173,10 @@ def waypoints(results: dict, conditions: str) -> Grid:
          'experiment. Means over the rounds and seeds.'])
 
 
-def _both(task, *keys):
-    """U of position and orientation in one cell."""
-    def cell(name):
-        if task.value(name, *keys, 'U_position_m', 'mean') is None:
-            return Cell()
-        return Cell([task.number(name, *keys, 'U_position_m', 'mean', digits=4), ' / ',
-                     task.number(name, *keys, 'U_orientation_deg', 'mean', digits=2)])
-    return cell
+def _both(task, *keys, error='U'):
+    """U or L of position and orientation in one cell."""
+    return task.cells((*keys, f'{error}_position_m', 'mean', 4), ' / ',
+                      (*keys, f'{error}_orientation_deg', 'mean', 2))
 
 
 def lemniscate(results: dict, conditions: str) -> Grid:
@@ -199,23 +187,15 @@ def lemniscate(results: dict, conditions: str) -> Grid:
                               ('orientation error [deg]', 'orientation_deg', 2)):
         rows += [task.row(f'{text}, mean ± std', task.mean_std('trajectory', key, digits=digits),
                           best=('trajectory', key, 'mean')),
-                 task.row('range of the means of the rounds', _round_range(task, key, digits)),
+                 task.row('range of the means of the rounds', task.cells(
+                     ('trajectory', key, 'round_min', digits), ' to ',
+                     ('trajectory', key, 'round_max', digits))),
                  task.row('largest', task.plain('trajectory', key, 'max', digits=digits))]
     rows.append(task.row('rounds', task.plain('trajectory', 'rounds', digits=0)))
     return task.grid(
         '3D lemniscate, five rounds', rows,
         ['Ours is simulated, the published columns are measured on the real robot. The '
          "publication does not state its curve's size and speed: for orientation only."])
-
-
-def _round_range(task, key, digits):
-    def cell(name):
-        if task.value(name, 'trajectory', key, 'round_min') is None:
-            return Cell()
-        low, high = (task.number(name, 'trajectory', key, end, digits=digits)
-                     for end in ('round_min', 'round_max'))
-        return Cell([low, ' to ', high])
-    return cell
 
 
 def disturbance(results: dict, kind: str, conditions: str) -> Grid:
@@ -280,7 +260,8 @@ def payload(results: dict, conditions: str) -> Grid:
     rows = []
     for k, entry in enumerate(entries):
         mass = f"{entry['payload_kg']:g} kg"
-        rows.append(task.row(f'{mass}: height error [m]', _signed(task, k),
+        rows.append(task.row(f'{mass}: height error [m]',
+                             task.mean_range('payload', k, 'height_error_m', digits=4),
                              best=('payload', k, 'height_error_m', 'mean')))
     rows += [task.row(f"{entry['payload_kg']:g} kg: orientation error [deg]",
                       task.mean_range('payload', k, 'orientation_deg', digits=2),
@@ -291,19 +272,6 @@ def payload(results: dict, conditions: str) -> Grid:
         ['Mean over 7.0 to 7.5 s after the mass was attached [least, largest of the seeds]; '
          'positive: above the target. The publication shows its real robot in a figure without '
          'numbers, with 1.0 kg for RL only.'])
-
-
-def _signed(task, k):
-    keys = ('payload', k, 'height_error_m')
-
-    def cell(name):
-        if task.value(name, *keys, 'mean') is None:
-            return Cell()
-        low, high = (task.number(name, *keys, end, digits=4) for end in ('min', 'max'))
-        several = low.value(task.results) != high.value(task.results)
-        return Cell([task.number(name, *keys, 'mean', digits=4)],
-                    ['[', low, ', ', high, ']'] if several else [])
-    return cell
 
 
 def hover(results: dict, conditions: str) -> Grid:
@@ -378,9 +346,9 @@ def glance(results: dict) -> Grid:
 def _glance_rows(task, conditions):
     """(text, cell builder, whether published on the real robot) for a task."""
     if task.task == 'lemniscate':
-        return [('mean error [m] / [deg]', _pair(
-            task, ('trajectory', 'position_m', 'mean'),
-            ('trajectory', 'orientation_deg', 'mean')), True)]
+        return [('mean error [m] / [deg]', task.cells(
+            ('trajectory', 'position_m', 'mean', 4), ' / ',
+            ('trajectory', 'orientation_deg', 'mean', 2)), True)]
     if task.task in ('force', 'torque'):
         unit = 'N' if task.task == 'force' else 'N m'
         return [('control lost at', lost(task, task.task, unit), False)]
@@ -388,39 +356,26 @@ def _glance_rows(task, conditions):
         return [('largest height error up to 1 kg [m]',
                  task.plain('payload_height_max_m', digits=4), False)]
     if task.task == 'hover':
-        return [('command change in 10 ms, RMS [rad] / [N]', _pair(
-            task, ('command_change_rms', 'joint_rad'), ('command_change_rms', 'thrust_N')),
-            False)]
+        return [('command change in 10 ms, RMS [rad] / [N]', task.cells(
+            ('command_change_rms', 'joint_rad', 4), ' / ',
+            ('command_change_rms', 'thrust_N', 4)), False)]
     real = task.task == 'waypoints'
-    made = [('U, mean [m] / [deg]', _pair(task, ('U_position_m', 'mean'),
-                                          ('U_orientation_deg', 'mean')), real)]
+    made = [('U, mean [m] / [deg]', _both(task), real)]
     if not real:
-        made += [('L, mean [m] / [deg]', _pair(task, ('L_position_m', 'mean'),
-                                               ('L_orientation_deg', 'mean')), False),
+        made += [('L, mean [m] / [deg]', _both(task, error='L'), False),
                  ('poses reached', reached(task), False)]
     return made
 
 
-def _pair(task, first, second):
-    def cell(name):
-        if task.value(name, *first) is None:
-            return Cell()
-        return Cell([task.number(name, *first, digits=4), ' / ',
-                     task.number(name, *second, digits=2 if 'deg' in ''.join(map(str, second))
-                                 else 4)])
-    return cell
-
-
 def flights(results: dict) -> str:
     """HTML rows of all flights: task, end and CPU time."""
-    rows = []
-    for k, flight in enumerate(results['flights']):
-        end = flight['failure'] or ('touched the ground' if flight['metrics']['crashed']
-                                    else 'flown')
-        rows.append((k, flight, end))
+    def end(flight):
+        return flight['failure'] or ('touched the ground' if flight['metrics']['crashed']
+                                     else 'flown')
+
     return ''.join(
         f"<tr><td>{escape(flight['task'])}</td><td>{escape(flight['conditions'])}</td>"
         f"<td>{escape(flight['controller'])}</td><td>{flight['seed']}</td>"
-        f"<td>{escape(end)}</td><td><span data-key=\"flights/{k}/cpu_s\">"
+        f"<td>{escape(end(flight))}</td><td><span data-key=\"flights/{k}/cpu_s\">"
         f"{Number(('flights', k, 'cpu_s'), 1).text(results)}</span></td></tr>\n"
-        for k, flight, end in rows)
+        for k, flight in enumerate(results['flights']))
