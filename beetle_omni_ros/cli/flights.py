@@ -9,6 +9,7 @@ from typing import Annotated, Optional
 import typer
 
 from beetle_omni_ros.cli.options import (
+    check_files,
     check_flight,
     CompressionOption,
     CONDITIONS,
@@ -18,6 +19,7 @@ from beetle_omni_ros.cli.options import (
     fail,
     FAILED,
     FaultsOption,
+    JobsOption,
     JsonOption,
     KNOWN,
     names,
@@ -32,6 +34,7 @@ from beetle_omni_ros.cli.options import (
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.registry import ControllerOptions, DEFAULT, owner
 from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.runs.json_file import check_writable, write_json
 
 
 def fly(bag: Annotated[Path, typer.Option(
@@ -156,9 +159,7 @@ def compare(controllers: Annotated[Optional[str], typer.Option(
                 '--seeds', metavar='N,...',
                 help='Default: 0,1; only 0 for tasks of more than 50 s.')] = None,
             policy: PolicyOption = None,
-            jobs: Annotated[Optional[int], typer.Option(
-                '--jobs', '-j', min=1, help='Parallel flights. Default: one on each core.')]
-            = None,
+            jobs: JobsOption = None,
             backend: Annotated[str, typer.Option(
                 '--backend', metavar='processes|ray', help='Run the flights on this computer, or '
                                                            'on Ray.')]
@@ -181,13 +182,11 @@ def compare(controllers: Annotated[Optional[str], typer.Option(
     An interrupted or repeated comparison flies only the missing flights. Example: beetle_omni
     compare --controllers rl,nmpc --tasks waypoints --seeds 0,1,2
     """
-    from beetle_omni_ros.runs.json_file import check_writable
     arguments = {'controllers': names('--controllers', controllers),
                  'tasks': names('--tasks', tasks),
                  'conditions': names('--conditions', conditions),
                  'seeds': numbers('--seeds', seeds)}
-    if policy and not policy.is_file():
-        raise ParameterError(f'{policy}: no such file')
+    check_files(policy)
     check_writable(json_path)
     from beetle_omni_ros.comparison.command import run_compare
     from beetle_omni_ros.comparison.sweep import SweepError
@@ -228,9 +227,7 @@ def faults(faults: Annotated[Optional[Path], typer.Option(
                '--ros', help='Inject the faults that need the ROS graph, in real time and in '
                              'hover: killed or stopped processes, and other programs that publish '
                              'on its topics.')] = False,
-           jobs: Annotated[Optional[int], typer.Option(
-               '--jobs', '-j', min=1, help='Parallel flights. Default: one on each core.')]
-            = None,
+           jobs: JobsOption = None,
            bags: Annotated[bool, typer.Option(
                '--bags', help='Record each flight in --output, and read its bag.')] = False,
            output: Annotated[Optional[Path], typer.Option(
@@ -249,8 +246,7 @@ def faults(faults: Annotated[Optional[Path], typer.Option(
     """
     if conditions not in CONDITIONS:
         raise ParameterError(f"--conditions '{conditions}': expected {' or '.join(CONDITIONS)}")
-    if faults and not faults.is_file():
-        raise ParameterError(f'{faults}: no such file')
+    check_files(faults)
     if without_mocap and not landings:
         raise ParameterError('--without-mocap: expected --landings N with it')
     chosen, through_ros = names('--only', only), None
@@ -281,7 +277,6 @@ def report(runs: Annotated[list[Path], typer.Argument(
 
     Example: beetle_omni report flight_a flight_b --output report.html
     """
-    from beetle_omni_ros.runs.json_file import check_writable
     check_writable(output, 'report')
     check_writable(json_path)
     from beetle_omni_ros.runs.report import run_report
@@ -318,10 +313,7 @@ def film(runs: Annotated[list[Path], typer.Argument(
     Needs OpenGL for off-screen rendering; without it, a message names the packages to install.
     Example: beetle_omni film my_run/rl my_run/nmpc --output flight.gif
     """
-    from beetle_omni_ros.runs.json_file import check_writable
-    for file in (*(model or ()), *((robot,) if robot else ())):
-        if not file.is_file():
-            raise ParameterError(f'{file}: no such file')
+    check_files(*(model or ()), robot)
     for path in output:
         check_writable(path, 'film')
     from beetle_omni_ros.film.graphics import choose_backend
@@ -341,7 +333,6 @@ def controllers(json_path: JsonOption = None):
     from rich.console import Console
     from rich.table import Table
 
-    from beetle_omni_ros.runs.json_file import check_writable, write_json
     check_writable(json_path)
     found = {name: _known(name) for name in registry.names()}
     table = Table(box=None, header_style='dim', padding=(0, 2, 0, 0))

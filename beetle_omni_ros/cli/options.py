@@ -8,6 +8,7 @@ import typer
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.runs.json_file import check_writable
 
 UNUSABLE, FAILED, INTERRUPTED = 2, 1, 130
 CONDITIONS = ('nominal', 'published')
@@ -48,6 +49,8 @@ CompressionOption = Annotated[str, typer.Option(
 FaultsOption = Annotated[Optional[Path], typer.Option(
     '--faults', metavar='FILE', help='Faults with times and durations (YAML, see '
                                      'docs/faults.md).')]
+JobsOption = Annotated[Optional[int], typer.Option(
+    '--jobs', '-j', min=1, help='Parallel flights. Default: one on each core.')]
 JsonOption = Annotated[Optional[Path], typer.Option(
     '--json', metavar='FILE', help='Write the results as JSON.')]
 
@@ -92,9 +95,15 @@ def usage_text(error: Exception, args: list[str]) -> str:
     return f'{text} See {command} --help.'
 
 
+def check_files(*files: Path | None):
+    """Refuse files that do not exist; None: not given."""
+    for file in files:
+        if file is not None and not file.is_file():
+            raise ParameterError(f'{file}: no such file')
+
+
 def check_flight(*, task, seed, conditions, bag, compression, json_path, files):
     """Refuse unusable input before the flight starts."""
-    from beetle_omni_ros.runs.json_file import check_writable
     from beetle_omni_ros.runs.rosbag2_writer import COMPRESSIONS
     from beetle_omni_ros.runs.tasks import make_task
     if conditions not in CONDITIONS:
@@ -102,9 +111,7 @@ def check_flight(*, task, seed, conditions, bag, compression, json_path, files):
     if compression not in COMPRESSIONS:
         raise ParameterError(f"--compression '{compression}': expected "
                              f"{' or '.join(COMPRESSIONS)}")
-    for file in files:
-        if file is not None and not file.is_file():
-            raise ParameterError(f'{file}: no such file')
+    check_files(*files)
     make_task(task, seed)
     check_writable(json_path)
     if bag:
