@@ -8,8 +8,6 @@ controller that predicts with them has no steady error. The module also predicts
 sensor reports: the rotors' thrust, and the present tilts, because encoder readings are delayed.
 """
 
-from __future__ import annotations
-
 from collections import deque
 
 import numpy as np

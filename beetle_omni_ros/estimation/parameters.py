@@ -1,7 +1,5 @@
 """The estimator's parameters (params/ekf.yaml)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -5,8 +5,6 @@ Recording of a flight.
 that a loop records into memory, onto disk, or both with :class:`Tee`.
 """
 
-from __future__ import annotations
-
 from array import array
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The reported states of the actuator bridges, as used by the supervisor."""
 
-from __future__ import annotations
-
 READY, SILENT, LOST = 'ready', 'silent:', 'lost:'
 NODES = {'joint': 'joint_bridge_node', 'rotor': 'rotor_bridge_node'}
 

@@ -9,8 +9,6 @@ and velocity are dead reckoning, and the velocity slowly decays to the desired v
 descent stays slow. Without IMU the rotor model is used between MoCap poses.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import replace
 from math import isfinite, sqrt

@@ -1,7 +1,5 @@
 """Outputs of the supervisor: events, answers to requests, and timeouts of sources."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 INFO, WARNING, ERROR = 'info', 'warning', 'error'

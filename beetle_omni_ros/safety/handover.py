@@ -1,7 +1,5 @@
 """Transition between the commands of two controllers without a jump."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from beetle_omni_ros.control.base import Command

@@ -1,7 +1,5 @@
 """Landing: level out, sink at a set rate, detect the ground, with any remaining estimate."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from math import inf, isfinite
 

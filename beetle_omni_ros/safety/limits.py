@@ -1,7 +1,5 @@
 """Checks of commands, and a record of each controller's valid and refused commands."""
 
-from __future__ import annotations
-
 from collections import Counter
 from math import isfinite
 

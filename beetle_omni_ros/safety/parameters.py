@@ -1,7 +1,5 @@
 """The supervisor's parameters; params/supervisor.yaml gives the reasons of their values."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from beetle_omni_ros.control import registry

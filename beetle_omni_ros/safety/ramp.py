@@ -1,7 +1,5 @@
 """A target that climbs or sinks with a limited speed while the attitude turns to level."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import sqrt
 

@@ -1,7 +1,5 @@
 """The active controller, and the command streams of all controllers."""
 
-from __future__ import annotations
-
 from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.limits import CommandStream, UNKNOWN

@@ -5,8 +5,6 @@ A pure state machine that reads no clock and no topic. All times are arguments, 
 and the in-process evaluation run the same code with the same results. See docs/safety.md.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Share of the weight that the rotors carry, for the detection of the ground."""
 
-from __future__ import annotations
-
 from math import exp
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Takeoff: joints to their hover angles, then a climb by the hover controller."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -8,8 +8,6 @@ robot therefore flies to an attitude that the other three rotors hold with a mar
 rotor, turns its joint, and continues with four rotors.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import combinations
 

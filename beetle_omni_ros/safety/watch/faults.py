@@ -1,7 +1,5 @@
 """All detectors of one vehicle: detected faults, and the health of the actuators."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Joints that do not follow their commands, and encoders that jump."""
 
-from __future__ import annotations
-
 from collections import deque
 from math import expm1
 

@@ -1,7 +1,5 @@
 """Detection of contradictions between MoCap and estimate, and their cause."""
 
-from __future__ import annotations
-
 from math import sqrt
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Thrust limit of a sagging pack, from its voltage under load."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from beetle_omni_ros.robot.allocation import Allocator, ROTORS

@@ -1,7 +1,5 @@
 """Thresholds of all detectors; params/supervisor.yaml gives the reasons of their values."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from beetle_omni_ros.robot.schema import group, parameter

@@ -1,7 +1,5 @@
 """Detection of rotors whose ESC speed differs from the commanded thrust."""
 
-from __future__ import annotations
-
 from collections import deque
 from math import exp, expm1
 

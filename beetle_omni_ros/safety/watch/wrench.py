@@ -1,7 +1,5 @@
 """Detection of a lost rotor or contact by unexplained forces and torques."""
 
-from __future__ import annotations
-
 from collections import deque
 from math import exp, expm1, sqrt
 
