@@ -151,19 +151,17 @@ class HoverController:
         if not free or state.command is None:
             return
         force, torque = self._allocator.wrench(state.tilt, self._thrust)
-        rate, inertia = state.angular_velocity, self._robot.inertia
-        model, measured = np.empty(6), np.empty(6)
-        model[:3] = (rotations.matrix(state.quaternion) @ force - self._allocator.weight) \
+        rate, inertia, p = state.angular_velocity, self._robot.inertia, self.parameters
+        gain = -expm1(-dt / p.disturbance_time)
+        modelled = (rotations.matrix(state.quaternion) @ force - self._allocator.weight) \
             / self._allocator.mass
-        model[3:] = (torque - rotations.cross(rate, inertia * rate)) / inertia
-        measured[:3] = state.velocity - before.velocity
-        measured[3:] = rate - before.angular_velocity
-        measured /= dt
-        self._disturbance += -expm1(-dt / self.parameters.disturbance_time) \
-            * (measured - model - self._disturbance)
-        p = self.parameters
-        self._disturbance[:3] = _shortened(self._disturbance[:3], p.position.disturbance_limit)
-        self._disturbance[3:] = _shortened(self._disturbance[3:], p.attitude.disturbance_limit)
+        turning = (torque - rotations.cross(rate, inertia * rate)) / inertia
+        for part, measured, model, limit in (
+                (self._disturbance[:3], state.velocity - before.velocity, modelled,
+                 p.position.disturbance_limit),
+                (self._disturbance[3:], rate - before.angular_velocity, turning,
+                 p.attitude.disturbance_limit)):
+            part[:] = _shortened(part + gain * (measured / dt - model - part), limit)
 
     def diagnostics(self) -> dict[str, float | int | str]:
         """Errors of the last step, disturbances and saturated steps since reset."""

@@ -1,7 +1,8 @@
 """Detection of rotors whose ESC speed differs from the commanded thrust."""
 
 from collections import deque
-from math import exp, expm1
+from math import exp, expm1, inf, isfinite, nan
+from operator import attrgetter
 
 import numpy as np
 
@@ -48,13 +49,9 @@ class SpeedWatch:
 
     def reset(self) -> None:
         """Reset all learnt factors."""
-        self._stamp, self._interval, self._settled_at = -np.inf, np.inf, -np.inf
+        self._stamp, self._interval, self._settled_at = -inf, inf, -inf
         self._commands: deque = deque(maxlen=KEPT)
-        self._thrust = np.zeros(ROTORS)
-        self._factor = np.zeros(ROTORS)     # [N s^2/rad^2]
-        self._learnt_for = np.zeros(ROTORS)
-        self._for, self._deaf_for, self._more_for = np.zeros((3, ROTORS))
-        self._sums = np.zeros((5, ROTORS))      # moments of modelled and measured thrust
+        self._rotors = [Rotor(self._p) for _ in range(ROTORS)]
         self.lost: int | None = None
         self.deaf: int | None = None
         self.thrust = np.full(ROTORS, np.nan)
@@ -62,12 +59,12 @@ class SpeedWatch:
 
     def on_command(self, stamp: float, thrust: np.ndarray) -> None:
         """Receive the commanded thrusts (4,) [N] of the time ``stamp`` [s]."""
-        self._commands.append((stamp + DELAY, thrust))
+        self._commands.append((stamp + DELAY, thrust.tolist()))
 
     def forget(self) -> None:
         """Suspect no rotor."""
-        self._for, self._deaf_for, self._more_for = np.zeros((3, ROTORS))
-        self._sums[:] = 0.0
+        for rotor in self._rotors:
+            rotor.forget()
         self.slow = np.zeros(ROTORS, dtype=bool)
         self.lost = self.deaf = None
 
@@ -76,11 +73,13 @@ class SpeedWatch:
         commands = self._commands
         while len(commands) > 1 and commands[1][0] <= start:
             commands.popleft()
-        for k, (stamp, thrust) in enumerate(commands):
+        for k, (stamp, asked) in enumerate(commands):
             until = commands[k + 1][0] if k + 1 < len(commands) else end
             span = min(until, end) - max(stamp, start)
             if span > 0:
-                self._thrust = self._thrust - expm1(-span / self._lag) * (thrust - self._thrust)
+                gain = -expm1(-span / self._lag)
+                for rotor, thrust in zip(self._rotors, asked):
+                    rotor.modelled += gain * (thrust - rotor.modelled)
 
     def on_speeds(self, stamp: float, speed: np.ndarray) -> None:
         """
@@ -98,43 +97,89 @@ class SpeedWatch:
         if dt > max(SHORTEST, STALLED * self._interval):
             self._settled_at = stamp + SETTLED
         self._interval = dt
+        rotors = self._rotors
         if dt > LONGEST:
             if self._commands:
-                self._thrust = np.array(self._commands[-1][1], dtype=float)
+                for rotor, thrust in zip(rotors, self._commands[-1][1]):
+                    rotor.modelled = thrust
             return self.forget()
         self._follow(before, stamp)
         if stamp < self._settled_at:
             return self.forget()
-        square = np.asarray(speed, dtype=float)**2
-        judged = np.isfinite(square) & (self._thrust > self._p.least_thrust)
-        known = judged & (self._learnt_for >= LEARNT)
-        slow = known & (self._factor * square < (1 - self._p.share) * self._thrust)
-        self.slow = known & (self._factor * square < (1 - self._p.noticed) * self._thrust)
-        self._for = np.where(slow, self._for + dt, 0.0)
-        self.lost = int(np.argmax(self._for)) if self._for.max() >= self._p.speed_time else None
-        self.thrust = np.where(known, self._factor * square, np.nan)
-        self._judge(known, dt)
-        learn = judged & ~slow & (square > 0)
-        ratio = np.divide(self._thrust, square, out=np.zeros(ROTORS), where=learn)
-        gain = np.minimum(1.0, dt / np.maximum(self._learnt_for, dt))
-        gain = np.maximum(gain, min(1.0, dt / LEARNT))
-        self._factor = np.where(learn, self._factor + gain * (ratio - self._factor), self._factor)
-        self._learnt_for = np.where(learn, self._learnt_for + dt, self._learnt_for)
+        decay = exp(-dt / self._p.slope_window)
+        for rotor, value in zip(rotors, speed.tolist()):
+            rotor.update(value * value, dt, decay)
+        self.thrust = np.array([rotor.measured for rotor in rotors])
+        self.slow = np.array([rotor.slow for rotor in rotors])
+        longest = max(rotors, key=attrgetter('slow_for'))
+        self.lost = rotors.index(longest) if longest.slow_for >= self._p.speed_time else None
+        self.deaf = next((i for i, rotor in enumerate(rotors) if rotor.deaf), None)
 
-    def _judge(self, known, dt):
-        """Rotor whose measured thrust does not follow the modelled thrust, or None."""
-        x, y = np.where(known, [self._thrust, self.thrust], 0.0)
-        self._sums *= known * exp(-dt / self._p.slope_window)
-        self._sums += dt * np.array([known, x, y, x * x, x * y])
-        weight, sum_x, sum_y, sum_xx, sum_xy = self._sums
-        full = weight > 0.5 * self._p.slope_window
-        count = np.where(full, weight, 1.0)
-        variance = sum_xx / count - (sum_x / count) ** 2
-        slope_times = sum_xy / count - sum_x * sum_y / count**2
-        more = known & (y > (1 + self._p.share) * x) & (y - x > self._p.excess)
-        self._more_for = np.where(more, self._more_for + dt, 0.0)
-        deaf = full & (variance > self._p.least_variation**2) \
-            & (slope_times < self._p.least_slope * variance)
-        self._deaf_for = np.where(deaf, self._deaf_for + dt, 0.0)
-        found = (self._deaf_for >= self._p.deaf_time) | (self._more_for >= self._p.speed_time)
-        self.deaf = int(np.argmax(found)) if found.any() else None
+
+class Rotor:
+    """
+    One rotor of :class:`SpeedWatch`; plain floats, because numpy is slower for single numbers.
+
+    Attributes:
+        modelled: thrust by the commands [N].
+        measured: thrust by the speed [N], nan if unknown.
+        slow: whether it turns noticeably too slowly at the last report.
+        slow_for: time for which it has turned too slowly [s].
+        deaf: whether its speed does not follow its commands.
+
+    """
+
+    def __init__(self, limits: RotorLimits):
+        self._p = limits
+        self.modelled, self._factor, self._learnt_for = 0.0, 0.0, 0.0   # factor in N s^2/rad^2
+        self.forget()
+
+    def forget(self) -> None:
+        """Remove every suspicion."""
+        self.measured, self.slow, self.slow_for, self.deaf = nan, False, 0.0, False
+        self._deaf_for = self._more_for = 0.0
+        # Moments of modelled (x) and measured (y) thrust, with fading memory.
+        self._weight = self._x = self._y = self._xx = self._xy = 0.0
+
+    def update(self, square: float, dt: float, decay: float) -> None:
+        """
+        Process one report.
+
+        Args:
+            square: squared speed [rad^2/s^2], nan if unknown.
+            dt: time since the report before [s].
+            decay: factor of the moments in this time.
+
+        """
+        p, x = self._p, self.modelled
+        judged = isfinite(square) and x > p.least_thrust
+        known = judged and self._learnt_for >= LEARNT
+        y = self._factor * square if known else nan
+        too_slow = known and y < (1 - p.share) * x
+        self.measured, self.slow = y, known and y < (1 - p.noticed) * x
+        self.slow_for = self.slow_for + dt if too_slow else 0.0
+        if known:
+            self._regress(x, y, dt, decay)
+        else:
+            self._weight = self._x = self._y = self._xx = self._xy = 0.0
+            self.deaf, self._deaf_for, self._more_for = False, 0.0, 0.0
+        if judged and not too_slow and square > 0:
+            gain = max(min(1.0, dt / max(self._learnt_for, dt)), min(1.0, dt / LEARNT))
+            self._factor += gain * (x / square - self._factor)
+            self._learnt_for += dt
+
+    def _regress(self, x, y, dt, decay):
+        """Whether the measured thrust ``y`` does not follow the modelled thrust ``x``."""
+        p = self._p
+        self._weight = self._weight * decay + dt
+        self._x, self._y = self._x * decay + dt * x, self._y * decay + dt * y
+        self._xx, self._xy = self._xx * decay + dt * (x * x), self._xy * decay + dt * (x * y)
+        w = self._weight
+        variance = self._xx / w - (self._x / w) ** 2
+        covariance = self._xy / w - self._x * self._y / w**2
+        deaf = w > 0.5 * p.slope_window and variance > p.least_variation**2 \
+            and covariance < p.least_slope * variance
+        self._deaf_for = self._deaf_for + dt if deaf else 0.0
+        more = y > (1 + p.share) * x and y - x > p.excess
+        self._more_for = self._more_for + dt if more else 0.0
+        self.deaf = self._deaf_for >= p.deaf_time or self._more_for >= p.speed_time
