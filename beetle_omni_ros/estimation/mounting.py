@@ -55,40 +55,46 @@ class Mounting:
             readings: IMU readings (stamp, specific force, rate, after impact) up to the node's.
 
         """
-        age, delayed = node.time_offset, node
+        age = node.time_offset
         late = age > SIGNIFICANT * self._model.time_deviation(node)
-        if late:
-            node = self._extrapolated(delayed, age, self.trend(readings))
-        rate = node.rate - node.gyroscope_bias
-        position, velocity = node.position, node.velocity
+        position, velocity, quaternion, measured_rate = (
+            self._extrapolated(node, age, self.trend(readings)) if late else
+            (node.position, node.velocity, node.quaternion, node.rate))
+        rate = measured_rate - node.gyroscope_bias
         if self._arm is not None:
-            position = position - node.rotation @ self._arm
-            velocity = velocity - node.rotation @ rotations.cross(rate, self._arm)
+            rotation = rotations.matrix(quaternion)
+            position = position - rotation @ self._arm
+            velocity = velocity - rotation @ rotations.cross(rate, self._arm)
 
         def covariance():
-            found = self._model.covariance(delayed)
+            found, rotation = self._model.covariance(node), rotations.matrix(quaternion)
             if late:
-                found = self._extrapolated_covariance(delayed, node, age, found)
+                # the mean rate, which includes half of the trend
+                mean = 0.5 * (node.rate + measured_rate) - node.gyroscope_bias
+                found = self._extrapolated_covariance(node, rotation, mean, age, found)
             found = found[:ERROR_STATES, :ERROR_STATES]
             return found if self._arm is None else \
-                self._covariance_at_base(node, rate, found, self._arm)
+                self._covariance_at_base(rotation, rate, found, self._arm)
 
-        return Estimate(node.stamp, position, velocity, node.quaternion, rate,
+        return Estimate(node.stamp, position, velocity, quaternion, rate,
                         node.accelerometer_bias, node.gyroscope_bias, covariance)
 
     def trend(self, readings) -> np.ndarray:
         """(3,) angular acceleration [rad/s^2], by least squares through the last readings."""
         count = self._trend_samples
         last = [readings[i] for i in range(max(0, len(readings) - count), len(readings))]
-        if len(last) < max(count, 2) or any(reading[3] for reading in last):
+        if len(last) < max(count, 2):
             return np.zeros(3)
-        times = np.array([reading[0] for reading in last])
+        stamps, _, rates, after_impact = zip(*last)
+        if any(after_impact):
+            return np.zeros(3)
+        times = np.array(stamps)
         times -= times.sum() / len(last)
-        return times.dot(np.array([reading[2] for reading in last])) / times.dot(times)
+        return times.dot(rates) / times.dot(times)
 
-    def _extrapolated(self, node, age, trend) -> Node:
+    def _extrapolated(self, node, age, trend) -> tuple[np.ndarray, ...]:
         """
-        Extrapolate a state over the latency in the IMU's stamps.
+        Extrapolate position, velocity, quaternion and rate over the latency in the IMU's stamps.
 
         A stamp on arrival can be late but not early. IMU stamps later than the MoCap's therefore
         mean a delayed reading. In the opposite case the MoCap's stamps are late and the reading is
@@ -105,28 +111,24 @@ class Mounting:
                     for p, v, a in zip(node.position.tolist(), velocity0, acceleration)]
         velocity = [v + age * a for v, a in zip(velocity0, acceleration)]
         rate = [w + age * slope for w, slope in zip(rate0, slopes)]
-        return Node(node.stamp, node.force, np.array(rate), np.array(position),
-                    np.array(velocity), quaternion, rotations.matrix(quaternion),
-                    node.accelerometer_bias, node.gyroscope_bias, node.time_offset)
+        return np.array(position), np.array(velocity), quaternion, np.array(rate)
 
-    def _extrapolated_covariance(self, before, after, age, covariance) -> np.ndarray:
-        """(16, 16) covariance of ``after``, the extrapolation of ``before``."""
+    def _extrapolated_covariance(self, before, rotation, rate, age, covariance) -> np.ndarray:
+        """(16, 16) covariance after an extrapolation to ``rotation`` with a mean rate."""
         acceleration = before.rotation @ (before.force - before.accelerometer_bias)
         acceleration[2] -= self._gravity
-        # the mean rate, which includes half of the trend
-        rate = 0.5 * (before.rate + after.rate) - before.gyroscope_bias
         jacobian = np.eye(STATES)
         jacobian[POSITION, VELOCITY] = age * np.eye(3)
         jacobian[POSITION, TIME_OFFSET] = before.velocity
         jacobian[VELOCITY, TIME_OFFSET] = acceleration
         jacobian[VELOCITY, ATTITUDE] = -age * rotations.skew(acceleration) @ before.rotation
         jacobian[VELOCITY, ACCELEROMETER_BIAS] = -age * before.rotation
-        jacobian[ATTITUDE, ATTITUDE] = after.rotation.T @ before.rotation
+        jacobian[ATTITUDE, ATTITUDE] = rotation.T @ before.rotation
         jacobian[ATTITUDE, GYROSCOPE_BIAS] = -age * np.eye(3)
         jacobian[ATTITUDE, TIME_OFFSET] = rate
         return jacobian @ covariance @ jacobian.T
 
-    def _covariance_at_base(self, node, rate, covariance, lever: np.ndarray) -> np.ndarray:
+    def _covariance_at_base(self, rotation, rate, covariance, lever: np.ndarray) -> np.ndarray:
         """
         Transform a state's covariance (15, 15) from the IMU to base_link's origin.
 
@@ -134,10 +136,10 @@ class Mounting:
         sample affects the velocity through the arm.
         """
         swing = rotations.cross(rate, lever)
-        arm = node.rotation @ rotations.skew(lever)
+        arm = rotation @ rotations.skew(lever)
         jacobian = np.eye(ERROR_STATES)
         jacobian[POSITION, ATTITUDE] = arm
-        jacobian[VELOCITY, ATTITUDE] = node.rotation @ rotations.skew(swing)
+        jacobian[VELOCITY, ATTITUDE] = rotation @ rotations.skew(swing)
         jacobian[VELOCITY, GYROSCOPE_BIAS] = -arm
         covariance = jacobian @ covariance @ jacobian.T
         covariance[VELOCITY, VELOCITY] += self._rate_noise * arm @ arm.T
