@@ -57,7 +57,7 @@ def test_an_own_controller_flies_beside_the_nmpc(poses):
 
 
 def test_an_own_trajectory_is_followed_by_both_controllers():
-    printed = run('own_trajectory.py', 6)
+    printed = run('own_trajectory.py', 2)
     errors = dict(re.findall(r'^(nmpc|rl): ([\d.]+) mm', printed, re.MULTILINE))
     assert {'nmpc', 'rl'} == set(errors) and max(map(float, errors.values())) < 100
 
