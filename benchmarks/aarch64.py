@@ -245,13 +245,13 @@ def count(sysroot: Path, console: Console) -> list[dict]:
                         capture_output=True)
     if done.returncode:
         sys.exit(f'aarch64: counting failed: {done.stderr[-500:]}')
-    begun, counts = {}, {key: [] for key in PARTS}
+    begin, counts = {}, {key: [] for key in PARTS}
     for number, total in re.findall(r'^mark (\d+) (\d+)$', done.stderr, re.M):
         number, total = int(number), int(total)
         if number in PARTS:
-            begun[number] = total
+            begin[number] = total
         else:
-            counts[number - 1].append(total - begun[number - 1])
+            counts[number - 1].append(total - begin[number - 1])
     table, rows = Table(title=f'instructions on aarch64, {date.today()}'), []
     for column in ('', 'steps', 'median [10^6]', 'p99', 'max', *(
             f'p99 [ms] at {one} a cycle' for one in CYCLES), 'bound [ms]', 'needs a cycle'):

@@ -50,9 +50,9 @@ class Heartbeat:
         time.sleep(2 * PERIOD)      # a stall that ends now is recorded soon
         found = []
         for line in self._file.read_text().splitlines():
-            begun, ended = map(float, line.split())
-            if begun < end and ended > start:
-                found.append(ended - begun - PERIOD)
+            began, ended = map(float, line.split())
+            if began < end and ended > start:
+                found.append(ended - began - PERIOD)
         return found
 
     def close(self) -> None:

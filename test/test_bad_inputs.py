@@ -88,10 +88,10 @@ def rows():
         base = command if command is EVALUATE else [*FLY, '--task', 'good.csv']
         for option, cases in (('--task', TASKS), ('--robot', ROBOTS), ('--seed', SEEDS),
                               ('--json', RESULTS), ('--plant', ROBOTS[1:6])):
-            for value, said in cases:
-                yield [*base, option, value], said
-        for value, said in FAULTS:
-            yield [*base, '--faults', value], said
+            for value, fragment in cases:
+                yield [*base, option, value], fragment
+        for value, fragment in FAULTS:
+            yield [*base, '--faults', value], fragment
         yield [*base, '--conditions', 'windy'], "--conditions 'windy': expected nominal or"
         yield [*base, '--compression', 'rar'], "compression 'rar': expected none or zstd"
         yield [*base, '--sed', '1'], '--sed'
@@ -106,20 +106,21 @@ def rows():
         yield [*base, '--bag', 'notes.txt/bag'], 'is not a folder'
     for value in ('', ' , ', 'nmpc,nmpc'):
         yield [*EVALUATE, '--controllers', value], "--controllers '"
-    for value, said in (('none.yaml', 'no such file'), ('horizon.yaml', "'horizn': unknown key"),
+    for value, fragment in (('none.yaml', 'no such file'),
+                            ('horizon.yaml', "'horizn': unknown key"),
                         ('broken.yaml', 'broken.yaml: ')):
-        yield [*EVALUATE, '--nmpc', value], said
+        yield [*EVALUATE, '--nmpc', value], fragment
     yield [*EVALUATE, '--controllers', 'hover', '--nmpc', 'horizon.yaml'], '--nmpc horizon.yaml'
     yield ['fly'], "'--bag'"
-    for option, value, said in (
+    for option, value, fragment in (
             ('--actuators', 'steam', "actuators 'steam': expected emulated or direct"),
             ('--clock', 'sun', "clock 'sun': expected auto or system or simulated"),
             ('--domain-id', '102', "--domain-id '102': expected"),
             ('--domain-id', 'x', "--domain-id 'x': expected"),
             ('--discovery', 'OFF', '--discovery OFF'), ('--discovery', 'MARS', 'MARS')):
-        yield [*FLY, '--task', 'good.csv', option, value], said
+        yield [*FLY, '--task', 'good.csv', option, value], fragment
     yield [*FLY, '--clock', 'simulated', '--actuators', 'emulated'], 'serial devices keep real'
-    for option, value, said in (
+    for option, value, fragment in (
             ('--controllers', '', "--controllers '': expected"), ('--tasks', 'hovr', 'hovr'),
             ('--controllers', 'npmc', 'npmc'), ('--tasks', 'hover,hover', "--tasks 'hover,hover'"),
             ('--tasks', 'text.csv', 'row 3, column roll_deg: expected'), ('--seeds', '0,x', "'x'"),
@@ -129,8 +130,8 @@ def rows():
             ('--policy', 'none.onnx', 'none.onnx: no such file'),
             ('--output', 'notes.txt', 'notes'),
             ('--json', 'no/result.json', 'there is no folder')):
-        yield [*COMPARE, option, value], said
-    for option, value, said in (
+        yield [*COMPARE, option, value], fragment
+    for option, value, fragment in (
             ('--faults', 'none.yaml', 'none.yaml'), ('--faults', 'no_list.yaml', "'faults'"),
             ('--only', 'rotor_9_stops', "fault 'rotor_9_stops' is unknown; known:"),
             ('--from', 'bed', "--from 'bed': expected hover, moving, upside_down"),
@@ -141,47 +142,47 @@ def rows():
             ('--conditions', 'windy', 'windy'), ('--controller', 'npmc', 'npmc'),
             ('--docs', 'notes.txt', 'notes.txt: no line'), ('--output', 'notes.txt', 'notes.txt'),
             ('--jobs', '0', "--jobs '0': expected"), ('--json', 'folder', 'it is a folder')):
-        yield ['faults', '--only', 'mocap_lost', option, value], said
+        yield ['faults', '--only', 'mocap_lost', option, value], fragment
     yield ['faults', '--only', 'mocap_lost', '--bags'], '--bags: expected --output'
     for command in ('report', 'gap'):
         yield [command], "'RUN...'"
-        for value, said in RUNS:
-            yield [command, value], said
+        for value, fragment in RUNS:
+            yield [command, value], fragment
         yield [command, 'imu_only', '--json', 'no/result.json'], 'there is no folder'
     yield ['report', 'imu_only'], 'ground_truth/odom'
     yield ['report', *['imu_only'] * 7], 'at most'
     yield ['report', 'imu_only', '--output', 'no/page.html'], 'page.html'
     yield ['gap', 'imu_only', 'imu_only'], 'imu_only'
-    for option, value, said in (
+    for option, value, fragment in (
             ('--robot', 'none.yaml', 'none.yaml'), ('--robot', 'unknown.yaml', 'masss'),
             ('--apply', 'no/robot.yaml', 'there is no folder'),
             ('--gap', 'none.yaml', 'none.yaml'),
             ('--gap', 'unknown.yaml', 'masss'), ('--report', 'folder', 'it is a folder')):
-        yield ['gap', 'imu_only', option, value], said
+        yield ['gap', 'imu_only', option, value], fragment
     yield ['identify', 'engine'], 'engine'
     for kind, metavar in (('joint', 'LOG'), ('rotor', 'LOG.csv')):
         yield ['identify', kind], metavar
-        for value, said in (('none.csv', 'none.csv'), ('', "'': expected a value"),
+        for value, fragment in (('none.csv', 'none.csv'), ('', "'': expected a value"),
                             ('columns.csv', 'columns.csv'), ('empty.csv', 'empty.csv'),
                             ('binary.csv', 'binary.csv'), ('folder', 'folder')):
-            yield ['identify', kind, value], said
-        for option, value, said in (
+            yield ['identify', kind, value], fragment
+        for option, value, fragment in (
                 ('--robot', 'none.yaml', 'none.yaml'), ('--robot', 'negative.yaml', "'mass'"),
                 ('--params', 'no/robot.yaml', 'there is no folder'),
                 ('--report', 'folder', 'it is a folder'), ('--json', 'folder', 'it is a folder')):
-            yield ['identify', kind, 'times.csv', option, value], said
-    for value, said in (('times.csv', 'times.csv'), ('one_joint.csv', 'one_joint.csv'),
+            yield ['identify', kind, 'times.csv', option, value], fragment
+    for value, fragment in (('times.csv', 'times.csv'), ('one_joint.csv', 'one_joint.csv'),
                         ('word_joint.csv', 'word_joint.csv')):
-        yield ['identify', 'joint', value], said
+        yield ['identify', 'joint', value], fragment
     yield (['identify', 'joint', 'times.csv', 'more.csv'],
            'more.csv: the identification uses one log')
-    for option, value, said in (
+    for option, value, fragment in (
             ('--seconds', '0', "--seconds '0': expected"), ('--seconds', 'x', "--seconds 'x'"),
             ('--seconds', 'nan', "--seconds 'nan'"), ('--skip', 'legs', "--skip 'legs': expected"),
             ('--servo-bus', 'none.yaml', 'none.yaml'), ('--servo-bus', 'baud.yaml', 'baud_rate'),
             ('--servo-bus', 'ids.yaml', 'ids'), ('--motor-board', 'port.yaml', "'prt': unknown"),
             ('--robot', 'unknown.yaml', 'masss'), ('--json', 'no/x.json', 'there is no folder')):
-        yield ['check', option, value], said
+        yield ['check', option, value], fragment
     yield ['controllers', 'nmpc'], 'nmpc'
     yield ['controllers', '--json', 'folder'], 'it is a folder'
     yield ['frobnicate'], 'frobnicate'
@@ -220,7 +221,7 @@ def inputs(tmp_path_factory):
     return folder
 
 
-def refused(arguments, said, inputs, monkeypatch, capsys):
+def refused(arguments, fragment, inputs, monkeypatch, capsys):
     """Check one case: status 2, one line with its words, and no written file."""
     monkeypatch.chdir(inputs)
     before = sorted(Path().rglob('*'))
@@ -228,26 +229,26 @@ def refused(arguments, said, inputs, monkeypatch, capsys):
     lines = capsys.readouterr().err.splitlines()
     assert status == 2, lines
     assert len(lines) == 1, lines
-    assert said in lines[0], lines[0]
+    assert fragment in lines[0], lines[0]
     assert any(word in lines[0] for word in EXPECTATIONS), lines[0]
     assert lines[0].startswith('beetle_omni') and ': error: ' in lines[0]
     assert sorted(Path().rglob('*')) == before
 
 
-@pytest.mark.parametrize(('arguments', 'said'), ROWS, ids=[' '.join(row[0]) for row in ROWS])
-def test_unusable_input_is_one_line(arguments, said, inputs, monkeypatch, capsys):
+@pytest.mark.parametrize(('arguments', 'fragment'), ROWS, ids=[' '.join(row[0]) for row in ROWS])
+def test_unusable_input_is_one_line(arguments, fragment, inputs, monkeypatch, capsys):
     if arguments[0] == 'fly':
         pytest.importorskip('rclpy')
     if arguments[0] == 'check':
         pytest.importorskip('serial')
-    refused(arguments, said, inputs, monkeypatch, capsys)
+    refused(arguments, fragment, inputs, monkeypatch, capsys)
 
 
-@pytest.mark.parametrize(('arguments', 'said'), TRAINING,
+@pytest.mark.parametrize(('arguments', 'fragment'), TRAINING,
                          ids=[' '.join(row[0]) for row in TRAINING])
-def test_unusable_input_of_train_is_one_line(arguments, said, inputs, monkeypatch, capsys):
+def test_unusable_input_of_train_is_one_line(arguments, fragment, inputs, monkeypatch, capsys):
     pytest.importorskip('torch')
-    refused(['train', *arguments], said, inputs, monkeypatch, capsys)
+    refused(['train', *arguments], fragment, inputs, monkeypatch, capsys)
 
 
 def test_there_are_150_inputs_of_each_kind_for_every_subcommand():

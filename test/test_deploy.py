@@ -84,9 +84,9 @@ def test_the_service_starts_the_bridges_without_arming(tmp_path):
     assert {'User=pilot', 'KillSignal=SIGINT'} <= set(unit.splitlines())
     analyse = shutil.which('systemd-analyze')
     if analyse:
-        said = subprocess.run([analyse, 'verify', str(tmp_path / UNIT)], capture_output=True,
-                              text=True, timeout=60).stderr
-        assert not re.search(r'Unknown|Invalid|Failed to parse|ignoring', said), said
+        output = subprocess.run([analyse, 'verify', str(tmp_path / UNIT)], capture_output=True,
+                                text=True, timeout=60).stderr
+        assert not re.search(r'Unknown|Invalid|Failed to parse|ignoring', output), output
 
 
 def test_without_service_only_rules_and_limits_are_installed(tmp_path):
@@ -107,10 +107,10 @@ def test_unusable_options_are_refused_in_one_line_and_write_nothing(tmp_path, op
 
 def test_help_names_every_option():
     script = (DEPLOY / 'install.sh').read_text()
-    said = subprocess.run(['sh', str(DEPLOY / 'install.sh'), '--help'], capture_output=True,
-                          text=True, timeout=60).stdout
+    output = subprocess.run(['sh', str(DEPLOY / 'install.sh'), '--help'], capture_output=True,
+                            text=True, timeout=60).stdout
     for option in re.findall(r'^ +(--[\w-]+)\)', script, re.M):
-        assert option in said
+        assert option in output
 
 
 def test_shellcheck_accepts_the_shell_scripts():

@@ -238,13 +238,13 @@ class ServoUpkeep:
             elif servo.torque and not enabled:
                 # It did not answer when the torque was switched off.
                 self._link.sync_write(register, {servo.identifier: 0})
-                self.log(f'{self._where(servo)}: had torque left, taken off')
+                self.log(f'{self._where(servo)}: still had torque, switched off')
         elif register is registers.STATUS_LEVEL:
             servo.error = data[2]  # Hardware Error Status is the third
         elif register is registers.WATCHDOG:
             servo.watchdog_expired = data[0] == registers.WATCHDOG_EXPIRED
             if servo.watchdog_expired and enabled:
-                self.log(f'{self._where(servo)}: was stopped by its watchdog, goes on')
+                self.log(f'{self._where(servo)}: was stopped by its watchdog, continues')
                 self._restart_watchdog([servo])
         else:
             servo.voltage = int.from_bytes(data[:2], 'little') * registers.VOLTAGE_UNIT

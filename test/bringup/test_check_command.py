@@ -94,8 +94,8 @@ def test_a_port_in_use_by_the_bridge_is_not_opened(robot, tmp_path):
     bus, _, _ = robot
     graph = ObservedGraph(0, 1.0, {}, {'joint_bridge': 'ready'},
                   {'joint_bridge_node: gimbal2': Status(2, 'overload', {})})
-    path, told = tmp_path / 'result.json', []
-    bus.network.handle = lambda packet, *_: told.append(packet) or []
+    path, packets = tmp_path / 'result.json', []
+    bus.network.handle = lambda packet, *_: packets.append(packet) or []
     bridge = subprocess.Popen([sys.executable, '-c', 'import sys; f = open(sys.argv[1], "rb", 0); '
                                'print("open", flush=True); sys.stdin.read()', bus.port],
                               stdin=subprocess.PIPE, stdout=subprocess.PIPE)
@@ -106,7 +106,7 @@ def test_a_port_in_use_by_the_bridge_is_not_opened(robot, tmp_path):
     finally:
         bridge.communicate()
     rows = {row['item']: row for row in json.loads(path.read_text())['findings']}
-    assert status == 1 and not told
+    assert status == 1 and not packets
     assert rows['servo port']['level'] == rows['joint_bridge state']['level'] == 'ok'
     assert str(bridge.pid) in rows['servo port']['found']
     assert rows['joint_bridge gimbal2']['level'] == 'fail'

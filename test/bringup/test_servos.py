@@ -41,11 +41,11 @@ def test_the_check_writes_no_register():
     with EmulatedServoBus(motion=JOINTS) as emulated:
         emulated.set_state(np.full(4, 0.5), np.zeros(4), np.zeros(4))
         emulated.faults.silent = {4}
-        network, told = emulated.network, []
+        network, packets = emulated.network, []
         handle = network.handle
-        network.handle = lambda packet, *rest: told.append(packet) or handle(packet, *rest)
+        network.handle = lambda packet, *rest: packets.append(packet) or handle(packet, *rest)
         servos(emulated.port)
-    assert told and {packet.instruction for packet in told} == {1, 2}    # ping and read
+    assert packets and {packet.instruction for packet in packets} == {1, 2}    # ping and read
 
 
 def test_torque_that_was_on_before_stays_on_and_is_reported():

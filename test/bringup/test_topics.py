@@ -67,13 +67,13 @@ def test_a_pause_in_a_topic_is_reported():
     assert levels(judged(mocap=paused)) == {'mocap/pose rate': 'warn'}
 
 
-@pytest.mark.parametrize(('age', 'jitter', 'level', 'said'), [
+@pytest.mark.parametrize(('age', 'jitter', 'level', 'words'), [
     (0.010, 0.004, 'ok', ''), (0.050, 0.001, 'warn', 'not synchronised'),
     (0.050, 0.100, 'warn', 'buffers'), (3600.0, 0.01, 'fail', 'not synchronised'),
     (0.150, 0.300, 'fail', 'buffers'), (-0.020, 0.001, 'fail', 'not synchronised')])
-def test_ages_distinguish_latency_from_a_clock_offset(age, jitter, level, said):
+def test_ages_distinguish_latency_from_a_clock_offset(age, jitter, level, words):
     finding = judged(mocap=stream(100, age, jitter))['mocap/pose age']
-    assert finding.level == level and said in finding.remedy
+    assert finding.level == level and words in finding.remedy
     assert ('in the future' in finding.found) == (age < 0)
 
 
@@ -126,9 +126,9 @@ def test_a_port_in_use_by_a_bridge_is_not_opened():
     port, state, gimbal = bridge_findings(busy, 'joint_bridge', running())
     assert [port.level, state.level, gimbal.level] == ['ok'] * 3
     assert 'joint_bridge_node reports' in port.found
-    told = by_item(check_topics(running(), LIMITS, ROBOT.gravity, frozenset({'joint_bridge'})))
-    assert 'joint_bridge state' not in told
-    for nobody in (None, graph()):
-        assert bridge_findings(busy, 'joint_bridge', nobody) == [busy]
+    rows = by_item(check_topics(running(), LIMITS, ROBOT.gravity, frozenset({'joint_bridge'})))
+    assert 'joint_bridge state' not in rows
+    for observed in (None, graph()):
+        assert bridge_findings(busy, 'joint_bridge', observed) == [busy]
     absent = Finding('servo port', 'fail', 'p: no such port', 'plug it in')
     assert bridge_findings(absent, 'joint_bridge', running()) == [absent]

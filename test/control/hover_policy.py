@@ -103,8 +103,9 @@ def write_hover_policy(path, memory=False, blind_above=None):
     components = g('MatMul', wrench, Allocator(robot).inverse.T)
     tilt, thrust = targets(g, components, g.columns(seen, 21, 25), g.columns(seen, 25, 29),
                            contract, robot.joints.position_limit)
-    wished = g('Sub', g('Concat', tilt, thrust, axis=1), contract.action_offset[None])
-    action = g('Div', wished, contract.action_scale[None], result='t' if blind_above else 'action')
+    requested = g('Sub', g('Concat', tilt, thrust, axis=1), contract.action_offset[None])
+    action = g('Div', requested, contract.action_scale[None],
+               result='t' if blind_above else 'action')
     if blind_above:
         height = g('Sub', g('MatMul', way, g('Transpose', up)), float(blind_above))
         g('Where', g('Greater', height, 0.0), np.nan, action, result='action')

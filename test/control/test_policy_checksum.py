@@ -20,9 +20,9 @@ SHIPPED = [share_path(f'policies/{name}.onnx') for name in ('rl', 'rl_memory')]
 def refusal(path):
     with pytest.raises(ParameterError) as error:
         PolicyNetwork(path, ROBOT)
-    told = str(error.value)
-    assert '\n' not in told and len(told) < 1500 and str(path) in told
-    return told
+    message = str(error.value)
+    assert '\n' not in message and len(message) < 1500 and str(path) in message
+    return message
 
 
 @pytest.mark.parametrize('path', SHIPPED, ids=lambda path: path.stem)
@@ -56,9 +56,9 @@ def test_metadata_may_change_and_the_checksum_survives_a_copy_by_onnx(tmp_path):
 
 def test_a_policy_without_checksum_is_refused_with_the_way_to_add_it(tmp_path):
     path = write(tmp_path / 'p.onnx', hidden=(16,), checksum=False)
-    told = refusal(path)
-    assert "metadata 'checksum' is missing" in told
-    assert 'python -m beetle_omni_ros.control.policy_checksum FILE' in told
+    message = refusal(path)
+    assert "metadata 'checksum' is missing" in message
+    assert 'python -m beetle_omni_ros.control.policy_checksum FILE' in message
     assert policy_checksum.main([str(path)]) == 0
     PolicyNetwork(path, ROBOT)
     before = path.read_bytes()

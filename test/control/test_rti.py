@@ -149,11 +149,12 @@ def test_inputs_stay_inside_their_bounds(problem):
         assert np.all(rti.inputs >= bounds[:8] - 1e-6)
 
 
-@pytest.mark.parametrize('compilers, says', [('no-such-cc', 'no C compiler'), ('false', 'failed')])
-def test_an_unusable_compiler_is_named(problem, tmp_path, monkeypatch, compilers, says):
+@pytest.mark.parametrize('compilers, expected', [
+    ('no-such-cc', 'no C compiler'), ('false', 'failed')])
+def test_an_unusable_compiler_is_named(problem, tmp_path, monkeypatch, compilers, expected):
     monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
     monkeypatch.setenv('CC', compilers)
-    with pytest.raises(native.CompilerError, match=says):
+    with pytest.raises(native.CompilerError, match=expected):
         CompiledRti(problem, INTERVALS, SOFT, 1e-6, 50, REACHES)
 
 

@@ -263,20 +263,20 @@ def test_a_bag_contains_the_frames_and_topics_of_all_layouts(tmp_path):
     for link in links:      # each has world as its root
         while link != 'world':
             link = parents[link]
-    told = {split(curve.get('name'))[0] for curve in
-            ElementTree.parse(VIEWERS / 'plotjuggler.xml').getroot().iter('curve')}
-    told |= {split(path['value'])[0] for panel in layout.values()
-             for path in panel.get('paths', ())}
-    told |= {'robot_description'}
-    missing = {name for name in told if f'/{name}' not in held}
+    plotted = {split(curve.get('name'))[0] for curve in
+               ElementTree.parse(VIEWERS / 'plotjuggler.xml').getroot().iter('curve')}
+    plotted |= {split(path['value'])[0] for panel in layout.values()
+                for path in panel.get('paths', ())}
+    plotted |= {'robot_description'}
+    missing = {name for name in plotted if f'/{name}' not in held}
     # Topics between nodes, which a flight in one process does not have.
-    assert missing <= {name for name in told if name.endswith('/state')}, missing
-    for name in told - missing:
+    assert missing <= {name for name in plotted if name.endswith('/state')}, missing
+    for name in plotted - missing:
         assert held[f'/{name}'] == TYPES[name]
     for panel in layout.values():
         for path in panel.get('paths', ()):
             topic, fields = split(path['value'])
-            if topic in told - missing:
+            if topic in plotted - missing:
                 value = from_bytes(newest[f'/{topic}'].data, TYPES[topic])
                 for field in re.findall(r'\w+', fields):
                     value = value[int(field)] if field.isdigit() else getattr(value, field)

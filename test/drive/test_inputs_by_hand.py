@@ -81,24 +81,24 @@ def test_commands_that_go_to_poses_and_that_request_actions(p):
     assert parse('', p.poses) is None and parse('# nothing', p.poses) is None
 
 
-@pytest.mark.parametrize(('line', 'said'), [
+@pytest.mark.parametrize(('line', 'fragment'), [
     ('up', 'expected up METRES'), ('up high', 'expected up METRES'), ('up nan', 'METRES'),
     ('up 1 2', 'METRES'), ('roll 200', 'at most 180'), ('goto 1 2', 'X Y Z'), ('goto', 'X Y Z'),
     ('jump 3', "'jump': expected"), ('jump', 'or a pose of home'), ('home 3', 'nothing after'),
     ('controller', 'NAME'), ('wait -1', 'SECONDS'), ('land now', 'nothing after')])
-def test_an_unknown_command_is_refused_with_the_expected_ones(p, line, said):
+def test_an_unknown_command_is_refused_with_the_expected_ones(p, line, fragment):
     with pytest.raises(WordError) as raised:
         parse(line, p.poses)
-    assert said in str(raised.value) and 'expected' in str(raised.value)
+    assert fragment in str(raised.value) and 'expected' in str(raised.value)
     assert '\n' not in str(raised.value)
 
 
-@pytest.mark.parametrize(('text', 'said'), [
+@pytest.mark.parametrize(('text', 'fragment'), [
     ('shelf: [1, 2, 3]', "'shelf': expected six numbers"), ('a b: [0, 0, 1, 0, 0, 0]', "'a b'"),
     ('shelf: [0, 0, 1, 0, 0, .nan]', "'shelf'"), ('- 3', 'expected a mapping')])
-def test_an_unusable_pose_file_is_refused_with_the_cause(tmp_path, text, said):
+def test_an_unusable_pose_file_is_refused_with_the_cause(tmp_path, text, fragment):
     file = tmp_path / 'poses.yaml'
     file.write_text(text)
     with pytest.raises(ParameterError, match='poses.yaml') as raised:
         read_named_poses(file)
-    assert said in str(raised.value)
+    assert fragment in str(raised.value)

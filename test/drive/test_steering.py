@@ -59,8 +59,8 @@ def test_a_path_through_the_floor_ends_above_it(p):
     driven.position = np.array([0.0, 0.0, 0.2])     # the feet are just above the floor
     driven.goal = driven.position, driven.quaternion
     assert driven.go([0.0, 0.0, 0.3], rotations.from_rpy(np.pi, 0, 0)) == '', 'itself it is good'
-    said = [driven.update(DT) for _ in range(200)]
-    assert any('the floor' in text for text in said) and driven.arrived
+    texts = [driven.update(DT) for _ in range(200)]
+    assert any('the floor' in text for text in texts) and driven.arrived
     assert rotations.geodesic_angle(driven.quaternion, LEVEL) < 1.5
 
 

@@ -204,7 +204,7 @@ def test_pending_torque_off_is_executed_when_a_silent_servo_answers():
         emulated.faults.silent = set()
         assert emulated.torque_enabled.tolist() == [False, False, True, False]
         until(lambda *_: not emulated.torque_enabled.any(), bus, GOAL)
-        assert any('had torque left' in line for line in bus.take_events())
+        assert any('still had torque' in line for line in bus.take_events())
 
 
 def test_disabling_on_a_bad_line_reports_whether_it_is_confirmed():

@@ -110,9 +110,9 @@ def test_stiction_is_found_from_below_and_from_above(fading, start):
     (0.009, [0.008, 0.010], (0.009, [0.008, 0.010]))])
 def test_the_stated_stiction_is_at_least_the_coulomb_friction(stiction, interval,
                                                               expected):
-    said = {'value': stiction, 'interval': interval}
-    at_least(said, {'value': 0.006, 'interval': [0.005, 0.007]})
-    assert (said['value'], said['interval']) == expected
+    stated = {'value': stiction, 'interval': interval}
+    at_least(stated, {'value': 0.006, 'interval': [0.005, 0.007]})
+    assert (stated['value'], stated['interval']) == expected
 
 
 @pytest.mark.parametrize('stiction', [0.0, 0.002])

@@ -83,9 +83,9 @@ def test_a_fit_begins_at_the_sensor_effects_of_the_robot_file(name):
     known = replace(ROBOT, effects={name: {parameter: (np.array(spec.neutral)
                                                        + spec.typical).tolist()}})
     keys = {**all_keys(known), **extra_keys()}
-    told = FlightModel(MOTION.flight(), known, BODY, keys, P).residual({})
+    given = FlightModel(MOTION.flight(), known, BODY, keys, P).residual({})
     theta = dict.fromkeys(names_of(name, parameter), spec.typical)
     fitted = FlightModel(MOTION.flight(), ROBOT, BODY, KEYS, P).residual(theta)
-    for group in told:
-        assert told[group] == pytest.approx(fitted[group], abs=1e-9)
+    for group in given:
+        assert given[group] == pytest.approx(fitted[group], abs=1e-9)
     assert keys[names_of(name, parameter)[0]].value(0.0) == pytest.approx(spec.typical)

@@ -39,17 +39,17 @@ def test_sensor_names_have_their_usual_spelling():
 
 
 def test_bad_data_states_the_first_cause_and_counts_the_others():
-    told = {'verdict': 'bad_data', 'reason': 'a: imu/data_raw: degrees per second?',
-            'bad_data': [{}, {}]}
-    assert summary(told) == 'a: imu/data_raw: degrees per second? 1 more fault is listed below.'
-    assert summary({**told, 'reason': 'a: cut', 'bad_data': [{}]}) == 'a: cut.'
+    result = {'verdict': 'bad_data', 'reason': 'a: imu/data_raw: degrees per second?',
+              'bad_data': [{}, {}]}
+    assert summary(result) == 'a: imu/data_raw: degrees per second? 1 more fault is listed below.'
+    assert summary({**result, 'reason': 'a: cut', 'bad_data': [{}]}) == 'a: cut.'
 
 
 def test_a_partial_explanation_is_stated_once():
-    told = {'verdict': 'unknown', 'reason': 'joint_4 is off, also with centre_of_mass',
-            'partial': [{'names': ['centre_of_mass']}]}
-    assert summary(told).endswith('also with centre_of_mass.')
-    assert 'Wind would explain a part' in summary({**told, 'partial': [{'names': ['wind']}]})
+    result = {'verdict': 'unknown', 'reason': 'joint_4 is off, also with centre_of_mass',
+              'partial': [{'names': ['centre_of_mass']}]}
+    assert summary(result).endswith('also with centre_of_mass.')
+    assert 'Wind would explain a part' in summary({**result, 'partial': [{'names': ['wind']}]})
 
 
 def test_the_headline_distinguishes_joints():

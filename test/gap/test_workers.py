@@ -102,8 +102,8 @@ def test_workers_do_the_work_and_end(cores):
 def test_state_of_a_worker_stays_in_its_process(cores):
     with Workers([]) as shared:
         done = [row for _ in range(3) for row in shared.map(counted, range(cores))]
-    for who in {who for who, _ in done}:
-        counts = [count for by, count in done if by == who]
+    for pid in {pid for pid, _ in done}:
+        counts = [count for by, count in done if by == pid]
         assert counts == list(range(1, len(counts) + 1))
 
 

@@ -58,9 +58,9 @@ def test_a_time_counts_as_stamp_or_from_the_start(at_s, near):
 
 def test_repairable_damage_may_be_used_if_it_is_reported():
     kind = KINDS['imu_spike']
-    told = judge(kind, asked('no_gap', findings=['imu/data_raw: a spike at 3.0 s'])
-                 | {'onset': 3.0})
-    assert told.right and told.onset
+    judged = judge(kind, asked('no_gap', findings=['imu/data_raw: a spike at 3.0 s'])
+                   | {'onset': 3.0})
+    assert judged.right and judged.onset
     assert not judge(kind, asked('no_gap')).right
 
 

@@ -109,9 +109,9 @@ def test_the_given_robot_file_describes_no_hidden_effect(tmp_path, name):
     case = replace(SMALL, effects=((name, 0.3 if name == 'mass' else 1.0, 'plain'),), fit=1,
                    duration=2.0)
     made = make_case(case, tmp_path / 'flights', tmp_path / 'sealed')
-    told = RobotParameters.load(made / 'robot.yaml')
-    assert (told.multibody is None) == (name == 'module_reaction')
-    assert not told.effects
+    given = RobotParameters.load(made / 'robot.yaml')
+    assert (given.multibody is None) == (name == 'module_reaction')
+    assert not given.effects
 
 
 def test_a_campaign_scores_workflows_side_by_side(folder, stub):

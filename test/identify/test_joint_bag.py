@@ -46,12 +46,12 @@ def test_the_part_of_highest_excitation_of_the_longest_stretch_is_used(
     assert np.abs(log.command[0]).max() == pytest.approx(np.abs(command).max())
 
 
-@pytest.mark.parametrize(('made', 'said'), [
+@pytest.mark.parametrize(('made', 'words'), [
     ({'joints': False}, 'no joint_states in this bag'),
     ({'sent': np.zeros(300, dtype=bool)}, 'no command in this bag')])
-def test_a_bag_without_servos_is_refused_in_one_line(tmp_path, made, said):
+def test_a_bag_without_servos_is_refused_in_one_line(tmp_path, made, words):
     t, command = sweep(duration=3.0)
-    with pytest.raises(LogError, match=said) as error:
+    with pytest.raises(LogError, match=words) as error:
         read_joint_log(recorded(tmp_path / 'bag', t, command, **made))
     assert '\n' not in str(error.value)
     with pytest.raises(LogError):

@@ -75,12 +75,12 @@ CASES = {
 
 @pytest.mark.parametrize('case', CASES)
 def test_unusable_logs_are_refused(good, tmp_path, case):
-    change, header, said = CASES[case]
+    change, header, words = CASES[case]
     path = saved(tmp_path / 'bad.csv', change(good), header)
     with pytest.raises(LogError) as caught:
         read_joint_log(path)
     text = str(caught.value)
-    assert said in text and str(path) in text and '\n' not in text
+    assert words in text and str(path) in text and '\n' not in text
 
 
 @pytest.mark.parametrize('content', [b'', b'\xff\xfe\x00binary', b'\n\n'])

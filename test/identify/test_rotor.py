@@ -154,9 +154,9 @@ CASES = {
 
 @pytest.mark.parametrize('case', CASES)
 def test_unusable_logs_are_refused(tmp_path, case):
-    change, header, said = CASES[case]
+    change, header, words = CASES[case]
     path = write(tmp_path / 'bad.csv', change(bench(np.random.default_rng(0))), header)
     with pytest.raises(LogError) as caught:
         identify_rotor(read_rotor_log(path))
-    assert said in str(caught.value) and 'bad.csv' in str(caught.value)
+    assert words in str(caught.value) and 'bad.csv' in str(caught.value)
     assert '\n' not in str(caught.value)

@@ -65,7 +65,7 @@ def test_sigterm_ends_a_flight_cleanly_and_the_bag_is_complete(tmp_path, moment)
         env={**os.environ, 'TMPDIR': str(temporary)})
     deadline = time.monotonic() + 120
     try:
-        while not begun(bag, b'flying:nmpc' if moment == 'flight' else b''):
+        while not has_started(bag, b'flying:nmpc' if moment == 'flight' else b''):
             assert process.poll() is None and time.monotonic() < deadline
             time.sleep(0.1)
         process.send_signal(signal.SIGTERM)
@@ -84,6 +84,6 @@ def test_sigterm_ends_a_flight_cleanly_and_the_bag_is_complete(tmp_path, moment)
         assert log.meta['task'] == 'hover' and log.meta['interrupted']
 
 
-def begun(bag: Path, text: bytes):
+def has_started(bag: Path, text: bytes):
     """Whether the recorder writes, and has written ``text``."""
     return any(text in file.read_bytes() for file in bag.glob('*.mcap'))

@@ -46,8 +46,8 @@ def test_lost_servos_in_flight_lead_to_a_landing_that_names_them(text):
     assert rig.supervisor.state == 'flying'
     report(rig, 'joint', text)
     assert rig.supervisor.state == 'landing'
-    assert any(said.startswith(f'joint_bridge_node {text}: landing')
-               for said in rig.texts('error'))
+    assert any(event.startswith(f'joint_bridge_node {text}: landing')
+               for event in rig.texts('error'))
     report(rig, 'joint', 'ready')
     assert rig.supervisor.state == 'landing'
 
@@ -62,7 +62,7 @@ def test_a_lost_motor_board_in_flight_stops_everything_until_disarmed(landing):
     report(rig, 'rotor', 'lost: restarted')
     assert rig.supervisor.state == 'emergency_stop'
     assert not rig.command.thrust.any()
-    assert any('rotor_bridge_node lost: restarted' in said for said in rig.texts('error'))
+    assert any('rotor_bridge_node lost: restarted' in event for event in rig.texts('error'))
     report(rig, 'rotor', 'ready')
     assert rig.supervisor.state == 'emergency_stop'
     assert rig.supervisor.disarm(rig.now)
@@ -72,8 +72,8 @@ def test_a_silent_motor_board_leads_to_a_powered_landing():
     rig = flown()
     report(rig, 'rotor', 'silent: no message from the board')
     assert rig.supervisor.state == 'landing' and rig.command.thrust.any()
-    assert any('silent: no message from the board: landing' in said
-               for said in rig.texts('error'))
+    assert any('silent: no message from the board: landing' in event
+               for event in rig.texts('error'))
     report(rig, 'rotor', 'lost: restarted')
     assert rig.supervisor.state == 'emergency_stop'
 
@@ -87,8 +87,8 @@ def test_a_bridge_lost_before_lift_off_stops_the_motors(name):
     rig.run(0.1)
     report(rig, name, 'lost: not armed: refused by the board: battery low')
     assert rig.supervisor.state == 'disarmed'
-    assert any('battery low' in said and 'still on the ground: motors off' in said
-               for said in rig.texts('error'))
+    assert any('battery low' in event and 'still on the ground: motors off' in event
+               for event in rig.texts('error'))
 
 
 def test_a_bridge_lost_while_disarmed_does_not_affect_the_next_flight():
@@ -104,4 +104,4 @@ def test_an_unknown_bridge_is_refused_and_reported():
     assert not rig.supervisor.on_actuators('wheel', 'lost: it', rig.now)
     rig.run(0.1)
     assert rig.supervisor.state == 'flying'
-    assert any("unknown bridge 'wheel'" in said for said in rig.texts('warning'))
+    assert any("unknown bridge 'wheel'" in event for event in rig.texts('warning'))

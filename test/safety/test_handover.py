@@ -19,8 +19,8 @@ def command(stamp, tilt, thrust):
 def changes(handover, asked, start):
     """Largest changes of tilt and thrust over a stream of (stamp, tilt, thrust), last command."""
     in_force, changed = start, []
-    for wish in asked:
-        given = handover.limit(command(*wish), in_force)
+    for requested in asked:
+        given = handover.limit(command(*requested), in_force)
         changed.append((np.abs(given.tilt - in_force.tilt).max(),
                         np.abs(given.thrust - in_force.thrust).max()))
         in_force = given

@@ -48,7 +48,7 @@ def test_arming_is_refused_with_the_reason(spoil, text):
     answer = rig.supervisor.arm(rig.now)
     assert not answer and text in answer.text
     assert rig.supervisor.state == 'disarmed' and set(rig.run(0.1)) == {None}
-    assert any(text in said for said in rig.texts('warning'))
+    assert any(text in event for event in rig.texts('warning'))
 
 
 def test_silent_controller_falls_back_to_hover_without_a_jump_and_gets_control_back():

@@ -182,7 +182,7 @@ def test_an_esc_without_telemetry_is_not_a_lost_rotor():
     (lambda lagged, t: np.full(4, 7.0), True)], ids=['healthy', 'weak', 'holds its thrust'])
 def test_a_rotor_that_does_not_follow_its_commands_is_detected_by_the_slope(answer, deaf):
     watch, thrust, noise = SpeedWatch(P.rotor, ROBOT), np.full(4, 7.0), np.random.default_rng(0)
-    told = False
+    detected = False
     for n in range(1200):
         t = 0.005 * n
         asked = 7.0 + 3.0 * np.sin(6.0 * t + np.arange(4))
@@ -191,9 +191,9 @@ def test_a_rotor_that_does_not_follow_its_commands_is_detected_by_the_slope(answ
         if n % 4 == 0:
             given = np.where(np.arange(4) == 2, answer(thrust, t) if t > 2 else thrust, thrust)
             watch.on_speeds(t, 300.0 * np.sqrt(given) * noise.normal(1.0, 0.01, 4))
-            told |= watch.deaf == 2
+            detected |= watch.deaf == 2
             assert watch.deaf in (None, 2)
-    assert told == deaf
+    assert detected == deaf
 
 
 @pytest.mark.parametrize('stall', [0.1, 0.15, 0.3])

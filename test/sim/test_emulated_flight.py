@@ -40,7 +40,7 @@ class Flight:
         self.board = driver(self.actuators.board.port)
         self.tilt, self.thrust = np.zeros(4), HOVER
         self.readings = self.reports = None
-        self.told = {}
+        self.latest = {}
 
     def __enter__(self):
         """Switch the torque on and arm."""
@@ -71,7 +71,7 @@ class Flight:
         for name in ('battery', 'rotors', 'status'):
             news = getattr(update, name)
             if news is not None:
-                self.told[name] = news
+                self.latest[name] = news
         time.sleep(max(0.0, began + TICK - time.monotonic()))
 
     def run(self, seconds):
@@ -113,11 +113,11 @@ def test_thrusts_and_tilts_act_and_are_measured(flight):
     np.testing.assert_allclose(flight.truth.thrust, HOVER, rtol=0.01)
     np.testing.assert_allclose(flight.truth.tilt, flight.tilt, atol=0.07)   # bent by the module
     np.testing.assert_allclose(flight.readings.position, flight.truth.tilt, atol=0.05)
-    told, battery = flight.told['battery'], flight.simulator.battery
-    assert told.voltage == pytest.approx(battery.voltage, abs=0.1)
-    assert -told.current == pytest.approx(battery.current, abs=1.0)
+    read, battery = flight.latest['battery'], flight.simulator.battery
+    assert read.voltage == pytest.approx(battery.voltage, abs=0.1)
+    assert -read.current == pytest.approx(battery.current, abs=1.0)
     rpm = QUICK.rpm_at_1_newton * np.sqrt(ROBOT.hover_thrust)
-    np.testing.assert_allclose(flight.told['rotors'].rpm, rpm, rtol=0.02)
+    np.testing.assert_allclose(flight.latest['rotors'].rpm, rpm, rtol=0.02)
 
 
 def test_rotors_stop_when_targets_cease_and_come_back_with_them(flight):
@@ -165,10 +165,10 @@ def test_a_failed_esc_stops_its_rotor_alone(flight):
 
 
 def test_a_sagging_pack_is_reported_and_thrust_is_kept(flight):
-    before = flight.told['battery'].voltage
+    before = flight.latest['battery'].voltage
     flight.switch(board={'voltage_sag': 2.0})
     flight.run(0.6)
-    assert flight.told['battery'].voltage == pytest.approx(before - 2.0, abs=0.2)
+    assert flight.latest['battery'].voltage == pytest.approx(before - 2.0, abs=0.2)
     np.testing.assert_allclose(flight.truth.thrust, HOVER, rtol=0.02)
 
 

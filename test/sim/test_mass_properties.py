@@ -40,12 +40,12 @@ def test_totals_hold_for_a_robot_whose_parts_are_not_described(effects):
     total = whole(properties)
     assert total.mass == pytest.approx(ROBOT.mass, rel=1e-12)
     np.testing.assert_allclose(total.inertia, np.diag(ROBOT.inertia), atol=1e-15)
-    told = effects.get('module_reaction', {})
+    module_effect = effects.get('module_reaction', {})
     for module, joint in zip(properties.modules, properties.joint_origins):
         lever = module.centre - joint
-        assert module.mass * -lever[2] == pytest.approx(told.get('mass_moment', 0.0))
+        assert module.mass * -lever[2] == pytest.approx(module_effect.get('mass_moment', 0.0))
         assert module.inertia_about(joint)[0, 0] == pytest.approx(
-            told.get('module_inertia', 0.0))
+            module_effect.get('module_inertia', 0.0))
 
 
 def test_parts_agree_with_the_published_description():

@@ -51,9 +51,9 @@ def test_the_initial_state_of_a_missed_target_is_stored():
 
 def test_the_next_target_begins_where_the_last_one_ended():
     replays, s, first = store()
-    begun = replays.unpacked(s['target_start'])
+    initial = replays.unpacked(s['target_start'])
     for row, expected in ((2, states(1)), (3, states(1)), (4, first)):
-        torch.testing.assert_close(begun['past'][row], expected['past'][row])
+        torch.testing.assert_close(initial['past'][row], expected['past'][row])
 
 
 def test_an_episode_begins_with_a_stored_situation_and_the_longest_time():
@@ -113,7 +113,7 @@ def test_the_environment_replays_missed_situations():
     env = quiet({**only('hover'), 'episode.replay_share': 0.9, 'episode.hold_targets': 0.0,
                  'episode.target_time': [1.0, 1.0], 'episode.duration': 2.0,
                  'episode.rate_limit': 200.0, 'episode.velocity_limit': 100.0}, robots=16)
-    begun = {name: value.clone() for name, value in env.state.items()}
+    initial = {name: value.clone() for name, value in env.state.items()}
     still = torch.zeros(16, 8)
     for _ in range(99):
         env.advance(still)
@@ -123,7 +123,7 @@ def test_the_environment_replays_missed_situations():
     assert missed.any()
     kept = env._replays.unpacked(env.state['stored'])
     for name in ('x', 'target_attitude', 'body', 'delays', 'bias'):
-        torch.testing.assert_close(kept[name][missed], begun[name][missed])
+        torch.testing.assert_close(kept[name][missed], initial[name][missed])
     while not (env.state['source'] >= 0).any():
         assert env.state['age'].max() < 199.5
         kept = env._replays.unpacked(env.state['stored'].clone())

@@ -25,7 +25,7 @@ PAGES = sorted((ROOT / 'docs' / 'tutorials').glob('*.md'))
 NAMES = ('beetle_omni', 'sim_node')
 STARTED = 'first_flight'    # the page whose commands load their modules, as for a reader
 TIMEOUT = 1000       # s of one block
-BLOCK = re.compile(r'(?P<before>[^\n]*)\n(?:\n<!-- test: (?P<told>[^\n]*) -->\n)?\n'
+BLOCK = re.compile(r'(?P<before>[^\n]*)\n(?:\n<!-- test: (?P<options>[^\n]*) -->\n)?\n'
                    r'```(?P<language>\w+)\n(?P<text>.*?)^```$', re.DOTALL | re.MULTILINE)
 
 
@@ -36,19 +36,19 @@ class Block:
     language: str
     text: str
     file: str = ''
-    told: list[str] = field(default_factory=list)
+    options: list[str] = field(default_factory=list)
 
     def one(self, word):
         """The argument of an instruction; '' without it."""
-        return next((told.removeprefix(word).strip() for told in self.told
-                     if told.split(' ')[0] == word), '')
+        return next((option.removeprefix(word).strip() for option in self.options
+                     if option.split(' ')[0] == word), '')
 
     @property
     def commands(self):
         """The text with the replacements of the test."""
         text = self.text
-        for told in self.told:
-            old, arrow, new = told.partition(' -> ')
+        for option in self.options:
+            old, arrow, new = option.partition(' -> ')
             if arrow:
                 assert old in text, f'{old!r} is not in the block'
                 text = text.replace(old, new)
@@ -59,10 +59,10 @@ def blocks(page):
     """Executed and written blocks of a page, in order."""
     found = []
     for match in BLOCK.finditer(page.read_text(encoding='utf-8')):
-        told = [part.strip() for part in (match['told'] or '').split(', ') if part]
+        options = [part.strip() for part in (match['options'] or '').split(', ') if part]
         file = re.search(r'as `([\w.]+)`:?$', match['before'])
         if match['language'] == 'sh' or file:
-            found.append(Block(match['language'], match['text'], file[1] if file else '', told))
+            found.append(Block(match['language'], match['text'], file[1] if file else '', options))
     return found
 
 
@@ -115,9 +115,9 @@ def run(block, folder, environment):
     done = subprocess.run(['bash', '-euo', 'pipefail', '-c', block.commands], cwd=folder,
                           env=environment, capture_output=True, text=True, timeout=TIMEOUT,
                           check=False)
-    said = f'{block.commands}\n{done.stdout[-3000:]}\n{done.stderr[-3000:]}'
-    assert done.returncode == int(block.one('fails') or 0), said
-    assert block.one('prints') in done.stdout, said
+    output = f'{block.commands}\n{done.stdout[-3000:]}\n{done.stderr[-3000:]}'
+    assert done.returncode == int(block.one('fails') or 0), output
+    assert block.one('prints') in done.stdout, output
 
 
 def stop(process):
@@ -136,7 +136,7 @@ def test_the_commands_of_a_tutorial_give_its_results(page, tmp_path, shell):
     folder.mkdir()
     try:
         for block in found:
-            if 'skip' in block.told:
+            if 'skip' in block.options:
                 continue
             if block.one('ends'):
                 stop(background.pop(block.one('ends')))
@@ -156,5 +156,5 @@ def test_the_commands_of_a_tutorial_give_its_results(page, tmp_path, shell):
 
 @pytest.mark.parametrize('page', PAGES, ids=lambda page: page.stem)
 def test_a_tutorial_has_tested_commands_and_a_picture(page):
-    assert any('skip' not in block.told and block.language == 'sh' for block in blocks(page))
+    assert any('skip' not in block.options and block.language == 'sh' for block in blocks(page))
     assert re.search(r'!\[.*\]\(\S+\.(png|gif)\)', page.read_text())
