@@ -108,7 +108,7 @@ def rows():
         yield [*EVALUATE, '--controllers', value], "--controllers '"
     for value, fragment in (('none.yaml', 'no such file'),
                             ('horizon.yaml', "'horizn': unknown key"),
-                        ('broken.yaml', 'broken.yaml: ')):
+                            ('broken.yaml', 'broken.yaml: ')):
         yield [*EVALUATE, '--nmpc', value], fragment
     yield [*EVALUATE, '--controllers', 'hover', '--nmpc', 'horizon.yaml'], '--nmpc horizon.yaml'
     yield ['fly'], "'--bag'"
