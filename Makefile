@@ -23,7 +23,7 @@ setup:  ## make .venv with all but training (also: PYTHON=..., EXTRAS=...)
 setup-train:  # the same with what training needs
 	@PYTHON='$(PYTHON)' .ci/setup train
 
-fly: setup  ## fly the waypoints in real time through ROS nodes; the bag lands in runs_out/
+fly: setup  ## fly the waypoints in real time through ROS nodes; the bag is in runs_out/
 	@mkdir -p runs_out
 	$(TOOL) fly --controller nmpc --task waypoints --bag runs_out/fly_$(RUN) $(ARGS)
 
@@ -44,7 +44,7 @@ evaluate: setup  ## 100 random poses, in one process and faster than real time
 	@mkdir -p runs_out
 	$(TOOL) evaluate --controllers nmpc --task random100 --json runs_out/evaluate_$(RUN).json $(ARGS)
 
-compare: setup  ## every experiment for RL and NMPC, to docs/comparison/; goes on where it was left
+compare: setup  ## every experiment for RL and NMPC, to docs/comparison/; continues an interrupted run
 	@mkdir -p docs/comparison runs_out
 	$(TOOL) compare --output docs/comparison --cache runs_out/comparison $(ARGS)
 
@@ -52,7 +52,7 @@ faults: setup  ## every listed fault from hover, on the move, upside down; to ru
 	@mkdir -p runs_out
 	$(TOOL) faults --output runs_out/faults $(ARGS)
 
-gap: setup  ## hide effects in the plant, fly, find and add them, fly better; to runs_out/gap/
+gap: setup  ## hide effects in the plant, fly, identify them, correct the model; to runs_out/gap/
 	@mkdir -p runs_out
 	.venv/bin/python benchmarks/gap_demo.py --output runs_out/gap $(ARGS)
 
@@ -67,6 +67,6 @@ film: setup  ## fly and draw the films of the pages: docs/pictures/*.gif, runs_o
 	    .venv/bin/python -m pip install --quiet --editable '.[film]'
 	.venv/bin/python benchmarks/film.py $(ARGS)
 
-clean:  ## remove the environment and what builds and tools leave; keeps runs_out/
+clean:  ## remove the environment and files of builds and tools; keep runs_out/
 	rm -rf .venv build install log dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

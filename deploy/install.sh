@@ -1,21 +1,21 @@
 #!/bin/sh
 # Prepare the onboard computer: names of the serial ports, real-time limits, a service for the
-# bridges. It changes files of the system and nothing of the package; run again, it changes nothing.
+# bridges. It changes system files only. A second run changes nothing.
 #
 #   sudo deploy/install.sh [OPTION...]
 #
-#   --user NAME          who runs the nodes; default: who called sudo
+#   --user NAME          user of the nodes; default: the user who called sudo
 #   --workspace DIR      colcon workspace with .venv and install; default: ~NAME/ws
 #   --servo-serial TEXT  serial number of the servos' adapter (U2D2); default: any
 #   --board-serial TEXT  serial number of the motor board (STM32); default: any
 #   --robot FILE         robot file of the bridges; default: the shipped one
-#   --no-service         leave the service out
-#   --uninstall          remove everything again
-#   --root DIR           write below DIR and call no program of the system: a dry run
+#   --no-service         do not install the service
+#   --uninstall          remove all installed files
+#   --root DIR           dry run: write below DIR and call no system program
 #
-# The service opens both ports and reads. It gives no torque and lets the motor board not be armed:
-# that takes `ros2 lifecycle set /joint_bridge_node activate`, the same for /rotor_bridge_node, and
-# then the arming of the supervisor.
+# The service opens both ports and reads. It switches no torque on, and the motor board cannot be
+# armed. A flight needs `ros2 lifecycle set /joint_bridge_node activate`, the same for
+# /rotor_bridge_node, and then the arming of the supervisor.
 set -eu
 
 ROOT=

@@ -198,7 +198,7 @@ def _constants(tree: ast.AST) -> dict[str, list[str]]:
 
 
 def _ends() -> dict[str, dict[str, list[str]]]:
-    """Topic -> nodes that publish it and that subscribe it, as the files of the nodes say."""
+    """Topic -> its publishers and its subscribers, from the files of the nodes."""
     found: dict[str, dict[str, list[str]]] = {}
     nodes = ROOT / PACKAGE / 'nodes'
     shared = _constants(ast.parse((nodes / 'command_source.py').read_text(encoding='utf-8')))
@@ -279,8 +279,8 @@ def _options(command) -> list[list[str]]:
             names += f' {option.metavar or option.name.upper()}'
         default = option.default
         text = 'required' if option.required else ''
-        told = default is not None and str(default) not in ('', 'False', '()')
-        if not option.required and told and not callable(default) \
+        has_default = default is not None and str(default) not in ('', 'False', '()')
+        if not option.required and has_default and not callable(default) \
                 and not (is_flag and not option.secondary_opts):
             text = (option.opts[0] if default else option.secondary_opts[0]) \
                 if is_flag else str(default)
@@ -310,12 +310,12 @@ def command_line() -> str:
                 ['2', 'unusable input; one line on standard error'],
                 ['3', '`gap`: the verdict `bad_data`'], ['130', 'interrupted']])]
     for name, command in _commands(get_command(app), 'beetle_omni'):
-        told = (command.help or '').replace('\b', '').strip()
-        paragraphs = [' '.join(part.split()) for part in told.split('\n\n')]
+        description = (command.help or '').replace('\b', '').strip()
+        paragraphs = [' '.join(part.split()) for part in description.split('\n\n')]
         text.append(f'\n## {name}\n')
         for paragraph in paragraphs:
-            say, _, example = paragraph.partition('Example: ')
-            text += [f'\n{_wrapped(say.strip())}\n'] if say.strip() else []
+            sentences, _, example = paragraph.partition('Example: ')
+            text += [f'\n{_wrapped(sentences.strip())}\n'] if sentences.strip() else []
             text += [f'\n```sh\n{example.strip()}\n```\n'] if example else []
         text.append('\n' + table(['option', 'default', 'meaning'], _options(command)))
     return ''.join(text)
@@ -424,7 +424,7 @@ PAGES = {'parameters.md': parameters, 'topics.md': topics, 'command_line.md': co
 
 
 def out_of_date() -> list[str]:
-    """Names of pages that differ from what the code says."""
+    """Names of pages that differ from those made from the code."""
     return [name for name, make in PAGES.items() if not (REFERENCE / name).is_file()
             or (REFERENCE / name).read_text(encoding='utf-8') != make()]
 

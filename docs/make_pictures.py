@@ -1,5 +1,5 @@
 """
-Fly what the tutorials show and draw their pictures: ``python docs/make_pictures.py [NAME...]``.
+Fly and draw the pictures of the tutorials: ``python docs/make_pictures.py [NAME...]``.
 
 Pictures are written to docs/tutorials/pictures/. Each takes up to a minute; ``hardware_flight``
 needs ROS.

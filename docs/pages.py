@@ -1,5 +1,5 @@
 """
-What the pages say about themselves: sentences, links and anchors of Markdown files.
+Sentences, links and anchors of Markdown files.
 
 ``python docs/pages.py [FILE...]`` prints the mean and the longest sentence of each page. The tests
 in test/docs hold the limits.

@@ -1,7 +1,7 @@
 """
 Draw docs/pictures/view.png: ``python docs/render_view.py my_run/rl my_run/nmpc --at 9.2``.
 
-The page of `beetle_omni view`, in a headless browser that is installed already.
+It shows the page of `beetle_omni view` in an installed headless browser.
 """
 
 import argparse
