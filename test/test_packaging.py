@@ -12,6 +12,7 @@ import xml.etree.ElementTree as ElementTree
 import pytest
 
 import beetle_omni_ros
+from beetle_omni_ros import start
 from beetle_omni_ros.bringup.limits import CheckLimits
 from beetle_omni_ros.control.hover import HoverParameters
 from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
@@ -123,10 +124,11 @@ def test_every_executable_has_its_function(setup_arguments):
         _, target = (part.strip() for part in script.split('='))
         module, function = target.split(':')
         program, = getattr(import_module(module), function).args
-        if program.startswith(f'{PACKAGE}.nodes') and not HAS_ROS:
-            assert importlib.util.find_spec(program), f'{script}: no such module'
+        if program in start.PROGRAMS or HAS_ROS:
+            assert callable(start.load(program)), script
             continue
-        assert callable(import_module(program).main), script
+        file = 'controller_node' if program in ('nmpc_node', 'rl_node') else program
+        assert importlib.util.find_spec(f'{PACKAGE}.nodes.{file}'), f'{script}: no such module'
 
 
 def test_every_node_file_is_an_executable(setup_arguments):
