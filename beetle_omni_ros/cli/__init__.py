@@ -69,7 +69,7 @@ def main(args: list[str] | None = None) -> int:
         elif top in HARDWARE_MODULES:
             cure = "pip install 'beetle_omni_ros[hardware]'"
         elif top in TRAIN_MODULES:
-            cure = "pip install 'beetle_omni_ros[train]'"
+            cure = "run make setup-train in a checkout, or pip install 'beetle_omni_ros[train]'"
         return fail(f"the module '{top}' is not installed; {cure}", UNUSABLE)
     except ParameterError as error:
         return fail(error, UNUSABLE)

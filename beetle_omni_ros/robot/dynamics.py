@@ -53,7 +53,7 @@ def thrust_direction(arm_yaw: float, tilt):
 def rigid_body(robot: RobotParameters, velocity, quaternion, angular_velocity, tilt, thrust,
                force_world=None, torque_body=None, tilt_acceleration=None, effects=None, *,
                tilt_rate=None, thrust_rate=None, position=None, voltage_ratio=None,
-               rotor_positions=None):
+               charge_drawn=None, rotor_positions=None):
     """
     Newton-Euler equations of the robot as one rigid body.
 
@@ -75,7 +75,8 @@ def rigid_body(robot: RobotParameters, velocity, quaternion, angular_velocity, t
         tilt_rate: (4,) [rad/s].
         thrust_rate: (4,) [N/s].
         position: (3,) in world [m]; None: no ground effect.
-        voltage_ratio: pack voltage over that of a full pack; None: no voltage sag.
+        voltage_ratio: pack voltage over that of a full pack; None: no effect of it.
+        charge_drawn: charge drawn from the pack [A h]; None: no effect of it.
         rotor_positions: (4, 3) in place of the robot file's [m].
 
     Returns:
@@ -96,10 +97,11 @@ def rigid_body(robot: RobotParameters, velocity, quaternion, angular_velocity, t
         hover_thrust=robot.hover_thrust, force_world=_given(force_world, 3), rotor_forces=[0] * 4,
         torque_ratio=rotors.torque_to_thrust_ratio, tilt_rate=_given(tilt_rate, 4),
         thrust_rate=_given(thrust_rate, 4), spin=tuple(map(float, rotors.spin)),
-        position=position, voltage_ratio=voltage_ratio)
+        position=position, voltage_ratio=voltage_ratio, charge_drawn=charge_drawn)
     effects = robot.effects if effects is None else effects
     for name, effect in CATALOGUE.items():
-        if name in effects and effect.apply is not None:
+        if name in effects and effect.apply is not None and not any(
+                getattr(terms, term) is None for term in effect.measured):
             effect.apply(terms, **effects[name])
     force, torque = 0, terms.torque
     for i in range(4):
@@ -134,12 +136,12 @@ def added_wrench(robot: RobotParameters, names: list[str]) -> ca.Function:
 
     Returns:
         f(quaternion, velocity, rate, tilt, tilt_rate, tilt_acceleration, thrust, thrust_rate,
-        position, voltage_ratio) -> force, torque.
+        position, voltage_ratio, charge_drawn) -> force, torque.
 
     """
     sizes = {'quaternion': 4, 'velocity': 3, 'rate': 3, 'tilt': 4, 'tilt_rate': 4,
              'tilt_acceleration': 4, 'thrust': 4, 'thrust_rate': 4, 'position': 3,
-             'voltage_ratio': 1}
+             'voltage_ratio': 1, 'charge_drawn': 1}
     x = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
     both = {name: robot.effects[name] for name in ('torque_coefficient',) if name in robot.effects}
 
@@ -148,7 +150,7 @@ def added_wrench(robot: RobotParameters, names: list[str]) -> ca.Function:
             robot, x['velocity'], x['quaternion'], x['rate'], x['tilt'], x['thrust'],
             tilt_acceleration=x['tilt_acceleration'], effects=effects,
             **{name: x[name] for name in ('tilt_rate', 'thrust_rate', 'position',
-                                          'voltage_ratio')})
+                                          'voltage_ratio', 'charge_drawn')})
         return robot.mass * acceleration, ca.DM(robot.inertia) * turning
 
     without = wrench(both)

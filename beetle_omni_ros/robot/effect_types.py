@@ -7,6 +7,10 @@ from typing import Any
 import casadi as ca
 
 LAYERS = ('body', 'rotor', 'joint', 'timing', 'sensor')
+# Terms that the simulated plant and the gap finder have -> why NMPC and training leave out an
+# effect of them.
+MEASURED = {'voltage_ratio': 'it has no voltage and assumes a full pack',
+            'charge_drawn': 'it has no current of the pack and assumes that no charge was drawn'}
 
 
 @dataclass(frozen=True)
@@ -148,6 +152,8 @@ class Terms:
         spin: (4,) direction of rotation, +1 along the thrust.
         position: (3,) of base_link in world [m], or None if unknown.
         voltage_ratio: pack voltage over that of a full pack, or None if unknown.
+        charge_drawn: charge drawn from the pack [A h], or None if unknown; in the simulator
+            since the pack was inserted, in a recording since its first battery message.
 
     """
 
@@ -173,6 +179,7 @@ class Terms:
     spin: tuple[float, ...]
     position: ca.SX | None = None
     voltage_ratio: ca.SX | None = None
+    charge_drawn: ca.SX | None = None
 
     def rotor_speeds(self) -> list:
         """Rotor speeds relative to hover, computed from thrust; list of four scalars."""
@@ -253,9 +260,12 @@ class Effect:
         same_response: entry that is another form of the same response.
         log_rival: entry that a servo's response log hardly distinguishes from it.
         allocated: whether the allocation includes it.
+        measured: terms that not every consumer has, of ``MEASURED``. Where one is None, the
+            effect is left out.
         plant: how the simulated plant includes a body effect. 'model': numbers of its bodies and
             rotors, 'own': equations of its own, else the equation of this entry.
-        treatments: consumer -> :class:`Treatment` that does not follow from the kind of effect.
+        treatments: 'nmpc', 'training', 'plant', 'estimator', 'buses' or 'gap' -> its
+            :class:`Treatment`, if that does not follow from the kind of effect.
 
     """
 
@@ -277,6 +287,7 @@ class Effect:
     same_response: str = ''
     log_rival: str = ''
     allocated: bool = False
+    measured: tuple[str, ...] = ()
     plant: str = ''
     treatments: dict[str, Treatment] = field(default_factory=dict)
 

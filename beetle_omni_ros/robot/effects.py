@@ -22,6 +22,7 @@ from beetle_omni_ros.robot.effect_types import (
     Effect,
     EffectParameter,
     LimitStarts,
+    MEASURED,
     SensorErrors,
     ServoTerms,
     Terms,
@@ -155,7 +156,11 @@ def treatment(consumer: str, name: str) -> Treatment:
 
     """
     effect = CATALOGUE[name]
-    return effect.treatments.get(consumer) or _TREATMENTS[consumer].get(effect.kind, ACTS)
+    if consumer in effect.treatments:
+        return effect.treatments[consumer]
+    if effect.measured and consumer in ('nmpc', 'training'):
+        return Treatment(False, '; '.join(MEASURED[term] for term in effect.measured))
+    return _TREATMENTS[consumer].get(effect.kind, ACTS)
 
 
 def check(consumer: str, effects: Iterable[str]) -> None:
@@ -166,8 +171,12 @@ def check(consumer: str, effects: Iterable[str]) -> None:
         ParameterError: names the effect and the reason.
 
     """
-    for name in effects:
-        found = treatment(consumer, name)
-        if found.error:
-            raise ParameterError(f'effects.{name}: the {CONSUMERS[consumer]} refuses this effect: '
-                                 f'{found.reason}')
+    for text in refusals(consumer, effects):
+        raise ParameterError(f'effects.{text}')
+
+
+def refusals(consumer: str, effects: Iterable[str]) -> list[str]:
+    """Text with the reason for each effect that a consumer refuses."""
+    found = {name: treatment(consumer, name) for name in effects}
+    return [f'{name}: refused by the {CONSUMERS[consumer]}: {one.reason}'
+            for name, one in found.items() if one.error]

@@ -15,8 +15,7 @@ NAN = float('nan')
 
 
 def _voltage_sag(terms, exponent):
-    if terms.voltage_ratio is not None:
-        terms.thrust = terms.thrust * ca.exp(exponent * ca.log(terms.voltage_ratio))
+    terms.thrust = terms.thrust * ca.exp(exponent * ca.log(terms.voltage_ratio))
 
 
 def _joint_offset(terms, offset):
@@ -66,8 +65,7 @@ ACTUATOR: dict[str, Effect] = {
         'f = f* (V / V_full)^k: thrust of a thrust map without voltage; 6.9 %/V on this '
         "robot's map", 'flights at several states of charge', ('thrust_coefficient', 'mass'),
         'three flights at different charge; thrust steps by internal force', _voltage_sag,
-        treatments=dict.fromkeys(('nmpc', 'training'), Treatment(
-            False, 'it has no voltage and assumes a full pack'))),
+        measured=('voltage_ratio',)),
     'rotor_lag': Effect(
         'rotor', {'time_constant': _number('rotors.time_constant', 's', 0.001, 2.0, 0.4, 0.12,
                                            step=0.02, tolerance='lag')},

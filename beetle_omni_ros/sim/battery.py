@@ -18,6 +18,7 @@ class Battery:
         voltage: voltage under the present load [V].
         extra_resistance: additional resistance of a bad contact or cell [ohm].
         current: drawn current [A], positive.
+        drawn: charge drawn since the reset [A h].
 
     """
 
@@ -36,7 +37,7 @@ class Battery:
         """Set the initial charge and no load."""
         self.charge = self._pack.initial_charge
         self.extra_resistance = 0.0
-        self.current = 0.0
+        self.current = self.drawn = 0.0
         self.voltage = self.rest_voltage
 
     @property
@@ -56,6 +57,7 @@ class Battery:
         self.current = power / self.voltage
         if resistance:
             self.current = min(self.current, (rest - self.voltage) / resistance)
+        self.drawn += self.current * duration / 3600
         self.charge = max(0.0, self.charge - self.current * duration / (3600 * pack.capacity))
 
     @property

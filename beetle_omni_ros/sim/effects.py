@@ -111,9 +111,10 @@ class CatalogueForces:
     def __call__(self, quaternion: np.ndarray, velocity: np.ndarray, rate: np.ndarray,
                  tilt: np.ndarray, tilt_rate: np.ndarray, tilt_acceleration: np.ndarray,
                  thrust: np.ndarray, thrust_rate: np.ndarray, position: np.ndarray,
-                 voltage_ratio: float) -> tuple[np.ndarray, np.ndarray]:
+                 voltage_ratio: float,
+                 charge_drawn: float) -> tuple[np.ndarray, np.ndarray]:
         """Force (3,) in world [N], torque (3,) in base_link [N m]; SI arguments, xyzw."""
         force, torque = self._function(quaternion, velocity, rate, tilt, tilt_rate,
                                        tilt_acceleration, thrust, thrust_rate, position,
-                                       voltage_ratio)
+                                       voltage_ratio, charge_drawn)
         return np.array(force).ravel(), np.array(torque).ravel()

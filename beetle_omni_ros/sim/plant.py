@@ -33,6 +33,7 @@ class Plant:
 
     Attributes:
         voltage_ratio: battery voltage relative to a full one, set by the owner of the battery.
+        charge_drawn: charge drawn from the battery [A h], set by its owner.
 
     Raises:
         ParameterError: the plant lacks an effect, or impossible mass properties.
@@ -61,7 +62,7 @@ class Plant:
         self._tilt, self._rate, self._target = self._qpos[7:], self._qvel[6:], self.data.ctrl[4:]
         self._ground_height: float | None = None
         self._commanded_tilt = np.zeros(4)
-        self.voltage_ratio = 1.0
+        self.voltage_ratio, self.charge_drawn = 1.0, 0.0
         self._wrench = np.zeros(6)
         self._payload: float | None = None      # not yet set
         self._servos = (True,) * 4, (False,) * 4
@@ -253,7 +254,8 @@ class Plant:
             catalogue = self._catalogue_forces(
                 quaternion, motion[:3], motion[3:6], tilt, motion[6:], data.qacc[6:],
                 self._scale * thrust, self._scale * (data.ctrl[:4] - thrust)
-                / self._robot.rotors.time_constant, self._qpos[:3], self.voltage_ratio)
+                / self._robot.rotors.time_constant, self._qpos[:3], self.voltage_ratio,
+                self.charge_drawn)
             force, torque = force + catalogue[0], torque + catalogue[1]
         applied[:3] = self._wrench[:3] + force
         applied[3:6] = self._wrench[3:] + torque

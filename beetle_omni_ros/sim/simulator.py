@@ -221,6 +221,7 @@ class Simulator:
         else:
             wear = self._actuate(drive.tilt, drive.thrust, drive.powered)
         plant.voltage_ratio = battery.voltage / self._robot.battery.full_voltage
+        plant.charge_drawn = battery.drawn
         plant.step()
         self._ticks += 1
         self.time = self._ticks * self.tick

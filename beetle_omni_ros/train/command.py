@@ -1,6 +1,6 @@
 """`beetle_omni train`: trains a policy from a parameter file and exports it to ONNX."""
 
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
 import io
 import os
 from pathlib import Path
@@ -33,6 +33,8 @@ COLUMNS = (('iteration', 'iteration', '{:.0f}'), ('seconds', 'time s', '{:.0f}')
            ('attitude_error_deg', 'error deg', '{:.1f}'), ('deaths', 'lost', '{:.0f}'),
            ('tilt_std', 'std tilt', '{:.2f}'), ('thrust_std', 'std thrust', '{:.2f}'),
            ('learning_rate', 'rate', '{:.0e}'))
+
+OF_TARGETS = ('success_rate', 'position_error_m', 'attitude_error_deg')  # averages over targets
 
 
 class TrainingError(RuntimeError):
@@ -98,15 +100,20 @@ def run_train(*, output: Path | None, config: Path | None = None, robot: Path | 
     changes = {**(SMOKE if smoke and not checkpoint else {}), **(changes or {})}
     parameters = read_parameters(config, changes)
     nominal = RobotParameters.load(robot)
-    if is_rank_zero():
-        make_folder(output, checkpoint)
+    new = is_rank_zero() and make_folder(output, checkpoint)
     torch.set_float32_matmul_precision('high')
     if smoke:
         torch.set_num_threads(1)    # on a loaded machine several threads wait for each other
-    with redirect_stdout(io.StringIO()):     # rsl-rl prints its models
-        runner = Runner(parameters, nominal, output, where)
-    if checkpoint:
-        runner.resume(checkpoint)
+    try:
+        with redirect_stdout(io.StringIO()):     # rsl-rl prints its models
+            runner = Runner(parameters, nominal, output, where)
+        if checkpoint:
+            runner.resume(checkpoint)
+    except BaseException:
+        if new:
+            with suppress(OSError):     # not empty
+                output.rmdir()
+        raise
     if is_rank_zero():
         write_parameters(parameters, output / PARAMETER_FILE)
     processes = f'{runner.gpu_world_size} x ' if runner.is_distributed else ''
@@ -168,6 +175,7 @@ class ProgressTable:
             self._console.print(' '.join(title.rjust(width) for (_, title, _), width
                                          in zip(COLUMNS, widths)), style='bold', soft_wrap=True)
         self._count += 1
-        self._console.print(' '.join(pattern.format(row[key]).rjust(width)
-                                     for (key, _, pattern), width in zip(COLUMNS, widths)),
-                            soft_wrap=True, highlight=False)
+        cells = ['–' if key in OF_TARGETS and not row['targets'] else pattern.format(row[key])
+                 for key, _, pattern in COLUMNS]
+        self._console.print(' '.join(map(str.rjust, cells, widths)), soft_wrap=True,
+                            highlight=False)

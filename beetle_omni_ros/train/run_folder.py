@@ -62,14 +62,15 @@ def checkpoints(folder: Path) -> dict[int, Path]:
             if (match := re.fullmatch(r'model_(\d+)\.pt', path.name))}
 
 
-def make_folder(output: Path, checkpoint: Path | None) -> None:
+def make_folder(output: Path, checkpoint: Path | None) -> bool:
     """
-    Create the folder of a run.
+    Create the folder of a run; return whether it is new.
 
     Raises:
         ParameterError: it cannot be created, or contains another run.
 
     """
+    new = not output.exists()
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -78,6 +79,7 @@ def make_folder(output: Path, checkpoint: Path | None) -> None:
     if checkpoints(output) and not resumed:
         raise ParameterError(f'--output {output}: holds the checkpoints of another run; '
                              f'--resume {output} continues it')
+    return new
 
 
 def parse_changes(texts: list[str], **others) -> dict:

@@ -53,6 +53,8 @@ class Motion:
         self.thrust, self.thrust_rate, _ = waves(t, seed + 3, 4, 3.0)
         self.thrust = self.thrust + ROBOT.hover_thrust
         self.voltage = 25.2 - 0.15 * t / 2
+        self.current = -20 - 0.5 * t
+        self.charge = (20 * t + 0.25 * t**2) / 3600
         self.delays = P.command_delay, P.command_delay
         self.tilt_command = self.tilt + (ROBOT.joints.kd * self.tilt_rate + ROBOT.joints.inertia
                                          * self.tilt_acceleration) / ROBOT.joints.kp
@@ -87,7 +89,7 @@ class Motion:
                       imu, self.t[::2] + pose_delay, pose, self.t + joint_delay, self.tilt,
                       self.t - shift,
                       np.concatenate([self.tilt_command, thrust], axis=1), self.t,
-                      self.voltage[:, None])
+                      np.column_stack([self.voltage, self.charge]))
 
 
 def gusts(motion, seed, size=0.1, lag=0.5):

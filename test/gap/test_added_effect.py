@@ -14,11 +14,11 @@ from beetle_omni_ros.identify.gap.body import BodyModel
 from beetle_omni_ros.identify.gap.candidates import candidates
 from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys
 from beetle_omni_ros.identify.gap.residual import FlightModel
-from beetle_omni_ros.robot import effects
+from beetle_omni_ros.robot import effect_types, effects
 from beetle_omni_ros.robot.effects import CATALOGUE, separating_experiment
 
 PAGE = Path(__file__).resolve().parents[2] / 'docs/how-to/add_an_effect.md'
-ENTRY, TEST = re.findall(r'```python\n(.*?)```', PAGE.read_text(), flags=re.S)
+ENTRY, MEASURED, TEST = re.findall(r'```python\n(.*?)```', PAGE.read_text(), flags=re.S)
 NAME = 'motor_heat'
 
 
@@ -45,6 +45,19 @@ def test_the_plant_applies_the_added_effect(consumer):
     assert effects.treatment(consumer, NAME).acts
     found = np.concatenate([np.ravel(part) for part in OUTPUTS[consumer](with_effect(NAME))])
     assert not np.array_equal(found, plain(consumer))
+
+
+def test_the_page_lists_the_consumers():
+    rows = re.findall(r'^\| `(\w+)` \| ([^|]+) \|$', PAGE.read_text().split('## Consumers')[1],
+                      flags=re.M)
+    assert dict(rows) == effects.CONSUMERS
+    described, = re.findall(r'treatments: (.*?)-> its', effect_types.Effect.__doc__, flags=re.S)
+    assert set(re.findall(r"'(\w+)'", described)) == set(effects.CONSUMERS)
+
+
+def test_the_page_lists_the_measured_terms():
+    table = PAGE.read_text().split('## An effect of a measured quantity')[1].split('```')[0]
+    assert re.findall(r'^\| `(\w+)` \|', table, flags=re.M) == list(effect_types.MEASURED)
 
 
 def test_the_added_effect_has_its_own_experiment():

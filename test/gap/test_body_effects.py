@@ -207,7 +207,8 @@ def test_a_mirrored_robot_gives_mirrored_results(name):
         out = rigid_body(robot, *(ca.SX(ca.DM(x)) for x in (
             v, attitude.as_quat(), w, tilt, thrust)), tilt_acceleration=ca.DM(acceleration),
             effects=effects, tilt_rate=ca.DM(rate), thrust_rate=ca.DM(change),
-            position=ca.DM(p), voltage_ratio=ca.DM(0.9))
+            position=ca.DM(p), voltage_ratio=ca.DM(0.9),
+            charge_drawn=ca.DM(0.5))
         return [np.array(ca.DM(ca.evalf(x))).ravel() for x in out]
 
     first = answer({name: plain}, v, w, p, attitude, tilt, rate, acceleration, thrust, change)

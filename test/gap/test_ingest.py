@@ -15,13 +15,15 @@ from beetle_omni_ros.runs.bag_files import BagError
 
 
 def recording(duration=16.0):
-    flight = Motion(duration=duration).flight()
+    motion = Motion(duration=duration)
+    flight = motion.flight()
     return Recording('case', {
         'imu/data_raw': flight.imu_t, 'mocap/pose': flight.pose_t,
         'joint_states': flight.joint_t, 'command': flight.command_t + 0.02,
         'battery_state': flight.battery_t}, {
         'imu/data_raw': flight.imu, 'mocap/pose': flight.pose, 'joint_states': flight.joint,
-        'command': flight.command, 'battery_state': flight.battery})
+        'command': flight.command, 'battery_state': np.column_stack([
+            motion.voltage, motion.current])})
 
 
 def refused(made, *words):

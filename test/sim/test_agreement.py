@@ -155,7 +155,7 @@ def test_terminal_speed_is_where_drag_carries_the_weight():
 @pytest.mark.parametrize('name, values', [
     ('joint_backlash', {'gap': 0.01}), ('joint_friction', {'coulomb': 0.01, 'stiction': 0.01})])
 def test_an_effect_without_support_in_the_plant_is_refused_by_name(name, values):
-    with pytest.raises(ParameterError, match=f'effects.{name}: the simulated plant refuses'):
+    with pytest.raises(ParameterError, match=f'effects.{name}: refused by the simulated plant'):
         plant(replace(ROBOT, effects={name: values}))
 
 
@@ -175,6 +175,6 @@ def test_forces_of_the_plant_equal_those_of_the_catalogue(name, values):
         own = plant_effects.MotionForces(robot)(
             Rotation.from_quat(quaternion).as_matrix(), velocity, rate, tilt, thrust, height)
         found = function(quaternion, velocity, rate, tilt, np.zeros(4), np.zeros(4), thrust,
-                         np.zeros(4), [0, 0, height], 1.0)
+                         np.zeros(4), [0, 0, height], 1.0, 0.0)
         for a, b in zip(own, found, strict=True):
             np.testing.assert_allclose(a, np.array(b).ravel(), atol=2e-4)

@@ -1,5 +1,6 @@
 """`beetle_omni train`: a smoke run, resume, one-line refusals."""
 
+import io
 import json
 from pathlib import Path
 import shutil
@@ -7,6 +8,7 @@ import shutil
 import extra_train  # noqa: F401
 import numpy as np
 import pytest
+from rich.console import Console
 import torch
 
 from beetle_omni_ros import cli
@@ -207,6 +209,25 @@ def test_a_broken_parameter_file_is_named_with_its_key(capsys, tmp_path):
     path.write_text('ppo: {robots: 12, stpes: 4}\n')
     line = refused(capsys, '--output', tmp_path / 'run', '--config', path)
     assert 'mine.yaml' in line and 'stpes' in line
+
+
+@pytest.mark.parametrize('effect', ['joint_backlash: {gap: 0.01}',
+                                    'command_latency: {delay: 0.015}'])
+def test_a_refused_effect_leaves_no_empty_folder(capsys, tmp_path, effect):
+    (tmp_path / 'mine.yaml').write_text(f'extends: robot.yaml\neffects:\n  {effect}\n')
+    refused(capsys, *TINY, '--robot', tmp_path / 'mine.yaml', '--output', tmp_path / 'run')
+    assert not (tmp_path / 'run').exists()
+
+
+def test_an_average_over_no_target_is_a_dash():
+    row = {key: 0.0 for key, _, _ in command.COLUMNS}
+    printed = {}
+    for targets in (0.0, 2.0):
+        console = Console(file=io.StringIO(), width=200)
+        command.ProgressTable(console)({**row, 'targets': targets})
+        printed[targets] = console.file.getvalue().splitlines()[1].split()
+    assert printed[0.0][4:7] == ['–'] * 3 and printed[0.0][7] == '0'
+    assert printed[2.0][4:7] == ['0.0%', '0.000', '0.0']
 
 
 def test_another_run_is_not_overwritten(capsys, run):

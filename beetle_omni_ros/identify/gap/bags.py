@@ -15,10 +15,10 @@ from beetle_omni_ros.runs.bag_files import BagError, read_together
 
 # Topic -> columns of its table; PARTS: fields of the message that they come from.
 NEEDED = {'imu/data_raw': 6, 'mocap/pose': 7, 'joint_states': 4, 'command': 8}
-OPTIONAL = {'battery_state': 1}
+OPTIONAL = {'battery_state': 2}
 PARTS = {'imu/data_raw': ('specific_force', 'angular_velocity'),
          'mocap/pose': ('position', 'quaternion'), 'joint_states': ('position',),
-         'command': ('tilt', 'thrust'), 'battery_state': ('voltage',)}
+         'command': ('tilt', 'thrust'), 'battery_state': ('voltage', 'current')}
 
 
 @dataclass
@@ -30,7 +30,7 @@ class Recording:
         name: name of the bag.
         times: topic -> (N,) header stamps [s], in the order of recording.
         values: topic -> (N, width): IMU specific force and rates, pose and quaternion xyzw, joint
-            positions, tilt and thrust commands, voltage.
+            positions, tilt and thrust commands, voltage and current.
         states: (time of recording, supervisor state), if recorded.
         warnings: problems while reading.
         received: topic -> (N,) times of recording [s]; empty if unknown.

@@ -11,7 +11,8 @@ from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 WIDTHS = {'velocity': 3, 'quaternion': 4, 'rate': 3, 'tilt': 4, 'thrust': 4, 'tilt_rate': 4,
-          'tilt_acceleration': 4, 'thrust_rate': 4, 'position': 3, 'voltage': 1, 'modules': 1}
+          'tilt_acceleration': 4, 'thrust_rate': 4, 'position': 3, 'voltage': 1, 'charge': 1,
+          'modules': 1}
 
 
 class BodyModel:
@@ -53,7 +54,7 @@ class BodyModel:
             robot, x['velocity'], x['quaternion'], x['rate'], x['tilt'], x['thrust'],
             tilt_acceleration=x['tilt_acceleration'], effects=effects, tilt_rate=x['tilt_rate'],
             thrust_rate=x['thrust_rate'], position=x['position'], voltage_ratio=x['voltage'],
-            rotor_positions=places)
+            charge_drawn=x['charge'], rotor_positions=places)
         rotation = dynamics.rotation_matrix(x['quaternion'])
         force = rotation.T @ (acceleration + ca.DM([0, 0, robot.gravity]))
         self._out = ca.cse(ca.densify(ca.vertcat(force, turning)))

@@ -23,6 +23,7 @@ from beetle_omni_ros.identify.gap.results import grids, headline, results
 from beetle_omni_ros.identify.gap.workers import Workers
 from beetle_omni_ros.identify.robot_file import check_outputs
 from beetle_omni_ros.pages.table import print_grids
+from beetle_omni_ros.robot.effects import CONSUMERS, refusals
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.bag_files import names_of
 from beetle_omni_ros.runs.json_file import write_json, write_text
@@ -85,6 +86,10 @@ def gap_results(runs, holdout=(), robot=None, apply=None, json_path=None, page=N
         if result['effects']:
             write_corrected(apply, result, robot_parameters, robot, tolerances)
             console.print(f'corrected robot: {apply}', highlight=False)
+            corrected = RobotParameters.load(apply).effects
+            for consumer in CONSUMERS:
+                for text in refusals(consumer, corrected):
+                    console.print(f'note: {text}', highlight=False, markup=False)
         else:
             console.print('no effect is named: no robot file is written', highlight=False)
     return result

@@ -5,8 +5,9 @@ import hashlib
 from pathlib import Path
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
-from beetle_omni_ros.identify.gap.bags import NEEDED, read_recording, Recording
+from beetle_omni_ros.identify.gap.bags import NEEDED, OPTIONAL, read_recording, Recording
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.series import aligned, shortest_flight
 from beetle_omni_ros.identify.recording.check import damages, repaired
@@ -51,7 +52,8 @@ class Flight:
         pose_t, pose: (N,) and (N, 7) position [m] and quaternion xyzw, sign-continuous.
         joint_t, joint: (N,) and (N, 4) [rad].
         command_t, command: (N,) and (N, 8) [rad], [N].
-        battery_t, battery: (N,) and (N, 1) [V], possibly empty.
+        battery_t, battery: (N,) and (N, 2) voltage [V] and charge drawn since the first
+            message [A h], zero if no current is known; possibly empty.
         findings: remarks of the checks.
 
     """
@@ -115,6 +117,8 @@ def prepare(recording: Recording, robot: RobotParameters, p: GapParameters,
     if wrong:
         raise UnusableFlight(wrong[0].text, wrong)
     series = {topic: _in_order(name, topic, recording, findings) for topic in recording.times}
+    t, battery = series['battery_state']
+    series['battery_state'] = t, np.column_stack([battery[:, 0], _drawn(t, battery[:, 1])])
     begin, end = _flown(name, recording, series, robot, p)
     begin, end = _without_gaps(name, series, begin, end, p, findings)
     least = max(p.least_duration, shortest_flight(p))
@@ -144,7 +148,8 @@ def _unusable(name, topic, cause, at_s=None):
 def _in_order(name, topic, recording, findings):
     """Finite samples in ascending order, without repeated stamps."""
     t, values = recording.times[topic], recording.values[topic]
-    fine = np.isfinite(t) & np.isfinite(values).all(axis=1)
+    needed = values[:, :1] if topic in OPTIONAL else values     # a pack may measure no current
+    fine = np.isfinite(t) & np.isfinite(needed).all(axis=1)
     if not fine.all():
         findings.append(f'{name}: {topic}: {int((~fine).sum())} messages hold no numbers')
         t, values = t[fine], values[fine]
@@ -153,6 +158,15 @@ def _in_order(name, topic, recording, findings):
     if lost > 2:
         findings.append(f'{name}: {topic}: {lost} stamps occur twice')
     return t, values[first]
+
+
+def _drawn(t, current):
+    """Charge (N,) drawn since the first message [A h], whichever sign discharging has."""
+    known = np.isfinite(current)
+    if known.sum() < 2:
+        return np.zeros(len(t))
+    current = np.interp(t, t[known], current[known])
+    return np.abs(cumulative_trapezoid(current, t, initial=0)) / 3600
 
 
 def _flown(name, recording, series, robot, p):

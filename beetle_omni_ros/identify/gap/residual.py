@@ -96,6 +96,7 @@ class FlightModel:
         return {'velocity': velocity, 'quaternion': quaternion, 'rate': rate, 'tilt': tilt,
                 'thrust': thrust, 'tilt_rate': tilt_rate, 'tilt_acceleration': tilt_acceleration,
                 'thrust_rate': thrust_rate, 'position': position, 'voltage': s.voltage,
+                'charge': s.charge,
                 'modules': np.full(len(s.t), self.modules + theta.get('modules.share', 0.0))}
 
     def _thinned(self, theta):

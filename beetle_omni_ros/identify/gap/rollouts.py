@@ -67,7 +67,7 @@ def free_runs(model: FlightModel, theta: dict[str, float], noise: Noise) -> Runs
                'tilt_acceleration': at(acceleration), 'position': p,
                'thrust': (1 - part) * inputs['thrust'][rows] + part * inputs['thrust'][rows + 1],
                'thrust_rate': inputs['thrust_rate'][rows], 'voltage': inputs['voltage'][rows],
-               'modules': inputs['modules'][rows]}
+               'charge': inputs['charge'][rows], 'modules': inputs['modules'][rows]}
         out = model._body(now, theta)
         force = np.einsum('nij,nj->ni', matrices(q), out[:, :3])
         force[:, 2] -= model.robot.gravity

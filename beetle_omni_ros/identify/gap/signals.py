@@ -67,6 +67,8 @@ class Signals:
             if len(flight.battery_t) > 1 else np.ones(len(self.t))
         if not (0.5 < self.voltage.min() and self.voltage.max() < 1.5):
             self.voltage = np.ones(len(self.t))
+        self.charge = np.interp(self.t, flight.battery_t, flight.battery[:, 1]) \
+            if len(flight.battery_t) else np.zeros(len(self.t))
         # Sensor effects and backlash of the robot file; deviations are added to them.
         self.file = {key: float(value) for name, values in robot.effects.items()
                      for parameter, given in values.items()
