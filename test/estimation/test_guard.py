@@ -1,5 +1,6 @@
 """Bad input is refused, counted by its reason, and does not change the state."""
 
+from copy import deepcopy
 from dataclasses import replace
 import warnings
 
@@ -12,14 +13,19 @@ from beetle_omni_ros.estimation.ekf import EkfParameters, ErrorStateEkf
 NAN, INF, HUGE = np.nan, np.inf, 1e200
 
 
-@pytest.fixture
-def flying():
-    """A filter in the middle of a flight, and the flight."""
+@pytest.fixture(scope='module')
+def flown():
+    """A flight, a filter in the middle of it, and one after it."""
     flight = fly(1, 4.0)
-    ekf = ErrorStateEkf(EkfParameters.load(), GRAVITY)
-    run(ekf, flight, until=1.5)
-    assert ekf.status == 'tracking' and not ekf.rejected
-    return ekf, flight
+    middle = run(ErrorStateEkf(EkfParameters.load(), GRAVITY), flight, until=1.5)
+    assert middle.status == 'tracking' and not middle.rejected
+    return flight, middle, run(ErrorStateEkf(EkfParameters.load(), GRAVITY), flight)
+
+
+@pytest.fixture
+def flying(flown):
+    """A filter in the middle of a flight, and the flight."""
+    return deepcopy(flown[1]), flown[0]
 
 
 def vector(value, size=3):
@@ -66,9 +72,8 @@ def refused(ekf, sample, reason):
         assert np.array_equal(getattr(after, name), getattr(before, name))
 
 
-def continued(ekf, flight, after):
+def continued(ekf, flight, after, undisturbed):
     """Finish the flight; the filter must track as without the refused input."""
-    undisturbed = run(ErrorStateEkf(EkfParameters.load(), GRAVITY), flight)
     for time, sample in flight.arrivals():
         if time > after:
             feed(ekf, sample)
@@ -77,25 +82,25 @@ def continued(ekf, flight, after):
 
 
 @pytest.mark.parametrize('reason, change', cases(BAD_IMU))
-def test_a_bad_imu_sample_is_refused_without_effect(flying, reason, change):
+def test_a_bad_imu_sample_is_refused_without_effect(flying, flown, reason, change):
     ekf, flight = flying
     change = dict(change)
     last = max(s.stamp for s in flight.imu if s.stamp <= 1.5)
     stamp = last + change.pop('ahead', 0.005)
     good = ImuReading(stamp, np.array([0.0, 0.0, GRAVITY]), np.zeros(3))
     refused(ekf, replace(good, **change), reason)
-    continued(ekf, flight, 1.5)
+    continued(ekf, flight, 1.5, flown[2])
 
 
 @pytest.mark.parametrize('reason, change', cases(BAD_POSE))
-def test_a_bad_pose_is_refused_without_effect(flying, reason, change):
+def test_a_bad_pose_is_refused_without_effect(flying, flown, reason, change):
     ekf, flight = flying
     change = dict(change)
     last = max((s for s in flight.poses if s.stamp + flight.delay <= 1.5 + 1e-9),
                key=lambda s: s.stamp)
     ahead = change.pop('ahead', 0.005)
     refused(ekf, replace(last, **{'stamp': last.stamp + ahead, **change}), reason)
-    continued(ekf, flight, 1.5)
+    continued(ekf, flight, 1.5, flown[2])
 
 
 def test_a_pose_older_than_the_history_is_refused():
