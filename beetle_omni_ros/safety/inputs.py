@@ -67,7 +67,7 @@ class Inputs:
         before = self.vehicle.status
         reading = numbers(state.tilt, 4)
         true = state if reading is None else corrected(state, self.watch.health)
-        reason = self.vehicle.on_state(true, status, self._now)
+        reason = self.vehicle.on_state(true, status, self._now, self.airborne)
         if reason:
             self._say(self._now, WARNING, f'ekf_node: estimate refused: {reason}', reason)
         elif reading is not None:

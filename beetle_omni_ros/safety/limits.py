@@ -22,7 +22,7 @@ TILT = 'tilt out of range'
 JUMP = 'implausible jump'
 FROZEN = 'the same numbers again'
 UNKNOWN = 'unknown controller'
-SAME = 10       # commands in a row that are equal to the last digit
+SAME = 10       # commands or estimates in a row that are equal to the last digit
 
 
 class CommandStream:

@@ -13,6 +13,7 @@ from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.descent import BackupEstimator
 from beetle_omni_ros.safety.events import Silence
+from beetle_omni_ros.safety.limits import FROZEN, SAME
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.ramp import inclination
 
@@ -43,6 +44,7 @@ class Vehicle:
         self.state: State | None = None
         # stamp, position and quaternion of the estimate before, accepted or not
         self._offered: tuple[float, list[float], list[float]] | None = None
+        self._same = 0      # estimates in a row with equal position and attitude
         self.status = ''
         self.tilt, self.tilt_velocity, self.tilt_stamp = np.zeros(4), np.zeros(4), -np.inf
         self.modelled_tilt: np.ndarray | None = None    # (4,) of silent joints [rad]
@@ -86,9 +88,10 @@ class Vehicle:
         self.tilt_stamp = min(self.tilt_stamp, now)
         self.backup.clock_went_back(by)
 
-    def on_state(self, state: State, status: str, now: float | None) -> str:
+    def on_state(self, state: State, status: str, now: float | None,
+                 airborne: bool = False) -> str:
         """Receive an estimate; '' when it is valid, else the reason of the refusal."""
-        reason = self._check_state(state, status, now)
+        reason = self._check_state(state, status, now, airborne)
         if reason:
             self.refused[f'estimate: {reason}'] += 1
             self.last_refusal = reason
@@ -226,7 +229,7 @@ class Vehicle:
         rate = state.angular_velocity
         return sqrt(float(rate @ rate)) > fence.rate or state.velocity[2] < -fence.fall_speed
 
-    def _check_state(self, state, status, now):
+    def _check_state(self, state, status, now, airborne):
         limits = self._parameters.state
         position, quaternion = _numbers(state.position, 3), _numbers(state.quaternion, 4)
         velocity, rate = _numbers(state.velocity, 3), _numbers(state.angular_velocity, 3)
@@ -247,6 +250,10 @@ class Vehicle:
         if status not in TRACKING:
             return f"status '{status}'"
         before, self._offered = self._offered, (state.stamp, position, quaternion)
+        self._same = self._same + 1 if before is not None and before[1:] == self._offered[1:] \
+            else 0
+        if self._same >= SAME and airborne:
+            return FROZEN
         if before is not None and 0 < state.stamp - before[0] <= limits.timeout and (
                 dist(before[1], position) > limits.jump_position
                 or rotations.geodesic_angle(before[2], quaternion) > limits.jump_attitude):

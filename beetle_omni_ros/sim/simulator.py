@@ -87,6 +87,7 @@ class Simulator:
         self.battery.reset()
         self._crash.reset()
         self._wrench, self._payload = np.zeros(6), 0.0
+        self._wear = INTACT
         self._link = CommandLink(self._robot, self._parameters.actuators, self.conditions)
         self.truth = self._truth()
         *seeds, fault_seed = np.random.SeedSequence(self._seed).spawn(7)[1:]
@@ -223,6 +224,9 @@ class Simulator:
         plant.voltage_ratio = battery.voltage / self._robot.battery.full_voltage
         plant.charge_drawn = battery.drawn
         plant.step()
+        if wear is not self._wear:      # shows with the thrust, which follows with the rotors' lag
+            wear = self._wear = self._wear - np.expm1(
+                -self.tick / self._robot.rotors.time_constant) * (wear - self._wear)
         self._ticks += 1
         self.time = self._ticks * self.tick
         self._crash.step(self.truth, plant.contact)

@@ -77,8 +77,22 @@ def test_fallback_holds_the_pose_at_which_it_began():
     rig.alive.discard('nmpc')
     rig.run(0.2)
     goal = rig.supervisor._target.at(rig.now)
-    np.testing.assert_array_equal(goal.position, rig.position)
+    np.testing.assert_allclose(goal.position, rig.position, atol=1e-8)
     np.testing.assert_array_equal(goal.quaternion, rig.quaternion)
+
+
+def test_an_estimate_that_repeats_its_numbers_with_new_stamps_is_refused():
+    rig = flown()
+    rig.alive.discard('estimate')
+    state = rig.supervisor.vehicle.state
+    accepted = 0
+    while rig.supervisor.state == 'flying':
+        rig.run(TICK)
+        accepted += rig.supervisor.on_state(replace(state, stamp=rig.now))
+        assert accepted < 12
+    assert accepted > 5     # a short pause of the estimator's inputs is no fault
+    assert rig.supervisor.reported_state == 'landing:estimator_lost'
+    assert any('the same numbers again' in text for text in rig.texts())
 
 
 def test_a_controller_with_invalid_commands_only_counts_as_silent_with_the_reason():

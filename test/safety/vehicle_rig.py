@@ -91,8 +91,10 @@ class VehicleRig:
         if 'joints' in alive:
             supervisor.on_joints(joints[0], tilt, np.zeros(4))
         if 'estimate' in alive:
-            supervisor.on_state(State(self.now, self.position, self.velocity, self.quaternion,
-                                      self.rate, joints[1], np.zeros(4), joints[0]), self.status)
+            noise = 1e-9 * np.sin(1e3 * self.now + np.arange(3))    # no two estimates are equal
+            supervisor.on_state(State(
+                self.now, self.position + noise, self.velocity, self.quaternion, self.rate,
+                joints[1], np.zeros(4), joints[0]), self.status)
         supervisor.on_battery(self.voltage)
         for name in ('nmpc', 'rl'):
             if name in alive:

@@ -154,6 +154,18 @@ def test_a_broken_propeller_turns_as_fast_as_a_whole_one():
     assert thrust[0] < 0.6 * whole[-1].truth.thrust[0]
 
 
+@pytest.mark.parametrize('share', [0.8, 0.5])
+def test_a_propeller_that_breaks_changes_no_speed(share):
+    intact, _ = flight(ticks=300)
+    broken, _ = flight(Fault('propeller_broken', at=0.5, rotor=1, share=share, duration=0.5),
+                       ticks=300)
+    speeds = [np.array([frame.rotors.speed[0] for frame in frames if frame.rotors is not None])
+              for frames in (intact, broken)]
+    np.testing.assert_allclose(*speeds, rtol=0.1)
+    assert min(frame.truth.thrust[0] for frame in broken[150:200]) \
+        < 1.1 * share * min(frame.truth.thrust[0] for frame in intact[150:200])
+
+
 def test_a_jammed_joint_slips_at_its_rate_and_then_holds():
     frames, _ = flight(Fault('servo_jammed', at=0.2, servo=2, offset=0.8), ticks=200)
     tilt = np.array([frame.truth.tilt[1] for frame in frames])

@@ -11,6 +11,7 @@ from beetle_omni_ros.safety.watch.parameters import PackLimits
 DIRECTIONS = 200        # of up in the body, with a computed hover load, 14 deg apart
 BISECTIONS = 20
 SURPRISE = 3.0          # [-] standard deviations beyond which a reading means a fault
+LEAST = 1.0             # [V] a smaller reading is that of a disconnected sensor
 UNKNOWN = 1.0           # [ohm W/N^1.5] initial value; a good pack has 0.4
 
 
@@ -65,7 +66,7 @@ class PackWatch:
     def on_voltage(self, stamp: float, voltage: float) -> None:
         """Receive a reading [V]."""
         since, self._read_at = min(stamp - self._read_at, 1.0), stamp
-        if since <= 0 or voltage <= 0:
+        if since <= 0 or voltage < LEAST:
             return
         if np.isnan(self._state[0]):
             self._state[0] = voltage
