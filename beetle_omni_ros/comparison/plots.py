@@ -5,9 +5,9 @@ from matplotlib.ticker import FuncFormatter
 import numpy as np
 
 from beetle_omni_ros.comparison.plan import Flight
-from beetle_omni_ros.comparison.style import FAINT, INK, look
+from beetle_omni_ros.comparison.style import look
 from beetle_omni_ros.comparison.summary import PUBLISHED
-from beetle_omni_ros.pages.figures import panels, WIDTH
+from beetle_omni_ros.pages.figures import FAINT, INK, panels, WIDTH
 from beetle_omni_ros.runs import lemniscate as curve
 from beetle_omni_ros.runs import published
 from beetle_omni_ros.runs.body import roll_pitch_yaw

@@ -5,7 +5,6 @@ from pathlib import Path
 from zlib import crc32
 
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.pages.figures import FAINT, INK
 
 
 @dataclass(frozen=True)
@@ -29,8 +28,6 @@ CONDITIONS = {
     'published': "the same with the publication's randomisation, drawn from the seed: mass, "
                  'inertia, centre of mass, sensor biases, more noise, latencies',
 }
-
-__all__ = ['CONDITIONS', 'FAINT', 'INK', 'Look', 'look', 'PUBLISHED']
 
 
 def look(controller: str) -> Look:

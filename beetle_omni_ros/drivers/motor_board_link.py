@@ -69,10 +69,7 @@ class BoardLink:
         if self._thread is not threading.current_thread():
             self._thread.join(2.0)
         self._thread = None
-        with self._write_lock:
-            port, self._port = self._port, None
-        if port:
-            port.close()
+        self._disconnect()
         os.close(self._wake_read)
         os.close(self._wake_write)
 

@@ -70,6 +70,7 @@ class FlightLoop:
     Attributes:
         simulator, supervisor: the arguments.
         refusals: reasons of refused targets.
+        ending: time and reason of an early end of the flight by the supervisor, or ''.
 
     """
 
@@ -95,7 +96,7 @@ class FlightLoop:
         self._state_name = self._recorded_state = ''
         self._health = ALL_HEALTHY
         self._crashed = False
-        self._ending = ''
+        self.ending = ''
 
     @classmethod
     def shipped(cls, robot: RobotParameters, plant: RobotParameters,
@@ -128,11 +129,6 @@ class FlightLoop:
     def compute(self) -> dict[str, dict]:
         """Controller -> summary of its CPU times."""
         return {name: timer.summary() for name, timer in self._timers.items()}
-
-    @property
-    def ending(self) -> str:
-        """Time and reason of an early end of the flight by the supervisor, or ''."""
-        return self._ending
 
     def fly(self, task: Task, progress: Callable[[float], None] = lambda part: None) -> bool:
         """
@@ -334,7 +330,7 @@ class FlightLoop:
             if self._state_name.startswith(('flying', 'fallback')) \
                     and name in ('landing', 'emergency_stop', 'disarmed'):
                 last = [e.text for e in self.supervisor.events][-1:]
-                self._ending = f'{name} at {now:.1f} s: {last[0] if last else "unknown"}'
+                self.ending = f'{name} at {now:.1f} s: {last[0] if last else "unknown"}'
             if self._state_name.startswith(('flying', 'fallback', 'landing')) \
                     and name in ('disarmed', 'emergency_stop'):
                 self._crashed = True

@@ -247,7 +247,7 @@ class Page:
                 if self._labels:
                     self._place_label(k, pose(run.row) if wanted else None)
             # An estimate at the true pose would only tint the robot.
-            if self._show_estimate.value and _differ(*estimate_error(first.row)):
+            if self._show_estimate.value and _differ(*_apart(first.row, 'estimate_')):
                 self._estimate.show(first.row, 'estimate_')
             else:
                 self._estimate.hide()
@@ -326,13 +326,13 @@ class Page:
             self.server.stop()
 
 
-def estimate_error(row: np.ndarray) -> tuple[float, float]:
-    """Return the error of the estimate [m], [deg]; NaN if estimate or truth is unknown."""
-    true, estimated = pose(row), pose(row, 'estimate_')
-    if true is None or estimated is None:
+def _apart(row, prefix):
+    """Distance [m], [deg] of body and 'estimate_' or 'target_'; NaN if one is unknown."""
+    body, other = pose(row), pose(row, prefix)
+    if body is None or other is None:
         return np.nan, np.nan
-    return (float(np.linalg.norm(true[0] - estimated[0])),
-            float(np.degrees(rotations.geodesic_angle(true[1], estimated[1]))))
+    return (float(np.linalg.norm(body[0] - other[0])),
+            float(np.degrees(rotations.geodesic_angle(body[1], other[1]))))
 
 
 def _differ(metres, degrees):
@@ -346,16 +346,12 @@ def status(run: Shown, headline: str, model: Model, names: list[str]) -> str:
         lines.append('<div style="font-size:.85em">' + ' &nbsp; '.join(
             f'<span style="color:{plots.colour(k)}">&#9632;</span> {html.escape(name)}'
             for k, name in enumerate(names)) + '</div>')
-    target, placed = pose(run.row, 'target_'), pose(run.row)
     voltage, current = known(run.row, 'voltage'), known(run.row, 'current')
     entries = [('state', html.escape(run.state or 'unknown'))]
-    if target is not None and placed is not None:
-        away = float(np.linalg.norm(placed[0] - target[0]))
-        angle = np.degrees(rotations.geodesic_angle(placed[1], target[1]))
-        entries.append(('off target', f'{away:.3f} m, {angle:.1f}&deg;'))
-    off = estimate_error(run.row)
-    if np.isfinite(off[0]):
-        entries.append(('estimate', f'{off[0]:.3f} m, {off[1]:.1f}&deg; off'))
+    for name, prefix, word in (('off target', 'target_', ''), ('estimate', 'estimate_', ' off')):
+        away, angle = _apart(run.row, prefix)
+        if np.isfinite(away):
+            entries.append((name, f'{away:.3f} m, {angle:.1f}&deg;{word}'))
     if voltage is not None:
         text = f'{voltage[0]:.1f} V'
         if current is not None:
