@@ -9,8 +9,13 @@ import numpy as np
 
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.sim.command_link import ROUNDING
-from beetle_omni_ros.sim.emulated import fault_switches
-from beetle_omni_ros.sim.emulated.fault_switches import BoardFaultSwitches, ServoFaultSwitches
+from beetle_omni_ros.sim.emulated.fault_switches import (
+    BoardFaultSwitches,
+    SERVO_EVENTS,
+    SERVO_LISTS,
+    ServoFaultSwitches,
+    switched_on,
+)
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
 from beetle_omni_ros.sim.readings import Drive, Frame
@@ -97,21 +102,39 @@ class EmulatedActuators:
                 use when it is plugged in.
 
         """
-        fault_switches.check_servo_faults(servo, self.bus)
-        fault_switches.check_board_faults(board)
+        _check_faults(servo, board, [one['ID'] for one in self.bus.servos])
         try:
-            fault_switches.set_servo_faults(servo, self.bus)
-            fault_switches.set_board_faults(board, self.board)
+            self._set_servo_faults(servo)
+            self._set_board_faults(board)
         except OSError as error:
             raise ParameterError(str(error)) from None
         self._servo_faults, self._board_faults = servo, board
+
+    def _set_servo_faults(self, faults):
+        bus = self.bus
+        bus.faults = faults
+        (bus.unplug if faults.unplugged else bus.replug)()
+        places = {servo['ID']: place for place, servo in enumerate(bus.servos)}
+        if faults.reboot:
+            bus.reboot(places[faults.reboot])
+        if faults.expire_watchdog:
+            bus.expire_watchdog(places[faults.expire_watchdog])
+
+    def _set_board_faults(self, faults):
+        board = self.board
+        board.faults = faults
+        (board.unplug if faults.unplugged else board.plug)()
+        if faults.hang:
+            board.hang()
+        if faults.reboot:
+            board.reboot()
 
     @property
     def faults(self) -> list[str]:
         """Active faults as texts such as 'servo silent [2]'."""
         return [f'{device} {text}' for device, faults in
                 (('servo', self._servo_faults), ('board', self._board_faults))
-                for text in fault_switches.switched_on(faults)]
+                for text in switched_on(faults)]
 
     def status(self) -> dict[str, object]:
         """States and refusals of the devices, for diagnostics."""
@@ -121,6 +144,18 @@ class EmulatedActuators:
                 'stopped': [bool(on) for on in bus.stopped],
                 'servo refused': bus.network.refusals,
                 **{f'board refused: {reason}': count for reason, count in board.refused.items()}}
+
+
+def _check_faults(servo, board, known):
+    """Refuse unknown IDs, and numbers of rotors that are not whole."""
+    for name in SERVO_LISTS + SERVO_EVENTS:
+        for wanted in np.ravel(getattr(servo, name)):
+            if wanted not in known and not (name in SERVO_EVENTS and wanted == 0):
+                raise ParameterError(f'servo_faults.{name}: no servo has the id {wanted:g}; '
+                                     f'ids are {known}')
+    if np.any(board.failed_escs != np.round(board.failed_escs)):
+        raise ParameterError('board_faults.failed_escs: expected rotors 1 to 4, found '
+                             f'{board.failed_escs}')
 
 
 def _line(delay, tick, make):

@@ -1,20 +1,18 @@
-"""Faults of the emulated devices as parameters: permanent levels, and single events."""
+"""Faults of the emulated devices as parameters: levels, then the switches of single events."""
 
 from dataclasses import dataclass, fields
 
 import numpy as np
 
-from beetle_omni_ros.robot.schema import parameter, ParameterError
-from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
-from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
+from beetle_omni_ros.robot.schema import parameter
 
 SHARE = {'low': 0, 'high': 1}
 LISTED = {'low': 1, 'high': 252}
 
 
-@dataclass(frozen=True, kw_only=True)
-class ServoFaultSwitches:
-    """Faults of the servo bus."""
+@dataclass(kw_only=True)
+class ServoFaults:
+    """Levels of faults of the servo bus, which may be changed at any time."""
 
     bad_crc: float = parameter(0.0, doc='share of answers with a flipped bit', **SHARE)
     dropped: float = parameter(0.0, doc='share of lost answers', **SHARE)
@@ -25,14 +23,20 @@ class ServoFaultSwitches:
     overheated: np.ndarray = parameter([], doc='IDs above their temperature limit', **LISTED)
     supply_voltage: float = parameter(12.0, doc='supply voltage of the servos', unit='V', low=0,
                                       high=30)
+
+
+@dataclass(kw_only=True)
+class ServoFaultSwitches(ServoFaults):
+    """Faults of the servo bus."""
+
     unplugged: bool = parameter(False, doc='whether the cable of the adapter is unplugged')
     reboot: int = parameter(0, doc='ID to restart once', low=0, high=252)
     expire_watchdog: int = parameter(0, doc='ID whose watchdog expires once', low=0, high=252)
 
 
-@dataclass(frozen=True, kw_only=True)
-class BoardFaultSwitches:
-    """Faults of the motor board, its battery, its rotors and its cable."""
+@dataclass(kw_only=True)
+class BoardFaults:
+    """Levels of faults of the motor board, which may be changed at any time."""
 
     corrupt_out: float = parameter(0.0, doc='share of packets of the board with a flipped bit',
                                    **SHARE)
@@ -48,6 +52,12 @@ class BoardFaultSwitches:
     voltage_sag: float = parameter(0.0, doc='drop of the battery voltage', unit='V', low=0,
                                    high=30)
     failed_escs: np.ndarray = parameter([], doc='rotors (1 to 4) that do not turn', low=1, high=4)
+
+
+@dataclass(kw_only=True)
+class BoardFaultSwitches(BoardFaults):
+    """Faults of the motor board, its battery, its rotors and its cable."""
+
     unplugged: bool = parameter(False, doc='whether the cable of the board is unplugged')
     reboot: bool = parameter(False, doc='reset once')
     hang: bool = parameter(False, doc='hang once, until the reset by the watchdog')
@@ -55,62 +65,6 @@ class BoardFaultSwitches:
 
 SERVO_EVENTS, BOARD_EVENTS = ('reboot', 'expire_watchdog'), ('reboot', 'hang')
 SERVO_LISTS = ('silent', 'overload', 'overheated')
-
-
-def check_servo_faults(faults: ServoFaultSwitches, bus: EmulatedServoBus) -> None:
-    """
-    Check that the bus has the IDs.
-
-    Raises:
-        ParameterError: unknown ID; the message has key and IDs.
-
-    """
-    known = [servo['ID'] for servo in bus.servos]
-    for name in SERVO_LISTS + SERVO_EVENTS:
-        for wanted in np.ravel(getattr(faults, name)):
-            if wanted not in known and not (name in SERVO_EVENTS and wanted == 0):
-                raise ParameterError(f'servo_faults.{name}: no servo has the id {wanted:g}; '
-                                     f'ids are {known}')
-
-
-def check_board_faults(faults: BoardFaultSwitches) -> None:
-    """
-    Check the numbers of rotors.
-
-    Raises:
-        ParameterError: not a whole number; the message has key and value.
-
-    """
-    if np.any(faults.failed_escs != np.round(faults.failed_escs)):
-        raise ParameterError('board_faults.failed_escs: expected rotors 1 to 4, found '
-                             f'{faults.failed_escs}')
-
-
-def set_servo_faults(faults: ServoFaultSwitches, bus: EmulatedServoBus) -> None:
-    """Apply the levels and trigger the events."""
-    for name in ('bad_crc', 'dropped', 'delayed', 'delay', 'supply_voltage'):
-        setattr(bus.faults, name, getattr(faults, name))
-    for name in SERVO_LISTS:
-        setattr(bus.faults, name, set(_whole(getattr(faults, name))))
-    (bus.unplug if faults.unplugged else bus.replug)()
-    places = {servo['ID']: place for place, servo in enumerate(bus.servos)}
-    if faults.reboot:
-        bus.reboot(places[faults.reboot])
-    if faults.expire_watchdog:
-        bus.expire_watchdog(places[faults.expire_watchdog])
-
-
-def set_board_faults(faults: BoardFaultSwitches, board: EmulatedMotorBoard) -> None:
-    """Apply the levels and trigger the events."""
-    for name in ('corrupt_out', 'corrupt_in', 'drop_out', 'drop_in', 'delay_out', 'delay_in',
-                 'mute', 'voltage_sag'):
-        setattr(board.faults, name, getattr(faults, name))
-    board.faults.failed_escs = tuple(_whole(faults.failed_escs))
-    (board.unplug if faults.unplugged else board.plug)()
-    if faults.hang:
-        board.hang()
-    if faults.reboot:
-        board.reboot()
 
 
 def switched_on(faults: ServoFaultSwitches | BoardFaultSwitches) -> list[str]:
@@ -122,11 +76,8 @@ def switched_on(faults: ServoFaultSwitches | BoardFaultSwitches) -> list[str]:
         if entry.name in (*events, 'delay') or np.array_equal(value,
                                                               getattr(healthy, entry.name)):
             continue
-        text = '' if value is True else f' {_whole(value)}' if isinstance(value, np.ndarray) \
-            else f' {value:g}'
-        found.append(entry.name + text)
+        if isinstance(value, np.ndarray):
+            found.append(f'{entry.name} {sorted({int(one) for one in np.ravel(value)})}')
+        else:
+            found.append(entry.name + ('' if value is True else f' {value:g}'))
     return found
-
-
-def _whole(values):
-    return sorted({int(value) for value in np.ravel(values)})

@@ -13,9 +13,10 @@ import numpy as np
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.thrust_map import duty_of_command, ThrustMap
 from beetle_omni_ros.sim.emulated import mavlink
-from beetle_omni_ros.sim.emulated.board_faults import BoardFaults, frames, Line
+from beetle_omni_ros.sim.emulated.board_cable import frames, Line
 from beetle_omni_ros.sim.emulated.board_firmware import BoardFirmware
 from beetle_omni_ros.sim.emulated.board_parameters import EmulatedBoardParameters
+from beetle_omni_ros.sim.emulated.fault_switches import BoardFaults
 from beetle_omni_ros.sim.emulated.pseudo_terminal import PseudoTerminal
 
 TICK = 0.01             # [s] longest sleep of the thread
@@ -109,7 +110,7 @@ class EmulatedMotorBoard:
     def _thrusts(self, commands):
         thrust = self._map.thrust(duty_of_command(commands), self.voltage)
         for rotor in self.faults.failed_escs:
-            thrust[rotor - 1] = 0.0
+            thrust[int(rotor) - 1] = 0.0
         return thrust
 
     @property
@@ -217,7 +218,7 @@ class EmulatedMotorBoard:
         telemetry = self._firmware.telemetry
         telemetry.voltage = self.voltage + self._error[0]
         telemetry.current = self._current + self._error[1]
-        telemetry.failed = frozenset(rotor - 1 for rotor in self.faults.failed_escs)
+        telemetry.failed = frozenset(int(rotor) - 1 for rotor in self.faults.failed_escs)
         thrust = self._thrust
         if thrust is None:
             thrust = self._thrusts(np.array(self._firmware.outputs(now)))

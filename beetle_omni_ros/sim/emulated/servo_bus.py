@@ -1,7 +1,6 @@
 """The emulated servo bus: servos and faults on a pseudo-terminal."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 import heapq
 import itertools
 from random import Random
@@ -14,6 +13,7 @@ from beetle_omni_ros.robot.parameters import JointParameters
 from beetle_omni_ros.robot.servo import NUMPY, Servo, Step
 from beetle_omni_ros.sim.emulated import servo_table as table
 from beetle_omni_ros.sim.emulated.dynamixel import Receiver
+from beetle_omni_ros.sim.emulated.fault_switches import ServoFaults
 from beetle_omni_ros.sim.emulated.pseudo_terminal import PseudoTerminal
 from beetle_omni_ros.sim.emulated.servo import EmulatedServo
 from beetle_omni_ros.sim.emulated.servo_network import ServoNetwork
@@ -52,20 +52,6 @@ class SecondOrderMotion:
                 powered, moved, [self.position, np.zeros_like(self.velocity)])
             self.effort = np.where(powered, self._servo.motor(
                 NUMPY, goals - self.position, self.velocity), 0.0)
-
-
-@dataclass
-class ServoFaults:
-    """Present faults, which may be changed at any time; see :class:`.ServoFaultSwitches`."""
-
-    bad_crc: float = 0.0
-    dropped: float = 0.0
-    delayed: float = 0.0
-    delay: float = 0.02
-    silent: set[int] = field(default_factory=set)
-    overload: set[int] = field(default_factory=set)
-    overheated: set[int] = field(default_factory=set)
-    supply_voltage: float | None = None
 
 
 class EmulatedServoBus:

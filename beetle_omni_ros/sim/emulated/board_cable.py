@@ -1,23 +1,7 @@
-"""Faults of the emulated motor board and of its cable."""
+"""The cable of the emulated motor board, with faults."""
 
-from dataclasses import dataclass
 import heapq
 import random
-
-
-@dataclass
-class BoardFaults:
-    """Present faults, which may be changed at any time; see :class:`.BoardFaultSwitches`."""
-
-    corrupt_out: float = 0.0
-    corrupt_in: float = 0.0
-    drop_out: float = 0.0
-    drop_in: float = 0.0
-    delay_out: float = 0.0
-    delay_in: float = 0.0
-    mute: bool = False
-    voltage_sag: float = 0.0
-    failed_escs: tuple[int, ...] = ()
 
 
 class Line:
