@@ -133,7 +133,8 @@ def rows():
         yield [*COMPARE, option, value], fragment
     for option, value, fragment in (
             ('--faults', 'none.yaml', 'none.yaml'), ('--faults', 'no_list.yaml', "'faults'"),
-            ('--only', 'rotor_9_stops', "fault 'rotor_9_stops' is unknown; known:"),
+            ('--only', 'rotor_9_stops', "fault 'rotor_9_stops' is unknown, a name of the list is "
+                                         'expected; near: rotor_4_stops'),
             ('--from', 'bed', "--from 'bed': expected hover, moving, upside_down"),
             ('--seeds', '0', "--seeds '0': expected"), ('--seeds', 'x', "--seeds 'x': expected"),
             ('--landings', '-1', "--landings '-1': expected"),

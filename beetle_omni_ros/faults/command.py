@@ -3,17 +3,16 @@
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import asdict
+from datetime import datetime, timezone
 import json
 from math import ceil
 from pathlib import Path
 
 from rich.console import Console
-from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
 
 from beetle_omni_ros import __version__
-from beetle_omni_ros.comparison.fingerprint import code_fingerprint, file_digest
+from beetle_omni_ros.comparison.fingerprint import code_fingerprint, commit, file_digest
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import guidance_of
 from beetle_omni_ros.faults import campaign, page
@@ -27,10 +26,13 @@ from beetle_omni_ros.faults.landings import (
 )
 from beetle_omni_ros.faults.trial import fly_trial, Trial
 from beetle_omni_ros.faults.watch import as_expected
+from beetle_omni_ros.pages.table import print_grids
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.json_file import check_writable, write_json
 from beetle_omni_ros.sim.faults.listed import FaultList
+
+PAGE = 'faults.html'
 
 
 def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
@@ -63,7 +65,9 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
     guidance = guidance_of(entry.make(RobotParameters.load()))  # refuses an unusable controller
     meta = {'command': _described(faults, only, starts, seeds, seed, conditions, controller,
                                   landings, without_mocap, healthy, bool(through_ros)),
-            'version': __version__, 'guidance': guidance}
+            'version': __version__, 'commit': commit(),
+            'date': datetime.now(timezone.utc).strftime('%Y-%m-%d'), 'guidance': guidance,
+            'limits': asdict(listed.limits)}
     fly = _Flyer(console, jobs, output, file_digest(faults) if faults else '')
     results: dict = {'meta': meta}
     if landings:
@@ -94,7 +98,10 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
                                     one['seed']))
         results.update(flights=flown, summary=campaign.summary(flown, listed))
     _write(results, output, json_path, docs)
-    _print(results, console)
+    print_grids(page.terminal_grids(results), console)
+    for text in (page.total_text(results), f'page: {output / PAGE}' if output
+                 else 'no page written; --output DIR writes one'):
+        console.print(text, highlight=False, markup=False, soft_wrap=True)
     return results
 
 
@@ -202,28 +209,8 @@ def _write(results, output, json_path, docs):
     for path in filter(None, (json_path, output and output / 'faults.json')):
         write_json(path, results)
     if output:
-        (output / 'faults.html').write_text(page.as_page(results), encoding='utf-8')
+        (output / PAGE).write_text(page.as_page(results, output), encoding='utf-8')
         (output / 'faults.md').write_text(page.as_markdown(results), encoding='utf-8')
     if docs and results.get('summary'):
         table = page.markdown(page.COLUMNS, page.fault_rows(results))
         docs.write_text(page.in_docs(_text(docs), table), encoding='utf-8')
-
-
-def _print(results, console):
-    if results.get('summary'):
-        _table(console, 'Faults', page.COLUMNS[:1] + page.COLUMNS[2:],
-               [row[:1] + row[2:] for row in page.fault_rows(results)])
-        console.print(page.total_text(results), highlight=False)
-    for title, header, rows in page.other_tables(results):
-        # The description of a fault is too long for a terminal; the page has it.
-        kept = [k for k, name in enumerate(header) if name != 'what happens']
-        _table(console, title, [header[k] for k in kept], [[row[k] for k in kept] for row in rows])
-
-
-def _table(console, title, header, rows):
-    table = Table(title=title, title_justify='left')
-    for column in header:
-        table.add_column(column)
-    for row in rows:
-        table.add_row(*map(escape, row))
-    console.print(table)

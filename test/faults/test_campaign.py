@@ -1,6 +1,6 @@
 """The campaign: repeatable flights, correct counts, tables that match the list."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 import io
 import json
 from pathlib import Path
@@ -21,6 +21,8 @@ from beetle_omni_ros.faults.landings import (
     LandingTrial,
 )
 from beetle_omni_ros.faults.trial import fly_to_start, fly_trial, Trial
+from beetle_omni_ros.faults.watch import BETTER
+from beetle_omni_ros.pages.table import print_grids
 
 ROOT = Path(__file__).parents[2]
 
@@ -97,6 +99,69 @@ def test_summary_counts_add_up(listed):
                              'lost_bags': 1}
 
 
+def campaign_of(flights, listed):
+    """Results of a campaign with these flights."""
+    return {'flights': flights, 'summary': summary(flights, listed), 'meta': {
+        'command': 'beetle_omni faults', 'date': '2026-11-25', 'version': '0.1.0',
+        'commit': 'abcdef0123', 'limits': asdict(listed.limits)}}
+
+
+def terminal(results):
+    """Tables and summary on a terminal of 80 columns."""
+    console = Console(file=io.StringIO(), width=80)
+    print_grids(page.terminal_grids(results), console)
+    return console.file.getvalue()
+
+
+def test_no_name_and_no_header_is_cut_at_80_columns(listed):
+    flights = [result(name, expected=case.expected, outcome=outcome, named_s=12.34, named='x',
+                      impact_m_s=12.34) for name, case in listed.cases.items()
+               for outcome in ('flies_on', 'crash, motors on', 'does not land')]
+    landings = [{'conditions': 'published', 'without_mocap': lost, 'good': lost,
+                 'outcome': outcome, 'impact_m_s': 10.3, 'inclination_deg': 124.0}
+                for lost in (True, False) for outcome in ('lands', 'crash, motors on')]
+    printed = terminal({**campaign_of(flights, listed),
+                        'landings': {'summary': landing_summary(landings)}})
+    words = printed.split()
+    assert {*listed.cases, 'expected', 'good', 'outcomes', 'impact', '[m/s]', 'named', '[s]',
+            'conditions', 'MoCap', 'inclination', '[deg]', 'flies_on', '12.34'} <= {*words}
+    assert '…' not in printed and max(map(len, printed.splitlines())) <= 80
+
+
+def test_bags_are_counted_only_if_recorded(listed):
+    without = page.total_text(campaign_of([result('gust')], listed))
+    assert 'bag' not in without and '1 of 1 flights' in without
+    assert '0 lost bags' in page.total_text(campaign_of([result('gust', bag_lost=False)], listed))
+
+
+def test_the_page_explains_its_columns_and_outcomes_and_shows_each_flight(listed):
+    said = 'rotor 1 gives less thrust than asked'
+    flights = [result('rotor_1_stops', start=start, said=said, bag_lost=False)
+               for start in ('hover', 'moving')]
+    flights.append(result('gust', seed=4, outcome='crash, motors on', good=False, bag_lost=True,
+                          impact_m_s=None))
+    html = page.as_page(campaign_of(flights, listed), Path('runs_out/faults'))
+    assert html.count('<h1>Faults</h1>') == 1 and '<h2>Faults</h2>' not in html
+    for text in ('2026-11-25', 'version 0.1.0, commit abcdef0123', 'as expected: ',
+                 'named after: ', '2 of 3 as expected'):
+        assert text in html
+    assert {*BETTER, 'flyaway', 'takes off', 'crash, motors on', 'hard', 'tilted',
+            'does not land', 'error'} == {*page.OUTCOMES}
+    assert all(f'</i>{name}</dt>' in html for name in page.OUTCOMES)
+    assert 'below 1 m/s and 30 deg' in html and '0.6 m/s' in html
+    each = html.split('<h2>Each flight</h2>')[1]
+    assert '<summary>3 flights</summary>' in each and each.count(said) == 2
+    assert 'href="bags/rotor_1_stops_moving_nominal_nmpc_0/"' in each and '<td>lost</td>' in each
+    assert 'beetle_omni report runs_out/faults/bags/NAME' in each
+    assert html.count('<svg') == 2 and html.count('<circle') == 2 and html.count('<rect') == 2
+
+
+def test_a_long_table_of_flights_is_folded(listed):
+    flights = [result(name) for name in listed.cases]
+    each = page.as_page(campaign_of(flights, listed)).split('<h2>Each flight</h2>')[1]
+    assert f'<details><summary>{len(flights)} flights</summary>' in each and 'bags' not in each
+
+
 def test_landings_and_healthy_flights_are_summed_by_conditions():
     landings = [{'conditions': 'nominal', 'without_mocap': lost, 'good': lost, 'outcome': 'lands',
                  'impact_m_s': 0.3, 'inclination_deg': 4.0} for lost in (True, True, False)]
@@ -115,8 +180,12 @@ def test_the_command_writes_page_markdown_and_json(listed, tmp_path, monkeypatch
                                    outcome='<b>') for trial in trials))
     docs = tmp_path / 'safety.md'
     docs.write_text(f'before\n{page.BEGIN}\nold\n{page.END}\nafter\n')
+    console = Console(file=io.StringIO())
     totals = run_faults(only=['gust', 'impact'], starts=['hover'], seeds=2, seed=7, docs=docs,
-                      output=tmp_path / 'out', console=Console(file=io.StringIO()))
+                        output=tmp_path / 'out', console=console)
+    assert f"page: {tmp_path / 'out' / 'faults.html'}\n" in console.file.getvalue()
+    run_faults(only=['gust'], starts=['hover'], console=console)
+    assert console.file.getvalue().endswith('no page written; --output DIR writes one\n')
     assert [(one['case'], one['seed']) for one in totals['flights']] == [
         ('gust', 7), ('gust', 8), ('impact', 7), ('impact', 8)]
     assert '--seeds 2 --seed 7 ' in totals['meta']['command']
@@ -164,7 +233,9 @@ def test_the_table_in_the_docs_agrees_with_the_list(listed):
 
 
 @pytest.mark.parametrize(('arguments', 'named'), [
-    (['--only', 'gust,gost'], 'gost'), (['--from', 'floor'], 'hover, moving, upside_down'),
+    (['--only', 'gust,gost'], "'gost' is unknown, a name of the list is expected; near: gust"),
+    (['--only', 'rotor_9_stops'], 'near: rotor_4_stops, rotor_3_stops'),
+    (['--only', '7'], 'for example rotor_1'), (['--from', 'floor'], 'hover, moving, upside_down'),
     (['--controller', 'pid'], 'pid'), (['--conditions', 'windy'], 'windy'),
     (['--faults', 'none.yaml'], 'no such file'), (['--without-mocap'], '--landings'),
     (['--bags'], '--output'), (['--json', 'no/x.json'], 'x.json'), (['--seeds', '0'], '--seeds'),

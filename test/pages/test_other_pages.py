@@ -1,5 +1,6 @@
 """Pages of identify, gap, faults and compare in a real browser: complete, without errors."""
 
+from dataclasses import asdict
 import json
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from beetle_omni_ros.comparison.page import Section
 from beetle_omni_ros.faults.page import as_page
 from beetle_omni_ros.pages.page import page, section, verdict_head
 from beetle_omni_ros.pages.table import Grid
+from beetle_omni_ros.sim.faults.listed import FaultList
 
 ROOT = Path(__file__).parents[2]
 LONG = 'a text of many words that says what was found and what to do about it ' * 3
@@ -35,12 +37,15 @@ def comparison(folder):
 
 def faults(folder):
     flight = {'case': 'rotor_1_stops', 'start': 'upside_down', 'seed': 0, 'conditions': 'nominal',
+              'expected': 'lands', 'controller': 'nmpc', 'bag_lost': False,
               'outcome': 'crash', 'good': False, 'error': '', 'said': LONG, 'impact_m_s': 3.0}
     row = {'what': LONG, 'expected': 'lands', 'flights': 3, 'good': 2, 'outcomes': {'crash': 1},
            'impact_median_m_s': 1.0, 'impact_worst_m_s': 3.0, 'named_s': 0.2}
     total = dict.fromkeys(('good', 'flights', 'flyaways', 'motors_on_after_crash', 'takeoffs',
                            'lost_bags', 'errors'), 1)
-    return as_page({'meta': {'command': 'beetle_omni faults ' + '--only a_long_name_of_one ' * 3},
+    meta = {'command': 'beetle_omni faults ' + '--only a_long_name_of_one ' * 3, 'commit': None,
+            'date': '2026-11-25', 'version': '0', 'limits': asdict(FaultList.load().limits)}
+    return as_page({'meta': meta,
                     'flights': [flight], 'summary': {'faults': {'rotor_1_stops': row},
                                                      'total': total}})
 

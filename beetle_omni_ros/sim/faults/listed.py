@@ -142,7 +142,8 @@ class FaultList:
         """
         for name in names or ():
             if name not in self.cases:
-                raise ParameterError(f"fault '{name}' is unknown; known: {', '.join(self.cases)}")
+                raise ParameterError(f'fault {quoted(name)} is unknown, a name of the list is '
+                                     f'expected{_near(name, self.cases)}')
         return [self.cases[name] for name in names or self.cases]
 
 
@@ -207,16 +208,20 @@ def _placed(entry, at, named):
             raise ParameterError(f"{at}: key 'kind': give the kind as 'what'")
         return [_fault({'kind': what, **numbers}, at)]
     if what not in named:
-        near = get_close_matches(what[:60], [*KINDS, *named], 8, 0.4)
         raise ParameterError(f"{at}: key 'what': {quoted(what)} is unknown, a kind or a name of "
-                             'params/faults.yaml is expected' + (
-                                 f"; near: {', '.join(dict.fromkeys(near))}" if near else ''))
+                             f'params/faults.yaml is expected{_near(what, [*KINDS, *named])}')
     for key in numbers:
         if key not in ('at', 'duration'):
             raise ParameterError(f'{at}: key {quoted(key)}: a fault of the list takes at and '
                                  'duration')
     return [_fault({'kind': fault.kind, **fault.numbers, 'duration': fault.duration, **numbers},
                    at) for fault in named[what].strike]
+
+
+def _near(name, known):
+    near = get_close_matches(name[:60], known, 8, 0.4)
+    return f"; near: {', '.join(dict.fromkeys(near))}" if near else \
+        f"; for example {', '.join([*known][:4])}"
 
 
 def text(faults: list[Fault]) -> str:
