@@ -8,6 +8,7 @@ Write the pages of docs/reference that are made from code: ``python docs/generat
 | command_line.md | the options of ``beetle_omni`` and its subcommands |
 | effects.md | the catalogue of effects |
 | faults.md | params/faults.yaml |
+| python.md | the docstrings of the public module and of a flight's arrays |
 
 ``--check`` writes nothing and exits with status 1 where a page is out of date. ROS is not needed:
 the files of the nodes are read, not imported.
@@ -18,6 +19,7 @@ from __future__ import annotations
 import ast
 from dataclasses import fields, is_dataclass
 from importlib import import_module
+import inspect
 from pathlib import Path
 import re
 import sys
@@ -419,8 +421,70 @@ def faults() -> str:
             + table(['fault', 'event', 'expected', 'kinds'], rows))
 
 
+def python() -> str:
+    """The public module and the classes of its results."""
+    import beetle_omni_ros as module
+    from beetle_omni_ros.control import base
+    from beetle_omni_ros.runs import log
+    text = [f'# Python\n\n{MADE}\n'
+            'The functions of `import beetle_omni_ros as bo`. They need no ROS. Short scripts are '
+            'in\n`examples/`; `examples/read_bag.py` reads a bag.\n\n'
+            + table(['function', ''], [
+                [f'[`bo.{name}`](#{name})', _sections(_documented(module, name))['']
+                 .partition('\n\n')[0]] for name in module.__all__])]
+    for name in module.__all__:
+        function = _documented(module, name)
+        parameters = [one.replace(annotation=inspect.Parameter.empty) for one in
+                      inspect.signature(function).parameters.values() if one.name != 'self']
+        call = f'bo.{name}{inspect.Signature(parameters)}'
+        text.append(f'\n## {name}\n\n```python\n{call}\n```\n{_described(function)}')
+    text.append(
+        '\n## Times of a flight\n\nThe times of a recorded flight (`bo.read_run`) are absolute, '
+        'in seconds since 1970-01-01 UTC. Those\nof `bo.simulate` begin at 0. `log.imu_t - '
+        'log.start` is the time since the start of either. The\ntimes of a `TrajectoryTarget`, '
+        'and the argument of `target.at(t)`, are on the same clock.\n')
+    for kind in (log.FlightLog, log.Commands, base.PoseTarget, base.TrajectoryTarget,
+                 base.Reference):
+        text.append(f'\n## {kind.__name__}\n{_described(kind)}')
+        methods = [[f'`{name}`' if isinstance(one, property) else f'`{name}()`',
+                    ' '.join(_sections(one)[''].split())]
+                   for name, one in vars(kind).items() if not name.startswith('_')
+                   and (isinstance(one, property) or inspect.isfunction(one))]
+        text.append('\n' + table(['property, method', ''], methods) if methods else '')
+    return ''.join(text)
+
+
+def _documented(module, name):
+    """A public function; `robot` is a subpackage that can be called."""
+    found = getattr(module, name)
+    return found if inspect.isfunction(found) else type(found).__call__
+
+
+def _described(documented) -> str:
+    """A docstring as Markdown: text, a table of arguments or fields, results, errors."""
+    sections = _sections(documented)
+    parts = [_wrapped(' '.join(part.split())) for part in sections.pop('').split('\n\n')]
+    for title, content in sections.items():
+        if title in ('Args', 'Attributes'):
+            entries = re.findall(r'^(\w[^:\n]*):\s+(.*(?:\n +.*)*)', content, flags=re.M)
+            parts.append(table(['argument' if title == 'Args' else 'field', ''], [
+                [', '.join(f'`{name}`' for name in names.split(', ')), ' '.join(what.split())]
+                for names, what in entries]).rstrip())
+        else:
+            parts.append(_wrapped(f'*{title}*: ' + ' '.join(content.split())))
+    return ''.join(f'\n{part}\n' for part in parts)
+
+
+def _sections(documented) -> dict[str, str]:
+    """Title -> content of a docstring of Google style; '': the text before."""
+    text = re.sub(r':\w+:`~?([^`]*)`', r'`\1`', inspect.getdoc(documented)).replace('``', '`')
+    parts = re.split(r'^(Args|Attributes|Returns|Raises):\n', text, flags=re.M)
+    return {'': parts[0].strip(), **{title: inspect.cleandoc(content) for title, content
+                                     in zip(parts[1::2], parts[2::2], strict=True)}}
+
+
 PAGES = {'parameters.md': parameters, 'topics.md': topics, 'command_line.md': command_line,
-         'effects.md': effects, 'faults.md': faults}
+         'effects.md': effects, 'faults.md': faults, 'python.md': python}
 
 
 def out_of_date() -> list[str]:

@@ -2,6 +2,8 @@
 Read a recorded flight into numpy arrays.
 
     python examples/read_bag.py [BAG]           # without one, a short flight is recorded first
+
+Times are absolute, in seconds since 1970; t - log.start is the time since the start.
 """
 
 from pathlib import Path
@@ -14,13 +16,20 @@ import beetle_omni_ros
 
 
 def summary(bag):
-    """Print the contents of a bag, and the error of the estimated position."""
+    """Print the contents of a bag, and errors of the position."""
     log = beetle_omni_ros.read_run(bag)
     print(f'{log.end - log.start:.1f} s, task {log.meta.get("task")}, '
           f'{len(log.imu_t)} IMU samples, {len(log.mocap_t)} poses, {len(log.targets)} targets')
     print('highest speed', f'{np.linalg.norm(log.odom_velocity, axis=1).max():.2f} m/s,',
           'largest tilt', f'{np.abs(log.joint_position).max():.2f} rad,',
           'mean thrust', f'{log.command_thrust.mean():.2f} N')
+    stamps = [target.stamp for target in log.targets]
+    latest = np.searchsorted(stamps, log.odom_t, side='right') - 1      # -1 before the first
+    error = [np.linalg.norm(position - log.targets[k].at(t).position) for k, t, position
+             in zip(latest, log.odom_t, log.odom_position, strict=True) if k >= 0]
+    if error:
+        print(f'distance to the target: {1000 * np.median(error):.1f} mm median, '
+              f'{1000 * error[-1]:.1f} mm at {log.odom_t[-1] - log.start:.1f} s')
     if len(log.truth_t):                        # of simulated flights only
         truth = np.column_stack([np.interp(log.odom_t, log.truth_t, axis)
                                  for axis in log.truth_position.T])

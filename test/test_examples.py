@@ -70,6 +70,9 @@ def test_an_own_robot_flies_with_known_and_unknown_parameters(poses):
 def test_a_bag_becomes_arrays(bags):
     printed = run('read_bag.py', bags[0])
     assert 'IMU samples' in printed and 'hover asked for' in printed
+    median, last, end = map(float, re.search(
+        r'to the target: ([\d.]+) mm median, ([\d.]+) mm at ([\d.]+) s', printed).groups())
+    assert 0 < median < 1000 and 0 < last < 100 and 1 < end < 100     # not seconds since 1970
     assert 'warning' not in printed
 
 

@@ -122,6 +122,7 @@ class TrajectoryTarget:
         quaternions: (N, 4) body to world.
         velocities: (N, 3) in world [m/s].
         angular_velocities: (N, 3) in the reference's body frame [rad/s].
+        stamp: when it was issued [s].
 
     """
 

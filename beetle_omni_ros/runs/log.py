@@ -64,7 +64,8 @@ class FlightLog:
         truth_t, truth_position, truth_quaternion, truth_velocity, truth_angular_velocity:
             simulated truth: (N,) [s], (N, 3) in world [m], (N, 4) body to world (x, y, z, w),
             (N, 3) in world [m/s], (N, 3) in base_link [rad/s].
-        odom_t, odom_position, ...: the estimate, same channels.
+        odom_t, odom_position, odom_quaternion, odom_velocity, odom_angular_velocity: the estimate,
+            same channels.
         imu_t, imu_specific_force, imu_angular_velocity: (N,), (N, 3) [m/s^2], (N, 3) [rad/s].
         mocap_t, mocap_position, mocap_quaternion: measured poses at their capture times.
         joint_t, joint_position, joint_velocity, joint_effort: (N, 4) [rad], [rad/s], [N m];

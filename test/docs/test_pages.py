@@ -1,11 +1,16 @@
 """Pages: links exist, sentences and lines are short, and pages from code are up to date."""
 
+from dataclasses import fields
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 import re
 
 import pytest
 import yaml
+
+import beetle_omni_ros
+from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
+from beetle_omni_ros.runs.log import FlightLog
 
 ROOT = Path(__file__).resolve().parents[2]
 # Pages with a style of their own: made by a command.
@@ -62,6 +67,17 @@ def test_the_readme_has_150_lines_at_most():
 def test_the_pages_made_from_code_are_up_to_date():
     old = module('generate_reference').out_of_date()
     assert not old, f'{old}: run python docs/generate_reference.py'
+
+
+def test_the_page_of_python_has_every_public_function_and_every_array():
+    page = read('docs/reference/python.md')
+    for name in beetle_omni_ros.__all__:
+        assert f'## {name}\n\n```python\nbo.{name}(' in page
+    for kind in (FlightLog, PoseTarget, TrajectoryTarget):
+        part = page.split(f'\n## {kind.__name__}\n')[1].split('\n## ')[0]
+        missing = [one.name for one in fields(kind) if f'`{one.name}`' not in part]
+        assert not missing, kind
+    assert 'seconds since 1970' in page and 'log.imu_t - log.start' in page
 
 
 def test_every_page_is_in_the_navigation_and_every_entry_is_a_page():
