@@ -11,10 +11,9 @@ from math import inf
 from pathlib import Path
 import re
 import sys
-import traceback
 from typing import Any, TYPE_CHECKING
 
-from beetle_omni_ros.control.base import Controller, reach_of
+from beetle_omni_ros.control.base import Controller, error_text, reach_of
 from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
@@ -196,7 +195,7 @@ class ControllerEntry:
             if isinstance(self.controller, str):    # a shipped controller: a defect of the package
                 raise
             raise ParameterError(f"controller '{self.reference}': building it raised "
-                                 f'{_error_text(error)}') from error
+                                 f'{error_text(error)}') from error
         self._check(controller)
         return controller
 
@@ -371,14 +370,7 @@ def _module(place, spec):
                              'which is not installed') from error
     except Exception as error:
         raise ParameterError(f"controller '{spec}': importing {place} raised "
-                             f'{_error_text(error)}') from error
-
-
-def _error_text(error):
-    """Error in one line, with its place."""
-    frames = traceback.extract_tb(error.__traceback__)
-    at = f' ({Path(frames[-1].filename).name}, line {frames[-1].lineno})' if frames else ''
-    return f'{type(error).__name__}: {error}{at}'
+                             f'{error_text(error)}') from error
 
 
 ANY = frozenset({'parameters', 'options'})      # if the object has no signature

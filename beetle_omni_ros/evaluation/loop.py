@@ -15,6 +15,7 @@ from dataclasses import replace
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import (
+    called,
     checked,
     Controller,
     corrected,
@@ -284,14 +285,14 @@ class FlightLoop:
             self._hold = PoseTarget(state.position, state.quaternion, state.stamp)
         if self.supervisor.health is not self._health:
             self._health = self.supervisor.health
-            for controller in self._controllers.values():
-                forward_health(controller, self._health)
+            for name, controller in self._controllers.items():
+                called(name, 'set_health', forward_health, controller, self._health)
         state = corrected(state, self._health)
         for name, controller in self._controllers.items():
             if self._ticks % self._every[name]:
                 continue
-            command = checked(name, self._timers[name].call(controller.step, state,
-                                                            self._target_in_force()))
+            command = checked(name, called(name, 'step', self._timers[name].call, controller.step,
+                                           state, self._target_in_force()))
             if name == self.supervisor.active:
                 for passed in self._processes.requests(command, now):
                     self._request(name, passed, now)
@@ -335,8 +336,8 @@ class FlightLoop:
                     and name in ('disarmed', 'emergency_stop'):
                 self._crashed = True
             if name in ('disarmed', 'emergency_stop'):
-                for controller in self._controllers.values():
-                    controller.reset()
+                for key, controller in self._controllers.items():
+                    called(key, 'reset', controller.reset)
             self._state_name = name
 
     def _report_compute(self):

@@ -7,7 +7,9 @@ from rclpy.node import Node
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import (
+    called,
     checked,
+    ControllerError,
     corrected,
     forward_health,
     guidance_of,
@@ -38,7 +40,8 @@ class ControllerNode(FlightNode):
     Steps a controller once a period, triggered by the estimate.
 
     Before the first target it holds the pose at which it became active. While another controller
-    is active, it still computes commands, so that it can take over without a jump.
+    is active, it still computes commands, so that it can take over without a jump. An exception of
+    the controller is logged and reported in diagnostics; no command is then published.
     """
 
     real_time = True
@@ -67,6 +70,8 @@ class ControllerNode(FlightNode):
         self._checks = TargetChecks(RobotParameters.load(self.parameters.robot_file or None))
         self._mode, self._own_mode = '', f'flying:{entry.name}'
         self._last_step = 0.0
+        self._errors, self._reported_errors = 0, 0
+        self._error, self._logged = '', ('', -math.inf)     # text, time of the line
         self._publisher = self.publisher(f'{entry.name}/command')
         self.listen('odom', self._on_odom, max_age=ODOM_AGE)
         self.listen('joint_states', self._on_joints, max_age=JOINT_AGE)
@@ -127,12 +132,12 @@ class ControllerNode(FlightNode):
 
     def _on_actuators(self, report):
         self._actuators = report.health
-        forward_health(self._controller, report.health)
+        self._call('set_health', forward_health, self._controller, report.health)
 
     def _on_mode(self, mode):
         state = mode.partition(':')[0]
         if state in ('disarmed', 'emergency_stop') and self._mode.partition(':')[0] != state:
-            self._controller.reset()
+            self._call('reset', self._controller.reset)
             self._command = self._hold = self._override = None
         took_over = mode == self._own_mode != self._mode
         self._mode = mode
@@ -152,8 +157,29 @@ class ControllerNode(FlightNode):
             if self._hold is None or not self._mode.startswith('flying'):
                 self._hold = PoseTarget(odom.position, odom.quaternion, odom.stamp)
         target = self._override or self._target or self._hold
-        command = self.timed(self._controller.step, state, target)
-        self._publisher.publish(checked(self._entry.name, command))
+        command = self._call('step', self._step, state, target)
+        if command is not None:
+            self._publisher.publish(command)
+
+    def _step(self, state, target):
+        return self.timed(self._controller.step, state, target)
+
+    def _call(self, method, function, *arguments):
+        """
+        Return the result of a controller's method; None after an exception, which is logged.
+
+        In a process with other nodes, the exception would end the supervisor, too.
+        """
+        try:
+            result = called(self._entry.name, method, function, *arguments)
+            return checked(self._entry.name, result) if method == 'step' else result
+        except ControllerError as error:
+            self._errors, self._error = self._errors + 1, str(error)
+            text, at = self._logged
+            if text != self._error and not 0 <= (now := self.elapsed()) - at < health.REPEAT:
+                self._logged = self._error, now
+                self.get_logger().error(self._error)
+            return None
 
     def _is_due(self, stamp):
         period = self._controller.period
@@ -176,9 +202,14 @@ class ControllerNode(FlightNode):
 
     def _controller_status(self):
         controller = self._controller
-        report = getattr(controller, 'diagnostics', dict)()
-        return health.OK, getattr(controller, 'name', self._entry.name), {
-            **report, 'guidance': guidance_of(controller)}
+        report = self._call('diagnostics', getattr(controller, 'diagnostics', dict)) or {}
+        new, self._reported_errors = self._errors - self._reported_errors, self._errors
+        values = {**report, 'guidance': guidance_of(controller)}
+        if self._errors:
+            values['errors'] = self._errors
+        if new:
+            return health.ERROR, self._error, values
+        return health.OK, getattr(controller, 'name', self._entry.name), values
 
 
 class NmpcNode(ControllerNode):

@@ -7,6 +7,7 @@ import time
 from rich.progress import Progress
 
 from beetle_omni_ros.nodes.graph import Graph
+from beetle_omni_ros.nodes.health import ERROR
 from beetle_omni_ros.nodes.operator import Operator
 from beetle_omni_ros.nodes.plan import BRIDGES
 from beetle_omni_ros.runs.tasks import Task
@@ -244,13 +245,18 @@ class Flight:
                                   f"'{self._operator.state}'" + (waits and f'; {waits}'))
 
     def _spin(self, seconds=CHECK_PERIOD):
-        """Process messages; a process that has ended ends the flight."""
+        """Process messages; an ended process and a failing controller end the flight."""
         self._operator.spin(seconds)
         dead = {name: how for name, how in self._graph.dead().items()
                 if name not in self._reported}
         self._reported |= set(dead)
         if dead:
             raise FlightError('; '.join(f'{name} died ({how})' for name, how in dead.items()))
+        operator = self._operator
+        status = operator.diagnostics.get(f'{operator.controller}_node: controller')
+        if status is not None and status.level >= ERROR \
+                and not operator.state.startswith('flying'):
+            raise FlightError(status.message)
 
     def _show(self, text, at='', completed=0.0):
         self._progress.update(self._bar, description=text, at=at,

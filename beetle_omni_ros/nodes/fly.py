@@ -216,7 +216,7 @@ def _absolute(path):
 
 def _fly(graph: Graph, controller: str, task: Task, meta: dict, console: Console,
          faults: str, may_be_slow: bool) -> int:
-    status = runner.OK
+    status, failure = runner.OK, None
     operator = None
     try:
         graph.start()
@@ -231,7 +231,7 @@ def _fly(graph: Graph, controller: str, task: Task, meta: dict, console: Console
                 raise
             except FlightError as error:
                 print(f'beetle_omni fly: error: {error}', file=sys.stderr)
-                status = runner.FAILED
+                status, failure = runner.FAILED, str(error)
             flight.land()
         meta['graph'] = flight.measured
         operator.report('fly: run', 'what is flown', {k: v for k, v in meta.items()
@@ -246,6 +246,8 @@ def _fly(graph: Graph, controller: str, task: Task, meta: dict, console: Console
     for name in stubborn:
         print(f'beetle_omni fly: error: {name} did not stop and was killed', file=sys.stderr)
     for line in graph.warnings():
+        if failure and line.endswith(failure):
+            continue        # printed above
         console.print(line, markup=False, emoji=False, highlight=False, style='yellow')
     return status
 
@@ -257,7 +259,8 @@ def _report(bag, controller, task, meta, json_path, console) -> int:
     for line in log.warnings:
         console.print(line, markup=False, emoji=False, style='yellow')
     results = {'meta': meta, controller: metrics(log, task)}
-    table.print_results(results, console)
+    if log.controllers():       # a controller flew
+        table.print_results(results, console)
     _print_measured(meta, console)
     write_json(json_path, results)
     return runner.OK if not results[controller].get('crashed') else runner.FAILED

@@ -30,6 +30,7 @@ class Operator:
     With simulated time, seconds are those of /clock.
 
     Attributes:
+        controller: name of the watched controller.
         state: state of the supervisor, '' before the first message.
         progress: state of reference_node, '' before the first message.
         bridges: bridge node -> its newest state.
@@ -41,6 +42,7 @@ class Operator:
     def __init__(self, domain: int, controller: str = registry.DEFAULT):
         """Join ``domain`` and count the commands of ``controller``."""
         confine()
+        self.controller = controller
         self._context = rclpy.Context()
         rclpy.init(args=[], context=self._context, domain_id=domain,
                    signal_handler_options=SignalHandlerOptions.NO)

@@ -181,7 +181,7 @@ def test_an_unusable_class_is_refused_in_one_line(module, spec, message):
 
 @pytest.mark.parametrize('text, message', [
     ('import none_such\n', "needs the module 'none_such'"), ('1 +\n', 'raised SyntaxError'),
-    ('raise ValueError("bad")\n', r'raised ValueError: bad \(broken.py, line 1\)')])
+    ('raise ValueError("bad")\n', r'raised ValueError: bad \(broken.py:1\)')])
 def test_a_module_that_cannot_be_imported_is_refused_with_the_cause(tmp_path, text, message):
     (tmp_path / 'broken.py').write_text(text)
     with pytest.raises(ParameterError, match=message):

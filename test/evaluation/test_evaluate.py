@@ -9,6 +9,7 @@ import pytest
 from rich.console import Console
 import yaml
 
+from beetle_omni_ros import cli
 from beetle_omni_ros.evaluation import command, loop
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
@@ -127,6 +128,18 @@ def test_a_flight_ended_by_the_supervisor_is_reported_with_time_and_reason(poses
     assert 'battery' in results['nmpc']['ended']     # empty, or too weak before that
     assert results['nmpc']['ended'].startswith('landing at ')
     assert f"nmpc: the flight ended early, {results['nmpc']['ended']}" in text.getvalue()
+
+
+def test_an_exception_of_step_ends_the_command_with_one_line(poses, tmp_path, capsys):
+    own = tmp_path / 'bad.py'
+    own.write_text('from beetle_omni_ros.control.hover import HoverController\n'
+                   'class Bad(HoverController):\n'
+                   '    def step(self, state, target):\n'
+                   '        return self.absent\n')
+    assert cli.main(['evaluate', '--controllers', f'{own}:Bad', '--task', str(poses)]) == 2
+    line, = capsys.readouterr().err.splitlines()
+    assert line == "beetle_omni: error: controller 'bad': step raised AttributeError: " \
+                   "'Bad' object has no attribute 'absent' (bad.py:4)"
 
 
 def test_a_force_task_ends_with_the_level_of_lost_control():

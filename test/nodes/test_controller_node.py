@@ -10,17 +10,19 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rclpy
+from witness import HEADER, READY
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.messages.topics import split_topic, topic_of, topics_with
 from beetle_omni_ros.messages.values import MessageError, Odom
-from beetle_omni_ros.nodes import plan
+from beetle_omni_ros.nodes import health, plan
 from beetle_omni_ros.nodes.controller_node import ControllerNode
 from beetle_omni_ros.nodes.supervisor_node import SupervisorNode
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth
 from beetle_omni_ros.robot.readings import JointReading
 from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.runs.bag import read_bag
 
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 OWN = f"{Path(__file__).resolve().parents[2] / 'examples' / 'own_controller.py'}:PoseController"
@@ -82,6 +84,65 @@ def test_any_controller_sees_true_tilts_and_no_target_beyond_its_reach(make, mon
     controller.reach = 3.0
     with pytest.raises(MessageError, match='expected at most 3 m'):
         node._check_target(far, math.nan)
+
+
+FAILING = """from beetle_omni_ros.control.hover import HoverController
+
+
+class Failing(HoverController):
+    fails_from = {fails_from}
+
+    def step(self, state, target):
+        if state.stamp > self.fails_from:
+            state.positon
+        return super().step(state, target)
+"""
+
+
+def test_an_exception_of_step_is_logged_and_reported_and_publishes_no_command(
+        make, tmp_path, capfd):
+    own, published = tmp_path / 'bad.py', []
+    own.write_text(FAILING.format(fails_from=1.5))
+    node = make(ControllerNode, f'controller:={own}:Failing')
+    node._publisher = SimpleNamespace(publish=published.append)
+    node._on_joints(JointReading(1.0, np.zeros(4), np.zeros(4)))
+
+    def step(stamp):
+        node._on_odom(Odom(stamp, np.array([0.0, 0.0, 1.0]), np.zeros(3), LEVEL, np.zeros(3)))
+
+    step(1.0)
+    step(2.0)
+    step(2.1)
+    assert [command.stamp for command in published] == [1.0]
+    error = "controller 'failing': step raised AttributeError: 'State' object has no attribute " \
+            "'positon' (bad.py:9)"
+    level, text, values = node._controller_status()
+    assert (level, text, values['errors']) == (health.ERROR, error, 2)
+    assert node._controller_status()[0] == health.OK      # none since the last report
+    node._controller.step = lambda state, target: ()
+    step(2.2)
+    assert 'step returned tuple' in node._controller_status()[1] and len(published) == 1
+    lines = [line for line in capfd.readouterr().err.splitlines() if 'ERROR' in line]
+    assert len(lines) == 1 and lines[0].endswith(error)     # at most one a second
+
+
+@pytest.mark.simulated_time
+def test_fly_names_the_exception_of_a_controller_and_the_supervisor_lands(tmp_path):
+    own, task = tmp_path / 'bad.py', tmp_path / 'poses.csv'
+    own.write_text(FAILING.format(fails_from='float("inf")').replace(
+        'state.stamp > self', 'target.at(state.stamp).position[0] > 0.2 or state.stamp > self'))
+    task.write_text(HEADER + '0,0,1.2,0,0,0\n0.3,0,1.2,0,0,0\n')
+    done = subprocess.run(
+        [sys.executable, '-m', 'beetle_omni_ros.start', 'beetle_omni', 'fly', '--controller',
+         f'{own}:Failing', '--task', str(task), '--bag', str(tmp_path / 'bag'), '--alone',
+         '--clock', 'simulated'], capture_output=True, text=True, timeout=READY, check=False,
+        env=dict(os.environ))
+    line = done.stderr.splitlines()[0]
+    assert done.returncode == 1 and 'Traceback' not in done.stderr
+    assert line.startswith("beetle_omni fly: error: controller 'failing': step raised Attribute")
+    assert line.endswith('(bad.py:9)') and line not in done.stdout
+    states = [state.partition(':')[0] for state in read_bag(tmp_path / 'bag').states]
+    assert 'fallback' in states and states[-2:] == ['landing', 'disarmed']
 
 
 def test_the_supervisor_accepts_the_listed_controllers(make):
