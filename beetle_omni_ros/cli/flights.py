@@ -330,9 +330,9 @@ def controllers(json_path: JsonOption = None):
     Others fly as FILE.py:Class or package.module:Class, see docs/how-to/own_controller.md.
     Example: beetle_omni controllers --json controllers.json
     """
-    from rich.console import Console
     from rich.table import Table
 
+    from beetle_omni_ros.runs.table import Terminal
     check_writable(json_path)
     found = {name: _known(name) for name in registry.names()}
     table = Table(box=None, header_style='dim', padding=(0, 2, 0, 0))
@@ -346,7 +346,7 @@ def controllers(json_path: JsonOption = None):
         table.add_row(name, known['description'], f"{known['rate_hz']:g}",
                       known['parameters_file'] or '–', known['policy_file'] or '–',
                       'flies' if known['flies_degraded'] else '–', known['guidance'])
-    Console().print(table)
+    Terminal().print(table)
     write_json(json_path, found)
 
 

@@ -28,6 +28,7 @@ from beetle_omni_ros.comparison.sweep import check_backend, Store, sweep
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import guidance_of
 from beetle_omni_ros.control.registry import ControllerOptions
+from beetle_omni_ros.pages.table import Terminal
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.json_file import write_json
@@ -57,7 +58,7 @@ def run_compare(*, output: Path, controllers: list[str] | None = None,
         SweepError: a worker was lost.
 
     """
-    console = console or Console()
+    console = console or Terminal()
     names = controllers or registry.compared()
     arguments = (names, tasks or TASKS, conditions or CONDITIONS, seeds)
     check_backend(backend)

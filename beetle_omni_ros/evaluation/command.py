@@ -102,7 +102,7 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
         ParameterError, TaskError, BagError: unusable input, one line.
 
     """
-    console = console or Console()
+    console = console or table.Terminal()
     nominal = RobotParameters.load(robot)
     true = RobotParameters.load(plant) if plant else nominal
     entries = registry.find_all(controllers)

@@ -11,6 +11,7 @@ from beetle_omni_ros.film.frames import frames
 from beetle_omni_ros.film.free_runs import free_runs
 from beetle_omni_ros.film.scenes import model_scene, Scene, target_scene
 from beetle_omni_ros.pages.figures import COLOURS
+from beetle_omni_ros.pages.table import Terminal
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.bag import BagError, read_bag
@@ -33,7 +34,7 @@ def run_film(paths: list[Path], outputs: list[Path], *, models: list[Path] = (),
         ParameterError: unusable arguments or files.
 
     """
-    console = console or Console()
+    console = console or Terminal()
     _check(paths, outputs, models, size, start, duration)
     drawn = RobotParameters.load(robot)
     logs = [_read(path) for path in paths]

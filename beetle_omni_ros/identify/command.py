@@ -13,7 +13,7 @@ from beetle_omni_ros.identify.joint_servos import file_servos
 from beetle_omni_ros.identify.robot_file import check_outputs
 from beetle_omni_ros.identify.rotor import identify_rotor
 from beetle_omni_ros.identify.rotor_log import read_rotor_log
-from beetle_omni_ros.pages.table import print_grids
+from beetle_omni_ros.pages.table import print_grids, Terminal
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.json_file import write_json, write_text
 
@@ -33,7 +33,7 @@ def run_identify_joint(path: Path, *, validate: Sequence[Path] = (), robot: Path
         LogError, ParameterError: unusable input.
 
     """
-    console = console or Console()
+    console = console or Terminal()
     check_outputs(params, robot, json_path, report, 'report')
     robot_parameters = RobotParameters.load(robot)
     published = robot_parameters.joints
@@ -70,7 +70,7 @@ def run_identify_rotor(path: Path, *, robot: Path | None = None, json_path: Path
         LogError, ParameterError: unusable input.
 
     """
-    console = console or Console()
+    console = console or Terminal()
     check_outputs(params, robot, json_path, report, 'report')
     robot_parameters = RobotParameters.load(robot)
     log = read_rotor_log(path)

@@ -56,7 +56,7 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
         Exit status: 0 flown to the end, 1 not, 2 unusable input, 130 interrupted.
 
     """
-    console = console or Console()
+    console = console or table.Terminal()
     try:
         if (discovery or '').strip().upper() == 'OFF':
             raise ParameterError('--discovery OFF: the nodes of a flight would not find each '

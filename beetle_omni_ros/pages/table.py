@@ -3,16 +3,28 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
+import os
+import sys
 
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 ABSENT = '–'
+SPACE = 2               # characters between columns
 LONGEST_TITLE = 78      # characters that fit on one line of a terminal
 PUBLISHED = ' class="published"'
 LONG = ' class="long"'
 LONGEST_CELL = 45       # characters that fit on one line of a page's cell
+
+
+class Terminal(Console):
+    """The console of a command, which still writes its files after `| head` has ended."""
+
+    def on_broken_pipe(self) -> None:
+        """Discard all further output."""
+        self.quiet = True
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 @dataclass(frozen=True)
@@ -41,22 +53,43 @@ class Grid:
 def print_grids(shown: list[Grid], console: Console) -> None:
     """Print tables to the terminal."""
     for grid in shown:
-        console.print(_rich(grid))
+        console.print(_rich(grid, console.width), crop=False)
         if grid.note:
             console.print(grid.note, style='dim', highlight=False, markup=False)
 
 
-def _rich(grid):
+def _rich(grid, available):
+    widths = _widths(list(zip(grid.header, *grid.rows, strict=True)), available)
+    total = _total(widths)
     table = Table(title=Text(grid.title), title_justify='left', title_style='', box=None,
                   min_width=min(len(grid.title), LONGEST_TITLE), header_style='dim',
-                  padding=(0, 2, 0, 0))
-    for k, name in enumerate(grid.header):
-        table.add_column(Text(name), justify='left' if k == 0 else 'right', overflow='fold',
-                         no_wrap=k == 0, style='dim' if k in grid.faint_columns else None)
+                  padding=(0, SPACE, 0, 0), width=total if total > available else None)
+    for k, (name, width) in enumerate(zip(grid.header, widths, strict=True)):
+        table.add_column(Text(name), justify='left' if k == 0 else 'right', width=width,
+                         style='dim' if k in grid.faint_columns else None)
     for k, row in enumerate(grid.rows):
         table.add_row(*(Text(cell) for cell in row),
                       style='dim' if k in grid.faint else None)
     return table
+
+
+def _widths(columns, available):
+    """
+    Widths with which lines break between words only.
+
+    The sum exceeds ``available`` if words alone need more. The first column is never broken.
+    """
+    widths = [max(map(len, column)) for column in columns]
+    least = [widths[0]] + [max(len(word) for cell in column for word in cell.split() or [''])
+                           for column in columns[1:]]
+    while _total(widths) > available and widths != least:
+        k = max(range(len(widths)), key=lambda k: (widths[k] > least[k], widths[k]))
+        widths[k] -= 1
+    return widths
+
+
+def _total(widths):
+    return sum(widths) + SPACE * len(widths)
 
 
 def markdown(header: Sequence[str], rows: Iterable[Sequence[str]], numeric: bool = False) -> str:

@@ -7,6 +7,7 @@ from rich.console import Console
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.pages.figures import COLOURS
+from beetle_omni_ros.pages.table import Terminal
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs import table
 from beetle_omni_ros.runs.bag import BagError, read_bag
@@ -35,7 +36,7 @@ def run_report(paths: list[Path], output: Path, *, json_path: Path | None = None
         ParameterError: too many runs, or the page cannot be written.
 
     """
-    console = console or Console()
+    console = console or Terminal()
     paths = [run for path in paths for run in _runs_in(path)]
     if len(paths) > MAX_RUNS:
         raise ParameterError(f'{len(paths)} runs; a page shows at most {MAX_RUNS} side by side')

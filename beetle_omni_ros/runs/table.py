@@ -4,7 +4,7 @@ from itertools import zip_longest
 
 from rich.console import Console
 
-from beetle_omni_ros.pages.table import ABSENT, Grid, print_grids
+from beetle_omni_ros.pages.table import ABSENT, Grid, print_grids, Terminal
 from beetle_omni_ros.runs import published
 
 MANY_POSES = 20  # above this number, only the summary is shown
@@ -196,7 +196,7 @@ def _number(value, digits):
 
 def print_results(results: dict, console: Console | None = None) -> None:
     """Print the tables of a result to the terminal."""
-    console = console or Console()
+    console = console or Terminal()
     meta = results.get('meta', {})
     known = [f'{key} {meta[key]}' for key in ('task', 'conditions', 'seed')
              if meta.get(key) is not None]

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import yaml
 
 from beetle_omni_ros.identify.gap.apply import own_numbers, write_corrected
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -36,6 +37,17 @@ def test_by_default_only_named_effects_are_written(tmp_path):
     mine = RobotParameters.load(tmp_path / 'mine.yaml')
     assert replace(mine, effects={}).hash() == ROBOT.hash()
     assert mine.sensors.imu_rotation == (0.01, 0.0, -0.02)
+
+
+def test_a_number_that_was_not_fitted_has_no_interval(tmp_path):
+    servo = {'names': ['joint_bandwidth'], 'parameters': {
+        'kp': {'value': 0.33, 'interval': [0.32, 0.34], 'unit': 'N m/rad'},
+        'kd': {'value': 0.0094, 'interval': [0.0094, 0.0094], 'unit': 'N m s/rad'}}}
+    write_corrected(tmp_path / 'mine.yaml', {**RESULTS, 'effects': [servo]}, ROBOT, None)
+    written, = yaml.safe_load((tmp_path / 'mine.yaml').read_text())['provenance']['named']
+    assert written['parameters'] == {
+        'kp': {'value': 0.33, 'interval': [0.32, 0.34], 'unit': 'N m/rad'},
+        'kd': {'value': 0.0094, 'unit': 'N m s/rad'}}
 
 
 def test_a_named_value_has_precedence_over_its_tolerance():

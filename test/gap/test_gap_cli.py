@@ -4,6 +4,7 @@ import pytest
 
 from beetle_omni_ros import cli
 from beetle_omni_ros.cli.models import spread
+from beetle_omni_ros.identify.gap import command
 
 
 @pytest.mark.parametrize(('given', 'meant'), [
@@ -14,6 +15,19 @@ from beetle_omni_ros.cli.models import spread
     ('a --holdout c --holdout d', 'a --holdout c --holdout d')])
 def test_every_run_after_holdout_is_held_out(given, meant):
     assert spread(given.split()) == meant.split()
+
+
+def test_files_are_written_before_anything_is_printed(tmp_path, monkeypatch):
+    def broken(*_):
+        raise SystemExit(1)
+
+    monkeypatch.setattr(command, 'analyse_joint_log', lambda *_: ({'effects': []}, '<html>'))
+    monkeypatch.setattr(command, '_print', broken)
+    (tmp_path / 'log.csv').touch()
+    files = [tmp_path / 'gap.json', tmp_path / 'gap.html']
+    with pytest.raises(SystemExit):
+        command.run_gap([tmp_path / 'log.csv'], json_path=files[0], page=files[1])
+    assert all(file.stat().st_size for file in files)
 
 
 def test_unusable_input_is_one_line(tmp_path, capsys):

@@ -22,7 +22,7 @@ from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.results import grids, headline, results
 from beetle_omni_ros.identify.gap.workers import Workers
 from beetle_omni_ros.identify.robot_file import check_outputs
-from beetle_omni_ros.pages.table import print_grids
+from beetle_omni_ros.pages.table import print_grids, Terminal
 from beetle_omni_ros.robot.effects import CONSUMERS, refusals
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.bag_files import names_of
@@ -57,7 +57,7 @@ def run_gap(runs: list[Path], holdout: Sequence[Path] = (), robot: Path | None =
 def gap_results(runs, holdout=(), robot=None, apply=None, json_path=None, page=None,
                 console=None, parameters=None, fix=False, tolerances=False) -> dict:
     """As :func:`run_gap`, but return the results that it writes as JSON."""
-    console = console or Console()
+    console = console or Terminal()
     runs, holdout = [Path(r) for r in runs], [Path(h) for h in holdout]
     check_outputs(apply, robot, json_path, page, 'page')
     check_apart([*runs, *holdout])
@@ -78,20 +78,19 @@ def gap_results(runs, holdout=(), robot=None, apply=None, json_path=None, page=N
             path = given[names_of(given).index(a.damages[0].run)]
             a.damaged = read_recording(path), a.damages[0]
         html = gap_page(a, result) if page else ''
-    _print(console, result)
     write_json(json_path, result)
     if page:
         write_text(page, html, 'page')
+    if apply and result['effects']:
+        write_corrected(apply, result, robot_parameters, robot, tolerances)
+    _print(console, result)
     if apply:
-        if result['effects']:
-            write_corrected(apply, result, robot_parameters, robot, tolerances)
-            console.print(f'corrected robot: {apply}', highlight=False)
-            corrected = RobotParameters.load(apply).effects
-            for consumer in CONSUMERS:
-                for text in refusals(consumer, corrected):
-                    console.print(f'note: {text}', highlight=False, markup=False)
-        else:
-            console.print('no effect is named: no robot file is written', highlight=False)
+        console.print(f'corrected robot: {apply}' if result['effects'] else
+                      'no effect is named: no robot file is written', highlight=False)
+        corrected = RobotParameters.load(apply).effects if result['effects'] else {}
+        for consumer in CONSUMERS:
+            for text in refusals(consumer, corrected):
+                console.print(f'note: {text}', highlight=False, markup=False)
     return result
 
 
