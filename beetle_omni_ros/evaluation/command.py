@@ -136,7 +136,6 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
             if log.meta['ended']:
                 console.print(f'{name}: the flight ended early, {log.meta["ended"]}',
                               style='yellow', highlight=False)
-                results[name]['ended'] = log.meta['ended']
     table.print_results(results, console)
     write_json(json_path, results)
     return results

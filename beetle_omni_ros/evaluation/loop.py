@@ -97,6 +97,7 @@ class FlightLoop:
         self._state_name = self._recorded_state = ''
         self._health = ALL_HEALTHY
         self._crashed = False
+        self._began = 0.0       # of the task, simulated time
         self.ending = ''
 
     @classmethod
@@ -151,7 +152,8 @@ class FlightLoop:
             return self._play(task, progress)
 
     def _play(self, task, progress):
-        player = TaskPlayer(task, self.simulator.time)
+        self._began = self.simulator.time
+        player = TaskPlayer(task, self._began)
         self.start_faults()
         reported = self.simulator.time
         while True:
@@ -331,7 +333,8 @@ class FlightLoop:
             if self._state_name.startswith(('flying', 'fallback')) \
                     and name in ('landing', 'emergency_stop', 'disarmed'):
                 last = [e.text for e in self.supervisor.events][-1:]
-                self.ending = f'{name} at {now:.1f} s: {last[0] if last else "unknown"}'
+                self.ending = (f'{name} at {self.simulator.time - self._began:.1f} s: '
+                               f'{last[0] if last else "unknown"}')
             if self._state_name.startswith(('flying', 'fallback', 'landing')) \
                     and name in ('disarmed', 'emergency_stop'):
                 self._crashed = True

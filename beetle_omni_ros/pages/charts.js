@@ -38,19 +38,41 @@ function rounded(value) {
     : String(+value.toPrecision(4));
 }
 
-function decorations(spec) {
-  return plot => {
-    const {ctx, bbox} = plot, ratio = devicePixelRatio;
-    ctx.save();
-    ctx.beginPath();
-    ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
-    ctx.clip();
+function inside(plot, draw) {
+  const {ctx, bbox} = plot;
+  ctx.save();
+  ctx.beginPath();
+  ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
+  ctx.clip();
+  draw(ctx, bbox, devicePixelRatio);
+  ctx.restore();
+}
+
+// Below the grid.
+function windows(spec) {
+  return plot => inside(plot, (ctx, bbox) => {
     for (const [from, to, colour] of spec.windows) {
       const left = plot.valToPos(from, 'x', true), right = plot.valToPos(to, 'x', true);
       ctx.fillStyle = colour;
       ctx.fillRect(left, bbox.top, right - left, bbox.height);
     }
-    ctx.strokeStyle = ctx.fillStyle = '#8a939d';
+  });
+}
+
+// Above the grid and below the series, with a light edge around the text.
+function marks(spec) {
+  return plot => inside(plot, (ctx, bbox, ratio) => {
+    const write = (text, x, y) => {
+      ctx.save();
+      ctx.setLineDash([]);
+      ctx.strokeStyle = '#ffffff';
+      ctx.lineWidth = 4 * ratio;
+      ctx.strokeText(text, x, y);
+      ctx.fillText(text, x, y);
+      ctx.restore();
+    };
+    ctx.strokeStyle = '#8a939d';
+    ctx.fillStyle = '#3b444e';
     ctx.lineWidth = ratio;
     ctx.font = `${11 * ratio}px system-ui, sans-serif`;
     ctx.setLineDash([4 * ratio, 3 * ratio]);
@@ -59,16 +81,15 @@ function decorations(spec) {
       ctx.beginPath(); ctx.moveTo(at, bbox.top); ctx.lineTo(at, bbox.top + bbox.height); ctx.stroke();
       const fits = at + 6 * ratio + ctx.measureText(text).width < bbox.left + bbox.width;
       ctx.textAlign = fits ? 'left' : 'right';
-      ctx.fillText(text, at + (fits ? 3 : -3) * ratio, bbox.top + 11 * ratio);
+      write(text, at + (fits ? 3 : -3) * ratio, bbox.top + 11 * ratio);
     }
     ctx.textAlign = 'left';
     for (const [y, text] of spec.level) {
       const at = plot.valToPos(y, 'y', true);
       ctx.beginPath(); ctx.moveTo(bbox.left, at); ctx.lineTo(bbox.left + bbox.width, at); ctx.stroke();
-      ctx.fillText(text, bbox.left + 4 * ratio, at - 3 * ratio);
+      write(text, bbox.left + 4 * ratio, at - 3 * ratio);
     }
-    ctx.restore();
-  };
+  });
 }
 
 let following = false;
@@ -105,19 +126,24 @@ function seekOnClick(plot) {
   });
 }
 
-// Of a logarithmic axis, only the powers of ten are labelled.
+// Of a logarithmic axis, only the powers of ten have a line and a label.
+function powers(plot, splits) {
+  return splits.map(value => value !== null
+    && Math.abs(Math.log10(value) - Math.round(Math.log10(value))) < 1e-9 ? value : null);
+}
+
 function decades(plot, splits) {
-  return splits.map(value => {
-    if (value === null || Math.abs(Math.log10(value) - Math.round(Math.log10(value))) > 1e-9) return null;
-    return value < 1e-3 || value >= 1e5 ? value.toExponential(0) : rounded(value);
-  });
+  return powers(plot, splits).map(value => value === null ? null
+    : value < 1e-3 || value >= 1e5 ? value.toExponential(0) : rounded(value));
 }
 
 function draw(holder) {
   const spec = page.charts[holder.dataset.chart], timed = spec.x === null;
   const narrow = holder.clientWidth < 520;
-  const axis = {stroke: '#3b444e', font: '11px system-ui, sans-serif', grid: {stroke: '#e6e9ed'},
-                ticks: {stroke: '#c9d0d8', size: 4}};
+  const lines = log => log ? {filter: powers} : {};
+  const axis = log => ({
+    stroke: '#3b444e', font: '11px system-ui, sans-serif', grid: {stroke: '#e6e9ed', ...lines(log)},
+    ticks: {stroke: '#c9d0d8', size: 4, ...lines(log)}, ...(log ? {values: decades} : {})});
   const series = [{label: timed ? 't [s]' : spec.xlabel, value: (_, value) => rounded(value)}];
   const bands = [];
   for (const line of spec.series) {
@@ -133,13 +159,13 @@ function draw(holder) {
   const plot = new uPlot({
     width: holder.clientWidth, height: narrow ? 190 : 210, series, bands,
     scales: {x: {time: false, ...scale(spec.log[0])}, y: scale(spec.log[1])},
-    axes: [{...axis, size: 34, ...(spec.log[0] ? {values: decades} : {})},
-           {...axis, size: narrow ? 46 : 56, values: spec.log[1] ? decades :
-             (_, splits) => splits.map(rounded)}],
+    axes: [{...axis(spec.log[0]), size: 34},
+           {values: (_, splits) => splits.map(rounded), ...axis(spec.log[1]),
+            size: narrow ? 46 : 56}],
     cursor: {sync: timed ? {key: 'time'} : undefined, drag: {x: true, y: false, dist: 5},
              points: {size: 6}},
     legend: {live: true},
-    hooks: {drawClear: [decorations(spec)], setScale: timed ? [alignTimes] : []},
+    hooks: {drawClear: [windows(spec)], drawAxes: [marks(spec)], setScale: timed ? [alignTimes] : []},
   }, [timed ? times : unpacked(spec.x), ...spec.series.map(line => unpacked(line.y))], holder);
   const title = document.createElement('div');
   title.className = 'label';

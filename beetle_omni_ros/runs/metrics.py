@@ -11,6 +11,7 @@ import numpy as np
 
 from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
 from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.yaml_file import shortened
 from beetle_omni_ros.runs.body import (
     errors,
     estimate_errors,
@@ -35,6 +36,7 @@ L_WINDOW = (1.0, 7.0)  # [s]
 REACHED_POSITION = 0.10  # [m]
 REACHED_ORIENTATION = 10.0  # [deg]
 COMMAND_PERIOD = 0.010  # [s] for changes of the command
+END_MARGIN = 0.1  # [s] before the end of the task, above which a landing is early
 CRASH = 'emergency_stop:crash'    # supervisor/state after a crash
 SUMMARY = (('mean', np.mean), ('std', np.std), ('min', np.min), ('max', np.max))
 POSE_KEYS = ('U_position_m', 'U_orientation_deg', 'L_position_m', 'L_orientation_deg')
@@ -142,7 +144,8 @@ def _landing(log, after):
 
 def _controller_metrics(log, task, part, expected):
     body = motion(log)
-    poses = [_pose(body, log.targets[k], task) for k in part.poses]
+    ended_at, ending = _early_end(log, task)
+    poses = [_pose(body, log.targets[k], task, ended_at) for k in part.poses]
     for missing in (task.poses[len(poses):] if expected else ()):
         poses.append({'target': [float(v) for v in missing], **dict.fromkeys(POSE_KEYS),
                       'reached': False})
@@ -152,13 +155,15 @@ def _controller_metrics(log, task, part, expected):
         result[name] = {key: _reduced(reduce, [pose[key] for pose in poses]) for key in POSE_KEYS}
     result['success_rate'] = float(np.mean([p['reached'] for p in poses])) if poses else None
     result['crashed'] = _crashed(log, body, part)
+    if ending:
+        result['ended'] = ending
     result['guidance'] = _guidance(log, part.name)
     result['lowest'] = _lowest(log, body, part)
     compute = log.compute.get(part.name, {})
     result['compute_ms'] = {key: compute.get(key)
                             for key in ('median', 'p99', 'max', 'deadline_misses')}
     windows = [(log.targets[k].stamp + U_WINDOW[0], log.targets[k].stamp + U_WINDOW[1])
-               for k in part.poses]
+               for k in part.poses if log.targets[k].stamp + U_WINDOW[1] <= ended_at]
     result.update(_effort(log, part.intervals, windows))
     result.update(_stillness(body, windows))
     result.update(_timing(log, part.intervals))
@@ -166,6 +171,24 @@ def _controller_metrics(log, task, part, expected):
     if task:
         result.update(_task_metrics(log, body, task))
     return result
+
+
+def _early_end(log, task):
+    """
+    Time and text of a landing or stop before the end of the task; (inf, '') for none.
+
+    If the task is unknown or ends with the loss of control, only a landing with a fault counts.
+    """
+    start = log.targets[0].stamp if log.targets else np.inf
+    due = start + task.duration - END_MARGIN if task else np.inf
+    for t, state in zip(log.state_t, log.states, strict=True):
+        kind, _, reason = shortened(state).partition(':')
+        if t <= start or kind not in ('landing', 'emergency_stop', 'disarmed'):
+            continue
+        if t < due and (reason or (task and task.kind not in ('force', 'torque'))):
+            return float(t), f"{kind}{': ' if reason else ''}{reason} at {t - start:.1f} s"
+        break
+    return np.inf, ''
 
 
 def _guidance(log, controller):
@@ -178,11 +201,11 @@ def _guidance(log, controller):
     return reports[-1] if reports else None
 
 
-def _pose(body: Motion, target, task):
+def _pose(body: Motion, target, task, ended_at):
     means = []
     for window in (U_WINDOW, L_WINDOW):
         begin, end = target.stamp + window[0], target.stamp + window[1]
-        if body.covers(begin, end):
+        if end <= ended_at and body.covers(begin, end):
             means += [float(np.mean(e)) for e in errors(body, target, body.window(begin, end))]
         else:
             means += [None, None]

@@ -63,7 +63,7 @@ LEMNISCATE = {
 
 def pose_results(task: str) -> dict[str, dict]:
     """Return the published results of a pose task in the form of our metrics, if any."""
-    if task.startswith('random'):
+    if task == 'random100':
         return RANDOM_POSES
     return WAYPOINTS if task == 'waypoints' else {}
 

@@ -62,9 +62,8 @@ def make_page(runs: list[Run], results: dict) -> str:
     tables = ''.join(html(grid) for grid in shown if grid.title != 'Poses')
     poses = ''.join(html(grid) for grid in shown if grid.title == 'Poses')
     folded = f'<section><details><summary>Every pose</summary>{poses}</details></section>'
-    faults = ''.join(f'<div data-of-run="{number}">{html(grid)}</div>'
-                     for number, run in enumerate(runs)
-                     for grid in (*supervisor_grids(run), *fault_grids(run)))
+    faults = ''.join(f'<div data-of-run="{number}">{part}</div>'
+                     for number, run in enumerate(runs) for part in _faults(run))
     content = f"""<div class="cards">{''.join(map(_card, range(len(runs)), runs))}</div>
 {_player()}
 <section><h2>Flight</h2><p>Solid: flown, ghost: target, arrows: thrust. Below: states of the
@@ -78,7 +77,9 @@ zoom.</p>
 {folded if poses else ''}
 <section class="faults"><h2>Faults</h2>{faults}</section>
 {kit.data_block(_data(runs, robot, axis, specs, numbers), numbers)}{kit.scripts()}"""
-    return frame('Flight report', _subtitle(results['meta']), content)
+    meta = results['meta']
+    subtitle = ', '.join(filter(None, [table.title(meta), f"beetle_omni_ros {meta['version']}"]))
+    return frame('Flight report', subtitle, content)
 
 
 def _robot(runs):
@@ -90,12 +91,6 @@ def _robot(runs):
         return RobotParameters.load()
 
 
-def _subtitle(meta):
-    known = [f'{key} {meta[key]}' for key in ('task', 'conditions', 'seed')
-             if meta.get(key) is not None]
-    return ', '.join([*known, f"beetle_omni_ros {meta['version']}"])
-
-
 def outcome(run: Run) -> str:
     """Return the outcome of a flight in one sentence."""
     sentences = []
@@ -103,6 +98,7 @@ def outcome(run: Run) -> str:
         name = '' if label == run.label else f'{label.removeprefix(run.label + ": ")}: '
         poses = result.get('poses') or []
         parts = ['crashed'] if result.get('crashed') else []
+        parts += [result['ended']] if result.get('ended') else []
         if poses:
             parts.append(f"{sum(pose['reached'] for pose in poses)} of {len(poses)} poses reached")
         median = result.get('median') or {}
@@ -125,11 +121,18 @@ def _card(number, run):
     named = [f'fault: {shortened(name)} at {at - run.start:.2f} s'
              for name, at in log.named_faults().items()]
     lines = ''.join(f'<span class="warning">{escape(text)}</span>'
-                    for text in (*named[:MOST_ROWS], *log.warnings))
+                    for text in (*_injected(run), *named[:MOST_ROWS], *log.warnings))
     text = escape(' · '.join(fact for fact in facts if fact))
     return (f'<label class="card" style="border-top-color: {run.colour}">'
             f'<input type="checkbox" checked data-run="{number}"><strong>{escape(run.label)}'
             f'</strong><em>{escape(outcome(run))}</em><span>{text}</span>{lines}</label>')
+
+
+def _injected(run):
+    """One line for each fault that was injected."""
+    faults = run.log.meta.get('faults') or []
+    return [f'injected: {shortened(str(fault))}'
+            for fault in (faults if isinstance(faults, list) else [faults])][:MOST_ROWS]
 
 
 def _player():
@@ -201,6 +204,14 @@ def _scene(run, axis, numbers):
                         'pose': np.round(np.hstack([position, quaternion]), 5).ravel().tolist()}}
 
 
+def _faults(run):
+    """Injected faults, states of the supervisor, warnings and rejected messages as HTML."""
+    grids = fault_grids(run)
+    return [*(f'<p>{escape(f"{run.label}: {text}")}</p>' for text in _injected(run)),
+            *map(html, (*supervisor_grids(run), *grids)),
+            *([] if grids else [f'<p>{escape(run.label)}: nothing rejected</p>'])]
+
+
 def supervisor_grids(run: Run) -> list[Grid]:
     """Return a table of the supervisor's states with times and controllers or faults."""
     rows: list[list[str]] = []
@@ -213,7 +224,7 @@ def supervisor_grids(run: Run) -> list[Grid]:
 
 
 def fault_grids(run: Run) -> list[Grid]:
-    """Return tables of warnings and errors of the nodes, and of rejected messages."""
+    """Return tables of warnings and errors of the nodes, and of rejected messages, if any."""
     faults: dict[tuple, list] = {}
     last: dict[str, dict] = {}
     for entry in run.log.diagnostics:
@@ -233,6 +244,4 @@ def fault_grids(run: Run) -> list[Grid]:
                                rows[:MOST_ROWS]))
     if rejected:
         made.append(Grid(f'{run.label}: rejected', ['node', 'reason', 'count'], rejected))
-    if not made:
-        made.append(Grid(f'{run.label}: no fault, nothing rejected', [''], []))
     return made

@@ -7,6 +7,7 @@ from rich.console import Console
 from beetle_omni_ros.pages.table import ABSENT, Grid, print_grids, Terminal
 from beetle_omni_ros.runs import published
 
+FILES, SHIPPED_ROBOT = ('robot', 'plant'), 'params/robot.yaml'    # keys in the metadata
 MANY_POSES = 20  # above this number, only the summary is shown
 
 ERROR_ROWS = (  # text, path in the metrics, digits
@@ -79,6 +80,8 @@ def _summary(by_label, task):
     rows = [[text, *(_number(_at(column, path), digits) for column in columns)]
             for text, path, digits in ERROR_ROWS]
     rows += [['poses reached', *(_reached(column) for column in columns)],
+             *([['ended', *(column.get('ended', ABSENT) for column in columns)]]
+               if any('ended' in column for column in columns) else []),
              ['crashed', *({True: 'yes', False: 'no'}.get(column.get('crashed'), ABSENT)
                            for column in columns)],
              ['lowest point [m]', *(_lowest(column) for column in columns)]]
@@ -194,12 +197,16 @@ def _number(value, digits):
     return ABSENT if value is None else f'{value:.{digits}f}'
 
 
+def title(meta: dict) -> str:
+    """Task, conditions, seed, and the robot files that are not the shipped ones."""
+    return ', '.join(f'{key} {meta[key]}' for key in ('task', 'conditions', 'seed', *FILES)
+                     if meta.get(key) not in (None, 'None')
+                     and (key not in FILES or str(meta[key]) != SHIPPED_ROBOT))
+
+
 def print_results(results: dict, console: Console | None = None) -> None:
     """Print the tables of a result to the terminal."""
     console = console or Terminal()
-    meta = results.get('meta', {})
-    known = [f'{key} {meta[key]}' for key in ('task', 'conditions', 'seed')
-             if meta.get(key) is not None]
-    if known:
-        console.print(', '.join(known), style='bold', highlight=False)
+    if known := title(results.get('meta', {})):
+        console.print(known, style='bold', highlight=False, markup=False)
     print_grids(grids(results), console)

@@ -132,3 +132,11 @@ def test_time_axes_zoom_together_and_a_tap_sets_the_time(chromium, page_file):
         page.wait_for_timeout(300)
         legend = page.locator('[data-chart="chart0"] .u-value').all_inner_texts()
         assert float(legend[1]) < 1.0 and float(legend[2]) >= 0.29
+
+
+def test_a_logarithmic_axis_has_lines_at_powers_of_ten_only(chromium, page_file):
+    with opened(chromium, page_file, 1280) as page:
+        pixels = picture(page, '[data-chart="chart0"]').astype(int)
+    grey = np.abs(pixels - (0xe6, 0xe9, 0xed)).max(axis=2) < 3
+    lines = np.flatnonzero(np.diff((grey.mean(axis=1) > 0.3).astype(int)) == 1)
+    assert 2 <= len(lines) <= 8 and np.diff(lines).min() > 20

@@ -215,6 +215,24 @@ def test_landing_after_the_task_is_not_a_crash():
     assert result['success_rate'] == 1.0
 
 
+def test_poses_after_an_early_landing_have_no_errors_and_the_end_is_stated():
+    task, recorder = make_task('waypoints'), LogRecorder()
+    fly(recorder, task, duration=26.0)
+    write_state(recorder, 14.1, 'landing:rotor2_lost')      # 13.1 s after the first target
+    result = metrics(recorder.log(), task)
+    assert result['ended'] == 'landing: rotor2_lost at 13.1 s'
+    assert [pose['U_position_m'] is None for pose in result['poses'][:3]] == [False, True, True]
+    assert result['poses'][1]['L_position_m'] is None and result['success_rate'] == 1 / 15
+    assert result['hover_speed_mean_m_s'] is not None    # of the first pose
+    assert metrics(recorder.log())['ended'] == result['ended']      # by the task of the metadata
+
+
+def test_a_landing_after_the_task_or_after_the_loss_of_control_is_no_early_end():
+    for name, duration in (('random2', None), ('force', 20.0)):
+        task = make_task(name)
+        assert 'ended' not in metrics(flown(task, duration=duration), task)
+
+
 def test_each_controller_has_the_metrics_of_its_poses():
     task = make_task('waypoints')
     recorder = LogRecorder()

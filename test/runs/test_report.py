@@ -12,6 +12,7 @@ import yaml
 from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.runs.bag import BagWriter, read_bag
 from beetle_omni_ros.runs.report import make_page, make_runs, results_of, run_report
+from beetle_omni_ros.runs.table import grids
 
 LEVEL = np.array([0, 0, 0, 1.0])
 
@@ -79,6 +80,34 @@ def test_flights_with_and_without_targets_share_one_page(tmp_path):
             record(tmp_path / 'one', task='hover', targets=2)]
     run_report(bags, tmp_path / 'page.html', console=Console(file=io.StringIO()))
     assert (tmp_path / 'page.html').stat().st_size > 10_000
+
+
+def test_the_outcome_and_the_injected_faults_are_on_the_page_and_in_the_table(tmp_path):
+    meta = {'task': 'waypoints', 'seed': 0, 'plant': 'used.yaml', 'robot': 'params/robot.yaml',
+            'faults': ['rotor_stops(rotor=2) at 5 s']}
+    with BagWriter(tmp_path / 'bag', meta) as writer:
+        for k in range(80):
+            t = 10 + 0.05 * k
+            write_truth(writer, t, np.array([0, 0, 1.0]), LEVEL, np.zeros(3), np.zeros(3))
+            write_state(writer, t, 'flying:nmpc' if k < 50 else 'landing:rotor2_lost')
+        writer.write_target(PoseTarget(np.array([0, 0, 1.0]), LEVEL, 10.5))
+    text, page = io.StringIO(), tmp_path / 'page.html'
+    run_report([tmp_path / 'bag'], page, console=Console(file=text, width=200))
+    printed = text.getvalue()
+    assert printed.startswith('task waypoints, seed 0, plant used.yaml')
+    assert 'landing: rotor2_lost at 2.0 s' in printed
+    for expected in ('landing: rotor2_lost at 2.0 s, 0 of 15 poses reached',
+                     'injected: rotor_stops(rotor=2) at 5 s', 'bag: nothing rejected',
+                     'plant used.yaml'):
+        assert expected in page.read_text(), expected
+    assert 'no fault' not in page.read_text()
+
+
+def test_published_poses_are_shown_beside_their_own_task_only():
+    flown = {'poses': []}
+    for task, shown in (('random100', True), ('random4', False), ('waypoints', True)):
+        grid = grids({'meta': {'task': task}, 'nmpc': flown})[0]
+        assert any('published' in name for name in grid.header) == shown
 
 
 def test_a_fault_of_the_supervisor_is_on_the_page(tmp_path):
