@@ -71,7 +71,7 @@ class FlightLoop:
     Attributes:
         simulator, supervisor: the arguments.
         refusals: reasons of refused targets.
-        ending: time and reason of an early end of the flight by the supervisor, or ''.
+        ending: time in the task and reason of an early end of the flight by the supervisor, or ''.
 
     """
 
