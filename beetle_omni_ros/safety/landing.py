@@ -1,7 +1,7 @@
 """Landing: level out, sink at a set rate, detect the ground, with any remaining estimate."""
 
 from dataclasses import replace
-from math import inf, isfinite
+from math import floor, inf, isfinite
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from beetle_omni_ros.safety.vehicle import Vehicle
 
 FADING_STEPS = 10       # in which a rotor comes to rest
 AT_ONCE = 1e-3          # [s]
+AT_REST = 0.5           # [m/s]
 STILL = 1.0     # [s] without IMU: time without sinking until the ground is detected
 AHEAD, BETWEEN = 20.0, 0.1      # [s] length and spacing of the published way
 
@@ -132,8 +133,11 @@ class Landing:
         p, blind = self._parameters, self._without_mocap
         level = replace(p.level, rate=p.blind_level_rate) if blind else p.level
         self._end_turnover()
-        way = plan(state.quaternion, state.tilt, self._allocator, level) if self._health.healthy \
-            else self._way_with_what_is_left(state, level.rate)
+        leap = 0.0, 0.0
+        if self._health.healthy:
+            way = plan(state.quaternion, state.tilt, self._allocator, level)
+        else:
+            way, leap = self._way_with_what_is_left(state, level.rate)
         if way.lost > p.turnover.lost_lift and self._begin_turnover(state, level):
             return
         slanted = inclination(state.quaternion) > p.level_first or not self._health.healthy
@@ -142,7 +146,7 @@ class Landing:
         fast = max(0.0, height - p.flare_height) if blind else 0.0
         self._ramp = Ramp(state.stamp, state.position, way, wait, *(
             (-fast, p.blind_speed, p.blind_acceleration) if fast
-            else (-inf, p.speed, p.acceleration)))
+            else (-inf, p.speed, p.acceleration)), leap=leap)
         self._due = now + wait + (height - fast) / p.speed + (
             self._ramp.duration - wait if fast else 0.0)
 
@@ -194,7 +198,16 @@ class Landing:
             self._hover.set_health(self._health)
 
     def _way_with_what_is_left(self, state, rate):
-        """First to the attitude where control is regained soonest, then towards level."""
+        """
+        First to the attitude where control is regained soonest, then towards level.
+
+        If only the pack is weak, an attitude at rest may be held, but not all attitudes on the
+        way. The robot then leaps first, to have speed and height for the fall in the turn.
+
+        Returns:
+            the way, and the acceleration [m/s^2] and duration [s] of the leap.
+
+        """
         holding = Holding(self._robot, self._health)
         p = holding.parameters
         escape = holding.quickest(state.quaternion, state.angular_velocity, state.tilt,
@@ -202,8 +215,16 @@ class Landing:
         level = rotations.from_rpy(0.0, 0.0, rotations.to_rpy(state.quaternion)[2])
         goal = holding.nearest(level, p.flying_margin)
         turn = max(rotations.geodesic_angle(goal, escape) / rate, 1e-3)
-        return Way(np.cumsum([0.0, AT_ONCE, p.escape_time, turn]),
-                   np.array([state.quaternion, escape, escape, goal]))
+        leap = 0.0, 0.0
+        speed = np.linalg.norm(state.velocity)
+        if replace(self._health, thrust_limit=None).healthy and speed < AT_REST:
+            margin = holding.margin(state.quaternion)
+            if margin > 0 and holding.unheld_angle(state.quaternion) > 0:
+                # The turn begins between two samples of the published way, which has no rate then.
+                leap = self._parameters.leap_share * margin, BETWEEN * (
+                    floor(self._parameters.leap_time / BETWEEN) + 0.5)
+        return Way(np.cumsum([leap[1], AT_ONCE, p.escape_time, turn]),
+                   np.array([state.quaternion, escape, escape, goal])), leap
 
     @property
     def _without_mocap(self):

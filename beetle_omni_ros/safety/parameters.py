@@ -136,6 +136,11 @@ class LandingParameters:
     flare_height: float = parameter(
         0.5, doc='height above the floor at which the descent slows down to speed', unit='m',
         low=0, high=10)
+    leap_share: float = parameter(
+        0.7, doc='share of the margin used for it', low=0, high=1)
+    leap_time: float = parameter(
+        0.8, doc='duration of the acceleration upwards before a turn with a weak pack', unit='s',
+        low=0, high=3)
     time_limit: float = parameter(
         90.0, doc='longest landing, after which the motors are switched off', unit='s', low=1,
         high=600)

@@ -10,6 +10,7 @@ from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.safety.levelling import Way
 
 UP = np.array([0.0, 0.0, 1.0])
+BRAKE = 3.0     # [-] in the turn after the leap the robot falls anyway
 
 
 def inclination(quaternion: np.ndarray) -> float:
@@ -33,6 +34,8 @@ class Ramp:
         speed: of the vertical motion [m/s].
         acceleration: of the vertical motion [m/s^2].
         moving: whether it starts with its speed.
+        leap: upward acceleration at the start [m/s^2] and its duration [s]; BRAKE times this
+            deceleration follows.
 
     """
 
@@ -44,6 +47,7 @@ class Ramp:
     speed: float
     acceleration: float
     moving: bool = False
+    leap: tuple[float, float] = (0.0, 0.0)
 
     @property
     def duration(self) -> float:
@@ -56,7 +60,18 @@ class Ramp:
         way, speed, _ = self._profile(elapsed - self.wait)
         quaternion, rate = self.way.at(elapsed)
         sign = np.sign(self.climb)
-        return Reference(self.position + sign * way * UP, quaternion, sign * speed * UP, rate)
+        leapt, rising = self._leap(elapsed)
+        return Reference(self.position + (leapt + sign * way) * UP, quaternion,
+                         (rising + sign * speed) * UP, rate)
+
+    def _leap(self, elapsed):
+        """Height and speed of the leap."""
+        acceleration, duration = self.leap
+        if elapsed < duration:
+            return 0.5 * acceleration * elapsed ** 2, acceleration * elapsed
+        left = max(0.0, (1 + 1 / BRAKE) * duration - elapsed)
+        top = 0.5 * acceleration * duration ** 2 * (1 + 1 / BRAKE)
+        return top - 0.5 * BRAKE * acceleration * left ** 2, BRAKE * acceleration * left
 
     def _profile(self, elapsed):
         """Distance, speed and total time of a trapezoidal speed profile."""

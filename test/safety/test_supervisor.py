@@ -8,7 +8,7 @@ from vehicle_rig import flown, hover_command, PARAMETERS, ROBOT, TICK, VehicleRi
 
 from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.actuator_health import ActuatorHealth
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 
 TIMEOUT = PARAMETERS.commands.timeout
@@ -447,6 +447,23 @@ def test_a_second_rotor_lost_at_the_floor_stops_the_motors_at_once(height, stops
     rig.supervisor.watch.health = ActuatorHealth(rotors=(True, False, False, True))
     rig.run(TICK)
     assert (rig.supervisor.state in ('disarmed', 'emergency_stop')) == stops
+
+
+@pytest.mark.parametrize(('speed', 'leaps'), [(0.0, True), (1.0, False)])
+def test_with_a_weak_pack_an_inverted_robot_at_rest_leaps_before_it_turns(speed, leaps):
+    rig = flown()
+    rig.position, rig.velocity = np.array([0.3, -0.2, 1.5]), np.array([speed, 0.0, 0.0])
+    rig.quaternion = rotations.from_rpy(np.pi, 0.0, 0.0)
+    rig.run(0.2)
+    rig.supervisor.watch.health = replace(ALL_HEALTHY, thrust_limit=8.8)
+    rig.run(TICK)
+    way = rig.supervisor.target_override
+    turned = np.array([rotations.geodesic_angle(rig.quaternion, q) for q in way.quaternions])
+    first = int(np.argmax(turned > 0.1))
+    rise, climb = way.positions[first - 1, 2] - 1.5, way.velocities[first - 1, 2]
+    assert (rise > 0.2 and climb > 0.5) if leaps else (abs(rise) < 1e-6 and first == 1)
+    assert way.positions[:, 2].max() < 2.3
+    assert np.abs(way.angular_velocities).max() < 10    # no sample in the step of the attitude
 
 
 def test_an_impact_high_above_the_floor_is_no_crash():
