@@ -191,3 +191,12 @@ def test_a_missing_ros_is_named_with_its_extra(capsys, monkeypatch, tmp_path):
     line = refused(capsys, 'fly', '--bag', tmp_path / 'bag')
     assert 'rclpy' in line
     assert 'beetle_omni_ros[ros]' in line
+
+
+def test_a_missing_torch_names_the_command_that_installs_it(monkeypatch, capsys):
+    for name in [name for name in sys.modules if name.startswith('beetle_omni_ros.train')]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, 'torch', None)
+    assert cli.main(['train', '--smoke', '--output', 'never']) == 2
+    line, = capsys.readouterr().err.splitlines()
+    assert 'make setup-train' in line and "pip install 'beetle_omni_ros[train]'" in line
