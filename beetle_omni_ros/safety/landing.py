@@ -22,6 +22,7 @@ from beetle_omni_ros.safety.vehicle import Vehicle
 FADING_STEPS = 10       # in which a rotor comes to rest
 AT_ONCE = 1e-3          # [s]
 AT_REST = 0.5           # [m/s]
+FELT = 0.1      # [s] time constant of the force that the ground carries
 STILL = 1.0     # [s] without IMU: time without sinking until the ground is detected
 AHEAD, BETWEEN = 20.0, 0.1      # [s] length and spacing of the published way
 
@@ -54,6 +55,7 @@ class Landing:
         self._hover, self._gauge, self._vehicle, self._events = hover, gauge, vehicle, events
         self.grounded, self.given_up = False, ''
         self._standing_for, self._still_for, self._blind_for = 0.0, 0.0, 0.0
+        self._support = 0.0     # share of the weight that the rotors do not carry, filtered
         self._blind = False
         self._robot, self._health = robot, ALL_HEALTHY
         self._turnover: Turnover | None = None
@@ -281,7 +283,10 @@ class Landing:
         by_poses = self._vehicle.backup.velocity_by_poses if blind else None
         sinks = state.velocity[2] if by_poses is None else by_poses[2]
         still = abs(sinks) < p.ground_speed
-        carried = self._gauge.support(specific_force_up) > p.ground_support
+        # The accelerometer jitters on the floor, by more than the weight with idle rotors.
+        self._support += min(1.0, dt / FELT) * (
+            self._gauge.support(specific_force_up) - self._support)
+        carried = self._support > p.ground_support
         sinking = reference.velocity[2] < -0.5 * p.speed
         stands = sinking and carried and (still or specific_force_up is not None)
         self._standing_for = self._standing_for + dt if stands else 0.0

@@ -145,7 +145,7 @@ class LandingParameters:
         90.0, doc='longest landing, after which the motors are switched off', unit='s', low=1,
         high=600)
     overdue_acceleration: float = parameter(
-        0.6, doc='without MoCap: acceleration of the descent after the expected touchdown',
+        0.3, doc='without MoCap: acceleration of the descent after the expected touchdown',
         unit='m/s^2', low=0, high=2)
     overdue_limit: float = parameter(
         6.0, doc='without MoCap: time from the expected touchdown until the motors are switched '
