@@ -77,14 +77,17 @@ def _widths(columns, available):
     """
     Widths with which lines break between words only.
 
-    The sum exceeds ``available`` if words alone need more. The first column is never broken.
+    Headers are broken before cells. The sum exceeds ``available`` if words alone need more. The
+    first column is never broken.
     """
+    words = [[max(map(len, cell.split() or [''])) for cell in column] for column in columns]
     widths = [max(map(len, column)) for column in columns]
-    least = [widths[0]] + [max(len(word) for cell in column for word in cell.split() or [''])
-                           for column in columns[1:]]
-    while _total(widths) > available and widths != least:
-        k = max(range(len(widths)), key=lambda k: (widths[k] > least[k], widths[k]))
-        widths[k] -= 1
+    for least in ([max(head[0], *map(len, column[1:]), 0)
+                   for head, column in zip(words, columns, strict=True)], list(map(max, words))):
+        least[0] = widths[0]
+        while _total(widths) > available and widths != least:
+            k = max(range(len(widths)), key=lambda k: (widths[k] > least[k], widths[k]))
+            widths[k] -= 1
     return widths
 
 
