@@ -10,6 +10,7 @@ from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
 from beetle_omni_ros.safety.parameters import SupervisorParameters
+from beetle_omni_ros.safety.ramp import inclination
 
 TIMEOUT = PARAMETERS.commands.timeout
 
@@ -447,6 +448,23 @@ def test_a_second_rotor_lost_at_the_floor_stops_the_motors_at_once(height, stops
     rig.supervisor.watch.health = ActuatorHealth(rotors=(True, False, False, True))
     rig.run(TICK)
     assert (rig.supervisor.state in ('disarmed', 'emergency_stop')) == stops
+
+
+def test_without_mocap_an_inverted_robot_sinks_while_it_turns_and_is_level_for_the_flare():
+    rig = flown()
+    rig.position, rig.status = np.array([0.3, -0.2, 2.0]), 'dead_reckoning'
+    rig.quaternion = rotations.from_rpy(np.pi, 0.0, 0.0)
+    rig.alive.discard('mocap')
+    rig.run(PARAMETERS.state.mocap_timeout + 0.1)
+    rig.supervisor.land(rig.now)
+    ramp = rig.supervisor._landing._ramp
+    times = rig.now + np.arange(0.0, 6.0, 0.02)
+    height = np.array([ramp.at(time).position[2] for time in times])
+    tilted = np.array([inclination(ramp.at(time).quaternion) for time in times])
+    flare = height.min()
+    assert flare == pytest.approx(0.16 + PARAMETERS.landing.flare_height, abs=0.05)
+    assert tilted[height < 1.9].max() > 1.0         # sinks before it is level
+    assert tilted[height < flare + 0.02].max() < 0.3
 
 
 @pytest.mark.parametrize(('speed', 'leaps'), [(0.0, True), (1.0, False)])
