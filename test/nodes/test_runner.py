@@ -8,12 +8,10 @@ import time
 
 import pytest
 
-MODULE = 'beetle_omni_ros.nodes'
-
 
 def start(node, *arguments, **popen):
     """Start a node's process with its output in a pipe."""
-    return subprocess.Popen([sys.executable, '-m', f'{MODULE}.{node}', *arguments],
+    return subprocess.Popen([sys.executable, '-m', 'beetle_omni_ros.start', node, *arguments],
                             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **popen)
 
 
@@ -105,7 +103,8 @@ def test_sigterm_ends_a_node_cleanly(ros_domain):
 def test_a_node_ends_with_the_process_that_started_its_graph(ros_domain):
     script = ('import os, subprocess, sys, time\n'
               'os.environ["BEETLE_OMNI_PARENT"] = str(os.getpid())\n'
-              f'child = subprocess.Popen([sys.executable, "-m", "{MODULE}.ekf_node"])\n'
+              'command = [sys.executable, "-m", "beetle_omni_ros.start", "ekf_node"]\n'
+              'child = subprocess.Popen(command)\n'
               'print(child.pid, flush=True)\n'
               'time.sleep(60)\n')
     parent = subprocess.Popen([sys.executable, '-c', script], stdout=subprocess.PIPE, text=True)

@@ -16,7 +16,7 @@ from beetle_omni_ros.runs.tasks import make_task
 class Nodes:
     """Stand-in for graph and operator of nodes that are ready and refuse to arm."""
 
-    nodes, composed, simulated = ('sim_node',), True, False
+    nodes, composed, simulated, controller = ('sim_node',), True, False, 'nmpc'
     ready, progress, state, states = True, 'waiting', 'disarmed', []
     diagnostics = {PACING: None}
 
