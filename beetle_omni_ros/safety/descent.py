@@ -93,7 +93,7 @@ class BackupEstimator:
     def checked_pose(self, stamp: float, position: np.ndarray,
                      quaternion: np.ndarray) -> Timed | None:
         """Stamp, position and unit quaternion of a valid pose newer than the last, else None."""
-        place, attitude = vector(position, 3), vector(quaternion, 4)
+        place, attitude = _vector(position, 3), _vector(quaternion, 4)
         if place is None or attitude is None or not isfinite(stamp) \
                 or stamp <= self._mocap_stamp or not abs(attitude @ attitude - 1) <= 0.02:
             return None
@@ -279,11 +279,11 @@ class BackupEstimator:
 def checked_sample(stamp: float, specific_force: np.ndarray,
                    angular_velocity: np.ndarray) -> Timed | None:
     """Stamp and copies (3,), (3,) of an IMU sample; None when a number is not plausible."""
-    force, rate = vector(specific_force, 3), vector(angular_velocity, 3)
+    force, rate = _vector(specific_force, 3), _vector(angular_velocity, 3)
     return None if force is None or rate is None or not isfinite(stamp) else (stamp, force, rate)
 
 
-def vector(value, size: int) -> np.ndarray | None:
+def _vector(value, size: int) -> np.ndarray | None:
     """Copy of ``value`` as finite floats (size,) within plausible limits, or None."""
     try:
         array = np.array(value, dtype=float)

@@ -146,7 +146,7 @@ class Landing:
         wait = way.duration if slanted else 0.0
         height = max(0.0, state.position[2] - self._floor)
         fast = max(0.0, height - p.flare_height) if blind else 0.0
-        if fast:    # level when the flare begins: velocity errors grow with time
+        if fast and self._health.healthy:   # level for the flare: velocity errors grow with time
             wait = max(0.0, wait - fast / p.blind_speed)
         self._ramp = Ramp(state.stamp, state.position, way, wait, *(
             (-fast, p.blind_speed, p.blind_acceleration) if fast
