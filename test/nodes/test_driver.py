@@ -87,7 +87,8 @@ def test_a_stick_moves_the_robot_at_its_speed_and_a_silent_joystick_holds_it(fli
         begin, at = witness.truth.position[0], witness.time()
         push(2.0, x=1.0)
         pushed = witness.time() - at + p.joystick_timeout
-        witness.spin(2.0)
+        witness.spin(1.0)
+        assert witness.wait(lambda: np.linalg.norm(witness.truth.velocity) < 0.02, 20)
         moved = witness.truth.position[0] - begin
         assert 0.4 < moved < pushed * p.speed + 0.1
         witness.spin(1.0)
