@@ -12,7 +12,7 @@ from beetle_omni_ros.sim.faults.listed import FaultList
 def fly_all(function: Callable, trials: Iterable, *arguments, jobs: int | None = None,
             ) -> Iterator[dict]:
     """
-    Call ``function(trial, *arguments)`` for each trial, each in its own process.
+    Call ``function(trial, *arguments)`` for each trial, in processes if there are several.
 
     Args:
         function: function at the top of a module.
@@ -25,7 +25,8 @@ def fly_all(function: Callable, trials: Iterable, *arguments, jobs: int | None =
 
     """
     calls = [joblib.delayed(function)(trial, *arguments) for trial in trials]
-    with joblib.parallel_config('loky', n_jobs=jobs or -1, inner_max_num_threads=1):
+    width = min(jobs or joblib.cpu_count(), max(1, len(calls)))
+    with joblib.parallel_config('loky', n_jobs=width, inner_max_num_threads=1):
         yield from joblib.Parallel(return_as='generator_unordered', batch_size=1,
                                    pre_dispatch='all')(calls)
 

@@ -130,8 +130,8 @@ def test_an_exception_of_step_is_logged_and_reported_and_publishes_no_command(
 def test_fly_names_the_exception_of_a_controller_and_the_supervisor_lands(tmp_path):
     own, task = tmp_path / 'bad.py', tmp_path / 'poses.csv'
     own.write_text(FAILING.format(fails_from='float("inf")').replace(
-        'state.stamp > self', 'target.at(state.stamp).position[0] > 0.2 or state.stamp > self'))
-    task.write_text(HEADER + '0,0,1.2,0,0,0\n0.3,0,1.2,0,0,0\n')
+        'state.stamp > self', 'state.position[2] > 1.3 or state.stamp > self'))
+    task.write_text(HEADER + '0,0,1.6,0,0,0\n')      # higher than the climb
     done = subprocess.run(
         [sys.executable, '-m', 'beetle_omni_ros.start', 'beetle_omni', 'fly', '--controller',
          f'{own}:Failing', '--task', str(task), '--bag', str(tmp_path / 'bag'), '--alone',

@@ -156,8 +156,9 @@ def test_bad_messages_are_refused_counted_and_change_nothing(ros_domain, tmp_pat
 
 
 FLY = ('import sys\nfrom pathlib import Path\nfrom beetle_omni_ros.nodes.fly import run_fly\n'
+       'composed = sys.argv[4] == "composed"\n'
        'sys.exit(run_fly(task=sys.argv[1], bag=Path(sys.argv[2]), json_path=Path(sys.argv[3]), '
-       'composed=sys.argv[4] == "composed", clock=sys.argv[5]))')
+       'composed=composed, standby=composed, clock=sys.argv[5]))')
 
 
 def fly(tmp_path, poses, arrangement, clock='auto'):
@@ -211,7 +212,7 @@ def test_a_killed_node_is_named_and_all_processes_end(tmp_path):
             assert process.poll() is None and time.monotonic() < deadline
             time.sleep(0.2)
         nodes = children(process.pid)
-        assert set(NODES) <= set(nodes)     # and rl_node, if a policy exists
+        assert set(NODES) == set(nodes)
         os.kill(nodes['nmpc_node'], signal.SIGKILL)
         _, error = process.communicate(timeout=60)
     finally:

@@ -1,7 +1,6 @@
 """rl_node as a process, and changes of the controller in a flight."""
 
 from dataclasses import replace
-import json
 import os
 import subprocess
 import sys
@@ -15,7 +14,7 @@ from rcl_interfaces.msg import ParameterEvent
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from sensor_msgs.msg import JointState
-from witness import HEADER, READY, Witness
+from witness import READY, Witness
 
 from beetle_omni_ros.control.base import PoseTarget, State
 from beetle_omni_ros.control.policy import DEFAULT, PolicyController, PolicyParameters
@@ -29,7 +28,6 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import JointReading
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.bag import read_bag
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 
 pytest.importorskip('onnx')
@@ -210,7 +208,7 @@ def flight(ros_domain, tmp_path):
 def test_twenty_switches_through_the_parameter_in_a_real_flight(flight):
     graph, pilot = flight
     names = ['rl', 'nmpc'] * (SWITCHES // 2)
-    for name, wait in zip(names, np.random.default_rng(0).uniform(0.2, 1.4, SWITCHES)):
+    for name, wait in zip(names, np.random.default_rng(0).uniform(0.2, 0.8, SWITCHES)):
         assert pilot.stays_in_the_air(wait) or pilot.height_min > 0.15
         assert pilot.select_when_good(name) == (True, '')
         assert pilot.wait(lambda name=name: pilot.state == f'flying:{name}', 2), pilot.states
@@ -238,24 +236,3 @@ def is_smooth(commands, targets):
     thrust = np.abs(np.diff([command.thrust for command in commands], axis=0))
     return np.all(tilt <= limits.tilt_rate * steps) and np.all(thrust
                                                                <= limits.thrust_rate * steps)
-
-
-@pytest.mark.simulated_time
-def test_one_call_flies_the_policy_and_the_bag_holds_both_controllers(tmp_path):
-    policy = write_hover_policy(tmp_path / 'hover.onnx', memory=True)
-    task, bag, result = tmp_path / 'poses.csv', tmp_path / 'bag', tmp_path / 'result.json'
-    task.write_text(HEADER + '0.3,0,1,20,0,0\n')
-    done = subprocess.run(
-        [sys.executable, '-m', 'beetle_omni_ros.cli', 'fly', '--controller', 'rl', '--policy',
-         str(policy), '--task', str(task), '--bag', str(bag), '--json', str(result),
-         '--clock', 'simulated'],
-        capture_output=True, text=True, timeout=READY, check=False)
-    assert done.returncode == 0, done.stderr
-    results = json.loads(result.read_text())
-    assert set(results) == {'meta', 'rl'} and not results['rl']['crashed']
-    assert results['rl']['poses'][0]['U_position_m'] < 0.5
-    log = read_bag(bag)
-    assert 'flying:rl' in log.states and 'flying:nmpc' not in log.states
-    for name in ('nmpc', 'rl'):     # 8 s at 100 Hz; the climb compensates skipped steps
-        assert len(log.requests[name].t) > 800
-        assert log.compute[name]['count'] > 800

@@ -19,6 +19,7 @@ import time
 
 import pytest
 import ready_program
+from ros_flights import FLIGHTS
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted((ROOT / 'docs' / 'tutorials').glob('*.md'))
@@ -132,8 +133,10 @@ def test_the_commands_of_a_tutorial_give_its_results(page, tmp_path, shell):
     found = blocks(page)
     if any('fly ' in block.text or block.one('background') for block in found):
         pytest.importorskip('rclpy')
+    prepare, check = FLIGHTS.get(page.stem, (lambda folder: None,) * 2)
     folder, background = tmp_path / 'reader', {}
     folder.mkdir()
+    prepare(folder)
     try:
         for block in found:
             if 'skip' in block.options:
@@ -151,6 +154,7 @@ def test_the_commands_of_a_tutorial_give_its_results(page, tmp_path, shell):
     finally:
         for process in background.values():
             stop(process)
+    check(folder)
     shutil.rmtree(folder)
 
 
