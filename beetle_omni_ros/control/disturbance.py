@@ -160,7 +160,7 @@ class DisturbanceEstimator:
         change[model.FORCE] = self._force_gain * (state.velocity - predicted[model.VELOCITY])
         change[model.TORQUE] = self._torque_gain * (
             state.angular_velocity - predicted[model.RATE])
-        self.disturbance = _clipped(self.disturbance + change, self._limit)
+        self.disturbance = clipped(self.disturbance + change, -self._limit, self._limit)
 
     def _correct_tilt(self, state, present, step):
         """Compare the encoders with the tilt model at their capture time."""
@@ -168,10 +168,10 @@ class DisturbanceEstimator:
         if modelled is None:
             return
         limit = self._limit[model.TILT_OFFSET]
-        error = self._movable * _clipped(state.tilt - modelled, limit)
+        error = self._movable * clipped(state.tilt - modelled, -limit, limit)
         present[model.TILT] += self._tilt_correction * error
         offset = self.disturbance[model.TILT_OFFSET] + self._tilt_bandwidth * step * error
-        self.disturbance[model.TILT_OFFSET] = _clipped(offset, limit)
+        self.disturbance[model.TILT_OFFSET] = clipped(offset, -limit, limit)
 
     def _modelled_tilt(self, stamp):
         later = None
@@ -185,6 +185,6 @@ class DisturbanceEstimator:
         return None
 
 
-def _clipped(values, limit):
-    """Clip to +-limit, faster than np.clip for a few numbers."""
-    return np.minimum(np.maximum(values, -limit), limit)
+def clipped(values: np.ndarray, low: np.ndarray | float, high: np.ndarray | float) -> np.ndarray:
+    """As np.clip, which takes three times as long for a few numbers."""
+    return np.minimum(np.maximum(values, low), high)

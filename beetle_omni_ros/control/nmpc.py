@@ -8,7 +8,7 @@ import numpy as np
 from beetle_omni_ros.control import ocp
 from beetle_omni_ros.control.base import Command, State, Target
 from beetle_omni_ros.control.call import FunctionCall
-from beetle_omni_ros.control.disturbance import DisturbanceEstimator
+from beetle_omni_ros.control.disturbance import clipped, DisturbanceEstimator
 from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
 from beetle_omni_ros.control.references import ReferencePlanner
 from beetle_omni_ros.control.rti import CompiledRti, InterpretedRti
@@ -153,10 +153,10 @@ class NmpcController:
         return self._command(state.stamp)
 
     def _command(self, stamp):
-        command = np.clip(self._rti.inputs[0], self._bounds[:8], self._bounds[8:16])
+        command = clipped(self._rti.inputs[0], self._bounds[:8], self._bounds[8:16])
         rotors, health = self._robot.rotors, self._health
         tilt = command[:4]
-        thrust = np.clip(command[4:], rotors.thrust_min, rotors.thrust_max)
+        thrust = clipped(command[4:], rotors.thrust_min, rotors.thrust_max)
         return Command(stamp, *((tilt, thrust) if health.healthy else
                                 health.possible(tilt, thrust)))
 

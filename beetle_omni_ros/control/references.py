@@ -94,6 +94,8 @@ class ReferencePlanner:
 
     def _unwound(self, tilt, present):
         """Choose the tilts within +-pi unless the joint would have to travel much farther."""
+        if max(map(abs, tilt.tolist())) <= np.pi:
+            return tilt
         other = tilt - 2 * np.pi * np.sign(tilt)
         detour = np.abs(other - present) - np.abs(tilt - present)
         better = (np.abs(tilt) > np.pi) & (detour < self._unwind) & self._movable

@@ -89,7 +89,7 @@ class Mounting:
         if any(after_impact):
             return np.zeros(3)
         times = np.array(stamps)
-        times -= times.sum() / len(last)
+        times -= np.add.reduce(times) / len(last)
         return times.dot(rates) / times.dot(times)
 
     def _extrapolated(self, node, age, trend) -> tuple[np.ndarray, ...]:

@@ -75,6 +75,8 @@ class Allocator:
                 self.matrix[:, column] = scale[i] * np.concatenate([direction, torque])
         self.axes = robot.tilt_axes
         self.inverse = np.linalg.pinv(self.matrix, rcond=SINGULAR)
+        self._by_force, self._by_torque = map(np.ascontiguousarray, (self.inverse[:, :3],
+                                                                     self.inverse[:, 3:]))
         self._negligible = NEGLIGIBLE * robot.hover_thrust
         self._thrust_min, self._thrust_max = rotors.thrust_min, rotors.thrust_max
         self.tilt_limit = robot.joints.position_limit
@@ -94,7 +96,7 @@ class Allocator:
         components = np.empty(2 * ROTORS)
         components[0::2] = thrust * np.cos(tilt)
         components[1::2] = thrust * np.sin(tilt)
-        wrench = self.matrix @ components
+        wrench = self.matrix.dot(components)
         return wrench[:3], wrench[3:]
 
     def allocate(self, force: np.ndarray, torque: np.ndarray,
@@ -111,12 +113,10 @@ class Allocator:
             present_tilt: (4,) present angles, for the choice of the nearest turn [rad].
 
         """
-        components = self.inverse[:, :3] @ force + self.inverse[:, 3:] @ torque
-        tilt, thrust = np.empty(ROTORS), np.empty(ROTORS)
-        saturated = np.zeros(ROTORS, dtype=bool)
-        pairs = components.tolist()
-        for i, present in enumerate(np.asarray(present_tilt, dtype=float).tolist()):
-            along, across = pairs[2 * i], pairs[2 * i + 1]
+        pairs = (self._by_force.dot(force) + self._by_torque.dot(torque)).tolist()
+        tilt, thrust, saturated = [], [], []
+        for along, across, present in zip(pairs[0::2], pairs[1::2],
+                                          np.asarray(present_tilt, dtype=float).tolist()):
             length = hypot(along, across)
             if length <= self._negligible:
                 angle, cut = self._inside(present)
@@ -124,9 +124,10 @@ class Allocator:
             else:
                 angle, cut = self._nearest_turn(atan2(across, along), present)
             held = min(max(length, self._thrust_min), self._thrust_max)
-            tilt[i], thrust[i] = angle, held
-            saturated[i] = cut or abs(held - length) > self._negligible
-        return Allocation(tilt, thrust, saturated)
+            tilt.append(angle)
+            thrust.append(held)
+            saturated.append(cut or abs(held - length) > self._negligible)
+        return Allocation(np.array(tilt), np.array(thrust), np.array(saturated))
 
     def hover(self, quaternion: np.ndarray, present_tilt: np.ndarray,
               extra_force_world: np.ndarray | None = None,
@@ -143,7 +144,7 @@ class Allocator:
         """
         force = self.weight if extra_force_world is None else self.weight + extra_force_world
         torque = np.zeros(3) if extra_torque_body is None else extra_torque_body
-        return self.allocate(force @ rotations.matrix(quaternion), torque, present_tilt)
+        return self.allocate(force.dot(rotations.matrix(quaternion)), torque, present_tilt)
 
     def upright(self, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """

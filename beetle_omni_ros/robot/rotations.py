@@ -2,7 +2,9 @@
 Rotations with quaternions in scipy's order (x, y, z, w), body to world.
 
 The estimator calls these functions hundreds of times a second. They convert arrays to plain
-floats first, because arithmetic on numpy scalars takes several times as long.
+floats first, because arithmetic on numpy scalars takes several times as long. For the same reason
+this package uses ``ndarray.dot`` in each cycle: for a few numbers it takes a third of the time of
+``@``, with the same result.
 """
 
 from collections.abc import Sequence
@@ -15,12 +17,13 @@ Vector = np.ndarray | Sequence[float]
 
 
 def matrix(quaternion: Vector) -> np.ndarray:
-    """Rotation matrix (3, 3) of a unit quaternion (x, y, z, w)."""
+    """Rotation matrix (3, 3) of a unit quaternion (x, y, z, w); (3, 3, N) of arrays (N,)."""
     x, y, z, w = _floats(quaternion)
-    return np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]])
+    rows = np.array((    # flat, because nested sequences take longer
+        1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
+        2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
+        2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)))
+    return rows.reshape(3, 3, *rows.shape[1:])
 
 
 def up(quaternion: Vector) -> np.ndarray:
@@ -60,7 +63,9 @@ def exp(vector: Vector) -> np.ndarray:
 
 def log(quaternion: Vector) -> np.ndarray:
     """Rotation vector [rad] of a unit quaternion, at most pi long."""
-    x, y, z, w = quaternion if quaternion[3] >= 0 else -np.asarray(quaternion)
+    x, y, z, w = _floats(quaternion)
+    if not w >= 0:
+        x, y, z, w = -x, -y, -z, -w
     norm = sqrt(x * x + y * y + z * z)
     scale = 2.0 if norm < 1e-9 else 2 * atan2(norm, w) / norm
     return np.array([scale * x, scale * y, scale * z])
@@ -69,13 +74,13 @@ def log(quaternion: Vector) -> np.ndarray:
 def normalized(quaternion: Vector) -> np.ndarray:
     """``quaternion`` scaled to unit length."""
     q = np.asarray(quaternion, dtype=float)
-    return q / sqrt(float(q @ q))
+    return q / sqrt(q.dot(q))
 
 
 def skew(vector: Vector) -> np.ndarray:
     """Cross-product matrix (3, 3) of a vector."""
     x, y, z = _floats(vector)
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.array((0.0, -z, y, z, 0.0, -x, -y, x, 0.0)).reshape(3, 3)
 
 
 def cross(a: Vector, b: Vector) -> np.ndarray:

@@ -106,11 +106,12 @@ class LogRecorder(Recorder):
             return
         row = [stamp]
         for channel, width in SERIES[series].items():
-            part = getattr(value, channel) if channel != 'received' else \
-                stamp if received is None else received
             if not width:
-                row.append(part)
-            elif isinstance(part, np.ndarray):
+                row.append(getattr(value, channel) if channel != 'received' else
+                           stamp if received is None else received)
+                continue
+            part = getattr(value, channel)
+            if isinstance(part, np.ndarray):
                 row += part.tolist()    # floats are added faster than numpy's numbers
             else:
                 row += [np.nan] * width if part is None else part

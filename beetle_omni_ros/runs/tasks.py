@@ -142,7 +142,7 @@ class TaskPlayer:
 
         Pose (3,) in world [m] and (4,) of the robot serve to detect a loss of control.
         """
-        index = int(np.searchsorted(self._ends, now - self.start + 1e-6, side='right'))
+        index = int(self._ends.searchsorted(now - self.start + 1e-6, side='right'))
         if position is not None and self._lost(position, quaternion, index):
             self.lost_level = self.task.segments[max(self._index, 0)].level
         if index >= len(self._ends) or self.lost_level is not None:

@@ -95,7 +95,7 @@ class BackupEstimator:
         """Stamp, position and unit quaternion of a valid pose newer than the last, else None."""
         place, attitude = _vector(position, 3), _vector(quaternion, 4)
         if place is None or attitude is None or not isfinite(stamp) \
-                or stamp <= self._mocap_stamp or not abs(attitude @ attitude - 1) <= 0.02:
+                or stamp <= self._mocap_stamp or not abs(attitude.dot(attitude) - 1) <= 0.02:
             return None
         return stamp, place, rotations.normalized(attitude)
 
@@ -125,7 +125,7 @@ class BackupEstimator:
         if not 0 < dt <= LONGEST_STEP or state.stamp - sample[0] > LONGEST_STEP:
             return
         acceleration = (state.velocity - before.velocity) / dt
-        expected = (acceleration - self._gravity) @ rotations.matrix(state.quaternion)
+        expected = (acceleration - self._gravity).dot(rotations.matrix(state.quaternion))
         if not self._biases or state.stamp - self._biases[-1][0] > BIAS_EVERY:
             self._biases.append((state.stamp, self._accelerometer_bias, self._gyroscope_bias))
         gain = min(1.0, dt / self._parameters.bias_time)
@@ -234,7 +234,7 @@ class BackupEstimator:
         if stamp <= self._stamp:
             return
         self._rate = rate - self._gyroscope_bias
-        in_world = rotations.matrix(self._quaternion) @ (force - self._accelerometer_bias)
+        in_world = rotations.matrix(self._quaternion).dot(force - self._accelerometer_bias)
         self.specific_force_up = float(in_world[2])
         self._advance(stamp, in_world + self._gravity)
 
@@ -298,5 +298,5 @@ def _vector(value, size: int) -> np.ndarray | None:
 
 
 def _shortened(vector, limit):
-    length = sqrt(float(vector @ vector))
+    length = sqrt(vector.dot(vector))
     return vector if length <= limit else vector * (limit / length)

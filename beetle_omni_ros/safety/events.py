@@ -1,6 +1,7 @@
 """Outputs of the supervisor: events, answers to requests, and timeouts of sources."""
 
 from dataclasses import dataclass
+from math import inf
 
 INFO, WARNING, ERROR = 'info', 'warning', 'error'
 KEPT = 1000   # events; a flight has tens
@@ -47,7 +48,7 @@ class EventLog(list):
     def say(self, stamp: float, severity: str, text: str, key: str | None = None) -> None:
         """Add one event; with a ``key``, not again within the quiet time."""
         if key is not None:
-            if abs(stamp - self._said.get(key, float('-inf'))) < self._quiet_time:
+            if abs(stamp - self._said.get(key, -inf)) < self._quiet_time:
                 return
             self._said[key] = stamp
         self.append(Event(stamp, severity, text))
@@ -67,7 +68,7 @@ class Silence:
     def __init__(self, limit: float):
         """``limit``: longer silence is a fault [s]."""
         self.limit = limit
-        self.elapsed = float('inf')   # no message yet
+        self.elapsed = inf   # no message yet
         self._just_reset = False
 
     def reset(self) -> None:
@@ -84,7 +85,7 @@ class Silence:
     @property
     def from_the_start(self) -> bool:
         """Whether no message has arrived yet."""
-        return self.elapsed == float('inf')
+        return self.elapsed == inf
 
     @property
     def silent(self) -> bool:

@@ -141,10 +141,14 @@ class CommandStream:
             return NOT_A_COMMAND, None
         if tilt.shape != (ROTORS,) or thrust.shape != (ROTORS,):
             return SHAPE, None
-        if not (isfinite(stamp) and all(map(isfinite, tilt.tolist() + thrust.tolist()))):
+        angles, forces = tilt.tolist(), thrust.tolist()
+        if not (isfinite(stamp) and all(map(isfinite, angles + forces))):
             return NOT_FINITE, None
-        clean = Command(stamp, _cut(tilt, -self._tilt_limit, self._tilt_limit),
-                        _cut(thrust, self._rotors.thrust_min, self._rotors.thrust_max))
+        limit, low, high = self._tilt_limit, self._rotors.thrust_min, self._rotors.thrust_max
+        clean = Command(stamp,
+                        tilt if max(map(abs, angles)) <= limit else _cut(tilt, -limit, limit),
+                        thrust if low <= min(forces) and max(forces) <= high else
+                        _cut(thrust, low, high))
         return self._check_stamp(stamp, now) or self._check_range(tilt, thrust, clean), clean
 
     def _check_stamp(self, stamp, now):
@@ -158,9 +162,9 @@ class CommandStream:
 
     def _check_range(self, tilt, thrust, clean):
         tolerance = self._limits.limit_tolerance
-        if _farthest(thrust, clean.thrust) > tolerance:
+        if thrust is not clean.thrust and _farthest(thrust, clean.thrust) > tolerance:
             return THRUST
-        if _farthest(tilt, clean.tilt) > tolerance:
+        if tilt is not clean.tilt and _farthest(tilt, clean.tilt) > tolerance:
             return TILT
         before, self._offered = self._offered, clean
         same = before is not None and before.tilt.tolist() == clean.tilt.tolist() \

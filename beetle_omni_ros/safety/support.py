@@ -27,6 +27,9 @@ class SupportGauge:
         self.thrust = 0.0     # modelled thrust along world up, in weights
         self.lift = 0.0       # the same, corrected by the baseline
         self._thrusts = np.zeros(ROTORS)    # modelled thrust of each rotor [N]
+        # The last command and its force: a controller is slower than the supervisor.
+        self._command: Command | None = None
+        self._force = np.zeros(3)
 
     def update(self, command: Command | None, quaternion: np.ndarray, dt: float,
                specific_force_up: float | None, learn: bool) -> None:
@@ -34,8 +37,10 @@ class SupportGauge:
         now, share = 0.0, 1.0 - exp(-dt / self._lag)
         self._thrusts += share * ((0.0 if command is None else command.thrust) - self._thrusts)
         if command is not None:
-            force, _ = self._allocator.wrench(command.tilt, command.thrust)
-            now = float(rotations.up(quaternion) @ force) \
+            if command is not self._command:
+                self._command = command
+                self._force, _ = self._allocator.wrench(command.tilt, command.thrust)
+            now = float(rotations.up(quaternion).dot(self._force)) \
                 / (self._allocator.mass * self._gravity)
         self.thrust += share * (now - self.thrust)
         if learn and specific_force_up is not None and self.thrust > LEAST_THRUST:

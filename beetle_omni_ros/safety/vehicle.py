@@ -155,7 +155,7 @@ class Vehicle:
         force = self.backup.last_specific_force
         if force is None or self.state is None or self.imu.silent:
             return None
-        return float(rotations.up(self.state.quaternion) @ force)
+        return float(rotations.up(self.state.quaternion).dot(force))
 
     @property
     def mocap_lost(self) -> bool:
@@ -227,7 +227,7 @@ class Vehicle:
     def _tumbling(self):
         fence, state = self._parameters.envelope, self._best
         rate = state.angular_velocity
-        return sqrt(float(rate @ rate)) > fence.rate or state.velocity[2] < -fence.fall_speed
+        return sqrt(rate.dot(rate)) > fence.rate or state.velocity[2] < -fence.fall_speed
 
     def _check_state(self, state, status, now, airborne):
         limits = self._parameters.state

@@ -1,6 +1,7 @@
 """Link of the commands to the actuators: checks, delay, timeout."""
 
 from collections import Counter, deque
+from math import isfinite
 
 import numpy as np
 
@@ -54,9 +55,8 @@ class CommandLink:
             return False
         self.accepted += 1
         self._last_stamp, self._last_arrival = command.stamp, now
-        low, high = self._thrust_range
-        tilt = np.minimum(np.maximum(command.tilt, -self._limit), self._limit)
-        thrust = np.minimum(np.maximum(command.thrust, low), high)
+        tilt = _clipped(command.tilt, -self._limit, self._limit)
+        thrust = _clipped(command.thrust, *self._thrust_range)
         for queue, delay, value in zip(self._pending, self._delays, (tilt, thrust)):
             queue.append((max(command.stamp + delay, now), value))
         return True
@@ -70,7 +70,7 @@ class CommandLink:
             return 'not numbers'
         if tilt.shape != (4,) or thrust.shape != (4,):
             return 'wrong length'
-        if not (np.isfinite(stamp) and np.isfinite(tilt.sum() + thrust.sum())):
+        if not all(map(isfinite, (stamp, *tilt.tolist(), *thrust.tolist()))):
             return 'not finite'
         if stamp < self._last_stamp:
             return 'older than the last'
@@ -88,3 +88,9 @@ class CommandLink:
             self.thrust = thrusts.popleft()[1]
         if now - self._last_arrival >= self._timing.command_timeout - ROUNDING:
             self.thrust = np.zeros(4)
+
+
+def _clipped(values, low, high):
+    """Clipped copy of four numbers, for which plain floats are faster than numpy."""
+    return np.array([min(max(value, low), high)
+                     for value in np.asarray(values, dtype=float).tolist()])

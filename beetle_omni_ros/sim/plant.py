@@ -194,7 +194,7 @@ class Plant:
             self._update()
             effort = self._robot.joints.effort_limit
             model.actuator_forcerange[4:] = (-effort, effort)
-        if not abs(float(data.qacc.sum())) < DIVERGED:
+        if not abs(np.add.reduce(data.qacc)) < DIVERGED:
             raise RuntimeError(f'the simulated plant diverged: position {self._qpos[:3]} m, '
                                f'velocity {self._qvel[:3]} m/s, tilts {self._tilt} rad')
 

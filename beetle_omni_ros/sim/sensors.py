@@ -215,12 +215,15 @@ def mean_motion(before: Truth, after: Truth, gravity: float) -> np.ndarray:
     instant would alias the fast accelerations of a tilting module into velocity errors.
     """
     dt = after.stamp - before.stamp
-    turn = rotations.log(rotations.multiply(rotations.conjugate(before.quaternion),
-                                            after.quaternion))
-    middle = rotations.multiply(before.quaternion, rotations.exp(0.5 * turn))
+    x, y, z, w = own = before.quaternion.tolist()
+    turn = rotations.log(rotations.product(-x, -y, -z, w, *after.quaternion.tolist()))
+    middle = rotations.product(*own, *rotations.exp(0.5 * turn).tolist())
     acceleration = (after.velocity - before.velocity) / dt
     acceleration[2] += gravity
-    return np.concatenate([acceleration @ rotations.matrix(middle), turn / dt])
+    motion = np.empty(6)
+    motion[:3] = acceleration.dot(rotations.matrix(middle))
+    motion[3:] = turn / dt
+    return motion
 
 
 def _delay_line(ticks):

@@ -96,4 +96,4 @@ class MocapWatch:
 
 def _length(vector):
     """Norm, faster than np.linalg.norm."""
-    return sqrt(float(vector @ vector))
+    return sqrt(vector.dot(vector))

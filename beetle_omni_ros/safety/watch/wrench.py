@@ -90,7 +90,7 @@ class WrenchWatch:
         if dt <= 0:
             return
         self._stamp = stamp
-        size = sqrt(float(force @ force))
+        size = sqrt(force.dot(force))
         self.impact = size if size > self._contact.impact * self._reach else 0.0
         commanded = thrust if all(health.rotors) else np.where(health.rotors, thrust, 0.0)
         if dt > LONGEST or tilt is None:
@@ -109,7 +109,7 @@ class WrenchWatch:
         vectors = np.empty((ROTORS, 2))
         vectors[:, 0] = np.cos(tilt) * self._thrust
         vectors[:, 1] = np.sin(tilt) * self._thrust
-        modelled = self._allocator.matrix @ vectors.ravel() / self._units
+        modelled = self._allocator.matrix.dot(vectors.ravel()) / self._units
         gain = 1 - exp(-dt / self._contact.filter)
         self._filtered += gain * (measured - modelled - self._filtered)
         self._vectors += gain * (vectors - self._vectors)
@@ -119,7 +119,7 @@ class WrenchWatch:
         """The rotor whose thrust vector explains the residual, and this vector."""
         p = self._p
         residual = self._filtered * self._weights
-        size = float(residual @ residual)
+        size = float(residual.dot(residual))
         self.unexplained = self._filtered[:3]
         if size <= p.least_evidence**2 and not self._suspects:
             return
@@ -190,7 +190,7 @@ class ContactWatch:
             wrench: of the same sample.
 
         """
-        push = sqrt(float(wrench.unexplained @ wrench.unexplained)) / self._gravity
+        push = sqrt(wrench.unexplained.dot(wrench.unexplained)) / self._gravity
         near = height is None or height <= self._limits.near_ground
         self._since_hit = 0.0 if wrench.impact else self._since_hit + dt
         hit = self._since_hit < AFTER_HIT
