@@ -94,6 +94,15 @@ def pytest_unconfigure(config):
         config.stash[BEAT].close()
 
 
+@pytest.fixture(scope='session', autouse=True)
+def shared_folder(tmp_path_factory):
+    """Folder of the flights that several files use, the same for all workers."""
+    import flown_once
+    root = tmp_path_factory.getbasetemp()
+    flown_once.folder = (root.parent if WORKER else root) / 'flown_once'
+    flown_once.folder.mkdir(exist_ok=True)
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item):
     """Require the mark real_time of tests with devices, whose threads use the clock."""

@@ -1,11 +1,11 @@
 """Every example runs by its documented command, and the public functions work."""
 
-from dataclasses import replace
 from pathlib import Path
 import re
 import subprocess
 import sys
 
+from flown_once import flight
 import numpy as np
 import pytest
 
@@ -30,14 +30,9 @@ def poses(tmp_path_factory):
 
 
 @pytest.fixture(scope='module')
-def bags(tmp_path_factory):
+def bags():
     """Two short flights in a wind that is not in the robot file."""
-    windy = replace(beetle_omni_ros.robot(), effects={'wind': {'force': (1.2, -0.8, 0.0)}})
-    flown = [[0.8, 0.4, 1.2, 40, 20, 90], [-0.6, 0.8, 0.9, -30, 35, -120]]
-    folder = tmp_path_factory.mktemp('bags')
-    for k in range(2):
-        beetle_omni_ros.simulate('hover', flown, seed=k, plant=windy, bag=folder / f'flight{k}')
-    return [folder / f'flight{k}' for k in range(2)]
+    return [flight('windy_0'), flight('windy_1')]
 
 
 def run(name, *arguments):

@@ -15,9 +15,10 @@ from beetle_omni_ros.evaluation import command, loop
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.runs import tasks
 from beetle_omni_ros.runs.bag_reader import read_bag
 from beetle_omni_ros.runs.metrics import metrics
-from beetle_omni_ros.runs.tasks import make_task, TaskError
+from beetle_omni_ros.runs.tasks import make_task, Task, TaskError
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 
 ROBOT = RobotParameters.load()
@@ -25,7 +26,8 @@ CAPACITY = 0.0975   # [A h] of a pack that does not last for two poses
 
 
 def evaluate(task, controllers=('nmpc',), **options):
-    return command.run_evaluate(controllers=list(controllers), task=str(task),
+    return command.run_evaluate(controllers=list(controllers),
+                                task=task if isinstance(task, Task) else str(task),
                                 console=Console(file=io.StringIO()), **options)
 
 
@@ -145,13 +147,15 @@ def test_an_exception_of_step_ends_the_command_with_one_line(poses, tmp_path, ca
                    "'Bad' object has no attribute 'absent' (bad.py:4)"
 
 
-def test_a_force_task_ends_with_the_level_of_lost_control():
+def test_a_force_task_ends_with_the_level_of_lost_control(monkeypatch):
+    monkeypatch.setattr(tasks, 'FORCE_LEVELS', (10.0, 60.0, 70.0))     # [N]
     task = make_task('force')
     log = command.fly('nmpc', task, robot=ROBOT, plant=ROBOT)
-    lost = metrics(log, task)
-    levels = [segment.level for segment in task.segments if segment.level]
     assert np.isfinite(log.truth_position).all()
-    assert any(str(level) in json.dumps(lost) for level in levels)
+    force = metrics(log, task)['force']
+    assert [(row['level_N'], row['lost']) for row in force['levels']] == [
+        (10.0, False), (60.0, True)]
+    assert force['withstood_N'] == 10.0 and force['lost_at_N'] == 60.0
 
 
 @pytest.mark.parametrize('charge', [0.3, 0.0])      # 0: by the warning of the supervisor only
@@ -168,10 +172,12 @@ def test_an_empty_pack_is_swapped_at_the_next_target(charge, tmp_path, monkeypat
     assert drawn > CAPACITY     # more than one pack holds
 
 
-def test_faults_of_a_file_act_and_are_listed_in_the_results(poses, tmp_path):
+def test_faults_of_a_file_act_and_are_listed_in_the_results(tmp_path):
+    task = make_task('random1')
+    task = replace(task, segments=(replace(task.segments[0], duration=3.0),))
     path = tmp_path / 'faults.yaml'
     path.write_text('faults: [{what: rotor_stops, at: 1.0, rotor: 2}, {what: controller_silent}]')
-    results = evaluate(poses, ('hover',), faults=path, bag=tmp_path / 'bag')
+    results = evaluate(task, ('hover',), faults=path, bag=tmp_path / 'bag')
     listed = ['rotor_stops(rotor=2) at 1 s', 'controller_silent at 0 s']
     assert results['meta']['faults'] == listed
     log = read_bag(tmp_path / 'bag')

@@ -5,27 +5,23 @@ from functools import cache
 from pathlib import Path
 import tempfile
 
+from flown_once import flight, hover, THREE_POSES
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from beetle_omni_ros.evaluation.command import fly
 from beetle_omni_ros.identify.gap.bags import read_recording
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.runs.tasks import make_task
 
 ROBOT = RobotParameters.load()
-POSES = '-0.7,0.5,1.0,-90,10,-60\n0.9,-0.6,1.3,60,50,100\n0,0.4,1.1,170,0,20\n'
 
 
 @cache
 def _flown(conditions):
+    if conditions == 'nominal':
+        return read_recording(flight('calm'))
     with tempfile.TemporaryDirectory() as folder:
-        folder = Path(folder)
-        (folder / 'poses.csv').write_text('x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg\n'
-                                          + POSES)
-        fly('hover', make_task(str(folder / 'poses.csv'), 0), robot=ROBOT, plant=ROBOT, seed=5,
-            conditions=conditions, bag=folder / 'case')
-        return read_recording(folder / 'case')
+        return read_recording(hover(Path(folder) / conditions, THREE_POSES, seed=5,
+                                    conditions=conditions))
 
 
 def recording(conditions='nominal'):

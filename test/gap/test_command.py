@@ -6,25 +6,20 @@ import json
 import shutil
 import sys
 
+from flown_once import flight, hover, TWO_POSES, WIND
 import numpy as np
 import pytest
 from rich.console import Console
 
 from beetle_omni_ros import cli
-from beetle_omni_ros.evaluation.command import fly
 from beetle_omni_ros.identify.gap import workers
 from beetle_omni_ros.identify.gap.command import gap_results, run_gap
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.bag import BagWriter
 from beetle_omni_ros.runs.bag_files import read_messages
-from beetle_omni_ros.runs.tasks import make_task
 
-TRUE = np.array([1.2, -0.8, 0.0])
-POSES = """x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg
-0.8,0.4,1.2,40,20,90
--0.6,0.8,0.9,-30,35,-120
-"""
+TRUE = np.array(WIND)
 
 
 def quiet():
@@ -35,14 +30,8 @@ def quiet():
 def made(tmp_path_factory):
     """Results of two short flights in a wind that is not in the robot file."""
     folder = tmp_path_factory.mktemp('gap')
-    (folder / 'poses.csv').write_text(POSES)
-    robot = RobotParameters.load()
-    plant = replace(robot, effects={'wind': {'force': tuple(TRUE)}})
-    for k in range(2):
-        fly('hover', make_task(str(folder / 'poses.csv'), 0), robot=robot, plant=plant, seed=k,
-            bag=folder / f'flight{k}')
     console = quiet()
-    results = gap_results([folder / 'flight0'], [folder / 'flight1'], apply=folder / 'new.yaml',
+    results = gap_results([flight('windy_0')], [flight('windy_1')], apply=folder / 'new.yaml',
                           json_path=folder / 'gap.json', page=folder / 'gap.html',
                           console=console)
     return folder, results, console.file.getvalue()
@@ -59,9 +48,9 @@ def test_the_hidden_wind_is_named_with_its_size(made):
 
 @pytest.mark.skipif(sys.platform != 'linux', reason='forks on Linux only')
 def test_two_cores_give_the_same_result_as_one(made, monkeypatch):
-    folder, results, _ = made
+    _, results, _ = made
     monkeypatch.setattr(workers, 'width', lambda: 2)
-    again = gap_results([folder / 'flight0'], [folder / 'flight1'], console=quiet())
+    again = gap_results([flight('windy_0')], [flight('windy_1')], console=quiet())
     for name in results.keys() - {'meta'}:
         assert again[name] == results[name], name
 
@@ -73,22 +62,17 @@ def test_the_held_out_gap_shrinks_and_a_placebo_does_not_shrink_it(made):
     assert results['horizons']['0.5 s']['placebo'] > results['gap_before']
 
 
-def test_an_effect_that_worsens_held_out_flights_is_not_named(made):
-    folder, robot = made[0], RobotParameters.load()
-    fly('hover', make_task(str(folder / 'poses.csv'), 0), robot=robot, plant=robot, seed=2,
-        bag=folder / 'calm')        # another day: no wind
-    results = gap_results([folder / 'flight0'], [folder / 'calm'], console=quiet())
+def test_an_effect_that_worsens_held_out_flights_is_not_named():
+    # another day: no wind
+    results = gap_results([flight('windy_0')], [flight('calm')], console=quiet())
     assert results['verdict'] == 'unknown' and results['effects'] == []
     assert 'wind' in results['reason'] and 'makes the held-out ones worse' in results['reason']
     assert results['gap_after'] == results['gap_before']
 
 
-def test_an_effect_that_leaves_most_of_a_large_gap_is_not_named(made):
-    folder, robot = made[0], RobotParameters.load()
-    strong = replace(robot, effects={'wind': {'force': 6 * np.array(TRUE)}})
-    fly('hover', make_task(str(folder / 'poses.csv'), 0), robot=robot, plant=strong, seed=3,
-        bag=folder / 'storm')
-    results = gap_results([folder / 'flight0'], [folder / 'storm'], console=quiet())
+def test_an_effect_that_leaves_most_of_a_large_gap_is_not_named(tmp_path):
+    hover(tmp_path / 'storm', TWO_POSES, 6 * TRUE, seed=3)
+    results = gap_results([flight('windy_0')], [tmp_path / 'storm'], console=quiet())
     assert results['gap_before'] > 10
     assert results['verdict'] == 'unknown' and results['effects'] == []
     assert 'wind' in results['reason'] and 'does not explain most' in results['reason']
@@ -143,10 +127,10 @@ def test_a_run_of_another_kind_is_refused_with_one_line_and_status_2(made, words
     assert words in capsys.readouterr().err
 
 
-def test_a_recording_of_another_robot_with_the_same_sensors_is_refused(made, tmp_path, capsys):
+def test_a_recording_of_another_robot_with_the_same_sensors_is_refused(tmp_path, capsys):
     other = tmp_path / 'other'
     with BagWriter(other) as bag:
-        for message in read_messages(made[0] / 'flight0'):
+        for message in read_messages(flight('windy_0')):
             data = bytes(message.data)      # names of the same length keep the layout
             for own, strange in ((b'gimbal', b'swivel'), (b'rotor', b'motor')):
                 data = data.replace(own, strange)
@@ -156,34 +140,34 @@ def test_a_recording_of_another_robot_with_the_same_sensors_is_refused(made, tmp
     assert 'no recording of this robot' in error and 'swivel1' in error and 'gimbal1' in error
 
 
-def test_the_same_recording_twice_is_refused_under_any_name(made, tmp_path, capsys):
-    flight = made[0] / 'flight0'
-    (tmp_path / 'link').symlink_to(flight)
-    shutil.copytree(flight, tmp_path / 'copy')
-    for other in (flight, tmp_path / 'link', tmp_path / 'copy'):
-        assert cli.main(['gap', str(flight), '--holdout', str(other)]) == 2
+def test_the_same_recording_twice_is_refused_under_any_name(tmp_path, capsys):
+    first = flight('windy_0')
+    (tmp_path / 'link').symlink_to(first)
+    shutil.copytree(first, tmp_path / 'copy')
+    for other in (first, tmp_path / 'link', tmp_path / 'copy'):
+        assert cli.main(['gap', str(first), '--holdout', str(other)]) == 2
         error = capsys.readouterr().err
         assert 'the same recording twice' in error and str(other) in error
 
 
-def test_a_part_of_a_fitted_flight_is_refused_as_held_out_flight(made, tmp_path, capsys):
+def test_a_part_of_a_fitted_flight_is_refused_as_held_out_flight(tmp_path, capsys):
     part = tmp_path / 'part'
     with BagWriter(part) as bag:
-        for message in read_messages(made[0] / 'flight0'):
+        for message in read_messages(flight('windy_0')):
             if message.received > 2.0:
                 bag.write_raw(message.topic, message.type, message.data, message.received)
-    assert cli.main(['gap', str(made[0] / 'flight0'), '--holdout', str(part)]) == 2
+    assert cli.main(['gap', str(flight('windy_0')), '--holdout', str(part)]) == 2
     assert 'the same flight in two recordings' in capsys.readouterr().err
 
 
-def test_a_damaged_held_out_flight_gives_bad_data(made, tmp_path):
+def test_a_damaged_held_out_flight_gives_bad_data(tmp_path):
     damaged = tmp_path / 'damaged'
     with BagWriter(damaged) as bag:
-        for message in read_messages(made[0] / 'flight1'):
+        for message in read_messages(flight('windy_1')):
             if not message.topic.endswith('imu/data_raw'):
                 bag.write_raw(message.topic, message.type, message.data, message.received)
     console = quiet()
-    status = run_gap([made[0] / 'flight0'], [damaged], json_path=tmp_path / 'gap.json',
+    status = run_gap([flight('windy_0')], [damaged], json_path=tmp_path / 'gap.json',
                      page=tmp_path / 'gap.html', console=console)
     results = json.loads((tmp_path / 'gap.json').read_text())
     assert status == 3 and results['verdict'] == 'bad_data'
@@ -196,12 +180,12 @@ def test_a_damaged_held_out_flight_gives_bad_data(made, tmp_path):
     assert 'bad data' in page and page.index('class="said"') < page.index('<img')
 
 
-def test_each_cause_is_printed_once(made, tmp_path):
+def test_each_cause_is_printed_once(tmp_path):
     folders = []
     for k in range(2):
         folders.append(tmp_path / f'damaged{k}')
         with BagWriter(folders[-1]) as bag:
-            for message in read_messages(made[0] / f'flight{k}'):
+            for message in read_messages(flight(f'windy_{k}')):
                 if not message.topic.endswith('imu/data_raw'):
                     bag.write_raw(message.topic, message.type, message.data, message.received)
     console = Console(file=StringIO(), width=300)

@@ -4,22 +4,22 @@ from dataclasses import replace
 import io
 
 from flights import Motion, P
+from flown_once import THREE_POSES
 import numpy as np
 import pytest
-from recordings import POSES, ROBOT
+from recordings import ROBOT
 from rich.console import Console
 from test_added_effect import ENTRY, MEASURED, PAGE
 from test_consumers import OUTPUTS, plain
 from test_ingest import recording
 
-from beetle_omni_ros.evaluation.command import fly
+import beetle_omni_ros
 from beetle_omni_ros.identify.gap.command import gap_results
 from beetle_omni_ros.identify.gap.ingest import prepare
 from beetle_omni_ros.identify.gap.signals import Signals
 from beetle_omni_ros.robot import effects
 from beetle_omni_ros.robot.effects import CATALOGUE, Treatment
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.tasks import make_task
 
 NAME, LOSS = 'charge_fade', 0.15
 made: dict = {}
@@ -82,9 +82,8 @@ def test_without_a_current_no_charge_is_drawn_and_the_voltage_is_kept():
 
 def test_the_gap_finder_identifies_it_with_an_interval_that_covers_the_truth(
         tmp_path, monkeypatch):
-    (tmp_path / 'poses.csv').write_text('x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg\n' + POSES)
-    fly('hover', make_task(str(tmp_path / 'poses.csv'), 0), robot=ROBOT, plant=faded(), seed=1,
-        conditions='nominal', bag=tmp_path / 'flight')
+    beetle_omni_ros.simulate('hover', THREE_POSES[:2], plant=faded(), seed=1,
+                             bag=tmp_path / 'flight')
     monkeypatch.setitem(CATALOGUE, NAME, replace(FADE, treatments={
         'nmpc': Treatment(False, 'it has no current', error=True)}))
     console = Console(file=io.StringIO(), width=200)

@@ -1,6 +1,7 @@
 """Artificial response logs: an independent simulation of a servo, sampled like a real log."""
 
 import csv
+from functools import cache
 
 import numpy as np
 
@@ -20,9 +21,16 @@ def sweep(duration=10.0, periods=(1.8, 2.6), amplitudes=(1.0, 1.7), rate=100.0):
     return t, amplitude * np.sin(phase)
 
 
-def servo(t, command, *, frequency=47.0, damping=0.63, delay=0.015, coulomb=0.0, stiction=0.0,
+def servo(t, command, **values):
+    """Positions (N,) [rad] of :func:`_moved`; most logs differ in the noise alone."""
+    return _moved(t.tobytes(), command.tobytes(), **values)
+
+
+@cache
+def _moved(t, command, *, frequency=47.0, damping=0.63, delay=0.015, coulomb=0.0, stiction=0.0,
           stribeck=0.1, backlash=0.0, velocity_limit=np.inf, torque_limit=np.inf, offset=0.0):
     """Positions (N,) [rad] of a servo that holds each command from its logged time on."""
+    t, command = np.frombuffer(t), np.frombuffer(command)
     # It has been moving before the log: a straight run-up of a second.
     lead = np.arange(-1.0, 0.0, t[1] - t[0])
     first = command[0] + (command[1] - command[0]) / (t[1] - t[0]) * lead

@@ -1,0 +1,36 @@
+"""Simulated flights that several test files use; each is flown once for all workers."""
+
+from dataclasses import replace
+import fcntl
+from pathlib import Path
+
+import beetle_omni_ros
+
+WIND = 1.2, -0.8, 0.0       # [N], not in the robot file
+# x, y, z [m], roll, pitch, yaw [deg]
+TWO_POSES = [[0.8, 0.4, 1.2, 40, 20, 90], [-0.6, 0.8, 0.9, -30, 35, -120]]
+THREE_POSES = [[-0.7, 0.5, 1.0, -90, 10, -60], [0.9, -0.6, 1.3, 60, 50, 100],
+               [0, 0.4, 1.1, 170, 0, 20]]
+FLIGHTS = {'windy_0': (TWO_POSES, WIND, 0), 'windy_1': (TWO_POSES, WIND, 1),
+           'calm': (THREE_POSES, None, 5)}      # name -> poses, wind, seed
+folder: Path | None = None      # set by conftest.py, the same for all workers
+
+
+def flight(name):
+    """Bag of a flight by the hover controller; the first caller flies it."""
+    bag = folder / name
+    with open(folder / f'{name}.lock', 'w') as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not bag.exists():
+            poses, wind, seed = FLIGHTS[name]
+            hover(folder / 'new' / name, poses, wind, seed=seed).rename(bag)
+    return bag
+
+
+def hover(bag, poses, wind=None, **options):
+    """Fly poses by the hover controller, in a wind that is not in the robot file."""
+    robot = beetle_omni_ros.robot()
+    bag.parent.mkdir(exist_ok=True)
+    beetle_omni_ros.simulate('hover', poses, bag=bag, **options, plant=replace(
+        robot, effects={'wind': {'force': tuple(wind)}}) if wind is not None else robot)
+    return bag
