@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import sqrt
 
 import numpy as np
 
@@ -81,17 +82,24 @@ class RotorReading:
     speed: np.ndarray
 
 
+AGREE = 0.5         # squared cosine: two independent errors agree with a probability of 5 %
+LONGEST_HELD = 5    # readings
+
+
 class SpikeFilter:
     """
-    Rejects single outliers of the IMU: a jump is used only if the next reading confirms it.
+    Rejects outliers of the IMU: a jump is used only if the next reading confirms it.
+
+    An impact pushes again in about the same direction, and the rate that it causes remains. Two
+    independent errors in a row rarely agree in all six axes.
 
     Args:
         force_change: largest change of the specific force between two readings [m/s^2].
         rate_change: largest change of the angular rate between two readings [rad/s].
 
     Attributes:
-        lasted: whether the latest reading confirmed a held one. That is an impact, of which one
-            reading is missing.
+        lasted: whether the latest reading confirmed a held one. That is an impact, of which at
+            least one reading is missing.
 
     """
 
@@ -102,16 +110,27 @@ class SpikeFilter:
     def reset(self) -> None:
         """Forget the readings so far."""
         self._last: tuple[np.ndarray, np.ndarray] | None = None
-        self._held = self.lasted = False
+        self._held: np.ndarray | None = None
+        self._count, self.lasted = 0, False
 
     def passes(self, force: np.ndarray, rate: np.ndarray) -> bool:
         """Whether a reading (3,) [m/s^2], (3,) [rad/s] is used; False holds it back."""
-        far = False
+        self.lasted = False
         if self._last is not None:
             push, turn = force - self._last[0], rate - self._last[1]
-            far = bool(push.dot(push) > self._limits[0] or turn.dot(turn) > self._limits[1])
-        self.lasted = far and self._held
-        self._held = far and not self._held
-        if not self._held:
-            self._last = force, rate
-        return not self._held
+            if push.dot(push) > self._limits[0] or turn.dot(turn) > self._limits[1]:
+                held, jump = self._held, self._scaled(push, turn)
+                self._held, self._count = jump, self._count + 1
+                if held is None or not (self._agree(held, jump) or self._count > LONGEST_HELD):
+                    return False
+                self.lasted = True
+        self._held, self._count, self._last = None, 0, (force, rate)
+        return True
+
+    def _scaled(self, push, turn):
+        return np.concatenate([push / sqrt(self._limits[0]), turn / sqrt(self._limits[1])])
+
+    @staticmethod
+    def _agree(a, b):
+        dot = a.dot(b)
+        return dot > 0 and dot**2 >= AGREE * a.dot(a) * b.dot(b)
