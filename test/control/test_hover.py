@@ -15,7 +15,7 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 ROBOT = RobotParameters.load()
 PARAMETERS = HoverParameters.load()
 PERIOD = PARAMETERS.period
-HOME = np.array([0.0, 0.0, 1.0])
+HOME, LEVEL = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 0.0, 1.0])
 
 
 def unit(rng, size=3):
@@ -83,10 +83,19 @@ def test_hovers_with_thrust_along_an_arm_where_one_rotor_is_unloaded():
 
 
 def test_the_observer_removes_the_steady_error_of_a_wrong_mass():
-    level = np.array([0, 0, 0, 1.0])
-    plant, in_force = start(level, mass_scale=1.1)
-    log = fly(plant, HoverController(ROBOT), PoseTarget(HOME, level), 3.0, in_force)
+    plant, in_force = start(LEVEL, mass_scale=1.1)
+    log = fly(plant, HoverController(ROBOT), PoseTarget(HOME, LEVEL), 3.0, in_force)
     assert log[-1][0] < 0.01
+
+
+@pytest.mark.parametrize('rotor', range(4))
+def test_the_observer_removes_the_tilt_that_a_weak_rotor_causes(rotor):
+    missing = np.zeros(4)
+    missing[rotor] = -0.3 * Allocator(ROBOT).hover(LEVEL, np.zeros(4)).thrust[rotor]
+    _, torque = Allocator(ROBOT).wrench(np.zeros(4), missing)
+    plant, in_force = start(LEVEL, torque_body=torque)
+    log = fly(plant, HoverController(ROBOT), PoseTarget(HOME, LEVEL), 4.0, in_force)
+    assert log[-1][1] < np.radians(1)
 
 
 def test_takes_over_without_a_jump_from_any_command_in_force():

@@ -86,9 +86,18 @@ def test_a_thrust_in_another_direction_is_a_slipped_joint(joint, angle):
     assert watch.slipped[0] == joint and watch.slipped[1] == pytest.approx(angle, abs=0.25)
 
 
+@pytest.mark.parametrize('rotor', range(4))
+def test_a_loss_of_two_fifths_is_a_lost_rotor_if_it_lasts(rotor):
+    body, watch = Body(ATTITUDES[1], seed=rotor), wrench_watch()
+    assert body.feed(watch, 2.0) is None
+    works = np.where(np.arange(4) == rotor, 0.6, 1.0)
+    assert P.rotor.steady_time < body.feed(watch, 4.0, works) < 3.0
+    assert watch.lost == rotor
+
+
 def test_a_weaker_rotor_and_an_external_push_are_not_a_lost_rotor():
     body, watch = Body(ATTITUDES[0]), wrench_watch()
-    assert body.feed(watch, 0.5, works=np.array([0.8, 1, 1, 1])) is None
+    assert body.feed(watch, 4.0, works=np.array([0.8, 1, 1, 1])) is None
     body, watch = Body(ATTITUDES[0]), wrench_watch()
     assert body.feed(watch, 2.0, push=np.array([20.0, 0, 0])) is None
     assert np.linalg.norm(watch.unexplained) == pytest.approx(20.0 / ALLOCATOR.mass, rel=0.05)

@@ -49,6 +49,19 @@ class RotorLimits:
         low=0.005, high=1)
     time_alone: float = parameter(
         0.3, doc='duration until detection by the wrench alone', unit='s', low=0.005, high=2)
+    steady_share: float = parameter(
+        0.35, doc='missing share of the thrust of a lost rotor, if the loss lasts', low=0.1,
+        high=1)
+    steady_filter: float = parameter(
+        0.5, doc='time constant of the filter of a lasting loss', unit='s', low=0.05, high=10)
+    steady_explained: float = parameter(
+        0.8, doc='smallest share of the squared residual that a lasting loss explains', low=0.1,
+        high=1)
+    steady_evidence: float = parameter(
+        2.0, doc='smallest residual of a lasting loss, in the deviations above', low=0.5,
+        high=1000)
+    steady_time: float = parameter(
+        1.0, doc='duration of a lasting loss until detection', unit='s', low=0.05, high=10)
     noticed: float = parameter(
         0.25, doc='missing share of the thrust by ESC telemetry that confirms a loss', low=0.05,
         high=1)

@@ -15,6 +15,7 @@ LONGEST = 0.05          # [s] between two IMU samples; a longer gap resets the f
 AFTER_HIT = 1.0         # [s] after an impact, in which a push at any height is contact
 SPAN, LONGEST_TRACK = 3, 0.12   # poses of either velocity; [s] of both
 USUAL = 1.0             # [s] time constant of the learnt steady push in the air
+BETWEEN = 0.05          # [s] between two updates of the slower filter
 
 
 class WrenchWatch:
@@ -25,7 +26,8 @@ class WrenchWatch:
     Model and measurement pass the same first-order filter. The residual, weighted by that of
     healthy flights, is fitted by another thrust vector of each rotor, one rotor at a time. A
     vector near zero is a lost rotor, one of about the same length a tilt that differs from its
-    encoder.
+    encoder. A second, slower filter finds a smaller loss that lasts, as of a broken propeller:
+    averaged over a manoeuvre the residual of a healthy robot is small.
 
     Args:
         rotor: thresholds of a lost rotor.
@@ -61,6 +63,8 @@ class WrenchWatch:
         self._stamp: float | None = None
         self.supported = np.zeros(ROTORS, dtype=bool)
         self._filtered, self._vectors = np.zeros(6), np.zeros((ROTORS, 2))
+        self._steady, self._steady_vectors = np.zeros(6), np.zeros((ROTORS, 2))
+        self._waited = 0.0
         self.forget()
         self.impact = 0.0
         self.unexplained = np.zeros(3)
@@ -68,6 +72,7 @@ class WrenchWatch:
     def forget(self) -> None:
         """Suspect no rotor."""
         self._lost_for, self._slipped_for = np.zeros(ROTORS), np.zeros(ROTORS)
+        self._weak_for = np.zeros(ROTORS)
         self._suspects = False
         self.lost: int | None = None
         self.slipped: tuple[int, float] | None = None
@@ -113,7 +118,36 @@ class WrenchWatch:
         gain = 1 - exp(-dt / self._contact.filter)
         self._filtered += gain * (measured - modelled - self._filtered)
         self._vectors += gain * (vectors - self._vectors)
+        self._waited += dt
+        if self._waited >= BETWEEN:
+            self._judge_steady(self._waited)
+            self._waited = 0.0
         self._judge(dt)
+
+    def _judge_steady(self, dt):
+        """Count the time for which a rotor has lost a smaller share."""
+        p = self._p
+        gain = -expm1(-dt / p.steady_filter)
+        self._steady += gain * (self._filtered - self._steady)
+        self._steady_vectors += gain * (self._vectors - self._steady_vectors)
+        residual = self._steady * self._weights
+        size = float(residual @ residual)
+        weak = np.zeros(ROTORS, dtype=bool)
+        if size > p.steady_evidence**2:
+            i, rest = self._culprit(residual)
+            length = float(np.hypot(*self._steady_vectors[i]))
+            true = self._steady_vectors[i] + self._fits[i] @ residual
+            weak[i] = rest @ rest < (1 - p.steady_explained) * size \
+                and length > p.least_thrust \
+                and float(np.hypot(*true)) < (1 - p.steady_share) * length
+        self._weak_for = self._counted(self._weak_for, weak, dt)
+
+    def _culprit(self, residual):
+        """The rotor (0 to 3) that explains most of a weighted residual, and the rest of it."""
+        left = [residual - basis @ (fit @ residual)
+                for basis, fit in zip(self._bases, self._fits)]
+        i = int(np.argmin([rest @ rest for rest in left]))
+        return i, left[i]
 
     def _judge(self, dt):
         """The rotor whose thrust vector explains the residual, and this vector."""
@@ -121,28 +155,28 @@ class WrenchWatch:
         residual = self._filtered * self._weights
         size = float(residual.dot(residual))
         self.unexplained = self._filtered[:3]
+        self.lost = self._first(self._weak_for >= p.steady_time)
         if size <= p.least_evidence**2 and not self._suspects:
             return
         lost, slipped = np.zeros(ROTORS, dtype=bool), np.zeros(ROTORS, dtype=bool)
         angle = 0.0
         if size > p.least_evidence**2:
-            left = [residual - basis @ (fit @ residual)
-                    for basis, fit in zip(self._bases, self._fits)]
-            i = int(np.argmin([rest @ rest for rest in left]))
+            i, rest = self._culprit(residual)
             modelled = self._vectors[i]
             length = float(np.hypot(*modelled))
-            if left[i] @ left[i] < (1 - p.explained) * size and length > p.least_thrust:
+            if rest @ rest < (1 - p.explained) * size and length > p.least_thrust:
                 true = modelled + self._fits[i] @ residual
                 share = float(np.hypot(*true)) / length
                 angle = float(np.arctan2(modelled[0] * true[1] - modelled[1] * true[0],
                                          modelled @ true))
                 lost[i] = share < 1 - p.share
                 slipped[i] = abs(share - 1) < p.share and abs(angle) > p.slip
-                self.unexplained = left[i][:3] / self._weights[:3]
+                self.unexplained = rest[:3] / self._weights[:3]
         self._lost_for = self._counted(self._lost_for, lost, dt)
         self._slipped_for = self._counted(self._slipped_for, slipped, dt)
         self._suspects = bool(self._lost_for.any() or self._slipped_for.any())
-        self.lost = self._first(self._lost_for >= np.where(self.supported, p.time, p.time_alone))
+        at_once = self._first(self._lost_for >= np.where(self.supported, p.time, p.time_alone))
+        self.lost = self.lost if at_once is None else at_once
         joint = self._first(self._slipped_for >= p.slip_time)
         self.slipped = None if joint is None or not slipped[joint] else (joint, angle)
 
