@@ -153,15 +153,18 @@ class HoverController:
         force, torque = self._allocator.wrench(state.tilt, self._thrust)
         rate, inertia, p = state.angular_velocity, self._robot.inertia, self.parameters
         gain = -expm1(-dt / p.disturbance_time)
-        # linear and angular acceleration in one array, which halves the number of operations
-        modelled, measured = np.empty(6), np.empty(6)
-        modelled[:3] = (rotations.matrix(state.quaternion).dot(force) - self._allocator.weight) \
-            / self._allocator.mass
-        modelled[3:] = (torque - rotations.cross(rate, inertia * rate)) / inertia
-        measured[:3] = state.velocity - before.velocity
-        measured[3:] = rate - before.angular_velocity
+        mass, weight = self._allocator.mass, self._allocator.weight.tolist()
+        # plain floats, because each numpy operation takes longer than these together
+        (x, y, z), (i, j, k), (a, b, c) = rate.tolist(), inertia.tolist(), torque.tolist()
+        modelled = [(own - other) / mass for own, other in zip(
+            rotations.matrix(state.quaternion).dot(force).tolist(), weight)]
+        modelled += [(a - (y * (k * z) - z * (j * y))) / i, (b - (z * (i * x) - x * (k * z))) / j,
+                     (c - (x * (j * y) - y * (i * x))) / k]
+        changes = (state.velocity - before.velocity).tolist() \
+            + (rate - before.angular_velocity).tolist()
         old = self._disturbance
-        new = old + gain * (measured / dt - modelled - old)
+        new = np.array([part + gain * (change / dt - model - part) for part, change, model in zip(
+            old.tolist(), changes, modelled)])
         old[:3] = _shortened(new[:3], p.position.disturbance_limit)
         old[3:] = _shortened(new[3:], p.attitude.disturbance_limit)
 

@@ -268,8 +268,8 @@ class ErrorStateModel:
     def _inject(self, prior: Node, error: np.ndarray, covariance: np.ndarray) -> Node:
         """Add the estimated error to the state; the remaining error has mean zero."""
         turn = error[ATTITUDE].tolist()
-        quaternion = rotations.normalized(
-            rotations.multiply(prior.quaternion, rotations.exp(turn)))
+        quaternion = rotations.normalized(np.array(rotations.product(
+            *prior.quaternion.tolist(), *rotations.exp_parts(*turn))))
         # The remaining attitude error refers to the corrected attitude: right Jacobian of SO(3),
         # first order.
         shift = rotations.skew([-0.5 * angle for angle in turn])

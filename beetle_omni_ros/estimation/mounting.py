@@ -104,7 +104,8 @@ class Mounting:
         velocity0, rate0, slopes = node.velocity.tolist(), node.rate.tolist(), trend.tolist()
         turn = [age * (w - bias + 0.5 * age * slope)
                 for w, bias, slope in zip(rate0, node.gyroscope_bias.tolist(), slopes)]
-        quaternion = rotations.multiply(node.quaternion, rotations.exp(turn))
+        quaternion = np.array(rotations.product(*node.quaternion.tolist(),
+                                                *rotations.exp_parts(*turn)))
         acceleration = node.rotation.dot(node.force - node.accelerometer_bias).tolist()
         acceleration[2] -= self._gravity
         position = [p + age * v + 0.5 * age ** 2 * a

@@ -94,10 +94,10 @@ def propagate(node: Node, stamp: float, force: np.ndarray, rate: np.ndarray,
     ax, ay, az = (node.rate - node.gyroscope_bias).tolist()
     bx, by, bz = (rate - node.gyroscope_bias).tolist()
     h, c = 0.5 * dt, dt * dt / 12
-    turn = rotations.exp((h * (ax + bx) + c * (ay * bz - az * by),
-                          h * (ay + by) + c * (az * bx - ax * bz),
-                          h * (az + bz) + c * (ax * by - ay * bx)))
-    x, y, z, w = rotations.product(*node.quaternion.tolist(), *turn.tolist())
+    turn = rotations.exp_parts(h * (ax + bx) + c * (ay * bz - az * by),
+                               h * (ay + by) + c * (az * bx - ax * bz),
+                               h * (az + bz) + c * (ax * by - ay * bx))
+    x, y, z, w = rotations.product(*node.quaternion.tolist(), *turn)
     scale = 1.5 - 0.5 * (x * x + y * y + z * z + w * w)  # Newton step of 1 / norm near 1
     unit = (scale * x, scale * y, scale * z, scale * w)
     rotation = rotations.matrix(unit)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -39,7 +40,7 @@ class ActuatorHealth:
             if len(getattr(self, name)) != 4:
                 raise ValueError(f'{name}: expected four, found {len(getattr(self, name))}')
 
-    @property
+    @cached_property
     def healthy(self) -> bool:
         """Whether every actuator follows commands; a wrong joint zero counts as healthy."""
         return all(self.rotors) and self.stuck == self.held == (None,) * 4 \

@@ -51,14 +51,18 @@ def conjugate(quaternion: Vector) -> np.ndarray:
 
 def exp(vector: Vector) -> np.ndarray:
     """Unit quaternion of a rotation vector [rad]."""
-    x, y, z = _floats(vector)
+    return np.array(exp_parts(*_floats(vector)))
+
+
+def exp_parts(x: float, y: float, z: float) -> tuple[float, ...]:
+    """Components x, y, z, w of :func:`exp`, for :func:`product`."""
     squared = x * x + y * y + z * z
     if squared < 1e-12:
         scale, w = 0.5 - squared / 48, 1 - squared / 8
     else:
         angle = sqrt(squared)
         scale, w = sin(0.5 * angle) / angle, cos(0.5 * angle)
-    return np.array([scale * x, scale * y, scale * z, w])
+    return scale * x, scale * y, scale * z, w
 
 
 def log(quaternion: Vector) -> np.ndarray:

@@ -24,6 +24,8 @@ from beetle_omni_ros.runs.log import (
     WIDTHS,
 )
 
+CHANNELS = {series: tuple(channels.items()) for series, channels in SERIES.items()}
+
 
 class Recorder:
     """
@@ -105,7 +107,7 @@ class LogRecorder(Recorder):
             self._add_all(series, rows, value, received)
             return
         row = [stamp]
-        for channel, width in SERIES[series].items():
+        for channel, width in CHANNELS[series]:
             if not width:
                 row.append(getattr(value, channel) if channel != 'received' else
                            stamp if received is None else received)

@@ -1,7 +1,7 @@
 """Checks of commands, and a record of each controller's valid and refused commands."""
 
 from collections import Counter
-from math import isfinite
+from math import inf, isfinite
 
 import numpy as np
 
@@ -111,8 +111,8 @@ class CommandStream:
 
     def tick(self, dt: float) -> None:
         """``dt`` seconds passed."""
-        if self.silence.from_the_start and self._overstepping.from_the_start:
-            return
+        if self.silence.elapsed == self._overstepping.elapsed == inf:
+            return      # no command yet
         self.silence.tick(dt)
         self._overstepping.tick(dt)
         self.good_for = 0.0 if self.silence.silent else self.good_for + dt
@@ -121,7 +121,7 @@ class CommandStream:
         """Accept new stamps after a step of the clock."""
         if self.accepted is not None and self.accepted.stamp > now:
             self.accepted = self._offered = self.cut = None
-            self.silence.elapsed = float('inf')
+            self.silence.elapsed = inf
 
     def _slightly(self, command, clean):
         """Whether a command exceeds the limits by at most a share of the ranges."""

@@ -213,7 +213,7 @@ class Supervisor(Inputs):
             self._look_down(now, dt)
         if self.watch.contact:
             self._crash(now, self.watch.contact)
-        elif self.watch.health != self._health:
+        elif self.watch.health is not self._health and self.watch.health != self._health:
             self._degrade(now)
 
     def _degrade(self, now):
@@ -485,7 +485,9 @@ class Supervisor(Inputs):
                                   f'{1000 * (now - command.stamp):.0f} ms old: nothing sent',
                       'old command')
             return None
-        self._in_force = within_limits(command, self._robot, stopped=self.source == 'none')
+        stopped = self.source == 'none'
+        if command is not self._in_force or stopped:    # each command is checked once
+            self._in_force = within_limits(command, self._robot, stopped=stopped)
         if self._in_force is None:
             self.emergency_stop(now, f'{self.source} gave a command that is not finite')
         return self._in_force

@@ -193,7 +193,8 @@ class Sensors:
     def _capture(self, truth):
         noise = self._mocap_noise.next()
         return PoseReading(truth.stamp + self._errors.mocap_delay, truth.position + noise[:3],
-                           rotations.multiply(truth.quaternion, rotations.exp(noise[3:])))
+                           np.array(rotations.product(*truth.quaternion.tolist(),
+                                                      *rotations.exp_parts(*noise[3:].tolist()))))
 
     def _joint_reading(self):
         stamp, tilt, velocity, effort = self._joints[0]
@@ -217,7 +218,7 @@ def mean_motion(before: Truth, after: Truth, gravity: float) -> np.ndarray:
     dt = after.stamp - before.stamp
     x, y, z, w = own = before.quaternion.tolist()
     turn = rotations.log(rotations.product(-x, -y, -z, w, *after.quaternion.tolist()))
-    middle = rotations.product(*own, *rotations.exp(0.5 * turn).tolist())
+    middle = rotations.product(*own, *rotations.exp_parts(*(0.5 * turn).tolist()))
     acceleration = (after.velocity - before.velocity) / dt
     acceleration[2] += gravity
     motion = np.empty(6)

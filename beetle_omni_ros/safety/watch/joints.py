@@ -74,7 +74,7 @@ class JointWatch:
             self._change, self.jump = np.zeros(ROTORS), NO_JUMP
             return True
         change = tilt - before
-        step = self._step(asked, dt)
+        step = self._step(asked - self.model, dt)
         furthest = self._rate_limit * dt + self._p.jump
         if max(map(abs, change.tolist())) > furthest:
             jumped = np.abs(change) > furthest
@@ -92,13 +92,12 @@ class JointWatch:
         if self.model is None or asked is None or dt <= 0:
             return
         self.stamp = stamp
-        self.model = self.model + self._step(asked, min(dt, LONGEST))
+        self.model = self.model + self._step(asked - self.model, min(dt, LONGEST))
 
-    def _step(self, asked, dt):
+    def _step(self, error, dt):
         """Motion (4,) [rad] of servos of first order with a limited rate in ``dt`` [s]."""
-        reach = self._rate_limit * dt
-        step = (asked - self.model) * -expm1(-dt / self._lag)
-        return np.minimum(np.maximum(step, -reach), reach)
+        reach, share = self._rate_limit * dt, -expm1(-dt / self._lag)
+        return np.array([min(max(each * share, -reach), reach) for each in error.tolist()])
 
     def _judge(self, tilt, dt, step):
         p = self._p

@@ -5,7 +5,6 @@ from math import exp, expm1, sqrt
 
 import numpy as np
 
-from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth
 from beetle_omni_ros.robot.allocation import Allocator, ROTORS
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -48,7 +47,7 @@ class WrenchWatch:
     def __init__(self, rotor: RotorLimits, contact: ContactLimits, robot: RobotParameters,
                  allocator: Allocator):
         self._p, self._contact, self._robot, self._allocator = rotor, contact, robot, allocator
-        rotors = robot.rotors
+        rotors, self._inertia = robot.rotors, robot.inertia.tolist()
         self._reach = ROTORS * rotors.thrust_max / allocator.mass
         self._units = np.concatenate([np.full(3, allocator.mass), robot.inertia])
         self._weights = 1 / np.repeat([rotor.force_noise, rotor.torque_noise], 3)
@@ -106,10 +105,7 @@ class WrenchWatch:
             return
         self._thrust += -expm1(-dt / self._robot.rotors.time_constant) \
             * (commanded - self._thrust)
-        inertia = self._robot.inertia
-        measured = np.empty(6)
-        measured[:3] = force
-        measured[3:] = (rate - self._rate) / dt + rotations.cross(rate, inertia * rate) / inertia
+        measured = np.array(force.tolist() + self._angular_acceleration(rate.tolist(), dt))
         self._rate = rate
         vectors = np.empty((ROTORS, 2))
         vectors[:, 0] = np.cos(tilt) * self._thrust
@@ -123,6 +119,13 @@ class WrenchWatch:
             self._judge_steady(self._waited)
             self._waited = 0.0
         self._judge(dt)
+
+    def _angular_acceleration(self, rate, dt):
+        """Torque by the gyroscope over inertia, three floats; numpy is slower here."""
+        (x, y, z), (i, j, k), (a, b, c) = rate, self._inertia, self._rate.tolist()
+        return [(x - a) / dt + (y * (k * z) - z * (j * y)) / i,
+                (y - b) / dt + (z * (i * x) - x * (k * z)) / j,
+                (z - c) / dt + (x * (j * y) - y * (i * x)) / k]
 
     def _judge_steady(self, dt):
         """Count the time for which a rotor has lost a smaller share."""
