@@ -1,5 +1,6 @@
 """Manual driving by keys: targets from keys, and the restored terminal."""
 
+from contextlib import contextmanager
 import fcntl
 import os
 import pty
@@ -77,28 +78,64 @@ class Terminal:
 
 
 @pytest.fixture
-def driven(ros_domain, tmp_path):
-    """A graph in simulated time, its witness, its targets, and a driving terminal."""
+def graph(ros_domain, tmp_path):
+    """A graph in simulated time; (domain, witness)."""
     graph = Graph({name: {} for name in NODES}, tmp_path, ros_domain, simulated=True)
-    witness = terminal = None
+    witness = None
     try:
         graph.start()
-        witness, targets = Witness(ros_domain), []
+        witness = Witness(ros_domain)
         assert witness.wait(lambda: witness.ready, READY), graph.dead()
-        wire.subscribe(witness._node, 'target_pose', targets.append, qos=EVENT)
-        terminal = Terminal(ros_domain)
-        assert witness.wait(lambda: terminal.shows('q quit'), PATIENCE), terminal.text
-        yield witness, targets, terminal
+        yield ros_domain, witness
     finally:
-        if terminal:
-            terminal.close()
         graph.stop()
         if witness:
             witness.close()
 
 
-def test_keys_become_targets_and_q_restores_the_terminal(driven):
-    witness, targets, terminal = driven
+@contextmanager
+def driving(graph):
+    """A driving terminal that shows its keys."""
+    domain, witness = graph
+    terminal = Terminal(domain)
+    try:
+        assert witness.wait(lambda: terminal.shows('q quit'), PATIENCE), terminal.text
+        yield witness, terminal
+    finally:
+        terminal.close()
+
+
+def test_keys_become_targets_and_each_end_restores_the_terminal(graph):
+    """One graph for all, because its start takes longer."""
+    with driving(graph) as (witness, terminal):
+        ctrl_c_restores_the_terminal(witness, terminal)
+    with driving(graph) as (witness, terminal):
+        a_terminal_that_closes_ends_the_driver(witness, terminal)
+    with driving(graph) as (witness, terminal):
+        keys_become_targets_and_q_restores_the_terminal(witness, terminal)
+
+
+def ctrl_c_restores_the_terminal(witness, terminal):
+    assert witness.wait(lambda: not terminal.echoes, 10)
+    terminal.press('\x03')
+    assert terminal.ends(witness) == 130
+    assert 'Traceback' not in terminal.text
+    assert 'left; the robot holds its last target' in terminal.text
+    assert terminal.state == terminal.before
+
+
+def a_terminal_that_closes_ends_the_driver(witness, terminal):
+    terminal.press('\x04')      # Ctrl-D is no end of input if keys are read one by one
+    witness.spin(0.5)
+    assert terminal.process.poll() is None
+    os.close(terminal.mine)
+    assert witness.wait(lambda: terminal.process.poll() is not None, PATIENCE)
+    terminal.mine = os.open(os.devnull, os.O_RDONLY)
+
+
+def keys_become_targets_and_q_restores_the_terminal(witness, terminal):
+    targets = []
+    wire.subscribe(witness._node, 'target_pose', targets.append, qos=EVENT)
     assert witness.wait(lambda: not terminal.echoes, 10)
     terminal.press('w')
     assert witness.wait(lambda: terminal.shows('arm first'), PATIENCE), terminal.text
@@ -118,23 +155,3 @@ def test_keys_become_targets_and_q_restores_the_terminal(driven):
     assert terminal.ends(witness) == 0
     assert 'left; the robot holds its last target' in terminal.text
     assert terminal.state == terminal.before and witness.state.startswith('flying')
-
-
-def test_ctrl_c_restores_the_terminal(driven):
-    witness, _, terminal = driven
-    assert witness.wait(lambda: not terminal.echoes, 10)
-    terminal.press('\x03')
-    assert terminal.ends(witness) == 130
-    assert 'Traceback' not in terminal.text
-    assert 'left; the robot holds its last target' in terminal.text
-    assert terminal.state == terminal.before
-
-
-def test_a_terminal_that_closes_ends_the_driver(driven):
-    witness, _, terminal = driven
-    terminal.press('\x04')      # Ctrl-D is no end of input if keys are read one by one
-    witness.spin(0.5)
-    assert terminal.process.poll() is None
-    os.close(terminal.mine)
-    assert witness.wait(lambda: terminal.process.poll() is not None, PATIENCE)
-    terminal.mine = os.open(os.devnull, os.O_RDONLY)
