@@ -33,9 +33,10 @@ LENGTH_UNITS = {1.0: '', 1e3: 'in millimetres, not metres', 100.0: 'in centimetr
                 1e-3: 'in kilometres, not metres', 1 / 0.3048: 'in feet, not metres',
                 1 / 0.0254: 'in inches, not metres'}
 AXES = 'xyz'
-ALL_AXES = [np.array([[sign * (place == column) for column in range(3)]
-                      for sign, place in zip(signs, order, strict=True)], dtype=float)
-            for order in permutations(range(3)) for signs in product((1, -1), repeat=3)]
+ALL_AXES = np.array([[[sign * (place == column) for column in range(3)]
+                      for sign, place in zip(signs, order, strict=True)]
+                     for order in permutations(range(3))
+                     for signs in product((1, -1), repeat=3)], dtype=float)
 UPS = [np.eye(3)[k] * sign for k in (2, 1, 0) for sign in (1, -1)]      # (0, 0, 1) first
 ONE = np.eye(3)
 
@@ -175,23 +176,26 @@ def _most_likely(m, robot, part, moving):
 def _matched(measured, seen, units, count):
     """(log likelihood, axes, unit) of the ten best signed permutations and units."""
     cross, size, total = measured.T @ seen, (seen**2).sum(), (measured**2).sum()
-    result = []
-    for unit in units:
-        for axes in ALL_AXES:
-            left = total - 2 * unit * (axes * cross).sum() + unit**2 * size
-            part = max(left / max(total, 1e-12), FLOOR)
-            result.append((-1.5 * count * np.log(part) - PRIOR * (unit != 1.0), axes, unit))
-    result.sort(key=lambda one: -one[0])
-    return [(score, ONE if (axes == ONE).all() else axes, unit)
-            for score, axes, unit in result[:10]]
+    common = (ALL_AXES * cross).reshape(len(ALL_AXES), -1).sum(axis=1)
+    scores = np.concatenate([
+        -1.5 * count * np.log(np.maximum((total - 2 * unit * common + unit**2 * size)
+                                         / max(total, 1e-12), FLOOR)) - PRIOR * (unit != 1.0)
+        for unit in units])
+    best = []
+    for index in np.argsort(-scores, kind='stable')[:10]:
+        unit, axes = tuple(units)[index // len(ALL_AXES)], ALL_AXES[index % len(ALL_AXES)]
+        best.append((scores[index], ONE if (axes == ONE).all() else axes, unit))
+    return best
 
 
 def _price(rate_axes, force_axes):
     """Prior cost of one rotated or mirrored frame, or of two mistakes."""
     if rate_axes is ONE and force_axes is ONE:
         return 0.0
-    same = np.allclose(rate_axes, np.linalg.det(force_axes) * force_axes)
-    return PRIOR * (1 if same or rate_axes is ONE or force_axes is ONE else 2)
+    if rate_axes is ONE or force_axes is ONE:
+        return PRIOR
+    same = (rate_axes == np.linalg.det(force_axes) * force_axes).all()
+    return PRIOR * (1 if same else 2)
 
 
 def _in_a_part(recording, m, robot, limits, parts, moving, usual_rate, usual_force):
