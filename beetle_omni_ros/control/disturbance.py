@@ -17,6 +17,7 @@ from beetle_omni_ros.control.call import FunctionCall
 from beetle_omni_ros.control.nmpc_parameters import DisturbanceParameters
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
+from beetle_omni_ros.robot.allocation import clipped
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 LONGEST_STEP = 0.1  # [s] a longer gap between states restarts the actuator model
@@ -183,8 +184,3 @@ class DisturbanceEstimator:
                 return tilt + part * (later[1] - tilt)
             later = (time, tilt)
         return None
-
-
-def clipped(values: np.ndarray, low: np.ndarray | float, high: np.ndarray | float) -> np.ndarray:
-    """As np.clip, which takes three times as long for a few numbers."""
-    return np.minimum(np.maximum(values, low), high)

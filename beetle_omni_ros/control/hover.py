@@ -24,6 +24,7 @@ import numpy as np
 from beetle_omni_ros.control.base import Command, Followed, State
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
+from beetle_omni_ros.robot.allocation import clipped
 from beetle_omni_ros.robot.degraded_allocation import allocator, DegradedAllocator, LocalWeights
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import group, parameter, ParameterFile
@@ -219,14 +220,14 @@ class HoverController:
             np.minimum(1.0, goal.thrust / p.tilt_full_thrust)
         limit = self._robot.joints.position_limit
         reach = p.tilt_rate * dt * busy
-        tilt = np.clip(present + np.clip(goal.tilt - present, -reach, reach), -limit, limit)
+        tilt = clipped(present + clipped(goal.tilt - present, -reach, reach), -limit, limit)
         thrust = self._thrust_on_the_way(goal, state.tilt)
         lead = rotors.time_constant / p.thrust_response
         thrust = self._thrust + max(lead, 1.0) * (thrust - self._thrust)
         if state.command is not None:
             reach = p.thrust_rate * dt
-            thrust = np.clip(thrust, state.command.thrust - reach, state.command.thrust + reach)
-        thrust = np.clip(thrust, rotors.thrust_min, self._thrust_max)
+            thrust = clipped(thrust, state.command.thrust - reach, state.command.thrust + reach)
+        thrust = clipped(thrust, rotors.thrust_min, self._thrust_max)
         return (tilt, thrust) if self._health.healthy else self._health.possible(tilt, thrust)
 
     def _thrust_on_the_way(self, goal, tilt):
@@ -252,7 +253,7 @@ class HoverController:
             thrust[free] = np.linalg.solve(columns.T @ columns + DAMPING * np.eye(free.sum()),
                                            columns.T @ rest + DAMPING * helpful[free])
             outside = (thrust < rotors.thrust_min) | (thrust > self._thrust_max)
-            thrust = np.clip(thrust, rotors.thrust_min, self._thrust_max)
+            thrust = clipped(thrust, rotors.thrust_min, self._thrust_max)
             if not np.any(outside & free):
                 break
             free &= ~outside

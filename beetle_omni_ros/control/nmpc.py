@@ -8,13 +8,14 @@ import numpy as np
 from beetle_omni_ros.control import ocp
 from beetle_omni_ros.control.base import Command, State, Target
 from beetle_omni_ros.control.call import FunctionCall
-from beetle_omni_ros.control.disturbance import clipped, DisturbanceEstimator
+from beetle_omni_ros.control.disturbance import DisturbanceEstimator
 from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
 from beetle_omni_ros.control.references import ReferencePlanner
 from beetle_omni_ros.control.rti import CompiledRti, InterpretedRti
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot import effects
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
+from beetle_omni_ros.robot.allocation import clipped
 from beetle_omni_ros.robot.native import CompilerError
 from beetle_omni_ros.robot.parameters import RobotParameters
 

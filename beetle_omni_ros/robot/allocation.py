@@ -176,6 +176,11 @@ class Allocator:
         return (angle, False) if abs(angle) <= limit else (copysign(limit, angle), True)
 
 
+def clipped(values: np.ndarray, low: np.ndarray | float, high: np.ndarray | float) -> np.ndarray:
+    """As np.clip, which takes three times as long for a few numbers."""
+    return np.minimum(np.maximum(values, low), high)
+
+
 def allocate(robot: RobotParameters, force: np.ndarray, torque: np.ndarray,
              present_tilt: np.ndarray) -> Allocation:
     """One allocation by :meth:`Allocator.allocate`; for many, construct an Allocator once."""

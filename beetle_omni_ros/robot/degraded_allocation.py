@@ -17,7 +17,7 @@ from itertools import combinations
 import numpy as np
 
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
-from beetle_omni_ros.robot.allocation import Allocation, Allocator, ROTORS, SINGULAR
+from beetle_omni_ros.robot.allocation import Allocation, Allocator, clipped, ROTORS, SINGULAR
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import parameter
 
@@ -141,7 +141,7 @@ class DegradedAllocator(Allocator):
                 thrust[i] = length
             else:
                 tilt[i], cut[i] = self._inside(float(tilt[i]))
-        held = np.clip(thrust, 0.0, self._thrust_max)
+        held = clipped(thrust, 0.0, self._thrust_max)
         return Allocation(tilt, held, cut | (not met))
 
     def allocate_near(self, force: np.ndarray, torque: np.ndarray, tilt: np.ndarray,
@@ -162,21 +162,21 @@ class DegradedAllocator(Allocator):
             weights: weights of the terms.
 
         """
-        scale = self._scale * np.r_[np.ones(3), np.full(3, weights.turning)]
+        scale = self._scale * np.repeat([1.0, weights.turning], 3)
         matrix, wrench = scale[:, None] * self.matrix, scale * np.concatenate([force, torque])
         still = [angle is not None for angle in self._health.stuck]
         centre, _ = self._health.possible(tilt, aim.thrust)
         reach = np.where(still, 0.0, weights.tilt_reach)
         lost = ~np.array(self._health.rotors)
         limit = self.tilt_limit
-        low = np.r_[np.clip(centre - reach, -limit, limit), np.zeros(ROTORS)]
-        high = np.r_[np.clip(centre + reach, -limit, limit),
-                     np.where(lost, 0.0, self._thrust_max)]
+        low = np.concatenate([clipped(centre - reach, -limit, limit), np.zeros(ROTORS)])
+        high = np.concatenate([clipped(centre + reach, -limit, limit),
+                               np.where(lost, 0.0, self._thrust_max)])
         for i, thrust in self.held.items():
             low[ROTORS + i] = high[ROTORS + i] = thrust
-        pull = np.r_[np.full(ROTORS, weights.tilt), np.full(ROTORS, weights.thrust)]
-        goal = np.r_[aim.tilt, aim.thrust]
-        z = np.clip(np.r_[centre, aim.thrust], low, high)
+        pull = np.repeat([weights.tilt, weights.thrust], ROTORS)
+        goal = np.concatenate([aim.tilt, aim.thrust])
+        z = clipped(np.concatenate([centre, aim.thrust]), low, high)
         made, cost = self._made(matrix, z), np.inf
         for _ in range(weights.iterations):
             cos, sin = np.cos(z[:ROTORS]), np.sin(z[:ROTORS])
@@ -249,7 +249,7 @@ def _bounded_step(jacobian, error, pull, towards, low, high):
         step[free] = np.linalg.solve(columns.T @ columns + np.diag(weight),
                                      columns.T @ rest + weight * towards[free])
         outside = (step < low) | (step > high)
-        step = np.clip(step, low, high)
+        step = clipped(step, low, high)
         if not (outside & free).any():
             break
         free &= ~outside

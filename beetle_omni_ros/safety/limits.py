@@ -6,6 +6,7 @@ from math import inf, isfinite
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, ROTORS
+from beetle_omni_ros.robot.allocation import clipped
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.events import Silence
 from beetle_omni_ros.safety.parameters import CommandLimits
@@ -146,9 +147,9 @@ class CommandStream:
             return NOT_FINITE, None
         limit, low, high = self._tilt_limit, self._rotors.thrust_min, self._rotors.thrust_max
         clean = Command(stamp,
-                        tilt if max(map(abs, angles)) <= limit else _cut(tilt, -limit, limit),
+                        tilt if max(map(abs, angles)) <= limit else clipped(tilt, -limit, limit),
                         thrust if low <= min(forces) and max(forces) <= high else
-                        _cut(thrust, low, high))
+                        clipped(thrust, low, high))
         return self._check_stamp(stamp, now) or self._check_range(tilt, thrust, clean), clean
 
     def _check_stamp(self, stamp, now):
@@ -199,13 +200,8 @@ def within_limits(command: Command, robot: RobotParameters, stopped: bool = Fals
     low, high = 0.0 if stopped else robot.rotors.thrust_min, robot.rotors.thrust_max
     if max(map(abs, tilt)) <= limit and low <= min(thrust) and max(thrust) <= high:
         return command
-    return Command(command.stamp, _cut(command.tilt, -limit, limit),
-                   _cut(command.thrust, low, high))
-
-
-def _cut(values, low, high):
-    """Clip, faster than np.clip."""
-    return np.minimum(np.maximum(values, low), high)
+    return Command(command.stamp, clipped(command.tilt, -limit, limit),
+                   clipped(command.thrust, low, high))
 
 
 def _farthest(a, b):

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 
 from beetle_omni_ros.robot import dynamics, effects, rotations
+from beetle_omni_ros.robot.allocation import clipped
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.sim.effects import CatalogueForces, MotionForces
@@ -225,8 +226,8 @@ class Plant:
         rate = self._rate
         limits = self.model.actuator_forcerange
         effort, rate_limit = joints.effort_limit, joints.velocity_limit
-        limits[4:, 0] = np.clip(gain * (-rate_limit - rate), -effort, effort)
-        limits[4:, 1] = np.clip(gain * (rate_limit - rate), -effort, effort)
+        limits[4:, 0] = clipped(gain * (-rate_limit - rate), -effort, effort)
+        limits[4:, 1] = clipped(gain * (rate_limit - rate), -effort, effort)
 
     def _apply_forces(self, ahead=0.0):
         """

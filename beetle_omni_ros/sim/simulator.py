@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from beetle_omni_ros.robot.allocation import clipped
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.sim.battery import Battery
@@ -262,7 +263,7 @@ class Simulator:
             drive.thrust[:], drive.powered[:] = 0.0, False
         limit = self._robot.joints.position_limit
         plant.set_powered(drive.powered, drive.jammed)
-        plant.set_targets(np.clip(drive.tilt, -limit, limit), drive.thrust)
+        plant.set_targets(clipped(drive.tilt, -limit, limit), drive.thrust)
         return drive.wear
 
     def _with_sensor_faults(self, frame):
