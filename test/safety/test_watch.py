@@ -274,6 +274,29 @@ def test_a_fault_stays_named_and_the_health_follows():
     assert watch.faults == {} and watch.health.healthy
 
 
+@pytest.mark.parametrize('sticks', [True, False], ids=['holds its thrust', 'stops'])
+def test_a_rotor_that_turns_but_ignores_more_thrust_is_deaf_and_not_lost(sticks):
+    watch, tilt, rotor = FaultWatch(P, ROBOT, ALLOCATOR), np.zeros(4), np.arange(4) == 2
+    thrust, rate = np.full(4, 7.0), np.zeros(3)
+    for n in range(800):
+        t = TICK * n
+        asked = 7.0 + np.where(rotor, (8.0 + 2.0 * np.sin(6.0 * t)) * (t > 2.0), np.sin(6.0 * t))
+        follows = np.where(rotor & (t > 2.0), 7.0 if sticks else 0.0, asked)
+        thrust = thrust - np.expm1(-TICK / LAG) * (follows - thrust)
+        force, torque = ALLOCATOR.wrench(tilt, thrust)
+        rate = rate + TICK * (torque - np.cross(rate, ROBOT.inertia * rate)) / ROBOT.inertia
+        command = Command(t, tilt, asked)
+        watch.on_command(command)
+        if n % 4 == 0:
+            watch.on_speeds(t, 300.0 * np.sqrt(thrust))
+        watch.on_imu(t, force / ALLOCATOR.mass, rate, tilt, command, 1.0)
+        if watch.faults:
+            break
+    assert list(watch.faults) == ['rotor3_deaf' if sticks else 'rotor3_lost']
+    assert watch.health.rotors[2] == sticks
+    assert watch.health.held[2] == (pytest.approx(7.0, abs=1.5) if sticks else None)
+
+
 @pytest.mark.parametrize('pause', [0.03, 0.3, 1.0])
 @pytest.mark.parametrize('spacing', [TICK, 1e-4, 1e-7, 0.0])
 def test_a_burst_of_samples_after_a_pause_is_neither_crash_nor_fault(pause, spacing):

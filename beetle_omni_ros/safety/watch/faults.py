@@ -122,8 +122,14 @@ class FaultWatch:
             return      # the floor also exerts a force
         if stamp < self._blind_until:
             return self._wrench.forget()
-        if self._wrench.lost is not None:
-            self._lose_rotor(self._wrench.lost, stamp, 'the wrench')
+        lost = self._wrench.lost
+        if lost is not None and self.health.rotors[lost] and self.health.held[lost] is None:
+            # A rotor that holds its thrust also gives less than commanded, while more is asked.
+            if lost in self._speeds.suspected and self._speeds.thrust[lost] > \
+                    self._p.rotor.least_thrust:
+                self._ignore_commands_of(lost, stamp)
+            else:
+                self._lose_rotor(lost, stamp, 'the wrench')
         if self._wrench.slipped is not None:
             joint, angle = self._wrench.slipped
             text = f'the thrust of rotor {joint + 1} points {angle:+.2f} rad from the reading ' \
@@ -222,11 +228,8 @@ class FaultWatch:
         for racing in np.flatnonzero(self._speeds.thrust > RACES * self._thrust_max):
             self._lose_rotor(int(racing), stamp, 'the speed at which it races')
         deaf = self._speeds.deaf
-        if deaf is not None and self.health.rotors[deaf] \
-                and self._name(f'rotor{deaf + 1}_deaf', stamp, f'rotor {deaf + 1} does not follow '
-                               f'its commands, by its ESC; it gives '
-                               f'{self._speeds.thrust[deaf]:.1f} N'):
-            self._hold(deaf, self._speeds.thrust[deaf])
+        if deaf is not None and self.health.rotors[deaf]:
+            self._ignore_commands_of(deaf, stamp)
         for rotor, held in enumerate(self.health.held):
             if held is not None and abs(self._speeds.thrust[rotor] - held) > NOTICEABLE:
                 self._hold(rotor, self._speeds.thrust[rotor])
@@ -234,6 +237,12 @@ class FaultWatch:
     def name(self, name: str, now: float, text: str) -> bool:
         """Add a fault detected elsewhere; False if it is already known."""
         return self._name(name, now, text)
+
+    def _ignore_commands_of(self, rotor, stamp):
+        thrust = self._speeds.thrust[rotor]
+        if self._name(f'rotor{rotor + 1}_deaf', stamp, f'rotor {rotor + 1} does not follow its '
+                      f'commands, by its ESC; it gives {thrust:.1f} N'):
+            self._hold(rotor, thrust)
 
     def _lose_rotor(self, rotor, stamp, by):
         rotors = self.health.rotors

@@ -57,6 +57,11 @@ class SpeedWatch:
         self.thrust = np.full(ROTORS, np.nan)
         self.slow = np.zeros(ROTORS, dtype=bool)
 
+    @property
+    def suspected(self) -> list[int]:
+        """Rotors whose speed at present does not follow their commands."""
+        return [i for i, rotor in enumerate(self._rotors) if rotor.suspected]
+
     def on_command(self, stamp: float, thrust: np.ndarray) -> None:
         """Receive the commanded thrusts (4,) [N] of the time ``stamp`` [s]."""
         self._commands.append((stamp + DELAY, thrust.tolist()))
@@ -167,6 +172,11 @@ class Rotor:
             gain = max(min(1.0, dt / max(self._learnt_for, dt)), min(1.0, dt / LEARNT))
             self._factor += gain * (x / square - self._factor)
             self._learnt_for += dt
+
+    @property
+    def suspected(self) -> bool:
+        """Whether the last reports do not follow the commands."""
+        return self._deaf_for > 0
 
     def _regress(self, x, y, dt, decay):
         """Whether the measured thrust ``y`` does not follow the modelled thrust ``x``."""
