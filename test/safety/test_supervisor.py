@@ -549,12 +549,17 @@ def test_a_landing_from_the_highest_place_inside_the_limits_ends_before_its_time
 
 
 def test_landing_and_fallback_end_in_time():
-    rig = flown()
+    rig = VehicleRig(replace(PARAMETERS, envelope=replace(PARAMETERS.envelope, fallback_time=3.0),
+                             landing=replace(PARAMETERS.landing, time_limit=10.0))).fly()
     rig.alive -= {'nmpc', 'rl'}
-    rig.run(PARAMETERS.envelope.fallback_time + 0.2)
+    rig.run(2.9)
+    assert rig.supervisor.state == 'fallback'
+    rig.run(0.3)
     assert rig.supervisor.state == 'landing'
     rig.velocity = np.array([0.0, 0.0, -0.3])
-    rig.run(PARAMETERS.landing.time_limit + 0.2)
+    rig.run(9.7)
+    assert rig.supervisor.state == 'landing'
+    rig.run(0.5)
     assert rig.supervisor.state == 'emergency_stop'
 
 
