@@ -6,7 +6,7 @@ import threading
 import numpy as np
 import pytest
 from synthetic_flights import fly, write_command, write_joints, write_state, write_truth
-from view_browser import at_rest, opened, rendered, until
+from view_browser import at_rest, opened, rendered, started, until
 
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -32,6 +32,13 @@ def bag(tmp_path_factory):
     with BagWriter(folder, {'task': 'waypoints'}) as writer:
         fly(writer, make_task('waypoints'), duration=20.0, start=50.0)
     return folder
+
+
+@pytest.fixture(scope='module')
+def chromium():
+    """A browser for all tests."""
+    with started() as browser:
+        yield browser
 
 
 @pytest.fixture
@@ -88,7 +95,7 @@ def changed(before, after):
     return np.mean(np.abs(before - after).max(axis=2) > STRANGE)
 
 
-def test_a_recording_is_rendered_and_moves_with_the_slider(bag, drawn):
+def test_a_recording_is_rendered_and_moves_with_the_slider(bag, drawn, chromium):
     recordings = [Recording(bag, 'a'), Recording(bag, 'b')]
     try:
         for recording in recordings:
@@ -96,7 +103,7 @@ def test_a_recording_is_rendered_and_moves_with_the_slider(bag, drawn):
         page = Page(['a', 'b'], Model.load(), ROBOT, port=8300)
         player = drawn(page, Player(page, recordings, start=6.0, play=False))
         player.look()
-        with opened(page.url) as (browser, requests):
+        with opened(page.url, browser=chromium) as (browser, requests):
             rendered(browser)
             # The CPU draws this page.
             assert set(browser.evaluate(ANTIALIASED)) == {False}
@@ -120,12 +127,12 @@ def test_a_recording_is_rendered_and_moves_with_the_slider(bag, drawn):
             recording.close()
 
 
-def test_a_target_that_is_dragged_with_the_mouse_arrives(drawn):
+def test_a_target_that_is_dragged_with_the_mouse_arrives(drawn, chromium):
     page = Page(['live'], Model.load(), ROBOT, title='Flight', port=8320)
     page.look_at_room()
     graph = Graph()
     drawn(page, Live(page, graph, ROBOT, allow_targets=True))
-    with opened(page.url) as (browser, _):
+    with opened(page.url, browser=chromium) as (browser, _):
         rendered(browser)
         client = until(lambda: list(page.server.get_clients().values()), 'a client')[0]
         # The arrow of the gizmo along world x, and the end of the drag.
@@ -145,11 +152,11 @@ def test_a_target_that_is_dragged_with_the_mouse_arrives(drawn):
         assert 100.0 < target.stamp <= graph.t
 
 
-def test_a_refused_target_is_reported_and_reset(drawn):
+def test_a_refused_target_is_reported_and_reset(drawn, chromium):
     page = Page(['live'], Model.load(), ROBOT, title='Flight', port=8340)
     graph = Graph(refuses='target_pose: 1 rejected, 9 m from the robot')
     live = drawn(page, Live(page, graph, ROBOT, allow_targets=True))
-    with opened(page.url, 400, 800) as (browser, _):
+    with opened(page.url, 400, 800, chromium) as (browser, _):
         until(lambda: page.server.get_clients(), 'a client')
         live._send(np.array([0.0, 0.0, -5.0]), UP)      # below the floor: not sent
         until(lambda: browser.get_by_text('target not sent').count(), 'a note')
@@ -160,10 +167,10 @@ def test_a_refused_target_is_reported_and_reset(drawn):
         until(lambda: live._sampler.target is None, 'the target before')
 
 
-def test_without_permission_the_page_has_no_controls_for_targets(drawn):
+def test_without_permission_the_page_has_no_controls_for_targets(drawn, chromium):
     page = Page(['live'], Model.load(), ROBOT, title='Flight', port=8360)
     live = drawn(page, Live(page, Graph(), ROBOT, allow_targets=False))
-    with opened(page.url) as (browser, _):
+    with opened(page.url, browser=chromium) as (browser, _):
         until(lambda: browser.get_by_text('flying:nmpc').count(), 'the state')
         assert not browser.get_by_text('fly there').count()
         assert not browser.get_by_text('controller').count()

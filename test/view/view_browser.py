@@ -1,6 +1,6 @@
 """A headless browser, and pictures of its page."""
 
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 import io
 import os
 import shutil
@@ -28,13 +28,23 @@ def chromium():
 
 
 @contextmanager
-def opened(url, width=900, height=560):
-    """Open a page; yield it and the list of its requests."""
+def started():
+    """Start the browser."""
     playwright = pytest.importorskip('playwright.sync_api', reason='no playwright: pip install '
                                      'playwright; its own browsers are not needed')
     path = chromium()
     with playwright.sync_playwright() as run:
         browser = run.chromium.launch(executable_path=path, args=list(FLAGS))
+        try:
+            yield browser
+        finally:
+            browser.close()
+
+
+@contextmanager
+def opened(url, width=900, height=560, browser=None):
+    """Open a page, in a new browser if none is given; yield it and the list of its requests."""
+    with started() if browser is None else nullcontext(browser) as browser:
         page = browser.new_page(viewport={'width': width, 'height': height})
         page.set_default_timeout(1e3 * PATIENCE)
         requests = []
@@ -44,7 +54,7 @@ def opened(url, width=900, height=560):
         try:
             yield page, requests
         finally:
-            browser.close()
+            page.close()
 
 
 def picture(page):
