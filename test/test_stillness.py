@@ -49,7 +49,7 @@ def test_broken():
 @pytest.fixture
 def outcomes(tmp_path):
     """Outcome of each inner test, in a file of tests in real time and in another one."""
-    for name in ('conftest.py', 'stillness.py'):
+    for name in ('conftest.py', 'flown_once.py', 'stillness.py'):
         shutil.copy(HERE / name, tmp_path)
     for folder in ('nodes', 'robot'):
         (tmp_path / folder).mkdir()

@@ -208,7 +208,7 @@ def flight(ros_domain, tmp_path):
 def test_twenty_switches_through_the_parameter_in_a_real_flight(flight):
     graph, pilot = flight
     names = ['rl', 'nmpc'] * (SWITCHES // 2)
-    for name, wait in zip(names, np.random.default_rng(0).uniform(0.2, 0.8, SWITCHES)):
+    for name, wait in zip(names, np.random.default_rng(0).uniform(0.2, 1.4, SWITCHES)):
         assert pilot.stays_in_the_air(wait) or pilot.height_min > 0.15
         assert pilot.select_when_good(name) == (True, '')
         assert pilot.wait(lambda name=name: pilot.state == f'flying:{name}', 2), pilot.states
