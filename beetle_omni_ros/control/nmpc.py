@@ -137,7 +137,8 @@ class NmpcController:
         x0 = np.concatenate([full[:13], full[model.TILT], full[model.THRUST]])[:self._state_size]
         start = state.stamp + self._parameters.model.command_delay
         disturbance = self._estimator.disturbance
-        references = self._planner.plan(target, start, full[model.TILT], disturbance)
+        references = self._planner.plan(target, start, state.quaternion, full[model.TILT],
+                                        disturbance)
         if not self._started:
             self._rti.fill(x0, np.clip(references[0, 13:21], self._bounds[:8], self._bounds[8:16]))
             self._iterate = FIRST_ITERATIONS

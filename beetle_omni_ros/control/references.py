@@ -15,6 +15,7 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 
 FIRST_ROUNDS = 3        # iterations of allocation with effects for a new target; later one a plan
 DIFFERENCE_STEP = 1e-3  # [s] for the reference's acceleration
+HALF_TURN = 0.05        # [rad] from half a turn of a joint, where noise decides its direction
 TILT, THRUST, TILT_LEAD, THRUST_LEAD = (slice(13, 17), slice(17, 21), slice(21, 25),
                                         slice(25, 29))
 
@@ -46,6 +47,8 @@ class ReferencePlanner:
         self._effects = EffectWrench(robot, self._allocator, len(times))
         self._beside = np.zeros((2, len(times), 3))     # force and torque of the effects, per node
         self._target: Target | None = None
+        self._turned_to: PoseTarget | None = None
+        self._towards: np.ndarray | None = None     # tilts in the middle of a half turn
         self._inertia = np.asarray(robot.inertia)
         length = np.diff(times)[:, None]
         self._tilt_lead = 1 / -np.expm1(-length / servo_lag)
@@ -56,7 +59,7 @@ class ReferencePlanner:
         self._allocator = allocator(self._robot, health)
         self._movable = np.array([angle is None for angle in health.stuck])
 
-    def plan(self, target: Target, start: float, tilt: np.ndarray,
+    def plan(self, target: Target, start: float, quaternion: np.ndarray, tilt: np.ndarray,
              disturbance: np.ndarray) -> np.ndarray:
         """
         Reference (N + 1, 29): position, velocity, quaternion, rates, tilts, thrusts, leads.
@@ -64,20 +67,21 @@ class ReferencePlanner:
         Args:
             target: pose or trajectory.
             start: time of the horizon's first node [s].
+            quaternion: (4,) present attitude.
             tilt: (4,) present tilts [rad].
             disturbance: (10,) as in :mod:`robot.dynamics`.
 
         """
         if not self._effects.needed:
-            return self._once(target, start, tilt, disturbance)
+            return self._once(target, start, quaternion, tilt, disturbance)
         rounds = 1 if target is self._target else FIRST_ROUNDS
         self._target = target
         for _ in range(rounds):
-            references = self._once(target, start, tilt, disturbance)
+            references = self._once(target, start, quaternion, tilt, disturbance)
             self._beside = np.stack(self._effects(references))
         return references
 
-    def _once(self, target, start, tilt, disturbance):
+    def _once(self, target, start, quaternion, tilt, disturbance):
         references = np.zeros((len(self._times), REFERENCE_SIZE))
         if isinstance(target, PoseTarget):
             force, torque = self._beside[:, 0]
@@ -86,11 +90,34 @@ class ReferencePlanner:
                                                -disturbance[model.TORQUE] - torque)
             references[:, 0:3] = target.position
             references[:, 6:10] = rotations.normalized(target.quaternion)
-            references[:, TILT] = self._unwound(allocation.tilt, tilt)
+            references[:, TILT] = self._turned(target, self._unwound(allocation.tilt, tilt),
+                                               quaternion, tilt)
             references[:, THRUST] = allocation.thrust
             return references
         self._follow(target, start + self._times, tilt, disturbance, references)
         return references
+
+    def _turned(self, target, tilt, quaternion, present):
+        """
+        Joints that have half a turn to go turn with the body, in directions chosen once.
+
+        Otherwise noise decides the direction of each joint. Joints that turn against each other
+        cost up to a metre of height.
+        """
+        if self._turned_to is None or not target.same_pose(self._turned_to):
+            self._turned_to, self._towards = target, None
+            tied = np.abs(np.abs(tilt - present) - np.pi) < HALF_TURN
+            if tied.any():
+                turn = rotations.log(rotations.multiply(
+                    rotations.conjugate(quaternion), target.quaternion))
+                half = rotations.multiply(quaternion, rotations.exp(0.5 * turn))
+                self._towards = np.where(tied, self._allocator.hover(half, present).tilt, np.nan)
+        if self._towards is None:
+            return tilt
+        other = tilt - 2 * np.pi * np.sign(tilt)
+        nearer = np.abs(other - self._towards) < np.abs(tilt - self._towards)
+        legal = np.abs(other) <= self._robot.joints.position_limit
+        return np.where(nearer & legal & self._movable, other, tilt)
 
     def _unwound(self, tilt, present):
         """Choose the tilts within +-pi unless the joint would have to travel much farther."""

@@ -21,6 +21,7 @@ ROBOT = RobotParameters.load()
 TIMES = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.4])
 LAG = 0.03
 LIMIT = ROBOT.joints.position_limit
+LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 
 
 def planner(unwind=4.0):
@@ -32,7 +33,8 @@ def test_a_pose_is_held_against_the_estimated_disturbance(seed):
     rng = np.random.default_rng(seed)
     quaternion = rotations.normalized(rng.normal(size=4))
     disturbance = np.r_[rng.normal(size=3), 0.1 * rng.normal(size=3), np.zeros(4)]
-    reference = planner().plan(PoseTarget(np.ones(3), quaternion), 5.0, np.zeros(4), disturbance)
+    reference = planner().plan(PoseTarget(np.ones(3), quaternion), 5.0, LEVEL, np.zeros(4),
+                               disturbance)
     assert np.all(reference == reference[0])
     # with the disturbance acting, the model does not accelerate
     x = np.concatenate([np.zeros(6), quaternion, np.zeros(3), reference[0, TILT], np.zeros(4),
@@ -53,7 +55,7 @@ def test_a_pose_is_held_under_the_effects_of_the_robot_file(effects):
     plan = ReferencePlanner(robot, TIMES, 4.0, LAG)
     target = PoseTarget(np.array([0.0, 0.0, 0.6]), quaternion)
     for _ in range(3):
-        reference = plan.plan(target, 5.0, np.zeros(4), np.zeros(10))
+        reference = plan.plan(target, 5.0, LEVEL, np.zeros(4), np.zeros(10))
     acceleration, angular = model.rigid_body(
         robot, np.zeros(3), quaternion, np.zeros(3), reference[0, TILT], reference[0, THRUST],
         position=target.position)
@@ -65,9 +67,9 @@ def test_joint_references_are_within_half_a_turn_unless_that_is_far(seed):
     rng = np.random.default_rng(seed)
     target = PoseTarget(np.zeros(3), rotations.normalized(rng.normal(size=4)))
     present = rng.uniform(-LIMIT, LIMIT, 4)
-    nearest = planner(0.0).plan(target, 0.0, present, np.zeros(10))[0, TILT]
-    unwound = planner(4.0).plan(target, 0.0, present, np.zeros(10))[0, TILT]
-    principal = planner(6.3).plan(target, 0.0, present, np.zeros(10))[0, TILT]
+    nearest = planner(0.0).plan(target, 0.0, LEVEL, present, np.zeros(10))[0, TILT]
+    unwound = planner(4.0).plan(target, 0.0, LEVEL, present, np.zeros(10))[0, TILT]
+    principal = planner(6.3).plan(target, 0.0, LEVEL, present, np.zeros(10))[0, TILT]
     assert np.allclose(np.cos(nearest - unwound), 1)
     assert np.allclose(np.cos(nearest - principal), 1)
     assert np.all(np.abs(principal) <= np.pi + 1e-12)
@@ -75,6 +77,30 @@ def test_joint_references_are_within_half_a_turn_unless_that_is_far(seed):
     assert np.all(extra < 4.0)
     assert np.all((np.abs(unwound) <= np.pi) | (unwound == nearest))
     assert np.all(np.abs(unwound) <= LIMIT)
+
+
+@pytest.mark.parametrize('axis', [(1, 0, 0), (0, 1, 0), (0.6, 0.8, 0)])
+@pytest.mark.parametrize('seed', range(5))
+def test_joints_with_half_a_turn_to_go_turn_with_the_body_in_spite_of_noise(axis, seed):
+    noise = np.random.default_rng(seed)
+    target, plan = PoseTarget(np.ones(3), np.array([*axis, 0.0])), planner()
+
+    def seen(angle):
+        """Attitude and tilts on the way, with the noise of the estimate."""
+        attitude = rotations.multiply(rotations.exp(angle * np.array(axis)),
+                                      rotations.exp(noise.normal(scale=1e-3, size=3)))
+        held = planner().plan(PoseTarget(np.ones(3), attitude), 0.0, LEVEL,
+                              np.zeros(4), np.zeros(10))[0, TILT]
+        return attitude, held + noise.normal(scale=0.01, size=4)
+
+    def asked(angle):
+        return plan.plan(target, 0.0, *seen(angle), np.zeros(10))[0, TILT]
+
+    first = asked(0.0)
+    assert np.allclose([asked(0.0) for _ in range(20)], first, atol=0.05)
+    # Joints pass these angles, or their negatives: the body may turn in either direction.
+    passed = np.sign(seen(0.5 * np.pi)[1])
+    assert abs(np.sign(first) @ passed) == 4
 
 
 def test_a_joint_that_follows_a_moving_reference_does_not_jump_at_half_a_turn():
@@ -87,14 +113,14 @@ def test_a_joint_that_follows_a_moving_reference_does_not_jump_at_half_a_turn():
     target = TrajectoryTarget(time, zeros, quaternions, zeros, rates)
     tilt, plan = np.zeros(4), planner()
     for start in np.arange(0.1, 3.5, 0.05):
-        reference = plan.plan(target, start, tilt, np.zeros(10))
+        reference = plan.plan(target, start, LEVEL, tilt, np.zeros(10))
         assert np.abs(np.diff(reference[:, TILT], axis=0)).max() < 2.0
         tilt = reference[0, TILT]
 
 
 def test_commands_lead_a_moving_reference_so_that_the_lag_arrives_on_time():
     target = lemniscate.target(0.0)
-    reference = planner().plan(target, 20.0, np.zeros(4), np.zeros(10))
+    reference = planner().plan(target, 20.0, LEVEL, np.zeros(4), np.zeros(10))
     for values, lead, lag in ((TILT, TILT_LEAD, LAG),
                               (THRUST, THRUST_LEAD, ROBOT.rotors.time_constant)):
         for k, length in enumerate(np.diff(TIMES)):
