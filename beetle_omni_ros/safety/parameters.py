@@ -215,7 +215,8 @@ class Envelope:
     rate: float = parameter(
         15.0, doc='angular rate above which the robot tumbles', unit='rad/s', low=1, high=100)
     fall_speed: float = parameter(
-        6.0, doc='downward speed above which the robot falls', unit='m/s', low=0.5, high=100)
+        6.0, doc='downward speed above which the robot falls; in a landing any speed', unit='m/s',
+        low=0.5, high=100)
     lost_time: float = parameter(
         0.3, doc='duration of tumbling or falling until the reaction', unit='s', low=0.02, high=10)
     lost_reaction: str = parameter(

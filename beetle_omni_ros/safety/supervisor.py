@@ -329,8 +329,8 @@ class Supervisor(Inputs):
         if self.state == LANDING and self._landing_for > envelope.recovery_time:
             if vehicle.far_outside_fence:
                 self.emergency_stop(now, 'left the fence while landing')
-            elif vehicle.lost:
-                self.emergency_stop(now, 'tumbling or falling while landing')
+            elif vehicle.lost or vehicle.runs_away:
+                self.emergency_stop(now, 'tumbling, falling or too fast while landing')
             elif self._landing_for > limits.time_limit:
                 self.emergency_stop(now, f'no ground within {limits.time_limit:g} s of landing')
             else:

@@ -56,7 +56,7 @@ class Vehicle:
         self.backup = BackupEstimator(parameters.backup, robot.gravity)
         self.refused: Counter = Counter()
         self.last_refusal = ''
-        self._low, self._empty, self._lost = 0.0, 0.0, 0.0
+        self._low, self._empty, self._lost, self._fast = 0.0, 0.0, 0.0, 0.0
 
     @property
     def known(self) -> State:
@@ -80,6 +80,7 @@ class Vehicle:
         self._low = self._low + dt if self._below(battery.warn) else 0.0
         self._empty = self._empty + dt if self._below(battery.land) else 0.0
         self._lost = self._lost + dt if self.state is not None and self._tumbling() else 0.0
+        self._fast = self._fast + dt if self.state is not None and self._speeding() else 0.0
 
     def clock_went_back(self, now: float, by: float) -> None:
         """Accept new stamps after the clock was set back by ``by`` [s]."""
@@ -207,6 +208,11 @@ class Vehicle:
         return self._lost >= self._parameters.envelope.lost_time
 
     @property
+    def runs_away(self) -> bool:
+        """Whether the speed has for long enough been one that no landing has."""
+        return self._fast >= self._parameters.envelope.lost_time
+
+    @property
     def outside_fence(self) -> bool:
         """Whether the estimate lies outside the fence."""
         return self._outside(0.0)
@@ -228,6 +234,10 @@ class Vehicle:
         fence, state = self._parameters.envelope, self._best
         rate = state.angular_velocity
         return sqrt(rate.dot(rate)) > fence.rate or state.velocity[2] < -fence.fall_speed
+
+    def _speeding(self):
+        velocity = self._best.velocity
+        return velocity.dot(velocity) > self._parameters.envelope.fall_speed**2
 
     def _check_state(self, state, status, now, airborne):
         limits = self._parameters.state

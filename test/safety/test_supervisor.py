@@ -316,6 +316,19 @@ def test_lost_control_reaction_is_a_parameter(motion, reaction, state):
     assert rig.supervisor.state == state
 
 
+@pytest.mark.parametrize('speed, stops', [(4.0, False), (8.0, True)])
+def test_a_robot_that_runs_away_in_a_landing_is_stopped(speed, stops):
+    rig, envelope = flown(), PARAMETERS.envelope
+    rig.velocity = np.array([0.8 * speed, 0.0, 0.6 * speed])
+    rig.run(2 * envelope.lost_time)
+    assert rig.supervisor.state == 'flying', 'in flight a target may be far away'
+    rig.supervisor.land(rig.now)
+    rig.run(envelope.recovery_time - 0.05)
+    assert rig.supervisor.state == 'landing'
+    rig.run(0.1)
+    assert rig.supervisor.state == ('emergency_stop' if stops else 'landing')
+
+
 def test_any_attitude_is_permitted():
     rig = flown()
     rng = np.random.default_rng(0)
