@@ -77,7 +77,8 @@ def test_the_ground_is_detected_although_the_accelerometer_jitters_on_it(listed)
     # took off again and fell.
     landed = fly_landing(LandingTrial(3103, 'published', without_mocap=True), listed)
     assert landed['state'] == 'disarmed' and landed['takeoffs'] == 0
-    assert landed['impact_m_s'] < 0.8, landed
+    # The drift decides the speed of this touchdown, but the robot must not fall again.
+    assert landed['impact_m_s'] < listed.limits.impact_speed and not landed['broken'], landed
 
 
 def test_every_fourth_landing_begins_upside_down():
