@@ -227,8 +227,11 @@ class Landing:
                 # The turn begins between two samples of the published way, which has no rate then.
                 leap = self._parameters.leap_share * margin, BETWEEN * (
                     floor(self._parameters.leap_time / BETWEEN) + 0.5)
-        return Way(np.cumsum([leap[1], AT_ONCE, p.escape_time, turn]),
-                   np.array([state.quaternion, escape, escape, goal])), leap
+        # The escape attitude is the reference at once: a sampled path to it costs height.
+        times, attitudes = ([leap[1], AT_ONCE], [state.quaternion, escape]) if leap[1] else \
+            ([0.0], [escape])
+        return Way(np.cumsum([*times, p.escape_time, turn]),
+                   np.array([*attitudes, escape, goal])), leap
 
     @property
     def _without_mocap(self):

@@ -118,6 +118,10 @@ class CommandStream:
         self._overstepping.tick(dt)
         self.good_for = 0.0 if self.silence.silent else self.good_for + dt
 
+    def expect_jump(self) -> None:
+        """Do not compare the next command with the last."""
+        self._offered = None
+
     def clock_went_back(self, now: float) -> None:
         """Accept new stamps after a step of the clock."""
         if self.accepted is not None and self.accepted.stamp > now:

@@ -63,6 +63,11 @@ class Selection:
         for stream in self._streams.values():
             stream.clock_went_back(now)
 
+    def expect_jump(self) -> None:
+        """Accept a jump of each next command, because the actuators are no longer the same."""
+        for stream in self._streams.values():
+            stream.expect_jump()
+
     def diagnostics(self) -> dict[str, float | int]:
         """For each controller: validity, silence [ms], refusals by reason."""
         values: dict[str, float | int] = {}

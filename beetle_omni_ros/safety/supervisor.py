@@ -227,6 +227,7 @@ class Supervisor(Inputs):
             # With two rotors no attitude can be held.
             return self._crash(now, 'a second rotor is lost at the floor')
         self._hover.set_health(health)
+        self._selection.expect_jump()
         if self.state != LANDING:
             self._land(now, ERROR, f"{', '.join(self.faults)}: landing with what is left")
         if self.state == LANDING and not moved:
