@@ -296,7 +296,11 @@ class Landing:
         stands = sinking and carried and (still or specific_force_up is not None)
         self._standing_for = self._standing_for + dt if stands else 0.0
         self._still_for = self._still_for + dt if blind and sinking and still else 0.0
-        self.grounded = self._standing_for >= p.ground_time - 1e-9 or self._still_for >= STILL
+        # Above the floor of the takeoff there may be a platform, or a wrong velocity estimate.
+        aloft = specific_force_up is None and \
+            state.position[2] - self._floor > p.platform_height
+        needed = p.platform_time if aloft else p.ground_time
+        self.grounded = self._standing_for >= needed - 1e-9 or self._still_for >= STILL
 
 
 class _Now:

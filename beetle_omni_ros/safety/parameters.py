@@ -160,6 +160,12 @@ class LandingParameters:
     ground_time: float = parameter(
         0.3, doc='duration of both conditions after which the robot stands', unit='s', low=0.02,
         high=5)
+    platform_height: float = parameter(
+        0.3, doc='height above the floor of the takeoff beyond which `platform_time` applies',
+        unit='m', low=0.0, high=10)
+    platform_time: float = parameter(
+        1.0, doc='duration of both conditions after which the robot stands on a platform', unit='s',
+        low=0.02, high=10)
 
 
 @dataclass(frozen=True, kw_only=True)
