@@ -55,6 +55,7 @@ class CommandStream:
         self._overstepping = Silence(limits.timeout)
         self.good_for = 0.0
         self._offered: Command | None = None
+        self._may_jump_for = 0.0
         self._same = 0
 
     @property
@@ -117,10 +118,11 @@ class CommandStream:
         self.silence.tick(dt)
         self._overstepping.tick(dt)
         self.good_for = 0.0 if self.silence.silent else self.good_for + dt
+        self._may_jump_for = max(0.0, self._may_jump_for - dt)
 
     def expect_jump(self) -> None:
-        """Do not compare the next command with the last."""
-        self._offered = None
+        """Do not refuse jumps until the controller has had time to answer, its timeout."""
+        self._may_jump_for = self._limits.timeout
 
     def clock_went_back(self, now: float) -> None:
         """Accept new stamps after a step of the clock."""
@@ -179,7 +181,8 @@ class CommandStream:
             return FROZEN
         # Compared with the previous command, accepted or not: a single spike is refused, a real
         # step is delayed by one period.
-        if before is not None and clean.stamp - before.stamp <= self._limits.timeout and (
+        if before is not None and self._may_jump_for <= 0 \
+                and clean.stamp - before.stamp <= self._limits.timeout and (
                 _farthest(clean.tilt, before.tilt) > self._limits.tilt_step
                 or _farthest(clean.thrust, before.thrust) > self._limits.thrust_step):
             return JUMP

@@ -64,7 +64,7 @@ class Selection:
             stream.clock_went_back(now)
 
     def expect_jump(self) -> None:
-        """Accept a jump of each next command, because the actuators are no longer the same."""
+        """Accept jumps for a moment, because the actuators are no longer the same."""
         for stream in self._streams.values():
             stream.expect_jump()
 
