@@ -164,8 +164,8 @@ class LandingParameters:
         0.3, doc='height above the floor of the takeoff beyond which `platform_time` applies',
         unit='m', low=0.0, high=10)
     platform_time: float = parameter(
-        1.0, doc='duration of both conditions after which the robot stands on a platform', unit='s',
-        low=0.02, high=10)
+        1.0, doc='duration of both conditions after which the robot stands on a platform',
+        unit='s', low=0.02, high=10)
 
 
 @dataclass(frozen=True, kw_only=True)
