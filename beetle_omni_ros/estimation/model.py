@@ -31,6 +31,7 @@ from beetle_omni_ros.estimation.samples import (
 )
 from beetle_omni_ros.robot import rotations
 
+PLAUSIBLE = 3.0  # standard deviations of a bias that markers may explain
 MEASUREMENTS = 6  # position in world, rotation vector in base_link
 
 
@@ -154,6 +155,35 @@ class ErrorStateModel:
         change[GYROSCOPE_BIAS], change[ATTITUDE] = np.eye(3), -span * np.eye(3)
         covariance += self.parameters.doubt.gyroscope_bias_std ** 2 * change @ change.T
         return replace(node, covariance=covariance)
+
+    def without_poses(self, node: Node) -> Node:
+        """
+        Divide the bias between accelerometer and markers, for the time after the last pose.
+
+        In a constant attitude, an attitude error theta (3,) of the markers in base_link and a bias
+        error -g up x theta have the same effect: no acceleration. The poses therefore determine
+        only their sum. Each receives the share of its prior variance. Both errors remain
+        correlated. See :class:`.DeadReckoningParameters`.
+        """
+        priors, gravity = self.parameters.dead_reckoning, self.gravity
+        markers = (gravity * priors.marker_attitude_std) ** 2
+        total = priors.accelerometer_bias_std ** 2 + markers
+        up = node.rotation[2]
+        bias = node.accelerometer_bias
+        bias = bias - up * up.dot(bias)
+        if not markers or bias.dot(bias) > PLAUSIBLE ** 2 * total:
+            return node
+        change = -markers / total * bias
+        turn = rotations.exp(rotations.cross(up, change) / gravity)
+        quaternion = rotations.normalized(rotations.multiply(node.quaternion, turn))
+        direction = np.zeros((STATES, 3))
+        direction[ATTITUDE] = np.eye(3) - np.outer(up, up)
+        direction[ACCELEROMETER_BIAS] = -gravity * rotations.skew(up)
+        variance = priors.accelerometer_bias_std ** 2 * markers / total
+        return replace(
+            node, quaternion=quaternion, rotation=rotations.matrix(quaternion),
+            accelerometer_bias=node.accelerometer_bias + change, before=None,
+            covariance=self.covariance(node) + variance / gravity ** 2 * direction @ direction.T)
 
     def after_clock_jump(self, node: Node, stamp: float, force: np.ndarray,
                          rate: np.ndarray) -> Node:

@@ -186,6 +186,18 @@ class DoubtParameters:
 
 
 @dataclass(frozen=True, kw_only=True)
+class DeadReckoningParameters:
+    """Priors that divide the estimated accelerometer bias when the poses end."""
+
+    accelerometer_bias_std: float = parameter(
+        0.03, doc='standard deviation of the true bias, each axis', unit='m/s^2', low=1e-6,
+        high=10)
+    marker_attitude_std: float = parameter(
+        0.006, doc="standard deviation of the markers' attitude error, each axis; 0: none",
+        unit='rad', low=0, high=0.3)
+
+
+@dataclass(frozen=True, kw_only=True)
 class EkfParameters(ParameterFile, file='ekf.yaml'):
     """Parameters of :class:`~beetle_omni_ros.estimation.ekf.ErrorStateEkf`."""
 
@@ -195,6 +207,7 @@ class EkfParameters(ParameterFile, file='ekf.yaml'):
     time_offset: TimeOffsetParameters = group(TimeOffsetParameters)
     doubt: DoubtParameters = group(DoubtParameters)
     status: StatusParameters = group(StatusParameters)
+    dead_reckoning: DeadReckoningParameters = group(DeadReckoningParameters)
 
     def __post_init__(self):
         """Check the times against each other."""

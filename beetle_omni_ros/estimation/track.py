@@ -43,6 +43,7 @@ class Track:
         self._history = history
         self.nodes = [first]
         self.last_fix = first.stamp
+        self._without_poses = False
         self.fixes = 1
 
     @property
@@ -62,6 +63,12 @@ class Track:
         while nodes[1].stamp < stamp - self._history:
             del nodes[0]
             self._model.covariance(nodes[0])    # otherwise it would keep its predecessors
+
+    def expect_no_poses(self) -> None:
+        """Prepare the newest state for dead reckoning, once after the last pose."""
+        if not self._without_poses:
+            self._without_poses = True
+            self.nodes[-1] = self._model.without_poses(self.nodes[-1])
 
     def correct(self, stamp: float, position: np.ndarray, quaternion: np.ndarray,
                 doubt_span: float = 0.0) -> bool:
@@ -101,6 +108,7 @@ class Track:
                                                 node.after_impact))
         self.nodes = replayed
         self.last_fix = stamp
+        self._without_poses = False
         return True
 
 
