@@ -114,10 +114,8 @@ class ErrorStateEkf:
                 track.predict(*reading)
         while self._early and self._early[0][0] <= stamp + SAME_INSTANT:
             self._apply(*self._early.popleft())
-        track = self._track
-        if track is not None \
-                and stamp - track.last_fix > self._parameters.status.dead_reckoning_after:
-            track.expect_no_poses()
+        if self._track is not None:
+            self._track.expect_poses(self._parameters.status.dead_reckoning_after)
         return True
 
     def pose(self, sample: PoseReading) -> bool:

@@ -43,7 +43,7 @@ class Track:
         self._history = history
         self.nodes = [first]
         self.last_fix = first.stamp
-        self._without_poses = False
+        self._waits_since: float | None = None     # first reading after a pose was used
         self.fixes = 1
 
     @property
@@ -64,11 +64,13 @@ class Track:
             del nodes[0]
             self._model.covariance(nodes[0])    # otherwise it would keep its predecessors
 
-    def expect_no_poses(self) -> None:
-        """Prepare the newest state for dead reckoning, once after the last pose."""
-        if not self._without_poses:
-            self._without_poses = True
-            self.nodes[-1] = self._model.without_poses(self.nodes[-1])
+    def expect_poses(self, period: float) -> None:
+        """Prepare the newest state for dead reckoning if no pose was used for ``period`` [s]."""
+        if self._waits_since is None:
+            self._waits_since = self.newest.stamp
+        if self.newest.stamp - self._waits_since > period:
+            self._waits_since = np.inf      # once after each pose
+            self.nodes[-1] = self._model.without_poses(self.newest)
 
     def correct(self, stamp: float, position: np.ndarray, quaternion: np.ndarray,
                 doubt_span: float = 0.0) -> bool:
@@ -108,7 +110,7 @@ class Track:
                                                 node.after_impact))
         self.nodes = replayed
         self.last_fix = stamp
-        self._without_poses = False
+        self._waits_since = None
         return True
 
 

@@ -20,15 +20,17 @@ def estimate_of(flight, parameters=None):
 @pytest.mark.parametrize('capture', [0.0, 0.0017])
 def test_replay_equals_processing_in_order(delay, capture):
     """For any latency of poses and any phase relative to the IMU samples."""
+    shipped = EkfParameters.load()      # in order, the last pose is older than the IMU by `delay`
+    patient = replace(shipped, status=replace(shipped.status, dead_reckoning_after=1.0))
     flight = fly(1, 1.5)
     poses = flight.trajectory(np.array([s.stamp + capture for s in flight.poses]))
     flight.poses = [PoseReading(s.stamp + capture, p, q) for s, p, q in
                     zip(flight.poses, poses['position'], poses['rotation'].as_quat())
                     if s.stamp + capture + delay < 1.49]
     flight.delay = delay
-    late = estimate_of(flight)
+    late = estimate_of(flight, patient)
     flight.delay = 0.0
-    prompt = estimate_of(flight)
+    prompt = estimate_of(flight, patient)
     np.testing.assert_allclose(late.position, prompt.position, atol=1e-9)
     np.testing.assert_allclose(late.velocity, prompt.velocity, atol=1e-9)
     np.testing.assert_allclose(late.quaternion, prompt.quaternion, atol=1e-9)
