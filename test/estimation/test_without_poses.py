@@ -46,6 +46,13 @@ def test_tilted_markers_cost_less_than_half_of_the_drift_after_a_turn():
     assert speed(0.006, markers=tilted) < 0.5 * speed(0.0, markers=tilted)
 
 
+@pytest.mark.parametrize('bias, better', [(0.05, True), (0.15, False)])
+def test_the_priors_fit_a_bias_below_their_own_size_only(bias, better):
+    """The limit that docs/explanation/estimation.md states."""
+    bias = 0.0, bias, 0.0
+    assert (speed(0.006, bias=bias) < speed(0.0, bias=bias)) == better
+
+
 def test_a_bias_that_markers_cannot_explain_remains_a_bias():
     bias = 0.0, 0.8, 0.0
     assert speed(0.006, bias=bias) == pytest.approx(speed(0.0, bias=bias), abs=1e-9)
