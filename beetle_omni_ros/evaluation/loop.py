@@ -43,6 +43,7 @@ from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.readings import Frame
 from beetle_omni_ros.sim.simulator import Simulator
 
+START_TIMEOUT = 5.0      # [s] for the estimator; noisy poses can need longer than SETTLE_TIME
 TAKEOFF_TIMEOUT = 30.0   # [s] simulated time for the take-off
 COMPUTE_REPORT = 1.0     # [s] between two records of compute times, as of the nodes
 SWAP_CHARGE = 0.3         # [-] charge below which the pack is replaced at the next target
@@ -205,7 +206,8 @@ class FlightLoop:
             FlightError: no take-off.
 
         """
-        while self.simulator.time < SETTLE_TIME:
+        while self.simulator.time < SETTLE_TIME or (
+                self._estimator.status != 'tracking' and self.simulator.time < START_TIMEOUT):
             self.step()
         answer = self.supervisor.arm(self.simulator.time)
         if not answer:

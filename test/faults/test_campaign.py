@@ -275,3 +275,10 @@ def test_random_fault_times_cover_the_time_of_a_pose(listed):
     assert all(flight.asked[:3] == ['pose', whole, 'pose'] for flight in flights)
     moments = np.array([flight.asked[3] for flight in flights]) / whole
     assert 0 <= moments.min() < 0.2 and 0.8 < moments.max() <= 1
+
+
+def test_a_flight_waits_for_an_estimator_that_noisy_poses_delay(listed):
+    """With this seed the estimator starts after more than the usual half second."""
+    short = replace(listed, healthy=replace(listed.healthy, flight_time=0.5))
+    flown = fly_healthy(HealthyTrial(7202, 'published'), short)
+    assert (flown['error'], flown['alarms'], flown['state']) == ('', [], 'disarmed')
