@@ -12,6 +12,7 @@ from math import sqrt
 
 import numpy as np
 
+from beetle_omni_ros.estimation.alignment import MarkerAlignment
 from beetle_omni_ros.estimation.guard import InputGuard
 from beetle_omni_ros.estimation.model import ErrorStateModel, MEASUREMENTS
 from beetle_omni_ros.estimation.mounting import Mounting
@@ -44,6 +45,7 @@ class ErrorStateEkf:
         self._parameters = parameters
         self._model = ErrorStateModel(parameters, gravity)
         self._mounting = Mounting(self._model)
+        self._gravity = gravity
         self.reset()
 
     def reset(self) -> None:
@@ -53,6 +55,7 @@ class ErrorStateEkf:
         self._noise_scale = self._noise.scale
         self._model.scale_noise(*self._noise_scale)
         self._readings: deque = deque()  # (stamp, force, rate, after_impact), base_link axes
+        self._alignment = MarkerAlignment(self._parameters, self._gravity)
         self._early: deque = deque()     # poses captured after the newest IMU sample
         self._track: Track | None = None
         self._candidate: Track | None = None
@@ -115,7 +118,8 @@ class ErrorStateEkf:
         while self._early and self._early[0][0] <= stamp + SAME_INSTANT:
             self._apply(*self._early.popleft())
         if self._track is not None:
-            self._track.expect_poses(self._parameters.status.dead_reckoning_after)
+            self._track.expect_poses(self._parameters.status.dead_reckoning_after,
+                                     self._alignment)
         return True
 
     def pose(self, sample: PoseReading) -> bool:
@@ -154,8 +158,10 @@ class ErrorStateEkf:
             self._model.scale_noise(*self._noise_scale)
         track = self._track if self._valid else None
         if track is not None:
-            if track.correct(stamp, position, quaternion) \
-                    or self._corrected_with_doubt(track, stamp, position, quaternion):
+            interval = track.correct(stamp, position, quaternion)
+            if interval:
+                self._alignment.add(*interval, position, float(self._model.filter.R[0, 0]))
+            if interval or self._corrected_with_doubt(track, stamp, position, quaternion):
                 self._candidate, self._contradictions = None, 0
                 self._good_pose = stamp, position, quaternion
                 return True
@@ -185,7 +191,7 @@ class ErrorStateEkf:
         self._doubt_until = stamp + self._parameters.doubt.time
         self.rejected['imu_contradicts'] += 1
         since = stamp - self._good_pose[0] if self._good_pose is not None else 0.0
-        return track.correct(stamp, position, quaternion, doubt_span=since)
+        return track.correct(stamp, position, quaternion, doubt_span=since) is not None
 
     def _continues_smoothly(self, track: Track, stamp, position, quaternion) -> bool:
         """Whether a pose continues smoothly from the last good one."""
@@ -222,7 +228,7 @@ class ErrorStateEkf:
         candidate = self._candidate
         agrees = candidate is None
         if candidate is not None:
-            agrees = candidate.correct(stamp, position, quaternion)
+            agrees = candidate.correct(stamp, position, quaternion) is not None
             if agrees:
                 limits = self._parameters.status
                 needed = limits.start_poses if valid is None else limits.jump_poses

@@ -31,7 +31,6 @@ from beetle_omni_ros.estimation.samples import (
 )
 from beetle_omni_ros.robot import rotations
 
-PLAUSIBLE = 3.0  # standard deviations of a bias that markers may explain
 MEASUREMENTS = 6  # position in world, rotation vector in base_link
 
 
@@ -156,34 +155,20 @@ class ErrorStateModel:
         covariance += self.parameters.doubt.gyroscope_bias_std ** 2 * change @ change.T
         return replace(node, covariance=covariance)
 
-    def without_poses(self, node: Node) -> Node:
+    def turned(self, node: Node, turn: np.ndarray) -> Node:
         """
-        Divide the bias between accelerometer and markers, for the time after the last pose.
+        Give a state the attitude error of the markers, and the bias that has the same effect.
 
-        In a constant attitude, an attitude error theta (3,) of the markers in base_link and a bias
-        error -g up x theta have the same effect: no acceleration. The poses therefore determine
-        only their sum. Each receives the share of its prior variance. Both errors remain
-        correlated. See :class:`.DeadReckoningParameters`.
+        Args:
+            node: state without this error.
+            turn: (3,) the error, a rotation vector in base_link [rad].
+
         """
-        priors, gravity = self.parameters.dead_reckoning, self.gravity
-        markers = (gravity * priors.marker_attitude_std) ** 2
-        total = priors.accelerometer_bias_std ** 2 + markers
-        up = node.rotation[2]
-        bias = node.accelerometer_bias
-        bias = bias - up * up.dot(bias)
-        if not markers or bias.dot(bias) > PLAUSIBLE ** 2 * total:
-            return node
-        change = -markers / total * bias
-        turn = rotations.exp(rotations.cross(up, change) / gravity)
-        quaternion = rotations.normalized(rotations.multiply(node.quaternion, turn))
-        direction = np.zeros((STATES, 3))
-        direction[ATTITUDE] = np.eye(3) - np.outer(up, up)
-        direction[ACCELEROMETER_BIAS] = -gravity * rotations.skew(up)
-        variance = priors.accelerometer_bias_std ** 2 * markers / total
-        return replace(
-            node, quaternion=quaternion, rotation=rotations.matrix(quaternion),
-            accelerometer_bias=node.accelerometer_bias + change, before=None,
-            covariance=self.covariance(node) + variance / gravity ** 2 * direction @ direction.T)
+        quaternion = rotations.normalized(rotations.multiply(
+            node.quaternion, rotations.exp(turn)))
+        bias = node.accelerometer_bias - self.gravity * rotations.cross(node.rotation[2], turn)
+        return replace(node, quaternion=quaternion, rotation=rotations.matrix(quaternion),
+                       accelerometer_bias=bias, covariance=self.covariance(node), before=None)
 
     def after_clock_jump(self, node: Node, stamp: float, force: np.ndarray,
                          rate: np.ndarray) -> Node:

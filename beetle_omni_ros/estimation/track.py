@@ -4,6 +4,7 @@ from bisect import bisect_right
 
 import numpy as np
 
+from beetle_omni_ros.estimation.alignment import MarkerAlignment
 from beetle_omni_ros.estimation.model import ErrorStateModel
 from beetle_omni_ros.estimation.propagation import Node
 
@@ -44,6 +45,7 @@ class Track:
         self.nodes = [first]
         self.last_fix = first.stamp
         self._waits_since: float | None = None     # first reading after a pose was used
+        self._aligned: tuple[float, np.ndarray] | None = None   # stamp and turn of expect_poses
         self.fixes = 1
 
     @property
@@ -64,16 +66,18 @@ class Track:
             del nodes[0]
             self._model.covariance(nodes[0])    # otherwise it would keep its predecessors
 
-    def expect_poses(self, period: float) -> None:
+    def expect_poses(self, period: float, alignment: MarkerAlignment) -> None:
         """Prepare the newest state for dead reckoning if no pose was used for ``period`` [s]."""
         if self._waits_since is None:
             self._waits_since = self.newest.stamp
         if self.newest.stamp - self._waits_since > period:
             self._waits_since = np.inf      # once after each pose
-            self.nodes[-1] = self._model.without_poses(self.newest)
+            known = alignment.corrected(self.newest, self._model.covariance(self.newest))
+            if known is not self.newest:
+                self.nodes[-1], self._aligned = known, (known.stamp, alignment.turn.copy())
 
     def correct(self, stamp: float, position: np.ndarray, quaternion: np.ndarray,
-                doubt_span: float = 0.0) -> bool:
+                doubt_span: float = 0.0) -> tuple[Node, Node] | None:
         """
         Apply a pose at its capture time and replay the later readings.
 
@@ -84,23 +88,30 @@ class Track:
             doubt_span: duration for which the IMU may have been wrong [s], 0: not at all.
 
         Returns:
-            False if the pose fails the gate; the track is then unchanged.
+            the oldest state, which is that after the previous pose unless the time since then was
+            too long, and the one predicted to this pose; None if the pose fails the gate, and the
+            track is then unchanged.
 
         """
         nodes = self.nodes
         stamp = max(stamp, nodes[0].stamp)
         index = bisect_right(nodes, stamp + SAME_INSTANT, key=_stamp) - 1
         prior = nodes[index]
+        since, turn = self._aligned or (np.inf, None)
+        aligned = prior.stamp >= since
         if stamp - prior.stamp > SAME_INSTANT:
             after = nodes[index + 1]
             prior = self._model.predict(prior, stamp, *interpolate(
                 stamp, (prior.stamp, prior.force, prior.rate),
                 (after.stamp, after.force, after.rate)), after.after_impact)
+        if turn is not None and aligned:    # poses refer to the markers
+            prior = self._model.turned(prior, turn)
         if doubt_span:
             prior = self._model.doubt(prior, doubt_span)
         posterior = self._model.correct(prior, position, quaternion)
         if posterior is None:
-            return False
+            return None
+        first = prior if aligned else nodes[0]
         self.fixes += 1
         if self.fixes == VELOCITY_KNOWN:
             self._model.add_time_uncertainty(posterior, self._time_deviation)
@@ -110,8 +121,8 @@ class Track:
                                                 node.after_impact))
         self.nodes = replayed
         self.last_fix = stamp
-        self._waits_since = None
-        return True
+        self._waits_since = self._aligned = None
+        return first, prior
 
 
 def _stamp(node):

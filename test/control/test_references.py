@@ -81,8 +81,11 @@ def test_joint_references_are_within_half_a_turn_unless_that_is_far(seed):
 
 @pytest.mark.parametrize('axis', [(1, 0, 0), (0, 1, 0), (0.6, 0.8, 0)])
 @pytest.mark.parametrize('seed', range(5))
-def test_joints_with_half_a_turn_to_go_turn_with_the_body_in_spite_of_noise(axis, seed):
+@pytest.mark.parametrize('encoder', [0.0, 0.3])
+def test_joints_with_half_a_turn_to_go_turn_with_the_body_in_spite_of_noise(axis, seed, encoder):
+    """``encoder`` [rad]: largest error of the encoders and of the hover before the turn."""
     noise = np.random.default_rng(seed)
+    offset = noise.uniform(-encoder, encoder, 4)
     target, plan = PoseTarget(np.ones(3), np.array([*axis, 0.0])), planner()
 
     def seen(angle):
@@ -91,7 +94,7 @@ def test_joints_with_half_a_turn_to_go_turn_with_the_body_in_spite_of_noise(axis
                                       rotations.exp(noise.normal(scale=1e-3, size=3)))
         held = planner().plan(PoseTarget(np.ones(3), attitude), 0.0, LEVEL,
                               np.zeros(4), np.zeros(10))[0, TILT]
-        return attitude, held + noise.normal(scale=0.01, size=4)
+        return attitude, held + offset + noise.normal(scale=0.01, size=4)
 
     def asked(angle):
         return plan.plan(target, 0.0, *seen(angle), np.zeros(10))[0, TILT]
