@@ -27,7 +27,7 @@ from beetle_omni_ros.robot import rotations
 POSES = 20          # averaged in one update
 SAME_INSTANT = 1e-6     # [s]
 GATE = float(2 * gammaincinv(3 / 2, 0.99999))   # of the chi-square distribution
-PLAUSIBLE = 3.0     # standard deviations of a bias that markers may explain
+PLAUSIBLE = 3.0     # standard deviations of an error that the priors explain
 MOTION, ERRORS = slice(0, 6), slice(6, 12)  # position and velocity; bias and attitude error
 BIAS, TURN = slice(6, 9), slice(9, 12)
 
@@ -73,9 +73,11 @@ class MarkerAlignment:
         """(6, 6) of bias and attitude error."""
         return self._kalman.P[ERRORS, ERRORS]
 
-    def distrust(self) -> None:
-        """Add the priors' variance again, after a sensor has changed."""
-        self._kalman.P[ERRORS, ERRORS] += np.diag(self._spread)
+    def _distrust(self):
+        """Be as uncertain as by the priors again, after a sensor has changed."""
+        covariance = self._kalman.P
+        covariance[ERRORS, :] = covariance[:, ERRORS] = 0.0
+        covariance[ERRORS, ERRORS] = np.diag(self._spread)
         self._stamp = -inf
 
     def add(self, first: Node, last: Node, position: np.ndarray, variance: float) -> None:
@@ -142,7 +144,7 @@ class MarkerAlignment:
         kalman.update(position - moved[:, 6], R=variance / POSES * np.eye(3), H=jacobian)
         if not kalman.y.dot(kalman.SI).dot(kalman.y) <= GATE:
             kalman.x, kalman.P = before
-            self.distrust()
+            self._distrust()
 
     def _predict(self, time, moved, gained, turned):
         """Predict to the end of the window."""
@@ -166,13 +168,15 @@ class MarkerAlignment:
             covariance: (16, 16) of it.
 
         Returns:
-            the state, unchanged if its bias is beyond the priors: then it is a bias.
+            the state, unchanged if its bias or the attitude error is beyond the priors: then it is
+            another error.
 
         """
-        limit = PLAUSIBLE ** 2 * (self._spread[0] + self._gravity ** 2 * self._spread[3])
+        bias, turn = self._spread[0], self._spread[3]
         up = node.rotation[2]
         across = node.accelerometer_bias - up * up.dot(node.accelerometer_bias)
-        if not self._spread[3] or across.dot(across) > limit:
+        if not turn or across.dot(across) > PLAUSIBLE ** 2 * (bias + self._gravity ** 2 * turn) \
+                or self.turn.dot(self.turn) > 3 * PLAUSIBLE ** 2 * turn:
             return node
         quaternion = rotations.normalized(rotations.multiply(
             node.quaternion, rotations.exp(-self.turn)))

@@ -88,6 +88,18 @@ def test_after_a_step_of_the_bias_the_new_one_is_learnt():
     assert alignment.bias[2] == pytest.approx(0.08, abs=0.02)
 
 
+def test_after_many_contradictions_it_is_not_more_uncertain_than_by_its_priors():
+    """Poses that jump by 1 m every second contradict every reading of the IMU."""
+    alignment, zero = MarkerAlignment(SHIPPED, GRAVITY), np.zeros(3)
+    for k in range(2000):
+        node = Node(k * PERIOD, -DOWN, zero, zero, zero, np.array([0.0, 0, 0, 1]), np.eye(3),
+                    zero, zero, 0.0)
+        alignment.add(node, replace(node, stamp=(k + 1) * PERIOD),
+                      np.full(3, float(k // 100 % 2)), NOISE ** 2)
+    limits = [PRIORS.accelerometer_bias_std] * 3 + [PRIORS.marker_attitude_std] * 3
+    assert np.all(np.diag(alignment.covariance) <= 1.05 * np.square(limits))
+
+
 def test_poses_after_a_pause_do_not_count_as_motion():
     """The next pose is 3 m away, because nobody integrated the way."""
     random, zero = np.random.default_rng(2), np.zeros(3)
