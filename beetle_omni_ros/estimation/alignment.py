@@ -20,12 +20,11 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from beetle_omni_ros.estimation.parameters import EkfParameters
-from beetle_omni_ros.estimation.propagation import Node, STATES
+from beetle_omni_ros.estimation.propagation import Node, SAME_INSTANT, STATES
 from beetle_omni_ros.estimation.samples import ACCELEROMETER_BIAS, ATTITUDE
 from beetle_omni_ros.robot import rotations
 
 POSES = 20          # averaged in one update
-SAME_INSTANT = 1e-6     # [s]
 GATE = float(2 * gammaincinv(3 / 2, 0.99999))   # of the chi-square distribution
 PLAUSIBLE = 3.0     # standard deviations of an error that the priors explain
 MOTION, ERRORS = slice(0, 6), slice(6, 12)  # position and velocity; bias and attitude error
@@ -120,7 +119,8 @@ class MarkerAlignment:
         # Effects on the velocity: of both errors (columns 0 to 5), and of the IMU (6).
         step = np.empty((POSES, 3, 7))
         step[:, :, 0:3] = -each[:, :, None] * rotation
-        step[:, :, 3:6] = -step[:, :, 0:3] @ _skew(np.array([node.force for node in lasts]))
+        step[:, :, 3:6] = -step[:, :, 0:3] @ np.array(
+            [rotations.skew(node.force) for node in lasts])
         known = (step[:, :, 0:3] @ bias[:, :, None])[:, :, 0]
         step[:, :, 6] = np.array([node.velocity for node in lasts]) - velocity - known
         gained = step.cumsum(axis=0)
@@ -185,11 +185,3 @@ class MarkerAlignment:
         return replace(node, quaternion=quaternion, rotation=rotations.matrix(quaternion),
                        accelerometer_bias=self.bias.copy(), before=None,
                        covariance=covariance + effect @ self.covariance @ effect.T)
-
-
-def _skew(vectors):
-    """Matrices (n, 3, 3) of the cross products with ``vectors`` (n, 3)."""
-    matrices = np.zeros((len(vectors), 3, 3))
-    for row, column, axis in ((2, 1, 0), (0, 2, 1), (1, 0, 2)):
-        matrices[:, row, column], matrices[:, column, row] = vectors[:, axis], -vectors[:, axis]
-    return matrices

@@ -18,8 +18,9 @@ from beetle_omni_ros.estimation.model import ErrorStateModel, MEASUREMENTS
 from beetle_omni_ros.estimation.mounting import Mounting
 from beetle_omni_ros.estimation.noise import NoiseMonitor
 from beetle_omni_ros.estimation.parameters import EkfParameters
+from beetle_omni_ros.estimation.propagation import SAME_INSTANT
 from beetle_omni_ros.estimation.samples import ATTITUDE, Estimate, POSITION
-from beetle_omni_ros.estimation.track import interpolate, SAME_INSTANT, Track
+from beetle_omni_ros.estimation.track import interpolate, Track
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.readings import ImuReading, PoseReading
 from beetle_omni_ros.robot.rotations import geodesic_angle
@@ -45,7 +46,6 @@ class ErrorStateEkf:
         self._parameters = parameters
         self._model = ErrorStateModel(parameters, gravity)
         self._mounting = Mounting(self._model)
-        self._gravity = gravity
         self.reset()
 
     def reset(self) -> None:
@@ -55,7 +55,7 @@ class ErrorStateEkf:
         self._noise_scale = self._noise.scale
         self._model.scale_noise(*self._noise_scale)
         self._readings: deque = deque()  # (stamp, force, rate, after_impact), base_link axes
-        self._alignment = MarkerAlignment(self._parameters, self._gravity)
+        self._alignment = MarkerAlignment(self._parameters, self._model.gravity)
         self._early: deque = deque()     # poses captured after the newest IMU sample
         self._track: Track | None = None
         self._candidate: Track | None = None

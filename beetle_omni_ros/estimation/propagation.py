@@ -25,6 +25,7 @@ from beetle_omni_ros.robot import rotations
 TIME_OFFSET = ERROR_STATES
 STATES = ERROR_STATES + 1
 ACCELERATING = slice(ATTITUDE.start, GYROSCOPE_BIAS.stop)  # errors that change the acceleration
+SAME_INSTANT = 1e-6  # [s] well below a sample period, well above the resolution of a stamp
 UNKNOWN = np.full((STATES, STATES), np.nan)
 
 

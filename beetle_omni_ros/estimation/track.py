@@ -6,10 +6,9 @@ import numpy as np
 
 from beetle_omni_ros.estimation.alignment import MarkerAlignment
 from beetle_omni_ros.estimation.model import ErrorStateModel
-from beetle_omni_ros.estimation.propagation import Node
+from beetle_omni_ros.estimation.propagation import Node, SAME_INSTANT
 
 VELOCITY_KNOWN = 5  # poses after which the velocity is known, so that the time can be uncertain
-SAME_INSTANT = 1e-6  # [s] well below a sample period, well above the resolution of a stamp
 
 
 def interpolate(stamp, before, after) -> tuple[np.ndarray, np.ndarray]:
