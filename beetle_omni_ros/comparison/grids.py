@@ -194,8 +194,8 @@ def lemniscate(results: dict, conditions: str) -> Grid:
     rows.append(task.row('rounds', task.plain('trajectory', 'rounds', digits=0)))
     return task.grid(
         '3D lemniscate, five rounds', rows,
-        ['Ours is simulated, the published columns are measured on the real robot. The '
-         "publication does not state its curve's size and speed: for orientation only."])
+        ['Ours is simulated, the published columns are measured on the real robot. The curve is '
+         "that of the authors' code."])
 
 
 def disturbance(results: dict, kind: str, conditions: str) -> Grid:

@@ -355,9 +355,9 @@ def lemniscate_path(flown: dict, conditions: str) -> Figure | None:
         panel.set_ylabel(label)
     above.tick_params(labelbottom=False)
     side.set_xlabel('x [m]')
-    space.set(xlabel='x [m]', ylabel='y [m]', zlabel='z [m]', zlim=(0.9, 1.7),
-              xticks=(-1, 0, 1), yticks=(-0.5, 0, 0.5), zticks=(1.0, 1.3, 1.6))
-    space.set_box_aspect((2, 1.3, 1.0), zoom=1.02)
+    space.set(xlabel='x [m]', ylabel='y [m]', zlabel='z [m]', zlim=(0.6, 1.4),
+              xticks=(-1, 0, 1), yticks=(-0.5, 0, 0.5), zticks=(0.7, 1.0, 1.3))
+    space.set_box_aspect((2, 1.2, 1.0), zoom=1.02)
     space.view_init(elev=26, azim=-62)
     label_once(figure, space)
     return figure

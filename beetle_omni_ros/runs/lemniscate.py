@@ -1,13 +1,14 @@
 """
-The 3D lemniscate: a figure of eight with varying height and attitude.
+The 3D lemniscate of the publication: a figure of eight with varying height and attitude.
 
-With the phase phi, one round of which is 2 pi:
-    x = A sin(phi),  y = B sin(2 phi) / 2,  z = H + C cos(phi)
-    roll = D sin(phi),  pitch = D sin(2 phi),  yaw = phi
-Roll and pitch are within D = 0.5 rad and yaw runs over [0, 2 pi] in each round, as published. The
-other numbers are chosen for a 4 m room. The phase starts and ends at rest: its rate follows a
-quintic smoothstep over the ramps before the first and after the last round, so all rounds have the
-same speed.
+With the phase phi, one round of which is 2 pi, and theta = phi + pi / 2:
+    x = A cos(theta),  y = A sin(2 theta) / 2,  z = H + C sin(2 theta + pi / 2)
+    roll = -D sin(2 theta),  pitch = D cos(theta),  yaw = pi / 2 (1 - sin(theta))
+The curve and its numbers are those of the authors' code (`LemniscateTrajOmni` in
+https://github.com/jsk-ros-pkg/jsk_aerial_robot). Yaw is within [0, pi] there; the publication
+states [0, 2 pi]. In addition, the phase starts and ends at rest here: its rate follows a quintic
+smoothstep over the ramps before the first and after the last round, so all rounds have the same
+speed.
 """
 
 from math import cos, pi, sin
@@ -17,12 +18,11 @@ import numpy as np
 from beetle_omni_ros.control.base import Reference, TrajectoryTarget
 from beetle_omni_ros.robot import rotations
 
-LENGTH = 1.2  # [m] A, half the extent in x
-WIDTH = 1.2  # [m] B, the extent in y
-HEIGHT = 1.3  # [m] H, mean height
+LENGTH = 1.0  # [m] A, half the extent in x, and the extent in y
+HEIGHT = 1.0  # [m] H, mean height
 RISE = 0.3  # [m] C, half the extent in z
 TILT = 0.5  # [rad] D, largest roll and pitch
-PERIOD = 16.0  # [s] of one round
+PERIOD = 20.0  # [s] of one round
 ROUNDS = 5
 RAMP = 4.0  # [s] from rest to full speed
 DURATION = 2 * RAMP + ROUNDS * PERIOD  # [s]
@@ -56,11 +56,14 @@ def _ramp_phase(time, rate):
 def sample(time: float) -> Reference:
     """Return pose and velocity in world and body rates at ``time`` since the start [s]."""
     phi, rate = phase(time)
-    position = np.array([LENGTH * sin(phi), WIDTH / 2 * sin(2 * phi), HEIGHT + RISE * cos(phi)])
-    velocity = rate * np.array([LENGTH * cos(phi), WIDTH * cos(2 * phi), -RISE * sin(phi)])
-    roll, pitch, yaw = TILT * sin(phi), TILT * sin(2 * phi), phi
-    roll_rate, pitch_rate, yaw_rate = (rate * TILT * cos(phi), 2 * rate * TILT * cos(2 * phi),
-                                       rate)
+    once, twice = phi + pi / 2, 2 * phi + pi
+    position = np.array([LENGTH * cos(once), LENGTH / 2 * sin(twice),
+                         HEIGHT + RISE * sin(twice + pi / 2)])
+    velocity = rate * np.array([-LENGTH * sin(once), LENGTH * cos(twice),
+                                2 * RISE * cos(twice + pi / 2)])
+    roll, pitch, yaw = -TILT * sin(twice), TILT * cos(once), pi / 2 * (1 - sin(once))
+    roll_rate, pitch_rate, yaw_rate = rate * np.array([
+        -2 * TILT * cos(twice), -TILT * sin(once), -pi / 2 * cos(once)])
     angular_velocity = np.array([  # body rates of R = Rz(yaw) Ry(pitch) Rx(roll)
         roll_rate - yaw_rate * sin(pitch),
         pitch_rate * cos(roll) + yaw_rate * cos(pitch) * sin(roll),

@@ -145,7 +145,7 @@ def test_a_bag_gives_the_metrics_of_the_flight_in_memory(tmp_path, name):
     task = make_task(name)
     meta = {'task': name, 'seed': 0}
     memory = LogRecorder(meta)
-    duration = {'waypoints': 16.5, 'lemniscate': 29.0, 'torque': 11.0, 'payload': 16.0,
+    duration = {'waypoints': 16.5, 'lemniscate': 33.0, 'torque': 11.0, 'payload': 16.0,
                 'hover': 12.0}[name]
     with BagWriter(tmp_path / 'bag', meta) as bag:
         fly(Tee(memory, bag), task, duration=duration, start=1.7e9 + 0.123456789)
@@ -268,7 +268,8 @@ def test_tracking_reports_every_round():
     for part in (tracking, *tracking['rounds']):
         assert part['position_mean_m'] == pytest.approx(0.02, abs=1e-6)
         assert part['orientation_max_deg'] == pytest.approx(3.0, abs=1e-6)
-    cut = metrics(flown(make_task('lemniscate'), duration=30.0), make_task('lemniscate'))
+    duration = make_task('lemniscate').rounds[0][1] + 2.0
+    cut = metrics(flown(make_task('lemniscate'), duration=duration), make_task('lemniscate'))
     assert [part['position_mean_m'] is None for part in cut['trajectory']['rounds']] \
         == [False, True, True, True, True]
 

@@ -73,12 +73,19 @@ def test_lemniscate_starts_and_ends_at_rest_without_a_jump_in_acceleration():
         assert np.linalg.norm(near.velocity) / step < 1e-3
 
 
-def test_lemniscate_keeps_the_published_ranges_in_every_round():
+def test_each_round_of_the_lemniscate_is_the_curve_of_the_authors():
+    period = 20.0
     for begin, end in make_task('lemniscate').rounds:
-        times = np.arange(begin, end, 0.01) - 8.0
-        angles = np.array([rotations.to_rpy(lemniscate.sample(t).quaternion) for t in times])
-        assert np.abs(angles[:, :2]).max() == pytest.approx(0.5, abs=1e-3)
-        assert np.ptp(np.unwrap(angles[:, 2])) == pytest.approx(2 * np.pi, abs=0.02)
+        assert end - begin == pytest.approx(period)
+        for t in np.linspace(0, period, 101):
+            w, shifted = 2 * np.pi / period, t + period / 4
+            given = lemniscate.sample(begin - 8.0 + t)
+            assert given.position == pytest.approx(
+                [np.cos(w * shifted), np.sin(2 * w * shifted) / 2,
+                 1.0 + 0.3 * np.sin(2 * w * shifted + np.pi / 2)], abs=1e-9)
+            assert rotations.to_rpy(given.quaternion) == pytest.approx(
+                [-0.5 * np.sin(2 * w * shifted), 0.5 * np.cos(w * shifted),
+                 np.pi / 2 * np.sin(w * shifted + np.pi) + np.pi / 2], abs=1e-9)
 
 
 def test_the_published_trajectory_follows_the_lemniscate_between_its_samples():
