@@ -142,7 +142,7 @@ def _line(flight, result, kept):
             parts.append('control never lost' if level is None else
                          f"control lost at {level:g} {unit.replace('_', ' ')}")
     if metrics['crashed'] and not ('force' in metrics or 'torque' in metrics):
-        parts.append('touched the ground')
+        parts.append(metrics.get('ended') or 'touched the ground')
     parts.append('kept' if kept else f"{result['cpu_s']:.0f} s")
     return f"{flight.name}: {', '.join(parts)}"
 

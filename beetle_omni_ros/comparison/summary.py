@@ -85,6 +85,7 @@ def _group(task, results):
 def _poses(judged):
     poses = [pose for metrics in judged for pose in metrics['poses']]
     return {'poses': len(poses), 'reached': sum(pose['reached'] for pose in poses),
+            'flown': sum(pose['U_position_m'] is not None for pose in poses),
             **{key: _spread(pose[key] for pose in poses) for key in POSE_KEYS}}
 
 

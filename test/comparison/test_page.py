@@ -143,8 +143,9 @@ def test_pictures_named_in_the_markdown_exist(whole):
 
 def test_failed_and_crashed_flights_are_reported_and_affect_no_other(tmp_path):
     fell = made('waypoints', duration=21.0)
-    fell['metrics']['crashed'] = True
+    fell['metrics'].update(crashed=True, ended='emergency_stop: crash at 20.9 s')
     lost = made('force', duration=13.0)
+    lost['metrics']['crashed'] = True
     flown = {Flight('waypoints', 'nominal', 'rl', 0): FAILED,
              Flight('waypoints', 'nominal', 'nmpc', 0): fell,
              Flight('waypoints', 'nominal', 'nmpc_published', 0): made('waypoints'),
@@ -154,11 +155,12 @@ def test_failed_and_crashed_flights_are_reported_and_affect_no_other(tmp_path):
     page, numbers, text = written(tmp_path, flown, ('waypoints', 'force'),
                                   skipped={'rl_memory': 'no such file'})
     assert 'no take-off &lt;within&gt; 30 s' in page and '<within>' not in page
-    assert 'touched the ground' in page
+    assert 'touched the ground' in page and 'crash at 20.9 s' in page
     assert 'no such file' in page and 'no such file' in text
     waypoints = numbers['summary']['tasks']['waypoints']['nominal']
     assert waypoints['rl']['failures'] == {'0': FAILED['failure']}
     assert (waypoints['nmpc']['reached'], waypoints['nmpc']['poses']) == (2, 15)
+    assert (waypoints['nmpc']['flown'], waypoints['nmpc_published']['flown']) == (2, 15)
     force = numbers['summary']['tasks']['force']['nominal']['rl']['force']
     assert force['lost_at'] == [30.0] and force['withstood_min'] == 20.0
 
