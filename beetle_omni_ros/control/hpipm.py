@@ -62,7 +62,7 @@ class OcpQp:
         state_sizes: N + 1 state dimensions.
         input_sizes: N + 1 input dimensions, the last one 0.
         state_bounds: N + 1 lists of bounded state indices.
-        soft: linear and quadratic slack weight on all state bounds, or None for hard ones.
+        soft: linear and quadratic slack weights of the state bounds, or None for hard ones.
         tolerance: residual at which the interior-point method stops.
         max_iterations: its iteration limit.
         general: N + 1 pairs of matrices (C on the state, D on the input), or None.
@@ -116,7 +116,7 @@ class OcpQp:
                 self._set_int('idxs', k, [input_sizes[k] + i for i in range(len(bounded))])
                 for name, value in (('zl', soft[0]), ('zu', soft[0]), ('Zl', soft[1]),
                                     ('Zu', soft[1]), ('lls', 0.0), ('lus', 0.0)):
-                    self.set(name, k, np.full(len(bounded), value))
+                    self.set(name, k, np.broadcast_to(value, len(bounded)))
 
     def _set_int(self, field, stage, values):
         array = np.array(list(values), dtype=np.int32)

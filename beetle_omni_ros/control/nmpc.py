@@ -53,7 +53,8 @@ class NmpcController:
         self._robot = robot
         problem = ocp.build(robot, p.model.servo_lag, p.model.rotor_lag, p.horizon.change_time)
         intervals = p.horizon.intervals
-        soft = (p.limits.slack_linear, p.limits.slack_quadratic) if p.limits.soft else None
+        soft = (p.limits.slack_linear, p.limits.slack_quadratic, p.limits.height_linear,
+                p.limits.height_quadratic) if p.limits.soft else None
         options = {'ocp': problem, 'intervals': intervals, 'soft': soft,
                    'tolerance': p.solver.tolerance, 'max_iterations': p.solver.max_iterations,
                    'reaches': p.limits.tilt_rate_intervals - 1}
@@ -139,16 +140,18 @@ class NmpcController:
         disturbance = self._estimator.disturbance
         references = self._planner.plan(target, start, state.quaternion, full[model.TILT],
                                         disturbance)
+        bounds = np.concatenate([self._bounds, np.minimum(references[1:, 2],
+                                                          self._parameters.limits.height)])
         if not self._started:
             self._rti.fill(x0, np.clip(references[0, 13:21], self._bounds[:8], self._bounds[8:16]))
             self._iterate = FIRST_ITERATIONS
         else:
             self._rti.shift(self.period)
         for _ in range(self._iterate):
-            self._rti.step(x0, references, disturbance, self._weights, self._bounds)
+            self._rti.step(x0, references, disturbance, self._weights, bounds)
         self._iterate = 0
         status, self._iterations = self._rti.step(x0, references, disturbance, self._weights,
-                                                  self._bounds)
+                                                  bounds)
         self._statuses[status] = self._statuses.get(status, 0) + 1
         self._failures = 0 if status == 0 else self._failures + 1
         self._started = self._failures < FAILURES_TO_RESTART

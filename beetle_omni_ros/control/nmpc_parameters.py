@@ -62,12 +62,19 @@ class LimitParameters:
     thrust_max: float = parameter(
         20.0, doc='largest thrust inside the optimisation', unit='N', low=0.1, high=200)
     soft: bool = parameter(
-        True, doc='velocity and rate limits may be exceeded at a cost, which keeps the QP '
-        'feasible', read_only=True)
-    slack_linear: float = parameter(10.0, doc='cost of exceeding a soft limit', unit='', low=0,
+        True, doc='limits of velocity, rate and height may be exceeded at a cost, which keeps the '
+        'QP feasible', read_only=True)
+    height: float = parameter(
+        0.5, doc='smallest height of base_link in world, unless the target is lower; -1000: none',
+        unit='m', low=-1000, high=1000)
+    height_linear: float = parameter(1000.0, doc='cost of a lower height', unit='1/m', low=0,
+                                     high=1e6, read_only=True)
+    height_quadratic: float = parameter(1e5, doc='cost of a lower height, squared', unit='1/m^2',
+                                        low=0, high=1e6, read_only=True)
+    slack_linear: float = parameter(10.0, doc='cost of exceeding velocity or rate', unit='', low=0,
                                     high=1e6, read_only=True)
-    slack_quadratic: float = parameter(100.0, doc='cost of exceeding a soft limit, squared', low=0,
-                                       high=1e6, read_only=True)
+    slack_quadratic: float = parameter(100.0, doc='cost of exceeding velocity or rate, squared',
+                                       low=0, high=1e6, read_only=True)
 
 
 @dataclass(frozen=True, kw_only=True)

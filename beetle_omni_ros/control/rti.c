@@ -17,10 +17,14 @@
 #define NT 4                            /* tilts, states TILT to TILT + 3 and inputs 0 to 3 */
 #define TILT 13
 #define OFFSET 6                        /* of the servos' offsets in the disturbance */
+#define NBX 7                           /* bounded states: height, velocity, body rate */
+#define HEIGHT 2
 #define MAX_STAGES 64
 
+static const int bounded_state[NBX] = {HEIGHT, 3, 4, 5, 10, 11, 12};
+
 struct rti {
-    int horizon, nx, soft;          /* intervals, states, whether v and w are softly bounded */
+    int horizon, nx, soft;          /* intervals, states, whether states are softly bounded */
     int reaches;                    /* intervals beyond the first with a bounded command lead */
     double interval[MAX_STAGES];    /* length of each interval [s] */
     double *x, *u;                  /* stored trajectory (N+1) x nx, N x NU */
@@ -52,7 +56,7 @@ void rti_free(struct rti *s)
     free(s);
 }
 
-/* soft_weights: linear and quadratic weight of the slacks on v and w. reaches: intervals beyond
+/* soft_weights: linear and quadratic weight of the slacks on v and w, then on the height. reaches: intervals beyond
  * the first in which tilt targets keep within reach of the tilts. */
 struct rti *rti_create(int horizon, const double *interval, int nx, int soft,
                        const double *soft_weights, double tolerance, int max_iterations, int reaches)
@@ -71,7 +75,7 @@ struct rti *rti_create(int horizon, const double *interval, int nx, int soft,
     void *memory = block(s, d_ocp_qp_dim_memsize(horizon));
     d_ocp_qp_dim_create(horizon, &s->dim, memory);
     for (int k = 0; k <= horizon; k++) {
-        int bounded = k > 0 ? 6 : 0;    /* velocity and body rate; the first state is given */
+        int bounded = k > 0 ? NBX : 0;  /* the first state is given */
         d_ocp_qp_dim_set_nx(k, k > 0 ? nx : 0, &s->dim);
         d_ocp_qp_dim_set_nu(k, k < horizon ? NU : 0, &s->dim);
         d_ocp_qp_dim_set_nbx(k, bounded, &s->dim);
@@ -91,18 +95,23 @@ struct rti *rti_create(int horizon, const double *interval, int nx, int soft,
     d_ocp_qp_ipm_ws_create(&s->dim, &s->arg, &s->ws,
                            block(s, d_ocp_qp_ipm_ws_memsize(&s->dim, &s->arg)));
 
-    int input_index[NU], state_index[6] = {3, 4, 5, 10, 11, 12}, slack_index[6];
-    double zero[6] = {0}, linear[6], quadratic[6], C[NT * 21] = {0}, D[NT * NU] = {0};
+    int input_index[NU], state_index[NBX], slack_index[NBX];
+    double zero[NBX] = {0}, linear[NBX], quadratic[NBX], C[NT * 21] = {0}, D[NT * NU] = {0};
+    double no_upper[NBX] = {0, 1, 1, 1, 1, 1, 1};           /* the height has no upper bound */
     for (int i = 0; i < NT; i++) C[(TILT + i) * NT + i] = -1, D[i * NT + i] = 1;
     for (int i = 0; i < NU; i++) input_index[i] = i;
-    for (int i = 0; i < 6; i++) linear[i] = soft_weights[0], quadratic[i] = soft_weights[1];
+    for (int i = 0; i < NBX; i++) {
+        const double *weights = soft_weights + (i == 0 ? 2 : 0);
+        state_index[i] = bounded_state[i], linear[i] = weights[0], quadratic[i] = weights[1];
+    }
     for (int k = 0; k <= horizon; k++) {
         if (k < horizon) d_ocp_qp_set_idxbu(k, input_index, &s->qp);
         if (k == 0) continue;
         if (k <= reaches) d_ocp_qp_set_C(k, C, &s->qp), d_ocp_qp_set_D(k, D, &s->qp);
         d_ocp_qp_set_idxbx(k, state_index, &s->qp);
+        d_ocp_qp_set_ubx_mask(k, no_upper, &s->qp);
         if (!soft) continue;
-        for (int i = 0; i < 6; i++) slack_index[i] = i + (k < horizon ? NU : 0);   /* bu, bx, g */
+        for (int i = 0; i < NBX; i++) slack_index[i] = i + (k < horizon ? NU : 0);   /* bu, bx, g */
         d_ocp_qp_set_idxs(k, slack_index, &s->qp);
         d_ocp_qp_set_Zl(k, quadratic, &s->qp), d_ocp_qp_set_Zu(k, quadratic, &s->qp);
         d_ocp_qp_set_zl(k, linear, &s->qp), d_ocp_qp_set_zu(k, linear, &s->qp);
@@ -141,8 +150,9 @@ static int finite_all(const double *values, int count)
 }
 
 /* One iteration. references: (N+1) x NREF; disturbance: 10; bounds: lower u (NU), upper u (NU),
- * limit of |v| and |w| by component, reach of the tilt targets (N). Returns the QP status: 0 solved, 1 iteration limit,
- * 2 step length, 3 NaN; on 2 and 3 the stored trajectory stays as it was. */
+ * limit of |v| and |w| by component, reach of the tilt targets (N), smallest height at the nodes
+ * 1 to N. Returns the QP status: 0 solved, 1 iteration limit, 2 step length, 3 NaN; on 2 and 3 the
+ * stored trajectory stays as it was. */
 int rti_step(struct rti *s, const double *x0, const double *references, const double *disturbance,
              const double *weights, const double *bounds)
 {
@@ -193,8 +203,9 @@ int rti_step(struct rti *s, const double *x0, const double *references, const do
     terminal(arg, res, 0, 0, 0);
     d_ocp_qp_set_Q(N, Q, &s->qp), d_ocp_qp_set_q(N, q, &s->qp);
     for (int k = 1; k <= N; k++) {
-        for (int i = 0; i < 6; i++) {
-            double limit = bounds[2 * NU + i / 3], value = x[k * nx + (i < 3 ? 3 + i : 7 + i)];
+        lower[0] = bounds[2 * NU + 2 + N + k - 1] - x[k * nx + HEIGHT], upper[0] = 0;
+        for (int i = 1; i < NBX; i++) {
+            double limit = bounds[2 * NU + (i - 1) / 3], value = x[k * nx + bounded_state[i]];
             lower[i] = -limit - value, upper[i] = limit - value;
         }
         d_ocp_qp_set_lbx(k, lower, &s->qp), d_ocp_qp_set_ubx(k, upper, &s->qp);

@@ -8,7 +8,8 @@ from beetle_omni_ros.control.hpipm import compiled_library, OcpQp
 from beetle_omni_ros.control.ocp import INPUT_SIZE, Ocp, REFERENCE_SIZE
 from beetle_omni_ros.robot.dynamics import TILT_OFFSET
 
-BOUNDED_STATES = [3, 4, 5, 10, 11, 12]  # velocity and body rates
+BOUNDED_STATES = [2, 3, 4, 5, 10, 11, 12]  # height, velocity and body rates
+UPPER = [0.0, *[1.0] * 6]               # the height has no upper bound
 QUATERNION, TILT = slice(6, 10), slice(13, 17)
 _DOUBLES = POINTER(c_double)
 
@@ -20,7 +21,8 @@ class CompiledRti:
     Args:
         ocp: stage functions.
         intervals: (N,) interval lengths [s].
-        soft: linear and quadratic slack weight of the velocity and rate limits, or None.
+        soft: linear and quadratic slack weight of the velocity and rate limits, then of the height
+            limit, or None.
         tolerance: residual at which the QP counts as solved.
         max_iterations: of the QP.
         reaches: number of intervals after the first in which the lead of tilt targets is bounded.
@@ -45,7 +47,7 @@ class CompiledRti:
         lib.rti_iterations.argtypes = lib.rti_free.argtypes = [c_void_p]
         n, size = len(intervals), ocp.state_size
         interval = np.array(intervals, dtype=float)
-        weights = np.array(soft if soft else (0.0, 0.0), dtype=float)
+        weights = np.array(soft if soft else (0.0,) * 4, dtype=float)
         self._handle = lib.rti_create(n, interval.ctypes.data_as(_DOUBLES), size, int(bool(soft)),
                                       weights.ctypes.data_as(_DOUBLES), tolerance, max_iterations,
                                       reaches)
@@ -76,8 +78,9 @@ class CompiledRti:
             references: (N + 1, 29).
             disturbance: (10,) force in world, torque in body, tilt offsets.
             weights: (11,) in the order of ``ocp.WEIGHTS``.
-            bounds: (18 + N,) lower and upper input bounds, limits of |v| and |w|, and for each
-                interval the largest lead of a tilt target.
+            bounds: (18 + 2 N,) lower and upper input bounds, limits of |v| and |w|, for each
+                interval the largest lead of a tilt target, and for each of the nodes 1 to N the
+                smallest height.
 
         Returns:
             QP status (0 solved) and iterations; above 1 nothing has changed.
@@ -97,8 +100,12 @@ class InterpretedRti:
         n, size = len(intervals), ocp.state_size
         self._ocp, self._intervals = ocp, np.array(intervals, dtype=float)
         self.states, self.inputs = np.zeros((n + 1, size)), np.zeros((n, INPUT_SIZE))
+        slack = [np.r_[soft[2 + i], np.full(6, soft[i])] for i in (0, 1)] if soft else None
         self._qp = OcpQp([0] + [size] * n, [INPUT_SIZE] * n + [0], [[]] + [BOUNDED_STATES] * n,
-                         soft, tolerance, max_iterations, self._lead_constraints(n, size, reaches))
+                         slack, tolerance, max_iterations,
+                         self._lead_constraints(n, size, reaches))
+        for k in range(1, n + 1):
+            self._qp.set('ubx_mask', k, np.array(UPPER))
         self._reaches = reaches
         self._buffer, self._evaluate = ocp.stage.buffer()
         shapes = [ocp.stage.size_out(i) for i in range(ocp.stage.n_out())]
@@ -134,9 +141,11 @@ class InterpretedRti:
         hessian, gradient = self._ocp.terminal(x[n], references[n], weights)
         qp.set('Q', n, np.array(hessian))
         qp.set('q', n, np.array(gradient).ravel())
-        limit = np.repeat(bounds[2 * INPUT_SIZE:2 * INPUT_SIZE + 2], 3)
+        limit = np.r_[0.0, np.repeat(bounds[2 * INPUT_SIZE:2 * INPUT_SIZE + 2], 3)]
         for k in range(1, n + 1):
-            qp.set('lbx', k, -limit - x[k, BOUNDED_STATES])
+            low = -limit
+            low[0] = bounds[2 * INPUT_SIZE + 1 + n + k]
+            qp.set('lbx', k, low - x[k, BOUNDED_STATES])
             qp.set('ubx', k, limit - x[k, BOUNDED_STATES])
         status, iterations = qp.solve()
         for k in range(n):

@@ -13,7 +13,8 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 ROBOT = RobotParameters.load()
 WEIGHTS = NmpcWeights().vector()
 INTERVALS = np.full(4, 0.1)
-SOFT = (10.0, 100.0)
+SOFT = (10.0, 100.0, 50.0, 2000.0)
+HEIGHT = 1.01  # [m] above the present height, so that the limit is active
 REACH = 0.15   # [rad]
 REACHES = 2
 needs_compiler = pytest.mark.skipif(
@@ -33,7 +34,7 @@ def setting(thrust=None):
     references[:, 0] = 1.5
     references[:, 6:10] = [np.sin(0.5), 0, 0, np.cos(0.5)]
     bounds = np.r_[np.full(4, -3.96), np.zeros(4), np.full(4, 3.96), np.full(4, 20.0), 0.2, 1.0,
-                   np.full(len(INTERVALS), REACH)]
+                   np.full(len(INTERVALS), REACH), np.full(len(INTERVALS), HEIGHT)]
     return x, references, 0.05 * np.ones(10), bounds
 
 
@@ -42,7 +43,7 @@ def qp_by_casadi(problem, x, u, x0, references, disturbance, bounds):
     n, size, nu = len(INTERVALS), problem.state_size, 8
     opti_x = [ca.MX.sym(f'x{k}', size) for k in range(n + 1)]
     opti_u = [ca.MX.sym(f'u{k}', nu) for k in range(n)]
-    slack = [ca.MX.sym(f's{k}', 12) for k in range(1, n + 1)]
+    slack = [ca.MX.sym(f's{k}', 13) for k in range(1, n + 1)]
     cost, equal, low, high, inequality = 0, [opti_x[0] - (x0 - x[0])], [], [], []
     for k in range(n):
         f, a, b, q_xx, r_uu, s_ux, q, r = problem.stage(
@@ -64,12 +65,14 @@ def qp_by_casadi(problem, x, u, x0, references, disturbance, bounds):
         high.append(np.full(4, REACH))
     limit = np.repeat(bounds[2 * nu:2 * nu + 2], 3)
     for k in range(1, n + 1):
-        s = slack[k - 1]
+        s, sunk = slack[k - 1][:12], slack[k - 1][12]
         cost += SOFT[0] * ca.sum1(s) + 0.5 * SOFT[1] * ca.sumsqr(s)
-        value = opti_x[k][BOUNDED_STATES] + x[k, BOUNDED_STATES]
-        inequality += [value + s[:6], value - s[6:], s]
-        low += [-limit, np.full(6, -np.inf), np.zeros(12)]
-        high += [np.full(6, np.inf), limit, np.full(12, np.inf)]
+        cost += SOFT[2] * sunk + 0.5 * SOFT[3] * sunk ** 2
+        moving = BOUNDED_STATES[1:]
+        value = opti_x[k][moving] + x[k, moving]
+        inequality += [value + s[:6], value - s[6:], opti_x[k][2] + x[k, 2] + sunk, slack[k - 1]]
+        low += [-limit, np.full(6, -np.inf), np.array([HEIGHT]), np.zeros(13)]
+        high += [np.full(6, np.inf), limit, np.full(14, np.inf)]
     variables = ca.vertcat(*opti_x, *opti_u, *slack)
     solver = ca.qpsol('qp', 'qrqp', {'x': variables, 'f': cost,
                                      'g': ca.vertcat(*equal, *inequality)},
@@ -90,6 +93,22 @@ def test_the_first_command_is_that_of_an_independent_qp_solver(problem):
     assert status == 0
     reference = qp_by_casadi(problem, x, u, x0, references, disturbance, bounds)
     assert np.allclose(rti.inputs[0], reference, atol=1e-5)
+
+
+def test_a_plan_sinks_below_the_smallest_height_only_while_it_cannot_help_it(problem):
+    x0, references, disturbance, bounds = setting()
+    x0[5] = -0.6                                      # [m/s] sinking
+    references[:, 2] = 0.8
+    heights = []
+    for height in (-1000.0, 0.92):
+        bounds[-len(INTERVALS):] = height
+        rti = InterpretedRti(problem, INTERVALS, (10.0, 100.0, 1e3, 1e5), 1e-8, 80, REACHES)
+        rti.fill(x0, np.r_[np.zeros(4), x0[17:]])
+        for _ in range(8):
+            rti.step(x0, references, 0 * disturbance, WEIGHTS, bounds)
+        heights.append(rti.states[:, 2].copy())
+    assert heights[0].min() < 0.89
+    assert heights[1].min() > 0.91
 
 
 @needs_compiler
