@@ -213,9 +213,9 @@ def disturbance(results: dict, kind: str, conditions: str) -> Grid:
     what = 'Upward force for 2 s at each level, without a pause' if kind == 'force' else \
         'Torque about x for 0.05 s at each level, one every 2 s'
     notes = [f'{what}, while hovering at [0, 0, 1.5] m with 25 deg of roll. Cells: largest '
-             'position [m] / orientation error [deg] in the 2 s, mean over the seeds; × where '
-             'control was lost: more than 1.5 m away, on the ground, or turned by more than 90 '
-             'deg when the next level is due. That ends the flight.']
+             'position [m] / orientation error [deg] in the 2 s, mean over the seeds. × marks a '
+             'lost control: more than 1.5 m away, on the ground, or turned by more than 90 deg '
+             'when the next level is due. That ends the flight.']
     if kind == 'torque':
         notes.append('Published: RL "loses stability rapidly" between 15 and 25 N m, neither '
                      'recovers above 25 N m.')

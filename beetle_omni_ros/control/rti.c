@@ -56,8 +56,8 @@ void rti_free(struct rti *s)
     free(s);
 }
 
-/* soft_weights: linear and quadratic weight of the slacks on v and w, then on the height. reaches: intervals beyond
- * the first in which tilt targets keep within reach of the tilts. */
+/* soft_weights: linear and quadratic weight of the slacks on v and w, then on the height.
+ * reaches: intervals beyond the first in which tilt targets keep within reach of the tilts. */
 struct rti *rti_create(int horizon, const double *interval, int nx, int soft,
                        const double *soft_weights, double tolerance, int max_iterations, int reaches)
 {
