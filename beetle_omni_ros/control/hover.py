@@ -13,7 +13,9 @@ wrong mass, an offset of the centre of gravity, wind. d is the low-passed differ
 measured acceleration and that of the present thrusts. It does not depend on errors or targets, and
 it is valid when this controller takes over from another. A lead filter compensates the rotors'
 slow thrust response. The tilt targets move at a limited rate from the executed command. A rotor
-whose joint is still turning gives only the thrust that is useful in its present direction.
+whose joint is still turning gives only the thrust that is useful in its present direction. A joint
+at its stop waits there for the end of a transient, because the same thrust direction on the other
+side of its travel is a full turn away.
 """
 
 from dataclasses import dataclass
@@ -67,6 +69,9 @@ class HoverParameters(ParameterFile, file='hover.yaml'):
     tilt_full_thrust: float = parameter(
         1.0, doc='a rotor with less thrust turns its joint proportionally slower', unit='N',
         low=0, high=20)
+    stop_overlap: float = parameter(
+        0.3, doc='a joint waits at its stop if the tilt that holds the weight is at most this far '
+        'beyond it', unit='rad', low=0, high=1.5)
 
     degraded: LocalWeights = group(LocalWeights, 'allocation with what is left of the actuators')
 
@@ -123,11 +128,14 @@ class HoverController:
         self.observe(state)
         force, torque = self._wrench(state, target)
         present = in_force.tilt if in_force is not None else state.tilt
-        goal = self._near(self._allocator, state, target, present, force, torque) \
-            if isinstance(self._allocator, DegradedAllocator) else \
-            self._allocator.hover(state.quaternion, present, force, torque)
+        if isinstance(self._allocator, DegradedAllocator):
+            goal = self._near(self._allocator, state, target, present, force, torque)
+            tilt = goal.tilt
+        else:
+            goal = self._allocator.hover(state.quaternion, present, force, torque)
+            tilt = self._waiting_at_stops(goal.tilt, state.quaternion, present)
         self._saturations += bool(goal.saturated.any())
-        self._command = Command(state.stamp, *self._targets(state, goal, present, dt))
+        self._command = Command(state.stamp, *self._targets(state, goal, tilt, present, dt))
         self._stamp = state.stamp
         return self._command
 
@@ -176,6 +184,17 @@ class HoverController:
                 'torque_disturbance_rad_s2': float(np.linalg.norm(self._disturbance[3:])),
                 'saturated_steps': int(self._saturations)}
 
+    def _waiting_at_stops(self, goal, quaternion, present):
+        """Tilt goals (4,) [rad]: a stop instead of a full turn that only a transient needs."""
+        over = np.abs(goal - present) > np.pi       # the nearest turn is beyond the stop
+        if not over.any():
+            return goal
+        steady = self._allocator.hover(quaternion, present).tilt
+        steady = steady + 2 * np.pi * np.round((present - steady) / (2 * np.pi))
+        limit = self._allocator.tilt_limit
+        waits = over & (np.abs(steady) <= limit + self.parameters.stop_overlap)
+        return np.where(waits, np.copysign(limit, present), goal)
+
     def _near(self, degraded: DegradedAllocator, state, target, present, force, torque):
         """Allocation near the present tilts, towards tilts that hold a nearby attitude."""
         turn = rotations.log(rotations.multiply(rotations.conjugate(state.quaternion),
@@ -213,14 +232,14 @@ class HoverController:
         if not self._health.healthy:
             self._thrust = self._health.possible(self._thrust, self._thrust)[1]
 
-    def _targets(self, state, goal, present, dt):
+    def _targets(self, state, goal, goal_tilt, present, dt):
         """Tilt and thrust targets after rate limits, projection and lead."""
         p, rotors = self.parameters, self._robot.rotors
         busy = np.ones(4) if p.tilt_full_thrust == 0 or not self._health.healthy else \
             np.minimum(1.0, goal.thrust / p.tilt_full_thrust)
         limit = self._robot.joints.position_limit
         reach = p.tilt_rate * dt * busy
-        tilt = clipped(present + clipped(goal.tilt - present, -reach, reach), -limit, limit)
+        tilt = clipped(present + clipped(goal_tilt - present, -reach, reach), -limit, limit)
         thrust = self._thrust_on_the_way(goal, state.tilt)
         lead = rotors.time_constant / p.thrust_response
         thrust = self._thrust + max(lead, 1.0) * (thrust - self._thrust)

@@ -4,9 +4,10 @@ Turns back to level that the joints can follow.
 In a slow turn each tilt is the angle of world's up about the rotor's arm. The tilts therefore
 follow from the path of the up direction in the body frame. The joints have stops, and a joint near
 half a turn can reach level only along paths on its own side. If an arm points upward, its thrust
-cannot carry weight and its tilt may have any value: there a joint that is wound in the wrong
-direction can turn over without loss. The planner compares paths of the up direction: the direct
-path, paths through the horizontal plane of the body, and paths through upward arms.
+cannot carry weight: there a joint that is wound in the wrong direction can turn over with little
+loss. The planner compares paths of the up direction: the direct path, paths through the horizontal
+plane of the body, and paths through upward arms. A joint may begin within the margin of its stop
+if the path leads it away at once.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ UP = np.array([0.0, 0.0, 1.0])
 STEP = 0.1              # [rad] between points of a path
 VIA = 16                # tested points of the body's horizontal plane
 TURNED_OVER = 1.0       # [rad] in one step: the thrust points in a wrong direction meanwhile
+UNLOADED = 0.3          # [-] of its hover thrust is the loss if a rotor without load turns over,
+                        # because its small thrust controls the attitude
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,17 +110,28 @@ def plan(quaternion: np.ndarray, tilt: np.ndarray, allocator: Allocator,
         the way, from the present attitude to a level one.
 
     """
-    start = rotations.up(quaternion)
-    paths = [_path(corners) for corners in _corners(start, allocator)]
+    paths, times, lost, best = _compare(quaternion, tilt[None], allocator, p)
+    k = int(best[0])
+    return _way(quaternion, paths[k], times[0, k, :len(paths[k])], float(lost[0, k]))
+
+
+def lost_lift(quaternion: np.ndarray, tilts: np.ndarray, allocator: Allocator,
+              p: LevellingParameters) -> np.ndarray:
+    """Lost lift (W,) of the planned way, see :class:`Way`, for each of the tilts (W, 4) [rad]."""
+    _, _, lost, best = _compare(quaternion, tilts, allocator, p)
+    return lost[np.arange(len(best)), best]
+
+
+def _compare(quaternion, tilts, allocator, p):
+    """Paths of the up direction, their times (W, N, P), lost lift (W, N), and the best (W,)."""
+    paths = [_path(corners) for corners in _corners(rotations.up(quaternion), allocator)]
     longest = max(map(len, paths))
     # One array: shorter paths stay level at their end.
     up = np.array([np.concatenate([path, np.tile(UP, (longest - len(path), 1))])
                    for path in paths])
-    waits, lost = _follow(tilt, up, allocator, p)
+    waits, lost = _follow(tilts, up, allocator, p)
     times = np.maximum(_angles_between(up) / p.rate, waits)
-    best = int(np.argmin(times.sum(axis=1) + p.missing_thrust * lost))
-    length = len(paths[best])
-    return _way(quaternion, paths[best], times[best, :length], float(lost[best]))
+    return paths, times, lost, np.argmin(times.sum(axis=2) + p.missing_thrust * lost, axis=1)
 
 
 def _corners(start, allocator):
@@ -150,26 +164,28 @@ def _angles_between(up):
     return np.concatenate([np.zeros((len(up), 1)), np.arccos(cosine)], axis=1)
 
 
-def _follow(tilt, up, allocator, p):
+def _follow(tilts, up, allocator, p):
     """
-    Times (N, P) [s] that the joints need for each step of N paths, and lift lost (N,) [s].
+    Times (W, N, P) [s] that the joints need for each step of N paths, and lift lost (W, N) [s].
 
-    A joint uses the nearest angle within its stops, as in the allocation. Lost lift is the hover
-    thrust of one rotor times the time for which its thrust points in a wrong direction.
+    A joint uses the nearest angle within its stops, as in the allocation. Lost lift is the thrust
+    of a rotor times the time for which it points in a wrong direction, in hover thrusts.
     """
     shape = up.shape[:2] + (ROTORS,)
     angles, thrusts = (x.reshape(shape) for x in allocator.upright(up.reshape(-1, 3)))
     limit, hover = allocator.tilt_limit - p.margin, np.linalg.norm(allocator.weight) / ROTORS
-    present = np.tile(np.asarray(tilt, dtype=float), (len(up), 1))
-    waits, lost = np.zeros(shape[:2]), np.zeros(len(up))
+    shares = np.maximum(thrusts / hover, UNLOADED)
+    present = np.tile(np.asarray(tilts, dtype=float)[:, None], (1, len(up), 1))
+    waits, lost = np.zeros((len(tilts), *shape[:2])), np.zeros((len(tilts), len(up)))
     for k in range(shape[1]):
         angle = angles[:, k]
         goal = angle + 2 * np.pi * np.round((present - angle) / (2 * np.pi))
-        goal = np.where(np.abs(goal) > limit, angle, goal)
+        if k:       # at the start a joint may be nearer to its stop, if the path leads away
+            goal = np.where(np.abs(goal) > limit, angle, goal)
         moves = np.abs(goal - present)
         time = moves / p.joint_rate
-        waits[:, k] = time.max(axis=1)
-        lost += (thrusts[:, k] * np.where(moves > TURNED_OVER, time, 0.0)).sum(axis=1) / hover
+        waits[..., k] = time.max(axis=2)
+        lost += (shares[:, k] * np.where(moves > TURNED_OVER, time, 0.0)).sum(axis=2)
         present = goal
     return waits, lost
 

@@ -2,10 +2,11 @@
 A joint that is wound in the wrong direction turns over while its rotor is off.
 
 Upside down each tilt may be +pi or -pi. On every way to level, one joint of an opposite pair turns
-forwards and the other backwards. If both are wound in the same direction, one of them reaches its
-stop. It must turn back by a full turn, during which its thrust points in wrong directions. The
-robot therefore flies to an attitude that the other three rotors hold with a margin, stops this
-rotor, turns its joint, and continues with four rotors.
+forwards and the other backwards. If both are wound in the same direction, one of them must turn
+back by a full turn, during which its thrust points in wrong directions. While its arm is upright
+this thrust is small, but it is needed to control the attitude. The robot therefore flies to an
+attitude that the other three rotors hold with a margin, stops this rotor, turns its joint, and
+continues with four rotors. If both pairs are wound so, this happens twice.
 """
 
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from beetle_omni_ros.robot.allocation import Allocator, ROTORS
 from beetle_omni_ros.robot.holding import Holding, leaned, up
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import parameter
-from beetle_omni_ros.safety.levelling import LevellingParameters, plan
+from beetle_omni_ros.safety.levelling import LevellingParameters, lost_lift
 
 TURN = 2 * np.pi
 
@@ -34,7 +35,7 @@ class TurnoverParameters:
         0.3, doc='smallest distance of the other tilts from their stops meanwhile', unit='rad',
         low=0, high=0.8)
     farthest: float = parameter(
-        1.0, doc='largest turn to the attitude in which the rotor is stopped', unit='rad', low=0,
+        1.3, doc='largest turn to the attitude in which the rotor is stopped', unit='rad', low=0,
         high=3.15)
     settling_time: float = parameter(
         0.5, doc='time in this attitude before the rotor stops', unit='s', low=0, high=10)
@@ -97,20 +98,19 @@ def find_turnover(quaternion: np.ndarray, tilt: np.ndarray, robot: RobotParamete
     return None
 
 
-def _wrong_joints(quaternion, tilt, allocator, level, lost_lift):
+def _wrong_joints(quaternion, tilt, allocator, level, limit):
     """The smallest set of joints whose turnover gives a way to level without loss of lift."""
     turned = tilt - np.copysign(TURN, tilt)
-    wound = np.flatnonzero(np.abs(turned) <= allocator.tilt_limit)
-    for count in range(1, len(wound) + 1):
-        best = min(combinations(wound.tolist(), count), default=(), key=lambda joints: plan(
-            quaternion, _with(tilt, turned, joints), allocator, level).lost)
-        if plan(quaternion, _with(tilt, turned, best), allocator, level).lost <= lost_lift:
-            return best
-    return ()
-
-
-def _with(tilt, turned, joints):
-    return np.where(np.isin(np.arange(ROTORS), joints), turned, tilt)
+    wound = np.flatnonzero(np.abs(turned) <= allocator.tilt_limit).tolist()
+    sets = [joints for count in range(1, len(wound) + 1) for joints in combinations(wound, count)]
+    if not sets:
+        return ()
+    tilts = np.array([np.where(np.isin(np.arange(ROTORS), joints), turned, tilt)
+                      for joints in sets])
+    lost = lost_lift(quaternion, tilts, allocator, level)
+    good = [(len(joints), loss, joints) for joints, loss in zip(sets, lost.tolist())
+            if loss <= limit]
+    return min(good)[2] if good else ()
 
 
 def _place(joint, quaternion, tilt, robot, allocator, p):

@@ -166,3 +166,34 @@ def test_follows_a_moving_target_with_its_velocity():
     plant, in_force = start(level)
     log = fly(plant, HoverController(ROBOT), target, 4.9, in_force)
     assert log[-1][0] < 0.05
+
+
+STOP = ROBOT.joints.position_limit
+AT_STOP = rotations.from_rpy(*np.radians([154.2, -47.0, 32.1]))     # joints 1 and 3 at +-3.93 rad
+
+
+@pytest.mark.parametrize('seed', range(6))
+def test_a_joint_waits_at_its_stop_for_the_end_of_a_transient(seed):
+    wound = Allocator(ROBOT).hover(AT_STOP, np.array([-STOP, 2.0, STOP, -2.0]))
+    assert np.abs(wound.tilt[[0, 2]]).min() > STOP - 0.1
+    rng = np.random.default_rng(seed)
+    plant = Plant(ROBOT, HOME, rotations.multiply(AT_STOP, rotations.exp(0.05 * unit(rng))),
+                  wound.tilt)
+    plant.thrust = wound.thrust.copy()
+    log = fly(plant, HoverController(ROBOT), PoseTarget(HOME + 0.2 * unit(rng), AT_STOP), 2.0,
+              Command(0.0, wound.tilt, wound.thrust))
+    farthest = max(np.abs(step[2].tilt - wound.tilt).max() for step in log)
+    assert farthest < 1.5                                   # not to the other side
+    assert log[-1][0] < 0.05 and log[-1][1] < 0.1
+
+
+def test_a_joint_leaves_its_stop_if_the_weight_needs_the_other_side():
+    on_its_side = rotations.from_rpy(np.pi / 2, 0.0, 0.0)
+    steady = Allocator(ROBOT).hover(on_its_side, np.zeros(4))
+    assert 2 * np.pi - np.abs(steady.tilt).max() > STOP + PARAMETERS.stop_overlap
+    command = Command(0.0, np.copysign(STOP, -steady.tilt), steady.thrust)
+    plant = Plant(ROBOT, HOME, on_its_side, command.tilt)
+    hover = HoverController(ROBOT)
+    for plant.time in np.arange(1, 40) * PERIOD:
+        command = hover.step(plant.state(command), PoseTarget(HOME, on_its_side))
+    assert (np.abs(command.tilt) < STOP - 2.0).all()

@@ -93,3 +93,28 @@ def test_the_attitude_is_held_while_a_joint_waits_at_the_start():
     attitude, rate = way.at(0.01)
     np.testing.assert_allclose(np.abs(attitude @ ATTITUDES[0]), 1, atol=1e-9)
     np.testing.assert_allclose(rate, 0)
+
+
+def test_two_opposite_joints_at_their_stops_turn_back_without_loss_of_lift():
+    limit, tried = ALLOCATOR.tilt_limit, 0
+    for attitude in np.random.default_rng(7).normal(size=(1500, 4)):
+        attitude = rotations.normalized(attitude)
+        tilt = held(attitude)
+        other = tilt - 2 * np.pi * np.sign(tilt)
+        at_stop = (np.abs(other) < limit) & (np.abs(other) > limit - P.margin)
+        if at_stop.sum() != 2 or not (at_stop[:2] & at_stop[2:]).any():
+            continue
+        tried += 1
+        tilt = np.where(at_stop, other, tilt)
+        way = plan(attitude, tilt, ALLOCATOR, P)
+        tilts, jumps = followed(way, tilt)
+        assert way.lost < 0.1 and jumps.max() < 1.0
+        np.testing.assert_allclose(tilts[-1], 0, atol=1e-3)
+    assert tried > 10
+
+
+def test_a_path_that_stays_near_a_stop_counts_as_a_turnover():
+    attitude = np.radians([-147.0, 2.0, -112.0])    # no path leads joint 2 away from its stop
+    attitude, tilt = rotations.from_rpy(*attitude), np.array([-3.90, 3.95, 3.83, 2.40])
+    np.testing.assert_allclose(ALLOCATOR.hover(attitude, tilt).tilt, tilt, atol=0.03)
+    assert plan(attitude, tilt, ALLOCATOR, P).lost > 0.3
