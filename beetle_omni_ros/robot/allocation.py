@@ -21,6 +21,8 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 ROTORS = 4
 NEGLIGIBLE = 1e-6   # of the hover thrust: below it the direction of a rotor is rounding noise
 SINGULAR = 1e-6     # of the largest singular value: below it the rotors cannot push a direction
+OVERLAP = 0.05      # [rad] beyond a stop, for which a joint at the stop does not turn to the other
+                    # side: ten deviations of the tilts of a held pose under published noise
 
 
 @dataclass(frozen=True)
@@ -105,7 +107,8 @@ class Allocator:
         Minimum-norm thrusts and tilts for a body wrench.
 
         A rotor with negligible thrust keeps its present angle, because its direction is
-        undetermined. Thrust and tilt stay within their limits.
+        undetermined. Thrust and tilt stay within their limits. A tilt that is less than 0.05 rad
+        beyond a stop becomes the stop: otherwise noise would turn the joint to the other side.
 
         Args:
             force: (3,) in base_link [N].
@@ -164,12 +167,12 @@ class Allocator:
     def _nearest_turn(self, angle, present):
         """Angle + 2 pi k nearest ``present`` inside the travel; (angle, whether limited)."""
         turned = angle + 2 * pi * round((present - angle) / (2 * pi))
-        if abs(turned) > self.tilt_limit:
+        if abs(turned) > self.tilt_limit + OVERLAP:
             other = turned - copysign(2 * pi, turned)
             if abs(other) <= self.tilt_limit:
                 return other, False
-            return self._inside(min(turned, other, key=abs))
-        return turned, False
+            turned = min(turned, other, key=abs)
+        return self._inside(turned)
 
     def _inside(self, angle):
         limit = self.tilt_limit

@@ -15,6 +15,7 @@ from beetle_omni_ros.control.nmpc_parameters import (
 )
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
 
@@ -75,6 +76,20 @@ def test_reaches_inverted_poses_without_error(controller, rpy):
     position, angle = errors(fly(controller, target, 6.0), target)
     assert position < 2e-3
     assert angle < 0.2
+
+
+def test_holds_a_pose_for_which_a_joint_is_barely_beyond_its_stop():
+    attitude = rotations.from_rpy(*np.radians([154.2, -47.0, 32.1]))
+    held = Allocator(ROBOT).hover(attitude, np.array([-3.96, 2.0, 3.96, -2.0]))
+    stop = np.abs(held.tilt).max() - 0.02
+    robot = replace(ROBOT, joints=replace(ROBOT.joints, position_limit=stop))
+    target = PoseTarget(np.array([0.0, 0.0, 1.5]), attitude)
+    x = np.r_[target.position, np.zeros(3), attitude, np.zeros(3),
+              np.clip(held.tilt, -stop, stop), np.zeros(4), held.thrust]
+    trace = fly(NmpcController(robot), target, 4.0, x=x)
+    position, angle = errors(trace, target)
+    assert position < 5e-3 and angle < 1.0
+    assert max(np.abs(command.tilt - held.tilt).max() for _, _, command in trace) < 1.0
 
 
 @pytest.mark.parametrize('changes', [

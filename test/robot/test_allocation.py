@@ -150,6 +150,19 @@ def test_a_tilt_without_a_permitted_turn_is_clipped_and_reported():
     assert got.saturated.all()
 
 
+@pytest.mark.parametrize('beyond, stays', [(0.02, True), (0.04, True), (0.06, False)])
+def test_a_joint_at_its_stop_stays_there_for_a_tilt_barely_beyond_it(beyond, stays):
+    on_its_side = rotations.from_rpy(np.pi / 2, 0.0, 0.0)
+    tilt = ALLOCATOR.hover(on_its_side, np.zeros(4)).tilt
+    other = tilt[0] - np.copysign(2 * np.pi, tilt[0])
+    stop = abs(other) - beyond
+    present = np.array([np.copysign(stop, other), *tilt[1:]])
+    got = Allocator(replace(ROBOT, joints=replace(ROBOT.joints, position_limit=stop))).hover(
+        on_its_side, present)
+    np.testing.assert_allclose(got.tilt, present if stays else tilt, atol=1e-9)
+    assert got.saturated[0] == stays
+
+
 def test_hover_carries_the_weight_within_the_thrust_that_the_paper_robot_needs():
     rng = np.random.default_rng(7)
     worst = 0.0
