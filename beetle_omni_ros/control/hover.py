@@ -26,7 +26,7 @@ import numpy as np
 from beetle_omni_ros.control.base import Command, Followed, State
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
-from beetle_omni_ros.robot.allocation import clipped
+from beetle_omni_ros.robot.allocation import clipped, nearest_turn
 from beetle_omni_ros.robot.degraded_allocation import allocator, DegradedAllocator, LocalWeights
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import group, parameter, ParameterFile
@@ -189,8 +189,7 @@ class HoverController:
         over = np.abs(goal - present) > np.pi       # the nearest turn is beyond the stop
         if not over.any():
             return goal
-        steady = self._allocator.hover(quaternion, present).tilt
-        steady = steady + 2 * np.pi * np.round((present - steady) / (2 * np.pi))
+        steady = nearest_turn(self._allocator.hover(quaternion, present).tilt, present)
         limit = self._allocator.tilt_limit
         waits = over & (np.abs(steady) <= limit + self.parameters.stop_overlap)
         return np.where(waits, np.copysign(limit, present), goal)

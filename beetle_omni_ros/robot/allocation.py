@@ -107,7 +107,7 @@ class Allocator:
         Minimum-norm thrusts and tilts for a body wrench.
 
         A rotor with negligible thrust keeps its present angle, because its direction is
-        undetermined. Thrust and tilt stay within their limits. A tilt that is less than 0.05 rad
+        undetermined. Thrust and tilt stay within their limits. A tilt that is less than OVERLAP
         beyond a stop becomes the stop: otherwise noise would turn the joint to the other side.
 
         Args:
@@ -177,6 +177,11 @@ class Allocator:
     def _inside(self, angle):
         limit = self.tilt_limit
         return (angle, False) if abs(angle) <= limit else (copysign(limit, angle), True)
+
+
+def nearest_turn(angle: np.ndarray, present: np.ndarray) -> np.ndarray:
+    """Angles + 2 pi k nearest the present ones [rad], without regard to stops."""
+    return angle + 2 * np.pi * np.round((present - angle) / (2 * np.pi))
 
 
 def clipped(values: np.ndarray, low: np.ndarray | float, high: np.ndarray | float) -> np.ndarray:

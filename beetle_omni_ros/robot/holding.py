@@ -21,6 +21,7 @@ import numpy as np
 
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth
+from beetle_omni_ros.robot.allocation import nearest_turn
 from beetle_omni_ros.robot.degraded_allocation import DegradedAllocator, RESIDUAL
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import parameter, ParameterFile
@@ -165,7 +166,7 @@ class Holding:
     def _on_nearest_turn(self, tilt, present):
         """Tilts (N, 4) on the legal turn nearest the present ones (4,)."""
         limit = self._robot.joints.position_limit
-        turned = tilt + 2 * np.pi * np.round((present - tilt) / (2 * np.pi))
+        turned = nearest_turn(tilt, present)
         return np.where(np.abs(turned) > limit, turned - 2 * np.pi * np.sign(turned), turned)
 
     def _margins(self, tilt, thrust, met):

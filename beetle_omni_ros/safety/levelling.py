@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.allocation import Allocator, ROTORS
+from beetle_omni_ros.robot.allocation import Allocator, nearest_turn, ROTORS
 from beetle_omni_ros.robot.schema import parameter
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -179,7 +179,7 @@ def _follow(tilts, up, allocator, p):
     waits, lost = np.zeros((len(tilts), *shape[:2])), np.zeros((len(tilts), len(up)))
     for k in range(shape[1]):
         angle = angles[:, k]
-        goal = angle + 2 * np.pi * np.round((present - angle) / (2 * np.pi))
+        goal = nearest_turn(angle, present)
         if k:       # at the start a joint may be nearer to its stop, if the path leads away
             goal = np.where(np.abs(goal) > limit, angle, goal)
         moves = np.abs(goal - present)

@@ -15,7 +15,7 @@ from itertools import combinations
 import numpy as np
 
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth
-from beetle_omni_ros.robot.allocation import Allocator, ROTORS
+from beetle_omni_ros.robot.allocation import Allocator, nearest_turn, ROTORS
 from beetle_omni_ros.robot.holding import Holding, leaned, up
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import parameter
@@ -119,7 +119,7 @@ def _place(joint, quaternion, tilt, robot, allocator, p):
     holding = Holding(robot, resting)
     others = np.arange(ROTORS) != joint
     angles, _ = allocator.upright(holding.directions)
-    healthy, three = (_nearest_turn(one, tilt) for one in (angles, holding.tilts))
+    healthy, three = (nearest_turn(one, tilt) for one in (angles, holding.tilts))
     limit = allocator.tilt_limit - p.room
     target = healthy[:, joint] - np.copysign(TURN, healthy[:, joint])
     fit = (np.abs(target) <= limit) & np.all(np.abs(healthy) <= limit, axis=1) \
@@ -130,7 +130,3 @@ def _place(joint, quaternion, tilt, robot, allocator, p):
     if holding.margins[best] < holding.parameters.flying_margin or not (fit & near)[best]:
         return None
     return Turnover(joint, leaned(quaternion, holding.directions[best]), float(target[best]))
-
-
-def _nearest_turn(angles, present):
-    return angles + TURN * np.round((present - angles) / TURN)

@@ -50,6 +50,19 @@ def test_the_lost_lift_of_several_windings_is_that_of_each():
                                           for tilt in WINDINGS], atol=1e-9)
 
 
+def test_nearly_every_attitude_with_wound_joints_is_near_a_place_to_turn_one_over():
+    random, found = np.random.default_rng(12), []
+    while len(found) < 60:
+        attitude = rotations.normalized(random.normal(size=4))
+        tilt = ALLOCATOR.hover(attitude, np.zeros(4)).tilt
+        other = tilt - np.copysign(2 * np.pi, tilt)
+        legal = np.abs(other) < ALLOCATOR.tilt_limit
+        tilt = np.where(legal & (random.uniform(size=4) < 0.6), other, tilt)
+        if plan(attitude, tilt, ALLOCATOR, LEVEL).lost > P.lost_lift:
+            found.append(find_turnover(attitude, tilt, ROBOT, ALLOCATOR, LEVEL, P) is not None)
+    assert np.mean(found) >= 0.95
+
+
 def test_no_joint_turns_over_if_none_can():
     level = rotations.from_rpy(0.0, 0.0, 0.7)
     assert find_turnover(level, np.zeros(4), ROBOT, ALLOCATOR, LEVEL, P) is None
