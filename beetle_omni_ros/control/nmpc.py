@@ -22,6 +22,7 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 log = logging.getLogger(__name__)
 FIRST_ITERATIONS = 5     # from a cold start, before the first command
 NARROW = 1e-3            # [rad or N] between bounds of a failed actuator; the QP needs an interior
+NO_HEIGHT = -1000.0      # [m] a bound that is never reached
 FAILURES_TO_RESTART = 5  # unsolved cycles in a row after which the horizon is initialised again
 
 
@@ -115,6 +116,7 @@ class NmpcController:
         """Reset estimates and horizon."""
         self._estimator.reset()
         self._started, self._failures, self._iterate = False, 0, 0
+        self._above = False     # whether the robot was above the smallest height
         self._statuses: dict[int, int] = {}
         self._iterations = self._rejected = 0
 
@@ -140,8 +142,7 @@ class NmpcController:
         disturbance = self._estimator.disturbance
         references = self._planner.plan(target, start, state.quaternion, full[model.TILT],
                                         disturbance)
-        bounds = np.concatenate([self._bounds, np.minimum(references[1:, 2],
-                                                          self._parameters.limits.height)])
+        bounds = np.concatenate([self._bounds, self._lowest(full[2], references[1:, 2])])
         if not self._started:
             self._rti.fill(x0, np.clip(references[0, 13:21], self._bounds[:8], self._bounds[8:16]))
             self._iterate = FIRST_ITERATIONS
@@ -156,6 +157,12 @@ class NmpcController:
         self._failures = 0 if status == 0 else self._failures + 1
         self._started = self._failures < FAILURES_TO_RESTART
         return self._command(state.stamp)
+
+    def _lowest(self, height, targets):
+        """Smallest height at each node; before the robot rises above it, it stands on a floor."""
+        lowest = self._parameters.limits.height
+        self._above = self._above or height > lowest
+        return np.minimum(targets, lowest if self._above else NO_HEIGHT)
 
     def _command(self, stamp):
         command = clipped(self._rti.inputs[0], self._bounds[:8], self._bounds[8:16])

@@ -65,9 +65,10 @@ class LimitParameters:
         True, doc='limits of velocity, rate and height may be exceeded at a cost, which keeps the '
         'QP feasible', read_only=True)
     height: float = parameter(
-        0.5, doc='smallest height of base_link in world, unless the target is lower; -1000: none',
+        0.5, doc='smallest height of base_link in world, unless the target is lower; inactive '
+        'until the robot was above it; -1000: none',
         unit='m', low=-1000, high=1000)
-    height_linear: float = parameter(1000.0, doc='cost of a lower height', unit='1/m', low=0,
+    height_linear: float = parameter(10.0, doc='cost of a lower height', unit='1/m', low=0,
                                      high=1e6, read_only=True)
     height_quadratic: float = parameter(1e5, doc='cost of a lower height, squared', unit='1/m^2',
                                         low=0, high=1e6, read_only=True)

@@ -45,6 +45,19 @@ def fly(controller, target, seconds, x=None, plant=ROBOT, disturbance=np.zeros(1
     return trace
 
 
+class Counted(NmpcController):
+    """Keeps the solver's iterations of each step."""
+
+    def reset(self):
+        super().reset()
+        self.iterations = []
+
+    def step(self, state, target):
+        command = super().step(state, target)
+        self.iterations.append(self.diagnostics()['iterations'])
+        return command
+
+
 def errors(trace, target):
     time, x, _ = trace[-1]
     reference = target.at(time)
@@ -90,6 +103,21 @@ def test_holds_a_pose_for_which_a_joint_is_barely_beyond_its_stop():
     position, angle = errors(trace, target)
     assert position < 5e-3 and angle < 1.0
     assert max(np.abs(command.tilt - held.tilt).max() for _, _, command in trace) < 1.0
+
+
+@pytest.mark.parametrize('height', [0.4, 1.0], ids=['take-off', 'hover'])
+def test_a_smallest_height_that_is_not_active_costs_no_iterations(height):
+    parameters = NmpcParameters.load()
+    limits = parameters.limits
+    without = replace(limits, height=-1000.0, height_linear=limits.slack_linear,
+                      height_quadratic=limits.slack_quadratic)
+    means = []
+    for each in (limits, without):
+        counted = Counted(ROBOT, replace(parameters, limits=each))
+        fly(counted, PoseTarget(np.array([0.0, 0.0, 1.0]), LEVEL), 1.0,
+            x=hovering((0.0, 0.0, height)))
+        means.append(np.mean(counted.iterations))
+    assert means[0] < 1.1 * means[1]
 
 
 @pytest.mark.parametrize('changes', [

@@ -102,7 +102,7 @@ def test_a_plan_sinks_below_the_smallest_height_only_while_it_cannot_help_it(pro
     heights = []
     for height in (-1000.0, 0.92):
         bounds[-len(INTERVALS):] = height
-        rti = InterpretedRti(problem, INTERVALS, (10.0, 100.0, 1e3, 1e5), 1e-8, 80, REACHES)
+        rti = InterpretedRti(problem, INTERVALS, (10.0, 100.0, 10.0, 1e5), 1e-8, 80, REACHES)
         rti.fill(x0, np.r_[np.zeros(4), x0[17:]])
         for _ in range(8):
             rti.step(x0, references, 0 * disturbance, WEIGHTS, bounds)
