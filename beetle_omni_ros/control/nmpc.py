@@ -109,7 +109,7 @@ class NmpcController:
             try:
                 return CompiledRti(**options, extra=(advance,))
             except CompilerError as error:
-                log.warning('NMPC runs interpreted, about four times slower: %s', error)
+                log.warning('NMPC runs interpreted, four to five times slower: %s', error)
         return InterpretedRti(**options)
 
     def reset(self) -> None:
