@@ -54,7 +54,7 @@ class NmpcController:
         self._robot = robot
         problem = ocp.build(robot, p.model.servo_lag, p.model.rotor_lag, p.horizon.change_time)
         intervals = p.horizon.intervals
-        soft = (p.limits.slack_linear, p.limits.slack_quadratic, p.limits.height_linear,
+        soft = (p.limits.slack_linear, p.limits.slack_quadratic,
                 p.limits.height_quadratic) if p.limits.soft else None
         options = {'ocp': problem, 'intervals': intervals, 'soft': soft,
                    'tolerance': p.solver.tolerance, 'max_iterations': p.solver.max_iterations,
@@ -159,7 +159,7 @@ class NmpcController:
         return self._command(state.stamp)
 
     def _lowest(self, height, targets):
-        """Smallest height at each node; before the robot rises above it, it stands on a floor."""
+        """Smallest height at each node; none until the robot was above it, as on the floor."""
         lowest = self._parameters.limits.height
         self._above = self._above or height > lowest
         return np.minimum(targets, lowest if self._above else NO_HEIGHT)

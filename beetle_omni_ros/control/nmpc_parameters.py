@@ -68,12 +68,11 @@ class LimitParameters:
         0.5, doc='smallest height of base_link in world, unless the target is lower; inactive '
         'until the robot was above it; -1000: none',
         unit='m', low=-1000, high=1000)
-    height_linear: float = parameter(10.0, doc='cost of a lower height', unit='1/m', low=0,
-                                     high=1e6, read_only=True)
     height_quadratic: float = parameter(1e5, doc='cost of a lower height, squared', unit='1/m^2',
                                         low=0, high=1e6, read_only=True)
-    slack_linear: float = parameter(10.0, doc='cost of exceeding velocity or rate', unit='', low=0,
-                                    high=1e6, read_only=True)
+    slack_linear: float = parameter(
+        10.0, doc='cost of exceeding velocity or rate, or of a lower height', unit='', low=0,
+        high=1e6, read_only=True)
     slack_quadratic: float = parameter(100.0, doc='cost of exceeding velocity or rate, squared',
                                        low=0, high=1e6, read_only=True)
 

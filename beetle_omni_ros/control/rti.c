@@ -56,7 +56,8 @@ void rti_free(struct rti *s)
     free(s);
 }
 
-/* soft_weights: linear and quadratic weight of the slacks on v and w, then on the height.
+/* soft_weights: linear weight of the slacks, quadratic on v and w, quadratic on the height. The
+ * linear one is common: HPIPM needs more iterations if the multipliers differ in scale.
  * reaches: intervals beyond the first in which tilt targets keep within reach of the tilts. */
 struct rti *rti_create(int horizon, const double *interval, int nx, int soft,
                        const double *soft_weights, double tolerance, int max_iterations, int reaches)
@@ -101,8 +102,8 @@ struct rti *rti_create(int horizon, const double *interval, int nx, int soft,
     for (int i = 0; i < NT; i++) C[(TILT + i) * NT + i] = -1, D[i * NT + i] = 1;
     for (int i = 0; i < NU; i++) input_index[i] = i;
     for (int i = 0; i < NBX; i++) {
-        const double *weights = soft_weights + (i == 0 ? 2 : 0);
-        state_index[i] = bounded_state[i], linear[i] = weights[0], quadratic[i] = weights[1];
+        state_index[i] = bounded_state[i];
+        linear[i] = soft_weights[0], quadratic[i] = soft_weights[i == 0 ? 2 : 1];
     }
     for (int k = 0; k <= horizon; k++) {
         if (k < horizon) d_ocp_qp_set_idxbu(k, input_index, &s->qp);

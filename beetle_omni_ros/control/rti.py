@@ -21,8 +21,8 @@ class CompiledRti:
     Args:
         ocp: stage functions.
         intervals: (N,) interval lengths [s].
-        soft: linear and quadratic slack weight of the velocity and rate limits, then of the height
-            limit, or None.
+        soft: linear weight of the slacks, quadratic weight on velocity and rate, quadratic weight
+            on the height; or None.
         tolerance: residual at which the QP counts as solved.
         max_iterations: of the QP.
         reaches: number of intervals after the first in which the lead of tilt targets is bounded.
@@ -47,7 +47,7 @@ class CompiledRti:
         lib.rti_iterations.argtypes = lib.rti_free.argtypes = [c_void_p]
         n, size = len(intervals), ocp.state_size
         interval = np.array(intervals, dtype=float)
-        weights = np.array(soft if soft else (0.0,) * 4, dtype=float)
+        weights = np.array(soft if soft else (0.0,) * 3, dtype=float)
         self._handle = lib.rti_create(n, interval.ctypes.data_as(_DOUBLES), size, int(bool(soft)),
                                       weights.ctypes.data_as(_DOUBLES), tolerance, max_iterations,
                                       reaches)
@@ -100,7 +100,7 @@ class InterpretedRti:
         n, size = len(intervals), ocp.state_size
         self._ocp, self._intervals = ocp, np.array(intervals, dtype=float)
         self.states, self.inputs = np.zeros((n + 1, size)), np.zeros((n, INPUT_SIZE))
-        slack = [np.r_[soft[2 + i], np.full(6, soft[i])] for i in (0, 1)] if soft else None
+        slack = [np.full(7, soft[0]), np.r_[soft[2], np.full(6, soft[1])]] if soft else None
         self._qp = OcpQp([0] + [size] * n, [INPUT_SIZE] * n + [0], [[]] + [BOUNDED_STATES] * n,
                          slack, tolerance, max_iterations,
                          self._lead_constraints(n, size, reaches))

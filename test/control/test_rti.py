@@ -13,7 +13,7 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 ROBOT = RobotParameters.load()
 WEIGHTS = NmpcWeights().vector()
 INTERVALS = np.full(4, 0.1)
-SOFT = (10.0, 100.0, 50.0, 2000.0)
+SOFT = (10.0, 100.0, 2000.0)
 HEIGHT = 1.01  # [m] above the present height, so that the limit is active
 REACH = 0.15   # [rad]
 REACHES = 2
@@ -67,7 +67,7 @@ def qp_by_casadi(problem, x, u, x0, references, disturbance, bounds):
     for k in range(1, n + 1):
         s, sunk = slack[k - 1][:12], slack[k - 1][12]
         cost += SOFT[0] * ca.sum1(s) + 0.5 * SOFT[1] * ca.sumsqr(s)
-        cost += SOFT[2] * sunk + 0.5 * SOFT[3] * sunk ** 2
+        cost += SOFT[0] * sunk + 0.5 * SOFT[2] * sunk ** 2
         moving = BOUNDED_STATES[1:]
         value = opti_x[k][moving] + x[k, moving]
         inequality += [value + s[:6], value - s[6:], opti_x[k][2] + x[k, 2] + sunk, slack[k - 1]]
@@ -102,7 +102,7 @@ def test_a_plan_sinks_below_the_smallest_height_only_while_it_cannot_help_it(pro
     heights = []
     for height in (-1000.0, 0.92):
         bounds[-len(INTERVALS):] = height
-        rti = InterpretedRti(problem, INTERVALS, (10.0, 100.0, 10.0, 1e5), 1e-8, 80, REACHES)
+        rti = InterpretedRti(problem, INTERVALS, (10.0, 100.0, 1e5), 1e-8, 80, REACHES)
         rti.fill(x0, np.r_[np.zeros(4), x0[17:]])
         for _ in range(8):
             rti.step(x0, references, 0 * disturbance, WEIGHTS, bounds)
