@@ -35,8 +35,6 @@ lint: setup  ## style of every Python file, types of the core
 	@.venv/bin/python -m mypy
 
 docs: setup  ## reference pages from the code, then the site with all links checked; to build/site/
-	@.venv/bin/python -c 'import material' 2>/dev/null || \
-	    .venv/bin/python -m pip install --quiet --editable '.[docs]'
 	.venv/bin/python docs/generate_reference.py
 	.venv/bin/python -m mkdocs build --strict
 
