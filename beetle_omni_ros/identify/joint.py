@@ -28,7 +28,6 @@ from beetle_omni_ros.identify.uncertainty import (
 from beetle_omni_ros.robot.parameters import JointParameters
 
 MOST_PASSES = 3         # of selection, while the noise decreases
-P = shipped().servo
 MOST_ROUNDS, RESTING = 10, 0.2    # of refits; they end at this change of the median, in scales
 CERTAIN = ('delay', 'coulomb_friction')   # terms of the model that estimates the noise
 
@@ -60,14 +59,13 @@ class JointModel:
     gain: dict[str, float]
 
 
-def identify_joints(log: JointLog, published: JointParameters,
-                    fitted: float = P.fitted) -> list[JointModel]:
-    """Identify every joint of a log from its first part (share ``fitted``)."""
-    log = log.first(fitted)
+def identify_joints(log: JointLog, published: JointParameters) -> list[JointModel]:
+    """Identify every joint of a log from its first part."""
+    log = log.first(shipped().servo.fitted)
     start = published_set(published)
     weight = np.tile(fitted_samples(log), (len(log.joints), 1))
     noise = _first_noise(log, start, weight)
-    prior = prior_of(encode(start), P.published)
+    prior = prior_of(encode(start), shipped().servo.published)
     for _ in range(MOST_PASSES):
         fitter = ServoFitter(log, noise, prior=prior)
         choices = Selector(fitter, weight[0]).run(_unlimited(start))
@@ -76,7 +74,7 @@ def identify_joints(log: JointLog, published: JointParameters,
             np.array([free_mask(choice.kept) for choice in choices]), weight)
         points = _best(fitter, problems)
         before, noise = noise, noise_around(log, decode(points), weight[0])
-        if (noise.sigma > P.nearly * before.sigma).all():
+        if (noise.sigma > shipped().servo.nearly * before.sigma).all():
             break       # with less noise, further terms may become significant
     sets = decode(_with_common_prior(log, noise, problems, points))
     return _models(log, noise, choices, sets, weight, start)
@@ -85,7 +83,7 @@ def identify_joints(log: JointLog, published: JointParameters,
 def _best(fitter, problems):
     """Fit each joint from several starts, because chi2 may have several minima."""
     count, starts = len(problems.joints), [problems]
-    for frequency, delay in P.restarts:
+    for frequency, delay in shipped().servo.restarts:
         sets = decode(problems.points)
         sets[:, INDEX['natural_frequency']] = frequency
         sets[:, INDEX['delay']] = np.where(problems.free[:, INDEX['delay']], delay, 0.0)
@@ -101,14 +99,14 @@ def _with_common_prior(log, noise, problems, points):
 
     The prior matters only for joints whose log is not informative.
     """
-    if len(points) < P.least_common:
+    if len(points) < shipped().servo.least_common:
         return points
     for _ in range(MOST_ROUNDS):
         common = np.median(points, axis=0)
-        points = ServoFitter(log, noise, prior=prior_of(common, P.common)).solve(
+        points = ServoFitter(log, noise, prior=prior_of(common, shipped().servo.common)).solve(
             replace(problems, points=points), 8).points
         change = np.median(points, axis=0) - common
-        if np.abs(change[[INDEX[name] for name in P.common]]).max() < RESTING:
+        if np.abs(change[[INDEX[name] for name in shipped().servo.common]]).max() < RESTING:
             break
     return points
 
@@ -123,11 +121,11 @@ def _first_noise(log, start, weight):
     sets = np.tile(_unlimited(start), (len(joints), 1))
     sets[:, INDEX['delay']], sets[:, INDEX['coulomb_friction']] = 0.01, 0.01
     free = np.tile(free_mask((*CERTAIN, 'offset')), (len(joints), 1))
-    beyond = log.command_speed() > P.beyond * log.speed()
+    beyond = log.command_speed() > shipped().servo.beyond * log.speed()
     limit = INDEX['velocity_limit']
     sets[beyond, limit], free[beyond, limit] = log.speed()[beyond], True
     fitter = ServoFitter(log, first_noise(log),
-                         prior=prior_of(encode(start), P.published))
+                         prior=prior_of(encode(start), shipped().servo.published))
     fits = fitter.solve(Problems.single_joints(joints, sets, free, weight))
     return noise_around(log, decode(fits.points), weight[0])
 

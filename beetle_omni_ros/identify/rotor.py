@@ -16,7 +16,6 @@ from beetle_omni_ros.identify.rotor_log import Plateau, RotorLog
 from beetle_omni_ros.runs.csv_table import LogError
 
 UNIT_THRUST = 10.0      # [N] for g = 1
-P = shipped().rotor
 NORMAL_95 = 1.96
 GRID = 400
 
@@ -76,7 +75,7 @@ def inverse(coefficients: np.ndarray, duty: np.ndarray, thrust_max: float) -> np
     inside = (g > 0) & (g < grid[-1])
     for _ in range(2):
         step = (np.polyval(coefficients[::-1], g) - duty) / np.maximum(
-            np.polyval(slope, g), P.least_slope / 10)
+            np.polyval(slope, g), shipped().rotor.least_slope / 10)
         g = np.where(inside, np.clip(g - step, 0, grid[-1]), g)
     return UNIT_THRUST * g
 
@@ -89,7 +88,7 @@ def fit_row(name: str, plateau: Plateau) -> MapRow:
         LogError: the sweep is too small, or thrust does not increase with duty.
 
     """
-    used = plateau.duty > P.stop_duty
+    used = plateau.duty > shipped().rotor.stop_duty
     duty, g = plateau.duty[used], plateau.force[used] / UNIT_THRUST
     if used.sum() < 12 or np.unique(np.round(duty, 1)).size < 5:
         raise LogError(f'{name}: at {plateau.voltage:.2f} V only {used.sum()} rows of '
@@ -119,7 +118,7 @@ def fit_row(name: str, plateau: Plateau) -> MapRow:
                  np.stack([coefficients - size, coefficients + size], axis=1),
                  float(UNIT_THRUST * np.sqrt(np.mean(residual**2))),
                  float(NORMAL_95 * UNIT_THRUST * band.max()), 0.0, int(used.sum()),
-                 bool(slopes.min() < 1.5 * P.least_slope))
+                 bool(slopes.min() < 1.5 * shipped().rotor.least_slope))
     back = row.thrust(row.duty(thrust))
     return MapRow(**{**row.__dict__, 'inverse_error': float(np.abs(back / thrust - 1).max())})
 
@@ -128,7 +127,8 @@ def _start(g, duty):
     """Coefficients of an increasing polynomial near the data."""
     run = g > 0.02
     start = np.polyfit(g[run], duty[run], 3)[::-1]
-    if np.polyval(np.polyder(start[::-1]), np.linspace(0, g.max(), 60)).min() < P.least_slope:
+    slope = np.polyval(np.polyder(start[::-1]), np.linspace(0, g.max(), 60))
+    if slope.min() < shipped().rotor.least_slope:
         start = np.array([*np.polyfit(g[run], duty[run], 1)[::-1], 0.0, 0.0])
     return start
 
@@ -146,8 +146,9 @@ def _fitted(start, g, duty, weight, scale):
 def _error(coefficients, g, duty, weight):
     """Weighted error of g, then the violation of the least slope."""
     slope = np.polyval(np.polyder(coefficients[::-1]), np.linspace(0, 1.05 * g.max(), 60))
+    missing = np.minimum(slope - shipped().rotor.least_slope, 0)
     fitted = inverse(coefficients, duty, UNIT_THRUST * 1.3 * g.max()) / UNIT_THRUST
-    return np.concatenate([weight * (fitted - g), 0.3 * np.minimum(slope - P.least_slope, 0)])
+    return np.concatenate([weight * (fitted - g), 0.3 * missing])
 
 
 def _weights(g, residual):
@@ -160,7 +161,8 @@ def _weights(g, residual):
 
 def _slopes(coefficients, g):
     """(N, 4) derivative of g by each coefficient at constant duty."""
-    slope = np.maximum(np.polyval(np.polyder(coefficients[::-1]), g), P.least_slope / 10)
+    slope = np.maximum(np.polyval(np.polyder(coefficients[::-1]), g),
+                       shipped().rotor.least_slope / 10)
     return -np.stack([g**k for k in range(4)], axis=1) / slope[:, None]
 
 

@@ -12,7 +12,6 @@ HEADER = 'pwm_us (or duty_percent),force_N,torque_N_m,voltage_V'
 ALTERNATIVES = {'force_N': ('force_N', 'thrust_N'), 'torque_N_m': ('torque_N_m', 'torque_Nm'),
                 'voltage_V': ('voltage_V',), 'pwm': ('duty_percent', 'pwm_us')}
 FULL_PULSE = 2000.0     # [us] of 100 % duty, the unit of the map in params/robot.yaml
-P = shipped().rotor
 
 
 @dataclass(frozen=True)
@@ -59,22 +58,23 @@ def read_rotor_log(path: str | Path) -> RotorLog:
         LogError: with file, row or column, and expectation.
 
     """
+    p = shipped().rotor
     table = read_table(path, _wanted, HEADER)
     # read_table has checked that each column exists.
     column = {wanted: next(table.columns[name] for name in names if name in table.columns)
               for wanted, names in ALTERNATIVES.items()}
     duty = column['pwm'] if 'duty_percent' in table.columns else 100 * column['pwm'] / FULL_PULSE
-    if len(table) < P.least_rows:
-        raise LogError(f'{path}: {len(table)} rows are too few; expected at least {P.least_rows}')
+    if len(table) < p.least_rows:
+        raise LogError(f'{path}: {len(table)} rows are too few; expected at least {p.least_rows}')
     pwm_name = 'duty_percent' if 'duty_percent' in table.columns else 'pwm_us'
     unit = ('percent of 2000 us, 50 at stop' if pwm_name == 'duty_percent'
             else 'microseconds, 1000 at stop')
-    _check(table, pwm_name, duty, P.duty, unit)
-    _check(table, 'force_N', column['force_N'], (-5.0, P.largest_force),
+    _check(table, pwm_name, duty, p.duty, unit)
+    _check(table, 'force_N', column['force_N'], (-5.0, p.largest_force),
            'newtons, thrust positive (grams?)')
-    _check(table, 'torque_N_m', np.abs(column['torque_N_m']), (0.0, P.largest_torque),
+    _check(table, 'torque_N_m', np.abs(column['torque_N_m']), (0.0, p.largest_torque),
            'newton metres')
-    _check(table, 'voltage_V', column['voltage_V'], P.voltage, 'volts (millivolts?)')
+    _check(table, 'voltage_V', column['voltage_V'], p.voltage, 'volts (millivolts?)')
     if np.ptp(duty) < 5:
         raise LogError(f'{path}: {pwm_name} spans {np.ptp(duty):.2g} % of duty only; expected a '
                        'sweep from stop to full')
@@ -135,7 +135,7 @@ def _settled(table, duty, warnings):
     last = np.searchsorted(changes, t, side='right') - 1
     since = np.where(last >= 0, t - changes[np.maximum(last, 0)] if changes.size else np.inf,
                      np.inf)
-    settled = since >= P.settling
+    settled = since >= shipped().rotor.settling
     if settled.mean() < 0.2:
         warnings.append('PWM changes all the time: all rows are used in spite of the rotor lag')
         return np.ones(len(duty), dtype=bool)
@@ -144,8 +144,9 @@ def _settled(table, duty, warnings):
 
 def _plateaus(path, voltage, duty, force, torque, warnings):
     """Divide the rows at minima of the voltage density."""
-    grid = np.arange(voltage.min() - 0.5, voltage.max() + 0.5, P.plateau_width / 4)
-    counts, _ = np.histogram(voltage, np.append(grid, grid[-1] + P.plateau_width / 4))
+    p = shipped().rotor
+    grid = np.arange(voltage.min() - 0.5, voltage.max() + 0.5, p.plateau_width / 4)
+    counts, _ = np.histogram(voltage, np.append(grid, grid[-1] + p.plateau_width / 4))
     kernel = np.exp(-0.5 * (np.arange(-16, 17) / 4.0)**2)
     density = np.convolve(counts, kernel, mode='same')
     peaks = [k for k in range(1, len(grid) - 1) if density[k - 1] < density[k] >= density[k + 1]]
@@ -154,7 +155,7 @@ def _plateaus(path, voltage, duty, force, torque, warnings):
     for peak in sorted(peaks):
         if last is not None:
             valley = last + int(np.argmin(density[last:peak + 1]))
-            if density[valley] > P.valley * min(density[last], density[peak]):
+            if density[valley] > p.valley * min(density[last], density[peak]):
                 last = max(last, peak, key=lambda k: density[k])
                 continue
             edges.append(grid[valley])
@@ -164,12 +165,12 @@ def _plateaus(path, voltage, duty, force, torque, warnings):
     for k in np.unique(group):
         rows = group == k
         middle = float(np.median(voltage[rows]))
-        if rows.sum() < P.least_rows or np.ptp(force[rows]) < 0.3 * np.ptp(force):
+        if rows.sum() < p.least_rows or np.ptp(force[rows]) < 0.3 * np.ptp(force):
             warnings.append(f'{rows.sum()} rows at {middle:.2f} V are too few, or too short a '
                             'sweep, for a row of the map: not used')
             continue
         found.append(Plateau(middle, duty[rows], force[rows], torque[rows]))
     if not found:
-        raise LogError(f'{path}: no voltage plateau with {P.least_rows} rows and a sweep of '
+        raise LogError(f'{path}: no voltage plateau with {p.least_rows} rows and a sweep of '
                        f'thrust; voltages span {voltage.min():.2f} to {voltage.max():.2f} V')
     return sorted(found, key=lambda plateau: -plateau.voltage)

@@ -28,7 +28,6 @@ from beetle_omni_ros.identify.joint_log import JointLog
 from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.servo_model import INDEX, NAMES, simulate, TERMS
 
-P = shipped().servo
 ORDERS = 6, 40          # range of the order of the whitening filter
 DIFFERENCE = 0.05       # finite difference in scales of a parameter
 SCATTER_BLOCKS = 10     # blocks for the scatter of the gradient
@@ -95,18 +94,18 @@ class Problems:
 
 def fitted_samples(log: JointLog) -> np.ndarray:
     """(N,) weight of each sample: 0 during settling."""
-    return (log.t >= log.t[0] + P.settling).astype(float)
+    return (log.t >= log.t[0] + shipped().servo.settling).astype(float)
 
 
 def first_noise(log: JointLog) -> Noise:
     """White noise for the first fit."""
-    return Noise.white(len(log.joints), P.first_noise)
+    return Noise.white(len(log.joints), shipped().servo.first_noise)
 
 
 def noise_around(log: JointLog, sets: np.ndarray, weight: np.ndarray) -> Noise:
     """Noise of each joint around its parameter set (J, n), from samples with a weight (N,)."""
     error = simulate(log, np.arange(len(sets)), sets) - log.measured
-    order = int(np.clip(round(P.memory / log.period), *ORDERS))
+    order = int(np.clip(round(shipped().servo.memory / log.period), *ORDERS))
     return Noise.of(error[:, weight > 0], order, max(log.quantum, 1e-4) / np.sqrt(12))
 
 

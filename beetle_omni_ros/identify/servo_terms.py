@@ -18,7 +18,6 @@ from beetle_omni_ros.identify.servo_fit import decode, Problems, ServoFitter
 from beetle_omni_ros.identify.servo_model import INDEX, NAMES, OFF, TERMS
 
 LINEAR = ('natural_frequency', 'damping_ratio')   # always in the model
-P = shipped().servo
 MOST_PASSES = 3
 QUICK, THOROUGH = 6, 15  # iterations
 
@@ -110,7 +109,7 @@ class Selector:
     def __init__(self, fitter: ServoFitter, weight: np.ndarray,
                  allowed: tuple[str, ...] = tuple(CANDIDATES)):
         self.fitter, self.log, self.allowed = fitter, fitter.log, allowed
-        self.blocks = block_masks(weight, P.blocks)
+        self.blocks = block_masks(weight, shipped().servo.blocks)
         self.all = self.blocks.sum(axis=0)
 
     def run(self, start: np.ndarray) -> list[Choice]:
@@ -167,7 +166,8 @@ class Selector:
     def _available(self, tier, joint):
         """Candidates of a tier that can still join the model of a joint."""
         kept = self.kept[joint]
-        slow = self.log.command_speed()[joint] < P.beyond * 0.95 * self.log.speed()[joint]
+        reached = 0.95 * self.log.speed()[joint]
+        slow = self.log.command_speed()[joint] < shipped().servo.beyond * reached
         return [name for name in self.allowed if name in tier and name not in kept
                 and CANDIDATES[name].needs in (None, *kept)
                 and not (name == 'velocity_limit' and slow)]
@@ -187,7 +187,7 @@ class Selector:
                 continue
             found, costs = answers[j, label]
             gain = float((answers[j, None][1] - costs).sum())
-            if gain > P.least_gain and self._is_relevant(j, rival, found):
+            if gain > shipped().servo.least_gain and self._is_relevant(j, rival, found):
                 self.kept[j], self.values[j], swapped = requests[j, label][0], found, True
                 self.tried[j][rival] = found
         return swapped
@@ -269,13 +269,13 @@ class Selector:
         """Whether a term exceeds the encoder's step, and a limit is reached."""
         sizes = {member: abs(values[INDEX[member]]) for member in CANDIDATES[name].members}
         if name == 'delay':
-            return sizes['delay'] >= P.least_delay
+            return sizes['delay'] >= shipped().servo.least_delay
         if name == 'velocity_limit':
-            return P.beyond * sizes[name] <= self.log.command_speed()[joint]
+            return shipped().servo.beyond * sizes[name] <= self.log.command_speed()[joint]
         if name == 'torque_limit':
             sent = self.log.t - values[INDEX['delay']] - self.log.period / 2
             errors = np.abs(self.log.command_at(joint, sent) - self.log.measured[joint])
-            return P.beyond * sizes[name] <= np.quantile(errors[self.all > 0], 0.99)
+            return shipped().servo.beyond * sizes[name] <= np.quantile(errors[self.all > 0], 0.99)
         return max(size for member, size in sizes.items()
                    if member != 'stribeck_velocity') >= self.log.quantum
 
@@ -288,4 +288,5 @@ def _weight(name, kept):
 def _gain(gains, weight):
     """Gain over all blocks, and whether it exceeds its scatter in most blocks."""
     held = HeldOut(gains)
-    return held.total, held.total > max(P.least_gain * weight, held.error) and held.positive > 0.5
+    least = max(shipped().servo.least_gain * weight, held.error)
+    return held.total, held.total > least and held.positive > 0.5

@@ -20,7 +20,6 @@ from beetle_omni_ros.identify.servo_model import INDEX, NAMES, simulate, TERMS
 RISE = 3.84             # 95 % quantile of chi2 with one degree of freedom
 PROFILED = ('natural_frequency', 'damping_ratio', 'delay')
 LADDER = np.array([0.5, 1.2, 2.2, 3.6, 5.5, 8.0, 12.0, 18.0])  # in scales of a term
-P = shipped().servo
 LOW, HIGH = SINGLE_JOINT.coordinates.low, SINGLE_JOINT.coordinates.high
 
 
@@ -148,10 +147,11 @@ def _crossing(rise):
 
 def inseparable_pairs(result: Uncertainty, names: list[str]) -> list[list[str]]:
     """Pairs of parameters that the log does not separate, largest correlation first."""
-    loose = [name for name in names if result.half_width(name) > P.loose]
+    loose = [name for name in names if result.half_width(name) > shipped().servo.loose]
     pairs = [(abs(result.correlation[INDEX[a], INDEX[b]]), a, b)
              for k, a in enumerate(loose) for b in loose[:k]]
-    return [sorted([a, b]) for r, a, b in sorted(pairs, reverse=True) if r >= P.traded]
+    return [sorted([a, b]) for r, a, b in sorted(pairs, reverse=True)
+            if r >= shipped().servo.traded]
 
 
 SINE_PERIOD = 0.01      # [s] sampling period
@@ -208,10 +208,10 @@ def separating_experiments(sets: np.ndarray, free: np.ndarray, noise: Noise, sca
 
 def _plans(sets, free, noise, scatter):
     """Experiments of all joints for each frequency, in one simulation."""
-    count, many = len(sets), len(P.sines)
-    t = np.arange(0.0, P.sine_time, SINE_PERIOD)
-    omega = 2 * np.pi * np.repeat(P.sines, count)
-    amplitude = np.minimum(P.sine_amplitude, P.sine_speed / omega)
+    count, many = len(sets), len(shipped().servo.sines)
+    t = np.arange(0.0, shipped().servo.sine_time, SINE_PERIOD)
+    omega = 2 * np.pi * np.repeat(shipped().servo.sines, count)
+    amplitude = np.minimum(shipped().servo.sine_amplitude, shipped().servo.sine_speed / omega)
     command = amplitude[:, None] * np.sin(omega[:, None] * t)
     sets, free = np.tile(sets, (many, 1)), np.tile(free, (many, 1))
     noise = Noise(np.tile(noise.taps, (many, 1)), np.tile(noise.sigma, many))
@@ -228,6 +228,6 @@ def _plans(sets, free, noise, scatter):
     for row, factor in zip(rows, np.tile(scatter, many), strict=True):
         width = np.sqrt(RISE * factor * np.diag(covariance(information[row], free[row]))) * scale
         plans.append(Experiment(float(omega[row] / 2 / np.pi), float(amplitude[row]),
-                                P.sine_time, float(width[d]),
+                                shipped().servo.sine_time, float(width[d]),
                                 float(width[f] * sets[row, f])))
     return [plans[k:k + count] for k in range(0, len(plans), count)]

@@ -29,7 +29,6 @@ from beetle_omni_ros.identify.servo_model import simulate
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
 
-FIT = shipped().servo
 QUICK = 5               # iterations that estimate a gain; accepted entries are fitted again
 MOST_PASSES = 3
 # The members are separable if both are known better than their smallest relevant change; else
@@ -129,10 +128,10 @@ class Search:
 
     def __init__(self, log: JointLog, robot: RobotParameters, p: GapParameters | None = None):
         self.p = p or GapParameters.load()
-        self.whole, self.log = log, log.first(FIT.fitted)
+        self.whole, self.log = log, log.first(shipped().servo.fitted)
         self.servos = Servos(robot, log.joints)
         self.weight = fitted_samples(self.log)
-        self.blocks = block_masks(self.weight, FIT.blocks)
+        self.blocks = block_masks(self.weight, shipped().servo.blocks)
         self.samples = int(self.weight.sum()) * len(log.joints)
         self.entries = self._entries()
         self._estimate_noise()
@@ -142,7 +141,7 @@ class Search:
                 for j in range(len(self.log.joints))]
         result += [Entry(name) for name in GROUPS if name != 'joint_offset']
         # A speed limit shows only if the command asks for that speed.
-        slow = (self.log.command_speed() < FIT.beyond * 0.95 * self.log.speed()).all()
+        slow = (self.log.command_speed() < shipped().servo.beyond * 0.95 * self.log.speed()).all()
         return [e for e in result if not (e.name == 'joint_velocity_limit' and slow)]
 
     def _estimate_noise(self):
@@ -222,7 +221,7 @@ class Search:
             accepted, point = self._grow(kept, point)
             kept, point = self._prune(accepted, point)
             noise = self._noise(point)
-            if (noise.sigma > FIT.nearly * self.noise.sigma).all():
+            if (noise.sigma > shipped().servo.nearly * self.noise.sigma).all():
                 break
             self.noise, self.full = noise, point
             self.fitter = self._fitter(noise)
@@ -259,11 +258,12 @@ class Search:
         points = [point, *(self._start_point(point, [e], k) for e, k in tried)]
         models = [accepted, *([*accepted, e] for e, _ in tried)]
         solved = self._solve(points, models, QUICK)
+        no_gain = HeldOut(np.zeros(shipped().servo.blocks))
         best: dict = {}
         for (entry, _), p, chi2 in zip(tried, solved.points[1:], solved.chi2[1:], strict=True):
             gain = (solved.chi2[0] - chi2) / self.scatter
             if entry not in best or gain > best[entry].gain:
-                best[entry] = self._trial(entry, gain, HeldOut(np.zeros(FIT.blocks)), p)
+                best[entry] = self._trial(entry, gain, no_gain, p)
         return list(best.values())
 
     def _count(self, entry):
@@ -285,7 +285,7 @@ class Search:
         if entry.name == 'joint_torque_limit':
             errors = np.abs(self.log.command - self.log.measured)
             limit = new[self.servos.index('effort_limit')] / new[self.servos.index('kp')]
-            if FIT.beyond * limit > np.quantile(errors[:, self.weight > 0], 0.99):
+            if shipped().servo.beyond * limit > np.quantile(errors[:, self.weight > 0], 0.99):
                 return False
         mask = self.servos.mask(entry.name, entry.joint)
         for k in np.flatnonzero(mask):
@@ -325,13 +325,13 @@ class Search:
                 for e, chi2, cost in zip(each, solved.chi2[1:], held_out[1:], strict=True)]
 
     def _held_out_costs(self, points, models):
-        """(M, FIT.blocks) chi2 of each block, predicted by models fitted without it."""
+        """(M, blocks) chi2 of each block, predicted by models fitted without it."""
         every = self.blocks.sum(axis=0)
-        rows = np.repeat(np.arange(len(models)), FIT.blocks)
+        rows = np.repeat(np.arange(len(models)), shipped().servo.blocks)
         left = np.tile(self.blocks, (len(models), 1))
         fitted = self._solve(points[rows], [models[r] for r in rows], 4, every - left).points
         cost = self.fitter.cost(self._problems(fitted, [models[r] for r in rows], left))
-        return cost.reshape(len(models), FIT.blocks)
+        return cost.reshape(len(models), shipped().servo.blocks)
 
     def _found(self, accepted, point, others):
         trials = self._trials_without(accepted, point) if accepted else []
@@ -454,12 +454,12 @@ class Search:
         joints = np.arange(len(self.log.joints))
         a, b = (simulate(self.whole, joints, self.servos.sets(p[None])[0])
                 for p in (point, self.servos.file_point))
-        return np.sqrt(np.mean((a - b)[:, self.whole.end_of(FIT.fitted):]**2, axis=1))
+        return np.sqrt(np.mean((a - b)[:, self.whole.end_of(shipped().servo.fitted):]**2, axis=1))
 
 
 def held_out_rms(log: JointLog, servos: Servos, point: np.ndarray) -> np.ndarray:
     """(J,) RMS of simulation minus log over the held-out part [rad]."""
     sets = servos.sets(point[None])[0]
     error = simulate(log, np.arange(len(sets)), sets) - log.measured
-    return np.sqrt(np.mean(error[:, log.end_of(FIT.fitted):]**2, axis=1))
+    return np.sqrt(np.mean(error[:, log.end_of(shipped().servo.fitted):]**2, axis=1))
 
