@@ -49,12 +49,10 @@ class GraphOptions:
         standby: whether the standby controllers run too, so that they can be selected in flight.
         policy: policy file of the controller that has the option `--policy`; '': the shipped one.
         allow_other_robot: whether a policy trained for other robot parameters may fly.
-        simulated: whether sim_node provides the sensors.
-        actuators: 'bridges', with emulated devices if ``simulated``; 'direct': from the topic to
-            the simulator; 'none': by nodes started elsewhere.
+        simulated: whether sim_node provides sensors and actuators. Otherwise nodes started
+            elsewhere do; on the robot deploy/install.sh starts the bridges.
+        actuators: 'bridges' to emulated devices, or 'direct': from the topic to the simulator.
         ports: folder of the names of the emulated devices' ports.
-        autostart: automatic transition of joint_bridge_node; '': depends on ``simulated``.
-        servo_bus_file, motor_board_file: parameters of the bridges; '': the shipped ones.
         robot_file: robot file of estimator and controllers; '': the shipped one.
         plant_file: robot file of the simulation; '': the same.
         conditions, seed: conditions and seed of the simulation.
@@ -73,9 +71,6 @@ class GraphOptions:
     simulated: bool = True
     actuators: str = 'bridges'
     ports: str = ''
-    autostart: str = ''
-    servo_bus_file: str = ''
-    motor_board_file: str = ''
     robot_file: str = ''
     plant_file: str = ''
     conditions: str = 'nominal'
@@ -124,7 +119,8 @@ def plan(options: GraphOptions) -> Plan:
     others = {} if active in registry.standing_by() else {
         'controllers': [active, *registry.standing_by()]}
     packed = {} if options.compression == 'none' else {'compression': options.compression}
-    bridges = _bridges(options, robot)
+    bridges = bridge_parameters(Path(options.ports), robot) \
+        if options.simulated and options.actuators == 'bridges' else {}
     table = (
         ('recorder_node', options.bag, {'bag': options.bag, **packed, **others}),
         ('sim_node', options.simulated, {
@@ -146,22 +142,6 @@ def in_simulated_time(nodes: Parameters) -> Parameters:
     return {name: {**values, **({'clock': 'simulated'} if name == 'sim_node'
                                 else {'use_sim_time': True})}
             for name, values in nodes.items()}
-
-
-def _bridges(options, robot):
-    """Parameters of bridges and simulator for the actuators, by node name."""
-    if options.actuators != 'bridges':
-        return {}
-    nodes = bridge_parameters(Path(options.ports), robot) if options.simulated else \
-        {name: dict(robot) for name in BRIDGES}
-    servos, board = BRIDGES
-    nodes[servos]['autostart'] = options.autostart or (
-        'activate' if options.simulated else 'configure')
-    if options.servo_bus_file:
-        nodes[servos]['servo_bus_file'] = options.servo_bus_file
-    if options.motor_board_file:
-        nodes[board]['motor_board_file'] = options.motor_board_file
-    return nodes
 
 
 def controller_nodes(active: str, *, robot_file: str = '', policy: str = '',
