@@ -83,8 +83,12 @@ class JointParameters:
 
     @property
     def time_constant(self) -> float:
-        """Time constant [s] of the first-order reduction: the ramp lag Kd / Kp."""
-        return self.kd / self.kp
+        """
+        Time constant [s] of the first-order reduction.
+
+        The ramp lag Kd / Kp; with little damping the inertia's sqrt(J / Kp).
+        """
+        return max(self.kd / self.kp, 1 / self.natural_frequency)
 
 
 @dataclass(frozen=True, kw_only=True)
