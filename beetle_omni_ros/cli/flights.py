@@ -23,6 +23,7 @@ from beetle_omni_ros.cli.options import (
     JsonOption,
     KNOWN,
     names,
+    NmpcOption,
     numbers,
     OtherRobotOption,
     PlantOption,
@@ -56,6 +57,7 @@ def fly(bag: Annotated[Path, typer.Option(
                  'real time.')] = 'auto',
         robot: RobotOption = None,
         plant: PlantOption = None,
+        nmpc_file: NmpcOption = None,
         policy: PolicyOption = None,
         allow_other_robot: OtherRobotOption = False,
         standby: Annotated[bool, typer.Option(
@@ -81,14 +83,14 @@ def fly(bag: Annotated[Path, typer.Option(
     Example: beetle_omni fly --controller nmpc --task waypoints --bag my_flight
     """
     check_flight(task=task, seed=seed, conditions=conditions, bag=bag, compression=compression,
-                 json_path=json_path, files=(robot, plant, policy, faults))
+                 json_path=json_path, files=(robot, plant, nmpc_file, policy, faults))
     if allow_targets and not view:
         raise ParameterError('--allow-targets: expected --view with it')
     from beetle_omni_ros.nodes.fly import FlightError, run_fly
     try:
         code = run_fly(controller=controller, task=task, bag=bag, compression=compression,
                        seed=seed, conditions=conditions, actuators=actuators, clock=clock,
-                       robot=robot, plant=plant, policy=policy,
+                       robot=robot, plant=plant, nmpc=nmpc_file, policy=policy,
                        allow_other_robot=allow_other_robot, standby=standby,
                        composed=composed, faults=faults, json_path=json_path,
                        domain_id=domain_id, discovery=discovery,
@@ -107,10 +109,7 @@ def evaluate(controllers: Annotated[str, typer.Option(
              seed: SeedOption = 0,
              robot: RobotOption = None,
              plant: PlantOption = None,
-             nmpc_file: Annotated[Optional[Path], typer.Option(
-                 '--nmpc', metavar='FILE',
-                 help=f"Parameters of the controller '{owner('--nmpc')}'. Default: the shipped "
-                      'params/nmpc.yaml.')] = None,
+             nmpc_file: NmpcOption = None,
              policy: PolicyOption = None,
              allow_other_robot: OtherRobotOption = False,
              bag: Annotated[Optional[Path], typer.Option(

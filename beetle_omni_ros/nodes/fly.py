@@ -42,8 +42,9 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             seed: int = 0, conditions: str = 'nominal',
             actuators: str | None = None,
             clock: str = 'auto', robot: Path | None = None, plant: Path | None = None,
-            policy: Path | None = None, allow_other_robot: bool = False, standby: bool = True,
-            composed: bool = True, faults: Path | None = None, json_path: Path | None = None,
+            nmpc: Path | None = None, policy: Path | None = None,
+            allow_other_robot: bool = False, standby: bool = True, composed: bool = True,
+            faults: Path | None = None, json_path: Path | None = None,
             domain_id: int | None = None, discovery: str | None = None,
             view: bool = False, allow_targets: bool = False,
             console: Console | None = None) -> int:
@@ -75,8 +76,8 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             actuators = _actuators_for(injected, actuators)
             clocks = _clocks(clock, actuators)
             options = GraphOptions(
-                controller=controller, policy=str(policy or ''), standby=standby,
-                allow_other_robot=allow_other_robot, robot_file=_absolute(robot),
+                controller=controller, nmpc=_absolute(nmpc), policy=str(policy or ''),
+                standby=standby, allow_other_robot=allow_other_robot, robot_file=_absolute(robot),
                 plant_file=_absolute(plant), conditions=conditions, seed=int(seed),
                 task=_absolute(task) if Path(task).is_file() else str(task), bag=str(bag),
                 compression=compression, actuators='direct', ports=str(folder))

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from beetle_omni_ros.control import registry
+from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 
@@ -47,7 +48,8 @@ class GraphOptions:
     Attributes:
         controller: active controller: a name, or a reference to a class.
         standby: whether the standby controllers run too, so that they can be selected in flight.
-        policy: policy file of the controller that has the option `--policy`; '': the shipped one.
+        nmpc, policy: files of the controllers that have the options `--nmpc` and `--policy`; '':
+            the shipped ones.
         allow_other_robot: whether a policy trained for other robot parameters may fly.
         simulated: whether sim_node provides sensors and actuators. Otherwise nodes started
             elsewhere do; on the robot deploy/install.sh starts the bridges.
@@ -66,6 +68,7 @@ class GraphOptions:
 
     controller: str = registry.DEFAULT
     standby: bool = True
+    nmpc: str = ''
     policy: str = ''
     allow_other_robot: bool = False
     simulated: bool = True
@@ -112,8 +115,9 @@ def plan(options: GraphOptions) -> Plan:
     robot = {'robot_file': options.robot_file} if options.robot_file else {}
     plant = {'robot_file': options.plant_file} if options.plant_file else robot
     controllers, left_out = controller_nodes(
-        options.controller, robot_file=options.robot_file, policy=options.policy,
-        allow_other_robot=options.allow_other_robot, standby=options.standby)
+        options.controller, robot_file=options.robot_file, nmpc=options.nmpc,
+        policy=options.policy, allow_other_robot=options.allow_other_robot,
+        standby=options.standby)
     active = registry.find(options.controller).name
     # The default of these nodes is the list of standby controllers.
     others = {} if active in registry.standing_by() else {
@@ -144,7 +148,7 @@ def in_simulated_time(nodes: Parameters) -> Parameters:
             for name, values in nodes.items()}
 
 
-def controller_nodes(active: str, *, robot_file: str = '', policy: str = '',
+def controller_nodes(active: str, *, robot_file: str = '', nmpc: str = '', policy: str = '',
                      allow_other_robot: bool = False, standby: bool = True
                      ) -> tuple[Parameters, dict[str, str]]:
     """
@@ -165,11 +169,17 @@ def controller_nodes(active: str, *, robot_file: str = '', policy: str = '',
         first.make(RobotParameters.load(robot_file or None))
     entries = [first, *(registry.find(name) for name in registry.standing_by()
                         if standby and name != first.name)]
+    if nmpc and not any(entry.option == '--nmpc' for entry in entries):
+        raise ParameterError(f"--nmpc {nmpc}: for the controller '{registry.owner('--nmpc')}', "
+                             'which does not run')
     nodes, left_out = {}, {}
     for entry in entries:
         node = f'{entry.name}_node'
         values = {} if node in NODES else {'controller': entry.reference}
         values |= {'robot_file': robot_file} if robot_file else {}
+        if nmpc and entry.option == '--nmpc' and entry.parameter_class:
+            schema.load(entry.parameter_class, nmpc)    # an error here, not in another process
+            values[entry.file_key] = nmpc
         if entry.policy_file:
             given = policy if entry.name == registry.owner('--policy') else ''
             values |= {'policy': str(Path(given).absolute())} if given else {}

@@ -122,6 +122,18 @@ def test_a_policy_that_cannot_fly_is_refused_at_the_start(ros_domain, tmp_path):
     assert 'robot_hash' in refusal(f"policy:={tmp_path / 'whole.onnx'}", f'robot_file:={other}')
 
 
+def test_a_file_of_the_nmpc_reaches_its_node(tmp_path):
+    mine = tmp_path / 'mine.yaml'
+    mine.write_text('limits: {tilt_rate_share: 0.5}\n')
+    for active in ('nmpc', 'hover'):
+        assert controller_nodes(active, nmpc=str(mine))[0]['nmpc_node'] == {'nmpc_file': str(mine)}
+    with pytest.raises(ParameterError, match="for the controller 'nmpc', which does not run"):
+        controller_nodes('hover', nmpc=str(mine), standby=False)
+    mine.write_text('limits: {tilt_rate: 7.0}\n')
+    with pytest.raises(ParameterError, match="unknown key; did you mean 'tilt_rate_share'"):
+        controller_nodes('nmpc', nmpc=str(mine))
+
+
 def test_an_unusable_policy_is_not_on_standby(tmp_path):
     policy = str(write(tmp_path / 'policy.onnx'))
     other = str(share_path('params/robot_weak_and_heavy.yaml'))
