@@ -16,7 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.nodes import runner
+from beetle_omni_ros.nodes import runner, speed
 from beetle_omni_ros.nodes.discovery import confine, reserved_domain
 from beetle_omni_ros.nodes.flight import Flight, FlightError, TooSlowError
 from beetle_omni_ros.nodes.graph import child_environment, Graph
@@ -112,10 +112,11 @@ def _attempt(clocks, actuators, options, meta, folder, number, task, faults, con
     for kind in clocks:
         meta |= {'clock': kind, 'actuators': actuators or (
             'direct' if kind == 'simulated' else 'emulated')}
-        graph = _make_graph(options, meta, folder, number)
+        graph, last = _make_graph(options, meta, folder, number), kind == clocks[-1]
         try:
-            return _fly(graph, meta['controller'], task, meta, console, faults,
-                        may_be_slow=kind == clocks[-1])
+            if graph.composed and not last and (load := speed.load(graph.nodes)) > speed.MAX_LOAD:
+                raise TooSlowError(f'the nodes would need {load:.0%} of a core')
+            return _fly(graph, meta['controller'], task, meta, console, faults, may_be_slow=last)
         except TooSlowError as error:
             _discard_attempt(bag, folder, error, console)
         except KeyboardInterrupt:
@@ -190,8 +191,8 @@ def _make_graph(options, meta, folder, number):
 
 def _discard_attempt(bag, folder, error, console):
     """Print why the flight is repeated, and delete bag and logs of the first attempt."""
-    _print(console, f'this computer is too slow for real time: {error}; again in simulated time, '
-          'which waits for the nodes, and without serial devices')
+    _print(console, f'this computer is too slow for real time: {error}; it flies in simulated '
+          'time, which waits for the nodes, and without serial devices')
     shutil.rmtree(bag, ignore_errors=True)
     for log in folder.glob('*.log'):
         log.unlink()

@@ -157,6 +157,8 @@ def _controller_metrics(log, task, part, expected):
     result['crashed'] = _crashed(log, body, part)
     if ending:
         result['ended'] = ending
+    if log.meta.get('controller_error'):
+        result['controller_error'] = log.meta['controller_error']
     result['guidance'] = _guidance(log, part.name)
     result['lowest'] = _lowest(log, body, part)
     compute = log.compute.get(part.name, {})

@@ -19,6 +19,7 @@ from beetle_omni_ros.runs import tasks
 from beetle_omni_ros.runs.bag_reader import read_bag
 from beetle_omni_ros.runs.metrics import metrics
 from beetle_omni_ros.runs.tasks import make_task, Task, TaskError
+from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 
 ROBOT = RobotParameters.load()
@@ -145,6 +146,36 @@ def test_an_exception_of_step_ends_the_command_with_one_line(poses, tmp_path, ca
     line, = capsys.readouterr().err.splitlines()
     assert line == "beetle_omni: error: controller 'bad': step raised AttributeError: " \
                    "'Bad' object has no attribute 'absent' (bad.py:4)"
+
+
+@pytest.mark.parametrize('until', [0.2, 100.0])
+def test_an_exception_in_flight_falls_back_and_is_in_the_results(until, tmp_path, monkeypatch):
+    limits = SupervisorParameters.load()
+    limits = replace(limits, envelope=replace(limits.envelope, fallback_time=1.0))
+    monkeypatch.setattr(SupervisorParameters, 'load', lambda: limits)
+    own, task = tmp_path / 'bad.py', make_task('hover')
+    own.write_text('from beetle_omni_ros.control.hover import HoverController\n'
+                   'class Bad(HoverController):\n'
+                   '    high = None\n'
+                   '    def step(self, state, target):\n'
+                   '        if target.position[2] == 1.0:       # of the task\n'
+                   '            self.high = self.high or state.stamp\n'
+                   f'            if 1.0 < state.stamp - self.high < {1.0 + until}:\n'
+                   '                return self.absent\n'
+                   '        return super().step(state, target)\n')
+    task = replace(task, segments=(replace(task.segments[0], duration=4.0),))
+    text = io.StringIO()
+    results = command.run_evaluate(controllers=[f'{own}:Bad'], task=task, bag=tmp_path / 'bag',
+                                   console=Console(file=text, width=300))['bad']
+    states = read_bag(tmp_path / 'bag').states
+    at = states.index('fallback:controller_silent')
+    assert states[at - 1] == 'flying:bad'
+    transient = until < 1.0
+    assert states[at + 1] == ('flying:bad' if transient else 'landing:controller_lost')
+    assert ('ended' in results) != transient and not results['crashed']
+    error = results['controller_error']
+    assert "controller 'bad': step raised AttributeError: 'Bad' object has no attribute" in error
+    assert '(bad.py:8)' in error and error in text.getvalue()
 
 
 def test_a_force_task_ends_with_the_level_of_lost_control(monkeypatch):
