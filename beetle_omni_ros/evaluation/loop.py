@@ -215,9 +215,10 @@ class FlightLoop:
         while self.supervisor.state != 'flying':
             self.step()
             if self.simulator.time > TAKEOFF_TIMEOUT or self.supervisor.state == 'disarmed':
-                events = [event.text for event in self.supervisor.events]
+                events = list(dict.fromkeys(     # the newest first, each once
+                    event.text for event in reversed(self.supervisor.events)))
                 raise FlightError(f'no take-off within {TAKEOFF_TIMEOUT:g} s, supervisor in '
-                                  f"'{self.supervisor.state}' ({'; '.join(events[-3:])})")
+                                  f"'{self.supervisor.state}' ({'; '.join(events[2::-1])})")
 
     def step(self) -> Frame:
         """Run one tick of the simulator and of every process that is due in it."""

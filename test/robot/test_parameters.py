@@ -1,9 +1,12 @@
 """The robot file: its consistency, and refusals."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import yaml
 
+from beetle_omni_ros.identify.robot_file import write_robot_file
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
@@ -81,6 +84,19 @@ def test_a_file_that_extends_another_contains_differences_only(tmp_path):
     assert mine.effects == {'wind': {'force': (1.0, 0.0, 0.0)}}
     assert np.array_equal(mine.rotors.positions, shipped.rotors.positions)
     assert mine.joints == shipped.joints
+
+
+def test_the_name_of_a_shipped_file_is_a_robot_file_unless_a_local_file_has_it(
+        tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert RobotParameters.load('robot.yaml').hash() == RobotParameters.load().hash()
+    (tmp_path / 'other').mkdir()
+    write_robot_file(tmp_path / 'other' / 'mine.yaml', '', {'mass': 3.1}, Path('robot.yaml'))
+    assert RobotParameters.load('other/mine.yaml').mass == 3.1
+    (tmp_path / 'robot.yaml').write_text('extends: robot.yaml\nmass: 3.2\n')
+    assert RobotParameters.load('robot.yaml').mass == 3.2
+    with pytest.raises(ParameterError, match='none.yaml: no such file'):
+        RobotParameters.load('none.yaml')
 
 
 @pytest.mark.parametrize('text, message', [
