@@ -24,8 +24,7 @@ setup-train:  # the same with what training needs
 	@PYTHON='$(PYTHON)' .ci/setup train
 
 fly: setup  ## fly the waypoints in real time through ROS nodes; the bag is in runs_out/
-	@mkdir -p runs_out
-	$(TOOL) fly --controller nmpc --task waypoints --bag runs_out/fly_$(RUN) $(ARGS)
+	$(TOOL) fly --controller nmpc --task waypoints $(ARGS)
 
 test: setup-train  ## the whole test suite
 	@.ci/test $(ARGS)

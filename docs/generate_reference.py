@@ -326,7 +326,7 @@ def command_line() -> str:
             '`beetle_omni` is also `ros2 run beetle_omni_ros beetle_omni`. Each subcommand has '
             '`--help`.\n\n'
             + table(['exit status', 'meaning'], [
-                ['0', 'success'], ['1', 'a flight or a check failed'],
+                ['0', 'success'], ['1', 'a flight failed or crashed, or a check failed'],
                 ['2', 'unusable input; one line on standard error'],
                 ['3', '`gap`: the verdict `bad_data`'], ['130', 'interrupted']])]
     for name, command in _commands(get_command(app), 'beetle_omni'):

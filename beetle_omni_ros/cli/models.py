@@ -81,7 +81,8 @@ def joint(logs: Annotated[list[Path], typer.Argument(
 
     Example: beetle_omni identify joint slow.csv --validate fast.csv --report servos.html
     """
-    log, *more = logs      # `--validate a.csv b.csv` puts b.csv here
+    from beetle_omni_ros.runs.bag_files import runs_in
+    log, *more = runs_in(logs)      # `--validate a.csv b.csv` puts b.csv here
     if more and not validate:
         raise ParameterError(f'{more[0]}: the identification uses one log; expected further logs '
                              'after --validate')

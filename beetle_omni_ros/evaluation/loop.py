@@ -214,9 +214,10 @@ class FlightLoop:
         while self.supervisor.state != 'flying':
             self._step_before_flight()
             if self.simulator.time > TAKEOFF_TIMEOUT or self.supervisor.state == 'disarmed':
-                events = [event.text for event in self.supervisor.events]
+                events = list(dict.fromkeys(     # the newest first, each once
+                    event.text for event in reversed(self.supervisor.events)))
                 raise FlightError(f'no take-off within {TAKEOFF_TIMEOUT:g} s, supervisor in '
-                                  f"'{self.supervisor.state}' ({'; '.join(events[-3:])})")
+                                  f"'{self.supervisor.state}' ({'; '.join(events[2::-1])})")
 
     def _step_before_flight(self):
         self.step()

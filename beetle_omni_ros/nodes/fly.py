@@ -23,12 +23,12 @@ from beetle_omni_ros.nodes.graph import child_environment, Graph
 from beetle_omni_ros.nodes.operator import Operator
 from beetle_omni_ros.nodes.plan import ACTUATORS, GraphOptions, plan
 from beetle_omni_ros.nodes.runner import signals_ignored, sigterm_as_interrupt
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.parameters import find_robot, RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs import table
 from beetle_omni_ros.runs.bag import add_meta, BagError, check_new, read_bag
 from beetle_omni_ros.runs.json_file import check_writable, write_json
-from beetle_omni_ros.runs.metrics import metrics
+from beetle_omni_ros.runs.metrics import failed, metrics
 from beetle_omni_ros.runs.tasks import make_task, Task
 from beetle_omni_ros.sim.faults import listed
 
@@ -72,13 +72,15 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             flown_task = make_task(task, seed, registry.find(controller).reach(
                 RobotParameters.load(robot)))
             RobotParameters.load(plant or robot)
+            robot_file, plant_file = (file and find_robot(file) for file in (robot, plant))
             injected = listed.load_faults(faults) if faults else []
             actuators = _actuators_for(injected, actuators)
             clocks = _clocks(clock, actuators)
             options = GraphOptions(
                 controller=controller, nmpc=_absolute(nmpc), policy=str(policy or ''),
-                standby=standby, allow_other_robot=allow_other_robot, robot_file=_absolute(robot),
-                plant_file=_absolute(plant), conditions=conditions, seed=int(seed),
+                standby=standby, allow_other_robot=allow_other_robot,
+                robot_file=_absolute(robot_file), plant_file=_absolute(plant_file),
+                conditions=conditions, seed=int(seed),
                 task=_absolute(task) if Path(task).is_file() else str(task), bag=str(bag),
                 compression=compression, actuators='direct', ports=str(folder))
             for name, reason in plan(options).left_out.items():
@@ -265,7 +267,7 @@ def _report(bag, controller, task, meta, json_path, console) -> int:
         table.print_results(results, console)
     _print_measured(meta, console)
     write_json(json_path, results)
-    return runner.OK if not results[controller].get('crashed') else runner.FAILED
+    return runner.FAILED if failed(results[controller]) else runner.OK
 
 
 def _print_measured(meta, console):

@@ -216,7 +216,7 @@ class RobotParameters:
     @classmethod
     def load(cls, path: str | Path | None = None) -> RobotParameters:
         """
-        Read a robot file; without a path, the shipped one.
+        Read a robot file, see :func:`find_robot`; without a path, the shipped one.
 
         A file may begin with ``extends: FILE``, a file in the same folder or of the shipped
         params. It then contains the differences only; what they move without being named, moves
@@ -226,7 +226,9 @@ class RobotParameters:
             ParameterError: names file, key and expected value.
 
         """
-        path = Path(path) if path else share_path('params/robot.yaml')
+        path = find_robot(path) if path else share_path('params/robot.yaml')
+        if not path.is_file():
+            raise ParameterError(f'{path}: no such file')
         robot = schema.bind(cls, _merged(path, ()), str(path))
         with _named(path):
             check_parts(robot)
@@ -281,6 +283,29 @@ class RobotParameters:
         return data
 
 
+def find_robot(name: str | Path, beside: Path | None = None) -> Path:
+    """
+    Locate a robot file: the given path, else a shipped file of that name.
+
+    Args:
+        name: path of a file, or the name of a file of the shipped params.
+        beside: the file that extends it; relative paths begin in its folder.
+
+    Returns:
+        The path; that of no file if neither exists.
+
+    """
+    path = beside.parent / name if beside else Path(name)
+    # `extends: robot.yaml` in a file named robot.yaml means the shipped file
+    if path.is_file() and not (beside and path.resolve() == beside.resolve()):
+        return path
+    try:
+        shipped = share_path(f'params/{name}')
+    except FileNotFoundError:
+        return path
+    return shipped if shipped.is_file() else path
+
+
 def _merged(path: Path, seen: tuple[Path, ...]) -> dict:
     """Content of a robot file, merged with the file that it extends."""
     content = schema.load_yaml(path)
@@ -290,17 +315,10 @@ def _merged(path: Path, seen: tuple[Path, ...]) -> dict:
     if not isinstance(name, str) or not name.isprintable() or len(name) > LONGEST_NAME:
         raise ParameterError(f"{path}: key 'extends': expected the name of a file, "
                              f'found {quoted(name)}')
-    base = path.parent / name
-    # `extends: robot.yaml` in a file named robot.yaml means the shipped file
-    itself = base.resolve() == path.resolve()
-    if itself or not base.is_file():
-        try:
-            base = share_path(f'params/{name}')
-        except FileNotFoundError:
-            if itself:
-                raise ParameterError(f"{path}: key 'extends': {name} extends itself") from None
-            raise ParameterError(f"{path}: key 'extends': no file {name!r} beside it or among the "
-                                 'shipped params') from None
+    base = find_robot(name, path)
+    if not base.is_file():
+        raise ParameterError(f"{path}: key 'extends': no file {name!r} beside it or among the "
+                             'shipped params')
     if base.resolve() in (*seen, path.resolve()):
         raise ParameterError(f"{path}: key 'extends': {name} extends itself")
     return _extended(base, _merged(base, (*seen, path.resolve())), path, content)

@@ -231,6 +231,11 @@ def _reduced(reduce, values):
     return float(reduce(values)) if values else None
 
 
+def failed(result: dict) -> bool:
+    """Whether the results of a flight are a crash; tasks that end with lost control may crash."""
+    return bool(result.get('crashed')) and not {'force', 'torque'} & result.keys()
+
+
 def _crashed(log, body, part):
     """Whether the robot hit the ground, had an emergency stop, or has a non-finite position."""
     if any(state == CRASH for state in log.states):

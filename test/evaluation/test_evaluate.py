@@ -17,7 +17,7 @@ from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs import tasks
 from beetle_omni_ros.runs.bag_reader import read_bag
-from beetle_omni_ros.runs.metrics import metrics
+from beetle_omni_ros.runs.metrics import failed, metrics
 from beetle_omni_ros.runs.tasks import make_task, Task, TaskError
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.sim.parameters import SimulatorParameters
@@ -134,6 +134,39 @@ def test_a_flight_ended_by_the_supervisor_is_reported_with_time_and_reason(poses
     at, = re.findall('nmpc: the flight ended early, landing at ([0-9.]+ s): ', text.getvalue())
     assert results['nmpc']['ended'].endswith(f' at {at}')   # both since the start of the task
     assert results['nmpc']['ended'] in text.getvalue().partition('crashed')[0]
+
+
+OPEN_LOOP = """
+import numpy as np
+from beetle_omni_ros.control.base import Command
+class Own:
+    period = 0.01
+    def __init__(self, robot): self.thrust = np.full(4, robot.hover_thrust)
+    def reset(self): pass
+    def step(self, state, target): return Command(state.stamp, np.zeros(4), self.thrust%s)
+"""
+
+
+def test_a_crash_ends_the_command_with_status_1_after_the_results(poses, tmp_path):
+    own, result = tmp_path / 'own.py', tmp_path / 'result.json'
+    own.write_text(OPEN_LOOP % ' * (0.5 + 1e-3 * (state.stamp % 1))')
+    assert cli.main(['evaluate', '--controllers', f'{own}:Own', '--task', str(poses), '--json',
+                     str(result)]) == 1
+    assert json.loads(result.read_text())['own']['crashed']
+
+
+def test_a_task_that_ends_with_lost_control_does_not_fail_by_a_crash():
+    assert failed({'crashed': True}) and not failed({'crashed': False})
+    assert not failed({'crashed': True, 'force': {}})
+
+
+def test_a_constant_controller_is_refused_once_with_the_rule(poses, tmp_path, monkeypatch):
+    monkeypatch.setattr(loop, 'TAKEOFF_TIMEOUT', 6.0)
+    own = tmp_path / 'own.py'
+    own.write_text(OPEN_LOOP % '')
+    with pytest.raises(loop.FlightError) as error:
+        evaluate(poses, [f'{own}:Own'])
+    assert str(error.value).count('more than 10 equal commands in a row') == 1
 
 
 def test_an_exception_of_step_ends_the_command_with_one_line(poses, tmp_path, capsys):

@@ -1,9 +1,12 @@
 """The robot file: its consistency, and refusals."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import yaml
 
+from beetle_omni_ros.identify.robot_file import write_robot_file
 from beetle_omni_ros.robot.mass_properties import mass_properties
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
@@ -136,6 +139,19 @@ def test_a_change_that_contradicts_the_extended_file_is_refused(tmp_path, text, 
         extended(tmp_path, text)
     assert message in str(error.value)
     assert 'mine.yaml: ' in str(error.value) and '\n' not in str(error.value)
+
+
+def test_the_name_of_a_shipped_file_is_a_robot_file_unless_a_local_file_has_it(
+        tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert RobotParameters.load('robot.yaml').hash() == RobotParameters.load().hash()
+    (tmp_path / 'other').mkdir()
+    write_robot_file(tmp_path / 'other' / 'mine.yaml', '', {'mass': 3.1}, Path('robot.yaml'))
+    assert RobotParameters.load('other/mine.yaml').mass == 3.1
+    (tmp_path / 'robot.yaml').write_text('extends: robot.yaml\nmass: 3.2\n')
+    assert RobotParameters.load('robot.yaml').mass == 3.2
+    with pytest.raises(ParameterError, match='none.yaml: no such file'):
+        RobotParameters.load('none.yaml')
 
 
 @pytest.mark.parametrize('text, message', [
