@@ -1,0 +1,64 @@
+"""Linear fits with robust weights, and intervals from the scatter between blocks."""
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.stats import t as student
+
+from beetle_omni_ros.identify.inference.least_squares import HUBER
+
+SIGMA_OF_MEDIAN = 1.4826    # standard deviation over the median of the size, normal distribution
+
+
+def scale_of(residual: np.ndarray) -> float:
+    """Standard deviation of residuals without their outliers."""
+    return float(SIGMA_OF_MEDIAN * np.median(np.abs(residual)) + 1e-12)
+
+
+def linear(x: np.ndarray, y: np.ndarray, passes: int = 8) -> np.ndarray:
+    """(K,) coefficients of y (n,) on x (n, K) with Huber's loss; the noise is the residuals'."""
+    root = np.ones(len(y))
+    for _ in range(passes):
+        fitted = np.linalg.lstsq(x * root[:, None], y * root, rcond=None)[0]
+        residual = y - x @ fitted
+        root = np.sqrt(np.minimum(1, HUBER * scale_of(residual)
+                                  / np.maximum(np.abs(residual), 1e-12)))
+    return fitted
+
+
+def consecutive(changes: np.ndarray, most: int) -> np.ndarray:
+    """Block of each row (n,): stretches between changes, joined to at most ``most`` blocks."""
+    stretch = np.cumsum(changes) - changes[0]
+    count = stretch[-1] + 1
+    return stretch * min(count, most) // count
+
+
+def jackknife(fit: Callable[[np.ndarray], np.ndarray], blocks: np.ndarray) -> np.ndarray:
+    """(B, ...) results of ``fit`` for masks of rows that leave out each block in turn."""
+    return np.array([fit(blocks != block) for block in np.unique(blocks)])
+
+
+def interval(value: np.ndarray, left_out: np.ndarray) -> np.ndarray:
+    """(..., 2) 95 % interval of a value from results without each of B blocks (B, ...)."""
+    count = len(left_out)
+    variance = (count - 1) * left_out.var(axis=0)
+    half = student.ppf(0.975, count - 1) * np.sqrt(variance)
+    return np.stack([value - half, value + half], axis=-1)
+
+
+def scatter(slopes: np.ndarray, residual: np.ndarray, prior: np.ndarray,
+            blocks: np.ndarray) -> np.ndarray:
+    """
+    (P, P) covariance of a nonlinear fit from the scatter of the gradient between blocks.
+
+    Args:
+        slopes: (P, N) derivatives of the residuals; 0: not free.
+        residual: (N,) residuals.
+        prior: (P,) slopes of the prior's residuals.
+        blocks: (N,) block of each residual.
+
+    """
+    inverse = np.linalg.pinv(slopes @ slopes.T + np.diag(prior**2 + 1e-9))
+    scores = np.array([slopes[:, blocks == block] @ residual[blocks == block]
+                       for block in np.unique(blocks)])
+    return inverse @ scores.T @ scores @ inverse * len(scores) / (len(scores) - 1)
