@@ -49,11 +49,14 @@ def interval(value: np.ndarray, left_out: np.ndarray) -> np.ndarray:
 def scatter(slopes: np.ndarray, residual: np.ndarray, prior: np.ndarray,
             blocks: np.ndarray) -> np.ndarray:
     """
-    (P, P) covariance of a nonlinear fit from the scatter of the gradient between blocks.
+    (2, P, P) covariance of a nonlinear fit, for white residuals and from blocks.
+
+    The second one comes from the scatter of the gradient between blocks. Use the larger variance:
+    few blocks can agree by chance.
 
     Args:
         slopes: (P, N) derivatives of the residuals; 0: not free.
-        residual: (N,) residuals.
+        residual: (N,) residuals with unit variance.
         prior: (P,) slopes of the prior's residuals.
         blocks: (N,) block of each residual.
 
@@ -61,4 +64,5 @@ def scatter(slopes: np.ndarray, residual: np.ndarray, prior: np.ndarray,
     inverse = np.linalg.pinv(slopes @ slopes.T + np.diag(prior**2 + 1e-9))
     scores = np.array([slopes[:, blocks == block] @ residual[blocks == block]
                        for block in np.unique(blocks)])
-    return inverse @ scores.T @ scores @ inverse * len(scores) / (len(scores) - 1)
+    between = scores.T @ scores * len(scores) / (len(scores) - 1)
+    return np.array([inverse, inverse @ between @ inverse])

@@ -26,7 +26,7 @@ LOOSE = 5.0             # ratio of interval's end and value, from which a log do
 LOW, HIGH = np.log(0.001), np.log(1.0)
 STEP = 1e-4             # of differences
 WEAK = 100.0            # deviation of a gain or ratio that a log does not show
-PHASES = 50             # of the windows
+PHASES = 10             # of the windows
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,11 +64,11 @@ class Lag:
 
 
 def respond(time, static, up, down):
-    """(M, N) thrust of M models with static thrust (M, N) and time constants (M,)."""
+    """(M, N) thrust of M models with time constants (M,) for held static thrusts (M, N)."""
     thrust = np.empty_like(static)
     thrust[:, 0] = level = static[:, 0]
     for k, step in enumerate(np.diff(time), start=1):
-        error = static[:, k] - level
+        error = static[:, k - 1] - level
         level = level + error * -np.expm1(-step / np.where(error > 0, up, down))
         thrust[:, k] = level
     return thrust
@@ -147,15 +147,16 @@ def _fitted(log, base, rest, reason, gains, one_rms):
 
     Points: mean of the logarithms of both time constants, half their difference, dead time, gains.
     """
+    # In a log with windows, the dead time also corrects the phase of the windows.
+    first, fixed = (-3 if reason else 0), ()
     count, size = len(base) + 3, np.abs(log.thrust).max() / np.abs(base).max(axis=1)
     weak = Prior(np.append([np.inf, WEAK, np.inf], np.full(len(base), WEAK)))
 
     def model(points):
-        static = points[:, 3:] * size @ base + rest
-        static = np.stack([np.interp(log.time - DEAD * dead, log.time, row)
-                           for dead, row in zip(points[:, 2], static, strict=True)])
-        return respond(log.time, static, *np.exp([points[:, 0] + points[:, 1],
-                                                  points[:, 0] - points[:, 1]]))
+        thrust = respond(log.time, points[:, 3:] * size @ base + rest, *np.exp(
+            [points[:, 0] + points[:, 1], points[:, 0] - points[:, 1]]))
+        return np.stack([np.interp(log.time - DEAD * dead, log.time, row)
+                         for dead, row in zip(points[:, 2], thrust, strict=True)])
 
     def residual(points, _):
         return huber((log.thrust - model(points)) / noise) * log.fresh
@@ -167,7 +168,7 @@ def _fitted(log, base, rest, reason, gains, one_rms):
     def solve(points, fixed):
         free = ~np.isin(np.arange(count), fixed)
         fits = minimise(points, np.tile(free, (len(points), 1)),
-                        np.array([LOW, -3, 0, *[-9] * len(base)]),
+                        np.array([LOW, -3, first, *[-9] * len(base)]),
                         np.array([HIGH, 3, 50, *[9] * len(base)]), residual,
                         lambda here, _, start: slopes(here, start) * free[:, None], weak, 60)
         best = fits.points[[np.argmin(fits.chi2)]]
@@ -175,9 +176,7 @@ def _fitted(log, base, rest, reason, gains, one_rms):
         return best, scatter(slopes(best, error)[0] * free[:, None], error[0], weak.slope(best[0]),
                              consecutive(np.ones(len(base[0]), dtype=bool), BLOCKS))
 
-    # The phase of the windows is fitted and takes up any dead time.
-    fixed = (2,) if reason else ()
-    start = np.tile([np.log(FIRST), 0, 0, *np.full(len(base), 0.5)], (1 if fixed else 4, 1))
+    start = np.tile([np.log(FIRST), 0, 0, *np.full(len(base), 0.5)], (1 if reason else 4, 1))
     start[:, 2] = np.array(STARTS[:len(start)]) / DEAD
     noise = np.std(log.thrust) / 5 + 1e-4
     for _ in range(3):
@@ -199,7 +198,7 @@ def _fitted(log, base, rest, reason, gains, one_rms):
 
 def _shown(value, wide, direction, unit=None):
     """Value and interval along a direction; of a logarithm without ``unit``; None: not shown."""
-    half = np.sqrt(direction @ wide @ direction) * student.ppf(0.975, BLOCKS - 1)
+    half = np.sqrt(np.max(direction @ wide @ direction)) * student.ppf(0.975, BLOCKS - 1)
     ends = np.array([value, value - half, value + half])
     if unit is None and half > np.log(LOOSE):
         return None

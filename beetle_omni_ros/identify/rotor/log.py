@@ -128,11 +128,11 @@ def read_rotor_log(path: str | Path, columns: Mapping[str, tuple[str, float]] | 
     _telemetry(path, data, notes)
     duty = None if 'duty' not in data else data['duty'] / 50 - 1
     voltage = data.get('voltage', np.ones(len(table)))
-    side = [data[name] for name in SIDE if name in data]
+    side = np.array([data[name] for name in SIDE if name in data]).T.reshape(len(table), -1)
     log = RotorLog(
         table.path.name, _time(path, data, table, rate), data['target'] if duty is None else None,
         duty, data['thrust'], data['torque'], voltage, data.get('temperature'),
-        data.get('pack', np.zeros(len(table))), np.array(side).reshape(len(side), -1).T,
+        data.get('pack', np.zeros(len(table))), side,
         np.ones(len(table), dtype=bool), np.ones(len(table), dtype=bool), notes)
     if log.time is not None:
         log = _series(log)

@@ -14,13 +14,12 @@ import numpy as np
 from beetle_omni_ros.identify.inference.robust import consecutive, interval, jackknife, linear
 from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.rotor.log import RotorLog
-from beetle_omni_ros.runs.csv_table import LogError
 
 P = shipped().rotor
 FORMS = (((1, 0), (2, 0)), ((1, 0), (2, 0), (3, 0)),
          ((1, 0), (2, 0), (3, 0), (2, 1), (3, 1)))  # powers of u and of duty
 GROUPS = 5              # of rows with neighbouring voltages, if packs are not labelled
-GRID = np.linspace(0, 1, 101)[1:]
+GRID = (1 - np.cos(np.linspace(0, np.pi, 101)[1:])) / 2     # dense at the ends, as errors are
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +73,7 @@ def terms(form, duty, voltage) -> np.ndarray:
 
 
 def settled_rows(logs: Sequence[RotorLog]) -> Rows | None:
-    """Settled rows of the logs with a duty; None: too few."""
+    """Settled rows of the logs with a duty; None: too few, or no sweep."""
     parts = [log for log in logs if log.duty is not None]
     if sum(log.settled.sum() for log in parts) < P.least_rows:
         return None
@@ -83,9 +82,8 @@ def settled_rows(logs: Sequence[RotorLog]) -> Rows | None:
         return np.concatenate([values(log)[log.settled] for log in parts])
 
     duty, voltage = joined(lambda log: log.duty), joined(lambda log: log.voltage)
-    if np.ptp(duty) < 0.1 or np.unique(duty.round(2)).size < 5:
-        raise LogError(f'{parts[0].name}: {len(duty)} settled rows span {np.ptp(duty):.0%} of the '
-                       'duty; expected a sweep from stop to full with five steps or more')
+    if np.ptp(duty) < P.least_sweep or np.unique(duty.round(2)).size < 5:
+        return None
     several = not any(np.ptp(log.pack) for log in parts)
     pack = np.concatenate([log.pack[log.settled] + several * k for k, log in enumerate(parts)])
     names, label = np.unique(pack, return_inverse=True)
