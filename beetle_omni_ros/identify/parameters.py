@@ -95,6 +95,8 @@ class RotorLogParameters:
     least_rows: int = parameter(doc='Least number of rows of a log.', low=5, high=10**6)
     least_sweep: float = parameter(doc='Least range of the duty from stop 0 to full 1.', unit='1',
                                    low=0.01, high=1)
+    least_heating: float = parameter(doc='Least range of the temperature.', unit='K', low=0,
+                                     high=100)
     settling: float = parameter(doc='Settling time after a change of command.', unit='s',
                                 low=0.01, high=60)
     still: float = parameter(doc='Largest share of the command that its lagged value differs by.',

@@ -4,12 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rotor_logs import bench, HEADER, RATIO, ROWS, series, SERIES, stand, SURFACE, write
+from rotor_logs import bench, HEADER, RATIO, SERIES, series, stand, SURFACE, write
 
 from beetle_omni_ros.identify.inference.robust import interval
 from beetle_omni_ros.identify.rotor.log import chosen, read_rotor_log
-from beetle_omni_ros.identify.rotor.results import (
-    identify_rotor, rotor_results, write_rotor_file)
+from beetle_omni_ros.identify.rotor.results import identify_rotor, rotor_results, write_rotor_file
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.robot.thrust_map import ThrustMap
@@ -23,6 +22,16 @@ real = pytest.mark.skipif(not DATA.is_dir(), reason='no measured logs')
 def identified(tmp_path, rows, header=HEADER, **options):
     path = write(tmp_path / 'bench.csv', rows, header)
     return identify_rotor([read_rotor_log(path, **options)])
+
+
+def thrust_of(model, duty, voltage):
+    return model.surfaces['thrust'].at(duty, voltage)[..., 0]
+
+
+def only_lag(model):
+    [(_, lag)] = model.lags
+    assert not lag.reason
+    return lag.result
 
 
 def within(result, truth):
@@ -42,8 +51,8 @@ def test_intervals_hold_the_true_surface_ratio_and_drift(tmp_path):
         inside['drift'].append(within(results['temperature'], 0.002))
         inside['ratio'].append(within(results['torque_to_thrust_ratio'], RATIO))
         model = identified(tmp_path, stand(rng), STAND)
-        limits = interval(model.thrust.at(duty, voltage), np.array(
-            [model.thrust.at(duty, voltage, c) for c in model.thrust.left_out]))
+        limits = np.array([interval(one) for one in
+                           model.surfaces['thrust'].at(duty, voltage)])
         inside['thrust'] += list((limits[:, 0] < true) & (true < limits[:, 1]))
         assert np.ptp(limits, axis=1).max() < 0.7
     assert all(np.mean(hits) > 0.8 for hits in inside.values()), inside
@@ -60,8 +69,8 @@ def test_outliers_do_not_change_the_surface(tmp_path):
     clean = identified(tmp_path, rows, STAND)
     rows[::40, 1] += 8.0
     dirty = identified(tmp_path, rows, STAND)
-    assert np.abs(dirty.thrust.at(np.array([0.2, 0.7]), 23.0)
-                  - clean.thrust.at(np.array([0.2, 0.7]), 23.0)).max() < 0.2
+    assert np.abs(thrust_of(dirty, np.array([0.2, 0.7]), 23.0)
+                  - thrust_of(clean, np.array([0.2, 0.7]), 23.0)).max() < 0.2
 
 
 def test_other_columns_signs_and_units_give_the_same_result(tmp_path):
@@ -73,27 +82,27 @@ def test_other_columns_signs_and_units_give_the_same_result(tmp_path):
             (('pwm_us', 'load', 'tz', 'mV'), [1, -100, 1, 1000],
              ('thrust=-load*0.01', 'voltage=mV*0.001'))):
         other = identified(tmp_path, rows * factor, header, columns=chosen(options))
-        assert np.allclose(other.thrust.value, first.thrust.value, rtol=0.02, atol=1e-3)
-        assert np.allclose(other.torque.value, first.torque.value, rtol=0.02, atol=1e-4)
+        for name, surface in first.surfaces.items():
+            assert np.allclose(other.surfaces[name].every[0], surface.every[0], rtol=0.02,
+                               atol=1e-3)
 
 
 def test_the_lag_and_its_directions_are_recovered(tmp_path):
     inside = []
     for seed in range(4):
         model = identified(tmp_path, series(np.random.default_rng(seed)), SERIES)
-        lag = model.lags[0]
-        assert not lag.reason
-        assert lag.up['value'] == pytest.approx(0.07, rel=0.15)
-        assert lag.down['value'] == pytest.approx(0.045, rel=0.15)
-        assert lag.up['interval'][0] > lag.down['interval'][1]
-        inside += [within(lag.up, 0.07), within(lag.down, 0.045), within(lag.dead_time, 0.0)]
+        lag = only_lag(model)
+        assert lag['up']['value'] == pytest.approx(0.07, rel=0.15)
+        assert lag['down']['value'] == pytest.approx(0.045, rel=0.15)
+        assert lag['up']['interval'][0] > lag['down']['interval'][1]
+        inside += [within(lag['up'], 0.07), within(lag['down'], 0.045), within(lag['dead_time'], 0.0)]
     assert np.mean(inside) > 0.8
 
 
 def test_dead_time_is_separated_from_the_lag(tmp_path):
-    lag = identified(tmp_path, series(np.random.default_rng(0), dead=0.04), SERIES).lags[0]
-    assert lag.dead_time['value'] == pytest.approx(0.04, abs=0.008)
-    assert lag.up['value'] == pytest.approx(0.07, rel=0.2)
+    lag = only_lag(identified(tmp_path, series(np.random.default_rng(0), dead=0.04), SERIES))
+    assert lag['dead_time']['value'] == pytest.approx(0.04, abs=0.008)
+    assert lag['up']['value'] == pytest.approx(0.07, rel=0.2)
 
 
 @pytest.mark.parametrize('seed', range(2))
@@ -116,8 +125,8 @@ def test_held_and_impossible_telemetry_is_masked_and_stated(tmp_path):
     bad = rows.copy()
     bad[1::10, 3], bad[3::20, 3] = 97.0, 0.46
     model = identified(tmp_path, bad, STAND)
-    assert np.abs(model.rows.voltage - rows[:, 3]).max() < 3
-    assert model.thrust.at(0.6, 23.0) == pytest.approx(clean.thrust.at(0.6, 23.0), abs=0.1)
+    assert np.abs(model.rows['voltage'] - rows[:, 3]).max() < 3
+    assert thrust_of(model, 0.6, 23.0) == pytest.approx(thrust_of(clean, 0.6, 23.0), abs=0.1)
     assert f'{np.sum(bad[:, 3] != rows[:, 3])} of {len(rows)} rows' in model.logs[0].notes[0]
     rows = series(np.random.default_rng(3))
     rows[:, 4:] = rows[np.arange(600) // 30 * 30][:, 4:]
@@ -139,10 +148,10 @@ def test_the_written_robot_file_gives_the_surface(tmp_path):
     assert '95 %' in path.read_text()
     found = ThrustMap(robot.rotors)
     assert not found.repaired
-    for voltage in np.linspace(model.rows.voltage.min(), model.rows.voltage.max(), 7):
+    for voltage in np.linspace(model.rows['voltage'].min(), model.rows['voltage'].max(), 7):
         thrust = np.linspace(2, found.thrust_limit(voltage), 20)
         duty = found.duty(thrust, voltage)
-        assert np.abs(model.thrust.at(duty / 50 - 1, voltage) - thrust).max() < 0.5
+        assert np.abs(thrust_of(model, duty / 50 - 1, voltage) - thrust).max() < 0.5
 
 
 @real
@@ -170,9 +179,9 @@ def test_the_measured_start_has_the_lag_of_a_rising_thrust():
     path = DATA / 'thrust_stand_start_24V.csv'
     with pytest.raises(LogError, match='--rate'):
         read_rotor_log(path)
-    lag = identify_rotor([read_rotor_log(path, rate=90)]).lags[0]
-    assert lag.from_rest and not lag.reason and lag.down is None
-    assert within(lag.up, 0.064) and lag.dead_time['interval'][0] > 0.1
+    lag = only_lag(identify_rotor([read_rotor_log(path, rate=90)]))
+    assert lag['from_rest'] and lag['down'] is None
+    assert within(lag['up'], 0.064) and lag['dead_time']['interval'][0] > 0.1
 
 
 def scaled(rows, column, factor):

@@ -34,16 +34,16 @@ def consecutive(changes: np.ndarray, most: int) -> np.ndarray:
 
 
 def jackknife(fit: Callable[[np.ndarray], np.ndarray], blocks: np.ndarray) -> np.ndarray:
-    """(B, ...) results of ``fit`` for masks of rows that leave out each block in turn."""
-    return np.array([fit(blocks != block) for block in np.unique(blocks)])
+    """(1 + B, ...) results of ``fit`` for a mask of all rows, then without each of B blocks."""
+    return np.array([fit(np.ones(len(blocks), dtype=bool)),
+                     *(fit(blocks != block) for block in np.unique(blocks))])
 
 
-def interval(value: np.ndarray, left_out: np.ndarray) -> np.ndarray:
-    """(..., 2) 95 % interval of a value from results without each of B blocks (B, ...)."""
-    count = len(left_out)
-    variance = (count - 1) * left_out.var(axis=0)
-    half = student.ppf(0.975, count - 1) * np.sqrt(variance)
-    return np.stack([value - half, value + half], axis=-1)
+def interval(every: np.ndarray) -> np.ndarray:
+    """95 % interval (2,) of a value from the results (1 + B,) of :func:`jackknife`."""
+    count = len(every) - 1
+    half = student.ppf(0.975, count - 1) * np.sqrt((count - 1) * every[1:].var())
+    return every[0] + half * np.array([-1, 1])
 
 
 def scatter(slopes: np.ndarray, residual: np.ndarray, prior: np.ndarray,

@@ -2,8 +2,8 @@
 Lag of thrust behind the command, and whether both belong together.
 
 Thrust follows its static value with one time constant while it rises and another while it falls,
-after a dead time. The static value is a gain times the command; in a log whose gain jumps, each
-window of time has its own gain.
+after a dead time. The static value is a curve over the command. In a log whose gain jumps, it is
+the command times a gain of each window of time.
 """
 
 from dataclasses import dataclass
@@ -18,49 +18,34 @@ from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.rotor.log import RotorLog
 
 P = shipped().rotor
-FIRST = 0.05            # [s] time constant of the first fit
+FIRST = 0.05            # [s] time constant to start from
+STARTS = (0.0, 0.05, 0.15, 0.3)     # [s] dead times to start from
+LIMITS = np.log([0.001, 1.0])       # [log s] of a time constant
 DEAD = 0.01             # [s] unit of the dead time
-STARTS = (0.0, 0.05, 0.15, 0.3)     # [s] dead times from which the fit begins
+PHASE = 3.0             # units by which the windows may shift
 BLOCKS = 20             # of a log, whose scatter gives the intervals
 LOOSE = 5.0             # ratio of interval's end and value, from which a log does not show a lag
-LOW, HIGH = np.log(0.001), np.log(1.0)
-STEP = 1e-4             # of differences
 WEAK = 100.0            # deviation of a gain or ratio that a log does not show
+STEP = 1e-4             # of differences
 PHASES = 10             # of the windows
+STRONG = 0.2            # share of the largest command, above which the gain of a window is used
 
 
 @dataclass(frozen=True, eq=False)
 class Lag:
     """
-    Lag of one log; dictionaries have value, unit and interval, None: the log does not show it.
+    Lag of one log.
 
     Attributes:
-        log: name of the log.
-        both, up, down, dead_time: time constants (equal, rising, falling) and dead time [s].
+        result: plain data; a lag that the log does not show is None.
         reason: why thrust and command do not belong together; empty: they do.
-        rms: RMS error of thrust [N]; with one gain, and as fitted.
-        gains: (K,) thrust over command of each window, if each has its own.
-        from_rest: whether the rotor started from rest.
         fitted: (N,) thrust of the model [N].
 
     """
 
-    log: str
-    both: dict | None
-    up: dict | None
-    down: dict | None
-    dead_time: dict | None
+    result: dict
     reason: str
-    rms: tuple[float, float]
-    gains: np.ndarray
-    from_rest: bool
     fitted: np.ndarray
-
-    def result(self) -> dict:
-        """Plain data."""
-        return {'log': self.log, **(self.both or {}), 'up': self.up, 'down': self.down, 'dead_time': self.dead_time,
-                'from_rest': self.from_rest, 'rms_N': self.rms[1], 'one_gain_rms_N': self.rms[0],
-                'window_gains': self.gains.tolist(), 'reason': self.reason or None}
 
 
 def respond(time, static, up, down):
@@ -75,125 +60,101 @@ def respond(time, static, up, down):
 
 
 def fit_lag(log: RotorLog) -> Lag | None:
-    """Fit a time series; None: it is too short, or its thrust does not move."""
-    command = log.command
-    raw = log.asked if log.duty is None else log.duty
-    first = np.flatnonzero(raw != raw[0])   # before it, the thrust is the settled one
-    if len(command) < P.least_rows or not first.size:
+    """Fit a time series; None: settled rows, or a command that does not change."""
+    raw = command = log.columns[log.command]
+    if not log.series or not np.ptp(raw):
         return None
-    held = np.arange(len(command)) < (first[0] if first[0] >= 3 else 0)
+    if log.command == 'duty':
+        command = raw * log.columns['voltage']      # mean voltage at the motor
+    # Thrust before the first change of the command is the settled one, at rest 0.
+    first = int(np.argmax(raw != raw[0]))
+    held = np.arange(len(raw)) < (first if first >= 3 else 0)
     command = np.where(held, 0, command)
-    rest = float(np.median(log.thrust[held])) if held.any() else 0.0
-    powers = min(3, np.unique(raw[~held].round(3)).size)
-    one = np.stack([command**k / np.abs(command).max()**(k - 1) for k in range(1, powers + 1)])
-    if log.duty is not None and powers == 3:
-        one = one[:2]       # thrust over mean voltage has no further term
-    base, own, reason, gains = one, False, '', np.zeros(0)
-    (smooth, rms), (windowed, fine, index, scale) = _gains(log, one, rest * held), _windows(
-        log, one, rest * held)
-    if log.time[-1] > 6 * P.gain_window:
-        reason, gains = _apart(log, command, smooth, rms, fine, index, scale)
-        own = bool(reason)
-        base = windowed if own else one
-    return _fitted(log, base, rest * held, reason, gains, rms)
+    rest = held * (float(np.median(log.columns['thrust'][held])) if held.any() else 0.0)
+    powers = min(2 if log.command == 'duty' else 3, np.unique(raw[~held].round(3)).size)
+    curve = np.array([(command / command.max())**k for k in range(1, powers + 1)])
+    smooth, rms = _static(log, curve, rest)
+    time, windows = log.columns['time'], []
+    for phase in np.arange(PHASES) / PHASES:
+        index = np.floor((time - time[0]) / P.gain_window + phase).astype(int)
+        basis = curve[0] * (index == np.unique(index)[:, None])
+        windows.append((*_static(log, basis, rest), basis, index))
+    fine, least, basis, index = min(windows, key=lambda one: one[1])
+    means = np.array([[values[index == k].mean() for values in (command, smooth, fine)]
+                      for k in np.unique(index)]).T
+    means = means[:, means[0] > STRONG * command.max()]
+    ratio = means[2] / np.maximum(means[1], STRONG * means[1].max())
+    if ratio.size < 4 or ratio.std() < P.gain_scatter * ratio.mean() or least > P.gain_share * rms:
+        return _fitted(log, curve, rest, '')
+    gains = means[2] / means[0] if log.command == 'target' else ratio
+    return _fitted(log, basis[basis.any(axis=1)], rest, (
+        f'thrust and command do not belong together: their ratio jumps about every '
+        f'{P.gain_window:g} s ({gains.min():.2f} to {gains.max():.2f}); one curve leaves '
+        f'{rms:.2f} N RMS, a gain for each window {least:.2f} N'))
 
 
-def _gains(log, basis, rest):
-    """Static thrust with the least error behind a lag of FIRST, and its RMS."""
-    lagged = _lagged(log, basis)
-    residual = log.thrust - _lagged(log, rest[None])[0]
-    gains = np.linalg.lstsq(lagged[:, log.fresh].T, residual[log.fresh], rcond=None)[0]
-    error = (residual - gains @ lagged)[log.fresh]
+def _static(log, basis, rest):
+    """Static thrust with the least error behind a lag of FIRST, and the RMS error."""
+    rows = np.append(basis, rest[None], axis=0)
+    lagged = respond(log.columns['time'], rows, np.full(len(rows), FIRST), FIRST)
+    target = log.columns['thrust'] - lagged[-1]
+    gains = np.linalg.lstsq(lagged[:-1, log.fresh].T, target[log.fresh], rcond=None)[0]
+    error = (target - gains @ lagged[:-1])[log.fresh]
     return gains @ basis + rest, float(np.sqrt(np.mean(error**2)))
 
 
-def _lagged(log, rows):
-    same = np.full(len(rows), FIRST)
-    return respond(log.time, rows, same, same)
-
-
-def _windows(log, one, rest):
-    """Commands of windows of the phase with the least error; RMS, window of each row, gains."""
-    best = None
-    for phase in np.arange(PHASES) / PHASES:
-        index = np.floor(log.time / P.gain_window + phase).astype(int)
-        basis = one[0] * (index == np.arange(index[-1] + 1)[:, None])
-        basis = basis[np.abs(basis).sum(axis=1) > 0]
-        static, rms = _gains(log, basis, rest)
-        if best is None or rms < best[1]:
-            best = basis, rms, index, static
-    return best
-
-
-def _apart(log, command, smooth, rms, fine, index, static):
-    """Reason why thrust and command do not belong together, and gains of the windows."""
-    means = np.array([[values[index == k].mean() for values in (command, smooth, static)]
-                      for k in np.unique(index)]).T
-    gains = means[2] / np.maximum(means[0], 1e-9)
-    strong = means[0] > 0.2 * command.max()
-    ratio = means[2][strong] / np.maximum(means[1][strong], 0.05 * smooth.max())
-    scatter = ratio.std() / ratio.mean()
-    if strong.sum() < 4 or scatter < P.gain_scatter or fine > P.gain_share * rms:
-        return '', gains
-    shown = gains[strong] if log.duty is None else ratio
-    return (f'thrust and command do not belong together: their ratio jumps about every '
-            f'{P.gain_window:g} s ({shown.min():.2f} to {shown.max():.2f}); one curve leaves '
-            f'{rms:.2f} N RMS, a gain for each window {fine:.2f} N'), gains
-
-
-def _fitted(log, base, rest, reason, gains, one_rms):
+def _fitted(log, base, rest, reason):
     """
     Time constants, dead time and gains together.
 
-    Points: mean of the logarithms of both time constants, half their difference, dead time, gains.
+    Points: mean of the logarithms of both time constants, half their difference, dead time (in a
+    log with windows also their phase), gains.
     """
-    # In a log with windows, the dead time also corrects the phase of the windows.
-    first, fixed = (-3 if reason else 0), ()
-    count, size = len(base) + 3, np.abs(log.thrust).max() / np.abs(base).max(axis=1)
+    time, thrust = log.columns['time'], log.columns['thrust']
+    count, size = len(base) + 3, np.abs(thrust).max()
     weak = Prior(np.append([np.inf, WEAK, np.inf], np.full(len(base), WEAK)))
+    low = np.array([LIMITS[0], -3, -PHASE if reason else 0, *[-9] * len(base)])
+    high = np.array([LIMITS[1], 3, 50, *[9] * len(base)])
+    blocks = consecutive(np.ones(len(time), dtype=bool), BLOCKS)
 
     def model(points):
-        thrust = respond(log.time, points[:, 3:] * size @ base + rest, *np.exp(
+        lagged = respond(time, points[:, 3:] * size @ base + rest, *np.exp(
             [points[:, 0] + points[:, 1], points[:, 0] - points[:, 1]]))
-        return np.stack([np.interp(log.time - DEAD * dead, log.time, row)
-                         for dead, row in zip(points[:, 2], thrust, strict=True)])
+        return np.array([np.interp(time - DEAD * dead, time, row)
+                         for dead, row in zip(points[:, 2], lagged, strict=True)])
 
     def residual(points, _):
-        return huber((log.thrust - model(points)) / noise) * log.fresh
+        return huber((thrust - model(points)) / noise) * log.fresh
 
-    def slopes(points, start):
+    def slopes(points, start, free):
         moved = residual((points[:, None] + STEP * np.eye(count)).reshape(-1, count), None)
-        return (moved.reshape(len(points), count, -1) - start[:, None]) / STEP
+        return (moved.reshape(len(points), count, -1) - start[:, None]) / STEP * free[:, None]
 
     def solve(points, fixed):
         free = ~np.isin(np.arange(count), fixed)
-        fits = minimise(points, np.tile(free, (len(points), 1)),
-                        np.array([LOW, -3, first, *[-9] * len(base)]),
-                        np.array([HIGH, 3, 50, *[9] * len(base)]), residual,
-                        lambda here, _, start: slopes(here, start) * free[:, None], weak, 60)
+        fits = minimise(points, np.tile(free, (len(points), 1)), low, high, residual,
+                        lambda here, _, start: slopes(here, start, free), weak, 60)
         best = fits.points[[np.argmin(fits.chi2)]]
         error = residual(best, None)
-        return best, scatter(slopes(best, error)[0] * free[:, None], error[0], weak.slope(best[0]),
-                             consecutive(np.ones(len(base[0]), dtype=bool), BLOCKS))
+        return best, scatter(slopes(best, error, free)[0], error[0], weak.slope(best[0]), blocks)
 
-    start = np.tile([np.log(FIRST), 0, 0, *np.full(len(base), 0.5)], (1 if reason else 4, 1))
-    start[:, 2] = np.array(STARTS[:len(start)]) / DEAD
-    noise = np.std(log.thrust) / 5 + 1e-4
+    points = np.tile([np.log(FIRST), 0, 0, *np.full(len(base), 0.5)], (len(STARTS), 1))
+    points[:, 2] = np.array(STARTS) / DEAD * (not reason)
+    noise, fixed = np.std(thrust) / 5 + 1e-4, []
     for _ in range(3):
-        start, wide = solve(start, fixed)
-        noise = np.std((log.thrust - model(start)[0])[log.fresh]) + 1e-4
-    dead = None if reason else _shown(start[0, 2], wide, np.eye(count)[2], DEAD)
+        points, wide = solve(points, fixed)
+        noise = np.std((thrust - model(points)[0])[log.fresh]) + 1e-4
+    dead = None if reason else _shown(points[0, 2], wide, np.eye(count)[2], DEAD)
     if dead and dead['interval'][0] <= 0:       # not shown by the log: the lags without it
-        dead['interval'][0], start[0, 2], fixed = 0.0, 0, (2,)
-        start, wide = solve(start, fixed)
-    same, wide_same = solve(start * np.array([1, 0, *np.ones(count - 2)]), (1, *fixed))
-    pair = np.eye(count)[:2]
-    lags = [_shown(same[0, 0], wide_same, pair[0]),
-            *(_shown(start[0] @ way, wide, way) for way in (pair.sum(0), pair[0] - pair[1]))]
-    fitted = model(start)[0]
-    rms = float(np.sqrt(np.mean((log.thrust - fitted)[log.fresh]**2)))
-    return Lag(log.name, *lags, dead, reason, (one_rms, rms), gains if reason else np.zeros(0),
-               bool(rest.any() and abs(rest[0]) < 0.05 * log.thrust.max()), fitted)
+        dead['interval'][0], points[0, 2], fixed = 0.0, 0, [2]
+        points, wide = solve(points, fixed)
+    same, wide_same = solve(points * np.array([1, 0, *np.ones(count - 2)]), [1, *fixed])
+    mean, half = np.eye(count)[:2]
+    return Lag({'log': log.name, **(_shown(same[0, 0], wide_same, mean) or {}),
+                'up': _shown(points[0] @ (mean + half), wide, mean + half),
+                'down': _shown(points[0] @ (mean - half), wide, mean - half), 'dead_time': dead,
+                'from_rest': bool(rest.any() and abs(rest[0]) < 0.05 * thrust.max()),
+                'rms_N': float(noise), 'gain_windows': bool(reason)}, reason, model(points)[0])
 
 
 def _shown(value, wide, direction, unit=None):
@@ -202,5 +163,5 @@ def _shown(value, wide, direction, unit=None):
     ends = np.array([value, value - half, value + half])
     if unit is None and half > np.log(LOOSE):
         return None
-    value, *ends = map(float, np.exp(ends) if unit is None else ends * unit)
-    return {'value': value, 'unit': 's', 'interval': ends}
+    value, *limits = map(float, np.exp(ends) if unit is None else ends * unit)
+    return {'value': value, 'unit': 's', 'interval': limits}

@@ -3,7 +3,7 @@ Thrust and torque of a rotor over duty and pack voltage, as one surface.
 
 The motor sees the mean voltage u = duty x voltage. With the induced voltage proportional to speed
 w and thrust ~ w^2, u = a w + b w^2, so thrust is a smooth function of u that begins with u and u^2.
-Terms with a further duty describe how the inverter's losses depend on it. The pack may sag.
+Terms with a further duty describe losses of the inverter. The pack may sag.
 """
 
 from collections.abc import Sequence
@@ -16,29 +16,13 @@ from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.rotor.log import RotorLog
 
 P = shipped().rotor
-FORMS = (((1, 0), (2, 0)), ((1, 0), (2, 0), (3, 0)),
-         ((1, 0), (2, 0), (3, 0), (2, 1), (3, 1)))  # powers of u and of duty
+FORMS: tuple[tuple[tuple[int, int], ...], ...] = (
+    ((1, 0), (2, 0)), ((1, 0), (2, 0), (3, 0)),
+    ((1, 0), (2, 0), (3, 0), (2, 1), (3, 1)))   # powers of u and of the duty
 GROUPS = 5              # of rows with neighbouring voltages, if packs are not labelled
+MAP_ROWS = 5            # of a robot file
 GRID = (1 - np.cos(np.linspace(0, np.pi, 101)[1:])) / 2     # dense at the ends, as errors are
-
-
-@dataclass(frozen=True, eq=False)
-class Rows:
-    """
-    Settled rows (n,) of all logs; attributes as of :class:`RotorLog`.
-
-    ``block`` is the block of each row for intervals, ``group`` what is left out together.
-    """
-
-    duty: np.ndarray
-    voltage: np.ndarray
-    thrust: np.ndarray
-    torque: np.ndarray
-    temperature: np.ndarray | None
-    side: np.ndarray
-    step: np.ndarray
-    block: np.ndarray
-    group: np.ndarray
+Rows = dict[str, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,149 +32,125 @@ class Surface:
 
     Attributes:
         form: (K,) powers of u and of the duty.
-        value: (K,) coefficients.
-        left_out: (B, K) coefficients without each block.
+        every: (1 + B, K) coefficients of all rows, and without each block.
         rms: RMS over rows.
-        held_out: RMS of the means of settled steps at a voltage left out.
+        left_out: RMS of the means of settled steps at a voltage left out.
 
     """
 
     form: tuple[tuple[int, int], ...]
-    value: np.ndarray
-    left_out: np.ndarray
+    every: np.ndarray
     rms: float
-    held_out: float
+    left_out: float
 
-    def at(self, duty, voltage, coefficients=None):
-        """Value at ``duty`` (0 to 1) and ``voltage`` [V]."""
-        return terms(self.form, duty, voltage) @ (
-            self.value if coefficients is None else coefficients)
+    def at(self, duty, voltage):
+        """(..., 1 + B) values at ``duty`` (0 to 1) and ``voltage`` [V]."""
+        return terms(self.form, duty, voltage) @ self.every.T
 
 
 def terms(form, duty, voltage) -> np.ndarray:
-    """(n, K) terms of a form."""
+    """(..., K) terms of a form."""
     return np.stack([(duty * voltage)**power * duty**more for power, more in form], axis=-1)
 
 
 def settled_rows(logs: Sequence[RotorLog]) -> Rows | None:
-    """Settled rows of the logs with a duty; None: too few, or no sweep."""
-    parts = [log for log in logs if log.duty is not None]
-    if sum(log.settled.sum() for log in parts) < P.least_rows:
-        return None
+    """
+    Columns of the settled rows of logs with a duty; None: too few, or no sweep.
 
-    def joined(values):
-        return np.concatenate([values(log)[log.settled] for log in parts])
-
-    duty, voltage = joined(lambda log: log.duty), joined(lambda log: log.voltage)
-    if np.ptp(duty) < P.least_sweep or np.unique(duty.round(2)).size < 5:
+    ``step`` numbers held commands, ``block`` what intervals leave out, ``group`` the voltages.
+    """
+    logs = [log for log in logs if log.command == 'duty']
+    shared = [name for name in ('duty', 'voltage', 'thrust', 'torque', 'temperature')
+              if all(name in log.columns for log in logs)]
+    if not logs or sum(log.settled.sum() for log in logs) < P.least_rows:
         return None
-    several = not any(np.ptp(log.pack) for log in parts)
-    pack = np.concatenate([log.pack[log.settled] + several * k for k, log in enumerate(parts)])
+    rows = {name: np.concatenate([log.columns[name][log.settled] for log in logs])
+            for name in shared}
+    if np.ptp(rows['duty']) < P.least_sweep or np.unique(rows['duty'].round(2)).size < 5:
+        return None
+    # Without labels, each log has its own pack.
+    pack = np.concatenate([log.columns.get('pack', np.full(len(log.settled), -k))[log.settled]
+                           for k, log in enumerate(logs)])
     names, label = np.unique(pack, return_inverse=True)
-    changes = np.append(True, (np.diff(duty) != 0) | (np.diff(label) != 0))
-    group = label if len(names) > 2 else np.digitize(
-        voltage, np.quantile(voltage, np.arange(1, GROUPS) / GROUPS))
-    with_heat = all(log.temperature is not None for log in parts)
-    same_side = len({log.side.shape[1] for log in parts}) == 1
-    return Rows(duty, voltage, joined(lambda log: log.thrust), joined(lambda log: log.torque),
-                joined(lambda log: log.temperature) if with_heat else None,
-                joined(lambda log: log.side if same_side else log.side[:, :0]),
-                np.cumsum(changes),
-                label if len(names) >= P.least_packs else consecutive(changes, P.blocks), group)
+    changes = np.append(True, (np.diff(rows['duty']) != 0) | (np.diff(label) != 0))
+    by_voltage = np.digitize(rows['voltage'], np.quantile(
+        rows['voltage'], np.arange(1, GROUPS) / GROUPS))
+    return rows | {'step': np.cumsum(changes) - 1, 'group': label if len(names) > 2 else by_voltage,
+                   'block': label if len(names) >= P.least_packs
+                   else consecutive(changes, P.blocks)}
 
 
-def fit_surface(rows: Rows, values: np.ndarray) -> Surface:
-    """Fit thrust or torque; the form predicts voltages left out, the simplest one nearly best."""
-    best, least = FORMS[0], np.inf
+def fit_surface(rows: Rows, name: str) -> Surface:
+    """Fit thrust or torque; more terms only if they predict voltages left out better."""
+    values, best, least = rows[name], FORMS[0], np.inf
     for form in FORMS:
-        x = terms(form, rows.duty, rows.voltage)
-        error = np.empty(len(values))
-        for group in np.unique(rows.group):
-            out = rows.group == group
+        x, error = terms(form, rows['duty'], rows['voltage']), np.empty(len(values))
+        for group in np.unique(rows['group']):
+            out = rows['group'] == group
             error[out] = values[out] - x[out] @ linear(x[~out], values[~out])
-        held_out = np.sqrt(np.mean(means(error, rows.step)**2))
-        if held_out < P.simpler * least:
-            best, least = form, held_out
-    x = terms(best, rows.duty, rows.voltage)
-    value = linear(x, values)
-    return Surface(best, value, jackknife(lambda m: linear(x[m], values[m]), rows.block),
-                   float(np.sqrt(np.mean((values - x @ value)**2))), float(least))
+        means = np.bincount(rows['step'], error) / np.bincount(rows['step'])
+        left_out = np.sqrt(np.mean(means**2))
+        if left_out < P.simpler * least:
+            best, least = form, left_out
+    x = terms(best, rows['duty'], rows['voltage'])
+    every = jackknife(lambda m: linear(x[m], values[m]), rows['block'])
+    return Surface(best, every, float(np.sqrt(np.mean((values - x @ every[0])**2))), float(least))
 
 
-def means(values: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Mean of the rows of each step."""
-    return np.bincount(step, values)[np.unique(step)] / np.bincount(step)[np.unique(step)]
+def estimate(every: np.ndarray, unit: str = '') -> dict:
+    """Plain data of a value with interval; ``every`` (1 + B,) with the value of all rows first."""
+    return {'value': float(every[0]), 'unit': unit, 'interval': interval(every).tolist()}
 
 
 def torque_ratio(rows: Rows, thrust: Surface) -> dict:
     """
-    Ratio of torque and thrust, and what could bias it.
+    Ratio of torque and thrust.
 
-    Torque is zero without thrust once the reading at rest is subtracted. A free offset would turn
-    the larger ratio at small thrust into an offset and a smaller slope. The fitted thrust replaces
-    the measured one, whose vibration would lower the ratio.
+    Torque is zero without thrust once the reading at rest is subtracted. A free offset would take
+    up the larger ratio at small thrust, and lower the slope. Fitted thrust replaces the measured
+    one, whose vibration would lower the ratio.
     """
-    rest = rows.duty < 0.01
-    tare = float(np.median(rows.torque[rest])) if rest.sum() >= 3 else 0.0
-    fitted = thrust.at(rows.duty, rows.voltage)[:, None]
-    value = linear(fitted, rows.torque - tare)[0]
-    others = jackknife(lambda m: linear(fitted[m], rows.torque[m] - tare)[0], rows.block)
-    result = {'value': float(value), 'unit': 'm', 'interval': interval(value, others).tolist(),
-              'rms_N_m': float(np.sqrt(np.mean((rows.torque - tare - value * fitted[:, 0])**2))),
-              'at_rest_N_m': tare if rest.sum() >= 3 else None,
-              'with_free_offset': float(linear(np.append(fitted, 0 * fitted + 1, axis=1),
-                                               rows.torque)[0]), 'cross_talk': None}
-    if rows.side.shape[1]:
-        x = np.append(fitted, rows.side, axis=1)
-        corrected = linear(x, rows.torque - tare)
-        rms = np.sqrt(np.mean((rows.torque - tare - x @ corrected)**2))
-        result['cross_talk'] = {'value': float(corrected[0]), 'rms_N_m': float(rms)}
-    return result
+    rest = rows['duty'] < 0.01
+    tare = float(np.median(rows['torque'][rest])) if rest.sum() >= 3 else 0.0
+    fitted, torque = thrust.at(rows['duty'], rows['voltage'])[:, :1], rows['torque'] - tare
+    every = jackknife(lambda m: linear(fitted[m], torque[m])[0], rows['block'])
+    offset = np.append(fitted, 0 * fitted + 1, axis=1)
+    return {**estimate(every, 'm'),
+            'rms_N_m': float(np.sqrt(np.mean((torque - every[0] * fitted[:, 0])**2))),
+            'at_rest_N_m': tare if rest.sum() >= 3 else None,
+            'with_free_offset': float(linear(offset, torque)[0])}
 
 
 def temperature_drift(rows: Rows, thrust: Surface) -> dict | None:
     """Relative change of thrust with temperature at equal duty and voltage; None: not shown."""
-    if rows.temperature is None or np.ptp(rows.temperature) < 5:
+    if 'temperature' not in rows or np.ptp(rows['temperature']) < P.least_heating:
         return None
-    x = terms(thrust.form, rows.duty, rows.voltage)
-    middle = rows.temperature.mean()
-    x = np.column_stack([x, (x @ thrust.value) * (rows.temperature - middle)])
-    value = linear(x, rows.thrust)[-1]
-    others = jackknife(lambda m: linear(x[m], rows.thrust[m])[-1], rows.block)
-    return {'value': float(value), 'unit': '1/K', 'interval': interval(value, others).tolist(),
-            'about_deg_C': float(middle),
-            'range_deg_C': [float(rows.temperature.min()), float(rows.temperature.max())]}
+    heat = rows['temperature'] - rows['temperature'].mean()
+    x = np.column_stack([terms(thrust.form, rows['duty'], rows['voltage']),
+                         thrust.at(rows['duty'], rows['voltage'])[:, 0] * heat])
+    every = jackknife(lambda m: linear(x[m], rows['thrust'][m])[-1], rows['block'])
+    return {**estimate(every, '1/K'), 'range_K': float(np.ptp(heat))}
 
 
-def map_rows(rows: Rows, thrust: Surface, count: int = 5) -> list[dict]:
+def map_rows(rows: Rows, thrust: Surface) -> list[dict]:
     """
     Rows of a robot file's map: cubics of the duty in thrust at voltages within the measured range.
 
     A row ends at the largest measured duty or mean voltage, whichever it reaches first.
     """
-    top, u = rows.duty.max(), (rows.duty * rows.voltage).max()
-    running = rows.voltage[rows.duty > 0.01]
-    found = []
-    for voltage in np.linspace(running.max(), running.min(), count):
+    top, u = rows['duty'].max(), (rows['duty'] * rows['voltage']).max()
+    running, found = rows['voltage'][rows['duty'] > 0.01], []
+    for voltage in np.linspace(running.max(), running.min(), MAP_ROWS):
         duty = GRID * min(top, u / voltage)
-        levels = np.array([thrust.at(duty, voltage, c)
-                           for c in (thrust.value, *thrust.left_out)])
-        cubics = np.array([cubic(duty, level) for level in levels])
-        last, slope = float(levels[0, -1]), np.gradient(levels[0], 50 * duty)
-        error = (np.polyval(cubics[0], levels[0] / 10) - 50 - 50 * duty) * slope
-        band = interval(levels[0], levels[1:])
-        limits = interval(cubics[0], cubics[1:])
-        rising = np.polyval(np.polyder(cubics[0]), np.linspace(0, last / 10, 100)).min() > 0
+        levels = thrust.at(duty, voltage)
+        cubics = np.array([np.polyfit(level / 10, 50 + 50 * duty, 3, w=np.maximum(
+            np.gradient(level, duty), 1e-3)) for level in levels.T])    # least error of thrust
+        error = np.gradient(levels[:, 0], 50 * duty) * (
+            np.polyval(cubics[0], levels[:, 0] / 10) - 50 - 50 * duty)
+        slope = np.polyval(np.polyder(cubics[0]), np.linspace(0, levels[-1, 0] / 10, 100))
         found.append({
-            'voltage_V': float(voltage), 'thrust_max_N': last,
-            'coefficients': {f'c{k}': {'value': float(cubics[0][3 - k]), 'unit': '%',
-                                       'interval': limits[3 - k].tolist()} for k in range(4)},
-            'rms_N': float(np.sqrt(np.mean(error**2))),
-            'thrust_half_width_N': float(np.diff(band).max() / 2), 'monotone': bool(rising)})
+            'voltage_V': float(voltage), 'thrust_max_N': float(levels[-1, 0]),
+            'coefficients': {f'c{k}': estimate(cubics[:, 3 - k], '%') for k in range(4)},
+            'rms_N': float(np.sqrt(np.mean(error**2))), 'monotone': bool(slope.min() > 0),
+            'thrust_half_width_N': float(max(np.ptp(interval(one)) for one in levels) / 2)})
     return found
-
-
-def cubic(duty: np.ndarray, thrust: np.ndarray) -> np.ndarray:
-    """Cubic of the duty [% of 2000 us] in thrust / 10 N, with least error of thrust."""
-    slope = np.maximum(np.gradient(thrust, duty), 1e-3)
-    return np.polyfit(thrust / 10, 50 + 50 * duty, 3, w=slope)
