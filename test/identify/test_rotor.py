@@ -30,8 +30,8 @@ def thrust_of(model, duty, voltage):
 
 def only_lag(model):
     [(_, lag)] = model.lags
-    assert not lag.reason
-    return lag.result
+    assert not lag['reason']
+    return lag
 
 
 def within(result, truth):
@@ -95,7 +95,8 @@ def test_the_lag_and_its_directions_are_recovered(tmp_path):
         assert lag['up']['value'] == pytest.approx(0.07, rel=0.15)
         assert lag['down']['value'] == pytest.approx(0.045, rel=0.15)
         assert lag['up']['interval'][0] > lag['down']['interval'][1]
-        inside += [within(lag['up'], 0.07), within(lag['down'], 0.045), within(lag['dead_time'], 0.0)]
+        inside += [within(lag['up'], 0.07), within(lag['down'], 0.045),
+                   within(lag['dead_time'], 0.0)]
     assert np.mean(inside) > 0.8
 
 

@@ -49,17 +49,10 @@ def interval(every: np.ndarray) -> np.ndarray:
 def scatter(slopes: np.ndarray, residual: np.ndarray, prior: np.ndarray,
             blocks: np.ndarray) -> np.ndarray:
     """
-    (2, P, P) covariance of a nonlinear fit, for white residuals and from blocks.
+    (2, P, P) covariance of a fit, for white residuals and by the scatter between blocks (N,).
 
-    The second one comes from the scatter of the gradient between blocks. Use the larger variance:
-    few blocks can agree by chance.
-
-    Args:
-        slopes: (P, N) derivatives of the residuals; 0: not free.
-        residual: (N,) residuals with unit variance.
-        prior: (P,) slopes of the prior's residuals.
-        blocks: (N,) block of each residual.
-
+    Use the larger variance, as few blocks can agree by chance. ``slopes`` (P, N) are derivatives
+    of the ``residual`` (N,) with unit variance; those of a prior are diagonal, (P,).
     """
     inverse = np.linalg.pinv(slopes @ slopes.T + np.diag(prior**2 + 1e-9))
     scores = np.array([slopes[:, blocks == block] @ residual[blocks == block]

@@ -6,8 +6,6 @@ after a dead time. The static value is a curve over the command. In a log whose 
 the command times a gain of each window of time.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.stats import t as student
 
@@ -31,23 +29,6 @@ PHASES = 10             # of the windows
 STRONG = 0.2            # share of the largest command, above which the gain of a window is used
 
 
-@dataclass(frozen=True, eq=False)
-class Lag:
-    """
-    Lag of one log.
-
-    Attributes:
-        result: plain data; a lag that the log does not show is None.
-        reason: why thrust and command do not belong together; empty: they do.
-        fitted: (N,) thrust of the model [N].
-
-    """
-
-    result: dict
-    reason: str
-    fitted: np.ndarray
-
-
 def respond(time, static, up, down):
     """(M, N) thrust of M models with time constants (M,) for held static thrusts (M, N)."""
     thrust = np.empty_like(static)
@@ -59,8 +40,13 @@ def respond(time, static, up, down):
     return thrust
 
 
-def fit_lag(log: RotorLog) -> Lag | None:
-    """Fit a time series; None: settled rows, or a command that does not change."""
+def fit_lag(log: RotorLog) -> dict | None:
+    """
+    Fit a time series; None: settled rows, or a command that does not change.
+
+    A lag that the log does not show is None. ``reason`` is why thrust and command do not belong
+    together, or empty; ``fitted`` (N,) is the thrust of the model [N].
+    """
     raw = command = log.columns[log.command]
     if not log.series or not np.ptp(raw):
         return None
@@ -140,21 +126,21 @@ def _fitted(log, base, rest, reason):
 
     points = np.tile([np.log(FIRST), 0, 0, *np.full(len(base), 0.5)], (len(STARTS), 1))
     points[:, 2] = np.array(STARTS) / DEAD * (not reason)
-    noise, fixed = np.std(thrust) / 5 + 1e-4, []
+    noise, fixed = np.std(thrust) / 5 + 1e-4, np.zeros(0)
     for _ in range(3):
         points, wide = solve(points, fixed)
         noise = np.std((thrust - model(points)[0])[log.fresh]) + 1e-4
     dead = None if reason else _shown(points[0, 2], wide, np.eye(count)[2], DEAD)
     if dead and dead['interval'][0] <= 0:       # not shown by the log: the lags without it
-        dead['interval'][0], points[0, 2], fixed = 0.0, 0, [2]
+        dead['interval'][0], points[0, 2], fixed = 0.0, 0, np.array([2])
         points, wide = solve(points, fixed)
     same, wide_same = solve(points * np.array([1, 0, *np.ones(count - 2)]), [1, *fixed])
     mean, half = np.eye(count)[:2]
-    return Lag({'log': log.name, **(_shown(same[0, 0], wide_same, mean) or {}),
-                'up': _shown(points[0] @ (mean + half), wide, mean + half),
-                'down': _shown(points[0] @ (mean - half), wide, mean - half), 'dead_time': dead,
-                'from_rest': bool(rest.any() and abs(rest[0]) < 0.05 * thrust.max()),
-                'rms_N': float(noise), 'gain_windows': bool(reason)}, reason, model(points)[0])
+    return {'log': log.name, **(_shown(same[0, 0], wide_same, mean) or {}),
+            'up': _shown(points[0] @ (mean + half), wide, mean + half),
+            'down': _shown(points[0] @ (mean - half), wide, mean - half), 'dead_time': dead,
+            'from_rest': bool(rest.any() and abs(rest[0]) < 0.05 * thrust.max()),
+            'rms_N': float(noise), 'reason': reason, 'fitted': model(points)[0]}
 
 
 def _shown(value, wide, direction, unit=None):

@@ -137,7 +137,8 @@ def _wanted(header, columns, source):
 
 def _telemetry(path, data, notes):
     """Replace impossible and held readings by interpolation between new ones."""
-    bounds = {'voltage': P.voltage, 'rpm': (0, P.largest_speed), 'temperature': P.temperature}
+    bounds = {'voltage': P.voltage, 'temperature': P.temperature,
+              'rpm': np.array([0, P.largest_speed])}
     there = [name for name in bounds if name in data]
     if not there:
         return
@@ -167,7 +168,7 @@ def _transient(path, command, thrust, rate):
     edges = np.flatnonzero(np.diff(command, prepend=np.nan, append=np.nan) != 0)
     longest = np.argmax(np.diff(edges))
     count, held = np.diff(edges)[longest], thrust[edges[longest]:edges[longest + 1]]
-    first, last = np.median(held[:max(count // 3, 1)]), np.median(held[count - count // 3:])
+    first, last = np.median(held[:count // 3 + 1]), np.median(held[-(count // 3) - 1:])
     if count < P.least_rows or abs(last - first) < 0.3 * np.ptp(thrust):
         return False
     if not rate:

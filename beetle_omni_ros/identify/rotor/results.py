@@ -9,7 +9,7 @@ import numpy as np
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.identify.robot_file import rounded, write_robot_file
-from beetle_omni_ros.identify.rotor.lag import fit_lag, Lag
+from beetle_omni_ros.identify.rotor.lag import fit_lag
 from beetle_omni_ros.identify.rotor.log import RotorLog
 from beetle_omni_ros.identify.rotor.surface import (
     estimate,
@@ -37,7 +37,7 @@ class RotorModel:
     logs: Sequence[RotorLog]
     rows: Rows
     surfaces: dict
-    lags: list[tuple[RotorLog, Lag]]
+    lags: list[tuple[RotorLog, dict]]
 
 
 def identify_rotor(logs: Sequence[RotorLog]) -> RotorModel:
@@ -50,7 +50,7 @@ def identify_rotor(logs: Sequence[RotorLog]) -> RotorModel:
     """
     fits = [(log, fit_lag(log)) for log in logs]
     lags = [(log, lag) for log, lag in fits if lag]
-    rows = settled_rows([log for log, lag in fits if not (lag and lag.reason)]) or {}
+    rows = settled_rows([log for log, lag in fits if not (lag and lag['reason'])]) or {}
     if not rows and not lags:
         raise LogError(f'{logs[0].name}: expected settled rows of five duties or more, or a '
                        'time series in which thrust changes')
@@ -60,13 +60,13 @@ def identify_rotor(logs: Sequence[RotorLog]) -> RotorModel:
 
 def rotor_results(model: RotorModel) -> dict:
     """Results as plain data."""
-    rows, bad = model.rows, [lag.reason for _, lag in model.lags if lag.reason]
+    rows, bad = model.rows, [lag['reason'] for _, lag in model.lags if lag['reason']]
     notes = [f'{log.name}: {note}' for log in model.logs for note in log.notes]
-    notes += [f'{log.name}: {lag.reason}' for log, lag in model.lags if lag.reason]
+    notes += [f'{log.name}: {lag["reason"]}' for log, lag in model.lags if lag['reason']]
     notes += [f'{log.name}: the dead time contains the start of the motor from rest'
-              for log, lag in model.lags if lag.result['from_rest']]
-    lags = [lag.result for _, lag in model.lags]
-    best = min(lags, key=lambda one: (not (one['up'] and one['down']), one['gain_windows'],
+              for log, lag in model.lags if lag['from_rest']]
+    lags = [{key: one for key, one in lag.items() if key != 'fitted'} for _, lag in model.lags]
+    best = min(lags, key=lambda one: (not (one['up'] and one['down']), bool(one['reason']),
                                       one['rms_N']), default=None)
     useless = bool(bad) and not rows
     results = {'meta': {'log': ', '.join(log.name for log in model.logs), 'version': __version__},
@@ -167,7 +167,7 @@ def _lag(log, lag):
     figure, axes = panels(1, height=2.8)
     time = log.columns['time']
     axes[0, 0].plot(time, log.columns['thrust'], color=FAINT, lw=0.8, label='measured')
-    axes[0, 0].plot(time, lag.fitted, color=INK, label='model')
+    axes[0, 0].plot(time, lag['fitted'], color=INK, label='model')
     axes[0, 0].set(xlabel='time [s]', ylabel='thrust [N]')
     legend(figure, axes[0, 0])
     return figure
@@ -191,8 +191,8 @@ def write_rotor_file(path: Path, results: dict, base: Path | None) -> None:
              'coefficients': [round(p['coefficients'][f'c{k}']['value'], 8) for k in range(4)]}
             for p in results['plateaus']]}
         band = max(p['thrust_half_width_N'] for p in results['plateaus'])
-        lines += ['map: duty [% of 2000 us] = c0 + c1 g + c2 g^2 + c3 g^3, g = thrust / 10 N; 95 %',
-                  f'  band of thrust {band:.2f} N; a voltage left out is predicted within '
+        lines += ['map: duty [% of 2000 us] = c0 + c1 g + c2 g^2 + c3 g^3, g = thrust / 10 N;',
+                  f'  95 % band of thrust {band:.2f} N, error at a voltage left out '
                   f'{results["surface"]["left_out_rms_N"]:.2f} N RMS',
                   _line('torque_to_thrust_ratio [m]', ratio)]
     if lag and 'value' in lag and results['verdict'] != 'bad_data':
@@ -200,7 +200,7 @@ def write_rotor_file(path: Path, results: dict, base: Path | None) -> None:
         lines += [_line(f'{name} [s], {lag["log"]}', one) for name, one in (
             ('time_constant', lag), ('  rising', lag['up']), ('  falling', lag['down'])) if one]
         lines += ['  with a gain for each window, as thrust and command do not belong together'
-                  ] * lag['gain_windows']
+                  ] * bool(lag['reason'])
     if not rotors:
         raise LogError(f'{log}: no robot file written: verdict {results["verdict"]}')
     write_robot_file(path, ''.join(f'# {line}\n' for line in lines), {'rotors': rotors}, base)

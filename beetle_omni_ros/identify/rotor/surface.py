@@ -2,8 +2,8 @@
 Thrust and torque of a rotor over duty and pack voltage, as one surface.
 
 The motor sees the mean voltage u = duty x voltage. With the induced voltage proportional to speed
-w and thrust ~ w^2, u = a w + b w^2, so thrust is a smooth function of u that begins with u and u^2.
-Terms with a further duty describe losses of the inverter. The pack may sag.
+w and thrust ~ w^2, u = a w + b w^2, so thrust is a smooth function of u that begins with u and
+u^2. Terms with a further duty describe losses of the inverter. The pack may sag.
 """
 
 from collections.abc import Sequence
@@ -75,7 +75,8 @@ def settled_rows(logs: Sequence[RotorLog]) -> Rows | None:
     changes = np.append(True, (np.diff(rows['duty']) != 0) | (np.diff(label) != 0))
     by_voltage = np.digitize(rows['voltage'], np.quantile(
         rows['voltage'], np.arange(1, GROUPS) / GROUPS))
-    return rows | {'step': np.cumsum(changes) - 1, 'group': label if len(names) > 2 else by_voltage,
+    return rows | {'step': np.cumsum(changes) - 1,
+                   'group': label if len(names) > 2 else by_voltage,
                    'block': label if len(names) >= P.least_packs
                    else consecutive(changes, P.blocks)}
 
