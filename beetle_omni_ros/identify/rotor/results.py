@@ -82,7 +82,7 @@ def rotor_results(model: RotorModel) -> dict:
     ratios = model.surfaces['torque'].at(duty, np.median(rows['voltage'])) / level
     torque['ratio_at'] = [{'thrust_N': float(at[0]), **estimate(one, 'm')}
                           for at, one in zip(level, ratios, strict=True)]
-    ratio = torque_ratio(rows, thrust)
+    ratio = torque_ratio(rows)
     low, high = ratio['interval']
     if ratio['at_rest_N_m'] is None and not low < ratio['with_free_offset'] < high:
         notes.append('no row at rest: with a free offset of the torque, the ratio would be '
@@ -94,7 +94,7 @@ def rotor_results(model: RotorModel) -> dict:
 
 def _surface(model, name):
     surface, unit = model.surfaces[name], QUANTITIES[name]
-    names = [f'u^{power}' + ' duty' * more for power, more in surface.form]
+    names = ['u' + f'^{power}' * (power > 1) + ' duty' * more for power, more in surface.form]
     return {'terms': {term: estimate(surface.every[:, k]) for k, term in enumerate(names)},
             f'rms_{unit}': surface.rms, f'left_out_rms_{unit}': surface.left_out,
             'voltage_V': [float(end(model.rows['voltage'])) for end in (np.min, np.max)]}

@@ -89,8 +89,7 @@ def fit_surface(rows: Rows, name: str) -> Surface:
         for group in np.unique(rows['group']):
             out = rows['group'] == group
             error[out] = values[out] - x[out] @ linear(x[~out], values[~out])
-        means = np.bincount(rows['step'], error) / np.bincount(rows['step'])
-        left_out = np.sqrt(np.mean(means**2))
+        left_out = np.sqrt(np.mean(means(error, rows['step'])**2))
         if left_out < P.simpler * least:
             best, least = form, left_out
     x = terms(best, rows['duty'], rows['voltage'])
@@ -98,27 +97,38 @@ def fit_surface(rows: Rows, name: str) -> Surface:
     return Surface(best, every, float(np.sqrt(np.mean((values - x @ every[0])**2))), float(least))
 
 
+def means(values: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Mean of the rows of each step."""
+    return np.bincount(step, values) / np.bincount(step)
+
+
 def estimate(every: np.ndarray, unit: str = '') -> dict:
     """Plain data of a value with interval; ``every`` (1 + B,) with the value of all rows first."""
     return {'value': float(every[0]), 'unit': unit, 'interval': interval(every).tolist()}
 
 
-def torque_ratio(rows: Rows, thrust: Surface) -> dict:
+def torque_ratio(rows: Rows) -> dict:
     """
-    Ratio of torque and thrust.
+    Ratio of torque and thrust, by the means of settled steps, whose vibration has no effect.
 
     Torque is zero without thrust once the reading at rest is subtracted. A free offset would take
-    up the larger ratio at small thrust, and lower the slope. Fitted thrust replaces the measured
-    one, whose vibration would lower the ratio.
+    up the larger ratio at small thrust, and lower the slope.
     """
-    rest = rows['duty'] < 0.01
-    tare = float(np.median(rows['torque'][rest])) if rest.sum() >= 3 else 0.0
-    fitted, torque = thrust.at(rows['duty'], rows['voltage'])[:, :1], rows['torque'] - tare
-    every = jackknife(lambda m: linear(fitted[m], torque[m])[0], rows['block'])
-    offset = np.append(fitted, 0 * fitted + 1, axis=1)
-    return {**estimate(every, 'm'),
-            'rms_N_m': float(np.sqrt(np.mean((torque - every[0] * fitted[:, 0])**2))),
-            'at_rest_N_m': tare if rest.sum() >= 3 else None,
+    first = np.unique(rows['step'], return_index=True)[1]
+    rest, block = rows['duty'][first] < 0.01, rows['block'][first]
+    thrust, torque = (means(rows[name], rows['step']) for name in ('thrust', 'torque'))
+    size = np.bincount(rows['step'])
+
+    def fit(mask):
+        still = rest & mask
+        tare = np.average(torque[still], weights=size[still]) if still.any() else 0.0
+        return np.array([linear(thrust[mask, None], torque[mask] - tare)[0], tare])
+
+    every = jackknife(fit, block)
+    (value, tare), offset = every[0], np.column_stack([thrust, np.ones(len(thrust))])
+    return {**estimate(every[:, 0], 'm'),
+            'rms_N_m': float(np.sqrt(np.mean((torque - tare - value * thrust)**2))),
+            'at_rest_N_m': float(tare) if rest.any() else None,
             'with_free_offset': float(linear(offset, torque)[0])}
 
 
