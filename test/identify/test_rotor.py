@@ -64,6 +64,13 @@ def test_a_published_voltage_is_predicted_from_the_others(tmp_path):
     assert within(results['torque_to_thrust_ratio'], RATIO)
 
 
+def test_one_voltage_gives_a_surface(tmp_path):
+    rows = stand(np.random.default_rng(0))[:, :4]
+    rows[:, 3] = 24.0
+    results = rotor_results(identified(tmp_path, rows))
+    assert 0 < results['surface']['left_out_rms_N'] < 2
+
+
 def test_outliers_do_not_change_the_surface(tmp_path):
     rows = stand(np.random.default_rng(5))
     clean = identified(tmp_path, rows, STAND)

@@ -48,7 +48,7 @@ def fit_lag(log: RotorLog) -> dict | None:
     together, or empty; ``fitted`` (N,) is the thrust of the model [N].
     """
     raw = command = log.columns[log.command]
-    if not log.series or not np.ptp(raw):
+    if not log.series or not np.ptp(raw) or raw.max() <= 0:
         return None
     if log.command == 'duty':
         command = raw * log.columns['voltage']      # mean voltage at the motor
@@ -69,7 +69,7 @@ def fit_lag(log: RotorLog) -> dict | None:
     means = np.array([[values[index == k].mean() for values in (command, smooth, fine)]
                       for k in np.unique(index)]).T
     means = means[:, means[0] > STRONG * command.max()]
-    ratio = means[2] / np.maximum(means[1], STRONG * means[1].max())
+    ratio = means[2] / np.maximum(means[1], STRONG * smooth.max())
     if ratio.size < 4 or ratio.std() < P.gain_scatter * ratio.mean() or least > P.gain_share * rms:
         return _fitted(log, curve, rest, '')
     gains = means[2] / means[0] if log.command == 'target' else ratio

@@ -73,12 +73,11 @@ def settled_rows(logs: Sequence[RotorLog]) -> Rows | None:
                            for k, log in enumerate(logs)])
     names, label = np.unique(pack, return_inverse=True)
     changes = np.append(True, (np.diff(rows['duty']) != 0) | (np.diff(label) != 0))
-    by_voltage = np.digitize(rows['voltage'], np.quantile(
+    block = label if len(names) >= P.least_packs else consecutive(changes, P.blocks)
+    group = label if len(names) > 2 else np.digitize(rows['voltage'], np.quantile(
         rows['voltage'], np.arange(1, GROUPS) / GROUPS))
-    return rows | {'step': np.cumsum(changes) - 1,
-                   'group': label if len(names) > 2 else by_voltage,
-                   'block': label if len(names) >= P.least_packs
-                   else consecutive(changes, P.blocks)}
+    return rows | {'step': np.cumsum(changes) - 1, 'block': block,
+                   'group': group if np.ptp(group) else block}      # a supply of one voltage
 
 
 def fit_surface(rows: Rows, name: str) -> Surface:
