@@ -6,13 +6,12 @@ from pathlib import Path
 from rich.console import Console
 
 from beetle_omni_ros.identify import joint_results as of_joints
-from beetle_omni_ros.identify import rotor_results as of_rotor
 from beetle_omni_ros.identify.joint import identify_joints
 from beetle_omni_ros.identify.joint_log import read_joint_log
 from beetle_omni_ros.identify.joint_servos import file_servos
 from beetle_omni_ros.identify.robot_file import check_outputs
-from beetle_omni_ros.identify.rotor import identify_rotor
-from beetle_omni_ros.identify.rotor_log import read_rotor_log
+from beetle_omni_ros.identify.rotor import results as of_rotor
+from beetle_omni_ros.identify.rotor.log import chosen, read_rotor_log
 from beetle_omni_ros.pages.table import print_grids, Terminal
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.json_file import write_json, write_text
@@ -55,16 +54,18 @@ def run_identify_joint(path: Path, *, validate: Sequence[Path] = (), robot: Path
     return results
 
 
-def run_identify_rotor(path: Path, *, robot: Path | None = None, json_path: Path | None = None,
-                       report: Path | None = None, params: Path | None = None,
-                       console: Console | None = None) -> dict:
+def run_identify_rotor(paths: Sequence[Path], *, columns: Sequence[str] = (),
+                       rate: float | None = None, robot: Path | None = None,
+                       json_path: Path | None = None, report: Path | None = None,
+                       params: Path | None = None, console: Console | None = None) -> dict:
     """
-    Identify a rotor's map and torque ratio from a bench log.
+    Identify a rotor's thrust, torque and lag from logs of a force-torque stand.
 
     Arguments are those of `beetle_omni identify rotor`.
 
     Returns:
-        ``plateaus``, ``torque_to_thrust_ratio``, ``warnings`` and ``meta``.
+        ``verdict``, ``surface``, ``plateaus``, ``torque``, ``torque_to_thrust_ratio``, ``lag``,
+        ``temperature``, ``warnings`` and ``meta``.
 
     Raises:
         LogError, ParameterError: unusable input.
@@ -73,16 +74,16 @@ def run_identify_rotor(path: Path, *, robot: Path | None = None, json_path: Path
     console = console or Terminal()
     check_outputs(params, robot, json_path, report, 'report')
     robot_parameters = RobotParameters.load(robot)
-    log = read_rotor_log(path)
-    rows, ratio = identify_rotor(log)
-    results = of_rotor.rotor_results(log, rows, ratio)
+    mapping = chosen(columns)
+    model = of_rotor.identify_rotor([read_rotor_log(path, mapping, rate) for path in paths])
+    results = of_rotor.rotor_results(model)
     if robot:
         results['meta']['robot'] = str(robot)
-    _print(console, of_rotor.grids(results), [f'warning: {w}' for w in results['warnings']])
+    _print(console, of_rotor.grids(results), [f'verdict: {results["verdict"]}', *(
+        f'warning: {w}' for w in results['warnings'])])
     write_json(json_path, results)
     if report:
-        write_text(report, of_rotor.rotor_page(log, rows, ratio, robot_parameters, results),
-                   'report')
+        write_text(report, of_rotor.rotor_page(model, robot_parameters, results), 'report')
     if params:
         of_rotor.write_rotor_file(params, results, robot)
     return results
