@@ -8,6 +8,7 @@ needs ROS.
 from __future__ import annotations
 
 from pathlib import Path
+import subprocess
 import sys
 import tempfile
 
@@ -19,12 +20,12 @@ import beetle_omni_ros as bo
 from beetle_omni_ros.pages.figures import COLOURS, FAINT, STYLE
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.runs.body import motion
-from beetle_omni_ros.runs.tasks import WAYPOINTS
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / 'docs' / 'tutorials' / 'pictures'
 DOTS = 110      # per inch
 POSE = 8.0      # [s] of a pose
+TASK = 'random2'
 
 
 def figure(columns, height=2.9):
@@ -67,9 +68,9 @@ def drawn_errors(logs, title, end):
 
 
 def first_flight():
-    """Errors of both controllers at the waypoints."""
-    return drawn_errors({name: bo.simulate(name, WAYPOINTS) for name in ('nmpc', 'rl')},
-                        'The first round of the waypoints', 5 * POSE)
+    """Errors of both controllers at the poses."""
+    return drawn_errors({name: bo.simulate(name, TASK) for name in ('nmpc', 'rl')},
+                        'Two random poses', 2 * POSE)
 
 
 def blocks_of(page, language):
@@ -101,26 +102,21 @@ def own_controller():
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / 'mine.py').write_text(blocks_of('own_controller', 'python')[0])
         return drawn_errors({
-            label: bo.simulate(name, WAYPOINTS) for label, name in (
+            label: bo.simulate(name, TASK) for label, name in (
                 ('Mine', f'{folder}/mine.py:Mine'), ('Stiffer', f'{folder}/mine.py:Stiffer'),
-                ('nmpc', 'nmpc'))}, 'The first round of the waypoints', 5 * POSE)
+                ('nmpc', 'nmpc'))}, 'Two random poses', 2 * POSE)
 
 
 def own_robot():
-    """Height error with the right and the wrong file."""
-    drawn, (left, right) = figure(2)
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / 'heavy.yaml'
-        file.write_text(blocks_of('own_robot', 'yaml')[0])
-        for (label, robot), colour in zip((('right file', file), ('wrong file', None)), COLOURS):
-            log = bo.simulate('nmpc', WAYPOINTS[:3], robot=robot, plant=file)
-            times, path, position, _ = flown(log, 3 * POSE)
-            left.plot(times, path[:, 2], color=colour, label=label)
-            right.semilogy(times, position, color=colour, label=label)
-    left.legend()
-    named(left, 'Height', 'time [s]', 'z [m]')
-    named(right, 'Distance from the target', 'time [s]', 'error [m]')
-    return drawn
+    """Errors with the right file, the wrong one, and one with the right time constant."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / 'heavy.yaml').write_text(blocks_of('own_robot', 'yaml')[0])
+        for command in blocks_of('own_robot', 'sh')[:2]:
+            subprocess.run(['bash', '-ec', command], cwd=folder, check=True,
+                           stdout=subprocess.DEVNULL)
+        return drawn_errors({name: bo.read_run(folder / name)
+                             for name in ('known', 'wrong', 'slow')}, 'Two poses', 2 * POSE)
 
 
 def own_gap():
@@ -130,7 +126,7 @@ def own_gap():
         plant = folder / 'secret.yaml'
         plant.write_text('extends: robot.yaml\neffects: {mass: {mass: 3.3}}\n')
         for seed in (1, 2):
-            bo.simulate('nmpc', 'random8', plant=plant, seed=seed, bag=folder / f'flight{seed}')
+            bo.simulate('nmpc', TASK, plant=plant, seed=seed, bag=folder / f'flight{seed}')
         found = bo.find_gap([folder / 'flight1'], holdout=[folder / 'flight2'])
     drawn, (left, right) = figure(2)
     bars = [found['gap_before'], found['gap_after'], found['noise_floor']]

@@ -1,5 +1,5 @@
 """
-Fly a robot of your own from a file with its differences: a heavier robot with weaker rotors.
+Fly a robot of your own from a file with its differences: a heavier robot with slower rotors.
 
     python examples/own_robot.py [TASK]
 
@@ -16,7 +16,7 @@ from beetle_omni_ros.robot.resources import share_path
 ROBOT = """\
 extends: {base}
 mass: 3.4                       # [kg]
-rotors: {{time_constant: 0.12}}   # [s]
+rotors: {{time_constant: 0.18}}   # [s]
 effects:
   thrust_coefficient: {{scale: 0.95}}
 """

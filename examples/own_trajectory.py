@@ -1,5 +1,5 @@
 """
-Fly a trajectory of your own: a circle with one full roll a round.
+Fly a trajectory of your own: a circle with rolls to both sides.
 
     python examples/own_trajectory.py [SECONDS]
 """
@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 import beetle_omni_ros
 
 RADIUS, HEIGHT, ROUND = 0.8, 1.5, 20.0          # [m], [m], [s]
+ROLL = 115.0    # [deg] to each side; a continuous roll would turn the joints to their stops
 
 
 def circle(duration):
@@ -20,7 +21,7 @@ def circle(duration):
     phase = 2 * np.pi / ROUND * np.where(times < 4, times ** 2 / 8, times - 2)     # 4 s to speed
     positions = np.column_stack([RADIUS * np.cos(phase), RADIUS * np.sin(phase),
                                  np.full_like(phase, HEIGHT)])
-    attitudes = Rotation.from_euler('x', phase[:, None]).as_quat()
+    attitudes = Rotation.from_euler('x', ROLL * np.sin(phase)[:, None], degrees=True).as_quat()
     return times, positions, attitudes
 
 

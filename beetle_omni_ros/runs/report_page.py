@@ -96,16 +96,16 @@ def outcome(run: Run) -> str:
     sentences = []
     for label, result in run.results.items():
         name = '' if label == run.label else f'{label.removeprefix(run.label + ": ")}: '
-        poses = result.get('poses') or []
+        tracking = result.get('trajectory') or {}
+        poses = [] if tracking else result.get('poses') or []
         parts = ['crashed'] if result.get('crashed') else []
         parts += [result['ended']] if result.get('ended') else []
         if poses:
             parts.append(f"{sum(pose['reached'] for pose in poses)} of {len(poses)} poses reached")
         median = result.get('median') or {}
-        if median.get('U_position_m') is not None:
+        if poses and median.get('U_position_m') is not None:
             parts.append(f"median error {1e3 * median['U_position_m']:.1f} mm and "
                          f"{median['U_orientation_deg']:.2f}° at the target")
-        tracking = result.get('trajectory') or {}
         if tracking.get('position_mean_m') is not None:
             parts.append(f"mean error {1e3 * tracking['position_mean_m']:.1f} mm and "
                          f"{tracking['orientation_mean_deg']:.2f}° on the trajectory")

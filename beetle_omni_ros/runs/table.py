@@ -10,6 +10,7 @@ from beetle_omni_ros.runs import published
 FILES, SHIPPED_ROBOT = ('robot', 'plant'), 'params/robot.yaml'    # keys in the metadata
 MANY_POSES = 20  # above this number, only the summary is shown
 
+POSE_ROWS = 'U: hovering, 7.0 to 7.5 s after each target; L: on the way, 1 to 7 s'
 ERROR_ROWS = (  # text, path in the metrics, digits
     ('U position, mean [m]', 'mean.U_position_m', 4),
     ('U position, max [m]', 'max.U_position_m', 4),
@@ -77,9 +78,12 @@ def _summary(by_label, task):
     """Table with a column for each controller and published result, a row for each metric."""
     others = published.pose_results(task)
     columns = [*by_label.values(), *others.values()]
+    # The only pose of a trajectory is its start: to reach it says nothing about the path.
+    posed = not all('trajectory' in result for result in by_label.values())
     rows = [[text, *(_number(_at(column, path), digits) for column in columns)]
             for text, path, digits in ERROR_ROWS]
-    rows += [['poses reached', *(_reached(column) for column in columns)],
+    rows.append(['poses reached', *(_reached(column) for column in columns)])
+    rows = [*(rows if posed else []),
              *([['ended', *(column.get('ended', ABSENT) for column in columns)]]
                if any('ended' in column for column in columns) else []),
              ['crashed', *({True: 'yes', False: 'no'}.get(column.get('crashed'), ABSENT)
@@ -93,14 +97,14 @@ def _summary(by_label, task):
         rows.append(['stamp to command, 99 % [ms]', *(
             _number(_at(column, 'stamp_to_command_ms.p99'), 2) for column in columns)])
     first = len(by_label) + 1
-    return Grid('U: hovering, 7.0 to 7.5 s after each target; L: on the way, 1 to 7 s',
+    return Grid(POSE_ROWS if posed else 'Flight',
                 ['', *by_label, *(f'published {name}' for name in others)], rows,
                 faint_columns=frozenset(range(first, first + len(others))))
 
 
 def _lowest(result):
     found = result.get('lowest') or {}
-    pose = found.get('pose')
+    pose = None if 'trajectory' in result else found.get('pose')
     return _number(found.get('height_m'), 2) + ('' if pose is None else f' (pose {pose + 1})')
 
 

@@ -5,6 +5,14 @@ A comment before a block states a difference between the test and a reader:
 ``<!-- test: skip -->``, ``OLD -> NEW`` in the commands, ``prints TEXT``, ``fails STATUS``,
 ``background NAME`` until a block that ``ends NAME`` or the page's end, and ``waits FILE`` for a
 file of that program.
+
+A block without a language shows lines that the command before it prints, so the test runs this
+command unchanged. Each number in the text of a page is in one of its blocks.
+
+Lines are compared to the last digit. The instructions of another processor (kernels of BLAS and
+libm, fused multiplications in the compiled NMPC) moved the robot of a flight by 1e-14 m, and left
+every shown line as it is.
+``RENEW=1 pytest test/tutorials`` writes the printed numbers into the pages.
 """
 
 from dataclasses import dataclass, field
@@ -27,7 +35,12 @@ NAMES = ('beetle_omni', 'sim_node')
 STARTED = 'first_flight'    # the page whose commands load their modules when first called
 TIMEOUT = 1000       # s of one block
 BLOCK = re.compile(r'(?P<before>[^\n]*)\n(?:\n<!-- test: (?P<options>[^\n]*) -->\n)?\n'
-                   r'```(?P<language>\w+)\n(?P<text>.*?)^```$', re.DOTALL | re.MULTILINE)
+                   r'```(?P<language>\w*)\n(?P<text>.*?)^```$', re.DOTALL | re.MULTILINE)
+DIGITS = re.compile(r'\d+(?:\.\d+)?')
+NUMBER = re.compile(rf'(?<![\w.]){DIGITS.pattern}(?!\.?\w)')
+NO_TEXT = re.compile(r'^```.*?^```$|^(?:## )?\d+\.|<!--.*?-->|\]\([^)]*\)',
+                     re.DOTALL | re.MULTILINE)
+RENEW = 'RENEW' in os.environ
 
 
 @dataclass
@@ -57,12 +70,12 @@ class Block:
 
 
 def blocks(page):
-    """Executed and written blocks of a page, in order."""
+    """Executed, written and shown blocks of a page, in order."""
     found = []
     for match in BLOCK.finditer(page.read_text(encoding='utf-8')):
         options = [part.strip() for part in (match['options'] or '').split(', ') if part]
         file = re.search(r'as `([\w.]+)`:?$', match['before'])
-        if match['language'] == 'sh' or file:
+        if match['language'] in ('sh', '') or file:
             found.append(Block(match['language'], match['text'], file[1] if file else '', options))
     return found
 
@@ -113,7 +126,7 @@ def shell(tmp_path, page, client):
 
 
 def run(block, folder, environment):
-    """Run one block like a reader who pastes it."""
+    """Run one block like a reader who pastes it; return what it prints."""
     if block.one('waits'):
         end = time.monotonic() + 60
         while not (folder / block.one('waits')).exists() and time.monotonic() < end:
@@ -124,6 +137,23 @@ def run(block, folder, environment):
     output = f'{block.commands}\n{done.stdout[-3000:]}\n{done.stderr[-3000:]}'
     assert done.returncode == int(block.one('fails') or 0), output
     assert block.one('prints') in done.stdout, output
+    return done.stdout + done.stderr
+
+
+def with_printed_numbers(shown, printed):
+    """The shown lines, each with the numbers of the next printed line that has its words."""
+    rest, lines = iter(printed.splitlines()), []
+    for line in shown.splitlines():
+        row = next((row for row in rest if words(row) == words(line)), None)
+        assert row is not None, f'{line!r} is not printed, or earlier:\n{printed}'
+        numbers = iter(DIGITS.findall(row))
+        lines.append(DIGITS.sub(lambda _, left=numbers: next(left), line) + '\n')
+    return ''.join(lines)
+
+
+def words(line):
+    """A line without the values of its numbers."""
+    return DIGITS.sub('0', line).split()
 
 
 def stop(process):
@@ -139,7 +169,7 @@ def test_the_commands_of_a_tutorial_give_its_results(page, tmp_path, shell):
     if any('fly ' in block.text or block.one('background') for block in found):
         pytest.importorskip('rclpy')
     prepare, check = FLIGHTS.get(page.stem, (lambda folder: None,) * 2)
-    folder, background = tmp_path / 'reader', {}
+    folder, background, printed = tmp_path / 'reader', {}, ''
     folder.mkdir()
     prepare(folder)
     try:
@@ -148,19 +178,42 @@ def test_the_commands_of_a_tutorial_give_its_results(page, tmp_path, shell):
                 continue
             if block.one('ends'):
                 stop(background.pop(block.one('ends')))
-            if block.file:
+            if not block.language:
+                true = with_printed_numbers(block.text, printed)
+                if RENEW:
+                    page.write_text(page.read_text().replace(block.text, true))
+                assert RENEW or block.text == true
+            elif block.file:
                 (folder / block.file).write_text(block.commands)
             elif block.one('background'):
                 background[block.one('background')] = subprocess.Popen(
                     ['bash', '-c', f'exec {block.commands}'], cwd=folder, env=shell,
                     stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
             else:
-                run(block, folder, shell)
+                printed = run(block, folder, shell)
     finally:
         for process in background.values():
             stop(process)
     check(folder)
     shutil.rmtree(folder)
+
+
+@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.stem)
+def test_shown_lines_follow_from_unchanged_blocks(page):
+    found = blocks(page)
+    shown = [k for k, block in enumerate(found) if not block.language]
+    assert all(block.commands == block.text for block in found[:max(shown, default=0)])
+
+
+@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.stem)
+def test_each_number_of_a_text_is_in_a_command_or_in_its_output(page):
+    text = page.read_text()
+    known = {number for block in re.findall(r'^```.*?^```$', text, re.DOTALL | re.MULTILINE)
+             for number in NUMBER.findall(block)}
+    for section in text.split('\n## '):
+        if 'test: skip' not in section:     # it describes what no test can run
+            said = NUMBER.findall(NO_TEXT.sub(' ', f'## {section}'))
+            assert set(said) <= known, section
 
 
 @pytest.mark.parametrize('page', PAGES, ids=lambda page: page.stem)
