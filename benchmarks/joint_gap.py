@@ -25,10 +25,10 @@ from beetle_omni_ros.identify.gap.apply import effects_with
 from beetle_omni_ros.identify.gap.joint_gap import gap_of
 from beetle_omni_ros.identify.gap.joint_search import Search
 from beetle_omni_ros.identify.joint import identify_joints
-from beetle_omni_ros.identify.joint_log import JointLog, read_joint_log
+from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
 from beetle_omni_ros.identify.joint_results import joint_results
 from beetle_omni_ros.identify.joint_servos import file_sets
-from beetle_omni_ros.identify.servo_model import simulate
+from beetle_omni_ros.identify.servo.model import simulate
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 LOG = Path(__file__).resolve().parents[2] / 'shared' / 'data' / 'joint_response_100Hz.csv'

@@ -150,6 +150,15 @@ ACTUATOR: dict[str, Effect] = {
         'true tilt = encoder + offset', 'several attitudes',
         ('joint_offset', 'torque_coefficient', 'imu_misalignment'),
         'attitudes with different sets of tilts; a jig', _joint_offset, each='joint'),
+    'joint_encoder_error': Effect(
+        'joint', {name: EffectParameter(unit, (0.0,) * 4, -0.3, 0.3, typical, smallest,
+                                        tolerance='angle', default=(0.0,) * 4)
+                  for name, unit, typical, smallest in (
+                      ('gain', '1', 0.02, 0.005), ('sine', 'rad', 0.02, 0.008),
+                      ('cosine', 'rad', 0.02, 0.008))},
+        "encoder = q + gain q + sine sin q + cosine (cos q - 1): an axis off the encoder's",
+        'large tilts', ('joint_offset', 'joint_bandwidth'), 'tilts held over the whole travel',
+        each='joint', channels='J'),
     'joint_feedback_delay': Effect(
         'timing', _delay(0.01, sensor='encoder_delay', tolerance='delay'),
         'the encoder reading is older than its stamp by d',

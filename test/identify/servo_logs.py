@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 
-from beetle_omni_ros.identify.joint_log import JointLog
+from beetle_omni_ros.identify.servo.log import JointLog
 
 STEP = 1e-4                        # [s] of the simulation, plain semi-implicit Euler
 COUNT = 2 * np.pi / 4096           # [rad] of the encoder

@@ -8,10 +8,10 @@ import pytest
 from servo_logs import log_of, sweep
 
 from beetle_omni_ros.identify.joint import error_rms, identify_joints
-from beetle_omni_ros.identify.joint_log import read_joint_log
+from beetle_omni_ros.identify.servo.log import read_joint_log
 from beetle_omni_ros.identify.joint_results import joint_results
 from beetle_omni_ros.identify.parameters import shipped
-from beetle_omni_ros.identify.servo_model import INDEX, published_set
+from beetle_omni_ros.identify.servo.model import INDEX, published_set
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 PUBLISHED = RobotParameters.load().joints

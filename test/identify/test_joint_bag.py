@@ -8,7 +8,7 @@ from servo_logs import sweep
 from synthetic_flights import write_command, write_joints
 
 from beetle_omni_ros.identify import joint_log
-from beetle_omni_ros.identify.joint_log import read_joint_log
+from beetle_omni_ros.identify.servo.log import read_joint_log
 from beetle_omni_ros.runs.bag import BagWriter
 from beetle_omni_ros.runs.csv_table import LogError
 

@@ -17,10 +17,10 @@ from beetle_omni_ros.identify.gap.joint_search import Search
 from beetle_omni_ros.identify.gap.keys import all_keys
 from beetle_omni_ros.identify.gap.keys import friction as friction_of
 from beetle_omni_ros.identify.inference.noise import Noise
-from beetle_omni_ros.identify.joint_log import JointLog, read_joint_log
+from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
 from beetle_omni_ros.identify.joint_servos import file_sets, Servos
 from beetle_omni_ros.identify.servo_fit import Problems, ServoFitter
-from beetle_omni_ros.identify.servo_model import INDEX, simulate
+from beetle_omni_ros.identify.servo.model import INDEX, simulate
 from beetle_omni_ros.robot import dynamics
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError

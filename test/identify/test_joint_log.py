@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from servo_logs import log_of, sweep, write
 
-from beetle_omni_ros.identify.joint_log import read_joint_log
+from beetle_omni_ros.identify.servo.log import read_joint_log
 from beetle_omni_ros.runs.csv_table import LogError
 
 HEADER = ['t_s', 'q1_rad', 'q2_rad', 'command_rad']

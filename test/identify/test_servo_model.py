@@ -6,8 +6,8 @@ from scipy.signal import cont2discrete, lfilter
 from servo_logs import servo, sweep
 
 from beetle_omni_ros.identify import servo_model
-from beetle_omni_ros.identify.joint_log import JointLog
-from beetle_omni_ros.identify.servo_model import INDEX, OFF, published_set, simulate
+from beetle_omni_ros.identify.servo.log import JointLog
+from beetle_omni_ros.identify.servo.model import INDEX, OFF, published_set, simulate
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 
