@@ -52,11 +52,8 @@ _NO_JOINTS = Treatment(False, 'the filter does not read the joints')
 _TREATMENTS = {
     'nmpc': {'sensor': _CORRECTED, 'play': Treatment(
         False, 'a play is an offset of the servos, which is estimated in flight')},
-    'training': {'sensor': _CORRECTED, 'play': Treatment(
-        False, 'the model of the servos has no play: train with joint_deflection or '
-               'joint_friction, or take the effect out of the file', error=True)},
-    'plant': {'play': Treatment(
-        False, 'MuJoCo has no play between encoder and rotor', error=True)},
+    'training': {'sensor': _CORRECTED},
+    'plant': {},
     'estimator': {**dict.fromkeys(('body', 'servo', 'number', 'command', 'play'), _NO_MODEL),
                   'feedback': _NO_JOINTS},
     'buses': dict.fromkeys(('body', 'servo', 'number', 'sensor', 'feedback', 'play'), _NO_DELAY),

@@ -179,7 +179,7 @@ def test_a_consumer_applies_an_effect_or_states_why_not(consumer, name):
 
 @pytest.mark.parametrize('name', CATALOGUE)
 def test_the_gap_finder_applies_every_effect(name):
-    assert gap(name) and effects.treatment('gap', name).acts
+    assert gap(name) == effects.treatment('gap', name).acts
 
 
 def test_training_refuses_delays_beyond_its_history():
