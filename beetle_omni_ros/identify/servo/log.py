@@ -137,9 +137,10 @@ def fresh_rows(measured: np.ndarray) -> np.ndarray:
     (N,) rows with a new reading.
 
     A logger may write rows faster than the bus delivers readings, and then repeats the last one.
-    The most frequent number of rows between two changes is the period of the readings. Over a
-    longer interval with at most two encoder steps of motion the joints rested, so each period has
-    a reading. Over one with more motion the readings were held, so it has none.
+    The most frequent number of rows between two changes is the period of the readings. Before a
+    longer interval, or over it, joints that rest move by at most two encoder steps (a command may
+    start them quickly), so each of its periods has a reading. If they move by more, the readings
+    were held, so it has none.
 
     Args:
         measured: (n, N) readings of all joints [rad], delivered together.
@@ -151,7 +152,8 @@ def fresh_rows(measured: np.ndarray) -> np.ndarray:
     gaps = np.diff(changed)
     period = int(np.bincount(gaps).argmax())
     jumps = np.abs(np.diff(measured[:, changed], axis=1)).max(axis=0)
-    rested = (gaps > 1.5 * period) & (jumps <= 2.01 * quantum(measured))
+    rested = (gaps > 1.5 * period) & (np.minimum(jumps, np.r_[0.0, jumps[:-1]])
+                                      <= 2.01 * quantum(measured))
     fresh = np.zeros(measured.shape[1], dtype=bool)
     fresh[changed] = True
     for row, gap in zip(changed[:-1][rested], gaps[rested], strict=True):
@@ -174,7 +176,7 @@ def reading_times(t: np.ndarray, row: float) -> np.ndarray:
         return t
     number = np.r_[0, np.cumsum(np.maximum(np.rint(np.diff(t) / period), 1))]
     period = float(np.polyfit(number, t, 1)[0])
-    about = np.pad(t - number * period, NEIGHBOURS, mode='edge')
+    about = np.pad(t - number * period, NEIGHBOURS, mode='reflect')
     windows = np.lib.stride_tricks.sliding_window_view(about, 2 * NEIGHBOURS + 1)
     return np.median(windows, axis=1) + number * period
 
