@@ -222,13 +222,11 @@ class Treatment:
     Attributes:
         acts: whether a change of its parameters changes the consumer's results.
         reason: reason why it does not act.
-        error: whether the consumer refuses a robot file with the effect.
 
     """
 
     acts: bool
     reason: str = ''
-    error: bool = False
 
 
 @dataclass(frozen=True)

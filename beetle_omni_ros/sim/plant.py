@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from beetle_omni_ros.robot import dynamics, effects, rotations
+from beetle_omni_ros.robot import dynamics, rotations
 from beetle_omni_ros.robot.allocation import clipped
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -44,7 +44,6 @@ class Plant:
 
     def __init__(self, robot: RobotParameters, parameters: PlantParameters,
                  variation: Variation | None = None):
-        effects.check('plant', robot.effects)
         self._robot, self._parameters, self._variation = robot, parameters, variation
         self._forces, self._catalogue_forces = MotionForces(robot), CatalogueForces(robot)
         play = robot.effects.get('joint_backlash', {'gap': 0.0, 'at_encoder': 0.0})

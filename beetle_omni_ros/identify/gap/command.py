@@ -23,7 +23,6 @@ from beetle_omni_ros.identify.robot_file import check_outputs
 from beetle_omni_ros.identify.servo.compare import analyse_joint_logs, is_joint_log
 from beetle_omni_ros.identify.servo.page import change_grids, gap_log_page
 from beetle_omni_ros.pages.table import print_grids, Terminal
-from beetle_omni_ros.robot.effects import CONSUMERS, refusals
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.bag_files import names_of
 from beetle_omni_ros.runs.json_file import write_json, write_text
@@ -90,10 +89,6 @@ def gap_results(runs, holdout=(), robot=None, apply=None, json_path=None, page=N
     if apply:
         console.print(f'corrected robot: {apply}' if result['effects'] else
                       'no effect is named: no robot file is written', highlight=False)
-        corrected = RobotParameters.load(apply).effects if result['effects'] else {}
-        for consumer in CONSUMERS:
-            for text in refusals(consumer, corrected):
-                console.print(f'note: {text}', highlight=False, markup=False)
     return result
 
 
