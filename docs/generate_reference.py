@@ -358,7 +358,7 @@ def effects() -> str:
         rows = [[f'`{key}`', spec.unit, _neutral(spec.neutral),
                  f'{_number(spec.low)} to {_number(spec.high)}', 'not fitted' if spec.form
                  else _known(spec.typical), _known(spec.smallest),
-                 '' if spec.default is None else _number(spec.default),
+                 '' if spec.default is None else _neutral(spec.default),
                  entry.settings.get(key) and f'`{entry.settings[key]}`' or '',
                  '4, one for each ' + entry.each if entry.each
                  else '1, or 4 for each joint' if spec.of_each
