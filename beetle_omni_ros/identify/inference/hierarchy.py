@@ -203,7 +203,7 @@ def _judged(x, s, theta, residuals, slopes, groups, blocks, memory):
     for part, j, r, block in zip(s, slopes, residuals, blocks, strict=True):
         moved = j.T @ (part @ deviations.T) if size else np.zeros((len(r), count))
         for b in range(count):
-            held[b] += ((r[block == b] + moved[block == b, b])**2).sum()
+            held[b] += (robust(r[block == b] + moved[block == b, b])[0]**2).sum()
     ratio = 1.0
     if size:
         inverse = np.linalg.inv(information)

@@ -88,7 +88,7 @@ def is_joint_log(path: Path) -> bool:
 
 def compare(log: JointLog, robot: RobotParameters) -> Found:
     """The entries by which a log differs from the servos of a robot file."""
-    return select(Servos([log], file_sets(robot)), (), NAMED, CERTAIN, visible=True)
+    return select(Servos([log], file_sets(robot)), (), NAMED, CERTAIN, named=True)
 
 
 def gap_of(found: Found, apart: Found, robot: RobotParameters) -> dict:
@@ -183,6 +183,7 @@ def _effects(found, robot):
                          'interval': entry['intervals'][str(number)],
                          'file': entry['files'][str(number)]} for key, entry in parts.items()}
             if any(not entry['interval'][0] <= entry['file'] <= entry['interval'][1]
+                   and abs(entry['value'] - entry['file']) > found.servos.logs[0].quantum
                    for entry in own.values()):
                 result.append(effect | {'joint': number, 'parameters': own})
     return result

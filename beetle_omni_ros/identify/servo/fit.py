@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import ttest_1samp
 
 from beetle_omni_ros.identify.inference.hierarchy import design, Fit, solve, Spread
 from beetle_omni_ros.identify.parameters import shipped
@@ -260,8 +261,14 @@ class Found:
         return self.values(trial)[np.array(self.servos.labels['log']) == index]
 
 
+def predicts(more: Trial, fewer: Trial) -> bool:
+    """Whether a model predicts left-out blocks better than another one, by a t-test at 5 %."""
+    return bool(ttest_1samp(fewer.fit.held - more.fit.held, 0.0,
+                            alternative='greater').pvalue < 0.05)
+
+
 def select(servos: Servos, always: Sequence[str], allowed: Sequence[str], least: float = 0.0,
-           visible: bool = False) -> Found:
+           named: bool = False) -> Found:
     """
     Add the entries that raise the evidence, largest gain first, and remove those that do not.
 
@@ -270,7 +277,8 @@ def select(servos: Servos, always: Sequence[str], allowed: Sequence[str], least:
         always: entries of every model.
         allowed: further entries.
         least: least gain of evidence [nat] of an entry.
-        visible: whether an entry must move some joint's readings by an encoder count (RMS).
+        named: whether an entry must also move some joint's readings by an encoder count (RMS) and
+            improve the prediction of left-out blocks (t-test at 5 %).
 
     """
     candidates = [name for name in servos.candidates() if name in {*always, *allowed}]
@@ -278,7 +286,8 @@ def select(servos: Servos, always: Sequence[str], allowed: Sequence[str], least:
     gain = servos.evidence
     chosen = servos.fit(always, starts=(full, *STARTS) if always else (full,))
     def worth(name, more, fewer):
-        return gain(more) >= gain(fewer) + least and (not visible or servos.visible(more, name))
+        return gain(more) >= gain(fewer) + least and (not named or (
+            predicts(more, fewer) and servos.visible(more, name)))
 
     while True:
         trials = {name: servos.fit([*chosen.entries, name], starts=(chosen, full))

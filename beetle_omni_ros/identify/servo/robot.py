@@ -41,7 +41,7 @@ def file_sets(robot: RobotParameters) -> np.ndarray:
     friction = effects.get('joint_friction', {'coulomb': 0.0, 'stiction': 0.0})
     encoder = effects.get('joint_encoder_error', {})
     for j in range(JOINTS):
-        kp, kd = per_joint(joint.kp, j), per_joint(joint.kd, j)
+        kp, kd = joint.of(j).kp, joint.of(j).kd
         coulomb, stiction = (per_joint(friction[name], j) for name in ('coulomb', 'stiction'))
         values = {
             'natural_frequency': np.sqrt(kp / joint.inertia),
@@ -72,7 +72,8 @@ def catalogue_values(values: np.ndarray, robot: RobotParameters) -> dict[str, di
             'kp': kp, 'kd': 2 * value['damping_ratio'] * kp / value['natural_frequency']},
         'joint_command_latency': {'delay': value['delay'] - other_delays(robot)},
         'joint_friction': {'coulomb': kp * band, 'stiction': kp * (band + value['stiction'])},
-        'joint_backlash': {'gap': 2 * value['backlash']},
+        # A log shows the play before the encoder only.
+        'joint_backlash': {'gap': 2 * value['backlash'], 'at_encoder': 1.0},
         'joint_offset': {'offset': -value['offset']},
         'joint_encoder_error': {name: value[f'encoder_{name}']
                                 for name in ('gain', 'sine', 'cosine')},
