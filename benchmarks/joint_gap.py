@@ -174,7 +174,9 @@ def run(logs: Sequence[JointLog], cases: int, seed: int, console: Console) -> di
                'effects': [[e['names'], e.get('joint'), {
                    key: e['parameters'][key].get('each', e['parameters'][key]['value'])
                    for key in e['parameters']}] for e in [*made['effects'], *made['partial']]],
-               'gains': {c['name']: c['evidence']['delta_bic'] / 2 for c in made['candidates']},
+               'gains': {c['name']: [c['evidence']['delta_bic'] / 2, c['evidence']['cv_gain'],
+                                     c['evidence']['blocks_positive']]
+                         for c in made['candidates']},
                'seconds': time.process_time() - begin}
         rows.append(row)
         mark = '' if row['named'] and not row['wrong'] else '  <-'

@@ -9,13 +9,14 @@
 #   --servo-serial TEXT  serial number of the servos' adapter (U2D2); default: any
 #   --board-serial TEXT  serial number of the motor board (STM32); default: any
 #   --robot FILE         robot file of the bridges; default: the shipped one
+#   --servo-bus FILE     file in place of params/servo_bus.yaml
+#   --motor-board FILE   file in place of params/motor_board.yaml
 #   --no-service         do not install the service
 #   --uninstall          remove all installed files
 #   --root DIR           dry run: write below DIR and call no system program
 #
-# The service opens both ports and reads. It switches no torque on, and the motor board cannot be
-# armed. A flight needs `ros2 lifecycle set /joint_bridge_node activate`, the same for
-# /rotor_bridge_node, and then the arming of the supervisor.
+# The service runs the only bridges of the robot: it opens both ports and reads. It switches no
+# torque on, and the motor board cannot be armed; docs/tutorials/hardware_flight.md flies.
 set -eu
 
 ROOT=
@@ -24,6 +25,8 @@ WORKSPACE=
 SERVO_SERIAL=
 BOARD_SERIAL=
 ROBOT=
+SERVO_BUS=
+MOTOR_BOARD=
 SERVICE=yes
 REMOVE=
 
@@ -44,6 +47,8 @@ while [ $# -gt 0 ]; do
         --servo-serial) value "$@"; SERVO_SERIAL=$2; shift ;;
         --board-serial) value "$@"; BOARD_SERIAL=$2; shift ;;
         --robot) value "$@"; ROBOT=$2; shift ;;
+        --servo-bus) value "$@"; SERVO_BUS=$2; shift ;;
+        --motor-board) value "$@"; MOTOR_BOARD=$2; shift ;;
         --root) value "$@"; ROOT=${2%/}; shift ;;
         --no-service) SERVICE= ;;
         --uninstall) REMOVE=yes ;;
@@ -60,12 +65,18 @@ plain() {
     esac
 }
 for pair in "--user=$NAME" "--workspace=$WORKSPACE" "--servo-serial=$SERVO_SERIAL" \
-        "--board-serial=$BOARD_SERIAL" "--robot=$ROBOT"; do
+        "--board-serial=$BOARD_SERIAL" "--robot=$ROBOT" "--servo-bus=$SERVO_BUS" \
+        "--motor-board=$MOTOR_BOARD"; do
     plain "${pair%%=*}" "${pair#*=}"
 done
-case $ROBOT in ''|/*) ;; *) fail "--robot '$ROBOT': expected an absolute path" ;; esac
 case $WORKSPACE in ''|/*) ;; *) fail "--workspace '$WORKSPACE': expected an absolute path" ;; esac
-[ -z "$ROBOT" ] || [ -f "$ROBOT" ] || fail "--robot $ROBOT: no such file"
+for pair in "--robot=$ROBOT" "--servo-bus=$SERVO_BUS" "--motor-board=$MOTOR_BOARD"; do
+    case ${pair#*=} in
+        '') ;;
+        /*) [ -f "${pair#*=}" ] || fail "${pair%%=*} ${pair#*=}: no such file" ;;
+        *) fail "${pair%%=*} '${pair#*=}': expected an absolute path" ;;
+    esac
+done
 
 if [ -z "$ROOT" ]; then
     [ "$(id -u)" = 0 ] || fail 'needs root: sudo deploy/install.sh, or --root DIR to try it'
@@ -157,7 +168,7 @@ User=$NAME
 SupplementaryGroups=dialout
 LimitRTPRIO=10
 LimitMEMLOCK=infinity
-ExecStart=/bin/bash -c '. /opt/ros/jazzy/setup.bash && . $WORKSPACE/.venv/bin/activate && . $WORKSPACE/install/setup.bash && exec python3 -m beetle_omni_ros.nodes.composed joint_bridge_node rotor_bridge_node --ros-args -p joint_bridge_node:autostart:=configure -p joint_bridge_node:port:=/dev/beetle_servos -p rotor_bridge_node:autostart:=configure -p rotor_bridge_node:port:=/dev/motor_board${ROBOT:+ -p joint_bridge_node:robot_file:=$ROBOT -p rotor_bridge_node:robot_file:=$ROBOT}'
+ExecStart=/bin/bash -c '. /opt/ros/jazzy/setup.bash && . $WORKSPACE/.venv/bin/activate && . $WORKSPACE/install/setup.bash && exec python3 -m beetle_omni_ros.start composed joint_bridge_node rotor_bridge_node --ros-args -p joint_bridge_node:autostart:=configure -p joint_bridge_node:port:=/dev/beetle_servos -p rotor_bridge_node:autostart:=configure -p rotor_bridge_node:port:=/dev/motor_board${ROBOT:+ -p joint_bridge_node:robot_file:=$ROBOT -p rotor_bridge_node:robot_file:=$ROBOT}${SERVO_BUS:+ -p joint_bridge_node:servo_bus_file:=$SERVO_BUS}${MOTOR_BOARD:+ -p rotor_bridge_node:motor_board_file:=$MOTOR_BOARD}'
 # SIGINT: torque off, disarmed, ports closed.
 KillSignal=SIGINT
 TimeoutStopSec=10

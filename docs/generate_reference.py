@@ -67,6 +67,22 @@ FILES = {
                       'Identification of servos and rotors from logs.'),
     'gap.yaml': ('identify.gap.parameters:GapParameters', 'The gap finder.')}
 
+ROBOT_FILE = """`mass`, `inertia` and `rotors.positions` are authoritative. With `multibody`, the
+simulated main body is what modules and end-effector leave of them. `multibody.main_body`,
+`multibody.module.joint_offset` and `multibody.centre_of_gravity_height` follow from these numbers.
+They are optional checks. A file that contradicts itself by more than 0.5 mm is refused, or if
+`multibody.main_body.inertia` is larger than the rest or lacks more than 10 % of the total inertia.
+
+A file that extends another moves what depends on its numbers:
+
+- `rotors.arm_length` [m] moves all rotor centres outwards to this mean horizontal distance.
+- If mass, rotor positions or parts change and the file has no `inertia`, the inertia follows. The
+  main body keeps its radii of gyration. Without `multibody`, changed positions need the `inertia`
+  beside them.
+- The checks of the extended file apply only if the file repeats them.
+
+"""
+
 # Nodes whose code is not in a file of their own name; '' is no node of its own.
 SHARED = {'controller_node': 'nmpc_node, rl_node', 'health': 'every node', 'operator': '',
           'driver': '', 'listener': '', 'node': '', 'recorder_node': '', 'command_source': '',
@@ -153,11 +169,13 @@ def parameters() -> str:
         text.append(f'\n## {name}\n\n{what}\n\n')
         if name == 'faults.yaml':
             text.append('The faults themselves are in [the list of faults](faults.md).\n\n')
+        if name == 'robot.yaml':
+            text.append(ROBOT_FILE)
         if kind in seen:
             same = {key: value for key, _, value in _leaves(_load(seen[kind]))}
             rows = [[f'`{key}`', _value(value) if repr(value) != '{}' else 'none',
-                     _value(same[key])] for key, _, value in _leaves(_load(name))
-                    if repr(value) != repr(same[key])]
+                     _value(same.get(key))] for key, _, value in _leaves(_load(name))
+                    if repr(value) != repr(same.get(key))]
             text.append(f'The keys are those of [{seen[kind]}](#{_anchor(seen[kind])}). These '
                         'values differ:\n\n'
                         + table(['key', 'value', f'in {seen[kind]}'], rows))
@@ -308,7 +326,7 @@ def command_line() -> str:
             '`beetle_omni` is also `ros2 run beetle_omni_ros beetle_omni`. Each subcommand has '
             '`--help`.\n\n'
             + table(['exit status', 'meaning'], [
-                ['0', 'success'], ['1', 'a flight or a check failed'],
+                ['0', 'success'], ['1', 'a flight failed or crashed, or a check failed'],
                 ['2', 'unusable input; one line on standard error'],
                 ['3', '`gap`: the verdict `bad_data`'], ['130', 'interrupted']])]
     for name, command in _commands(get_command(app), 'beetle_omni'):

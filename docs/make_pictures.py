@@ -128,7 +128,7 @@ def own_gap():
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         plant = folder / 'secret.yaml'
-        plant.write_text('extends: robot.yaml\nmass: 3.3\n')
+        plant.write_text('extends: robot.yaml\neffects: {mass: {mass: 3.3}}\n')
         for seed in (1, 2):
             bo.simulate('nmpc', 'random8', plant=plant, seed=seed, bag=folder / f'flight{seed}')
         found = bo.find_gap([folder / 'flight1'], holdout=[folder / 'flight2'])

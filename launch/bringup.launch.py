@@ -18,20 +18,15 @@ PACKAGE = 'beetle_omni_ros'
 ARGUMENTS = {
     # name: (default, choices or None, description)
     'backend': ('sim', ['sim', 'none'],
-                'who provides the sensors: the simulator, or nodes started elsewhere'),
-    'actuators': ('', ['', 'bridges', 'direct', 'none'],
-                  'how commands reach the actuators: through joint_bridge_node and '
-                  'rotor_bridge_node (with backend sim to emulated devices); straight into the '
-                  'simulated plant; or by nodes started elsewhere; empty: bridges, direct with '
-                  'clock simulated'),
+                'who provides sensors and actuators: the simulator, or nodes started elsewhere, '
+                'as the service of deploy/install.sh, which runs the bridges of the robot'),
+    'actuators': ('', ['', 'bridges', 'direct'],
+                  'how commands reach the simulated actuators: through joint_bridge_node and '
+                  'rotor_bridge_node to emulated devices, or straight into the plant; empty: '
+                  'bridges, direct with clock simulated'),
     'clock': ('system', ['system', 'simulated'],
               'real time, or simulated time on /clock, which waits for nodes that are late: for a '
               'computer that is too slow'),
-    'autostart': ('', ['', 'none', 'configure', 'activate'],
-                  'how far joint_bridge_node goes by itself; empty: activate with backend sim, '
-                  'else configure'),
-    'servo_bus_file': ('', None, 'parameters of joint_bridge_node; empty: the shipped ones'),
-    'motor_board_file': ('', None, 'parameters of rotor_bridge_node; empty: the shipped ones'),
     'controller': ('nmpc', None, 'the active controller: a registered name, '
                                  'FILE.py:Class or package.module:Class'),
     'standby': ('true', ['true', 'false'], 'the controllers that stand by run too, to be '
@@ -83,8 +78,8 @@ def options(given):
         seed=int(given['seed']),
         **{key: given[key] == 'true' for key in ('standby', 'allow_other_robot', 'viewer')},
         **{key: given[key] for key in (
-            'autostart', 'clock', 'compression', 'conditions', 'controller', 'motor_board_file',
-            'plant_file', 'policy', 'robot_file', 'servo_bus_file', 'task')})
+            'clock', 'compression', 'conditions', 'controller', 'plant_file', 'policy',
+            'robot_file', 'task')})
 
 
 def has_state_publisher():

@@ -111,7 +111,6 @@ def rows():
                             ('broken.yaml', 'broken.yaml: ')):
         yield [*EVALUATE, '--nmpc', value], fragment
     yield [*EVALUATE, '--controllers', 'hover', '--nmpc', 'horizon.yaml'], '--nmpc horizon.yaml'
-    yield ['fly'], "'--bag'"
     for option, value, fragment in (
             ('--actuators', 'steam', "actuators 'steam': expected emulated or direct"),
             ('--clock', 'sun', "clock 'sun': expected auto or system or simulated"),

@@ -11,6 +11,7 @@ import pytest
 from synthetic_flights import fly, write_imu
 
 from beetle_omni_ros import __version__, cli
+from beetle_omni_ros.film import graphics
 from beetle_omni_ros.runs.bag import BagWriter
 from beetle_omni_ros.runs.tasks import make_task
 
@@ -66,7 +67,6 @@ def test_the_version_is_printed(capsys):
 
 
 def test_usage_errors_are_one_line(capsys):
-    assert '--bag' in refused(capsys, 'fly')
     assert 'frobnicate' in refused(capsys, 'frobnicate')
     assert '--seed' in refused(capsys, 'evaluate', '--seed', 'x')
     assert '--seed' in refused(capsys, 'evaluate', '--seed', '-1')
@@ -134,6 +134,21 @@ def test_fly_refuses_an_unregistered_controller(capsys, tmp_path):
     pytest.importorskip('rclpy')
     line = refused(capsys, 'fly', '--controller', 'nmpc_publish', '--bag', tmp_path / 'bag')
     assert "controller 'nmpc_publish': expected one of nmpc, rl, rl_memory" in line
+
+
+@pytest.mark.parametrize('command', ['report', 'film', 'view', 'gap', 'identify joint'])
+def test_each_command_reads_the_bags_in_a_folder(capsys, monkeypatch, bag, tmp_path, command):
+    monkeypatch.setattr(graphics, 'choose_backend', lambda: 'none')
+    for name, size in (('first', 300), ('second', 400)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / 'cut.mcap').write_bytes((bag / 'flight.mcap').read_bytes()[:size])
+    given = [*command.split(), tmp_path / 'first' / '..']
+    if command == 'identify joint':     # which takes one
+        assert 'second: the identification uses one log' in refused(capsys, *given)
+        return
+    if command in ('report', 'film'):
+        given += ['-o', tmp_path / 'out.gif']
+    assert 'first: cut.mcap: cut off after 0 readable messages' in refused(capsys, *given)
 
 
 def test_report_takes_a_folder_of_bags(capsys, bag, tmp_path):

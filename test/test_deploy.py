@@ -71,7 +71,9 @@ def test_the_rules_name_both_ports_and_set_the_latency_timer(tmp_path):
 def test_the_service_starts_the_bridges_without_arming(tmp_path):
     robot = tmp_path / 'robot.yaml'
     robot.touch()
-    done = install(tmp_path, '--workspace', '/home/pilot/ws', '--robot', str(robot))
+    done = install(tmp_path, '--workspace', '/home/pilot/ws', *(
+        word for option in ('--robot', '--servo-bus', '--motor-board')
+        for word in (option, str(robot))))
     assert done.returncode == 0, done.stderr
     unit = (tmp_path / UNIT).read_text()
     start = re.search(r'^ExecStart=(.*)$', unit, re.M)[1]
@@ -80,6 +82,8 @@ def test_the_service_starts_the_bridges_without_arming(tmp_path):
         assert node in plan.NODES
         assert re.findall(rf'-p {node}:autostart:=(\w+)', start) == ['configure']
         assert f'-p {node}:robot_file:={robot}' in start
+    assert f'-p joint_bridge_node:servo_bus_file:={robot}' in start
+    assert f'-p rotor_bridge_node:motor_board_file:={robot}' in start
     assert 'activate ' not in start.replace('/bin/activate', '') and 'supervisor' not in start
     assert {'User=pilot', 'KillSignal=SIGINT'} <= set(unit.splitlines())
     analyse = shutil.which('systemd-analyze')
@@ -98,7 +102,8 @@ def test_without_service_only_rules_and_limits_are_installed(tmp_path):
 @pytest.mark.parametrize('options', [
     ['--user', 'a b'], ['--user', 'x;reboot'], ['--servo-serial', '"'], ['--workspace', '$HOME'],
     ['--board-serial', 'a\nb'], ['--robot', '/does/not/exist'], ['--robot', 'r.yaml'],
-    ['--workspace', 'ws'], ['--servo-serial'], ['--wrong'], ['--root', '/does/not/exist']])
+    ['--servo-bus', '/not/there'], ['--workspace', 'ws'], ['--servo-serial'], ['--wrong'],
+    ['--root', '/does/not/exist']])
 def test_unusable_options_are_refused_in_one_line_and_write_nothing(tmp_path, options):
     done = install(tmp_path, *options)
     assert done.returncode == 2 and done.stderr.startswith('install: error: ')

@@ -39,11 +39,10 @@ MANIFEST = ElementTree.parse(ROOT / 'package.xml').getroot()
 HAS_ROS = importlib.util.find_spec('rclpy') is not None
 
 # Import name -> distribution on PyPI, where they differ; import name -> rosdep key.
-DISTRIBUTION = {'yaml': 'pyyaml', 'mcap_ros2': 'mcap-ros2-support', 'serial': 'pyserial',
-                'dynamixel_sdk': 'dynamixel-sdk', 'rsl_rl': 'rsl-rl-lib', 'PIL': 'pillow',
-                'imageio_ffmpeg': 'imageio-ffmpeg'}
-KEY = {'yaml': 'python3-yaml', 'mcap': 'mcap-ros2-support', 'mcap_ros2': 'mcap-ros2-support',
-       'casadi': 'casadi-pip', 'serial': 'python3-serial', 'PIL': 'python3-pil'}
+DISTRIBUTION = {'yaml': 'pyyaml', 'serial': 'pyserial', 'dynamixel_sdk': 'dynamixel-sdk',
+                'rsl_rl': 'rsl-rl-lib', 'PIL': 'pillow', 'imageio_ffmpeg': 'imageio-ffmpeg'}
+KEY = {'yaml': 'python3-yaml', 'mcap': 'mcap-ros2-support', 'casadi': 'casadi-pip',
+       'serial': 'python3-serial', 'PIL': 'python3-pil'}
 PARAMETER_CLASSES = {
     'check.yaml': CheckLimits, 'degraded.yaml': HoldingParameters,
     'drive.yaml': DriveParameters, 'ekf.yaml': EkfParameters,
@@ -182,6 +181,16 @@ def test_every_import_is_a_declared_requirement(setup_arguments):
                           'threadpoolctl', 'imageio_ffmpeg'):
             candidates = {KEY.get(module), f'python3-{module}', f'python3-{module}-pip', module}
             assert keys & candidates, f'{module}: no rosdep key in package.xml'
+
+
+def test_every_requirement_is_imported_and_listed_once(setup_arguments):
+    extras = setup_arguments['extras_require']
+    imported = {DISTRIBUTION.get(module, module) for module in third_party_imports()}
+    for requirements in (setup_arguments['install_requires'], *extras.values()):
+        names = [re.split(r'[\[<>=~;! ]', line)[0] for line in requirements]
+        assert len(names) == len(set(names)), sorted(names)
+        if requirements is setup_arguments['install_requires']:
+            assert set(names) - imported == {'etils'}      # bounds a requirement of mujoco
 
 
 def test_each_parameter_file_is_read_by_its_class():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Optional
 
@@ -23,6 +24,7 @@ from beetle_omni_ros.cli.options import (
     JsonOption,
     KNOWN,
     names,
+    NmpcOption,
     numbers,
     OtherRobotOption,
     PlantOption,
@@ -37,11 +39,12 @@ from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.json_file import check_writable, write_json
 
 
-def fly(bag: Annotated[Path, typer.Option(
-            '--bag', metavar='DIR', help='New folder for the recorded bag.')],
-        compression: CompressionOption = 'none',
-        controller: ControllerOption = DEFAULT,
+def fly(controller: ControllerOption = DEFAULT,
         task: TaskOption = 'waypoints',
+        bag: Annotated[Optional[Path], typer.Option(
+            '--bag', metavar='DIR', help='New folder for the recorded bag. Default: '
+                                         'runs_out/fly_DATE.')] = None,
+        compression: CompressionOption = 'none',
         conditions: ConditionsOption = 'nominal',
         seed: SeedOption = 0,
         actuators: Annotated[Optional[str], typer.Option(
@@ -56,6 +59,7 @@ def fly(bag: Annotated[Path, typer.Option(
                  'real time.')] = 'auto',
         robot: RobotOption = None,
         plant: PlantOption = None,
+        nmpc_file: NmpcOption = None,
         policy: PolicyOption = None,
         allow_other_robot: OtherRobotOption = False,
         standby: Annotated[bool, typer.Option(
@@ -80,15 +84,18 @@ def fly(bag: Annotated[Path, typer.Option(
     Takes off, flies the task, lands, records a bag and prints the result table.
     Example: beetle_omni fly --controller nmpc --task waypoints --bag my_flight
     """
+    given, bag = bag, bag or Path('runs_out') / f'fly_{datetime.now():%Y%m%d_%H%M%S}'
     check_flight(task=task, seed=seed, conditions=conditions, bag=bag, compression=compression,
-                 json_path=json_path, files=(robot, plant, policy, faults))
+                 json_path=json_path, files=(nmpc_file, policy, faults))
     if allow_targets and not view:
         raise ParameterError('--allow-targets: expected --view with it')
     from beetle_omni_ros.nodes.fly import FlightError, run_fly
+    if not given:
+        typer.echo(f'bag: {bag}')
     try:
         code = run_fly(controller=controller, task=task, bag=bag, compression=compression,
                        seed=seed, conditions=conditions, actuators=actuators, clock=clock,
-                       robot=robot, plant=plant, policy=policy,
+                       robot=robot, plant=plant, nmpc=nmpc_file, policy=policy,
                        allow_other_robot=allow_other_robot, standby=standby,
                        composed=composed, faults=faults, json_path=json_path,
                        domain_id=domain_id, discovery=discovery,
@@ -107,10 +114,7 @@ def evaluate(controllers: Annotated[str, typer.Option(
              seed: SeedOption = 0,
              robot: RobotOption = None,
              plant: PlantOption = None,
-             nmpc_file: Annotated[Optional[Path], typer.Option(
-                 '--nmpc', metavar='FILE',
-                 help=f"Parameters of the controller '{owner('--nmpc')}'. Default: the shipped "
-                      'params/nmpc.yaml.')] = None,
+             nmpc_file: NmpcOption = None,
              policy: PolicyOption = None,
              allow_other_robot: OtherRobotOption = False,
              bag: Annotated[Optional[Path], typer.Option(
@@ -135,15 +139,18 @@ def evaluate(controllers: Annotated[str, typer.Option(
         if file:
             options[name] = replace(options[name], **{key: file})
     check_flight(task=task, seed=seed, conditions=conditions, bag=bag, compression=compression,
-                 json_path=json_path, files=(robot, plant, nmpc_file, policy, faults))
+                 json_path=json_path, files=(nmpc_file, policy, faults))
     from beetle_omni_ros.evaluation.command import run_evaluate
     from beetle_omni_ros.evaluation.loop import FlightError
+    from beetle_omni_ros.runs.metrics import failed
     try:
-        run_evaluate(controllers=chosen, task=task, conditions=conditions, robot=robot,
-                     plant=plant, seed=seed, bag=bag, compression=compression, json_path=json_path,
-                     faults=faults, options=options)
+        results = run_evaluate(controllers=chosen, task=task, conditions=conditions, robot=robot,
+                               plant=plant, seed=seed, bag=bag, compression=compression,
+                               json_path=json_path, faults=faults, options=options)
     except FlightError as error:
         raise typer.Exit(fail(error, FAILED)) from None
+    if any(map(failed, results.values())):
+        raise typer.Exit(FAILED)
 
 
 def compare(controllers: Annotated[Optional[str], typer.Option(
@@ -313,7 +320,6 @@ def film(runs: Annotated[list[Path], typer.Argument(
     Needs OpenGL for off-screen rendering; without it, a message names the packages to install.
     Example: beetle_omni film my_run/rl my_run/nmpc --output flight.gif
     """
-    check_files(*(model or ()), robot)
     for path in output:
         check_writable(path, 'film')
     from beetle_omni_ros.film.graphics import choose_backend

@@ -83,24 +83,37 @@ def joint(logs: Annotated[list[Path], typer.Argument(
 
     Example: beetle_omni identify joint slow.csv --validate fast.csv --report servos.html
     """
+    from beetle_omni_ros.runs.bag_files import runs_in
+    logs = runs_in(logs)
     more = logs[1:] if validate else []     # `--validate a.csv b.csv` puts b.csv here
     from beetle_omni_ros.identify.command import run_identify_joint
     run_identify_joint(logs[:len(logs) - len(more)], validate=[*(validate or []), *more],
                        robot=robot, report=report, params=params, json_path=json_path)
 
 
-def rotor(log: Annotated[Path, typer.Argument(
-              metavar='LOG.csv', help='Log of a force-torque stand, see '
-                                      'docs/how-to/identification.md.')],
+def rotor(logs: Annotated[list[Path], typer.Argument(
+              metavar='LOG.csv...', help='Logs of a force-torque stand, see '
+                                         'docs/how-to/identification.md.')],
+          columns: Annotated[Optional[list[str]], typer.Option(
+              '--column', metavar='QUANTITY=[-]COLUMN[*FACTOR]',
+              help='Column of a quantity with sign and factor to SI units, e.g. thrust=-fz or '
+                   'thrust=load_g*0.00981; may be repeated.')] = None,
+          rate: Annotated[Optional[float], typer.Option(
+              '--rate', min=1, metavar='HZ', help='Rows a second of time series without a column '
+                                                  'of times.')] = None,
           robot: PublishedOption = None, report: PageOption = None, params: ParamsOption = None,
           json_path: JsonOption = None):
     """
-    Fit thrust map and torque ratio of a rotor to a force-torque log.
+    Fit thrust, torque and lag of a rotor to logs of a force-torque stand.
+
+    Ends with status 3 for the verdict bad_data.
 
     Example: beetle_omni identify rotor bench.csv --params my_robot.yaml --report rotor.html
     """
     from beetle_omni_ros.identify.command import run_identify_rotor
-    run_identify_rotor(log, robot=robot, report=report, params=params, json_path=json_path)
+    results = run_identify_rotor(logs, columns=columns or (), rate=rate, robot=robot,
+                                 report=report, params=params, json_path=json_path)
+    raise typer.Exit(3 if results['verdict'] == 'bad_data' else 0)
 
 
 def train(output: Annotated[Path, typer.Option(

@@ -34,6 +34,10 @@ PublishedOption = Annotated[Optional[Path], typer.Option(
     '--robot', metavar='FILE', help='Robot file. Default: the shipped params/robot.yaml.')]
 PlantOption = Annotated[Optional[Path], typer.Option(
     '--plant', metavar='FILE', help='Robot file of the simulated plant. Default: as --robot.')]
+NmpcOption = Annotated[Optional[Path], typer.Option(
+    '--nmpc', metavar='FILE',
+    help=f"Parameters of the controller '{registry.owner('--nmpc')}'. Default: the shipped "
+         'params/nmpc.yaml.')]
 PolicyOption = Annotated[Optional[Path], typer.Option(
     '--policy', metavar='FILE',
     help=f"Policy (ONNX) for the controller '{registry.owner('--policy')}'. Default: the shipped "

@@ -32,6 +32,7 @@ from beetle_omni_ros.pages.table import Terminal
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.json_file import write_json
+from beetle_omni_ros.runs.metrics import failed
 
 PAGE, NUMBERS, TEXT = 'comparison.html', 'comparison.json', 'README.md'
 HOW = '../how-to/comparison.md'     # link from a folder in docs/
@@ -141,7 +142,7 @@ def _line(flight, result, kept):
             level = metrics[kind][f'lost_at_{unit}']
             parts.append('control never lost' if level is None else
                          f"control lost at {level:g} {unit.replace('_', ' ')}")
-    if metrics['crashed'] and not ('force' in metrics or 'torque' in metrics):
+    if failed(metrics):
         parts.append(metrics.get('ended') or 'touched the ground')
     parts.append('kept' if kept else f"{result['cpu_s']:.0f} s")
     return f"{flight.name}: {', '.join(parts)}"

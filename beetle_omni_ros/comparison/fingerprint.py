@@ -1,45 +1,40 @@
 """Fingerprint of everything that determines the numbers of a flight."""
 
+import ast
 from functools import cache
 import hashlib
 from importlib import metadata
 import inspect
 from pathlib import Path
 import platform
+import re
 import subprocess
 
 from beetle_omni_ros.comparison.plan import Flight
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.robot.resources import PACKAGE, share_path
 
-ROOMS = ('control', 'estimation', 'evaluation', 'robot', 'runs', 'safety', 'sim')
 LIBRARIES = ('casadi', 'filterpy', 'mujoco', 'numpy', 'onnxruntime', 'scipy')
-# Files and folders that only policies read.
-OF_POLICIES = ('control/guidance', 'control/observation.py', 'control/policy.py',
-               'control/policy_file.py', 'control/policy_network.py', 'params/rl.yaml')
-NOT_FLOWN = ('gap.yaml', 'train.yaml')  # parameters that no flight reads
+SOURCE = Path(__file__).resolve().parents[1]
+COMPARED = (SOURCE / 'comparison' / 'flight.py',)
 LENGTH = 16  # hexadecimal digits kept
+# How a module names the shipped parameter file that it reads.
+READ = re.compile(r"\bfile='([\w.]+\.yaml)'|share_path\('params/([\w.]+)'\)")
 
 
 @cache
-def code_fingerprint(policy: bool = True, beside: tuple[str, ...] = ()) -> str:
+def code_fingerprint(controller: str | None = None,
+                     flown_by: tuple[Path, ...] = COMPARED) -> str:
     """
     Digest of code, parameters and libraries of flights and their metrics.
 
     Args:
-        policy: whether to include the code and parameters that only policies use.
-        beside: further folders of the package.
+        controller: the shipped controller that flies; None: any of them.
+        flown_by: modules that fly and judge.
 
     """
-    package = Path(__file__).resolve().parents[1]
-    files = [path for room in (*ROOMS, *beside) for path in (package / room).rglob('*.*')
-             if path.suffix in ('.py', '.c', '.h')]
-    files += [package / 'comparison' / 'flight.py']
-    files += [path for path in share_path('params').glob('*.yaml') if path.name not in NOT_FLOWN]
-    if not policy:
-        files = [path for path in files if not is_of_policies(path)]
     digest = hashlib.sha256()
-    for path in sorted(files, key=lambda path: (path.parent.name, path.name)):
+    for path in flown_files(controller, flown_by):
         digest.update(f'{path.parent.name}/{path.name}'.encode())
         digest.update(path.read_bytes())
     for library in LIBRARIES:
@@ -48,10 +43,46 @@ def code_fingerprint(policy: bool = True, beside: tuple[str, ...] = ()) -> str:
     return digest.hexdigest()[:LENGTH]
 
 
-def is_of_policies(path: Path) -> bool:
-    """Whether only policies use a file."""
-    there = f"/{'/'.join(path.parts[-3:])}"
-    return any(there.endswith(f'/{part}') or f'/{part}/' in there for part in OF_POLICIES)
+def flown_files(controller: str | None = None,
+                flown_by: tuple[Path, ...] = COMPARED) -> list[Path]:
+    """Modules that flights import, directly or not, and the parameter files that these name."""
+    entries = [registry.SHIPPED[controller]] if controller else list(registry.SHIPPED.values())
+    modules = {str(reference).partition(':')[0]
+               for entry in entries for reference in (entry.controller, entry.parameters)}
+    left, code = [*flown_by, *filter(None, map(_module, modules))], {Path(__file__).resolve()}
+    while left:
+        path = left.pop()
+        if path not in code:
+            code.add(path)
+            left += filter(None, map(_module, _imports(path)))
+    code.remove(Path(__file__).resolve())
+    parameters = {name for path in code for names in READ.findall(path.read_text('utf-8'))
+                  for name in names if name}
+    parameters |= {Path(entry.parameters_file).name for entry in entries}
+    compiled = [file for path in code for file in path.parent.glob(f'{path.stem}.[ch]')]
+    return sorted([*code, *compiled, *(share_path('params') / name for name in parameters)],
+                  key=lambda path: (path.parent.name, path.name))
+
+
+def _module(name: str) -> Path | None:
+    """File of a module of the package; None for other modules, and for names in a module."""
+    if name.partition('.')[0] != PACKAGE:
+        return None
+    place = SOURCE.joinpath(*name.split('.')[1:])
+    return next((path for path in (place.with_suffix('.py'), place / '__init__.py')
+                 if place != SOURCE and path.is_file()), None)
+
+
+@cache
+def _imports(path: Path) -> list[str]:
+    """Names that a file imports, also inside functions."""
+    names = []
+    for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            names += [f'{node.module}', *(f'{node.module}.{alias.name}' for alias in node.names)]
+    return names
 
 
 def _version(library):
@@ -90,25 +121,24 @@ def policy_file(controller: str, other: str | Path | None = None) -> Path | None
         return None
 
 
-def own_code(controller: str) -> str:
-    """Digest of the code of a controller outside the package; '' for a shipped one."""
+def own_files(controller: str) -> tuple[Path, ...]:
+    """Code of a controller outside the package; nothing for a shipped one."""
     if controller in registry.SHIPPED:
-        return ''
+        return ()
     file = Path(inspect.getfile(registry.find(controller).builder()))
     top = file.parent
     while (top / '__init__.py').is_file():
         top = top.parent
-    files = [file] if top == file.parent else sorted(
-        (top / file.relative_to(top).parts[0]).rglob('*.py'))
-    return ' '.join(file_digest(path) for path in files)
+    return (file,) if top == file.parent else tuple(sorted(
+        (top / file.relative_to(top).parts[0]).rglob('*.py')))
 
 
 def flight_key(flight: Flight) -> str:
     """Digest of everything that determines a flight's numbers."""
-    entry, own = registry.find(flight.reference), own_code(flight.reference)
-    parts = [code_fingerprint(bool(entry.policy_file or own)), flight.reference,
-             flight.conditions, str(flight.seed)]
-    parts += [own] if own else []
+    own = own_files(flight.reference)
+    parts = [code_fingerprint(None if own else flight.reference, (*COMPARED, *own)),
+             flight.reference, flight.conditions, str(flight.seed),
+             *(file_digest(path) for path in own)]      # anew, because it may change meanwhile
     is_file = Path(flight.task).is_file()
     parts.append(file_digest(flight.task) if is_file else flight.task)
     if policy := policy_file(flight.reference, flight.policy):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from math import inf, sqrt
 from pathlib import Path
@@ -13,7 +12,6 @@ from typing import Any, Protocol
 import numpy as np
 
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth, NO_ZEROS
-from beetle_omni_ros.robot.schema import ParameterError
 
 ROTORS = 4
 # Folders of the package, of installed packages and of Python itself.
@@ -190,8 +188,8 @@ class Controller(Protocol):
     """
     A function of state and target with internal memory.
 
-    ``step`` is called once every ``period`` [s] with a new state. In the ROS graph, a
-    ``step`` that raises sends no command for this state. It is also called for a controller on
+    ``step`` is called once every ``period`` [s] with a new state. A ``step`` that raises sends no
+    command for this state. It is also called for a controller on
     standby, so that this controller can take over without a jump; ``state.command`` is the
     executed command.
 
@@ -244,25 +242,6 @@ def forward_health(controller: Controller, health: ActuatorHealth) -> None:
         set_health(health)
 
 
-class ControllerError(ParameterError):
-    """A method of a controller raised, or returned no command; one line."""
-
-
-def called(name: str, method: str, function: Callable, *arguments: Any) -> Any:
-    """
-    Call a method of the controller ``name`` and return its result.
-
-    Raises:
-        ControllerError: the method raised an exception; the text has its file and line.
-
-    """
-    try:
-        return function(*arguments)
-    except Exception as error:
-        raise ControllerError(f"controller '{name}': {method} raised "
-                              f'{error_text(error)}') from error
-
-
 def error_text(error: Exception) -> str:
     """An exception in one line, with the file and line of the last frame outside libraries."""
     frames = traceback.extract_tb(error.__traceback__)
@@ -275,27 +254,6 @@ def guidance_of(controller: Controller) -> str:
     """Text that names the functions that modify the targets of a controller; 'none' for none."""
     text = getattr(controller, 'guidance', '')
     return text if text and isinstance(text, str) else 'none'
-
-
-def checked(name: str, command: object) -> Command:
-    """
-    Check the return value of a controller's ``step`` and return it.
-
-    Raises:
-        ControllerError: it is no command; one line.
-
-    """
-    if not isinstance(command, Command):
-        raise ControllerError(f"controller '{name}': step returned {type(command).__name__}, "
-                              'expected control.base.Command')
-    for part in ('tilt', 'thrust'):
-        shape = getattr(getattr(command, part), 'shape', None)
-        if shape != (ROTORS,):
-            raise ControllerError(
-                f"controller '{name}': step returned a command whose {part} is "
-                f"{f'of shape {shape}' if shape is not None else 'no array'}, expected a numpy "
-                f'array of {ROTORS}')
-    return command
 
 
 def reach_of(controller: Controller) -> float:

@@ -64,8 +64,9 @@ class HoverParameters(ParameterFile, file='hover.yaml'):
         0.04, doc='time constant that the lead gives the thrust', unit='s', low=0.005, high=1)
     thrust_rate: float = parameter(300.0, doc='fastest change of a thrust target', unit='N/s',
                                    low=1, high=1e5)
-    tilt_rate: float = parameter(9.0, doc='fastest change of a tilt target', unit='rad/s', low=0.1,
-                                 high=100)
+    tilt_rate_share: float = parameter(
+        0.9, doc="fastest change of a tilt target, as a share of the servos' velocity limit",
+        low=0.01, high=1)
     tilt_full_thrust: float = parameter(
         1.0, doc='a rotor with less thrust turns its joint proportionally slower', unit='N',
         low=0, high=20)
@@ -236,8 +237,9 @@ class HoverController:
         p, rotors = self.parameters, self._robot.rotors
         busy = np.ones(4) if p.tilt_full_thrust == 0 or not self._health.healthy else \
             np.minimum(1.0, goal.thrust / p.tilt_full_thrust)
-        limit = self._robot.joints.position_limit
-        reach = p.tilt_rate * dt * busy
+        joints = self._robot.joints
+        limit = joints.position_limit
+        reach = p.tilt_rate_share * joints.velocity_limit * dt * busy
         tilt = clipped(present + clipped(goal_tilt - present, -reach, reach), -limit, limit)
         thrust = self._thrust_on_the_way(goal, state.tilt)
         lead = rotors.time_constant / p.thrust_response

@@ -1,6 +1,5 @@
 """Nonlinear model predictive control by real-time iteration."""
 
-from dataclasses import replace
 import logging
 
 import numpy as np
@@ -47,10 +46,12 @@ class NmpcController:
 
     def __init__(self, robot: RobotParameters, parameters: NmpcParameters | None = None):
         """Build or load the solver; the first time takes some seconds of compilation."""
-        p = with_delays(robot, parameters or NmpcParameters.load())
+        p = parameters or NmpcParameters.load()
+        actuators = p.actuators(robot)
         self._parameters, self.reach = p, p.reach
         self._robot = robot
-        problem = ocp.build(robot, p.model.servo_lag, p.model.rotor_lag, p.horizon.change_time)
+        problem = ocp.build(robot, actuators.servo_lag, p.model.rotor_lag,
+                            p.horizon.change_time)
         intervals = p.horizon.intervals
         soft = (p.limits.slack_linear, p.limits.slack_quadratic,
                 p.limits.height_quadratic) if p.limits.soft else None
@@ -64,17 +65,15 @@ class NmpcController:
         self._estimator = DisturbanceEstimator(robot, p.disturbance, p.model.command_delay,
                                                FunctionCall(advance, library))
         self._planner = ReferencePlanner(robot, np.r_[0.0, np.cumsum(intervals)], p.unwind,
-                                         p.model.servo_lag)
+                                         actuators.servo_lag)
         self._state_size = problem.state_size
         self._weights = p.weights.vector()
-        thrust_max = p.limits.thrust_max
-        tilt = min(p.limits.tilt, robot.joints.position_limit)
-        self._all_bounds = np.r_[np.full(4, -tilt), np.full(4, robot.rotors.thrust_min),
-                             np.full(4, tilt), np.full(4, thrust_max),
+        self._all_bounds = np.r_[np.full(4, -actuators.tilt), np.full(4, robot.rotors.thrust_min),
+                             np.full(4, actuators.tilt), np.full(4, actuators.thrust_max),
                              p.limits.velocity, p.limits.rate,
                              # lead of a held target at which the lag has the rate limit
-                             p.limits.tilt_rate * intervals / -np.expm1(
-                                 -intervals / p.model.servo_lag)]
+                             actuators.tilt_rate * intervals / -np.expm1(
+                                 -intervals / actuators.servo_lag)]
         self._health, self._bounds = ALL_HEALTHY, self._all_bounds
         self.reset()
 
@@ -133,10 +132,9 @@ class NmpcController:
         if self._started and not _finite(state):
             self._rejected += 1
             return self._command(state.stamp)
-        state = redated(state, self._robot)
         full = self._estimator.update(state)
         x0 = np.concatenate([full[:13], full[model.TILT], full[model.THRUST]])[:self._state_size]
-        start = state.stamp + self._parameters.model.command_delay
+        start = state.stamp + self._estimator.delay
         disturbance = self._estimator.disturbance
         references = self._planner.plan(target, start, state.quaternion, full[model.TILT],
                                         disturbance)
@@ -181,28 +179,6 @@ class NmpcController:
                 'force_estimate_N': float(np.linalg.norm(d[model.FORCE])),
                 'torque_estimate_Nm': float(np.linalg.norm(d[model.TORQUE])),
                 'servo_offset_rad': float(np.max(np.abs(d[model.TILT_OFFSET])))}
-
-
-def redated(state: State, robot: RobotParameters) -> State:
-    """State with the capture time of its tilts, which may be before their stamp."""
-    delay = robot.sensors.encoder_delay
-    return replace(state, tilt_stamp=state.tilt_stamp - delay) if delay else state
-
-
-def with_delays(robot: RobotParameters, parameters: NmpcParameters) -> NmpcParameters:
-    """
-    Add the robot file's command delays and servo gains to the controller's model.
-
-    The prediction uses the mean of the delays of tilts and thrusts. With a delay of 50 ms of the
-    tilts only, the error on a lemniscate of 2.4 m and 16 s is then 4 mm. It is 5 mm with a
-    prediction by the whole delay, 27 mm with a longer servo lag in the horizon, and 8 mm without
-    prediction. With 80 ms it is 6 mm with the mean; without prediction the robot crashes.
-    """
-    settings = parameters.model
-    servo = robot.joints.kd / robot.joints.kp if 'joint_bandwidth' in robot.effects \
-        else settings.servo_lag
-    delay = max(settings.command_delay + sum(robot.command_delays) / 2, 0.0)
-    return replace(parameters, model=replace(settings, servo_lag=servo, command_delay=delay))
 
 
 def _finite(state):

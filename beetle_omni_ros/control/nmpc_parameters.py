@@ -1,13 +1,33 @@
 """Parameters of the NMPC, as read from params/nmpc.yaml or nmpc_published.yaml."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from beetle_omni_ros.control.ocp import WEIGHTS
+from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import group, parameter, ParameterError, ParameterFile
 
 LONGEST_HORIZON = 64  # MAX_STAGES of rti.c
+
+
+class Actuators(NamedTuple):
+    """
+    Servos and rotors in the optimal control problem.
+
+    Attributes:
+        servo_lag: time constant of the first-order servo model [s].
+        tilt: largest tilt target, to each side [rad].
+        tilt_rate: largest tilt rate [rad/s].
+        thrust_max: largest thrust [N].
+
+    """
+
+    servo_lag: float
+    tilt: float
+    tilt_rate: float
+    thrust_max: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,8 +54,9 @@ class HorizonParameters:
 class ModelParameters:
     """Options of the prediction model."""
 
-    servo_lag: float = parameter(0.03, doc='time constant of the first-order servo model',
-                                 unit='s', low=0.002, high=0.5, read_only=True)
+    servo_lag: float | None = parameter(
+        None, doc="time constant of the first-order servo model; absent: the robot's", unit='s',
+        low=0.002, high=0.5, read_only=True)
     rotor_lag: bool = parameter(True, doc='thrust as a state with the rotor time constant '
                                 '(21 states) instead of a direct input (17)', read_only=True)
     command_delay: float = parameter(
@@ -51,16 +72,18 @@ class LimitParameters:
         3.0, doc='largest component of the world velocity', unit='m/s', low=0.05, high=20)
     rate: float = parameter(
         6.0, doc='largest component of the body rate', unit='rad/s', low=0.1, high=50)
-    tilt: float = parameter(
-        3.96, doc='largest tilt target, to each side', unit='rad', low=0.1, high=20)
-    tilt_rate: float = parameter(
-        7.0, doc='largest tilt rate, as a bound on the lead of the tilt targets', unit='rad/s',
-        low=0.1, high=1000)
+    tilt: float | None = parameter(
+        None, doc="largest tilt target, to each side; at most, and if absent, the robot's",
+        unit='rad', low=0.1, high=20)
+    tilt_rate_share: float = parameter(
+        0.7, doc="largest tilt rate, as a share of the robot's: a bound on the lead of the tilt "
+        'targets', low=0.01, high=1)
     tilt_rate_intervals: int = parameter(
         5, doc='number of first intervals with this bound; 0: none', low=0, high=60,
         read_only=True)
-    thrust_max: float = parameter(
-        20.0, doc='largest thrust inside the optimisation', unit='N', low=0.1, high=200)
+    thrust_max: float | None = parameter(
+        None, doc="largest thrust inside the optimisation; absent: the robot's", unit='N', low=0.1,
+        high=200)
     soft: bool = parameter(
         True, doc='limits of velocity, rate and height may be exceeded at a cost, which keeps the '
         'QP feasible', read_only=True)
@@ -151,3 +174,12 @@ class NmpcParameters(ParameterFile, file='nmpc.yaml'):
         unit='rad', low=0, high=6.3)
     reach: float = parameter(10.0, doc='a target farther from the robot is refused', unit='m',
                              low=0.5, high=1000, read_only=True)
+
+    def actuators(self, robot: RobotParameters) -> Actuators:
+        """Servos and rotors of the problem: of the robot file, unless this file overrides them."""
+        model, limits, joints = self.model, self.limits, robot.joints
+        return Actuators(
+            servo_lag=model.servo_lag or joints.time_constant,
+            tilt=min(limits.tilt or joints.position_limit, joints.position_limit),
+            tilt_rate=limits.tilt_rate_share * joints.velocity_limit,
+            thrust_max=limits.thrust_max or robot.rotors.thrust_max)

@@ -25,6 +25,7 @@ INPUT, OUTPUT = 'observation', 'action'
 ACTIONS = JOINT_NAMES + ROTOR_NAMES
 TILT_SCALE, THRUST_SCALE = 0.25, 0.5   # [rad], [N] for an action of 1, as published
 RATE_HZ = 100.0
+NAMED = 5                              # differing parameters in a message
 LARGEST = 1e12                         # of a scale or an offset
 TOLERANCE = 1e-6                       # of scales and offsets, which travel as text
 
@@ -47,6 +48,7 @@ class PolicyContract:
         rate_hz: steps a second.
         robot: name of the robot that it was trained for.
         robot_hash: :meth:`RobotParameters.hash` of that robot.
+        robot_values: its parameters, :meth:`RobotParameters.as_dict`; {} in an old file.
         name: of the policy.
         training: conditions: randomisation, seed, iterations, duration and so on.
         metrics: results of the assessment.
@@ -63,6 +65,7 @@ class PolicyContract:
     rate_hz: float = RATE_HZ
     robot: str
     robot_hash: str
+    robot_values: dict = field(default_factory=dict)
     name: str = ''
     training: dict = field(default_factory=dict)
     metrics: dict = field(default_factory=dict)
@@ -74,6 +77,7 @@ class PolicyContract:
     def default(cls, robot: RobotParameters, memory: bool = False) -> PolicyContract:
         """Describe a policy that this version can fly on ``robot``."""
         return cls(observations=blocks(memory), robot=robot.name, robot_hash=robot.hash(),
+                   robot_values=robot.as_dict(),
                    action_scale=np.repeat([TILT_SCALE, THRUST_SCALE], 4),
                    action_offset=np.repeat([0.0, robot.hover_thrust], 4),
                    name=kind(memory))
@@ -96,9 +100,10 @@ class PolicyContract:
                 'action_scale': json.dumps(np.asarray(self.action_scale).tolist()),
                 'action_offset': json.dumps(np.asarray(self.action_offset).tolist()),
                 'rate_hz': f'{self.rate_hz:g}', 'robot': self.robot,
-                'robot_hash': self.robot_hash, 'training': json.dumps(self.training),
-                'metrics': json.dumps(self.metrics), 'commit': self.commit,
-                'version': self.version, 'created': self.created}
+                'robot_hash': self.robot_hash,
+                'robot_values': json.dumps(self.robot_values),
+                'training': json.dumps(self.training), 'metrics': json.dumps(self.metrics),
+                'commit': self.commit, 'version': self.version, 'created': self.created}
 
     @classmethod
     def from_metadata(cls, metadata: dict[str, str]) -> PolicyContract:
@@ -120,6 +125,7 @@ class PolicyContract:
         return cls(observations=_blocks(metadata), actions=_names(metadata),
                    action_scale=_eight(metadata, 'action_scale'),
                    action_offset=_eight(metadata, 'action_offset'), rate_hz=_rate(metadata),
+                   robot_values=_mapping(metadata, 'robot_values'),
                    training=_mapping(metadata, 'training'), metrics=_mapping(metadata, 'metrics'),
                    **texts)
 
@@ -149,7 +155,9 @@ class PolicyContract:
                                  f'{self.rate_hz:g}')
         warning = self._other_robot(robot)
         if warning and not allow_other_robot:
-            raise ParameterError(f'{warning}; train a policy for it, or set allow_other_robot')
+            raise ParameterError(f'{warning}; train a policy for this robot, or fly this policy '
+                                 'with --allow-other-robot (evaluate and fly; '
+                                 'allow_other_robot:=true of launch file and nodes)')
         if not warning:
             _check_numbers('action_offset', self.action_offset, expected.action_offset)
         return warning
@@ -161,11 +169,24 @@ class PolicyContract:
                                         if CATALOGUE[name].kind != 'sensor'})
         if self.robot_hash == flown.hash():
             return ''
-        text = f'robot_hash: trained for {self.robot!r} ({self.robot_hash}), this is ' \
-               f'{robot.name!r} ({robot.hash()})'
-        if robot.effects and replace(robot, effects={}).hash() == self.robot_hash:
-            text += f", which adds the effects {', '.join(robot.effects)}"
-        return text
+        known, shipped = self.robot_values, RobotParameters.load()
+        if not known and shipped.hash() == self.robot_hash:
+            known = shipped.as_dict()
+        found = list(_differences(flown.as_dict(), known)) if known else []
+        found = found or [f'robot_hash {self.robot_hash} in training, {flown.hash()} here']
+        more = f'; {len(found) - NAMED} more' if len(found) > NAMED else ''
+        return f"trained for other robot parameters: {'; '.join(found[:NAMED])}{more}"
+
+
+def _differences(flown, trained, prefix=''):
+    """Yield a text for each parameter of ``flown`` that differs in ``trained``."""
+    for key, value in flown.items():
+        other = trained.get(key) if isinstance(trained, dict) else None
+        if isinstance(value, dict) and value and other:
+            yield from _differences(value, other, f'{prefix}{key}.')
+        elif value != other:
+            yield (f'{prefix}{key} {shortened(str(other), 60)} in training, '
+                   f'{shortened(str(value), 60)} here')
 
 
 def _entry(metadata, key, kind, what):

@@ -66,6 +66,7 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
                                   seed=seed, faults=faults)
         simulator, stayed = loop.simulator, loop.fly(task, progress)
         recorder.write_meta({'crashed': not stayed, 'ended': loop.ending,
+                             'controller_error': loop.controller_error,
                              'broken': simulator.truth.broken})
         if simulator.truth.impact is not None:
             recorder.write_meta({'impact': asdict(simulator.truth.impact)})
@@ -133,9 +134,11 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
             if not console.is_terminal:     # which shows no progress bar
                 console.print(f'{name}: {task} flown in {monotonic() - begin:.0f} s',
                               highlight=False)
-            if log.meta['ended']:
-                console.print(f'{name}: the flight ended early, {log.meta["ended"]}',
-                              style='yellow', highlight=False)
+            for text in (log.meta['ended'] and f'the flight ended early, {log.meta["ended"]}',
+                         log.meta['controller_error']):
+                if text:
+                    console.print(f'{name}: {text}', style='yellow', markup=False,
+                                  highlight=False)
     table.print_results(results, console)
     write_json(json_path, results)
     return results

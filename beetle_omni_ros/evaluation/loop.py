@@ -14,17 +14,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.control.base import (
-    called,
-    checked,
-    Controller,
-    corrected,
-    forward_health,
-    PoseTarget,
-    reach_of,
-    State,
-    Target,
-)
+from beetle_omni_ros.control.base import Controller, State, Target
+from beetle_omni_ros.control.host import ControllerError, ControllerHost
 from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.parameters import EkfParameters
@@ -34,7 +25,7 @@ from beetle_omni_ros.evaluation.processes import Processes
 from beetle_omni_ros.messages.values import Odom, Wrench
 from beetle_omni_ros.robot.actuator_health import ALL_HEALTHY
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.runs.target_checks import out_of_reach, TargetChecks
+from beetle_omni_ros.runs.target_checks import TargetChecks
 from beetle_omni_ros.runs.tasks import Task, TaskPlayer
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.supervisor import Supervisor
@@ -87,16 +78,16 @@ class FlightLoop:
         self._accepts_other = False
         self.refusals: list[str] = []
         self.simulator, self._estimator = simulator, estimator
-        self._controllers, self.supervisor, self._recorder = controllers, supervisor, recorder
+        self.supervisor, self._recorder = supervisor, recorder
         self._timers = {name: ComputeTimer(c.period) for name, c in controllers.items()}
         self._every = {name: max(1, round(c.period / simulator.tick))
                        for name, c in controllers.items()}
-        self._target: Target | None = None
-        self._hold: Target | None = None
+        self._hosts = {name: ControllerHost(name, c, self._timers[name].call)
+                       for name, c in controllers.items()}
         self._joints = self._battery = self._command = self._estimated = None
         self._ticks = 0
         self._state_name = self._recorded_state = ''
-        self._health = ALL_HEALTHY
+        self._override, self._health = None, ALL_HEALTHY
         self._crashed = False
         self._began = 0.0       # of the task, simulated time
         self.ending = ''
@@ -133,6 +124,12 @@ class FlightLoop:
         """Controller -> summary of its CPU times."""
         return {name: timer.summary() for name, timer in self._timers.items()}
 
+    @property
+    def controller_error(self) -> str:
+        """The last exception of each controller with their number, or ''."""
+        return '; '.join(f'{host.error}, {host.errors} times' for host in self._hosts.values()
+                         if host.errors)
+
     def fly(self, task: Task, progress: Callable[[float], None] = lambda part: None) -> bool:
         """
         Take off and fly the task.
@@ -145,7 +142,7 @@ class FlightLoop:
             whether the robot was airborne to the end.
 
         Raises:
-            FlightError: no take-off.
+            ControllerError, FlightError: no take-off.
 
         """
         with collector_off():
@@ -190,7 +187,8 @@ class FlightLoop:
 
     def aim(self, target: Target) -> None:
         """Set the target in force."""
-        self._target = target
+        for host in self._hosts.values():
+            host.target = target
         self._recorder.write_target(target)
 
     @property
@@ -203,21 +201,28 @@ class FlightLoop:
         Arm and climb until a controller flies.
 
         Raises:
+            ControllerError: the active controller raised an exception.
             FlightError: no take-off.
 
         """
         while self.simulator.time < SETTLE_TIME or (
                 self._estimator.status != 'tracking' and self.simulator.time < START_TIMEOUT):
-            self.step()
+            self._step_before_flight()
         answer = self.supervisor.arm(self.simulator.time)
         if not answer:
             raise FlightError(answer.text)
         while self.supervisor.state != 'flying':
-            self.step()
+            self._step_before_flight()
             if self.simulator.time > TAKEOFF_TIMEOUT or self.supervisor.state == 'disarmed':
-                events = [event.text for event in self.supervisor.events]
+                events = list(dict.fromkeys(     # the newest first, each once
+                    event.text for event in reversed(self.supervisor.events)))
                 raise FlightError(f'no take-off within {TAKEOFF_TIMEOUT:g} s, supervisor in '
-                                  f"'{self.supervisor.state}' ({'; '.join(events[-3:])})")
+                                  f"'{self.supervisor.state}' ({'; '.join(events[2::-1])})")
+
+    def _step_before_flight(self):
+        self.step()
+        if error := self._hosts[self.supervisor.active].error:
+            raise ControllerError(error)
 
     def step(self) -> Frame:
         """Run one tick of the simulator and of every process that is due in it."""
@@ -284,46 +289,43 @@ class FlightLoop:
             send('on_actuators', name, text, now)
 
     def _control(self, state, now):
-        """Step the controllers that are due; before the first target hold the take-off's pose."""
-        if self._target is None and not self._state_name.startswith('flying'):
-            self._hold = PoseTarget(state.position, state.quaternion, state.stamp)
-        if self.supervisor.health is not self._health:
-            self._health = self.supervisor.health
-            for name, controller in self._controllers.items():
-                called(name, 'set_health', forward_health, controller, self._health)
-        state = corrected(state, self._health)
-        for name, controller in self._controllers.items():
+        """Step the controllers that are due."""
+        supervisor = self.supervisor
+        for host in self._hosts.values():
+            host.on_estimate(state)
+            if supervisor.target_override is not self._override:
+                host.override = supervisor.target_override
+            if supervisor.health is not self._health:
+                host.on_health(supervisor.health)
+        self._override, self._health = supervisor.target_override, supervisor.health
+        for name, host in self._hosts.items():
             if self._ticks % self._every[name]:
                 continue
-            command = checked(name, called(name, 'step', self._timers[name].call, controller.step,
-                                           state, self._target_in_force()))
-            if name == self.supervisor.active:
+            command = host.step(state, self._target_of_fault(host))
+            if name == supervisor.active:
                 for passed in self._processes.requests(command, now):
                     self._request(name, passed, now)
-            else:
+            elif command is not None:
                 self._request(name, command, now)
 
     def _request(self, name, command, now):
         self._recorder.write(f'{name}/command', command, now)
         self._processes.send('on_command', name, command, now)
 
-    def _target_in_force(self):
-        """Target of the supervisor, else an accepted target of a fault, else that of the task."""
+    def _target_of_fault(self, host):
+        """Return the accepted target of a fault, which replaces that of the task, or None."""
         if self.supervisor.target_override is not None:
-            return self.supervisor.target_override
-        target = self._target if self._target is not None else self._hold
-        other = self._processes.target(target)
+            return None
+        other = self._processes.target(host.target_in_force)
         if other is None:
             self._other_target = None
-            return target
-        if self._other_target is None:
+        elif self._other_target is None:
             self._other_target = other
-            reason = self._check_target(other) or out_of_reach(
-                other, self._estimator.estimate.position,
-                reach_of(self._controllers[self.supervisor.active]), self.now)
+            active = self._hosts[self.supervisor.active]
+            reason = self._check_target(other) or active.too_far(other, self.now)
             self._accepts_other = not reason
             self.refusals += [reason] if reason else []
-        return self._other_target if self._accepts_other else target
+        return self._other_target if self._accepts_other else None
 
     def _note_state(self, now):
         reported = self.supervisor.reported_state
@@ -331,6 +333,9 @@ class FlightLoop:
         if reported != self._recorded_state:
             self._recorded_state = reported
             self._recorder.write('supervisor/state', reported, now)
+            for host in self._hosts.values():
+                reason = host.on_mode(reported, self.now)
+                self.refusals += [reason] if reason else []
         if name != self._state_name:
             if self._state_name.startswith(('flying', 'fallback')) \
                     and name in ('landing', 'emergency_stop', 'disarmed'):
@@ -340,9 +345,6 @@ class FlightLoop:
             if self._state_name.startswith(('flying', 'fallback', 'landing')) \
                     and name in ('disarmed', 'emergency_stop'):
                 self._crashed = True
-            if name in ('disarmed', 'emergency_stop'):
-                for key, controller in self._controllers.items():
-                    called(key, 'reset', controller.reset)
             self._state_name = name
 
     def _report_compute(self):

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import asdict
 from datetime import datetime, timezone
+from inspect import getfile
 import json
 from math import ceil
 from pathlib import Path
@@ -163,7 +164,8 @@ class _Flyer:
         with ExitStack() as stack:
             stored, kind, results = None, dict[str, str](), list[dict]()
             if self._file:
-                kind = {'code': code_fingerprint(beside=('faults',)), 'list': self._listed,
+                kind = {'code': code_fingerprint(flown_by=(Path(getfile(function)),)),
+                        'list': self._listed,
                         'flown': title + ' with bags' * any(
                             isinstance(argument, Path) for argument in arguments)}
                 lines, results = self._stored(kind, trials)

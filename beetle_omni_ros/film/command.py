@@ -14,7 +14,8 @@ from beetle_omni_ros.pages.figures import COLOURS
 from beetle_omni_ros.pages.table import Terminal
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.bag import BagError, read_bag
+from beetle_omni_ros.runs.bag import read_bag
+from beetle_omni_ros.runs.bag_files import no_pose, runs_in
 from beetle_omni_ros.runs.log import FlightLog
 
 MAX_PANELS = 4
@@ -34,7 +35,7 @@ def run_film(paths: list[Path], outputs: list[Path], *, models: list[Path] = (),
         ParameterError: unusable arguments or files.
 
     """
-    console = console or Terminal()
+    console, paths = console or Terminal(), runs_in(paths)
     _check(paths, outputs, models, size, start, duration)
     drawn = RobotParameters.load(robot)
     logs = [_read(path) for path in paths]
@@ -85,5 +86,5 @@ def _check(paths, outputs, models, size, start, duration):
 def _read(path: Path) -> FlightLog:
     log = read_bag(path)
     if not len(log.truth_t) and not len(log.odom_t):
-        raise BagError(f'{path}: contains no pose of the robot (ground_truth/odom or odom)')
+        raise no_pose(path, log.warnings)
     return log

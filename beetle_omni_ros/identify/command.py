@@ -5,10 +5,9 @@ from pathlib import Path
 
 from rich.console import Console
 
-from beetle_omni_ros.identify import rotor_results as of_rotor
 from beetle_omni_ros.identify.robot_file import check_outputs
-from beetle_omni_ros.identify.rotor import identify_rotor
-from beetle_omni_ros.identify.rotor_log import read_rotor_log
+from beetle_omni_ros.identify.rotor import results as of_rotor
+from beetle_omni_ros.identify.rotor.log import chosen, read_rotor_log
 from beetle_omni_ros.identify.servo import page as of_joints
 from beetle_omni_ros.identify.servo.joint import identify, joint_results
 from beetle_omni_ros.identify.servo.log import read_joint_log
@@ -53,16 +52,18 @@ def run_identify_joint(paths: Sequence[Path], *, validate: Sequence[Path] = (),
     return results
 
 
-def run_identify_rotor(path: Path, *, robot: Path | None = None, json_path: Path | None = None,
-                       report: Path | None = None, params: Path | None = None,
-                       console: Console | None = None) -> dict:
+def run_identify_rotor(paths: Sequence[Path], *, columns: Sequence[str] = (),
+                       rate: float | None = None, robot: Path | None = None,
+                       json_path: Path | None = None, report: Path | None = None,
+                       params: Path | None = None, console: Console | None = None) -> dict:
     """
-    Identify a rotor's map and torque ratio from a bench log.
+    Identify a rotor's thrust, torque and lag from logs of a force-torque stand.
 
     Arguments are those of `beetle_omni identify rotor`.
 
     Returns:
-        ``plateaus``, ``torque_to_thrust_ratio``, ``warnings`` and ``meta``.
+        ``verdict``, ``surface``, ``plateaus``, ``torque``, ``torque_to_thrust_ratio``, ``lag``,
+        ``temperature``, ``warnings`` and ``meta``.
 
     Raises:
         LogError, ParameterError: unusable input.
@@ -71,16 +72,16 @@ def run_identify_rotor(path: Path, *, robot: Path | None = None, json_path: Path
     console = console or Terminal()
     check_outputs(params, robot, json_path, report, 'report')
     robot_parameters = RobotParameters.load(robot)
-    log = read_rotor_log(path)
-    rows, ratio = identify_rotor(log)
-    results = of_rotor.rotor_results(log, rows, ratio)
+    mapping = chosen(columns)
+    model = of_rotor.identify_rotor([read_rotor_log(path, mapping, rate) for path in paths])
+    results = of_rotor.rotor_results(model)
     if robot:
         results['meta']['robot'] = str(robot)
-    _print(console, of_rotor.grids(results), [f'warning: {w}' for w in results['warnings']])
+    _print(console, of_rotor.grids(results), [f'verdict: {results["verdict"]}', *(
+        f'warning: {w}' for w in results['warnings'])])
     write_json(json_path, results)
     if report:
-        write_text(report, of_rotor.rotor_page(log, rows, ratio, robot_parameters, results),
-                   'report')
+        write_text(report, of_rotor.rotor_page(model, robot_parameters, results), 'report')
     if params:
         of_rotor.write_rotor_file(params, results, robot)
     return results

@@ -84,25 +84,35 @@ class ServoFitParameters:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RotorLogParameters:
-    """Bench log of a rotor, and its map."""
+    """Logs of a rotor on a force-torque stand."""
 
     duty: np.ndarray = parameter(doc='Range of the duty.', unit='%', shape=(2,), low=0, high=200)
     largest_force: float = parameter(doc='Largest thrust.', unit='N', low=1, high=1e4)
     largest_torque: float = parameter(doc='Largest torque.', unit='N m', low=0.1, high=1e4)
     voltage: np.ndarray = parameter(doc='Range of the voltage.', unit='V', shape=(2,), low=0,
                                     high=1000)
-    least_rows: int = parameter(doc='Least number of rows of a plateau.', low=5, high=10**6)
-    settling: float = parameter(doc='Unused time after a change of PWM.', unit='s', low=0, high=60)
-    plateau_width: float = parameter(
-        doc='Standard deviation of the smoothing of the voltage density.', unit='V', low=0.001,
-        high=10)
-    valley: float = parameter(
-        doc='Largest ratio of a minimum between two plateaus and the lower maximum.', unit='1',
-        low=0, high=1)
-    stop_duty: float = parameter(doc='Duty up to which the rotor does not turn.', unit='%', low=0,
+    largest_speed: float = parameter(doc='Largest speed.', unit='rpm', low=100, high=1e6)
+    temperature: np.ndarray = parameter(doc='Range of the temperature.', unit='deg C',
+                                        shape=(2,), low=-273, high=1000)
+    least_rows: int = parameter(doc='Least number of rows of a log.', low=5, high=10**6)
+    least_sweep: float = parameter(doc='Least range of the duty from stop 0 to full 1.', unit='1',
+                                   low=0.01, high=1)
+    least_heating: float = parameter(doc='Least range of the temperature.', unit='K', low=0,
+                                     high=100)
+    settling: float = parameter(doc='Settling time after a change of command.', unit='s',
+                                low=0.01, high=60)
+    still: float = parameter(doc='Largest share of the command that its lagged value differs by.',
+                             unit='1', low=0, high=1)
+    blocks: int = parameter(doc='Largest number of blocks of a surface.', low=5, high=1000)
+    least_packs: int = parameter(doc='Least number of packs that serve as blocks.', low=3,
                                  high=100)
-    least_slope: float = parameter(doc='Least slope of the map, for 10 N.', unit='%', low=0.01,
-                                   high=100)
+    simpler: float = parameter(doc='Largest ratio of the errors with more terms and without.',
+                               unit='1', low=0, high=1)
+    gain_window: float = parameter(doc='Time with one gain between thrust and command.',
+                                   unit='s', low=0.05, high=60)
+    gain_scatter: float = parameter(doc='Largest scatter of this gain.', unit='1', low=0, high=10)
+    gain_share: float = parameter(doc='Largest ratio of the errors with own gains and without.',
+                                  unit='1', low=0, high=1)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

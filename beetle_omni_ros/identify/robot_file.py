@@ -4,6 +4,7 @@ from pathlib import Path
 
 import yaml
 
+from beetle_omni_ros.robot.parameters import find_robot
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.json_file import check_writable, write_text
@@ -20,7 +21,7 @@ def check_outputs(path: Path | None, base: Path | None, json_path: Path | None,
         ParameterError: one cannot, or the robot file would replace the one that it extends.
 
     """
-    if path and base and path.resolve() == base.resolve():
+    if path and base and path.resolve() == find_robot(base).resolve():
         raise ParameterError(f'{path}: --params cannot replace the file of --robot, which it '
                              'extends')
     check_writable(json_path)
@@ -43,6 +44,7 @@ def write_robot_file(path: Path, head: str, content: dict, base: Path | None) ->
 
     """
     if base:
+        base = find_robot(base)
         together = base.resolve().parent == path.resolve().parent
         extends = base.name if together else str(base.resolve())
     else:

@@ -6,26 +6,16 @@ import math
 from rclpy.node import Node
 
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.control.base import (
-    called,
-    checked,
-    ControllerError,
-    corrected,
-    forward_health,
-    guidance_of,
-    PoseTarget,
-    reach_of,
-    State,
-)
+from beetle_omni_ros.control.base import guidance_of, PoseTarget, State
+from beetle_omni_ros.control.host import ControllerHost, MOTORS_OFF
 from beetle_omni_ros.control.registry import ControllerEntry
 from beetle_omni_ros.messages.values import MessageError
 from beetle_omni_ros.nodes import health
 from beetle_omni_ros.nodes.command_source import CommandSource
 from beetle_omni_ros.nodes.node import FlightNode
-from beetle_omni_ros.robot.actuator_health import ALL_HEALTHY
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import parameter, ParameterError
-from beetle_omni_ros.runs.target_checks import out_of_reach, TargetChecks
+from beetle_omni_ros.runs.target_checks import TargetChecks
 
 ODOM_AGE = 0.05         # s, no command answers an older estimate
 JOINT_AGE = 0.1         # s
@@ -37,11 +27,9 @@ NAME = 'controller_node'    # of the executable, before its controller is known
 
 class ControllerNode(FlightNode):
     """
-    Steps a controller once a period, triggered by the estimate.
+    Steps a controller once a period, triggered by the estimate; see ControllerHost.
 
-    Before the first target it holds the pose at which it became active. While another controller
-    is active, it still computes commands, so that it can take over without a jump. An exception of
-    the controller is logged and reported in diagnostics; no command is then published.
+    An exception of the controller is logged and reported in diagnostics.
     """
 
     real_time = True
@@ -61,17 +49,13 @@ class ControllerNode(FlightNode):
         super().__init__(f'{entry.name}_node', node_parameters(entry, not is_own),
                          entry.parameters_file, entry.file_key, completed=entry.completed)
         self._entry = entry
-        self._controller = entry.make(
-            RobotParameters.load(self.parameters.robot_file or None),
-            parameters=self.parameters if entry.parameters else None)
-        self._target = self._joints = self._command = None
-        self._hold = self._override = self._position = None
-        self._actuators = ALL_HEALTHY
-        self._checks = TargetChecks(RobotParameters.load(self.parameters.robot_file or None))
-        self._mode, self._own_mode = '', f'flying:{entry.name}'
+        robot = RobotParameters.load(self.parameters.robot_file or None)
+        controller = entry.make(robot, parameters=self.parameters if entry.parameters else None)
+        self._host = ControllerHost(entry.name, controller, self.timed, self._log)
+        self._checks = TargetChecks(robot)
+        self._joints = self._command = None
         self._last_step = 0.0
-        self._errors, self._reported_errors = 0, 0
-        self._error, self._logged = '', ('', -math.inf)     # text, time of the line
+        self._reported_errors, self._logged = 0, ('', -math.inf)    # text, time of the line
         self._publisher = self.publisher(f'{entry.name}/command')
         self.listen('odom', self._on_odom, max_age=ODOM_AGE)
         self.listen('joint_states', self._on_joints, max_age=JOINT_AGE)
@@ -83,7 +67,7 @@ class ControllerNode(FlightNode):
         self.follow('supervisor/state', self._on_mode)
         self.listen('supervisor/target', self._on_override, stale_after=None)
         self.listen('supervisor/actuators', self._on_actuators, stale_after=None)
-        self.health.track_compute(self._controller.period)
+        self.health.track_compute(controller.period)
         self.health.report('controller', self._controller_status)
 
     def _on_joints(self, joints):
@@ -101,14 +85,9 @@ class ControllerNode(FlightNode):
             now = self.now()
             then = now if now and abs(now - target.stamp) > OTHER_CLOCK else None
         reason = self._checks.why_not(target, then) or (
-            self._too_far(target) if self._mode == self._own_mode else '')
+            self._host.too_far(target, self.now()) if self._host.active else '')
         if reason:
             raise MessageError(reason, 'cannot be flown')
-
-    def _too_far(self, target):
-        """Return why a target is out of reach from the present position, or ''."""
-        return '' if self._position is None else out_of_reach(
-            target, self._position, reach_of(self._controller), self.now())
 
     def _on_target(self, target, _=math.nan):
         now = self.now()
@@ -118,8 +97,9 @@ class ControllerNode(FlightNode):
             target = replace(target, stamp=now)
         # Latched and volatile copies may overtake each other: the newest stamp counts, except
         # after the clock was set back.
-        if self._target is None or not target.stamp < self._target.stamp <= now:
-            self._target = target
+        old = self._host.target
+        if old is None or not target.stamp < old.stamp <= now:
+            self._host.target = target
 
     def _from_now(self, target):
         now = self.now()
@@ -128,61 +108,35 @@ class ControllerNode(FlightNode):
         return replace(target, stamp=now, times=target.times + now)
 
     def _on_override(self, override):
-        self._override = override.target
+        self._host.override = override.target
 
     def _on_actuators(self, report):
-        self._actuators = report.health
-        self._call('set_health', forward_health, self._controller, report.health)
+        self._host.on_health(report.health)
 
     def _on_mode(self, mode):
-        state = mode.partition(':')[0]
-        if state in ('disarmed', 'emergency_stop') and self._mode.partition(':')[0] != state:
-            self._call('reset', self._controller.reset)
-            self._command = self._hold = self._override = None
-        took_over = mode == self._own_mode != self._mode
-        self._mode = mode
-        if took_over and self._target is not None and (reason := self._too_far(self._target)):
-            # The target was accepted while another controller was active.
+        if mode.partition(':')[0] in MOTORS_OFF:
+            self._command = None
+        if reason := self._host.on_mode(mode, self.now()):
             self.health.rejected('target_pose', f'{reason}; the present pose is held',
                                  'cannot be flown')
-            self._target = self._hold = None
 
     def _on_odom(self, odom):
-        self._position = odom.position
+        self._host.on_estimate(odom)
         if self._joints is None or not self._is_due(odom.stamp):
             return
         self._last_step = odom.stamp
-        state = corrected(State.join(odom, self._joints, self._command), self._actuators)
-        if self._target is None:
-            if self._hold is None or not self._mode.startswith('flying'):
-                self._hold = PoseTarget(odom.position, odom.quaternion, odom.stamp)
-        target = self._override or self._target or self._hold
-        command = self._call('step', self._step, state, target)
+        command = self._host.step(State.join(odom, self._joints, self._command))
         if command is not None:
             self._publisher.publish(command)
 
-    def _step(self, state, target):
-        return self.timed(self._controller.step, state, target)
-
-    def _call(self, method, function, *arguments):
-        """
-        Return the result of a controller's method; None after an exception, which is logged.
-
-        In a process with other nodes, the exception would end the supervisor, too.
-        """
-        try:
-            result = called(self._entry.name, method, function, *arguments)
-            return checked(self._entry.name, result) if method == 'step' else result
-        except ControllerError as error:
-            self._errors, self._error = self._errors + 1, str(error)
-            text, at = self._logged
-            if text != self._error and not 0 <= (now := self.elapsed()) - at < health.REPEAT:
-                self._logged = self._error, now
-                self.get_logger().error(self._error)
-            return None
+    def _log(self, error):
+        text, at = self._logged
+        if text != error and not 0 <= (now := self.elapsed()) - at < health.REPEAT:
+            self._logged = error, now
+            self.get_logger().error(error)
 
     def _is_due(self, stamp):
-        period = self._controller.period
+        period = self._host.controller.period
         since = stamp - self._last_step
         if since < 0:
             return True     # the clock was set back
@@ -194,21 +148,21 @@ class ControllerNode(FlightNode):
 
     def _coincides_with_active(self, stamp):
         """Whether the active controller is another one and answers the same estimates."""
-        if self._command is None or not self._mode.startswith('flying:') \
-                or self._mode == self._own_mode:
+        host = self._host
+        if self._command is None or not host.mode.startswith('flying:') or host.active:
             return False
-        part = (stamp - self._command.stamp) / self._controller.period % 1.0
+        part = (stamp - self._command.stamp) / host.controller.period % 1.0
         return not 0.25 < part < 0.75
 
     def _controller_status(self):
-        controller = self._controller
-        report = self._call('diagnostics', getattr(controller, 'diagnostics', dict)) or {}
-        new, self._reported_errors = self._errors - self._reported_errors, self._errors
+        host, controller = self._host, self._host.controller
+        report = host.call('diagnostics', getattr(controller, 'diagnostics', dict)) or {}
+        new, self._reported_errors = host.errors - self._reported_errors, host.errors
         values = {**report, 'guidance': guidance_of(controller)}
-        if self._errors:
-            values['errors'] = self._errors
+        if host.errors:
+            values['errors'] = host.errors
         if new:
-            return health.ERROR, self._error, values
+            return health.ERROR, host.error, values
         return health.OK, getattr(controller, 'name', self._entry.name), values
 
 

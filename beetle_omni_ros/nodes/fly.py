@@ -16,19 +16,19 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.nodes import runner
+from beetle_omni_ros.nodes import runner, speed
 from beetle_omni_ros.nodes.discovery import confine, reserved_domain
 from beetle_omni_ros.nodes.flight import Flight, FlightError, TooSlowError
 from beetle_omni_ros.nodes.graph import child_environment, Graph
 from beetle_omni_ros.nodes.operator import Operator
 from beetle_omni_ros.nodes.plan import ACTUATORS, GraphOptions, plan
 from beetle_omni_ros.nodes.runner import signals_ignored, sigterm_as_interrupt
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.parameters import find_robot, RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs import table
 from beetle_omni_ros.runs.bag import add_meta, BagError, check_new, read_bag
 from beetle_omni_ros.runs.json_file import check_writable, write_json
-from beetle_omni_ros.runs.metrics import metrics
+from beetle_omni_ros.runs.metrics import failed, metrics
 from beetle_omni_ros.runs.tasks import make_task, Task
 from beetle_omni_ros.sim.faults import listed
 
@@ -42,8 +42,9 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             seed: int = 0, conditions: str = 'nominal',
             actuators: str | None = None,
             clock: str = 'auto', robot: Path | None = None, plant: Path | None = None,
-            policy: Path | None = None, allow_other_robot: bool = False, standby: bool = True,
-            composed: bool = True, faults: Path | None = None, json_path: Path | None = None,
+            nmpc: Path | None = None, policy: Path | None = None,
+            allow_other_robot: bool = False, standby: bool = True, composed: bool = True,
+            faults: Path | None = None, json_path: Path | None = None,
             domain_id: int | None = None, discovery: str | None = None,
             view: bool = False, allow_targets: bool = False,
             console: Console | None = None) -> int:
@@ -71,13 +72,15 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             flown_task = make_task(task, seed, registry.find(controller).reach(
                 RobotParameters.load(robot)))
             RobotParameters.load(plant or robot)
+            robot_file, plant_file = (file and find_robot(file) for file in (robot, plant))
             injected = listed.load_faults(faults) if faults else []
             actuators = _actuators_for(injected, actuators)
             clocks = _clocks(clock, actuators)
             options = GraphOptions(
-                controller=controller, policy=str(policy or ''), standby=standby,
-                allow_other_robot=allow_other_robot, robot_file=_absolute(robot),
-                plant_file=_absolute(plant), conditions=conditions, seed=int(seed),
+                controller=controller, nmpc=_absolute(nmpc), policy=str(policy or ''),
+                standby=standby, allow_other_robot=allow_other_robot,
+                robot_file=_absolute(robot_file), plant_file=_absolute(plant_file),
+                conditions=conditions, seed=int(seed),
                 task=_absolute(task) if Path(task).is_file() else str(task), bag=str(bag),
                 compression=compression, actuators='direct', ports=str(folder))
             for name, reason in plan(options).left_out.items():
@@ -111,10 +114,11 @@ def _attempt(clocks, actuators, options, meta, folder, number, task, faults, con
     for kind in clocks:
         meta |= {'clock': kind, 'actuators': actuators or (
             'direct' if kind == 'simulated' else 'emulated')}
-        graph = _make_graph(options, meta, folder, number)
+        graph, last = _make_graph(options, meta, folder, number), kind == clocks[-1]
         try:
-            return _fly(graph, meta['controller'], task, meta, console, faults,
-                        may_be_slow=kind == clocks[-1])
+            if graph.composed and not last and (load := speed.load(graph.nodes)) > speed.MAX_LOAD:
+                raise TooSlowError(f'the nodes would need {load:.0%} of a core')
+            return _fly(graph, meta['controller'], task, meta, console, faults, may_be_slow=last)
         except TooSlowError as error:
             _discard_attempt(bag, folder, error, console)
         except KeyboardInterrupt:
@@ -189,8 +193,8 @@ def _make_graph(options, meta, folder, number):
 
 def _discard_attempt(bag, folder, error, console):
     """Print why the flight is repeated, and delete bag and logs of the first attempt."""
-    _print(console, f'this computer is too slow for real time: {error}; again in simulated time, '
-          'which waits for the nodes, and without serial devices')
+    _print(console, f'this computer is too slow for real time: {error}; it flies in simulated '
+          'time, which waits for the nodes, and without serial devices')
     shutil.rmtree(bag, ignore_errors=True)
     for log in folder.glob('*.log'):
         log.unlink()
@@ -263,7 +267,7 @@ def _report(bag, controller, task, meta, json_path, console) -> int:
         table.print_results(results, console)
     _print_measured(meta, console)
     write_json(json_path, results)
-    return runner.OK if not results[controller].get('crashed') else runner.FAILED
+    return runner.FAILED if failed(results[controller]) else runner.OK
 
 
 def _print_measured(meta, console):

@@ -70,7 +70,8 @@ def declare(node: Node, cls: type, file: str | None = None, file_key: str | None
         if isinstance(value, (dict, tuple)) and hint != NAMES:
             continue    # structured values live in files only
         fixed = on_change is None or changeable is not None and name not in changeable
-        node.declare_parameter(name, _plain(value, hint), _descriptor(entry, hint, fixed),
+        node.declare_parameter(name, _plain(value, hint),
+                               _descriptor(entry, hint, fixed, value is None),
                                ignore_override=True)
     if on_change:
         _validate_changes(node, cls, instance, on_change)
@@ -123,7 +124,7 @@ def _kind(hint):
     return hint
 
 
-def _descriptor(entry, hint, fixed) -> ParameterDescriptor:
+def _descriptor(entry, hint, fixed, absent) -> ParameterDescriptor:
     meta = entry.metadata
     unit = f" [{meta['unit']}]" if meta.get('unit') else ''
     descriptor = ParameterDescriptor(
@@ -134,8 +135,8 @@ def _descriptor(entry, hint, fixed) -> ParameterDescriptor:
         additional_constraints=f"one of {', '.join(meta['choices'])}" if meta.get('choices')
         else '')
     low, high = meta.get('low'), meta.get('high')
-    if (low is None and high is None) or _kind(hint) not in (int, float):
-        return descriptor
+    if absent or (low is None and high is None) or _kind(hint) not in (int, float):
+        return descriptor   # NaN, which stands for an absent number, is in no range
     if _kind(hint) is int:
         descriptor.integer_range = [IntegerRange(
             from_value=int(-2**31 if low is None else low),

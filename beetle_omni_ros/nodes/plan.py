@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from beetle_omni_ros.control import registry
+from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 
@@ -47,14 +48,13 @@ class GraphOptions:
     Attributes:
         controller: active controller: a name, or a reference to a class.
         standby: whether the standby controllers run too, so that they can be selected in flight.
-        policy: policy file of the controller that has the option `--policy`; '': the shipped one.
+        nmpc, policy: files of the controllers that have the options `--nmpc` and `--policy`; '':
+            the shipped ones.
         allow_other_robot: whether a policy trained for other robot parameters may fly.
-        simulated: whether sim_node provides the sensors.
-        actuators: 'bridges', with emulated devices if ``simulated``; 'direct': from the topic to
-            the simulator; 'none': by nodes started elsewhere.
+        simulated: whether sim_node provides sensors and actuators. Otherwise nodes started
+            elsewhere do; on the robot deploy/install.sh starts the bridges.
+        actuators: 'bridges' to emulated devices, or 'direct': from the topic to the simulator.
         ports: folder of the names of the emulated devices' ports.
-        autostart: automatic transition of joint_bridge_node; '': depends on ``simulated``.
-        servo_bus_file, motor_board_file: parameters of the bridges; '': the shipped ones.
         robot_file: robot file of estimator and controllers; '': the shipped one.
         plant_file: robot file of the simulation; '': the same.
         conditions, seed: conditions and seed of the simulation.
@@ -68,14 +68,12 @@ class GraphOptions:
 
     controller: str = registry.DEFAULT
     standby: bool = True
+    nmpc: str = ''
     policy: str = ''
     allow_other_robot: bool = False
     simulated: bool = True
     actuators: str = 'bridges'
     ports: str = ''
-    autostart: str = ''
-    servo_bus_file: str = ''
-    motor_board_file: str = ''
     robot_file: str = ''
     plant_file: str = ''
     conditions: str = 'nominal'
@@ -117,14 +115,16 @@ def plan(options: GraphOptions) -> Plan:
     robot = {'robot_file': options.robot_file} if options.robot_file else {}
     plant = {'robot_file': options.plant_file} if options.plant_file else robot
     controllers, left_out = controller_nodes(
-        options.controller, robot_file=options.robot_file, policy=options.policy,
-        allow_other_robot=options.allow_other_robot, standby=options.standby)
+        options.controller, robot_file=options.robot_file, nmpc=options.nmpc,
+        policy=options.policy, allow_other_robot=options.allow_other_robot,
+        standby=options.standby)
     active = registry.find(options.controller).name
     # The default of these nodes is the list of standby controllers.
     others = {} if active in registry.standing_by() else {
         'controllers': [active, *registry.standing_by()]}
     packed = {} if options.compression == 'none' else {'compression': options.compression}
-    bridges = _bridges(options, robot)
+    bridges = bridge_parameters(Path(options.ports), robot) \
+        if options.simulated and options.actuators == 'bridges' else {}
     table = (
         ('recorder_node', options.bag, {'bag': options.bag, **packed, **others}),
         ('sim_node', options.simulated, {
@@ -148,23 +148,7 @@ def in_simulated_time(nodes: Parameters) -> Parameters:
             for name, values in nodes.items()}
 
 
-def _bridges(options, robot):
-    """Parameters of bridges and simulator for the actuators, by node name."""
-    if options.actuators != 'bridges':
-        return {}
-    nodes = bridge_parameters(Path(options.ports), robot) if options.simulated else \
-        {name: dict(robot) for name in BRIDGES}
-    servos, board = BRIDGES
-    nodes[servos]['autostart'] = options.autostart or (
-        'activate' if options.simulated else 'configure')
-    if options.servo_bus_file:
-        nodes[servos]['servo_bus_file'] = options.servo_bus_file
-    if options.motor_board_file:
-        nodes[board]['motor_board_file'] = options.motor_board_file
-    return nodes
-
-
-def controller_nodes(active: str, *, robot_file: str = '', policy: str = '',
+def controller_nodes(active: str, *, robot_file: str = '', nmpc: str = '', policy: str = '',
                      allow_other_robot: bool = False, standby: bool = True
                      ) -> tuple[Parameters, dict[str, str]]:
     """
@@ -185,11 +169,17 @@ def controller_nodes(active: str, *, robot_file: str = '', policy: str = '',
         first.make(RobotParameters.load(robot_file or None))
     entries = [first, *(registry.find(name) for name in registry.standing_by()
                         if standby and name != first.name)]
+    if nmpc and not any(entry.option == '--nmpc' for entry in entries):
+        raise ParameterError(f"--nmpc {nmpc}: for the controller '{registry.owner('--nmpc')}', "
+                             'which does not run')
     nodes, left_out = {}, {}
     for entry in entries:
         node = f'{entry.name}_node'
         values = {} if node in NODES else {'controller': entry.reference}
         values |= {'robot_file': robot_file} if robot_file else {}
+        if nmpc and entry.option == '--nmpc' and entry.parameter_class:
+            schema.load(entry.parameter_class, nmpc)    # an error here, not in another process
+            values[entry.file_key] = nmpc
         if entry.policy_file:
             given = policy if entry.name == registry.owner('--policy') else ''
             values |= {'policy': str(Path(given).absolute())} if given else {}

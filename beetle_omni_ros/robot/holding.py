@@ -39,7 +39,9 @@ class HoldingParameters(ParameterFile, file='degraded.yaml'):
 
     reach_time: float = parameter(0.1, doc='time within which actuators must act', unit='s',
                                   low=0.01, high=1)
-    tilt_rate: float = parameter(7.0, doc='rate of the servos', unit='rad/s', low=0.1, high=100)
+    tilt_rate_share: float = parameter(
+        0.7, doc='rate of the servos under load, as a share of their velocity limit', low=0.01,
+        high=1)
     directions: int = parameter(1000, doc='number of compared directions of gravity in the body',
                                 low=50, high=10000)
     flying_margin: float = parameter(2.0, doc='required margin of the attitude for flight',
@@ -77,6 +79,7 @@ class Holding:
         """Compute the table in about 10 ms."""
         self.parameters = parameters or HoldingParameters.load()
         self._robot, self._health = robot, health
+        self._tilt_rate = self.parameters.tilt_rate_share * robot.joints.velocity_limit
         self._allocator = DegradedAllocator(robot, health)
         self._scale = 1 / np.r_[np.full(3, self._allocator.mass), robot.inertia]
         self._thrust_max = health.limited(robot.rotors.thrust_max)
@@ -140,7 +143,7 @@ class Holding:
         angle = np.arccos(np.clip(self.directions[firm] @ up(quaternion), -1.0, 1.0))
         travel = np.abs(self._on_nearest_turn(self.tilts[firm], tilt) - tilt)
         travel[self._thrusts[firm] < LITTLE] = 0.0
-        time = angle / p.turn_rate + travel.max(axis=1) / p.tilt_rate \
+        time = angle / p.turn_rate + travel.max(axis=1) / self._tilt_rate \
             + self._unheld_angle(self.directions[firm]) / levelling_rate
         return leaned(quaternion, self.directions[firm[np.argmin(time)]])
 
@@ -204,7 +207,7 @@ class Holding:
         cos, sin = np.cos(tilt)[:, None], np.sin(tilt)[:, None]
         room = np.minimum(thrust, self._thrust_max - thrust).clip(0)
         room[:, list(self._allocator.held)] = 0.0
-        swing = thrust * min(p.tilt_rate * p.reach_time, 1.0) \
+        swing = thrust * min(self._tilt_rate * p.reach_time, 1.0) \
             * [float(angle is None) for angle in self._health.stuck]
         return np.concatenate([(up_part * cos + side_part * sin) * room[:, None],
                                (side_part * cos - up_part * sin) * swing[:, None]], axis=2)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 import hashlib
 from pathlib import Path
@@ -11,11 +13,14 @@ import yaml
 
 from beetle_omni_ros.robot import effects as catalogue
 from beetle_omni_ros.robot import schema
+from beetle_omni_ros.robot.mass_properties import check_parts, moved_inertia
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import parameter, ParameterError
 from beetle_omni_ros.robot.yaml_file import quoted
 
 LONGEST_NAME = 255      # characters of a file's name
+ARM_LENGTH = parameter(doc='mean horizontal distance of the rotor centres from the centre of '
+                       'gravity', unit='m', low=0.01, high=5)     # of a file that extends another
 JOINT_NAMES = ('gimbal1', 'gimbal2', 'gimbal3', 'gimbal4')
 ROTOR_NAMES = ('rotor1', 'rotor2', 'rotor3', 'rotor4')
 
@@ -92,8 +97,12 @@ class JointParameters:
 
     @property
     def time_constant(self) -> float:
-        """Time constant [s] of the first-order reduction: the ramp lag Kd / Kp."""
-        return float(np.mean(self.kd) / np.mean(self.kp))
+        """
+        Time constant [s] of the first-order reduction.
+
+        The ramp lag Kd / Kp; with little damping the inertia's sqrt(J / Kp).
+        """
+        return max(float(np.mean(self.kd) / np.mean(self.kp)), 1 / self.natural_frequency)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,7 +116,7 @@ class BatteryParameters:
 
 @dataclass(frozen=True, kw_only=True)
 class MainBodyParameters:
-    """The body without arms and modules."""
+    """The rest of the robot, described to check the totals."""
 
     centre_of_mass: np.ndarray = parameter(doc='centre of mass in its own frame', unit='m',
                                            shape=(3,))
@@ -120,7 +129,9 @@ class ModuleParameters:
     """One tilting rotor module."""
 
     mass: float = parameter(doc='mass', unit='kg', low=0, high=20)
-    joint_offset: float = parameter(doc='|x| = |y| of the joint origin', unit='m', low=0, high=5)
+    joint_offset: float | None = parameter(
+        None, doc='|x| = |y| of the joint origin in the main body frame; only compared with '
+        'rotors.positions', unit='m', low=0, high=5)
     joint_height: float = parameter(doc='z of the joint origin', unit='m', low=-5, high=5)
     centre_of_mass: np.ndarray = parameter(
         doc='outward, sideways, up from the joint axis', unit='m', shape=(3,))
@@ -140,22 +151,27 @@ class EndEffectorParameters:
 
 @dataclass(frozen=True, kw_only=True)
 class MultibodyParameters:
-    """Parts whose sum is the rigid body."""
+    """
+    Parts of the rigid body; the rest is the main body.
 
-    main_body: MainBodyParameters = parameter(doc='main body')
+    What follows from the totals (main body, joint origins, centre of gravity) is optional. A robot
+    file that contradicts itself is refused.
+    """
+
+    main_body: MainBodyParameters | None = parameter(None, doc='main body')
     module: ModuleParameters = parameter(doc='tilting module')
     end_effector: EndEffectorParameters = parameter(doc='end-effector')
-    centre_of_gravity_height: float = parameter(
-        doc='height above the main body origin', unit='m', low=-5, high=5)
+    centre_of_gravity_height: float | None = parameter(
+        None, doc='height above the main body origin; only compared with rotors.positions',
+        unit='m', low=-5, high=5)
 
     @classmethod
-    def from_totals(cls, inertia: np.ndarray, module_inertia: float = 0.0,
+    def from_totals(cls, module_inertia: float = 0.0,
                     mass_moment: float = 0.0) -> MultibodyParameters:
         """
         Parts of a robot that has only totals and perhaps the effect ``module_reaction``.
 
         Args:
-            inertia: (3,) diagonal of the whole robot [kg m^2].
             module_inertia: inertia of a tilting module about its joint axis [kg m^2]. Half of it
                 is assigned to its own inertia, half to its mass below the axis.
             mass_moment: moment of that mass [kg m].
@@ -163,14 +179,11 @@ class MultibodyParameters:
         """
         depth = 0.5 * module_inertia / mass_moment if mass_moment else 0.0
         own = module_inertia - mass_moment * depth
-        nowhere = np.zeros(3)
-        return cls(main_body=MainBodyParameters(centre_of_mass=nowhere, inertia=inertia),
-                   module=ModuleParameters(
-                       mass=mass_moment / depth if depth else 0.0, joint_offset=0.0,
-                       joint_height=0.0, centre_of_mass=np.array([0.0, 0.0, -depth]),
-                       inertia=np.full(3, own), rotor_offset=0.0),
-                   end_effector=EndEffectorParameters(mass=0.0, height=0.0),
-                   centre_of_gravity_height=0.0)
+        return cls(module=ModuleParameters(
+                       mass=mass_moment / depth if depth else 0.0, joint_height=0.0,
+                       centre_of_mass=np.array([0.0, 0.0, -depth]), inertia=np.full(3, own),
+                       rotor_offset=0.0),
+                   end_effector=EndEffectorParameters(mass=0.0, height=0.0))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -213,23 +226,29 @@ class RobotParameters:
     @classmethod
     def load(cls, path: str | Path | None = None) -> RobotParameters:
         """
-        Read a robot file; without a path, the shipped one.
+        Read a robot file, see :func:`find_robot`; without a path, the shipped one.
 
         A file may begin with ``extends: FILE``, a file in the same folder or of the shipped
-        params. It then contains the differences only.
+        params. It then contains the differences only; what they move without being named, moves
+        with them.
 
         Raises:
             ParameterError: names file, key and expected value.
 
         """
-        path = Path(path) if path else share_path('params/robot.yaml')
-        return schema.bind(cls, _merged(path, ()), str(path))
+        path = find_robot(path) if path else share_path('params/robot.yaml')
+        if not path.is_file():
+            raise ParameterError(f'{path}: no such file')
+        robot = schema.bind(cls, _merged(path, ()), str(path))
+        with _named(path):
+            check_parts(robot)
+        return robot
 
     @property
     def parts(self) -> MultibodyParameters:
         """The described parts, else parts from the totals."""
         return self.multibody or MultibodyParameters.from_totals(
-            self.inertia, **self.effects.get('module_reaction', {}))
+            **self.effects.get('module_reaction', {}))
 
     @property
     def tilt_axes(self) -> np.ndarray:
@@ -274,6 +293,29 @@ class RobotParameters:
         return data
 
 
+def find_robot(name: str | Path, beside: Path | None = None) -> Path:
+    """
+    Locate a robot file: the given path, else a shipped file of that name.
+
+    Args:
+        name: path of a file, or the name of a file of the shipped params.
+        beside: the file that extends it; relative paths begin in its folder.
+
+    Returns:
+        The path; that of no file if neither exists.
+
+    """
+    path = beside.parent / name if beside else Path(name)
+    # `extends: robot.yaml` in a file named robot.yaml means the shipped file
+    if path.is_file() and not (beside and path.resolve() == beside.resolve()):
+        return path
+    try:
+        shipped = share_path(f'params/{name}')
+    except FileNotFoundError:
+        return path
+    return shipped if shipped.is_file() else path
+
+
 def _merged(path: Path, seen: tuple[Path, ...]) -> dict:
     """Content of a robot file, merged with the file that it extends."""
     content = schema.load_yaml(path)
@@ -283,20 +325,67 @@ def _merged(path: Path, seen: tuple[Path, ...]) -> dict:
     if not isinstance(name, str) or not name.isprintable() or len(name) > LONGEST_NAME:
         raise ParameterError(f"{path}: key 'extends': expected the name of a file, "
                              f'found {quoted(name)}')
-    base = path.parent / name
-    # `extends: robot.yaml` in a file named robot.yaml means the shipped file
-    itself = base.resolve() == path.resolve()
-    if itself or not base.is_file():
-        try:
-            base = share_path(f'params/{name}')
-        except FileNotFoundError:
-            if itself:
-                raise ParameterError(f"{path}: key 'extends': {name} extends itself") from None
-            raise ParameterError(f"{path}: key 'extends': no file {name!r} beside it or among the "
-                                 'shipped params') from None
+    base = find_robot(name, path)
+    if not base.is_file():
+        raise ParameterError(f"{path}: key 'extends': no file {name!r} beside it or among the "
+                             'shipped params')
     if base.resolve() in (*seen, path.resolve()):
         raise ParameterError(f"{path}: key 'extends': {name} extends itself")
-    return _overlaid(_merged(base, (*seen, path.resolve())), content)
+    return _extended(base, _merged(base, (*seen, path.resolve())), path, content)
+
+
+def _extended(base: Path, below: dict, path: Path, content: dict) -> dict:
+    """
+    Merge a file with the file that it extends, whose content is ``below``.
+
+    A length of the arms moves the rotors. Changed masses and positions change the inertia, if the
+    file does not state it, and the checks of the extended file do not apply to them.
+    """
+    rotors = content.get('rotors')
+    if isinstance(rotors, dict) and 'arm_length' in rotors:
+        content = content | {'rotors': _with_arms(base, below, path, rotors)}
+    merged, own = _overlaid(below, content), content.get('multibody', {})
+    moves = {'mass', 'multibody'} & set(content) or (
+        isinstance(rotors, dict) and {'arm_length', 'positions'} & set(rotors))
+    if (moves or 'inertia' in content) and isinstance(own, dict) and merged.get('multibody'):
+        merged['multibody'] = _unchecked(merged['multibody'], own)
+    if moves and 'inertia' not in content:
+        pair = [schema.bind(RobotParameters, {**each, 'effects': {}}, str(file))
+                for each, file in ((merged, path), (below, base))]
+        with _named(path):
+            merged['inertia'] = moved_inertia(*pair)
+    return merged
+
+
+def _with_arms(base: Path, below: dict, path: Path, rotors: dict) -> dict:
+    """``rotors`` of a file with positions in place of the length of the arms."""
+    at = f"{path}: key 'rotors.arm_length'"
+    if 'positions' in rotors:
+        raise ParameterError(f'{at}: expected either this key or rotors.positions')
+    length = schema.check(ARM_LENGTH, float, rotors['arm_length'], at)
+    positions = schema.bind(RobotParameters, {**below, 'effects': {}}, str(base)).rotors.positions
+    scale = length / np.linalg.norm(positions[:, :2], axis=1).mean()
+    return {key: value for key, value in rotors.items() if key != 'arm_length'} | {
+        'positions': positions * [scale, scale, 1.0]}
+
+
+def _unchecked(multibody: dict, own: dict) -> dict:
+    """Parts without the keys that are only checks, except those of the file itself."""
+    kept = {key: value for key, value in multibody.items()
+            if key in own or key not in ('main_body', 'centre_of_gravity_height')}
+    module, stated = kept.get('module'), own.get('module')
+    if isinstance(module, dict) and not (isinstance(stated, dict) and 'joint_offset' in stated):
+        kept['module'] = {key: value for key, value in module.items() if key != 'joint_offset'}
+    return kept
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Put the file into the message of an error."""
+    try:
+        yield
+    except ParameterError as error:
+        raise ParameterError(f'{path}: {error}') from None
 
 
 def _overlaid(base: dict, content: dict) -> dict:

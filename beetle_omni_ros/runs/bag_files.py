@@ -1,16 +1,17 @@
 """Reading of the MCAP files of a rosbag2 folder without ROS, also of truncated files."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from io import BytesIO
 from pathlib import Path
 import struct
 from typing import NamedTuple
 
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import InvalidMagic, McapError
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Message, Schema
-from mcap.stream_reader import get_chunk_data_stream, StreamReader
+from mcap.stream_reader import get_chunk_data_stream, MAGIC_SIZE, StreamReader
+from mcap.writer import MCAP0_MAGIC
 import numpy as np
 
 from beetle_omni_ros.messages.conversions import from_nanoseconds
@@ -94,6 +95,23 @@ def bag_files(path: str | Path) -> list[Path]:
     return files
 
 
+def runs_in(paths: Iterable[str | Path]) -> list[Path]:
+    """Paths of RUN arguments, with the bags in a folder of bags in its place."""
+    runs: list[Path] = []
+    for path in map(Path, paths):
+        inside = []
+        if path.is_dir() and not any(path.glob('*.mcap')):
+            inside = sorted({file.parent for file in path.glob('*/*.mcap')})
+        runs += inside or [path]
+    return runs
+
+
+def no_pose(path: str | Path, warnings: list[str]) -> BagError:
+    """Error for a bag without a pose; ``warnings`` of its reading may give the reason."""
+    return BagError('; '.join([f'{path}: no pose of the robot; expected ground_truth/odom or '
+                               'odom', *warnings]))
+
+
 def _split_number(file):
     """Sort key of a split bag: name_2.mcap comes before name_10.mcap."""
     number = file.stem.rpartition('_')[2]
@@ -156,20 +174,34 @@ class _Part(NamedTuple):
 
 
 def _parts(path, warnings) -> Iterator[_Part]:
-    warnings = [] if warnings is None else warnings
+    found, broken = 0, ''
     for file in bag_files(path):
+        count = 0
         try:
             with file.open('rb') as stream:
-                yield from _Reader().parts(stream)
+                _check_magic(file, stream)
+                for part in _Reader().parts(stream):
+                    count += len(part.data)
+                    yield part
         except OSError as error:
             raise BagError(f'{file}: {error.strerror}') from None
-        except InvalidMagic:
-            raise BagError(f'{file}: not an MCAP file') from None
-        except GeneratorExit:
+        except (BagError, GeneratorExit):
             raise
         except Exception as error:  # broken bytes raise anything in the library
             kind = 'cut off' if isinstance(error, EOFError) else f'damaged ({error})'
-            warnings.append(f'{file.name}: {kind}; read up to there')
+            broken = f'{file.name}: {kind} after {count} readable messages'
+            if warnings is not None:
+                warnings.append(broken)
+        found += count
+    if broken and not found:
+        raise BagError(f"{path}: {broken}; 'mcap recover' of the mcap tool may save more")
+
+
+def _check_magic(file, stream):
+    """Refuse another kind of file; a shorter one may be an MCAP file that was cut off."""
+    if not MCAP0_MAGIC.startswith(stream.read(MAGIC_SIZE)):
+        raise BagError(f'{file}: not an MCAP file')
+    stream.seek(0)
 
 
 class _Reader:

@@ -157,6 +157,8 @@ def _controller_metrics(log, task, part, expected):
     result['crashed'] = _crashed(log, body, part)
     if ending:
         result['ended'] = ending
+    if log.meta.get('controller_error'):
+        result['controller_error'] = log.meta['controller_error']
     result['guidance'] = _guidance(log, part.name)
     result['lowest'] = _lowest(log, body, part)
     compute = log.compute.get(part.name, {})
@@ -227,6 +229,11 @@ def _numbers(target, task):
 def _reduced(reduce, values):
     values = [value for value in values if value is not None]
     return float(reduce(values)) if values else None
+
+
+def failed(result: dict) -> bool:
+    """Whether the results of a flight are a crash; tasks that end with lost control may crash."""
+    return bool(result.get('crashed')) and not {'force', 'torque'} & result.keys()
 
 
 def _crashed(log, body, part):

@@ -10,7 +10,8 @@ from beetle_omni_ros.pages.figures import COLOURS
 from beetle_omni_ros.pages.table import Terminal
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs import table
-from beetle_omni_ros.runs.bag import BagError, read_bag
+from beetle_omni_ros.runs.bag import read_bag
+from beetle_omni_ros.runs.bag_files import no_pose, runs_in
 from beetle_omni_ros.runs.body import motion
 from beetle_omni_ros.runs.json_file import write_json, write_text
 from beetle_omni_ros.runs.log import FlightLog
@@ -37,7 +38,7 @@ def run_report(paths: list[Path], output: Path, *, json_path: Path | None = None
 
     """
     console = console or Terminal()
-    paths = [run for path in paths for run in _runs_in(path)]
+    paths = runs_in(paths)
     if len(paths) > MAX_RUNS:
         raise ParameterError(f'{len(paths)} runs; a page shows at most {MAX_RUNS} side by side')
     logs = []
@@ -64,7 +65,7 @@ def _name(path):
 
 def _has_a_pose(log, name):
     if not len(motion(log).t):
-        raise BagError(f'{name}: no pose of the robot; expected ground_truth/odom or odom')
+        raise no_pose(name, log.warnings)
 
 
 def make_runs(logs: list[FlightLog], names: list[str]) -> list[Run]:
@@ -98,10 +99,3 @@ def results_of(runs: list[Run]) -> dict:
     for run in runs:
         results.update(run.results)
     return results
-
-
-def _runs_in(path: Path) -> list[Path]:
-    """Bags in a folder of bags, such as `evaluate` makes; for any other path, the path."""
-    if path.is_dir() and not any(path.glob('*.mcap')):
-        return sorted({file.parent for file in path.glob('*/*.mcap')}) or [path]
-    return [path]

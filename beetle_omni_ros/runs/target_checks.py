@@ -35,17 +35,6 @@ class TargetLimits(ParameterFile, file='targets.yaml'):
                                       unit='s', low=0.01, high=1e5)
 
 
-def out_of_reach(target: Target, position: np.ndarray, reach: float, now: float) -> str:
-    """
-    Check the distance of a target from the robot; returns as :meth:`TargetChecks.why_not`.
-
-    The target at ``now`` [s] must be within ``reach`` [m] of ``position`` (3,) in world [m].
-    """
-    away = float(np.linalg.norm(target.at(now).position - position))
-    return '' if away <= reach else (f'{away:.4g} m from the robot, expected at most {reach:g} m: '
-                                     'the reach of the controller')
-
-
 class TargetChecks:
     """Checks targets of one robot, by default with the limits of params/targets.yaml."""
 

@@ -14,7 +14,7 @@ from beetle_omni_ros.robot.readings import SpikeFilter
 from beetle_omni_ros.safety.actuators import Actuators
 from beetle_omni_ros.safety.descent import checked_sample
 from beetle_omni_ros.safety.events import EventLog, INFO, WARNING
-from beetle_omni_ros.safety.limits import JUMP
+from beetle_omni_ros.safety.limits import JUMP, MEANINGS
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.selection import Selection
 from beetle_omni_ros.safety.vehicle import numbers, Vehicle
@@ -83,7 +83,8 @@ class Inputs:
             # A step to a new target causes one jump; repeated jumps end in the controller's
             # timeout.
             self._say(now, INFO if reason == JUMP else WARNING,
-                      f'{controller}_node: command refused: {reason}', f'{controller}: {reason}')
+                      f'{controller}_node: command refused: {reason}{MEANINGS.get(reason, "")}',
+                      f'{controller}: {reason}')
         return not reason
 
     def on_joints(self, stamp: float, position: np.ndarray, velocity: np.ndarray) -> bool:

@@ -25,6 +25,10 @@ FROZEN = 'the same numbers again'
 UNKNOWN = 'unknown controller'
 SAME = 10       # commands or estimates in a row that are equal to the last digit
 
+MEANINGS = {    # of reasons for refusals that do not explain themselves
+    FROZEN: f' (more than {SAME} equal commands in a row count as a frozen controller; compute '
+            'the command from the state, see docs/safety.md)'}
+
 
 class CommandStream:
     """

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from beetle_omni_ros.robot.mass_properties import mass_properties
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.sim.mass_properties import mass_properties
 from beetle_omni_ros.sim.parameters import PlantParameters
 
 # Colours (red, green, blue), and sizes [m] that only pictures use.

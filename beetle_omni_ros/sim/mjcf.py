@@ -3,8 +3,8 @@
 import mujoco
 import numpy as np
 
+from beetle_omni_ros.robot.mass_properties import combined, mass_properties, RigidPart, Variation
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.sim.mass_properties import combined, mass_properties, RigidPart, Variation
 from beetle_omni_ros.sim.parameters import PlantParameters
 
 BASE = 1                        # body index of base_link; 0 is the world

@@ -7,7 +7,7 @@ from rich.console import Console
 
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.urdf import Model
-from beetle_omni_ros.runs.bag_files import names_of
+from beetle_omni_ros.runs.bag_files import names_of, runs_in
 from beetle_omni_ros.view.recording import Recording
 
 FIRST_ROWS = 60.0       # [s] timeout for the first rows of a run
@@ -32,7 +32,7 @@ def run_view(runs: list[Path], *, robot: Path | None = None, urdf: Path | None =
         ParameterError: other unusable input.
 
     """
-    console = console or Console()
+    console, runs = console or Console(), runs_in(runs)
     model, parameters = Model.load(urdf), RobotParameters.load(robot)
     with ExitStack() as stack:
         recordings = []

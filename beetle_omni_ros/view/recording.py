@@ -12,7 +12,7 @@ import threading
 import numpy as np
 
 import beetle_omni_ros
-from beetle_omni_ros.runs.bag_files import bag_files, BagError
+from beetle_omni_ros.runs.bag_files import bag_files, BagError, no_pose
 from beetle_omni_ros.view.frames import COLUMNS, Rows, Sampler
 
 STEP = 0.02         # [s] between rows
@@ -72,7 +72,7 @@ def parts(path: str | Path) -> Iterator[Part]:
             yield Part(np.concatenate(tables), list(sampler.states), dict(sampler.faults))
             tables, size = [], PART
     if not sampler.placed:
-        raise BagError(f'{path}: holds no pose of the robot (odom or ground_truth/odom)')
+        raise no_pose(path, warnings)
     yield Part(np.concatenate([Rows().table, *tables]), list(sampler.states),
                dict(sampler.faults), dict(sampler.meta), warnings)
 

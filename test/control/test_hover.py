@@ -15,6 +15,7 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 ROBOT = RobotParameters.load()
 PARAMETERS = HoverParameters.load()
 PERIOD = PARAMETERS.period
+TILT_RATE = PARAMETERS.tilt_rate_share * ROBOT.joints.velocity_limit
 HOME, LEVEL = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 0.0, 1.0])
 
 
@@ -79,7 +80,7 @@ def test_hovers_with_thrust_along_an_arm_where_one_rotor_is_unloaded():
         tilts.append(in_force.tilt)
     assert np.linalg.norm(plant.position - HOME) < 0.02
     assert rotations.geodesic_angle(attitude, plant.quaternion) < 0.03
-    assert np.abs(np.diff(tilts, axis=0)).max() <= PARAMETERS.tilt_rate * PERIOD + 1e-9
+    assert np.abs(np.diff(tilts, axis=0)).max() <= TILT_RATE * PERIOD + 1e-9
 
 
 def test_the_observer_removes_the_steady_error_of_a_wrong_mass():
@@ -106,7 +107,7 @@ def test_takes_over_without_a_jump_from_any_command_in_force():
         plant, _ = start(unit(rng, 4))
         controller.reset()
         command = controller.step(plant.state(in_force), PoseTarget(HOME, unit(rng, 4)))
-        assert np.abs(command.tilt - in_force.tilt).max() <= PARAMETERS.tilt_rate * PERIOD + 1e-9
+        assert np.abs(command.tilt - in_force.tilt).max() <= TILT_RATE * PERIOD + 1e-9
         assert np.abs(command.thrust - in_force.thrust).max() \
             <= PARAMETERS.thrust_rate * PERIOD + 1e-9
 
@@ -141,7 +142,7 @@ def test_a_repeated_stamp_repeats_the_command_and_a_pause_limits_the_time_step()
     assert controller.step(plant.state(first), target) is first
     plant.time += 10.0
     late = controller.step(plant.state(first), target)
-    assert np.abs(late.tilt - first.tilt).max() <= 5 * PARAMETERS.tilt_rate * PERIOD + 1e-9
+    assert np.abs(late.tilt - first.tilt).max() <= 5 * TILT_RATE * PERIOD + 1e-9
 
 
 def test_any_finite_state_gives_a_finite_command_within_limits():

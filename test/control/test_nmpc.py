@@ -201,11 +201,58 @@ def test_a_horizon_of_another_length_works():
     assert angle < 0.5
 
 
+def slow_servo(place):
+    """The robot with a weaker servo in its section ``joints`` or as an effect."""
+    gains = {'kp': 0.04, 'kd': ROBOT.joints.kd}
+    return replace(ROBOT, joints=replace(ROBOT.joints, **gains)) if place == 'joints' \
+        else replace(ROBOT, effects={'joint_bandwidth': gains})
+
+
+def test_a_servo_gives_the_same_problem_in_the_file_and_as_an_effect():
+    parameters = replace(NmpcParameters.load(), solver=SolverParameters(compile=False))
+    target = PoseTarget(np.array([1.0, -1.0, 1.5]), rotations.from_rpy(2.0, 0.5, 1.0))
+    plans = []
+    for place in ('joints', 'effects'):
+        robot = slow_servo(place)
+        controller = NmpcController(robot, parameters)
+        fly(controller, target, 0.3, plant=robot)
+        plans.append(controller.predicted_states)
+    np.testing.assert_array_equal(*plans)
+
+
+def test_a_slow_servo_of_the_robot_file_is_flown():
+    robot = slow_servo('joints')
+    parameters = replace(NmpcParameters.load(), solver=SolverParameters(compile=False))
+    target = PoseTarget(np.array([1.0, -1.0, 1.5]), rotations.from_rpy(2.0, 0.5, 1.0))
+    position, angle = errors(fly(NmpcController(robot, parameters), target, 5.0, plant=robot),
+                             target)
+    assert position < 0.05 and angle < 5    # with the lag of the shipped servo it falls
+
+
+@pytest.mark.parametrize('robot, field, expected', [
+    ({'joints': {'kd': 0.02}}, 'servo_lag', 0.02 / ROBOT.joints.kp),
+    ({'joints': {'kd': 0.0}}, 'servo_lag', np.sqrt(ROBOT.joints.inertia / ROBOT.joints.kp)),
+    ({'joints': {'velocity_limit': 5.0}}, 'tilt_rate', 3.5),
+    ({'joints': {'position_limit': 3.0}}, 'tilt', 3.0),
+    ({'rotors': {'thrust_max': 15.0}}, 'thrust_max', 15.0)])
+def test_actuators_of_the_problem_are_those_of_the_robot(robot, field, expected):
+    (part, change), = robot.items()
+    changed = replace(ROBOT, **{part: replace(getattr(ROBOT, part), **change)})
+    p = NmpcParameters.load()
+    assert getattr(p.actuators(changed), field) == pytest.approx(expected)
+    other = {'servo_lag': 0.05, 'tilt': 2.0, 'thrust_max': 30.0}.get(field)
+    if other:       # nmpc.yaml overrides the robot file
+        part = 'model' if field == 'servo_lag' else 'limits'
+        own = replace(p, **{part: replace(getattr(p, part), **{field: other})})
+        assert getattr(own.actuators(changed), field) == other
+
+
 def test_the_published_settings_are_unchanged():
     p = NmpcParameters.load(share_path('params/nmpc_published.yaml'))
     assert not p.model.rotor_lag
     assert p.horizon.intervals.tolist() == [0.1] * 20
     assert p.limits.velocity == 1.0
+    assert p.actuators(ROBOT) == (0.048, 3.15, 10.0, 30.0)
     assert (p.weights.position_xy, p.weights.position_z, p.weights.tilt) == (300, 400, 2)
     assert (p.weights.tilt_change, p.weights.thrust_command) == (250, 2)
     assert not p.limits.soft

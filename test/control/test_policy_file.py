@@ -98,10 +98,10 @@ def test_unreadable_metadata_are_refused_with_the_key(metadata, named):
 def test_another_robot_is_refused_and_may_be_allowed():
     other = RobotParameters.load(share_path('params/robot_weak_and_heavy.yaml'))
     contract = PolicyContract.default(ROBOT)
-    with pytest.raises(ParameterError, match='robot_hash'):
+    with pytest.raises(ParameterError, match='--allow-other-robot'):
         contract.check(other)
     warning = contract.check(other, allow_other_robot=True)
-    assert 'robot_hash' in warning and '\n' not in warning
+    assert 'mass' in warning and '\n' not in warning
 
 
 def test_permission_for_another_robot_covers_robot_parameters_only():
@@ -116,10 +116,21 @@ def test_sensor_effects_that_the_estimator_corrects_are_not_a_difference():
     assert not PolicyContract.default(ROBOT).check(turned)
 
 
-def test_a_difference_in_effects_only_is_named():
-    corrected = replace(ROBOT, effects={'thrust_coefficient': {'scale': 0.93}})
-    with pytest.raises(ParameterError, match='robot_hash.*effects thrust_coefficient'):
-        PolicyContract.default(ROBOT).check(corrected)
+@pytest.mark.parametrize('flown, named', [
+    (replace(ROBOT, mass=3.2, joints=replace(ROBOT.joints, kp=0.2)),
+     ['mass 3.0386 in training, 3.2 here', 'joints.kp 0.3449 in training, 0.2 here']),
+    (replace(ROBOT, effects={'thrust_coefficient': {'scale': 0.93}}),
+     ["effects {} in training, {'thrust_coefficient': {'scale': 0.93}} here"]),
+    (replace(ROBOT, multibody=None), ['in training, None here'])])
+@pytest.mark.parametrize('file', ['new', 'without values'])
+def test_parameters_that_differ_are_named_with_both_values(flown, named, file):
+    contract = PolicyContract.default(ROBOT)
+    if file != 'new':       # values of the shipped robot are known by its hash
+        contract = replace(contract, robot_values={})
+    with pytest.raises(ParameterError) as error:
+        contract.check(flown)
+    assert all(part in str(error.value) for part in named), error.value
+    assert str(error.value).count(' in training') == len(named)
 
 
 def test_a_copy_of_the_robot_under_another_name_is_the_same_robot():

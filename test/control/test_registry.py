@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.control.base import checked, Command, Controller
+from beetle_omni_ros.control.base import Command, Controller
 from beetle_omni_ros.control.entry import ControllerEntry, entry_of, RESERVED
+from beetle_omni_ros.control.host import checked
 from beetle_omni_ros.control.registry import ControllerOptions
 from beetle_omni_ros.nodes.plan import NODES
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -226,12 +227,12 @@ def test_a_class_that_inherits_from_the_protocol_needs_no_constructor():
 
 def test_the_return_value_of_step_is_checked():
     good = Command(0.0, np.zeros(4), np.ones(4))
-    assert checked('x', good) is good
+    assert checked(good) is good
     for wrong, message in ((None, 'returned NoneType'), ((0, 1), 'returned tuple'),
                            (Command(0.0, [0] * 4, np.ones(4)), 'tilt is no array'),
                            (Command(0.0, np.zeros(4), np.ones(3)), r'thrust is of shape \(3,\)')):
         with pytest.raises(ParameterError, match=message):
-            checked('x', wrong)
+            checked(wrong)
 
 
 def test_entry_points_of_other_packages_are_registered(module, monkeypatch):

@@ -4,9 +4,10 @@ from dataclasses import fields
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 import re
+import subprocess
+import sys
 
 import pytest
-import yaml
 
 import beetle_omni_ros
 from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
@@ -80,14 +81,29 @@ def test_the_page_of_python_has_every_public_function_and_every_array():
     assert 'seconds since 1970' in page and 'log.imu_t - log.start' in page
 
 
-def test_every_page_is_in_the_navigation_and_every_entry_is_a_page():
-    def files(entries):
-        for entry in entries:
-            for value in [entry] if isinstance(entry, str) else entry.values():
-                yield from [value] if isinstance(value, str) else files(value)
-    navigation = yaml.safe_load(read('mkdocs.yml').partition('\nnav:')[2])
-    listed = [f'docs/{file}' for file in files(navigation)]
-    assert sorted(listed) == sorted(page for page in PAGES if page.startswith('docs/'))
+@pytest.fixture(scope='module')
+def site(tmp_path_factory):
+    """The built site; every page is in the navigation, and every link has its target."""
+    pytest.importorskip('material')
+    folder = tmp_path_factory.mktemp('site')
+    done = subprocess.run(
+        [sys.executable, '-m', 'mkdocs', 'build', '--strict', '--site-dir', str(folder)],
+        cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def test_the_site_loads_nothing_from_the_network(site):
+    outside = re.compile(
+        r'<(?:script|link|img|iframe|source)\b[^>]*?\b(?:src|href)=["\']?(?:https?:)?//[^>]*'
+        r'|(?:@import\s*|url\()["\']?(?:https?:)?//[^)]*'
+        # The theme's program loads what draws these elements.
+        r'|class="?mermaid\b')
+    files = [path for path in site.rglob('*') if path.suffix in ('.html', '.css')]
+    assert len(files) > len(PAGES) - 4 and (site / 'search' / 'search_index.json').is_file()
+    found = {path.name: loaded.group() for path in files
+             if (loaded := outside.search(path.read_text(encoding='utf-8')))}
+    assert not found
 
 
 def test_the_start_page_links_every_tutorial_how_to_page_and_explanation():

@@ -17,8 +17,9 @@ from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs import tasks
 from beetle_omni_ros.runs.bag_reader import read_bag
-from beetle_omni_ros.runs.metrics import metrics
+from beetle_omni_ros.runs.metrics import failed, metrics
 from beetle_omni_ros.runs.tasks import make_task, Task, TaskError
+from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 
 ROBOT = RobotParameters.load()
@@ -135,6 +136,39 @@ def test_a_flight_ended_by_the_supervisor_is_reported_with_time_and_reason(poses
     assert results['nmpc']['ended'] in text.getvalue().partition('crashed')[0]
 
 
+OPEN_LOOP = """
+import numpy as np
+from beetle_omni_ros.control.base import Command
+class Own:
+    period = 0.01
+    def __init__(self, robot): self.thrust = np.full(4, robot.hover_thrust)
+    def reset(self): pass
+    def step(self, state, target): return Command(state.stamp, np.zeros(4), self.thrust%s)
+"""
+
+
+def test_a_crash_ends_the_command_with_status_1_after_the_results(poses, tmp_path):
+    own, result = tmp_path / 'own.py', tmp_path / 'result.json'
+    own.write_text(OPEN_LOOP % ' * (0.5 + 1e-3 * (state.stamp % 1))')
+    assert cli.main(['evaluate', '--controllers', f'{own}:Own', '--task', str(poses), '--json',
+                     str(result)]) == 1
+    assert json.loads(result.read_text())['own']['crashed']
+
+
+def test_a_task_that_ends_with_lost_control_does_not_fail_by_a_crash():
+    assert failed({'crashed': True}) and not failed({'crashed': False})
+    assert not failed({'crashed': True, 'force': {}})
+
+
+def test_a_constant_controller_is_refused_once_with_the_rule(poses, tmp_path, monkeypatch):
+    monkeypatch.setattr(loop, 'TAKEOFF_TIMEOUT', 6.0)
+    own = tmp_path / 'own.py'
+    own.write_text(OPEN_LOOP % '')
+    with pytest.raises(loop.FlightError) as error:
+        evaluate(poses, [f'{own}:Own'])
+    assert str(error.value).count('more than 10 equal commands in a row') == 1
+
+
 def test_an_exception_of_step_ends_the_command_with_one_line(poses, tmp_path, capsys):
     own = tmp_path / 'bad.py'
     own.write_text('from beetle_omni_ros.control.hover import HoverController\n'
@@ -145,6 +179,36 @@ def test_an_exception_of_step_ends_the_command_with_one_line(poses, tmp_path, ca
     line, = capsys.readouterr().err.splitlines()
     assert line == "beetle_omni: error: controller 'bad': step raised AttributeError: " \
                    "'Bad' object has no attribute 'absent' (bad.py:4)"
+
+
+@pytest.mark.parametrize('until', [0.2, 100.0])
+def test_an_exception_in_flight_falls_back_and_is_in_the_results(until, tmp_path, monkeypatch):
+    limits = SupervisorParameters.load()
+    limits = replace(limits, envelope=replace(limits.envelope, fallback_time=1.0))
+    monkeypatch.setattr(SupervisorParameters, 'load', lambda: limits)
+    own, task = tmp_path / 'bad.py', make_task('hover')
+    own.write_text('from beetle_omni_ros.control.hover import HoverController\n'
+                   'class Bad(HoverController):\n'
+                   '    high = None\n'
+                   '    def step(self, state, target):\n'
+                   '        if target.position[2] == 1.0:       # of the task\n'
+                   '            self.high = self.high or state.stamp\n'
+                   f'            if 1.0 < state.stamp - self.high < {1.0 + until}:\n'
+                   '                return self.absent\n'
+                   '        return super().step(state, target)\n')
+    task = replace(task, segments=(replace(task.segments[0], duration=4.0),))
+    text = io.StringIO()
+    results = command.run_evaluate(controllers=[f'{own}:Bad'], task=task, bag=tmp_path / 'bag',
+                                   console=Console(file=text, width=300))['bad']
+    states = read_bag(tmp_path / 'bag').states
+    at = states.index('fallback:controller_silent')
+    assert states[at - 1] == 'flying:bad'
+    transient = until < 1.0
+    assert states[at + 1] == ('flying:bad' if transient else 'landing:controller_lost')
+    assert ('ended' in results) != transient and not results['crashed']
+    error = results['controller_error']
+    assert "controller 'bad': step raised AttributeError: 'Bad' object has no attribute" in error
+    assert '(bad.py:8)' in error and error in text.getvalue()
 
 
 def test_a_force_task_ends_with_the_level_of_lost_control(monkeypatch):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.control.base import Command, State
-from beetle_omni_ros.control.nmpc import redated, with_delays
+from beetle_omni_ros.control.disturbance import DisturbanceEstimator, redated
 from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf, ImuReading, PoseReading
 from beetle_omni_ros.estimation.parameters import EkfParameters
@@ -62,13 +62,14 @@ def nmpc(robot):
     """Model, limits and delays of the NMPC, its tilt commands, and the allocation."""
     x, u = states()
     derivative = dynamics.full_model(robot)
-    settings = with_delays(robot, NmpcParameters.load()).model
+    settings = NmpcParameters.load()
+    estimator = DisturbanceEstimator(robot, settings.disturbance, settings.model.command_delay,
+                                     None)
     state = State(0.0, np.zeros(3), np.zeros(3), np.array([0, 0, 0, 1.0]), np.zeros(3),
                   np.zeros(4), np.ones(4), 0.0)
     allocator = Allocator(robot)
     return [np.array([derivative(a, b, np.zeros(10)) for a, b in zip(x, u)]).ravel(),
-            [settings.command_delay, settings.servo_lag],
-            [redated(state, robot).tilt_stamp],
+            [estimator.delay, *settings.actuators(robot)], [redated(state, robot).tilt_stamp],
             allocator.matrix.ravel(), np.array(allocator.weight).ravel()]
 
 

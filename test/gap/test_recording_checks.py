@@ -6,6 +6,7 @@ import warnings
 import numpy as np
 import pytest
 from recordings import columns, kept, late_half, recording, ROBOT, turned_pose
+from scipy.signal import step as step_response
 from scipy.spatial.transform import Rotation, Slerp
 
 from beetle_omni_ros.identify.gap.bags import read_recording
@@ -15,6 +16,7 @@ from beetle_omni_ros.identify.recording.actuator_conventions import thrust_damag
 from beetle_omni_ros.identify.recording.check import damages, repaired
 from beetle_omni_ros.identify.recording.limits import RecordingLimits
 from beetle_omni_ros.identify.recording.motion import Motion
+from beetle_omni_ros.identify.recording.readings import reading_damages
 from beetle_omni_ros.messages import columns as message_columns
 from beetle_omni_ros.runs.bag import BagWriter
 
@@ -272,6 +274,36 @@ def test_damage_is_refused_with_topic_cause_and_time(kind, conditions):
 def test_a_sound_recording_has_no_damage(conditions):
     assert damages(recording(conditions), ROBOT) == []
     assert damages(silent_clock(recording(conditions)), ROBOT) == []
+
+
+def joint_step(size, lag, end, frozen_from=np.inf):
+    """A joint at rest with one step of its command 8 s after the start; ``end`` [s] after that."""
+    made, joints = recording(), ROBOT.joints
+    at = made.times[JOINTS][0] + 8.0
+    columns(made, COMMAND, 1, 2, lambda v: np.where(made.times[COMMAND][:, None] < at, 0.1,
+                                                    0.1 + size))
+    t, turned = step_response(([joints.kp], [joints.inertia, joints.kd, joints.kp]),
+                              T=np.linspace(0, 1, 1001))
+    after = np.minimum(made.times[JOINTS] - at, frozen_from) - lag
+    count = 2 * np.pi / 4096
+    reading = count * np.round((0.1 + size * np.interp(after, t, turned)) / count)
+    columns(made, JOINTS, 1, 2, lambda v: reading[:, None])
+    return kept(made, JOINTS, made.times[JOINTS] < at + end)
+
+
+@pytest.mark.parametrize('seed', range(12))
+def test_a_joint_that_rests_until_its_command_arrives_is_not_frozen(seed):
+    # A step of the command, with any delay of a valid servo until the reading changes, and any
+    # time until the end of the recording.
+    rng, limits = np.random.default_rng(seed), RecordingLimits.load()
+    size, lag = rng.choice([-1, 1]) * rng.uniform(0.27, 0.35), rng.uniform(0, 0.3)
+    for end in (rng.uniform(0, lag), rng.uniform(lag, 1.0), 10.0):
+        found = reading_damages(joint_step(size, lag, end), limits, ROBOT)
+        assert not found, (size, lag, end, found[0].text)
+    # Frozen at any time before the step, it is found once every valid servo would have turned.
+    held = joint_step(size, lag, limits.servo_lag[1] + 0.1, frozen_from=0.0)
+    damage, = reading_damages(held, limits, ROBOT)
+    assert damage.topic == JOINTS and 'gimbal2 is frozen' in damage.cause
 
 
 @pytest.mark.parametrize('seed', range(4))

@@ -63,7 +63,7 @@ def test_rotor_writes_all_its_files(tmp_path, capsys):
     assert 'torque to thrust ratio' in capsys.readouterr().out
     results = json.loads(json_path.read_text())
     assert len(results['plateaus']) == 5
-    assert page.read_text().count('<img') == 3
+    assert page.read_text().count('<img') == 2
     assert len(RobotParameters.load(params).rotors.map) == 5
 
 

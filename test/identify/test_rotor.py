@@ -1,120 +1,195 @@
-"""The rotor map is recovered from artificial bench logs, and bad logs are refused."""
+"""Thrust, torque and lag are recovered from artificial and real logs; bad logs are refused."""
+
+from pathlib import Path
 
 import numpy as np
 import pytest
-from rotor_logs import bench, HEADER, RATIO, ROWS, write
+from rotor_logs import bench, HEADER, RATIO, SERIES, series, stand, SURFACE, write
 
-from beetle_omni_ros.identify.rotor import crossings, fit_row, identify_rotor
-from beetle_omni_ros.identify.rotor_log import Plateau, read_rotor_log
-from beetle_omni_ros.identify.rotor_results import rotor_results, write_rotor_file
+from beetle_omni_ros.identify.inference.robust import interval
+from beetle_omni_ros.identify.rotor.log import chosen, read_rotor_log
+from beetle_omni_ros.identify.rotor.results import identify_rotor, rotor_results, write_rotor_file
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.thrust_map import ThrustMap
 from beetle_omni_ros.runs.csv_table import LogError
 
-
-def identified(tmp_path, rows, header=HEADER):
-    log = read_rotor_log(write(tmp_path / 'bench.csv', rows, header))
-    return log, *identify_rotor(log)
-
-
-def relative_error(row, true, lowest=2.0):
-    """
-    Largest error of the thrust at a duty, relative to thrust.
-
-    Below ``lowest`` [N] it is relative to that, the resolution of 200 rows with 0.03 N of noise.
-    """
-    thrust = np.linspace(0.3, min(row.thrust_max, true.thrust_max), 200)
-    error = row.thrust(np.polyval(true.coefficients[::-1], thrust / 10)) - thrust
-    return np.abs(error / np.maximum(thrust, lowest)).max()
+DATA = Path(__file__).resolve().parents[3] / 'shared' / 'data'
+STAND = (*HEADER, 'temperature', 'file_voltage')
+real = pytest.mark.skipif(not DATA.is_dir(), reason='no measured logs')
 
 
-@pytest.mark.parametrize('seed', range(4))
-def test_the_five_published_rows_are_recovered(tmp_path, seed):
-    _, rows, ratio = identified(tmp_path, bench(np.random.default_rng(seed)))
-    assert len(rows) == 5
-    for row, true in zip(rows, ROWS, strict=True):
-        assert row.voltage == pytest.approx(true.voltage, abs=0.02)
-        assert row.thrust_max == pytest.approx(true.thrust_max, rel=0.02)
-        assert relative_error(row, true) < 0.01
-    assert ratio.interval[0] < RATIO < ratio.interval[1]
-    assert np.ptp(ratio.interval) < 0.02 * RATIO
-    assert crossings(rows) == []
+def identified(tmp_path, rows, header=HEADER, **options):
+    path = write(tmp_path / 'bench.csv', rows, header)
+    return identify_rotor([read_rotor_log(path, **options)])
 
 
-def test_the_map_and_its_inverse_agree(tmp_path):
-    _, rows, _ = identified(tmp_path, bench(np.random.default_rng(0)))
-    for row in rows:
-        thrust = np.linspace(0.5, row.thrust_max, 300)
-        assert np.allclose(row.thrust(row.duty(thrust)), thrust, rtol=1e-6)
-        assert row.inverse_error < 1e-3
-        assert (np.diff(row.duty(thrust)) > 0).all()
+def thrust_of(model, duty, voltage):
+    return model.surfaces['thrust'].at(duty, voltage)[..., 0]
 
 
-def test_intervals_cover_the_truth():
-    inside = []
-    for seed in range(15):
+def only_lag(model):
+    [(_, lag)] = model.lags
+    assert not lag['reason']
+    return lag
+
+
+def within(result, truth):
+    low, high = result['interval']
+    return low <= truth <= high
+
+
+def test_intervals_hold_the_true_surface_ratio_and_drift(tmp_path):
+    duty, voltage = np.array([0.2, 0.45, 0.75]), 23.0
+    true = np.polyval([*SURFACE[::-1], 0], duty * voltage)
+    inside = {'thrust': [], 'ratio': [], 'drift': []}
+    for seed in range(20):
         rng = np.random.default_rng(seed)
-        true = ROWS[seed % 5]
-        thrust = rng.uniform(0, true.thrust_max, 150)
-        duty = np.polyval(true.coefficients[::-1], thrust / 10)
-        row = fit_row('made', Plateau(true.voltage, duty, thrust + rng.normal(size=150) * 0.08,
-                                      RATIO * thrust))
-        inside += list((row.intervals[:, 0] < true.coefficients)
-                       & (true.coefficients < row.intervals[:, 1]))
-    assert np.mean(inside) > 0.85
+        model = identified(tmp_path, stand(rng, tare=0.03, drift=0.002), STAND)
+        results = rotor_results(model)
+        assert results['surface']['left_out_rms_N'] < 0.45
+        inside['drift'].append(within(results['temperature'], 0.002))
+        inside['ratio'].append(within(results['torque_to_thrust_ratio'], RATIO))
+        model = identified(tmp_path, stand(rng), STAND)
+        limits = np.array([interval(one) for one in
+                           model.surfaces['thrust'].at(duty, voltage)])
+        inside['thrust'] += list((limits[:, 0] < true) & (true < limits[:, 1]))
+        assert np.ptp(limits, axis=1).max() < 0.7
+    assert all(np.mean(hits) > 0.8 for hits in inside.values()), inside
 
 
-def test_the_fit_is_robust_to_growing_noise_and_outliers(tmp_path):
-    rng = np.random.default_rng(5)
-    rows = bench(rng, force_noise=0.0)
-    rows[:, 1] *= 1 + 0.01 * rng.normal(size=len(rows))
-    rows[::60, 1] += 3.0
-    _, fitted, _ = identified(tmp_path, rows)
-    assert max(relative_error(row, true) for row, true in zip(fitted, ROWS, strict=True)) < 0.01
+def test_a_published_voltage_is_predicted_from_the_others(tmp_path):
+    results = rotor_results(identified(tmp_path, bench(np.random.default_rng(0))))
+    assert results['surface']['left_out_rms_N'] < 0.3
+    assert within(results['torque_to_thrust_ratio'], RATIO)
 
 
-def test_a_sagging_supply_still_gives_five_plateaus(tmp_path):
-    log, rows, _ = identified(tmp_path, bench(np.random.default_rng(2), sag=0.3))
-    assert [len(plateau.duty) for plateau in log.plateaus] == [208] * 5
-    assert len(rows) == 5
+def test_one_voltage_gives_a_surface(tmp_path):
+    rows = stand(np.random.default_rng(0))[:, :4]
+    rows[:, 3] = 24.0
+    results = rotor_results(identified(tmp_path, rows))
+    assert 0 < results['surface']['left_out_rms_N'] < 2
 
 
-def test_other_columns_and_signs_give_the_same_result(tmp_path):
+def test_outliers_do_not_change_the_surface(tmp_path):
+    rows = stand(np.random.default_rng(5))
+    clean = identified(tmp_path, rows, STAND)
+    rows[::40, 1] += 8.0
+    dirty = identified(tmp_path, rows, STAND)
+    assert np.abs(thrust_of(dirty, np.array([0.2, 0.7]), 23.0)
+                  - thrust_of(clean, np.array([0.2, 0.7]), 23.0)).max() < 0.2
+
+
+def test_other_columns_signs_and_units_give_the_same_result(tmp_path):
     rows = bench(np.random.default_rng(1))
-    _, first, _ = identified(tmp_path, rows)
-    other = rows * [1 / 20, 1, -1, 1]
-    _, second, ratio = identified(tmp_path, other, ('duty_percent', 'thrust_N', 'torque_Nm',
-                                                    'voltage_V'))
-    assert ratio.value > 0
-    for a, b in zip(first, second, strict=True):
-        assert np.allclose(a.coefficients, b.coefficients, rtol=1e-3, atol=1e-2)
+    first = identified(tmp_path, rows)
+    for header, factor, options in (
+            (('duty_percent', 'thrust_N', 'torque_Nm', 'voltage'), [1 / 20, 1, -1, 1], ()),
+            (('pwm_us', 'fz', 'tz', 'voltage_V'), [1, -1, 1, 1], ()),
+            (('pwm_us', 'load', 'tz', 'mV'), [1, -100, 1, 1000],
+             ('thrust=-load*0.01', 'voltage=mV*0.001'))):
+        other = identified(tmp_path, rows * factor, header, columns=chosen(options))
+        for name, surface in first.surfaces.items():
+            assert np.allclose(other.surfaces[name].every[0], surface.every[0], rtol=0.02,
+                               atol=1e-3)
 
 
-def test_rows_before_the_rotor_settles_are_omitted(tmp_path):
-    rng = np.random.default_rng(3)
-    levels = np.repeat(np.linspace(55, 90, 15), 60)
-    t = 0.05 * np.arange(len(levels))
-    true = ROWS[0]
-    grid = np.linspace(0, 2.5, 4000)
-    steady = 10 * np.interp(levels, np.polyval(true.coefficients[::-1], grid), grid)
-    force = steady.copy()
-    for k in range(1, len(force)):
-        force[k] = force[k - 1] + (steady[k] - force[k - 1]) * 0.3
-    rows = np.stack([levels * 20, force + 0.02 * rng.normal(size=len(t)), RATIO * force,
-                     np.full(len(t), true.voltage), t], axis=1)
-    log, fitted, _ = identified(tmp_path, rows, (*HEADER, 't_s'))
-    assert len(log.plateaus[0].duty) < 0.9 * len(t)
-    assert relative_error(fitted[0], true, lowest=3.0) < 0.01
+def test_the_lag_and_its_directions_are_recovered(tmp_path):
+    inside = []
+    for seed in range(4):
+        model = identified(tmp_path, series(np.random.default_rng(seed)), SERIES)
+        lag = only_lag(model)
+        assert lag['up']['value'] == pytest.approx(0.07, rel=0.15)
+        assert lag['down']['value'] == pytest.approx(0.045, rel=0.15)
+        assert lag['up']['interval'][0] > lag['down']['interval'][1]
+        inside += [within(lag['up'], 0.07), within(lag['down'], 0.045),
+                   within(lag['dead_time'], 0.0)]
+    assert np.mean(inside) > 0.8
 
 
-def test_the_written_robot_file_contains_the_map(tmp_path):
-    log, rows, ratio = identified(tmp_path, bench(np.random.default_rng(0)))
+def test_dead_time_is_separated_from_the_lag(tmp_path):
+    lag = only_lag(identified(tmp_path, series(np.random.default_rng(0), dead=0.04), SERIES))
+    assert lag['dead_time']['value'] == pytest.approx(0.04, abs=0.008)
+    assert lag['up']['value'] == pytest.approx(0.07, rel=0.2)
+
+
+@pytest.mark.parametrize('seed', range(2))
+def test_a_gain_that_jumps_is_bad_data_with_the_lag_that_remains(tmp_path, seed):
+    rng = np.random.default_rng(seed)
+    gains = rng.permutation([0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.2, 0.3, 0.4, 0.5])
+    results = rotor_results(identified(tmp_path, series(rng, gains=gains), SERIES))
+    assert results['verdict'] == 'bad_data'
+    assert 'do not belong together' in results['reason']
+    assert results['lag']['value'] == pytest.approx(0.055, rel=0.3)
+    with pytest.raises(LogError, match='bad_data'):
+        write_rotor_file(tmp_path / 'robot.yaml', results, None)
+    steady = rotor_results(identified(tmp_path, series(rng, noise=1.0), SERIES))
+    assert steady['verdict'] == 'identified'
+
+
+def test_held_and_impossible_telemetry_is_masked_and_stated(tmp_path):
+    rows = stand(np.random.default_rng(3))
+    clean = identified(tmp_path, rows, STAND)
+    bad = rows.copy()
+    bad[1::10, 3], bad[3::20, 3] = 97.0, 0.46
+    model = identified(tmp_path, bad, STAND)
+    assert np.abs(model.rows['voltage'] - rows[:, 3]).max() < 3
+    assert thrust_of(model, 0.6, 23.0) == pytest.approx(thrust_of(clean, 0.6, 23.0), abs=0.1)
+    assert f'{np.sum(bad[:, 3] != rows[:, 3])} of {len(rows)} rows' in model.logs[0].notes[0]
+    rows = series(np.random.default_rng(3))
+    rows[:, 4:] = rows[np.arange(600) // 30 * 30][:, 4:]
+    rows[5::10, 2:4] = rows[4::10, 2:4]
+    held, repeated = identified(tmp_path, rows, SERIES).logs[0].notes
+    assert '580 of 600' in held and 'up to 0.30 s' in held
+    assert '60 of 600' in repeated
+
+
+def test_the_written_robot_file_gives_the_surface(tmp_path):
+    model = identified(tmp_path, stand(np.random.default_rng(0)), STAND)
     path = tmp_path / 'robot.yaml'
-    write_rotor_file(path, rotor_results(log, rows, ratio), None)
+    results = rotor_results(model)
+    write_rotor_file(path, results, None)
     robot, shipped = RobotParameters.load(path), RobotParameters.load()
     assert robot.joints == shipped.joints
-    assert robot.rotors.torque_to_thrust_ratio == pytest.approx(ratio.value, abs=1e-6)
-    for written, row in zip(robot.rotors.map, rows, strict=True):
-        assert np.allclose(written.coefficients, row.coefficients, atol=1e-7)
+    assert robot.rotors.torque_to_thrust_ratio == pytest.approx(
+        results['torque_to_thrust_ratio']['value'], rel=1e-4)
+    assert '95 %' in path.read_text()
+    found = ThrustMap(robot.rotors)
+    assert not found.repaired
+    for voltage in np.linspace(model.rows['voltage'].min(), model.rows['voltage'].max(), 7):
+        thrust = np.linspace(2, found.thrust_limit(voltage), 20)
+        duty = found.duty(thrust, voltage)
+        assert np.abs(thrust_of(model, duty / 50 - 1, voltage) - thrust).max() < 0.5
+
+
+@real
+def test_the_measured_stand_predicts_a_voltage_left_out():
+    results = rotor_results(identify_rotor([read_rotor_log(DATA / 'thrust_stand.csv')]))
+    assert results['verdict'] == 'identified'
+    assert results['surface']['left_out_rms_N'] < 0.4
+    ratio = results['torque_to_thrust_ratio']
+    assert within(ratio, 0.0165) and within(ratio, 0.0167)
+    assert np.ptp(ratio['interval']) < 0.0012
+
+
+@real
+def test_the_measured_rotor_log_is_bad_data_with_a_lag():
+    results = rotor_results(identify_rotor([read_rotor_log(DATA / 'rotor_log_100Hz.csv')]))
+    assert results['verdict'] == 'bad_data'
+    lag = results['lag']
+    assert 0.04 < lag['value'] < 0.07
+    assert within(lag['up'], 0.065) and within(lag['down'], 0.0475)
+    assert '22%' in results['warnings'][0]
+
+
+@real
+def test_the_measured_start_has_the_lag_of_a_rising_thrust():
+    path = DATA / 'thrust_stand_start_24V.csv'
+    with pytest.raises(LogError, match='--rate'):
+        read_rotor_log(path)
+    lag = only_lag(identify_rotor([read_rotor_log(path, rate=90)]))
+    assert lag['from_rest'] and lag['down'] is None
+    assert within(lag['up'], 0.064) and lag['dead_time']['interval'][0] > 0.1
 
 
 def scaled(rows, column, factor):
@@ -135,18 +210,18 @@ CASES = {
     'grams in the header': (lambda r: r, ('pwm_us', 'force_g', 'torque_N_m', 'voltage_V'),
                             "'force_g' has another unit"),
     'grams': (lambda r: scaled(r, 1, 102.0), HEADER, 'expected newtons'),
+    'thrust of the other sign': (lambda r: scaled(r, 1, -1.0), HEADER, 'expected newtons'),
+    'small thrust of the other sign': (lambda r: scaled(r, 1, -0.1), HEADER, 'are sign and unit'),
     'millivolts': (lambda r: scaled(r, 3, 1000.0), HEADER, 'millivolts'),
-    'pulse as duty': (lambda r: r, ('duty_percent', *HEADER[1:]), 'expected percent of 2000 us'),
-    'duty as pulse': (lambda r: scaled(r, 0, 0.05), HEADER, 'expected microseconds'),
-    'one duty': (lambda r: scaled(r, 0, 0.0) + [1500, 0, 0, 0], HEADER, 'expected a sweep'),
+    'pulse as duty': (lambda r: r, ('duty_percent', *HEADER[1:]), 'expected duty of 2000 us'),
+    'duty as pulse': (lambda r: scaled(r, 0, 0.05), HEADER, 'expected duty of 2000 us'),
+    'one duty': (lambda r: scaled(r, 0, 0.0) + [1500, 0, 0, 0], HEADER, 'expected'),
     'NaN': (lambda r: with_value(r, 3, 1, np.nan), HEADER, 'row 5, column force_N'),
     'few rows': (lambda r: r[:10], HEADER, '10 rows are too few'),
     'thrust falls': (lambda r: np.stack([3000 - r[:, 0], *r.T[1:]], axis=1)[r[:, 0] > 1100],
-                     HEADER, 'thrust does not rise with duty'),
+                     HEADER, 'thrust does not rise with the command'),
     'torque of noise': (lambda r: np.stack([r[:, 0], r[:, 1], np.random.default_rng(0).normal(
         size=len(r)), r[:, 3]], axis=1), HEADER, 'torque does not follow thrust'),
-    'no plateau': (lambda r: np.stack([*r[:90:5].T[:3], np.linspace(15, 25, 18)], axis=1).repeat(
-        2, axis=0), HEADER, 'no voltage plateau'),
     'both': (lambda r: np.concatenate([r, r[:, :1]], axis=1), (*HEADER, 'duty_percent'),
              'mean the same'),
 }
@@ -157,6 +232,12 @@ def test_unusable_logs_are_refused(tmp_path, case):
     change, header, words = CASES[case]
     path = write(tmp_path / 'bad.csv', change(bench(np.random.default_rng(0))), header)
     with pytest.raises(LogError) as caught:
-        identify_rotor(read_rotor_log(path))
+        identify_rotor([read_rotor_log(path)])
     assert words in str(caught.value) and 'bad.csv' in str(caught.value)
     assert '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize('text', ['thrust', 'lift=fz', 'thrust=fz*x', 'thrust='])
+def test_unusable_columns_are_refused(text):
+    with pytest.raises(ParameterError, match='expected QUANTITY'):
+        chosen([text])

@@ -76,7 +76,7 @@ class FollowerNode(ControllerNode):
     def __init__(self):
         super().__init__(ControllerEntry(name='nmpc', controller=Follower))
         self._publisher = Sent('nmpc/command')
-        self.follower = self._controller
+        self.follower = self._host.controller
 
 
 def odom_at(stamp, height=1.0):
@@ -110,7 +110,8 @@ def test_a_controller_on_standby_steps_between_the_steps_of_the_one_that_flies(m
     def steps_from(begin):
         before = len(node._publisher)
         for stamp in begin + np.arange(rate) / rate:
-            if round((stamp - begin) * rate) % (rate // 100) == 0 and node._mode == 'flying:rl':
+            due = round((stamp - begin) * rate) % (rate // 100) == 0
+            if due and node._host.mode == 'flying:rl':
                 node._on_command(Command(stamp, np.zeros(4), np.full(4, 7.5)))
             fly(node, [stamp])
         return np.array([conversions.seconds(m.header.stamp) for m in node._publisher[before:]])

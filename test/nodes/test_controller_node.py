@@ -68,7 +68,7 @@ def test_a_shipped_controller_has_its_parameters_and_policy(make):
 
 def test_any_controller_sees_true_tilts_and_no_target_beyond_its_reach(make, monkeypatch):
     node, seen = make(ControllerNode, f'controller:={OWN}'), []
-    controller = node._controller
+    controller = node._host.controller
     step = controller.step
     monkeypatch.setattr(controller, 'step', lambda state, target: seen.append(state) or step(
         state, target))
@@ -79,7 +79,7 @@ def test_any_controller_sees_true_tilts_and_no_target_beyond_its_reach(make, mon
                                np.zeros(3)))
     assert seen[0].tilt == pytest.approx(health.true(np.zeros(4))) and seen[0].tilt.any()
     far = PoseTarget(np.array([9.0, 0.0, 1.0]), LEVEL, 1.0)
-    node._mode = node._own_mode
+    node._on_mode('flying:pose_controller')
     node._check_target(far, math.nan)       # its reach is not limited
     controller.reach = 3.0
     with pytest.raises(MessageError, match='expected at most 3 m'):
@@ -119,7 +119,7 @@ def test_an_exception_of_step_is_logged_and_reported_and_publishes_no_command(
     level, text, values = node._controller_status()
     assert (level, text, values['errors']) == (health.ERROR, error, 2)
     assert node._controller_status()[0] == health.OK      # none since the last report
-    node._controller.step = lambda state, target: ()
+    node._host.controller.step = lambda state, target: ()
     step(2.2)
     assert 'step returned tuple' in node._controller_status()[1] and len(published) == 1
     lines = [line for line in capfd.readouterr().err.splitlines() if 'ERROR' in line]

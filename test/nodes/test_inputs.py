@@ -111,8 +111,8 @@ def test_a_bad_target_pose_is_refused_with_its_reason_and_the_old_one_stays(benc
     node = bench.add(StillNode())
     poses = bench.publisher(PoseStamped, 'target_pose')
     poses.publish(pose())
-    assert bench.wait(lambda: node._target is not None)
-    first, now = node._target, time.time()
+    assert bench.wait(lambda: node._host.target is not None)
+    first, now = node._host.target, time.time()
     for message, expected in (
             (pose(-5.0), 'z = -5 m, expected at least'),
             (pose(0.05), 'z = 0.05 m, expected at least'), (pose(1e300), 'the fence'),
@@ -123,7 +123,7 @@ def test_a_bad_target_pose_is_refused_with_its_reason_and_the_old_one_stays(benc
         poses.publish(message)
         assert bench.wait(lambda received=received: len(node.refusals) > received), expected
         assert node.refusals[-1].startswith('target_pose: ') and expected in node.refusals[-1]
-        assert node._target is first
+        assert node._host.target is first
     kinds = node.health._inputs['target_pose'].rejected
     assert kinds['cannot be flown'] == 6 and kinds.total() == 7
 
@@ -132,9 +132,9 @@ def test_a_target_from_a_clock_ahead_does_not_block_later_ones(bench):
     node = bench.add(StillNode())
     poses = bench.publisher(PoseStamped, 'target_pose')
     poses.publish(pose(1.0, time.time() + 0.8))
-    assert bench.wait(lambda: node._target is not None)
+    assert bench.wait(lambda: node._host.target is not None)
     poses.publish(pose(1.5, time.time()))
-    assert bench.wait(lambda: node._target.position[2] == 1.5)
+    assert bench.wait(lambda: node._host.target.position[2] == 1.5)
 
 
 def test_a_stamp_of_1970_is_refused_in_simulated_time_too(bench, monkeypatch):
@@ -159,24 +159,24 @@ def test_a_latched_target_stays_good_for_a_node_that_starts_later(bench, monkeyp
     monkeypatch.setattr(node, 'now', lambda: late)
     latched = bench.user.create_publisher(PoseStamped, 'target_pose', wire.profile(LATCHED))
     latched.publish(pose(1.2, time.time()))
-    assert bench.wait(lambda: node._target is not None)
+    assert bench.wait(lambda: node._host.target is not None)
 
 
 def test_a_target_beyond_the_reach_of_the_active_controller_is_refused_and_not_taken_over(bench):
     node = bench.add(StillNode())
-    node._controller.reach = 6.5
-    node._position = np.array([0.0, 0.0, 1.0])
+    node._host.controller.reach = 6.5
+    node._host.on_estimate(PoseTarget(np.array([0.0, 0.0, 1.0]), LEVEL))
     poses = bench.publisher(PoseStamped, 'target_pose')
     poses.publish(pose(x=12.0))
-    assert bench.wait(lambda: node._target is not None)     # others may reach it
+    assert bench.wait(lambda: node._host.target is not None)     # others may reach it
     node._on_mode('flying:nmpc')
-    assert node._target is None and 'the present pose is held' in node.refusals[-1]
+    assert node._host.target is None and 'the present pose is held' in node.refusals[-1]
     poses.publish(pose(x=3.0))
-    assert bench.wait(lambda: node._target is not None)
-    near, received = node._target, len(node.refusals)
+    assert bench.wait(lambda: node._host.target is not None)
+    near, received = node._host.target, len(node.refusals)
     poses.publish(pose(x=12.0))
     assert bench.wait(lambda: len(node.refusals) > received)
-    assert node._target is near
+    assert node._host.target is near
     assert '12 m from the robot, expected at most 6.5 m' in node.refusals[-1]
 
 
@@ -199,9 +199,9 @@ def test_every_point_of_a_target_trajectory_is_checked(bench):
     paths.publish(fast)
     assert bench.wait(lambda: len(node.refusals) > 1)
     assert 'point 2: velocity 1e+300 m/s, expected within +-10 m/s' in node.refusals[1]
-    assert node._target is None
+    assert node._host.target is None
     paths.publish(trajectory([1.0, 1.1, 1.2], time.time()))
-    assert bench.wait(lambda: node._target is not None)
+    assert bench.wait(lambda: node._host.target is not None)
 
 
 def test_refusals_of_many_kinds_take_no_memory(bench):

@@ -1,12 +1,21 @@
 """Processes of the launch file by its arguments; launch itself is replaced."""
 
+from contextlib import contextmanager, suppress
 from importlib.util import module_from_spec, spec_from_file_location
 import os
 from pathlib import Path
+import re
+import signal
+import subprocess
 import sys
+import time
 from types import ModuleType
 
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 import pytest
+from test_deploy import install, UNIT
+from witness import READY, Witness
 
 from beetle_omni_ros.messages.topics import TOPICS
 from beetle_omni_ros.nodes import discovery, plan, private
@@ -76,7 +85,7 @@ def test_composed_is_one_process_and_one_for_the_bridges(bringup):
 
 
 def test_separate_nodes_and_no_simulator_for_another_backend(bringup):
-    nodes = bringup.start(composed='false', backend='none', actuators='none', task='waypoints',
+    nodes = bringup.start(composed='false', backend='none', task='waypoints',
                           viewer='true', namespace='robot1')
     assert [n.kwargs['executable'] for n in nodes] == [
         'ekf_node', 'nmpc_node', 'rl_node', 'supervisor_node', 'reference_node', 'viewer_node']
@@ -113,14 +122,74 @@ def test_simulator_and_bridges_meet_at_the_same_ports(bringup):
                                    ).kwargs['parameters'][0]
 
 
-def test_on_the_robot_the_bridges_use_their_files_and_switch_no_torque_on(bringup):
-    nodes = {n.kwargs['name']: n.kwargs['parameters'][0] for n in bringup.start(
-        composed='false', backend='none', robot_file='r.yaml', servo_bus_file='s.yaml',
-        motor_board_file='m.yaml')}
-    assert nodes['joint_bridge_node'] == {
-        'robot_file': 'r.yaml', 'autostart': 'configure', 'servo_bus_file': 's.yaml'}
-    assert nodes['rotor_bridge_node'] == {'robot_file': 'r.yaml', 'motor_board_file': 'm.yaml'}
-    assert 'sim_node' not in nodes
+class Pilot(Witness):
+    """Operator that activates bridges, as `ros2 lifecycle set` does, and counts nodes."""
+
+    def activate(self, bridge):
+        """Activate a bridge; return whether it accepts."""
+        client = self._node.create_client(ChangeState, f'{bridge}/change_state')
+        assert self.wait(client.service_is_ready, 10)
+        request = ChangeState.Request()
+        request.transition.id = Transition.TRANSITION_ACTIVATE
+        future = client.call_async(request)
+        return self.wait(future.done, 10) and future.result().success
+
+    def count(self, name):
+        """Number of nodes of this name."""
+        return self._node.get_node_names().count(name)
+
+
+@contextmanager
+def running(commands, folder):
+    """Processes by name, with their output in the folder; ended by SIGINT."""
+    processes = {}
+    try:
+        for name, (command, needs) in commands.items():
+            deadline = time.monotonic() + 30
+            while not all(map(os.path.exists, needs)) and time.monotonic() < deadline:
+                time.sleep(0.05)
+            with open(folder / f'{name}.log', 'w') as log:
+                processes[name] = subprocess.Popen(command, stdout=log, stderr=log,
+                                                   stdin=subprocess.DEVNULL)
+        yield processes
+    finally:
+        for process in reversed(processes.values()):
+            process.send_signal(signal.SIGINT)
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(10)
+            process.kill()
+
+
+@pytest.mark.alone
+def test_the_service_and_the_launch_file_fly_with_one_pair_of_bridges(bringup, tmp_path,
+                                                                      ros_domain):
+    assert install(tmp_path).returncode == 0
+    start = re.search(r"exec python3 (.*)'$", (tmp_path / UNIT).read_text(), re.M)[1]
+    ports = [str(tmp_path / name) for name in ('beetle_servos', 'motor_board')]
+    python = [sys.executable, '-m', 'beetle_omni_ros.start']
+    launched, = bringup.start(backend='none', standby='false')
+    commands = {
+        # In place of the devices and of the drivers of MoCap and IMU.
+        'robot': ([*python, 'sim_node', '--ros-args', '-p', 'actuators:=emulated', '-p',
+                   f'servo_port:={ports[0]}', '-p', f'board_port:={ports[1]}'], ()),
+        'service': ([sys.executable, *start.replace('/dev', str(tmp_path)).split()], ports),
+        'launch': (launched.kwargs['cmd'], ())}
+    with running(commands, tmp_path) as processes:
+        operator = Pilot(ros_domain)
+        try:
+            assert operator.wait(lambda: set(operator.bridges) == set(BRIDGES), 40)
+            assert operator.wait(lambda: operator.ready, READY)
+            assert [operator.count(name) for name in BRIDGES] == [1, 1]
+            assert all(operator.waits_for([name]) for name in BRIDGES)
+            assert all(map(operator.activate, BRIDGES))
+            assert operator.wait(lambda: not operator.waits_for(BRIDGES), 20), operator.bridges
+            operator.take_off(lambda: operator.state == 'flying:nmpc')
+            assert operator.stays_in_the_air(2.0)
+            assert operator.call('land')[0]
+            assert operator.wait(lambda: operator.state == 'disarmed', 30), operator.states
+        finally:
+            operator.close()
+    assert [process.returncode for process in processes.values()] == [0, 0, 0]
 
 
 def test_the_plant_may_differ_from_the_robot_file(bringup):

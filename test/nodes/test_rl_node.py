@@ -119,7 +119,19 @@ def test_a_policy_that_cannot_fly_is_refused_at_the_start(ros_domain, tmp_path):
     cut.write_bytes(write(tmp_path / 'whole.onnx').read_bytes()[:300])
     assert 'not a readable ONNX file' in refusal(f'policy:={cut}')
     other = share_path('params/robot_weak_and_heavy.yaml')
-    assert 'robot_hash' in refusal(f"policy:={tmp_path / 'whole.onnx'}", f'robot_file:={other}')
+    assert 'mass' in refusal(f"policy:={tmp_path / 'whole.onnx'}", f'robot_file:={other}')
+
+
+def test_a_file_of_the_nmpc_reaches_its_node(tmp_path):
+    mine = tmp_path / 'mine.yaml'
+    mine.write_text('limits: {tilt_rate_share: 0.5}\n')
+    for active in ('nmpc', 'hover'):
+        assert controller_nodes(active, nmpc=str(mine))[0]['nmpc_node'] == {'nmpc_file': str(mine)}
+    with pytest.raises(ParameterError, match="for the controller 'nmpc', which does not run"):
+        controller_nodes('hover', nmpc=str(mine), standby=False)
+    mine.write_text('limits: {tilt_rate: 7.0}\n')
+    with pytest.raises(ParameterError, match="unknown key; did you mean 'tilt_rate_share'"):
+        controller_nodes('nmpc', nmpc=str(mine))
 
 
 def test_an_unusable_policy_is_not_on_standby(tmp_path):
@@ -128,7 +140,7 @@ def test_an_unusable_policy_is_not_on_standby(tmp_path):
     assert list(controller_nodes('nmpc', policy=policy)[0]) == ['nmpc_node', 'rl_node']
     assert list(controller_nodes('rl', policy=policy)[0]) == ['rl_node', 'nmpc_node']
     nodes, reason = controller_nodes('nmpc', policy=policy, robot_file=other)
-    assert list(nodes) == ['nmpc_node'] and 'robot_hash' in reason['rl']
+    assert list(nodes) == ['nmpc_node'] and 'mass' in reason['rl']
     nodes, reason = controller_nodes('nmpc', policy=policy, robot_file=other,
                                      allow_other_robot=True)
     assert nodes['rl_node'] == {'robot_file': other, 'policy': policy, 'allow_other_robot': True}

@@ -1,9 +1,13 @@
 """The robot file: its consistency, and refusals."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import yaml
 
+from beetle_omni_ros.identify.robot_file import write_robot_file
+from beetle_omni_ros.robot.mass_properties import mass_properties
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
@@ -15,21 +19,21 @@ def content():
     return yaml.safe_load(share_path('params/robot.yaml').read_text())
 
 
+def scaled(key, factor):
+    """Function that multiplies the numbers at a dotted key of a robot file."""
+    *parts, last = key.split('.')
+
+    def change(content):
+        for part in parts:
+            content = content[part]
+        content[last] = (np.array(content[last]) * factor).tolist()
+    return change
+
+
 def load(tmp_path, content):
     path = tmp_path / 'robot.yaml'
     path.write_text(yaml.safe_dump(content))
     return RobotParameters.load(path)
-
-
-def test_rotor_positions_of_parts_and_totals_agree():
-    robot = RobotParameters.load()
-    parts = robot.multibody
-    for i in range(4):
-        axis = robot.tilt_axes[i]
-        joint = parts.module.joint_offset * np.sign(axis) + [0, 0, parts.module.joint_height]
-        rotor = joint + parts.module.rotor_offset * axis \
-            - [0, 0, parts.centre_of_gravity_height]
-        assert np.allclose(rotor, robot.rotors.positions[i], atol=5e-4)
 
 
 def test_the_rotor_map_grows_with_thrust_at_every_voltage():
@@ -55,6 +59,12 @@ def test_the_hash_depends_on_physics_and_not_on_the_name(tmp_path, content):
     (lambda c: c['rotors'].update(thrust_min=30), 'rotors.thrust_min'),
     (lambda c: c['rotors'].update(spin=[1, 0, 1, 0]), 'must hold +1 or -1'),
     (lambda c: c['rotors']['map'][1].pop('voltage'), "key 'rotors.map[1].voltage': missing [V]"),
+    (scaled('rotors.positions', 1.2), 'multibody.module.joint_offset: 0.17938 m contradicts'),
+    (scaled('mass', 1.15), 'multibody.main_body.centre_of_mass: [0.     , 0.     , 0.01492] m '
+     'contradicts mass 3.49439 kg'),
+    (scaled('inertia', 1.15), 'inertia: [0.07222, 0.07139, 0.10911] kg m^2 leaves the main body'),
+    (lambda c: c.update(inertia=[0.03, 0.06, 0.09]), 'inertia: [0.03, 0.06, 0.09] kg m^2 leaves '
+     'the main body the principal moments'),
     (lambda c: c['joints'].update(stiffness=1), "key 'joints.stiffness': unknown key"),
     (lambda c: c.update(effects={'thrust_coeficient': {'scale': 1}}),
      "effects.thrust_coeficient: unknown effect; did you mean 'thrust_coefficient'?"),
@@ -81,6 +91,67 @@ def test_a_file_that_extends_another_contains_differences_only(tmp_path):
     assert mine.effects == {'wind': {'force': (1.0, 0.0, 0.0)}}
     assert np.array_equal(mine.rotors.positions, shipped.rotors.positions)
     assert mine.joints == shipped.joints
+
+
+def extended(tmp_path, text):
+    (tmp_path / 'mine.yaml').write_text('extends: robot.yaml\n' + text)
+    return RobotParameters.load(tmp_path / 'mine.yaml')
+
+
+def test_an_arm_length_moves_rotors_and_inertia(tmp_path):
+    shipped, arms = RobotParameters.load(), np.linalg.norm
+    longer = extended(tmp_path, 'rotors: {arm_length: 0.33}\n')
+    assert arms(longer.rotors.positions[:, :2], axis=1).mean() == pytest.approx(0.33)
+    assert np.array_equal(longer.rotors.positions[:, 2], shipped.rotors.positions[:, 2])
+    module = shipped.multibody.module
+    places = [robot.rotors.positions + (module.centre_of_mass[0] - module.rotor_offset)
+              * robot.tilt_axes for robot in (longer, shipped)]
+    squares = np.subtract(*[module.mass * np.sum(place[:, :2] ** 2, axis=0) for place in places])
+    assert longer.inertia - shipped.inertia == pytest.approx([*squares[::-1], squares.sum()],
+                                                             rel=1e-3)
+    stated = np.round(longer.rotors.positions, 9).tolist()
+    by_position = extended(tmp_path, f'rotors: {{positions: {stated}}}\n')
+    assert by_position.inertia == pytest.approx(longer.inertia, rel=1e-6)
+
+
+def test_an_added_mass_keeps_the_radii_of_gyration_of_the_main_body(tmp_path):
+    shipped, heavy = (mass_properties(robot).main_body for robot in (
+        RobotParameters.load(), extended(tmp_path, 'mass: 3.4\n')))
+    assert heavy.mass == pytest.approx(shipped.mass + 3.4 - 3.0386)
+    assert np.diag(heavy.inertia) / heavy.mass == pytest.approx(
+        np.diag(shipped.inertia) / shipped.mass)
+
+
+def test_an_inertia_beside_the_mass_is_kept(tmp_path):
+    heavy = extended(tmp_path, 'mass: 3.4\ninertia: [0.064, 0.063, 0.096]\n')
+    assert heavy.inertia.tolist() == [0.064, 0.063, 0.096]
+
+
+@pytest.mark.parametrize('text, message', [
+    ('rotors: {arm_length: long}', "key 'rotors.arm_length': expected a number [m], found 'long'"),
+    ('rotors: {arm_length: 0.3, positions: []}', 'either this key or rotors.positions'),
+    ('multibody: null\nrotors: {arm_length: 0.3}', 'inertia: without multibody it does not'),
+    ('multibody: {centre_of_gravity_height: 0.03}', 'height: 0.03 m contradicts mass'),
+    ('mass: 0.5', 'multibody: modules and end-effector weigh 0.76121 kg'),
+])
+def test_a_change_that_contradicts_the_extended_file_is_refused(tmp_path, text, message):
+    with pytest.raises(ParameterError) as error:
+        extended(tmp_path, text)
+    assert message in str(error.value)
+    assert 'mine.yaml: ' in str(error.value) and '\n' not in str(error.value)
+
+
+def test_the_name_of_a_shipped_file_is_a_robot_file_unless_a_local_file_has_it(
+        tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert RobotParameters.load('robot.yaml').hash() == RobotParameters.load().hash()
+    (tmp_path / 'other').mkdir()
+    write_robot_file(tmp_path / 'other' / 'mine.yaml', '', {'mass': 3.1}, Path('robot.yaml'))
+    assert RobotParameters.load('other/mine.yaml').mass == 3.1
+    (tmp_path / 'robot.yaml').write_text('extends: robot.yaml\nmass: 3.2\n')
+    assert RobotParameters.load('robot.yaml').mass == 3.2
+    with pytest.raises(ParameterError, match='none.yaml: no such file'):
+        RobotParameters.load('none.yaml')
 
 
 @pytest.mark.parametrize('text, message', [

@@ -233,7 +233,7 @@ def test_a_bag_cut_at_any_byte_reads_up_to_the_cut(recorded, tmp_path):
     cut = tmp_path / 'cut'
     cut.mkdir()
     rng = np.random.default_rng(0)
-    for size in [*sorted(rng.integers(9, len(data), 12)), len(data) - 100]:
+    for size in [*sorted(rng.integers(len(data) // 4, len(data), 12)), len(data) - 100]:
         (cut / 'cut.mcap').write_bytes(data[:size])
         log = read_bag(cut)
         n = len(log.truth_t)
@@ -241,6 +241,10 @@ def test_a_bag_cut_at_any_byte_reads_up_to_the_cut(recorded, tmp_path):
         assert any('cut off' in warning for warning in log.warnings)
         assert any('metadata.yaml is missing' in warning for warning in log.warnings)
     assert n > 0.9 * len(whole.truth_t)
+    for size in (0, 4, 8, 300):     # before the first message
+        (cut / 'cut.mcap').write_bytes(data[:size])
+        with pytest.raises(BagError, match='cut.mcap: cut off after 0 readable messages'):
+            read_bag(cut)
 
 
 def test_flushed_messages_survive_a_sigkill(tmp_path):
@@ -291,11 +295,13 @@ def test_a_folder_without_permission_is_refused(tmp_path):
 def test_a_path_that_is_not_a_bag_is_refused(tmp_path):
     (tmp_path / 'empty').mkdir()
     (tmp_path / 'text.mcap').write_text('hello, this is no bag at all')
+    (tmp_path / 'short.mcap').write_text('hello')
     (tmp_path / 'notes.txt').write_text('x')
     (tmp_path / 'old').mkdir()
     (tmp_path / 'old' / 'old.db3').write_text('')
     for name, reason in (('none', 'no such bag'), ('empty', r'no \.mcap file'),
-                         ('text.mcap', 'not an MCAP file'), ('notes.txt', 'expected a rosbag2'),
+                         ('text.mcap', 'not an MCAP file'),
+                         ('short.mcap', 'not an MCAP file'), ('notes.txt', 'expected a rosbag2'),
                          ('old', 'ros2 bag convert')):
         with pytest.raises(BagError, match=reason) as error:
             read_bag(tmp_path / name)

@@ -8,7 +8,7 @@ from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.pose_file import COLUMNS, read_poses, TaskError
-from beetle_omni_ros.runs.target_checks import out_of_reach, TargetChecks
+from beetle_omni_ros.runs.target_checks import TargetChecks
 
 CHECKS = TargetChecks(RobotParameters.load())
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
@@ -88,16 +88,6 @@ def test_a_row_beyond_the_reach_of_the_controller_is_named(tmp_path, reach, row)
     assert len(read_poses(file)) == 3
     with pytest.raises(TaskError, match=rf'row {row}: .* m from .*expected at most {reach:g} m'):
         read_poses(file, reach)
-
-
-def test_the_reach_counts_from_the_robots_position():
-    here = np.array([10.0, 0, 1])
-    near, far = (PoseTarget(np.array([x, 0, 1.0]), LEVEL) for x in (16.0, 17.0))
-    assert out_of_reach(near, here, 6.5, 0.0) == ''
-    assert out_of_reach(far, here, 6.5, 0.0).startswith('7 m from the robot, expected at most 6.5')
-    track = TrajectoryTarget(np.array([0.0, 10.0]), np.array([[0, 0, 1.0], [10.0, 0, 1]]),
-                             np.array([LEVEL, LEVEL]), np.zeros((2, 3)), np.zeros((2, 3)))
-    assert out_of_reach(track, here, 6.5, 0.0) and not out_of_reach(track, here, 6.5, 5.0)
 
 
 def test_every_step_of_the_shipped_tasks_is_in_reach_of_every_controller():

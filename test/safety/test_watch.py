@@ -1,5 +1,7 @@
 """Detectors: named faults, detection times, and no false alarms in healthy motion."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -147,6 +149,12 @@ def swings(t):
 def test_joints_that_follow_are_never_named():
     for delay in (0.01, 0.03, 0.05):
         assert follow(JointWatch(P.servo, ROBOT), swings, lambda t, q: q, 6.0, delay) is None
+
+
+def test_delays_of_the_robot_file_are_no_fault_of_its_joints():
+    late = replace(ROBOT, effects={'joint_command_latency': {'delay': 0.1}})
+    assert follow(JointWatch(P.servo, late), swings, lambda t, q: q, 6.0, 0.125) is None
+    assert follow(JointWatch(P.servo, ROBOT), swings, lambda t, q: q, 6.0, 0.125) is not None
 
 
 def test_a_jammed_and_a_drifting_joint_are_distinguished():

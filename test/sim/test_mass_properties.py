@@ -5,9 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from sim_robots import plant, ROBOT
+import yaml
 
+from beetle_omni_ros.robot import schema
+from beetle_omni_ros.robot.mass_properties import combined, mass_properties, Variation
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.sim.mass_properties import combined, mass_properties, Variation
 
 
 def whole(properties):
@@ -58,6 +62,28 @@ def test_parts_agree_with_the_published_description():
     assert -properties.main_origin[2] == pytest.approx(parts.centre_of_gravity_height, abs=1e-5)
     np.testing.assert_allclose(np.abs(properties.joint_origins - properties.main_origin)[:, :2],
                                parts.module.joint_offset, atol=1e-6)
+
+
+@pytest.mark.parametrize('key', [
+    name for name, _, _, _ in schema.flatten(ROBOT.multibody) if name != 'main_body'] + [
+    'main_body.centre_of_mass', 'main_body.inertia'])
+def test_each_key_of_a_part_changes_the_plant_or_is_refused(tmp_path, key):
+    content = schema.load_yaml(share_path('params/robot.yaml'))
+    *parts, last = key.split('.')
+    part = content['multibody']
+    for name in parts:
+        part = part[name]
+    part[last] = (1.2 * np.array(part[last])).tolist()
+    path = tmp_path / 'robot.yaml'
+    path.write_text(yaml.safe_dump(content))
+    try:
+        changed = plant(RobotParameters.load(path)).model
+    except ParameterError as error:
+        assert 'contradicts' in str(error) or 'but multibody.' in str(error)
+        return
+    made = plant().model
+    assert any(not np.array_equal(getattr(made, name), getattr(changed, name))
+               for name in ('body_mass', 'body_inertia', 'body_ipos', 'dof_armature'))
 
 
 def test_mujoco_sees_the_same_totals():

@@ -74,7 +74,7 @@ def test_help_and_flights_without_it_load_no_viewer():
     assert done.returncode == 0, done.stderr
 
 
-def test_fly_passes_on_the_options_of_the_viewer(monkeypatch, tmp_path):
+def test_fly_passes_on_the_bag_and_the_options_of_the_viewer(monkeypatch, tmp_path):
     fly_module = pytest.importorskip('beetle_omni_ros.nodes.fly')
     given = {}
     monkeypatch.setattr(fly_module, 'run_fly', lambda **arguments: given.update(arguments) or 0)
@@ -82,4 +82,7 @@ def test_fly_passes_on_the_options_of_the_viewer(monkeypatch, tmp_path):
     assert cli.main(base) == 0 and not given['view'] and not given['allow_targets']
     assert cli.main([*base, '--view']) == 0 and given['view'] and not given['allow_targets']
     assert cli.main([*base, '--view', '--allow-targets']) == 0 and given['allow_targets']
+    assert given['bag'] == tmp_path / 'bag'
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(['fly']) == 0 and re.match(r'runs_out/fly_\d+', str(given['bag']))
     assert cli.main([*base, '--allow-targets']) == 2

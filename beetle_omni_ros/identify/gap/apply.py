@@ -65,6 +65,8 @@ def own_numbers(robot: RobotParameters, tolerances: dict[str, dict],
              for k in range(12)]
     if any(moved):
         _put(result, 'rotors.positions', robot.rotors.positions + np.reshape(moved, (4, 3)))
+    if any(moved) or 'mass' in result:      # alone they would move the inertia
+        result.setdefault('inertia', robot.inertia.tolist())
     return result
 
 

@@ -24,7 +24,7 @@ from beetle_omni_ros.identify.servo.compare import analyse_joint_logs, is_joint_
 from beetle_omni_ros.identify.servo.page import change_grids, gap_log_page
 from beetle_omni_ros.pages.table import print_grids, Terminal
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.runs.bag_files import names_of
+from beetle_omni_ros.runs.bag_files import names_of, runs_in
 from beetle_omni_ros.runs.json_file import write_json, write_text
 
 BAD_DATA = 3        # exit status
@@ -57,7 +57,7 @@ def gap_results(runs, holdout=(), robot=None, apply=None, json_path=None, page=N
                 console=None, parameters=None, fix=False, tolerances=False) -> dict:
     """As :func:`run_gap`, but return the results that it writes as JSON."""
     console = console or Terminal()
-    runs, holdout = [Path(r) for r in runs], [Path(h) for h in holdout]
+    runs, holdout = runs_in(runs), runs_in(holdout)
     check_outputs(apply, robot, json_path, page, 'page')
     check_apart([*runs, *holdout])
     robot_parameters, p = RobotParameters.load(robot), GapParameters.load(parameters)

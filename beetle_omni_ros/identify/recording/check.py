@@ -21,7 +21,7 @@ def damages(recording: Recording, robot: RobotParameters,
     """
     Check a recording with every topic of ``NEEDED`` by redundant signals.
 
-    Of the robot file, only geometry and joint limits are used.
+    Of the robot file, only geometry, servos and joint limits are used.
 
     Returns:
         damages of the most fundamental kind only, because jumping values and wrong clocks hide
@@ -32,7 +32,7 @@ def damages(recording: Recording, robot: RobotParameters,
     if min(len(recording.times[topic]) for topic in NEEDED) < 2:
         return []
     found = clock_damages(recording, limits)
-    found += reading_damages(recording, limits, {damage.topic for damage in found})
+    found += reading_damages(recording, limits, robot, {damage.topic for damage in found})
     return found or lag_damages(recording, limits) \
         or _convention_damages(recording, robot, limits) or noise_damages(recording, limits)
 

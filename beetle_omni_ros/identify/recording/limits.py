@@ -37,10 +37,8 @@ class RecordingLimits(ParameterFile, file='recording.yaml'):
     room: float = limit(unit='m', doc='Largest position.')
     frozen: float = limit(unit='s', doc='Longest time of equal readings.')
     frozen_axis: float = limit(unit='s', doc='Longest time of equal readings of one axis.')
-    frozen_joint: float = limit(
-        unit='s', doc='Longest time of an encoder at rest while its command moves.')
     frozen_command: float = limit(
-        unit='rad', doc='Motion of the command that an encoder must follow.')
+        unit='rad', doc='Motion by the command that an encoder must show within the lag.')
     stale: float = limit(unit='1', doc='Largest share of readings equal to the previous one.')
     clipped: float = limit(
         unit='1', doc='Largest share of readings at the largest value of an axis.')

@@ -1,15 +1,21 @@
 """Impossible readings: frozen, repeated, clipped, spikes, quaternions of wrong norm, noise."""
 
 from collections.abc import Container
+from functools import partial
 
 import numpy as np
 from scipy.ndimage import median_filter
 
 from beetle_omni_ros.identify.gap.bags import Recording
+from beetle_omni_ros.identify.gap.keys import friction
 from beetle_omni_ros.identify.gap.series import aligned
 from beetle_omni_ros.identify.recording.clocks import begin_of, NORMAL
 from beetle_omni_ros.identify.recording.damage import changed, Damage
 from beetle_omni_ros.identify.recording.limits import RecordingLimits
+from beetle_omni_ros.identify.recording.motion import GRID
+from beetle_omni_ros.identify.servo_model import LONGEST_STEP
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.servo import NUMPY, Servo, Step
 
 AXES = {'imu/data_raw': [f'linear_acceleration.{a}' for a in 'xyz']
         + [f'angular_velocity.{a}' for a in 'xyz'],
@@ -20,7 +26,7 @@ DIFFERENCED = 20**0.5   # deviation of the third difference of white noise: 1 + 
 MOST_REPAIRED = 0.02    # largest share of a topic's readings that a repair drops
 
 
-def reading_damages(recording: Recording, limits: RecordingLimits,
+def reading_damages(recording: Recording, limits: RecordingLimits, robot: RobotParameters,
                     unclocked: Container[str] = ()) -> list[Damage]:
     """
     Damages in the values of single topics, at most one for each topic.
@@ -31,7 +37,7 @@ def reading_damages(recording: Recording, limits: RecordingLimits,
     for topic, checks in (('imu/data_raw', (_beyond, _clipped, _outliers, _stale, _frozen)),
                           ('mocap/pose', (_beyond, _norms, _alternating, _outliers, _stale,
                                           _frozen, _jumps)),
-                          ('joint_states', (_beyond, _outliers, _stuck)),
+                          ('joint_states', (_beyond, _outliers, partial(_stuck, robot=robot))),
                           ('command', (_beyond,))):
         if topic in unclocked:
             continue
@@ -277,23 +283,44 @@ def _jumps(series, limits):
                          series.t[k])
 
 
-def _stuck(series, limits):
-    """An encoder at rest while its command moves."""
+def _stuck(series, limits, robot):
+    """
+    An encoder at rest while its command moves.
+
+    It is frozen only if the robot's servo would have turned, with every lag that is valid: a
+    command that moved just before the first changed reading has not arrived yet.
+    """
     command = _Series(series.recording, 'command')
     if len(command.t) < 2 or np.abs(command.values[:, :4]).max() > 4 * np.pi:
         return None         # not in radians, which a later check reports
-    steps = max(1, round(limits.frozen_joint / series.period))
+    low, high = limits.servo_lag
     for k in range(4):
-        same = np.diff(series.values[:, k]) == 0
-        for first, length in _runs(same):
-            if length < steps:
+        for first, length in _runs(np.diff(series.values[:, k]) == 0):
+            t = series.t[first:first + length + 1]
+            span = slice(*np.searchsorted(command.t, (t[0] - high, t[-1] - low)))
+            if t[-1] - t[0] <= high or not len(command.t[span]) \
+                    or np.ptp(command.values[span, k]) <= limits.frozen_command:
                 continue
-            span = (command.t > series.t[first]) & (
-                command.t < series.t[min(first + length, len(series.t) - 1)])
-            if span.sum() > 2 and np.ptp(command.values[span, k]) > limits.frozen_command:
+            times, tilts = _servo(robot, k, command, t[0] - 2 * high, t[-1] - low)
+            turned = min(np.ptp(np.interp(t - lag, times, tilts))
+                         for lag in np.arange(low, high + GRID / 2, GRID))
+            if turned > limits.frozen_command:
                 return series.damage(
-                    f'gimbal{k + 1} is frozen: the same reading for '
-                    f'{series.t[first + length] - series.t[first]:.1f} s while its command moved '
-                    f'by {np.ptp(command.values[span, k]):.2f} rad: encoder, or a jammed servo',
-                    series.t[first])
+                    f'gimbal{k + 1} is frozen: the same reading for {t[-1] - t[0]:.1f} s while '
+                    f'its command turns the servo by {turned:.2f} rad: encoder, or a jammed '
+                    'servo', t[0])
     return None
+
+
+def _servo(robot, k, command, begin, end):
+    """Times (N,) [s] and angles (N,) [rad] of joint ``k`` by the robot file, without delay."""
+    times = np.arange(begin, end, LONGEST_STEP)
+    limit, (coulomb, stiction) = robot.joints.position_limit, friction(robot)
+    index = np.maximum(np.searchsorted(command.t, times, side='right') - 1, 0)
+    targets = np.clip(command.values[index, k], -limit, limit)
+    step = Step(NUMPY, Servo.of(robot.joints, coulomb=coulomb[k], stiction=stiction[k]),
+                LONGEST_STEP)
+    tilts, rate = targets.copy(), 0.0       # at rest at the first target
+    for i in range(len(times) - 1):
+        tilts[i + 1], rate = step(targets[i], tilts[i], rate)
+    return times, tilts

@@ -29,7 +29,6 @@ from beetle_omni_ros.robot.effects import CATALOGUE, separating_experiment
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.bag_files import BagError, read_messages
 
-P = shipped().servo
 # [nat] gain of evidence of a named entry: a Bayes factor of 150, "very strong" in the scale of
 # Kass and Raftery (1995).
 CERTAIN = 5.0
@@ -102,13 +101,13 @@ def gap_of(found: Found, apart: Found, robot: RobotParameters) -> dict:
 
     """
     log, units = found.servos.logs[0], range(len(found.servos.units))
-    last = slice(log.end_of(P.fitted), None)
+    last = slice(log.end_of(shipped().servo.fitted), None)
     numbers = [number for *_, number in found.servos.units]
     before, after, floor = (
         np.array([error_rms(log, u, sets[u], part=last) for u in units])
         for sets in (file_sets(robot)[np.array(numbers) - 1], found.values(), apart.values()))
     floor = np.minimum(floor, after)
-    allowed = np.hypot(P.as_well * floor, log.quantum)
+    allowed = np.hypot(shipped().servo.as_well * floor, log.quantum)
     effects = _effects(found, robot)
     explained = bool((after <= allowed).all())
     total = {key: float(np.sqrt(np.mean(values**2)))

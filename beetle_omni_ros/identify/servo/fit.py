@@ -24,7 +24,6 @@ from beetle_omni_ros.identify.servo.model import (
     TERMS,
 )
 
-P = shipped().servo
 LOGARITHMIC = np.array([term.logarithmic for term in TERMS.values()])
 STEP = np.where(LOGARITHMIC, 0.01, 2e-4)      # of the derivatives
 # Prior standard deviations about the robot file: of the common value, of each joint, of each log.
@@ -100,11 +99,13 @@ class Servos:
     Args:
         logs: response logs.
         base: (J, P) parameter sets of gimbal1 to gimbal4 from which the fits deviate.
-        fitted: fraction of each log that is fitted.
+        fitted: fraction of each log that is fitted; by default that of params/identify.yaml.
 
     """
 
-    def __init__(self, logs: Sequence[JointLog], base: np.ndarray, fitted: float = P.fitted):
+    def __init__(self, logs: Sequence[JointLog], base: np.ndarray, fitted: float | None = None):
+        p = shipped().servo
+        fitted = p.fitted if fitted is None else fitted
         self.logs = list(logs)
         self.units = [(k, j, number) for k, log in enumerate(logs)
                       for j, number in enumerate(log.joints)]
@@ -113,13 +114,12 @@ class Servos:
                        'log': [k for k, *_ in self.units], 'unit': self.units}
         self.rows, self.blocks = [], []
         for log in self.logs:
-            settled = log.t >= log.t[0] + P.settling
+            settled = log.t >= log.t[0] + p.settling
             rows = np.flatnonzero(log.fresh & settled & (np.arange(len(log.t))
                                                          < int(round(fitted * len(log.t)))))
             self.rows.append(rows)
-            self.blocks.append(np.minimum(np.arange(len(rows)) * P.blocks // max(len(rows), 1),
-                                          P.blocks - 1))
-        self.sigma = np.full(len(self.units), P.first_noise)
+            self.blocks.append(np.arange(len(rows)) * p.blocks // max(len(rows), 1))
+        self.sigma = np.full(len(self.units), p.first_noise)
         self._blocks = [self.blocks[k] for k, *_ in self.units]
         self.inflation = 1.0
 
@@ -228,7 +228,8 @@ class Servos:
 
     def candidates(self) -> list[str]:
         """Entries that these logs can show: a limit only if the commands exceed it."""
-        beyond = any((log.command_speed() > P.beyond * log.speed()).any() for log in self.logs)
+        least = shipped().servo.beyond
+        beyond = any((log.command_speed() > least * log.speed()).any() for log in self.logs)
         return [name for name in ENTRIES if beyond or name not in LIMITS]
 
 

@@ -27,7 +27,6 @@ from beetle_omni_ros.identify.servo.model import INDEX, NAMES, simulate, TERMS
 from beetle_omni_ros.identify.servo.robot import catalogue_values, file_sets, held
 from beetle_omni_ros.robot.parameters import RobotParameters
 
-P = shipped().servo
 ALWAYS = ('joint_bandwidth', 'joint_command_latency', 'joint_friction')
 RATE = 100.0        # [Hz] of a proposed log
 
@@ -42,7 +41,8 @@ class Plan:
     natural_frequency: float
 
 
-def identify(logs: Sequence[JointLog], robot: RobotParameters, fitted: float = P.fitted) -> Found:
+def identify(logs: Sequence[JointLog], robot: RobotParameters,
+             fitted: float | None = None) -> Found:
     """
     Identify the servos from the first part of some logs.
 
@@ -73,14 +73,14 @@ def joint_results(found: Found, validations: Sequence[JointLog], robot: RobotPar
               for unit, (k, *_) in enumerate(found.servos.units) if k == 0]
     return {'meta': {'log': log.name, 'logs': [each.name for each in found.servos.logs],
                      'validate': [other.name for other in validations],
-                     'fitted_part': P.fitted, 'version': __version__},
+                     'fitted_part': shipped().servo.fitted, 'version': __version__},
             'joints': joints, 'text': _merged(joints)}
 
 
 def _joint(found, unit, validations, robot, plan):
     log, (_, index, number) = found.servos.logs[0], found.servos.units[unit]
     file, is_held = file_sets(robot)[number - 1], held(robot)
-    values, end = found.values()[unit], log.end_of(P.fitted)
+    values, end = found.values()[unit], log.end_of(shipped().servo.fitted)
     first, last = slice(0, end), slice(end, None)
     known = [(other, other.joints.index(number) if number in other.joints else None)
              for other in validations]
@@ -100,7 +100,7 @@ def _joint(found, unit, validations, robot, plan):
         'traded': traded,
         'text': sentences(found, unit, traded, plan),
         'experiment': {'frequency_Hz': plan.frequency, 'amplitude_rad': plan.amplitude,
-                       'duration_s': P.sine_time, 'delay_half_width_s': plan.delay,
+                       'duration_s': shipped().servo.sine_time, 'delay_half_width_s': plan.delay,
                        'natural_frequency_half_width_rad_s': plan.natural_frequency},
         'derived': {'inertia_kg_m2': robot.joints.inertia,
                     'kp_N_m_per_rad': derived['joint_bandwidth']['kp'],
@@ -128,9 +128,9 @@ def inseparable(found: Found, unit: int) -> list[list[str]]:
     scale = np.array([term.scale for term in TERMS.values()])
     deviation = np.sqrt(np.diag(covariance))
     loose = [p for p in np.flatnonzero(mask(found.chosen.entries))
-             if WIDTH * deviation[p] > P.loose * scale[p]]
+             if WIDTH * deviation[p] > shipped().servo.loose * scale[p]]
     return [sorted([NAMES[p], NAMES[o]]) for k, p in enumerate(loose) for o in loose[k + 1:]
-            if abs(covariance[p, o]) > P.traded * deviation[p] * deviation[o]]
+            if abs(covariance[p, o]) > shipped().servo.traded * deviation[p] * deviation[o]]
 
 
 def separating_sine(found: Found) -> Plan:
@@ -139,13 +139,13 @@ def separating_sine(found: Found) -> Plan:
 
     It moves all joints at once with the fitted values and noise of the first log.
     """
-    fit, s = found.chosen.fit, found.servos
+    p, fit, s = shipped().servo, found.chosen.fit, found.servos
     first = np.array(s.labels['log']) == 0
     values, active = found.values()[first], mask(found.chosen.entries)
     plans = []
-    for frequency in P.sines:
-        amplitude = min(P.sine_amplitude, P.sine_speed / (2 * np.pi * frequency))
-        t = np.arange(0.0, P.sine_time, 1 / RATE)
+    for frequency in p.sines:
+        amplitude = min(p.sine_amplitude, p.sine_speed / (2 * np.pi * frequency))
+        t = np.arange(0.0, p.sine_time, 1 / RATE)
         command = np.tile(amplitude * np.sin(2 * np.pi * frequency * t), (len(values), 1))
         blank = JointLog('sine', t, s.logs[0].joints, command, command)
         log = JointLog('sine', t, s.logs[0].joints,
@@ -175,8 +175,8 @@ def sentences(found: Found, unit: int, traded: list[list[str]], plan: Plan) -> l
     if ['delay', 'natural_frequency'] in traded:
         text.append(
             f'To separate delay and bandwidth, log a sine of {plan.frequency:g} Hz and '
-            f'{plan.amplitude:.2f} rad for {P.sine_time:g} s (several reversals a second): it '
-            f'would give the delay to +-{1e3 * plan.delay:.1f} ms and the natural frequency '
+            f'{plan.amplitude:.2f} rad for {shipped().servo.sine_time:g} s (several reversals a '
+            f'second): it would give the delay to +-{1e3 * plan.delay:.1f} ms and the natural frequency '
             f'to +-{plan.natural_frequency:.1f} rad/s.')
     unmet = [name for entry in LIMITS if entry not in found.chosen.entries
              for name in ENTRIES[entry]]

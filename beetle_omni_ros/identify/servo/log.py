@@ -13,7 +13,6 @@ from beetle_omni_ros.runs.csv_table import LogError, missing, read_table
 
 HEADER = 't_s,q1_rad,q2_rad,q3_rad,q4_rad,command_rad (or command1_rad to command4_rad)'
 JOINTS = (1, 2, 3, 4)
-LIMITS = shipped().log
 NEIGHBOURS = 5      # readings on each side that determine the time of one
 
 
@@ -58,7 +57,7 @@ class JointLog:
         read_t[fresh] = reading_times(self.t[fresh], period)
         first = np.polyfit(read_t[used] - self.t[0], self.measured[:, used].T, 2)
         slope = np.polyfit(self.t[:count] - self.t[0], self.command[:, :count].T, 1)[0]
-        back = -period * np.arange(int(LIMITS.history / period) + 1, 0, -1)
+        back = -period * np.arange(int(shipped().log.history / period) + 1, 0, -1)
         before = self.command[:, :1] + slope[:, None] * back
         command_t = np.concatenate([self.t[0] + back, self.t])
         command = np.concatenate([before, self.command], axis=1)
@@ -229,36 +228,38 @@ def _wanted(header):
 
 
 def _check_times(path, t, rows):
-    if len(t) < LIMITS.least_samples:
+    p = shipped().log
+    if len(t) < p.least_samples:
         raise LogError(f'{path}: {len(t)} rows are too few; expected at least '
-                       f'{LIMITS.least_samples}')
+                       f'{p.least_samples}')
     steps = np.diff(t)
     if (steps <= 0).any():
         k = int(np.argmax(steps <= 0)) + 1
         raise LogError(f'{path}: row {rows[k]}, column t_s: {t[k]:g} s does not come after '
                        f'{t[k - 1]:g} s; expected increasing times')
     period = float(np.median(steps))
-    if not LIMITS.periods[0] <= period <= LIMITS.periods[1]:
+    if not p.periods[0] <= period <= p.periods[1]:
         raise LogError(f'{path}: column t_s: samples are {period:g} s apart; expected '
-                       f'{LIMITS.periods[0]:g} to {LIMITS.periods[1]:g} s (is the time in '
+                       f'{p.periods[0]:g} to {p.periods[1]:g} s (is the time in '
                        'seconds?)')
-    if t[-1] - t[0] < LIMITS.least_duration:
+    if t[-1] - t[0] < p.least_duration:
         raise LogError(f'{path}: {t[-1] - t[0]:.2f} s are too short; expected at least '
-                       f'{LIMITS.least_duration:g} s')
-    if steps.max() > LIMITS.longest_gap:
+                       f'{p.least_duration:g} s')
+    if steps.max() > p.longest_gap:
         k = int(np.argmax(steps)) + 1
         raise LogError(f'{path}: row {rows[k]}: {steps.max():.2f} s without a sample; '
-                       f'expected gaps below {LIMITS.longest_gap:g} s (split the log there)')
+                       f'expected gaps below {p.longest_gap:g} s (split the log there)')
 
 
 def _check_angles(path, joint, position, command):
+    p = shipped().log
     for name, values in (('the command', command), (f'q{joint}_rad', position)):
-        if np.abs(values).max() > LIMITS.largest_angle:
+        if np.abs(values).max() > p.largest_angle:
             raise LogError(f'{path}: {name} reaches {np.abs(values).max():g}; expected radians '
-                           f'within +-{LIMITS.largest_angle:g} (degrees or encoder counts?)')
-        if np.ptp(values) < LIMITS.least_travel:
+                           f'within +-{p.largest_angle:g} (degrees or encoder counts?)')
+        if np.ptp(values) < p.least_travel:
             raise LogError(f'{path}: {name} moves by {np.ptp(values):.4f} rad only; expected at '
-                           f'least {LIMITS.least_travel:g} rad (a constant does not identify a '
+                           f'least {p.least_travel:g} rad (a constant does not identify a '
                            'servo)')
     ratio = np.ptp(position) / np.ptp(command)
     if not 0.1 < ratio < 10:
@@ -299,7 +300,7 @@ def read_bag_response(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     fresh = np.r_[True, np.diff(log.joint_t) > 0]
     t, position = log.joint_t[fresh], log.joint_position[fresh]
     last = np.searchsorted(received, t, side='right') - 1
-    driven = (last >= 0) & (t - received[np.maximum(last, 0)] <= LIMITS.last_command)
+    driven = (last >= 0) & (t - received[np.maximum(last, 0)] <= shipped().log.last_command)
     edges = np.flatnonzero(np.diff(np.r_[False, driven, False].astype(int)))
     stretches = edges.reshape(-1, 2)
     if not len(stretches):
@@ -313,7 +314,8 @@ def read_bag_response(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _most_motion(t, command, first, end):
     """The part of an interval, at most ``longest_bag`` long, in which the commands travel most."""
-    ends = np.minimum(np.searchsorted(t, t[first:end] + LIMITS.longest_bag, side='right'), end)
+    longest = shipped().log.longest_bag
+    ends = np.minimum(np.searchsorted(t, t[first:end] + longest, side='right'), end)
     travel = np.cumsum(np.r_[0.0, np.abs(np.diff(command[:end], axis=0)).sum(axis=1)])
     gain = travel[ends - 1] - travel[first:end]
     begin = first + int(np.argmax(gain))

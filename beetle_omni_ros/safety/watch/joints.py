@@ -36,7 +36,8 @@ class JointWatch:
     def __init__(self, limits: ServoLimits, robot: RobotParameters):
         joints = robot.joints
         self._p, self._rate_limit = limits, joints.velocity_limit
-        self._lag = joints.kd / joints.kp
+        self._lag = joints.time_constant
+        self._delay = limits.delay + robot.command_delays[0] + robot.sensors.encoder_delay
         self.reset()
 
     def reset(self) -> None:
@@ -68,7 +69,7 @@ class JointWatch:
             return False
         before, self.stamp = getattr(self, '_tilt', tilt), stamp
         self._tilt = tilt
-        asked = self._asked(stamp - self._p.delay)
+        asked = self._asked(stamp - self._delay)
         if dt > LONGEST or asked is None or self.model is None:
             self.model, self._for = tilt.copy(), np.zeros(ROTORS)
             self._change, self.jump = np.zeros(ROTORS), NO_JUMP
@@ -88,7 +89,7 @@ class JointWatch:
 
     def advance(self, stamp: float) -> None:
         """Continue with the model to ``stamp`` [s], without readings."""
-        dt, asked = stamp - self.stamp, self._asked(stamp - self._p.delay)
+        dt, asked = stamp - self.stamp, self._asked(stamp - self._delay)
         if self.model is None or asked is None or dt <= 0:
             return
         self.stamp = stamp

@@ -1,0 +1,167 @@
+"""What a node and the in-process loop do around a controller: targets, health, reset, errors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from beetle_omni_ros.control.base import (
+    Command,
+    Controller,
+    corrected,
+    error_text,
+    forward_health,
+    PoseTarget,
+    reach_of,
+    ROTORS,
+    State,
+    Target,
+)
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
+from beetle_omni_ros.robot.schema import ParameterError
+
+MOTORS_OFF = ('disarmed', 'emergency_stop')     # states of the supervisor
+
+
+class ControllerError(ParameterError):
+    """A method of a controller raised, or returned no command; one line."""
+
+
+class ControllerHost:
+    """
+    Steps one controller for the supervisor.
+
+    Before the first target it holds the pose at which the controller became active. A controller
+    that is not active is stepped too, so that it can take over without a jump. An exception of the
+    controller means no command for this state, and the supervisor falls back.
+
+    Args:
+        name: name of the controller.
+        controller: the controller.
+        timed: called with ``step`` and its arguments; returns the result.
+        report: called with the text of each error.
+
+    Attributes:
+        controller: the argument.
+        target: target of the operator or the task, or None.
+        override: target of the supervisor, which replaces it, or None.
+        errors: number of exceptions.
+        error: the last one in one line, or ''.
+
+    """
+
+    def __init__(self, name: str, controller: Controller,
+                 timed: Callable[..., object] = lambda step, *arguments: step(*arguments),
+                 report: Callable[[str], None] = lambda text: None):
+        self.controller = controller
+        self.target: Target | None = None
+        self.override: Target | None = None
+        self.errors, self.error = 0, ''
+        self._name, self._timed, self._report = name, timed, report
+        self._hold: Target | None = None
+        self._position: np.ndarray | None = None
+        self._health = ALL_HEALTHY
+        self._mode, self._own_mode = '', f'flying:{name}'
+
+    @property
+    def mode(self) -> str:
+        """State of the supervisor, 'flying:NAME' while the controller NAME is active."""
+        return self._mode
+
+    @property
+    def active(self) -> bool:
+        """Whether the controller flies."""
+        return self._mode == self._own_mode
+
+    @property
+    def target_in_force(self) -> Target | None:
+        """Target of the next step; None before the first estimate."""
+        return self.override or self.target or self._hold
+
+    def on_mode(self, mode: str, now: float) -> str:
+        """
+        Follow the supervisor; motors that stop reset the controller and its targets.
+
+        Returns:
+            why the target is dropped at the takeover from another controller, or ''.
+
+        """
+        state, before = mode.partition(':')[0], self._mode
+        self._mode = mode
+        if state in MOTORS_OFF and before.partition(':')[0] != state:
+            self.call('reset', self.controller.reset)
+            self._hold = self.override = None
+        if not self.active or mode == before or self.target is None:
+            return ''
+        reason = self.too_far(self.target, now)     # accepted for the controller before
+        if reason:
+            self.target = self._hold = None
+        return reason
+
+    def on_health(self, health: ActuatorHealth) -> None:
+        """Take the health of the actuators, for this object and the controller."""
+        self._health = health
+        self.call('set_health', forward_health, self.controller, health)
+
+    def on_estimate(self, estimate: Any) -> None:
+        """Take position (3,), quaternion (4,) and stamp of each estimate."""
+        self._position = estimate.position
+        if self.target is None and (self._hold is None or not self._mode.startswith('flying')):
+            self._hold = PoseTarget(estimate.position, estimate.quaternion, estimate.stamp)
+
+    def too_far(self, target: Target, now: float) -> str:
+        """Why a target at ``now`` [s] is out of reach from the last estimate, or ''."""
+        if self._position is None:
+            return ''
+        away = float(np.linalg.norm(target.at(now).position - self._position))
+        reach = reach_of(self.controller)
+        return '' if away <= reach else (f'{away:.4g} m from the robot, expected at most '
+                                         f'{reach:g} m: the reach of the controller')
+
+    def step(self, state: State, target: Target | None = None) -> Command | None:
+        """Command for a state, to ``target`` or the target in force; None after an exception."""
+        return self.call('step', self._step, corrected(state, self._health),
+                         target or self.target_in_force)
+
+    def _step(self, state, target):
+        return checked(self._timed(self.controller.step, state, target))
+
+    def call(self, method: str, function: Callable, *arguments: Any) -> Any:
+        """
+        Call the controller's ``method`` by a function; returns its result.
+
+        In a process with other nodes, an exception would end the supervisor, too. It is reported,
+        and None is returned.
+        """
+        try:
+            return function(*arguments)
+        except ControllerError as error:
+            text = str(error)
+        except Exception as error:
+            text = f'{method} raised {error_text(error)}'
+        self.errors, self.error = self.errors + 1, f"controller '{self._name}': {text}"
+        self._report(self.error)
+        return None
+
+
+def checked(command: object) -> Command:
+    """
+    Check the return value of a controller's ``step`` and return it.
+
+    Raises:
+        ControllerError: it is no command; one line.
+
+    """
+    if not isinstance(command, Command):
+        raise ControllerError(f'step returned {type(command).__name__}, expected '
+                              'control.base.Command')
+    for part in ('tilt', 'thrust'):
+        shape = getattr(getattr(command, part), 'shape', None)
+        if shape != (ROTORS,):
+            raise ControllerError(
+                f'step returned a command whose {part} is '
+                f"{f'of shape {shape}' if shape is not None else 'no array'}, expected a numpy "
+                f'array of {ROTORS}')
+    return command

@@ -1,0 +1,61 @@
+"""Linear fits with robust weights, and intervals from the scatter between blocks."""
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.stats import t as student
+
+from beetle_omni_ros.identify.inference.least_squares import HUBER
+
+SIGMA_OF_MEDIAN = 1.4826    # standard deviation over the median of the size, normal distribution
+
+
+def scale_of(residual: np.ndarray) -> float:
+    """Standard deviation of residuals without their outliers."""
+    return float(SIGMA_OF_MEDIAN * np.median(np.abs(residual)) + 1e-12)
+
+
+def linear(x: np.ndarray, y: np.ndarray, passes: int = 8) -> np.ndarray:
+    """(K,) coefficients of y (n,) on x (n, K) with Huber's loss; the noise is the residuals'."""
+    root = np.ones(len(y))
+    for _ in range(passes):
+        fitted = np.linalg.lstsq(x * root[:, None], y * root, rcond=None)[0]
+        residual = y - x @ fitted
+        root = np.sqrt(np.minimum(1, HUBER * scale_of(residual)
+                                  / np.maximum(np.abs(residual), 1e-12)))
+    return fitted
+
+
+def consecutive(changes: np.ndarray, most: int) -> np.ndarray:
+    """Block of each row (n,): stretches between changes, joined to at most ``most`` blocks."""
+    stretch = np.cumsum(changes) - changes[0]
+    count = stretch[-1] + 1
+    return stretch * min(count, most) // count
+
+
+def jackknife(fit: Callable[[np.ndarray], np.ndarray], blocks: np.ndarray) -> np.ndarray:
+    """(1 + B, ...) results of ``fit`` for a mask of all rows, then without each of B blocks."""
+    return np.array([fit(np.ones(len(blocks), dtype=bool)),
+                     *(fit(blocks != block) for block in np.unique(blocks))])
+
+
+def interval(every: np.ndarray) -> np.ndarray:
+    """95 % interval (2,) of a value from the results (1 + B,) of :func:`jackknife`."""
+    count = len(every) - 1
+    half = student.ppf(0.975, count - 1) * np.sqrt((count - 1) * every[1:].var())
+    return every[0] + half * np.array([-1, 1])
+
+
+def scatter(slopes: np.ndarray, residual: np.ndarray, prior: np.ndarray,
+            blocks: np.ndarray) -> np.ndarray:
+    """
+    (2, P, P) covariance of a fit, for white residuals and by the scatter between blocks (N,).
+
+    Use the larger variance, as few blocks can agree by chance. ``slopes`` (P, N) are derivatives
+    of the ``residual`` (N,) with unit variance; those of a prior are diagonal, (P,).
+    """
+    inverse = np.linalg.pinv(slopes @ slopes.T + np.diag(prior**2 + 1e-9))
+    scores = np.array([slopes[:, blocks == block] @ residual[blocks == block]
+                       for block in np.unique(blocks)])
+    between = scores.T @ scores * len(scores) / (len(scores) - 1)
+    return np.array([inverse, inverse @ between @ inverse])
