@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from servo_logs import log_of, sweep
+from servo_logs import COUNT, log_of, sweep
 
 from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.servo.fit import encoded, error_rms, NAMES, Servos
@@ -19,8 +19,8 @@ ROBOT = RobotParameters.load()
 DATA = Path(__file__).resolve().parents[3] / 'shared' / 'data'
 REAL = [path for path in (DATA / f'joint_{name}.csv' for name in (
     'fading_50Hz', 'fast_50Hz', 'response_100Hz')) if path.is_file()]
-PARTS = {'slow': {'duration': 9.0},
-         'fast': {'duration': 4.5, 'periods': (0.3, 0.6), 'amplitudes': (0.3, 0.6)}}
+PARTS = {'slow': {'duration': 6.0},
+         'fast': {'duration': 4.0, 'periods': (0.3, 0.6), 'amplitudes': (0.3, 0.6)}}
 SERVOS = ({'coulomb': 0.013, 'frequency': 47.0, 'delay': 0.015},
           {'backlash': 0.015, 'frequency': 44.0, 'delay': 0.016, 'coulomb': 0.013},
           {'coulomb': 0.030, 'frequency': 52.0, 'delay': 0.014, 'offset': 0.012})
@@ -50,24 +50,29 @@ def known(one):
             yield unit, term, true, interval(one, one.chosen, unit, term)
 
 
+def ramp_lag(values):
+    """Lag [s] behind a ramp, of parameter sets."""
+    return values[:, INDEX['delay']] + 2 * values[:, INDEX['damping_ratio']] / values[:, 0]
+
+
 @pytest.mark.parametrize('every', [1, 4])
-@pytest.mark.parametrize('name', ['slow', 'fast'])
-def test_the_true_values_are_recovered_at_any_rate_of_the_readings(name, every):
-    one = found(name, every)
+def test_the_true_values_are_recovered_at_any_rate_of_the_readings(every):
+    one, inside = found('fast', every), []
+    for unit, term, true, (low, high) in known(one):
+        assert one.values()[unit, INDEX[term]] == pytest.approx(true, abs=WITHIN[term]), term
+        assert high - low < 2.5 * WITHIN[term]
+        if term != 'offset':        # of which the slow error of these logs is a part
+            inside.append(low <= true <= high)
+    assert np.mean(inside) >= 0.75
+
+
+def test_a_slow_log_determines_the_lag_and_the_friction():
+    one = found('slow')
+    lags = [servo['delay'] + 2 * 0.63 / servo['frequency'] for servo in SERVOS]
+    assert ramp_lag(one.values()) == pytest.approx(lags, abs=1e-3)
     for unit, term, true, _ in known(one):
-        slow = 2 if name == 'slow' else 1       # delay and bandwidth trade
-        assert one.values()[unit, INDEX[term]] == pytest.approx(true, abs=slow * WITHIN[term]), \
-            (unit, term)
-
-
-def test_intervals_hold_the_truth_and_are_narrow():
-    inside = []
-    for one in (found('slow'), found('fast'), found('slow', 4), found('fast', 4)):
-        for _, term, true, (low, high) in known(one):
-            if term not in ('backlash', 'offset') or low < high:
-                inside.append(low <= true <= high)
-                assert high - low < 6 * WITHIN[term]
-    assert np.mean(inside) > 0.8
+        if term in ('coulomb_friction', 'backlash', 'offset'):
+            assert one.values()[unit, INDEX[term]] == pytest.approx(true, abs=0.004), term
 
 
 def test_unneeded_terms_are_rejected():
@@ -87,16 +92,16 @@ def test_only_a_slow_log_confounds_delay_and_bandwidth():
 
 def test_two_logs_with_different_delays_narrow_the_common_frequency():
     later = tuple({**servo, 'delay': servo['delay'] + 0.008} for servo in SERVOS)
-    second = log_of(*sweep(**PARTS['slow']), later, seed=5, name='later')
-    both = identify([made('slow'), second], ROBOT)
-    first = found('slow')
+    second = log_of(*sweep(**PARTS['fast']), later, seed=5, name='later')
+    both, first = identify([made('fast'), second], ROBOT), found('fast')
     delays = [both.of_log(k)[:, INDEX['delay']].mean() for k in (0, 1)]
-    assert np.diff(delays) == pytest.approx(0.008, abs=0.001)
-    for unit in range(3):
-        wide, narrow = (np.ptp(interval(one, one.chosen, unit, 'natural_frequency'))
-                        for one in (first, both))
-        assert narrow < wide
-        assert both.values()[unit, 0] == pytest.approx(SERVOS[unit]['frequency'], abs=6.0)
+    assert np.diff(delays) == pytest.approx(0.008, abs=5e-4)
+    # both logs share the frequencies
+    assert both.of_log(0)[:, 0] == pytest.approx(both.of_log(1)[:, 0])
+    wide, narrow = ([np.ptp(interval(one, one.chosen, unit, 'natural_frequency'))
+                     for unit in range(3)] for one in (first, both))
+    assert np.mean(narrow) < 0.9 * np.mean(wide)
+    assert both.of_log(0)[:, 0] == pytest.approx([s['frequency'] for s in SERVOS], abs=3.0)
 
 
 def test_fits_of_the_slow_log_predict_the_fast_one():
@@ -131,15 +136,15 @@ def test_a_speed_limit_is_found_if_the_command_exceeds_it():
 def test_a_limit_that_is_never_reached_stays_with_an_open_interval():
     for joint in joint_results(found('slow'), [made('fast')], ROBOT)['joints']:
         limit = joint['terms']['velocity_limit']
-        assert not limit['kept'] and limit['value'] == ROBOT.joints.velocity_limit
+        assert not limit['kept'] and limit['value'] == pytest.approx(
+            ROBOT.joints.velocity_limit)
         assert limit['interval'][0] > 2 and limit['interval'][1] is None
 
 
 def test_samples_of_the_validation_part_are_not_used_by_the_fit():
     log = log_of(*sweep(3.0, periods=(0.8, 1.0)), SERVOS[:1], seed=4)
-    measured = log.measured.copy()
-    measured[:, log.end_of(shipped().servo.fitted):] += 0.3 * np.sin(40 * log.t[log.end_of(
-        shipped().servo.fitted):])
+    measured, end = log.measured.copy(), log.end_of(shipped().servo.fitted)
+    measured[:, end:] += COUNT * np.round(50 * np.sin(40 * log.t[end:]))
     one, other = (identify([each], ROBOT) for each in (log, replace(log, measured=measured)))
     assert one.chosen.entries == other.chosen.entries
     assert one.values() == pytest.approx(other.values(), rel=1e-9)
@@ -179,4 +184,4 @@ def test_real_servos_are_predicted_as_well_as_by_a_line_with_play(path):
         line = min(line_errors(log, k, np.zeros(1)),
                    line_errors(log, k, 1e-3 * np.arange(41)))
         assert joint['heldout_rms_rad'] < 1.1 * line, (k + 1, line)
-        assert joint['heldout_rms_rad'] < 0.25 * joint['published_heldout_rms_rad']
+        assert joint['heldout_rms_rad'] < 0.5 * joint['published_heldout_rms_rad']
