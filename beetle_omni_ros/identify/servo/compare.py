@@ -177,14 +177,14 @@ def _effects(found, robot):
         if CATALOGUE[name].each != 'joint':
             result.append(effect | {'parameters': parts})
             continue
-        for unit, (*_, number) in enumerate(found.servos.units):
+        s = found.servos
+        moved = s.visible(found.chosen, name) & s.changed(found.chosen, name)
+        for unit in np.flatnonzero(moved):
+            number = s.units[unit][2]
             own = {key: {'value': entry['each'][str(number)], 'unit': entry['unit'],
                          'interval': entry['intervals'][str(number)],
                          'file': entry['files'][str(number)]} for key, entry in parts.items()}
-            if any(not entry['interval'][0] <= entry['file'] <= entry['interval'][1]
-                   and abs(entry['value'] - entry['file']) > found.servos.logs[0].quantum
-                   for entry in own.values()):
-                result.append(effect | {'joint': number, 'parameters': own})
+            result.append(effect | {'joint': number, 'parameters': own})
     return result
 
 

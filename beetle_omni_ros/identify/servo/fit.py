@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import ttest_1samp
+from scipy.stats import chi2
 
 from beetle_omni_ros.identify.inference.hierarchy import design, Fit, solve, Spread
 from beetle_omni_ros.identify.parameters import shipped
@@ -26,12 +26,13 @@ from beetle_omni_ros.identify.servo.model import (
 
 LOGARITHMIC = np.array([term.logarithmic for term in TERMS.values()])
 STEP = np.where(LOGARITHMIC, 0.01, 2e-4)      # of the derivatives
-# Prior standard deviations about the robot file: of the common value, of each joint, of each log.
+# Prior standard deviations about the robot file: of the common value, of each joint, of each log,
+# of each joint in each log.
 # Logarithms for frequency, damping and limits. Servos of one type differ by 10 to 15 %.
 SPREADS = {
     'natural_frequency': Spread(0.5, {'joint': 0.15}),
     'damping_ratio': Spread(0.5, {'joint': 0.15}),
-    'delay': Spread(0.02, {'joint': 0.002, 'log': 0.01}),
+    'delay': Spread(0.02, {'log': 0.01}),        # one bus
     'offset': Spread(0.0, {'joint': 0.02, 'unit': 0.01}),
     'coulomb_friction': Spread(0.02, {'joint': 0.01, 'unit': 0.004}),
     'stiction': Spread(0.01, {}),
@@ -203,13 +204,23 @@ class Servos:
         """Logarithm of the evidence [nat] of a trial."""
         return trial.fit.evidence(self.inflation)
 
-    def visible(self, trial: Trial, entry: str) -> bool:
-        """Whether an entry moves the readings of some unit by an encoder count (RMS)."""
+    def visible(self, trial: Trial, entry: str) -> np.ndarray:
+        """(U,) whether an entry moves the readings of a unit by an encoder count (RMS)."""
         none, without = np.zeros(len(NAMES), dtype=bool), trial.fit.theta.copy()
         without[:, mask([entry])] = self.base[:, mask([entry])]
         reads = [self(theta, none)[0] for theta in (trial.fit.theta, without)]
-        return any(np.sqrt(np.mean((a - b)**2)) * sigma > self.logs[k].quantum
-                   for a, b, sigma, (k, *_) in zip(*reads, self.sigma, self.units, strict=True))
+        return np.array([np.sqrt(np.mean((a - b)**2)) * sigma > self.logs[k].quantum
+                         for a, b, sigma, (k, *_) in zip(*reads, self.sigma, self.units,
+                                                         strict=True)])
+
+    def changed(self, trial: Trial, entry: str) -> np.ndarray:
+        """(U,) whether a unit differs from the base by an entry, by a Wald test at 5 %."""
+        terms = mask([entry])
+        off = (trial.fit.theta - self.base)[:, terms]
+        spread = trial.fit.spread()[:, terms][:, :, terms]
+        size = np.array([o @ np.linalg.pinv(c, rcond=1e-8, hermitian=True) @ o
+                         for o, c in zip(off, spread, strict=True)])
+        return size > chi2.isf(0.05 / len(off), terms.sum())
 
     def _nearest(self, s, target):
         """Standardised values x with base + S x near a target, of least norm."""
@@ -262,12 +273,6 @@ class Found:
         return self.values(trial)[np.array(self.servos.labels['log']) == index]
 
 
-def predicts(more: Trial, fewer: Trial) -> bool:
-    """Whether a model predicts left-out blocks better than another one, by a t-test at 5 %."""
-    return bool(ttest_1samp(fewer.fit.held - more.fit.held, 0.0,
-                            alternative='greater').pvalue < 0.05)
-
-
 def select(servos: Servos, always: Sequence[str], allowed: Sequence[str], least: float = 0.0,
            named: bool = False) -> Found:
     """
@@ -279,7 +284,7 @@ def select(servos: Servos, always: Sequence[str], allowed: Sequence[str], least:
         allowed: further entries.
         least: least gain of evidence [nat] of an entry.
         named: whether an entry must also move some joint's readings by an encoder count (RMS) and
-            improve the prediction of left-out blocks (t-test at 5 %).
+            improve the prediction of left-out blocks in total.
 
     """
     candidates = [name for name in servos.candidates() if name in {*always, *allowed}]
@@ -288,7 +293,7 @@ def select(servos: Servos, always: Sequence[str], allowed: Sequence[str], least:
     chosen = servos.fit(always, starts=(full, *STARTS) if always else (full,))
     def worth(name, more, fewer):
         return gain(more) >= gain(fewer) + least and (not named or (
-            predicts(more, fewer) and servos.visible(more, name)))
+            more.fit.held.sum() < fewer.fit.held.sum() and servos.visible(more, name).any()))
 
     while True:
         trials = {name: servos.fit([*chosen.entries, name], starts=(chosen, full))

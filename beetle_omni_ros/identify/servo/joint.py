@@ -176,8 +176,8 @@ def sentences(found: Found, unit: int, traded: list[list[str]], plan: Plan) -> l
         text.append(
             f'To separate delay and bandwidth, log a sine of {plan.frequency:g} Hz and '
             f'{plan.amplitude:.2f} rad for {shipped().servo.sine_time:g} s (several reversals a '
-            f'second): it would give the delay to +-{1e3 * plan.delay:.1f} ms and the natural frequency '
-            f'to +-{plan.natural_frequency:.1f} rad/s.')
+            f'second): it would give the delay to +-{1e3 * plan.delay:.1f} ms and the natural '
+            f'frequency to +-{plan.natural_frequency:.1f} rad/s.')
     unmet = [name for entry in LIMITS if entry not in found.chosen.entries
              for name in ENTRIES[entry]]
     if unmet:
