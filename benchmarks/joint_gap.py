@@ -1,106 +1,102 @@
 """
 Detection of servo changes by `beetle_omni gap LOG.csv`, and false detections.
 
-`python benchmarks/joint_gap.py --cases 60 --seed 1 --json joint_gap.json`. The real log is
-compared with the shipped robot file, which is then corrected. Each case is an artificial log: a
-simulation of the corrected servos with one change, plus the residual of the real log, rounded to
-encoder counts. The residual is used unchanged, circularly shifted, or in blocks of a second drawn
-at random. The log is compared with the corrected file.
+`python benchmarks/joint_gap.py --cases 48 --seed 1 --json joint_gap.json`. The servos of each real
+log are identified. Each case is an artificial log: a simulation of the identified servos with one
+change, plus the residual of the real log, rounded to encoder counts. The residual is used
+unchanged, circularly shifted, or in blocks of a second drawn at random. The log is compared with
+the servos before the change.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import replace
 import json
 from pathlib import Path
 import sys
 import time
+from unittest.mock import patch
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
 from beetle_omni_ros.identify.gap.apply import effects_with
-from beetle_omni_ros.identify.gap.joint_gap import gap_of
-from beetle_omni_ros.identify.gap.joint_search import Search
-from beetle_omni_ros.identify.joint import identify_joints
-from beetle_omni_ros.identify.joint_log import JointLog, read_joint_log
-from beetle_omni_ros.identify.joint_results import joint_results
-from beetle_omni_ros.identify.joint_servos import file_sets
-from beetle_omni_ros.identify.servo_model import simulate
+from beetle_omni_ros.identify.servo import compare as servo_compare
+from beetle_omni_ros.identify.servo.compare import compare, gap_of
+from beetle_omni_ros.identify.servo.joint import identify
+from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
+from beetle_omni_ros.identify.servo.model import INDEX, simulate
 from beetle_omni_ros.robot.parameters import RobotParameters
 
-LOG = Path(__file__).resolve().parents[2] / 'shared' / 'data' / 'joint_response_100Hz.csv'
+DATA = Path(__file__).resolve().parents[2] / 'shared' / 'data'
 COUNT = 2 * np.pi / 4096    # [rad] of the encoder
 BLOCK = 1.0                 # [s] of a drawn block of the residual
-KINDS = ('nothing', 'one zero', 'two zeros', 'gains', 'delay', 'friction')
+SIZE = (0.010, 0.020)       # [rad] of a change
+# Kind of change -> the entry that must be named; of a single joint's zero or encoder, with it.
+KINDS = {'nothing': None, 'zero': 'joint_offset', 'two zeros': 'joint_offset',
+         'encoder gain': 'joint_encoder_error', 'servo gains': 'joint_bandwidth',
+         'delay': 'joint_command_latency', 'friction': 'joint_friction',
+         'play': 'joint_backlash'}
 
 
-def judged(log: JointLog, robot: RobotParameters) -> dict:
-    """Verdict and effects of a log, without the page."""
-    apart = joint_results(log, [], identify_joints(log, robot.joints), robot.joints)['joints']
-    return gap_of(Search(log, robot).run(), log, apart)
+def changed(sets: np.ndarray, log: JointLog, kind: str, rng: np.random.Generator):
+    """
+    Parameter sets (J, P) with a change.
 
+    Returns:
+        changed sets, (name, joint or None) of the entries that must be named, description.
 
-def corrected(robot: RobotParameters, made: dict) -> RobotParameters:
-    """Robot as written by `--apply`."""
-    return replace(robot, effects={
-        name: {key: tuple(v) if isinstance(v, list) else v for key, v in values.items()}
-        for name, values in effects_with(robot, made['effects']).items()})
-
-
-def changed(robot: RobotParameters, kind: str, rng: np.random.Generator):
-    """(robot with a change, set of (name, joint or None) that must be named, description)."""
-    effects = {name: dict(values) for name, values in robot.effects.items()}
+    """
+    sets, count = sets.copy(), len(sets)
+    name, joints = KINDS[kind], rng.permutation(count)
 
     def sized(low, high):
         return float(rng.uniform(low, high) * rng.choice([-1, 1]))
 
+    def moved(term, by, which):
+        sets[which, INDEX[term]] += by
+
     if kind == 'nothing':
-        return robot, set(), ''
-    if kind in ('one zero', 'two zeros'):
-        joints = rng.permutation(4)[:1 if kind == 'one zero' else 2]
-        zeros = [0.0] * 4
+        return sets, set(), ''
+    if kind in ('zero', 'two zeros', 'encoder gain'):
+        words = []
+        joints = joints[:2 if kind == 'two zeros' else 1]
         for j in joints:
-            zeros[j] = sized(0.010, 0.020)
-        effects['joint_offset'] = {'offset': tuple(zeros)}
-        words = ', '.join(f'{1e3 * z:+.1f}' for z in zeros) + ' mrad'
-        return replace(robot, effects=effects), {('joint_offset', int(j) + 1)
-                                                 for j in joints}, words
-    if kind == 'gains':
-        which = ['kp', 'kd', 'both', 'both with friction'][rng.integers(4)]
-        factor = 1 + sized(0.2, 0.4)
-        for gain in ('kp', 'kd'):
-            if which.startswith('both') or which == gain:
-                effects['joint_bandwidth'][gain] *= factor
-        if which.endswith('friction'):      # constant dead band instead of constant torque
-            _scale(effects, np.full(4, factor))
-        return replace(robot, effects=effects), {('joint_bandwidth', None)}, \
-            f'{which} x {factor:.2f}'
-    if kind == 'delay':
-        delay = effects['joint_command_latency']
-        change = sized(0.008, 0.020)
-        change = change if delay['delay'] + change >= 0 else -change
-        delay['delay'] += change
-        return replace(robot, effects=effects), {('joint_command_latency', None)}, \
-            f'{1e3 * change:+.1f} ms'
-    factor = float(rng.choice([rng.uniform(1.5, 2.5), rng.uniform(0.3, 0.6)]))
-    mine = np.ones(4)
-    mine[slice(None) if rng.random() < 0.7 else rng.integers(4)] = factor
-    _scale(effects, mine)
-    return replace(robot, effects=effects), {('joint_friction', None)}, \
-        f'x {np.array2string(mine, precision=2)}'
+            by = sized(*SIZE)
+            if kind == 'encoder gain':
+                by /= np.abs(log.measured[j]).max()
+            moved('encoder_gain' if kind == 'encoder gain' else 'offset', by, j)
+            words.append(f'joint {log.joints[j]} {by:+.4f}')
+        return sets, {(name, log.joints[j]) for j in joints}, ', '.join(words)
+    which = slice(None) if kind == 'delay' or rng.random() < 0.5 else joints[:1]
+    if kind == 'servo gains':
+        kp, kd = ((1 + sized(0.2, 0.4)) if used else 1.0
+                  for used in ((True, False), (False, True), (True, True))[rng.integers(3)])
+        sets[which, INDEX['natural_frequency']] *= np.sqrt(kp)
+        sets[which, INDEX['damping_ratio']] *= kd / np.sqrt(kp)
+        words = f'kp x {kp:.2f}, kd x {kd:.2f}'
+    elif kind == 'delay':
+        by = sized(0.008, 0.020)
+        by = by if sets[:, INDEX['delay']].min() + by >= 0 else -by
+        moved('delay', by, which)
+        words = f'{1e3 * by:+.1f} ms'
+    else:
+        term = 'coulomb_friction' if kind == 'friction' else 'backlash'
+        by = float(rng.uniform(*SIZE))
+        if rng.random() < 0.5 and sets[which, INDEX[term]].min() > by:
+            by = -by
+        moved(term, by, which)
+        words = f'{1e3 * by:+.1f} mrad'
+    return sets, {(name, None)}, words + (
+        '' if which == slice(None) else f', joint {log.joints[joints[0]]}')
 
 
-def _scale(effects, factors):
-    effects['joint_friction'] = {key: tuple(float(v) for v in np.broadcast_to(value, 4) * factors)
-                                 for key, value in effects['joint_friction'].items()}
-
-
-def drawn(residual: np.ndarray, period: float, rng: np.random.Generator) -> np.ndarray:
-    """Noise (J, N) from a residual (J, N) [rad]: unchanged, circularly shifted, or in blocks."""
-    way, size = rng.integers(3), round(BLOCK / period)
+def drawn(residual: np.ndarray, size: int, rng: np.random.Generator) -> np.ndarray:
+    """Noise (J, N) from a residual (J, N): unchanged, circularly shifted, or in blocks of size."""
+    way = rng.integers(3)
     if way == 0:
         return residual
     if way == 1:
@@ -111,64 +107,98 @@ def drawn(residual: np.ndarray, period: float, rng: np.random.Generator) -> np.n
                      for row, own in zip(residual, starts, strict=True)])
 
 
-def made_log(log: JointLog, robot: RobotParameters, residual, rng) -> JointLog:
-    """Log of a robot's servos with the commands of a real one."""
-    joints = np.arange(len(log.joints))
-    positions = simulate(log, joints, file_sets(robot, log.joints)) \
-        + drawn(residual, log.period, rng)
-    return JointLog('made.csv', log.t, log.joints, np.round(positions / COUNT) * COUNT,
+def made_log(log: JointLog, before: np.ndarray, after: np.ndarray, rng) -> JointLog:
+    """Log of servos ``after`` with commands, rows and residual to ``before`` of a real log."""
+    joints, fresh = np.arange(len(log.joints)), np.flatnonzero(log.fresh)
+    residual = (log.measured - simulate(log, joints, before))[:, fresh]
+    size = round(BLOCK / float(np.median(np.diff(log.read_t[fresh]))))
+    read = simulate(log, joints, after)[:, fresh] + drawn(residual, size, rng)
+    last = np.maximum(np.cumsum(log.fresh) - 1, 0)      # rows between readings repeat the last
+    return JointLog('made.csv', log.t, log.joints, (np.round(read / COUNT) * COUNT)[:, last],
                     log.command)
+
+
+def judged(log: JointLog, sets: np.ndarray, robot: RobotParameters) -> dict:
+    """Verdict and effects of a log against parameter sets of gimbal1 to gimbal4."""
+    apart = identify([log], robot)
+    with patch.object(servo_compare, 'file_sets', return_value=sets):
+        return gap_of(compare(log, robot), apart, robot)
 
 
 def scored(made: dict, wanted: set) -> dict:
     """Named entries of the expected ones (alone or in a set), and other named entries."""
-    named = [({(name, effect.get('joint')) for name in effect['names']}) for effect in
-             made['effects']]
+    named = [{(name, effect.get('joint')) for name in effect['names']}
+             for effect in [*made['effects'], *made['partial']]]
     found = {w for w in wanted if any(w in names for names in named)}
-    alone = {w for w in wanted if {w} in named}
-    wrong = [sorted(names) for names in named if not names & wanted]
-    return {'found': found == wanted, 'alone': alone == wanted, 'wrong': wrong,
+    return {'named': found == wanted and not made['partial'],
+            'alone': all({w} in named for w in wanted) and not made['partial'],
+            'wrong': [sorted(map(str, names)) for names in named if not names & wanted],
             'verdict': made['verdict']}
 
 
-def run(log: JointLog, cases: int, seed: int, console: Console) -> dict:
-    """Results of the real log, its own correction, and ``cases`` artificial logs of each kind."""
-    shipped = RobotParameters.load()
-    first = judged(log, shipped)
-    robot = corrected(shipped, first)
-    second = judged(log, robot)
-    residual = log.measured - simulate(log, np.arange(len(log.joints)),
-                                       file_sets(robot, log.joints))
-    rows = []
+def corrected(robot: RobotParameters, made: dict) -> RobotParameters:
+    """Robot as written by `--apply`."""
+    return replace(robot, effects={
+        name: {key: tuple(v) if isinstance(v, list) else v for key, v in values.items()}
+        for name, values in effects_with(robot, made['effects']).items()})
+
+
+def own_correction(log: JointLog, robot: RobotParameters) -> dict:
+    """Verdicts of a log against the shipped file, and against its correction by that."""
+    found = identify([log], robot)
+    first = gap_of(compare(log, robot), found, robot)
+    second = corrected(robot, first)
+    again = gap_of(compare(log, second), identify([log], second), second)
+    return {'verdict': first['verdict'], 'names': [e['names'] for e in first['effects']],
+            'reason': first['reason'], 'verdict_corrected': again['verdict'],
+            'names_corrected': [e['names'] for e in [*again['effects'], *again['partial']]],
+            'reason_corrected': again['reason']}
+
+
+def run(logs: Sequence[JointLog], cases: int, seed: int, console: Console) -> dict:
+    """Results of real logs with their own correction, and of ``cases`` artificial logs."""
+    robot, rows, real, sets = RobotParameters.load(), [], {}, {}
+    for log in logs:
+        real[log.name] = own_correction(log, robot)
+        console.print(f'{log.name}: {real[log.name]}', highlight=False, markup=False)
+        sets[log.name] = identify([log], robot).values()
     for k in range(cases):
         rng = np.random.default_rng([seed, k])
-        kind = KINDS[k % len(KINDS)]
-        truth, wanted, words = changed(robot, kind, rng)
+        kind, log = list(KINDS)[k % len(KINDS)], logs[k // len(KINDS) % len(logs)]
+        before = sets[log.name]
+        after, wanted, words = changed(before, log, kind, rng)
         begin = time.process_time()
-        made = judged(made_log(log, truth, residual, rng), robot)
-        row = {'kind': kind, 'case': k, 'change': words, **scored(made, wanted),
-               'named': [[e['names'], e.get('joint')] for e in made['effects']],
+        made = judged(made_log(log, before, after, rng), before, robot)
+        row = {'kind': kind, 'case': k, 'log': log.name, 'change': words,
+               **scored(made, wanted), 'reason': made['reason'],
+               'effects': [[e['names'], e.get('joint'), {
+                   key: e['parameters'][key].get('each', e['parameters'][key]['value'])
+                   for key in e['parameters']}] for e in [*made['effects'], *made['partial']]],
+               'gains': {c['name']: [c['evidence']['delta_bic'] / 2, c['evidence']['cv_gain'],
+                                     c['evidence']['blocks_positive']]
+                         for c in made['candidates']},
                'seconds': time.process_time() - begin}
         rows.append(row)
-        mark = '' if row['found'] and not row['wrong'] else '  <-'
-        console.print(f"{k} {kind} {words}: {row['verdict']} {row['named']}{mark}",
+        mark = '' if row['named'] and not row['wrong'] else '  <-'
+        console.print(f"{k} {log.name} {kind} {words}: {row['verdict']} "
+                      f"{[e[:2] for e in row['effects']]}{mark}",
                       highlight=False, markup=False, soft_wrap=True)
-    return {'seed': seed, 'real': {
-        'verdict': first['verdict'], 'names': [e['names'] for e in first['effects']],
-        'reason': first['reason'], 'verdict_corrected': second['verdict'],
-        'reason_corrected': second['reason']}, 'cases': rows}
+    return {'seed': seed, 'real': real, 'cases': rows}
 
 
 def table(made: dict) -> Table:
     """Counts by kind of change."""
-    shown = Table('change', 'logs', 'named', 'alone', 'nothing else', 'no gap', 'CPU s',
+    shown = Table('change', 'logs', 'named', 'alone', 'wrong names', 'no gap', 'unknown', 'CPU s',
                   title=f"Joint logs, seed {made['seed']}")
-    for kind in KINDS:
-        rows = [row for row in made['cases'] if row['kind'] == kind]
+    for kind in [*KINDS, None]:
+        rows = [row for row in made['cases'] if kind in (row['kind'], None)
+                and (kind or row['kind'] != 'nothing')]
         if rows:
-            shown.add_row(kind, *(str(x) for x in (
-                len(rows), sum(r['found'] for r in rows), sum(r['alone'] for r in rows),
-                sum(not r['wrong'] for r in rows), sum(r['verdict'] == 'no_gap' for r in rows),
+            shown.add_row(kind or 'all changes', *(str(x) for x in (
+                len(rows), sum(r['named'] for r in rows) if kind != 'nothing' else '',
+                sum(r['alone'] for r in rows) if kind != 'nothing' else '',
+                sum(bool(r['wrong']) for r in rows), sum(r['verdict'] == 'no_gap' for r in rows),
+                sum(r['verdict'] == 'unknown' for r in rows),
                 f"{np.mean([r['seconds'] for r in rows]):.1f}")))
     return shown
 
@@ -177,19 +207,17 @@ def main() -> int:
     """Run as a script; see the module's text."""
     parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('--log', type=Path, default=LOG, help='real joint log')
-    parser.add_argument('--cases', type=int, default=30, help='made logs')
+    parser.add_argument('--logs', type=Path, nargs='+', default=sorted(DATA.glob('joint_*.csv')),
+                        help='real joint logs')
+    parser.add_argument('--cases', type=int, default=24, help='made logs')
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--json', type=Path, help='file for the results')
     given = parser.parse_args()
-    if not given.log.is_file():
-        print(f'{given.log}: no such log; name one with --log', file=sys.stderr)
+    if not given.logs:
+        print(f'{DATA}: no joint_*.csv; name logs with --logs', file=sys.stderr)
         return 2
     console = Console()
-    made = run(read_joint_log(given.log), given.cases, given.seed, console)
-    console.print(f"real log: {made['real']['verdict']} {made['real']['names']}, "
-                  f"{made['real']['reason']}; with its own correction "
-                  f"{made['real']['verdict_corrected']}", highlight=False, markup=False)
+    made = run([read_joint_log(path) for path in given.logs], given.cases, given.seed, console)
     console.print(table(made))
     if given.json:
         given.json.write_text(json.dumps(made, indent=1))

@@ -353,8 +353,7 @@ def effects() -> str:
     apart: dict[tuple, list] = {}
     for (name, key), found in treatments.items():
         if not found.acts:
-            apart.setdefault((CONSUMERS[key], 'refuses' if found.error else 'ignores',
-                              found.reason), []).append(f'[{name}](#{name})')
+            apart.setdefault((CONSUMERS[key], found.reason), []).append(f'[{name}](#{name})')
     text = [f'# Effects\n\n{MADE}\n'
             'An effect is a deviation of the robot from the model. The key `effects` of a robot '
             'file switches\neffects on, for example `effects: {thrust_coefficient: {scale: '
@@ -364,21 +363,20 @@ def effects() -> str:
             'smallest relevant\ndeviation. If the neutral value is the number of the robot '
             'file, both are fractions of this number.\nA robot file may leave out a parameter '
             'that has a *default*.\n\n## Consumers\n\n'
-            'A consumer acts on an effect, ignores it, or refuses a robot file that has it. The '
-            'reasons are\nbelow the table. `test/gap/test_consumers.py` tests every pair.\n\n'
+            'A consumer acts on an effect or ignores it for a reason, which is below the table.\n'
+            '`test/gap/test_consumers.py` tests every pair.\n\n'
             + table(['effect', 'layer', 'acts through', *CONSUMERS.values()],
                     [[f'[{name}](#{name})', entry.layer, _acts(entry),
-                      *('acts' if (found := treatments[name, key]).acts
-                        else 'refuses' if found.error else 'ignores' for key in CONSUMERS)]
+                      *('acts' if treatments[name, key].acts else 'ignores' for key in CONSUMERS)]
                      for name, entry in CATALOGUE.items()])
-            + '\n' + table(['consumer', '', 'effects', 'reason'],
-                           [[who, what, ', '.join(names), reason]
-                            for (who, what, reason), names in sorted(apart.items())])]
+            + '\n' + table(['consumer', 'ignores', 'reason'],
+                           [[who, ', '.join(names), reason]
+                            for (who, reason), names in sorted(apart.items())])]
     for name, entry in CATALOGUE.items():
         rows = [[f'`{key}`', spec.unit, _neutral(spec.neutral),
                  f'{_number(spec.low)} to {_number(spec.high)}', 'not fitted' if spec.form
                  else _known(spec.typical), _known(spec.smallest),
-                 '' if spec.default is None else _number(spec.default),
+                 '' if spec.default is None else _neutral(spec.default),
                  entry.settings.get(key) and f'`{entry.settings[key]}`' or '',
                  '4, one for each ' + entry.each if entry.each
                  else '1, or 4 for each joint' if spec.of_each

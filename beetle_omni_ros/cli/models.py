@@ -8,7 +8,6 @@ from typing import Annotated, Optional
 import typer
 
 from beetle_omni_ros.cli.options import fail, FAILED, JsonOption, PublishedOption
-from beetle_omni_ros.robot.schema import ParameterError
 
 PageOption = Annotated[Optional[Path], typer.Option(
     '--report', metavar='FILE', help='Write a self-contained HTML page with plots.')]
@@ -18,7 +17,8 @@ HOLDOUT = '--holdout'
 
 
 def gap(runs: Annotated[list[Path], typer.Argument(
-            metavar='RUN...', help='Recorded flights (bags), or one joint log (CSV).')],
+            metavar='RUN...', help='Recorded flights (bags), or logs of the joints (CSV, or bags '
+                                     'with only joint_states and command).')],
         holdout: Annotated[Optional[list[Path]], typer.Option(
             HOLDOUT, metavar='RUN...', help='Flights for validation only. Default: the last run '
                                             'of three or more.')] = None,
@@ -70,25 +70,25 @@ def spread(arguments: list[str]) -> list[str]:
 
 
 def joint(logs: Annotated[list[Path], typer.Argument(
-              metavar='LOG', help='Response log (CSV) or recorded run (bag), see '
+              metavar='LOG...', help='Response logs (CSV) or recorded run (bag), see '
                                   'docs/how-to/identification.md.')],
           validate: Annotated[Optional[list[Path]], typer.Option(
               '--validate', metavar='LOG.csv...', help='Further logs for validation.')] = None,
           robot: PublishedOption = None, report: PageOption = None, params: ParamsOption = None,
           json_path: JsonOption = None):
     """
-    Fit servo models to the first 60 % of a response log; the rest is for validation.
+    Fit one servo model to the first 60 % of response logs; the rest is for validation.
+
+    Several logs of the same servos are fitted together. With --validate, one log is fitted.
 
     Example: beetle_omni identify joint slow.csv --validate fast.csv --report servos.html
     """
     from beetle_omni_ros.runs.bag_files import runs_in
-    log, *more = runs_in(logs)      # `--validate a.csv b.csv` puts b.csv here
-    if more and not validate:
-        raise ParameterError(f'{more[0]}: the identification uses one log; expected further logs '
-                             'after --validate')
+    logs = runs_in(logs)
+    more = logs[1:] if validate else []     # `--validate a.csv b.csv` puts b.csv here
     from beetle_omni_ros.identify.command import run_identify_joint
-    run_identify_joint(log, validate=[*(validate or []), *more], robot=robot, report=report,
-                       params=params, json_path=json_path)
+    run_identify_joint(logs[:len(logs) - len(more)], validate=[*(validate or []), *more],
+                       robot=robot, report=report, params=params, json_path=json_path)
 
 
 def rotor(logs: Annotated[list[Path], typer.Argument(

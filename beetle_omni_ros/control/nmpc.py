@@ -12,7 +12,6 @@ from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
 from beetle_omni_ros.control.references import ReferencePlanner
 from beetle_omni_ros.control.rti import CompiledRti, InterpretedRti
 from beetle_omni_ros.robot import dynamics as model
-from beetle_omni_ros.robot import effects
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
 from beetle_omni_ros.robot.allocation import clipped
 from beetle_omni_ros.robot.native import CompilerError
@@ -47,7 +46,6 @@ class NmpcController:
 
     def __init__(self, robot: RobotParameters, parameters: NmpcParameters | None = None):
         """Build or load the solver; the first time takes some seconds of compilation."""
-        effects.check('nmpc', robot.effects)
         p = parameters or NmpcParameters.load()
         actuators = p.actuators(robot)
         self._parameters, self.reach = p, p.reach

@@ -5,23 +5,23 @@ from pathlib import Path
 
 from rich.console import Console
 
-from beetle_omni_ros.identify import joint_results as of_joints
-from beetle_omni_ros.identify.joint import identify_joints
-from beetle_omni_ros.identify.joint_log import read_joint_log
-from beetle_omni_ros.identify.joint_servos import file_servos
 from beetle_omni_ros.identify.robot_file import check_outputs
 from beetle_omni_ros.identify.rotor import results as of_rotor
 from beetle_omni_ros.identify.rotor.log import chosen, read_rotor_log
+from beetle_omni_ros.identify.servo import page as of_joints
+from beetle_omni_ros.identify.servo.joint import identify, joint_results
+from beetle_omni_ros.identify.servo.log import read_joint_log
 from beetle_omni_ros.pages.table import print_grids, Terminal
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.json_file import write_json, write_text
 
 
-def run_identify_joint(path: Path, *, validate: Sequence[Path] = (), robot: Path | None = None,
-                       json_path: Path | None = None, report: Path | None = None,
-                       params: Path | None = None, console: Console | None = None) -> dict:
+def run_identify_joint(paths: Sequence[Path], *, validate: Sequence[Path] = (),
+                       robot: Path | None = None, json_path: Path | None = None,
+                       report: Path | None = None, params: Path | None = None,
+                       console: Console | None = None) -> dict:
     """
-    Identify the tilt servos from a response log.
+    Identify the tilt servos from response logs.
 
     Arguments are those of `beetle_omni identify joint`.
 
@@ -35,19 +35,17 @@ def run_identify_joint(path: Path, *, validate: Sequence[Path] = (), robot: Path
     console = console or Terminal()
     check_outputs(params, robot, json_path, report, 'report')
     robot_parameters = RobotParameters.load(robot)
-    published = robot_parameters.joints
-    log = read_joint_log(path)
-    servos = file_servos(robot_parameters, log.joints)
+    logs = [read_joint_log(path) for path in paths]
     validations = [read_joint_log(other) for other in validate]
-    with console.status(f'identifying {len(log.joints)} joints'):
-        models = identify_joints(log, published)
-    results = of_joints.joint_results(log, validations, models, published, servos)
+    with console.status(f'identifying {len(logs[0].joints)} joints'):
+        found = identify(logs, robot_parameters)
+    results = joint_results(found, validations, robot_parameters)
     if robot:
         results['meta']['robot'] = str(robot)
     _print(console, of_joints.grids(results, brief=True), results['text'])
     write_json(json_path, results)
     if report:
-        write_text(report, of_joints.joint_page(log, validations, models, servos, results),
+        write_text(report, of_joints.joint_page(found, validations, robot_parameters, results),
                    'report')
     if params:
         of_joints.write_joint_file(params, results, robot)

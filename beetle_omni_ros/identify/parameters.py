@@ -57,6 +57,8 @@ class ServoFitParameters:
     least_common: int = parameter(doc='Least number of joints for a median.', low=2, high=4)
     restarts: np.ndarray = parameter(doc='Frequency [rad/s] and delay [s] of further starts.',
                                      shape=(3, 2), low=0, high=1000)
+    as_well: float = parameter(doc='Largest ratio of the errors of a correction and of the best '
+                                   'model.', unit='1', low=1, high=10)
     traded: float = parameter(doc='Least correlation of a pair that the log does not separate.',
                               unit='1', low=0, high=1)
     loose: float = parameter(doc='Least half width in scales of a member of such a pair.',

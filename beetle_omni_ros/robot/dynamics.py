@@ -199,7 +199,7 @@ def tilt_servo(robot: RobotParameters, joint: int, target, thrust=0.0,
         if act is not None:
             act(terms, joint, **values)
     stiction = None if terms.coulomb is None else max(terms.coulomb, terms.stiction)
-    return Servo.of(robot.joints, coulomb=terms.coulomb, stiction=stiction), terms
+    return Servo.of(robot.joints.of(joint), coulomb=terms.coulomb, stiction=stiction), terms
 
 
 def derivative(robot: RobotParameters, x, u, d):

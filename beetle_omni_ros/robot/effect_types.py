@@ -5,35 +5,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import casadi as ca
+import numpy as np
 
 LAYERS = ('body', 'rotor', 'joint', 'timing', 'sensor')
 # Terms that the simulated plant and the gap finder have -> why NMPC and training leave out an
 # effect of them.
 MEASURED = {'voltage_ratio': 'it has no voltage and assumes a full pack',
             'charge_drawn': 'it has no current of the pack and assumes that no charge was drawn'}
-
-
-@dataclass(frozen=True)
-class LogNumber:
-    """
-    How a servo's response log determines a parameter.
-
-    Attributes:
-        scale: smallest significant change; of the logarithm if ``logarithmic``.
-        low: smallest value; of friction, as a dead band [rad].
-        high: largest value.
-        logarithmic: whether the logarithm is fitted.
-        each: whether each joint has its own value.
-        better: (name, unit) of a quantity that a log determines better, or nothing.
-
-    """
-
-    scale: float
-    low: float
-    high: float
-    logarithmic: bool = False
-    each: bool = False
-    better: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -58,7 +36,6 @@ class EffectParameter:
         step: step of a fit's derivatives; of the logarithm for the file's own numbers.
         curved: whether these derivatives change during a fit.
         form: whether it only chooses a form of the effect and is not fitted.
-        log: how a servo's response log determines it, or None.
 
     """
 
@@ -68,7 +45,7 @@ class EffectParameter:
     high: float
     typical: float = float('nan')
     smallest: float = float('nan')
-    default: float | None = None
+    default: float | tuple[float, ...] | None = None
     of_each: bool = False
     number: str = ''
     sensor: str = ''
@@ -77,7 +54,6 @@ class EffectParameter:
     step: float = 1e-3
     curved: bool = False
     form: bool = False
-    log: LogNumber | None = None
 
 
 @dataclass(frozen=True)
@@ -111,6 +87,9 @@ class SensorErrors:
         imu_delay: age of readings at their stamps [s].
         mocap_delay: age of poses at their stamps [s].
         encoder_delay: age of readings at their stamps [s].
+        encoder_gain: (4,) error of the readings per angle [1].
+        encoder_sine: (4,) error by the sine of the angle [rad].
+        encoder_cosine: (4,) error by the cosine of the angle minus 1 [rad].
 
     """
 
@@ -122,6 +101,26 @@ class SensorErrors:
     imu_delay: float = 0.0
     mocap_delay: float = 0.0
     encoder_delay: float = 0.0
+    encoder_gain: tuple[float, ...] = (0.0,) * 4
+    encoder_sine: tuple[float, ...] = (0.0,) * 4
+    encoder_cosine: tuple[float, ...] = (0.0,) * 4
+
+    @property
+    def encoders_err(self) -> bool:
+        """Whether the encoders' readings depend on the angle."""
+        return any((*self.encoder_gain, *self.encoder_sine, *self.encoder_cosine))
+
+    def encoders(self, tilt: np.ndarray) -> np.ndarray:
+        """Readings [rad] of the encoders at tilts (..., 4) [rad]."""
+        return tilt + tilt * self.encoder_gain + np.sin(tilt) * self.encoder_sine \
+            + (np.cos(tilt) - 1) * self.encoder_cosine
+
+    def tilts(self, readings: np.ndarray) -> np.ndarray:
+        """Tilts (..., 4) [rad] at readings of the encoders, by three fixed-point steps."""
+        tilt = readings
+        for _ in range(3):
+            tilt = tilt + readings - self.encoders(tilt)
+        return tilt
 
 
 @dataclass
@@ -223,13 +222,11 @@ class Treatment:
     Attributes:
         acts: whether a change of its parameters changes the consumer's results.
         reason: reason why it does not act.
-        error: whether the consumer refuses a robot file with the effect.
 
     """
 
     acts: bool
     reason: str = ''
-    error: bool = False
 
 
 @dataclass(frozen=True)
@@ -258,7 +255,6 @@ class Effect:
         forms: for each form of the effect, the parameters that choose it.
         one_regime: whether it acts in one regime only, such as near the ground.
         same_response: entry that is another form of the same response.
-        log_rival: entry that a servo's response log hardly distinguishes from it.
         allocated: whether the allocation includes it.
         measured: terms that not every consumer has, of ``MEASURED``. Where one is None, the
             effect is left out.
@@ -285,7 +281,6 @@ class Effect:
     forms: tuple[dict[str, float], ...] = ({},)
     one_regime: bool = False
     same_response: str = ''
-    log_rival: str = ''
     allocated: bool = False
     measured: tuple[str, ...] = ()
     plant: str = ''

@@ -13,7 +13,7 @@ its kind:
 - Sensor effects are in :attr:`RobotParameters.sensors`. The gap finder fits them.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from difflib import get_close_matches
 
 import numpy as np
@@ -52,11 +52,8 @@ _NO_JOINTS = Treatment(False, 'the filter does not read the joints')
 _TREATMENTS = {
     'nmpc': {'sensor': _CORRECTED, 'play': Treatment(
         False, 'a play is an offset of the servos, which is estimated in flight')},
-    'training': {'sensor': _CORRECTED, 'play': Treatment(
-        False, 'the model of the servos has no play: train with joint_deflection or '
-               'joint_friction, or take the effect out of the file', error=True)},
-    'plant': {'play': Treatment(
-        False, 'MuJoCo has no play between encoder and rotor', error=True)},
+    'training': {'sensor': _CORRECTED},
+    'plant': {},
     'estimator': {**dict.fromkeys(('body', 'servo', 'number', 'command', 'play'), _NO_MODEL),
                   'feedback': _NO_JOINTS},
     'buses': dict.fromkeys(('body', 'servo', 'number', 'sensor', 'feedback', 'play'), _NO_DELAY),
@@ -145,7 +142,7 @@ def _value(at, spec, value):
 
 def treatment(consumer: str, name: str) -> Treatment:
     """
-    How a consumer treats an effect: it acts on it, leaves it to another consumer or refuses it.
+    How a consumer treats an effect: it acts on it or states why not.
 
     This follows from the kind of effect (:attr:`Effect.kind`), so that each new entry has a
     treatment. ``test/gap/test_consumers.py`` checks every pair against the consumer's results.
@@ -161,22 +158,3 @@ def treatment(consumer: str, name: str) -> Treatment:
     if effect.measured and consumer in ('nmpc', 'training'):
         return Treatment(False, '; '.join(MEASURED[term] for term in effect.measured))
     return _TREATMENTS[consumer].get(effect.kind, ACTS)
-
-
-def check(consumer: str, effects: Iterable[str]) -> None:
-    """
-    Refuse effects of a robot file that a consumer cannot represent.
-
-    Raises:
-        ParameterError: names the effect and the reason.
-
-    """
-    for text in refusals(consumer, effects):
-        raise ParameterError(f'effects.{text}')
-
-
-def refusals(consumer: str, effects: Iterable[str]) -> list[str]:
-    """Text with the reason for each effect that a consumer refuses."""
-    found = {name: treatment(consumer, name) for name in effects}
-    return [f'{name}: refused by the {CONSUMERS[consumer]}: {one.reason}'
-            for name, one in found.items() if one.error]

@@ -6,7 +6,6 @@ from beetle_omni_ros.robot.effect_types import (
     Effect,
     EffectParameter,
     LimitStarts,
-    LogNumber,
     Treatment,
     vector,
 )
@@ -45,13 +44,8 @@ def _delay(typical, smallest=0.003, **more):
     return {'delay': EffectParameter('s', 0.0, -0.05, 0.2, typical, smallest, curved=True, **more)}
 
 
-def _friction(**more):
-    return EffectParameter('N m', 0.0, 0.0, 1.0, 0.01, 0.002, of_each=True, step=5e-4, curved=True,
-                           **more)
-
-
-def _logged(low, high):
-    return LogNumber(0.05, low, high, logarithmic=True)
+def _friction():
+    return EffectParameter('N m', 0.0, 0.0, 1.0, 0.01, 0.002, of_each=True, step=5e-4, curved=True)
 
 
 def _number(key, unit, low, high, typical, smallest, step=0.01, **more):
@@ -87,56 +81,48 @@ ACTUATOR: dict[str, Effect] = {
         'sine sweep of the tilts 0.5 to 6 Hz with thrust steps', delays=('tilt', 'thrust'),
         channels='BJ'),
     'joint_command_latency': Effect(
-        'joint', _delay(0.02, log=LogNumber(0.002, 0.0, 0.12, better=(('ramp_lag', 's'),))),
+        'joint', _delay(0.02),
         'q*(t - d)', 'fast tilting',
         ('joint_bandwidth', 'command_latency', 'joint_feedback_delay'),
-        'sine sweep of the tilts 0.5 to 6 Hz', delays=('tilt',), channels='J',
-        log_rival='joint_bandwidth'),
+        'sine sweep of the tilts 0.5 to 6 Hz', delays=('tilt',), channels='J'),
     'joint_bandwidth': Effect(
         'joint', {
             'kp': _number('joints.kp', 'N m/rad', 1e-4, 1e3, 0.3, 0.1, tolerance='lag',
-                          log=_logged(1e-3, 1e2)),
+                          of_each=True),
             'kd': _number('joints.kd', 'N m s/rad', 0.0, 1e2, 0.3, 0.1, tolerance='lag',
-                          log=_logged(1e-5, 1e1))},
+                          of_each=True)},
         "J q'' = Kp (q* - q) - Kd q'", 'fast tilting', ('joint_command_latency',
                                                        'joint_torque_limit'),
-        'sine sweep of the tilts 0.5 to 6 Hz with two amplitudes', channels='J',
-        log_rival='joint_command_latency'),
+        'sine sweep of the tilts 0.5 to 6 Hz with two amplitudes', channels='J'),
     'joint_velocity_limit': Effect(
         'joint', {
-            'velocity_limit': _number('joints.velocity_limit', 'rad/s', 0.1, 100, 0.5, 0.05,
-                                      log=_logged(0.2, 1e3))},
+            'velocity_limit': _number('joints.velocity_limit', 'rad/s', 0.1, 100, 0.5, 0.05)},
         "|q'| <= limit: voltage and gearing", 'large tilt steps',
         ('joint_torque_limit', 'joint_bandwidth'), 'tilt steps of 30, 90 and 180 deg',
-        channels='J', starts=LimitStarts('tilt_rate', (0.95, 0.8), 0.95),
-        log_rival='joint_torque_limit'),
+        channels='J', starts=LimitStarts('tilt_rate', (0.95, 0.8), 0.95)),
     'joint_torque_limit': Effect(
         'joint', {
             # The file's 3 N m is 60 times the demand of quick poses; the real limit may be lower.
             'effort_limit': _number('joints.effort_limit', 'N m', 0.001, 100, 0.8, 0.05,
-                                    least=1e-3, log=_logged(1e-3, 1e3))},
+                                    least=1e-3)},
         '|tau| <= limit: current limit, stall', 'large tilt steps',
         ('joint_velocity_limit', 'joint_bandwidth'), 'tilt steps of 30, 90 and 180 deg',
-        channels='J', starts=LimitStarts('torque', (1.1, 0.8, 0.5), 0.98),
-        log_rival='joint_velocity_limit'),
+        channels='J', starts=LimitStarts('torque', (1.1, 0.8, 0.5), 0.98)),
     'joint_friction': Effect(
         'joint', {
-            'coulomb': _friction(log=LogNumber(0.002, 0.0, 0.4, each=True,
-                                               better=(('dead_band', 'rad'),))),
-            'stiction': _friction()},
+            'coulomb': _friction(), 'stiction': _friction()},
         "-coulomb sgn(q') while sliding, up to stiction at rest (Armstrong-Helouvry 1994); "
         'smooth over 0.05 rad/s in the model', 'slow reversals of the tilts',
         ('joint_backlash', 'joint_bandwidth'), 'triangle of 2 deg at 0.1 Hz',
-        servo=_joint_friction, channels='J', starts=((0.004, 0.004), (0.012, 0.015)),
-        log_rival='joint_backlash', treatments={'plant': Treatment(
-            False, 'friction that holds a joint needs the contact solver, which the plant uses '
-                   'near the floor only', error=True)}),
+        servo=_joint_friction, channels='J', starts=((0.004, 0.004), (0.012, 0.015))),
     'joint_backlash': Effect(
-        'joint', {'gap': EffectParameter('rad', 0.0, 0.0, 0.3, 0.01, 0.003, curved=True,
-                                         log=LogNumber(0.002, 0.0, 0.3))},
-        'play of width gap between encoder and rotor', 'reversals of the tilts',
+        'joint', {'gap': EffectParameter('rad', 0.0, 0.0, 0.3, 0.01, 0.003, of_each=True,
+                                         curved=True),
+                  'at_encoder': EffectParameter('1', 0.0, 0.0, 1.0, default=0.0, form=True)},
+        'play of width gap between motor and rotor; the encoder is on the side of the motor, with '
+        'at_encoder 1 on that of the rotor', 'reversals of the tilts',
         ('joint_friction', 'joint_feedback_delay'), 'reversals loaded and unloaded',
-        starts=((0.005,), (0.02,)), log_rival='joint_friction'),
+        starts=((0.005,), (0.02,))),
     'joint_deflection': Effect(
         'joint', {'deflection_per_newton': EffectParameter('rad/N', 0.0, -0.05, 0.05, 0.002,
                                                            0.0004, step=1e-4, curved=True)},
@@ -145,11 +131,22 @@ ACTUATOR: dict[str, Effect] = {
         servo=_joint_deflection, channels='J'),
     'joint_offset': Effect(
         'joint', {'offset': EffectParameter('rad', (0.0,) * 4, -0.5, 0.5, 0.03, 0.008,
-                                            tolerance='angle',
-                                            log=LogNumber(0.002, -0.5, 0.5, each=True))},
+                                            tolerance='angle')},
         'true tilt = encoder + offset', 'several attitudes',
         ('joint_offset', 'torque_coefficient', 'imu_misalignment'),
         'attitudes with different sets of tilts; a jig', _joint_offset, each='joint'),
+    'joint_encoder_error': Effect(
+        'joint', {name: EffectParameter(unit, (0.0,) * 4, -0.3, 0.3, typical, smallest,
+                                        default=(0.0,) * 4, sensor=f'encoder_{name}')
+                  for name, unit, typical, smallest in (
+                      ('gain', '1', 0.02, 0.005), ('sine', 'rad', 0.02, 0.008),
+                      ('cosine', 'rad', 0.02, 0.008))},
+        "encoder = q + gain q + sine sin q + cosine (cos q - 1): an axis off the encoder's",
+        'large tilts', ('joint_offset', 'joint_bandwidth'), 'tilts held over the whole travel',
+        each='joint', channels='J', treatments={
+            'estimator': Treatment(False, 'the filter does not read the joints'),
+            'gap': Treatment(False, 'a flight does not separate it from joint_offset: fit it to a '
+                                    'response log')}),
     'joint_feedback_delay': Effect(
         'timing', _delay(0.01, sensor='encoder_delay', tolerance='delay'),
         'the encoder reading is older than its stamp by d',

@@ -67,7 +67,11 @@ class RotorParameters:
 
 @dataclass(frozen=True, kw_only=True)
 class JointParameters:
-    """One tilt servo: J q'' = Kp (q* - q) - Kd q', within limits."""
+    """
+    The tilt servos: J q'' = Kp (q* - q) - Kd q', within limits.
+
+    The effect ``joint_bandwidth`` may give each servo its own gains, (4,) arrays.
+    """
 
     inertia: float = parameter(doc='effective inertia', unit='kg m^2', low=1e-7, high=1)
     kp: float = parameter(doc='stiffness', unit='N m/rad', low=1e-4, high=1e3)
@@ -76,15 +80,20 @@ class JointParameters:
     effort_limit: float = parameter(doc='largest torque', unit='N m', low=0.01, high=100)
     position_limit: float = parameter(doc='travel to each side', unit='rad', low=0.1, high=100)
 
+    def of(self, joint: int) -> JointParameters:
+        """The servo of one joint (index)."""
+        kp, kd = (float(np.broadcast_to(value, 4)[joint]) for value in (self.kp, self.kd))
+        return replace(self, kp=kp, kd=kd)
+
     @property
     def natural_frequency(self) -> float:
-        """Undamped natural frequency [rad/s], sqrt(Kp / J)."""
-        return float(np.sqrt(self.kp / self.inertia))
+        """Undamped natural frequency [rad/s], sqrt(Kp / J), of the mean servo."""
+        return float(np.sqrt(np.mean(self.kp) / self.inertia))
 
     @property
     def damping_ratio(self) -> float:
-        """Damping ratio [1], Kd / (2 sqrt(Kp J))."""
-        return float(self.kd / (2 * np.sqrt(self.kp * self.inertia)))
+        """Damping ratio [1], Kd / (2 sqrt(Kp J)), of the mean servo."""
+        return float(np.mean(self.kd) / (2 * np.sqrt(np.mean(self.kp) * self.inertia)))
 
     @property
     def time_constant(self) -> float:
@@ -93,7 +102,7 @@ class JointParameters:
 
         The ramp lag Kd / Kp; with little damping the inertia's sqrt(J / Kp).
         """
-        return max(self.kd / self.kp, 1 / self.natural_frequency)
+        return max(float(np.mean(self.kd) / np.mean(self.kp)), 1 / self.natural_frequency)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -207,6 +216,7 @@ class RobotParameters:
         object.__setattr__(self, 'effects', catalogue.validated(self.effects))
         for key, value in catalogue.settings(self.effects).items():
             part, name = key.split('.')
+            value = np.array(value) if isinstance(value, tuple) else value
             object.__setattr__(self, part, replace(getattr(self, part), **{name: value}))
         hover = self.mass * self.gravity / 4
         if hover > self.rotors.thrust_max:

@@ -76,6 +76,15 @@ class MotionForces:
             torque += -change.ravel() @ self._levers + (self._reaction * along) @ normal
         return force, torque
 
+    def turned(self, rotation: np.ndarray, before: np.ndarray, after: np.ndarray,
+               thrust: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Change of force in world [N] and torque [N m] by rotors that turn between tilts (4,)."""
+        change = thrust[:, None] * (
+            (np.cos(after) - np.cos(before))[:, None] * self._up
+            + (np.sin(after) - np.sin(before))[:, None] * self._sideways)
+        return rotation @ change.sum(axis=0), -change.ravel() @ self._levers \
+            + self._reaction @ change
+
     def _thrust_change(self, rotation, hub, normal, tilt, thrust, height):
         """(4,) changes of the rotors' thrusts by the effects [N]."""
         part = np.ones(4)

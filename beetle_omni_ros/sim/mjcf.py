@@ -109,8 +109,8 @@ def _actuators(robot):
         f'dynprm="{rotors.time_constant!r}" gear="{_text(0, 0, scale[k], 0, 0)} '
         f'{_text(-rotors.spin[k] * ratio * scale[k])}"/>\n' for k in range(4))
     servo = ''.join(
-        f'<general name="servo{k + 1}" joint="gimbal{k + 1}" gainprm="{joints.kp!r}" '
-        f'biastype="affine" biasprm="{_text(0, -joints.kp, -joints.kd)}" '
+        f'<general name="servo{k + 1}" joint="gimbal{k + 1}" gainprm="{joints.of(k).kp!r}" '
+        f'biastype="affine" biasprm="{_text(0, -joints.of(k).kp, -joints.of(k).kd)}" '
         f'forcelimited="true" forcerange="{_text(-joints.effort_limit, joints.effort_limit)}"/>\n'
         for k in range(4))
     return rotor + servo

@@ -5,11 +5,12 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from beetle_omni_ros.robot import dynamics, effects, rotations
+from beetle_omni_ros.robot import dynamics, rotations
 from beetle_omni_ros.robot.allocation import clipped
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.mass_properties import Variation
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.servo import NUMPY
 from beetle_omni_ros.sim.effects import CatalogueForces, MotionForces
 from beetle_omni_ros.sim.mjcf import BASE, base_part, build_model, set_base_part, thrust_scale
 from beetle_omni_ros.sim.parameters import PlantParameters
@@ -43,12 +44,18 @@ class Plant:
 
     def __init__(self, robot: RobotParameters, parameters: PlantParameters,
                  variation: Variation | None = None):
-        effects.check('plant', robot.effects)
         self._robot, self._parameters, self._variation = robot, parameters, variation
         self._forces, self._catalogue_forces = MotionForces(robot), CatalogueForces(robot)
-        self._has_motion_forces = bool(self._forces.depends_on_motion
+        play = robot.effects.get('joint_backlash', {'gap': 0.0, 'at_encoder': 0.0})
+        self._half_gap = np.broadcast_to(play['gap'], 4) / 2
+        self._has_play, self._at_encoder = bool(self._half_gap.any()), bool(play['at_encoder'])
+        self._has_motion_forces = bool(self._forces.depends_on_motion or self._has_play
                                        or self._catalogue_forces.names)
-        self._has_servo_loads = any(CATALOGUE[name].servo for name in robot.effects)
+        self._has_servo_loads = any(CATALOGUE[name].servo for name in robot.effects
+                                    if name != 'joint_friction')
+        self._servo_terms = [dynamics.tilt_servo(robot, i, 0.0)[0] for i in range(4)]
+        self._has_friction = self._servo_terms[0].coulomb is not None
+        self._friction = np.zeros(4)
         self._scale = thrust_scale(robot)
         self.model = build_model(robot, parameters, variation)
         self.data = mujoco.MjData(self.model)
@@ -57,7 +64,7 @@ class Plant:
         self._flags = int(self.model.opt.disableflags)
         self._reach = _reach(self.model)
         # Largest change of a servo's rate in a tick for each rad of error.
-        self._rate_gain = robot.joints.kp * self._tick / robot.joints.inertia
+        self._rate_gain = float(np.max(robot.joints.kp)) * self._tick / robot.joints.inertia
         # Views of MuJoCo's state, stored because each access takes time.
         self._qpos, self._qvel = self.data.qpos, self.data.qvel
         self._tilt, self._rate, self._target = self._qpos[7:], self._qvel[6:], self.data.ctrl[4:]
@@ -91,6 +98,8 @@ class Plant:
         mujoco.mj_resetData(self.model, self.data)
         self.model.opt.disableflags = self._flags
         self.model.opt.timestep = self._tick / self._substeps
+        self._friction[:] = 0.0
+        self._shaft = np.zeros(4)
         self.data.qpos[:3] = position
         self.data.qpos[3:7] = rotations.normalized(quaternion)[[3, 0, 1, 2]]
         self._update()
@@ -180,12 +189,19 @@ class Plant:
         substeps = self._floor_substeps if fast and data.ncon else self._substeps
         model.opt.timestep = self._tick / substeps
         self._apply_forces(0.5 * self._tick)
-        if fast:
+        if fast and not self._has_friction:
             mujoco.mj_step(model, data, substeps)
         else:
+            others = self._other_torques()
             for _ in range(substeps):
-                self._limit_rates()
+                if not fast:
+                    self._limit_rates()
+                if self._has_friction:
+                    self._rub(others)
                 mujoco.mj_step(model, data)
+        if self._has_play:
+            self._shaft = clipped(self._shaft, self._tilt - self._half_gap,
+                                  self._tilt + self._half_gap)
         if fast:
             self._update()
         else:
@@ -247,7 +263,9 @@ class Plant:
         turn = rotations.exp(ahead * self._qvel[3:6])
         quaternion = rotations.multiply(self._qpos[XYZW], turn)
         motion = self._qvel + ahead * data.qacc
-        tilt = self._tilt + ahead * self._rate
+        driven = self._tilt + ahead * self._rate
+        tilt = clipped(self._shaft, driven - self._half_gap, driven + self._half_gap) \
+            if self._has_play else driven
         force, torque = self._forces(
             rotations.matrix(quaternion), motion[:3], motion[3:6], tilt, self._scale * thrust,
             float(self._qpos[2]))
@@ -258,6 +276,11 @@ class Plant:
                 / self._robot.rotors.time_constant, self._qpos[:3], self.voltage_ratio,
                 self.charge_drawn)
             force, torque = force + catalogue[0], torque + catalogue[1]
+        if self._has_play:
+            # MuJoCo's thrust acts along the motor's angle, the true one along the shaft's.
+            moved = self._forces.turned(rotations.matrix(quaternion), driven, tilt,
+                                        self._scale * thrust)
+            force, torque = force + moved[0], torque + moved[1]
         applied[:3] = self._wrench[:3] + force
         applied[3:6] = self._wrench[3:] + torque
 
@@ -270,7 +293,33 @@ class Plant:
             _, terms = dynamics.tilt_servo(self._robot, i, self._commanded_tilt[i], thrust[i],
                                            float(load))
             self._target[i] = terms.target
-            self.data.qfrc_applied[6 + i] = terms.load
+            self.data.qfrc_applied[6 + i] = terms.load + self._friction[i]
+
+    def _other_torques(self):
+        """Torques on the joints (4,) at the end of the last tick, but for motor and friction."""
+        if not self._has_friction:
+            return None
+        return self._robot.joints.inertia * self.data.qacc[6:] - self.data.actuator_force[4:] \
+            - self._friction
+
+    def _rub(self, others):
+        """
+        Set the friction of the joints for one substep.
+
+        It is the torque that stops the joint within the substep, at most the friction at its rate.
+        So a joint below its stiction rests without the solver of contacts.
+        """
+        joints, model, rate = self._robot.joints, self.model, self._rate
+        limits = model.actuator_forcerange[4:].T if model.actuator_forcelimited[4:].all() \
+            else (-np.inf, np.inf)
+        motor = clipped(model.actuator_gainprm[4:, 0] * (self._target - self._tilt)
+                        + model.actuator_biasprm[4:, 2] * rate, *limits)
+        stops = -joints.inertia * rate / model.opt.timestep - motor - others
+        most = np.array([servo.friction(NUMPY, one) for servo, one in zip(
+            self._servo_terms, rate.tolist(), strict=True)])
+        friction = clipped(stops, -most, most)
+        self.data.qfrc_applied[6:] += friction - self._friction
+        self._friction = friction
 
     def _update(self):
         """Compute accelerations and contacts of the present state."""
@@ -282,6 +331,16 @@ class Plant:
     def state(self) -> tuple[np.ndarray, np.ndarray]:
         """Copies of position, quaternion wxyz, tilts (11,) and velocities (10,)."""
         return self._qpos.copy(), self._qvel.copy()
+
+    @property
+    def tilt(self) -> np.ndarray:
+        """(4,) true tilts of the rotors [rad]."""
+        return self._shaft.copy() if self._has_play else self._tilt.copy()
+
+    @property
+    def encoder(self) -> np.ndarray:
+        """(4,) angles [rad] at the encoders, on the side of the motor or of the rotor."""
+        return self.tilt if self._at_encoder else self._tilt.copy()
 
     @property
     def thrust(self) -> np.ndarray:

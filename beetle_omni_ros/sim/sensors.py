@@ -164,9 +164,12 @@ class Sensors:
         self._mocap.append(self._capture(truth) if tick % self._mocap_period == 0 else None)
         motion = ImuReading(truth.stamp + self._imu_shift, imu[:3], imu[3:])
         effort = plant.effort
-        self._joints.append((truth.stamp, truth.tilt, truth.tilt_velocity, effort))
+        tilt = plant.encoder
+        if self._errors.encoders_err:
+            tilt = self._errors.encoders(tilt)
+        self._joints.append((truth.stamp, tilt, truth.tilt_velocity, effort))
         if devices:
-            tilt = truth.tilt + self._tilt_noise.next()
+            tilt = tilt + self._tilt_noise.next()
             return (motion, self._mocap[0],
                     JointReading(truth.stamp, tilt, truth.tilt_velocity, effort),
                     self._pack_reading(truth.stamp, battery))

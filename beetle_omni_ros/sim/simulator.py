@@ -278,7 +278,8 @@ class Simulator:
 
     def _truth(self):
         qpos, qvel = self._plant.state
-        return Truth(self.time, qpos[:3], qvel[:3], qpos[XYZW], qvel[3:6], qpos[7:], qvel[6:],
+        return Truth(self.time, qpos[:3], qvel[:3], qpos[XYZW], qvel[3:6], self._plant.tilt,
+                     qvel[6:],
                      self._plant.thrust, self._plant.contact, self._crash.impact,
                      self._crash.broken)
 

@@ -13,7 +13,6 @@ import torch
 
 from beetle_omni_ros.control.policy_file import PolicyContract
 from beetle_omni_ros.robot import dynamics as model
-from beetle_omni_ros.robot import effects
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.train import batch, rewards, starts
 from beetle_omni_ros.train.model import CENTRE, INERTIA, MASS, module_reaction, nominal_body
@@ -61,7 +60,6 @@ class TiltableQuadrotorEnv(VecEnv):
 
     def __init__(self, parameters: TrainParameters, robot: RobotParameters,
                  device: torch.device | str = 'cpu', compiled: bool | None = None):
-        effects.check('training', robot.effects)
         self.cfg, self.robot, self.device = parameters, robot, torch.device(device)
         self.num_envs, self.num_actions = parameters.ppo.robots, model.INPUT_SIZE
         self.max_episode_length = round(parameters.episode.duration / parameters.episode.period)

@@ -12,10 +12,11 @@ from dataclasses import replace
 from math import exp
 
 import casadi as ca
+import numpy as np
 
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.servo import CASADI, Step
+from beetle_omni_ros.robot.servo import CASADI, SLIDING_RATE, Step
 
 # Quantities of each robot: mass [kg], inertia (3) [kg m^2], centre of mass (3) [m].
 MASS, INERTIA, CENTRE = slice(0, 1), slice(1, 4), slice(4, 7)
@@ -62,6 +63,18 @@ def _servos(robot, x, target, h):
     return ca.vertcat(*tilts), ca.vertcat(*rates)
 
 
+def _behind_play(robot, tilt, rate):
+    """
+    Tilts of the rotors (4,) behind the play of the joints.
+
+    A turning motor leads by half the gap. The state has no side of contact at rest, so the rotor
+    is then in the middle.
+    """
+    half = ca.DM(np.broadcast_to(robot.effects.get('joint_backlash', {}).get('gap', 0.0), 4) / 2)
+    speed = rate / SLIDING_RATE
+    return tilt - half * speed / ca.sqrt(1 + speed * speed)
+
+
 def substep(robot: RobotParameters, duration: float) -> ca.Function:
     """
     One integration step of the full state.
@@ -100,7 +113,8 @@ def substep(robot: RobotParameters, duration: float) -> ca.Function:
                    centre_of_mass={'offset': body[CENTRE]})
     order = ['mass', *(name for name in effects if name != 'mass')]
     acceleration, angular_acceleration = model.rigid_body(
-        robot, x[model.VELOCITY], x[model.QUATERNION], x[model.RATE], new_tilt,
+        robot, x[model.VELOCITY], x[model.QUATERNION], x[model.RATE],
+        _behind_play(robot, new_tilt, new_rate),
         (thrust + new_thrust) / 2, wrench[:3], wrench[3:], (new_rate - rate) / h,
         {name: effects[name] for name in order}, tilt_rate=new_rate,
         thrust_rate=(new_thrust - thrust) / h, position=x[model.POSITION])

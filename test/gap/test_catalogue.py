@@ -18,7 +18,8 @@ NAMES = {
     'rotor': 'voltage_sag rotor_lag rotor_dead_time thrust_saturation',
     'timing': 'command_latency joint_feedback_delay mocap_time_offset imu_filter_lag',
     'joint': 'joint_command_latency joint_bandwidth joint_velocity_limit joint_torque_limit '
-             'joint_friction joint_backlash joint_deflection joint_offset',
+             'joint_friction joint_backlash joint_deflection joint_offset '
+             'joint_encoder_error',
     'sensor': 'imu_accelerometer_bias imu_gyroscope_bias imu_misalignment imu_lever_arm '
               'mocap_misalignment'}
 PARAMETERS = {
@@ -32,6 +33,7 @@ PARAMETERS = {
     'voltage_sag': ['exponent'], 'joint_friction': ['coulomb', 'stiction'],
     'joint_backlash': ['gap'], 'joint_velocity_limit': ['velocity_limit'],
     'joint_bandwidth': ['kp', 'kd'], 'joint_offset': ['offset'],
+    'joint_encoder_error': ['gain', 'sine', 'cosine'],
     'joint_deflection': ['deflection_per_newton'], 'command_latency': ['delay'],
     'joint_command_latency': ['delay'], 'rotor_dead_time': ['delay'],
     'joint_feedback_delay': ['delay'], 'mocap_time_offset': ['delay'],
@@ -67,7 +69,8 @@ def test_an_entry_states_its_excitation_and_its_confusions(name):
 def test_an_entry_acts_on_a_model_or_on_a_sensor():
     for name, effect in CATALOGUE.items():
         acts = effect.apply or effect.servo or effect.settings or 'delay' in effect.parameters
-        assert acts or effect.layer == 'sensor' or name == 'joint_backlash'
+        assert acts or effect.layer == 'sensor' or name in (
+            'joint_backlash', 'joint_encoder_error')
 
 
 def test_a_value_of_the_robot_file_is_varied_by_a_ratio():

@@ -21,7 +21,10 @@ def test_files_are_written_before_anything_is_printed(tmp_path, monkeypatch):
     def broken(*_):
         raise SystemExit(1)
 
-    monkeypatch.setattr(command, 'analyse_joint_log', lambda *_: ({'effects': []}, '<html>'))
+    monkeypatch.setattr(command, 'analyse_joint_logs',
+                        lambda *_: ({'effects': [], 'changes': []}, None))
+    monkeypatch.setattr(command, 'gap_log_page', lambda *_: '<html>')
+    monkeypatch.setattr(command, 'grids', lambda _: [])
     monkeypatch.setattr(command, '_print', broken)
     (tmp_path / 'log.csv').touch()
     files = [tmp_path / 'gap.json', tmp_path / 'gap.html']

@@ -5,10 +5,11 @@ from functools import cache
 
 import numpy as np
 
-from beetle_omni_ros.identify.joint_log import JointLog
+from beetle_omni_ros.identify.servo.log import JointLog
 
 STEP = 1e-4                        # [s] of the simulation, plain semi-implicit Euler
 COUNT = 2 * np.pi / 4096           # [rad] of the encoder
+FADING = 0.05                      # [rad/s] over which stiction falls to sliding friction
 
 
 def sweep(duration=10.0, periods=(1.8, 2.6), amplitudes=(1.0, 1.7), rate=100.0):
@@ -28,7 +29,7 @@ def servo(t, command, **values):
 
 @cache
 def _moved(t, command, *, frequency=47.0, damping=0.63, delay=0.015, coulomb=0.0, stiction=0.0,
-          stribeck=0.1, backlash=0.0, velocity_limit=np.inf, torque_limit=np.inf, offset=0.0):
+          backlash=0.0, velocity_limit=np.inf, torque_limit=np.inf, offset=0.0, gain=0.0):
     """Positions (N,) [rad] of a servo that holds each command from its logged time on."""
     t, command = np.frombuffer(t), np.frombuffer(command)
     # It has been moving before the log: a straight run-up of a second.
@@ -49,13 +50,13 @@ def _moved(t, command, *, frequency=47.0, damping=0.63, delay=0.015, coulomb=0.0
         # the limit is that of the motor's torque, which also brakes
         push = frequency**2 * (wanted + offset - q) - 2 * damping * frequency * v
         v += STEP * min(max(push, -frequency**2 * torque_limit), frequency**2 * torque_limit)
-        grip = STEP * frequency**2 * (coulomb + stiction * np.exp(-abs(v) / stribeck)
+        grip = STEP * frequency**2 * (coulomb + stiction * np.exp(-(v / FADING)**2)
                                       if stiction else coulomb)
         v = 0.0 if abs(v) <= grip else v - grip * (1 if v > 0 else -1)
         v = min(max(v, -velocity_limit), velocity_limit)
         q += STEP * v
         shown = min(max(shown, q - backlash), q + backlash)
-    return np.interp(t[-count:], fine, positions)
+    return (1 + gain) * np.interp(t[-count:], fine, positions)
 
 
 def noisy(positions, rng, sigma=0.0012, slow=0.001):
@@ -68,11 +69,25 @@ def noisy(positions, rng, sigma=0.0012, slow=0.001):
     return np.round(read / COUNT) * COUNT
 
 
-def log_of(t, command, servos, seed=0, name='made.csv'):
-    """JointLog of several servos (keyword dicts) with one command."""
+def log_of(t, command, servos, seed=0, name='made.csv', every=1, late=0.0):
+    """
+    JointLog of several servos (keyword dicts) with one command.
+
+    Args:
+        t: times of the rows (N,) [s].
+        command: commands (N,) [rad].
+        servos: one dictionary for each joint.
+        seed: of the noise.
+        name: of the log.
+        every: rows from one reading of the encoders to the next; the others repeat it.
+        late: share of the readings that appear one row late.
+
+    """
     rng = np.random.default_rng(seed)
-    measured = np.array([noisy(servo(t, command, **values), rng) for values in servos])
-    return JointLog(name, t, tuple(range(1, len(servos) + 1)), measured,
+    read = np.array([noisy(servo(t, command, **values)[::every], rng) for values in servos])
+    at = np.arange(0, len(t), every) + (rng.random(read.shape[1]) < late)
+    last = np.searchsorted(at[1:], np.arange(len(t)), side='right')
+    return JointLog(name, t, tuple(range(1, len(servos) + 1)), read[:, last],
                     np.tile(command, (len(servos), 1)))
 
 

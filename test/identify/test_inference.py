@@ -29,7 +29,7 @@ from beetle_omni_ros.identify.inference.least_squares import (
 )
 from beetle_omni_ros.identify.inference.noise import autoregression, gain, Noise, whitened
 from beetle_omni_ros.identify.inference.prior import Prior, together, UNKNOWN
-from beetle_omni_ros.identify.servo_model import TERMS
+from beetle_omni_ros.identify.servo.model import TERMS
 
 FOLDER = Path(inference.__file__).parent
 OWN = 'beetle_omni_ros.identify.inference'

@@ -1,134 +1,187 @@
 """Servos are recovered from artificial logs, and real ones are predicted."""
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
-from servo_logs import log_of, sweep
+from servo_logs import COUNT, log_of, sweep
 
-from beetle_omni_ros.identify.joint import error_rms, identify_joints
-from beetle_omni_ros.identify.joint_log import read_joint_log
-from beetle_omni_ros.identify.joint_results import joint_results
 from beetle_omni_ros.identify.parameters import shipped
-from beetle_omni_ros.identify.servo_model import INDEX, published_set
+from beetle_omni_ros.identify.servo.fit import encoded, error_rms, NAMES, Servos
+from beetle_omni_ros.identify.servo.joint import identify, interval, joint_results
+from beetle_omni_ros.identify.servo.log import read_joint_log
+from beetle_omni_ros.identify.servo.model import INDEX, published_set
 from beetle_omni_ros.robot.parameters import RobotParameters
 
-PUBLISHED = RobotParameters.load().joints
-REAL = Path(__file__).resolve().parents[3] / 'shared' / 'data' / 'joint_response_100Hz.csv'
-SLOW, FAST = sweep(duration=9.0), sweep(4.5, periods=(0.3, 0.6), amplitudes=(0.3, 0.6))
+ROBOT = RobotParameters.load()
+DATA = Path(__file__).resolve().parents[3] / 'shared' / 'data'
+REAL = [path for path in (DATA / f'joint_{name}.csv' for name in (
+    'fading_50Hz', 'fast_50Hz', 'response_100Hz')) if path.is_file()]
+PARTS = {'slow': {'duration': 6.0},
+         'fast': {'duration': 4.0, 'periods': (0.3, 0.6), 'amplitudes': (0.3, 0.6)}}
 SERVOS = ({'coulomb': 0.013, 'frequency': 47.0, 'delay': 0.015},
-          {'backlash': 0.015, 'frequency': 44.0, 'delay': 0.018},
-          {'coulomb': 0.030, 'frequency': 52.0, 'delay': 0.013, 'offset': 0.012})
+          {'backlash': 0.015, 'frequency': 44.0, 'delay': 0.016, 'coulomb': 0.013},
+          {'coulomb': 0.030, 'frequency': 52.0, 'delay': 0.014, 'offset': 0.012})
 TRUE = {'natural_frequency': 'frequency', 'delay': 'delay', 'coulomb_friction': 'coulomb',
         'backlash': 'backlash', 'offset': 'offset'}
+WITHIN = {'natural_frequency': 4.0, 'delay': 0.003, 'coulomb_friction': 0.003,
+          'backlash': 0.003, 'offset': 0.003}
 
 
-@pytest.fixture(scope='module')
-def logs():
-    """Slow and fast logs of the same three servos."""
-    return {'slow': log_of(*SLOW, SERVOS, seed=1), 'fast': log_of(*FAST, SERVOS, seed=2)}
+@cache
+def made(name, every=1):
+    """Log of the three servos; ``every`` 4: rows at 200 Hz with readings at 50 Hz."""
+    t, command = sweep(**PARTS[name], rate=100.0 if every == 1 else 200.0)
+    return log_of(t, command, SERVOS, seed=1, name=name, every=every, late=0.05 * (every > 1))
 
 
-@pytest.fixture(scope='module')
-def models(logs):
-    """Models identified from each log."""
-    return {name: identify_joints(log, PUBLISHED) for name, log in logs.items()}
+@cache
+def found(name, every=1):
+    return identify([made(name, every)], ROBOT)
 
 
-def judged(models):
-    """(model, true value, name of the term) of every known parameter."""
-    for model, servo in zip(models, SERVOS, strict=True):
+def known(one):
+    """(unit, name of the term, true value, 95 % interval) of every known parameter."""
+    for unit, (*_, number) in enumerate(one.servos.units):
         for term, key in TRUE.items():
-            if key in servo:
-                yield model, servo[key], term
+            true = SERVOS[number - 1].get(key, 0.0)
+            yield unit, term, true, interval(one, one.chosen, unit, term)
 
 
-@pytest.mark.parametrize('name', ['slow', 'fast'])
-def test_the_true_terms_are_kept_and_no_others(models, name):
-    for model, servo in zip(models[name], SERVOS, strict=True):
-        friction = 'backlash' if 'backlash' in servo else 'coulomb_friction'
-        expected = {'delay', friction} | ({'offset'} if 'offset' in servo else set())
-        assert set(model.kept) == expected, f'joint {model.joint}'
+def ramp_lag(values):
+    """Lag [s] behind a ramp, of parameter sets."""
+    return values[:, INDEX['delay']] + 2 * values[:, INDEX['damping_ratio']] / values[:, 0]
 
 
-@pytest.mark.parametrize(('name', 'tolerance'), [
-    ('slow', {'natural_frequency': 8.0, 'delay': 0.005}),
-    ('fast', {'natural_frequency': 3.0, 'delay': 0.002})])
-def test_the_true_values_are_recovered(models, name, tolerance):
-    for model, true, term in judged(models[name]):
-        assert model.values[INDEX[term]] == pytest.approx(true, abs=tolerance.get(term, 0.002))
+@pytest.mark.parametrize('every', [1, 4])
+def test_the_true_values_are_recovered_at_any_rate_of_the_readings(every):
+    one, inside = found('fast', every), []
+    for unit, term, true, (low, high) in known(one):
+        assert one.values()[unit, INDEX[term]] == pytest.approx(true, abs=WITHIN[term]), term
+        assert high - low < 2.5 * WITHIN[term]
+        if term != 'offset':        # of which the slow error of these logs is a part
+            inside.append(low <= true <= high)
+    assert np.mean(inside) >= 0.75
 
 
-@pytest.mark.parametrize('name', ['slow', 'fast'])
-def test_intervals_cover_the_truth_and_are_narrow(models, name):
-    inside = [low <= true <= high for model, true, term in judged(models[name])
-              for low, high in [model.uncertainty.intervals[INDEX[term]]]]
-    assert np.mean(inside) > 0.8
-    for model, true, term in judged(models[name]):
+def test_a_slow_log_determines_the_lag_and_the_friction():
+    one = found('slow')
+    lags = [servo['delay'] + 2 * 0.63 / servo['frequency'] for servo in SERVOS]
+    assert ramp_lag(one.values()) == pytest.approx(lags, abs=1e-3)
+    for unit, term, true, _ in known(one):
         if term in ('coulomb_friction', 'backlash', 'offset'):
-            assert np.ptp(model.uncertainty.intervals[INDEX[term]]) < max(0.3 * true, 0.004)
+            assert one.values()[unit, INDEX[term]] == pytest.approx(true, abs=0.004), term
 
 
-def test_only_a_slow_log_confounds_delay_and_bandwidth(models):
+def test_unneeded_terms_are_rejected():
+    kept = {entry for name in PARTS for entry in found(name).chosen.entries}
+    assert not kept & {'joint_velocity_limit', 'joint_torque_limit', 'joint_load'}
+
+
+def test_only_a_slow_log_confounds_delay_and_bandwidth():
     pair = ['delay', 'natural_frequency']
-    assert any(pair in model.inseparable for model in models['slow'])
-    assert not any(pair in model.inseparable for model in models['fast'])
-    for slow, fast in zip(models['slow'], models['fast'], strict=True):
-        widths = [np.ptp(model.uncertainty.intervals[INDEX['delay']]) for model in (slow, fast)]
-        assert widths[0] > 2 * widths[1]
+    slow, fast = (joint_results(found(name), [], ROBOT)['joints'] for name in PARTS)
+    assert any(pair in joint['traded'] for joint in slow)
+    assert not any(pair in joint['traded'] for joint in fast)
+    for a, b in zip(slow, fast, strict=True):
+        widths = [np.ptp(joint['terms']['delay']['interval']) for joint in (a, b)]
+        assert widths[0] > 1.5 * widths[1]
 
 
-def test_fits_of_the_slow_log_predict_the_fast_one(logs, models):
-    for k, model in enumerate(models['slow']):
-        assert error_rms(logs['fast'], k, model.values) < 0.006
-        assert error_rms(logs['fast'], k, published_set(PUBLISHED), held=False) > 0.03
+def test_two_logs_with_different_delays_narrow_the_common_frequency():
+    later = tuple({**servo, 'delay': servo['delay'] + 0.008} for servo in SERVOS)
+    second = log_of(*sweep(**PARTS['fast']), later, seed=5, name='later')
+    both, first = identify([made('fast'), second], ROBOT), found('fast')
+    delays = [both.of_log(k)[:, INDEX['delay']].mean() for k in (0, 1)]
+    assert np.diff(delays) == pytest.approx(0.008, abs=5e-4)
+    # both logs share the frequencies
+    assert both.of_log(0)[:, 0] == pytest.approx(both.of_log(1)[:, 0])
+    wide, narrow = ([np.ptp(interval(one, one.chosen, unit, 'natural_frequency'))
+                     for unit in range(3)] for one in (first, both))
+    assert np.mean(narrow) < 0.9 * np.mean(wide)
+    assert both.of_log(0)[:, 0] == pytest.approx([s['frequency'] for s in SERVOS], abs=3.0)
+
+
+def test_fits_of_the_slow_log_predict_the_fast_one():
+    for k, values in enumerate(found('slow').values()):
+        assert error_rms(made('fast'), k, values) < 0.006
+        assert error_rms(made('fast'), k, published_set(ROBOT.joints), held=False) > 0.03
+
+
+def test_the_derivatives_are_those_of_the_readings():
+    one = found('fast')
+    s = Servos([made('fast')], np.tile(one.values()[0], (4, 1)))
+    theta = encoded(one.values())
+    _, slopes = s(theta, np.ones(len(NAMES), dtype=bool))
+    for name in ('natural_frequency', 'damping_ratio', 'offset', 'encoder_gain', 'load_sine'):
+        step = np.zeros(len(NAMES))
+        step[INDEX[name]] = 2e-3
+        ends = [s(theta + sign * step, np.zeros(len(NAMES), dtype=bool))[0] for sign in (1, -1)]
+        for k in range(3):
+            numeric = (ends[0][k] - ends[1][k]) / 4e-3
+            error = np.linalg.norm(slopes[k][INDEX[name]] - numeric)
+            assert error < 0.1 * np.linalg.norm(numeric), name
 
 
 def test_a_speed_limit_is_found_if_the_command_exceeds_it():
     t, command = sweep(4.0, periods=(0.8, 1.2), amplitudes=(1.2, 1.6))
-    log = log_of(t, command, [{'velocity_limit': 5.5, 'coulomb': 0.012}], seed=3)
-    model, = identify_joints(log, PUBLISHED)
-    assert 'velocity_limit' in model.kept
-    assert model.values[INDEX['velocity_limit']] == pytest.approx(5.5, rel=0.02)
+    one = identify([log_of(t, command, [{'velocity_limit': 5.5, 'coulomb': 0.012}], seed=3)],
+                   ROBOT)
+    assert 'joint_velocity_limit' in one.chosen.entries
+    assert one.values()[0, INDEX['velocity_limit']] == pytest.approx(5.5, rel=0.02)
 
 
-def test_a_limit_that_is_never_reached_stays_with_an_open_interval(logs, models):
-    results = joint_results(logs['slow'], [logs['fast']], models['slow'], PUBLISHED)
-    for joint in results['joints']:
+def test_a_limit_that_is_never_reached_stays_with_an_open_interval():
+    for joint in joint_results(found('slow'), [made('fast')], ROBOT)['joints']:
         limit = joint['terms']['velocity_limit']
-        assert not limit['kept']
-        assert limit['value'] == PUBLISHED.velocity_limit
+        assert not limit['kept'] and limit['value'] == pytest.approx(
+            ROBOT.joints.velocity_limit)
         assert limit['interval'][0] > 2 and limit['interval'][1] is None
 
 
 def test_samples_of_the_validation_part_are_not_used_by_the_fit():
     log = log_of(*sweep(3.0, periods=(0.8, 1.0)), SERVOS[:1], seed=4)
-    one, other = (identify_joints(each, PUBLISHED)[0] for each in (log, replace_end(log)))
-    assert one.kept == other.kept and len(one.kept) > 1
-    assert np.array_equal(one.values, other.values)
-    assert np.array_equal(one.uncertainty.intervals, other.uncertainty.intervals)
+    measured, end = log.measured.copy(), log.end_of(shipped().servo.fitted)
+    measured[:, end:] += COUNT * np.round(50 * np.sin(40 * log.t[end:]))
+    one, other = (identify([each], ROBOT) for each in (log, replace(log, measured=measured)))
+    assert one.chosen.entries == other.chosen.entries
+    assert one.values() == pytest.approx(other.values(), rel=1e-9)
 
 
-def replace_end(log):
-    """The log with invalid readings in its last part."""
-    measured = log.measured.copy()
-    measured[:, log.end_of(shipped().servo.fitted):] = 0.3
-    return replace(log, measured=measured)
+def line_errors(log, joint, halves):
+    """Held-out RMS [rad] of gain * play(command(t - delay)) + offset, of the best fit."""
+    rows = np.flatnonzero(log.fresh & (log.t >= log.t[0] + 0.3))
+    fitted = rows < log.end_of(0.6)
+    read, t = log.measured[joint, rows], log.read_t[rows]
+
+    def one(delay, half):
+        x = log.command_at(joint, t - delay)
+        if half:
+            shown = np.empty_like(x)
+            last = x[0]
+            for k, value in enumerate(x):
+                last = shown[k] = min(max(last, value - half), value + half)
+            x = shown
+        a = np.stack([x, np.ones_like(x)], axis=1)
+        solution = np.linalg.lstsq(a[fitted], read[fitted], rcond=None)[0]
+        error = a @ solution - read
+        return np.mean(error[fitted]**2), np.sqrt(np.mean(error[~fitted]**2))
+
+    best = min((one(delay, half) + (delay, half) for delay in np.arange(0.0, 0.0901, 0.004)
+                for half in halves[::4]))
+    return min(one(best[2] + d, h) for d in np.arange(-0.004, 0.0041, 0.0005)
+               for h in halves[np.abs(halves - best[3]) < 0.0041])[1]
 
 
-@pytest.mark.skipif(not REAL.is_file(), reason='the measured log is not here')
-def test_the_real_servos_are_predicted():
-    log = read_joint_log(REAL)
-    results = joint_results(log, [log], identify_joints(log, PUBLISHED), PUBLISHED)
-    limits = zip(results['joints'], (0.072, 0.097, 0.069, 0.068), (0.005, 0.013, 0.004, 0.004),
-                 strict=True)
-    for joint, published, heldout in limits:
-        assert joint['published_rms_rad'] == pytest.approx(published, rel=0.03)
-        assert joint['heldout_rms_rad'] < heldout
-        assert joint['terms']['coulomb_friction']['kept']
-        assert joint['terms']['coulomb_friction']['interval'][0] > 0.005
-        assert ['delay', 'natural_frequency'] in joint['traded']
-        assert any('To separate delay and bandwidth' in text for text in joint['text'])
-        low, high = joint['terms']['delay']['interval']
-        assert high - low > 0.008
+@pytest.mark.skipif(not REAL, reason='the measured logs are not here')
+@pytest.mark.parametrize('path', REAL, ids=lambda path: path.stem)
+def test_real_servos_are_predicted_as_well_as_by_a_line_with_play(path):
+    log = read_joint_log(path)
+    results = joint_results(identify([log], ROBOT), [], ROBOT)
+    for k, joint in enumerate(results['joints']):
+        line = min(line_errors(log, k, np.zeros(1)),
+                   line_errors(log, k, 1e-3 * np.arange(41)))
+        assert joint['heldout_rms_rad'] < 1.1 * line, (k + 1, line)
+        assert joint['heldout_rms_rad'] < 0.5 * joint['published_heldout_rms_rad']

@@ -7,9 +7,9 @@ import pytest
 from servo_logs import sweep
 from synthetic_flights import write_command, write_joints
 
-from beetle_omni_ros.identify import joint_log
-from beetle_omni_ros.identify.joint_log import read_joint_log
 from beetle_omni_ros.identify.parameters import shipped
+from beetle_omni_ros.identify.servo import log as servo_log
+from beetle_omni_ros.identify.servo.log import read_joint_log
 from beetle_omni_ros.runs.bag import BagWriter
 from beetle_omni_ros.runs.csv_table import LogError
 
@@ -39,7 +39,7 @@ def test_each_reading_is_paired_with_the_last_command_before_it(tmp_path):
 def test_the_part_of_highest_excitation_of_the_longest_stretch_is_used(
         tmp_path, monkeypatch):
     given = shipped()
-    monkeypatch.setattr(joint_log, 'shipped',
+    monkeypatch.setattr(servo_log, 'shipped',
                         lambda: replace(given, log=replace(given.log, longest_bag=2.5)))
     t, command = sweep(duration=9.0)
     command = np.where((t > 5.0) & (t < 7.5), command, 0.05 * command)

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from servo_logs import log_of, sweep, write
+from servo_logs import COUNT, log_of, sweep, write
 
-from beetle_omni_ros.identify.joint_log import read_joint_log
+from beetle_omni_ros.identify.servo.log import fresh_rows, JointLog, read_joint_log, reading_times
 from beetle_omni_ros.runs.csv_table import LogError
 
 HEADER = ['t_s', 'q1_rad', 'q2_rad', 'command_rad']
@@ -114,3 +114,71 @@ def test_a_written_log_is_read_back(tmp_path):
     read = read_joint_log(write(tmp_path / 'log.csv', made))
     assert np.allclose(read.measured, made.measured, atol=1e-6)
     assert read.quantum == pytest.approx(2 * np.pi / 4096, rel=0.01)
+
+
+ROW, EVERY = 0.005, 4       # rows at 200 Hz, readings at 50 Hz
+
+
+def encoder(t):
+    """Readings (2, N) of joints that step, and come to rest, every 1.25 s."""
+    since = t % 1.25
+    moving = np.where((t // 1.25) % 2, 1, -1) * (2 * np.exp(-since / 0.08) - 1)
+    return np.round(np.array([moving, 0.8 * moving]) / COUNT) * COUNT
+
+
+def rows(count=1600, late=0.0, lost=(), seed=0):
+    """(rows in which readings appear, rows that repeat them (2, N), times of the readings)."""
+    rng = np.random.default_rng(seed)
+    taken = np.arange(0, count, EVERY)
+    at = taken + (rng.random(len(taken)) < late)
+    kept = ~np.isin(np.arange(len(taken)), lost)
+    last = np.searchsorted(at[kept][1:], np.arange(count), side='right')
+    return at[kept], encoder(ROW * taken[kept])[:, last], ROW * taken[kept]
+
+
+@pytest.mark.parametrize(('late', 'least'), [(0.0, 0.99), (0.15, 0.97)])
+def test_only_rows_with_a_new_reading_are_used_also_while_the_joints_rest(late, least):
+    at, measured, _ = rows(late=late)
+    fresh = np.flatnonzero(fresh_rows(measured))
+    # a late row of joints at rest cannot be seen
+    assert np.abs(fresh[:, None] - at).min(axis=1).max() <= (late > 0)
+    assert len(fresh) == pytest.approx(len(at), abs=5)
+    moving = np.r_[True, (np.diff(encoder(ROW * at)) != 0).any(axis=0)]
+    assert np.isin(at[moving], fresh).mean() > least
+
+
+def test_a_reading_that_was_held_while_the_joints_moved_is_used_once():
+    lost = np.arange(200, 230)      # 0.6 s
+    at, measured, _ = rows(lost=lost)
+    fresh = np.flatnonzero(fresh_rows(measured))
+    hidden = (fresh > EVERY * lost[0]) & (fresh < EVERY * (lost[-1] + 1))
+    assert not hidden.any() and len(fresh) == pytest.approx(len(at), abs=5)
+
+
+def test_every_row_is_new_where_the_bus_is_as_fast_as_the_logger():
+    t = ROW * np.arange(1600)
+    assert fresh_rows(encoder(t)).all()
+
+
+def test_times_of_periodic_readings_are_restored_from_late_rows():
+    rng = np.random.default_rng(0)
+    true = 1.0 + EVERY * ROW * np.delete(np.arange(400), [100, 101, 250])
+    late = rng.random(len(true)) < 0.15
+    late[0] = late[-1] = True
+    restored = reading_times(true + ROW * late, ROW)
+    assert np.abs(restored - true).max() < 0.02 * ROW
+
+
+def test_readings_in_every_row_keep_their_times():
+    t = np.cumsum(np.random.default_rng(0).uniform(0.8, 1.2, 300)) * ROW
+    assert np.array_equal(reading_times(t, ROW), t)
+
+
+def test_a_log_has_the_readings_of_the_bus_at_their_times():
+    at, measured, taken = rows(late=0.15)
+    t = ROW * np.arange(measured.shape[1])
+    log = JointLog('made.csv', t, (1, 2), measured, measured)
+    assert np.isnan(log.read_t[~log.fresh]).all()
+    near = np.abs(log.read_t[log.fresh][:, None] - taken).min(axis=1)
+    # a rest that begins late is late, which has no effect
+    assert np.mean(near < 0.1 * ROW) > 0.95 > np.mean(np.abs(t[at] - taken) < 0.1 * ROW)

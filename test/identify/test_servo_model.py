@@ -5,9 +5,9 @@ import pytest
 from scipy.signal import cont2discrete, lfilter
 from servo_logs import servo, sweep
 
-from beetle_omni_ros.identify import servo_model
-from beetle_omni_ros.identify.joint_log import JointLog
-from beetle_omni_ros.identify.servo_model import INDEX, OFF, published_set, simulate
+from beetle_omni_ros.identify.servo import model as servo_model
+from beetle_omni_ros.identify.servo.log import JointLog
+from beetle_omni_ros.identify.servo.model import INDEX, OFF, published_set, simulate
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 
@@ -53,12 +53,12 @@ def test_held_steps_agree_with_a_plain_simulation():
 
 @pytest.mark.parametrize('values', [
     {'delay': 0.0173}, {'coulomb': 0.013, 'delay': 0.01}, {'backlash': 0.02},
-    {'stiction': 0.01, 'coulomb': 0.01, 'stribeck': 0.2}, {'velocity_limit': 3.0},
-    {'torque_limit': 0.12}, {'offset': -0.03}])
+    {'stiction': 0.01, 'coulomb': 0.01}, {'velocity_limit': 3.0},
+    {'torque_limit': 0.12}, {'offset': -0.03}, {'gain': 0.04}])
 def test_every_term_agrees_with_a_plain_simulation(values):
     t, command = sweep(duration=4.0)
     positions = servo(t, command, frequency=50.0, damping=0.7, **{'delay': 0.0, **values})
-    names = {'coulomb': 'coulomb_friction', 'stribeck': 'stribeck_velocity'}
+    names = {'coulomb': 'coulomb_friction', 'gain': 'encoder_gain'}
     model = parameter_set(**{names.get(name, name): value for name, value in values.items()})
     error = simulate(log_for(t, command, positions), 0, model)[0] - positions
     assert np.sqrt(np.mean(error[25:]**2)) < 3e-4 and np.abs(error[25:]).max() < 1e-3

@@ -10,7 +10,6 @@ from sim_robots import massless_modules, plant, ROBOT
 from beetle_omni_ros.robot import dynamics
 from beetle_omni_ros.robot.dynamics import body_acceleration
 from beetle_omni_ros.robot.rotations import normalized
-from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.sim import effects as plant_effects
 
 EFFECTS = {
@@ -150,13 +149,6 @@ def test_terminal_speed_is_where_drag_carries_the_weight():
         made.step()
     speed = np.sqrt(ROBOT.mass * ROBOT.gravity / 2.0)
     assert made.state[1][2] == pytest.approx(-speed, rel=1e-5)
-
-
-@pytest.mark.parametrize('name, values', [
-    ('joint_backlash', {'gap': 0.01}), ('joint_friction', {'coulomb': 0.01, 'stiction': 0.01})])
-def test_an_effect_without_support_in_the_plant_is_refused_by_name(name, values):
-    with pytest.raises(ParameterError, match=f'effects.{name}: refused by the simulated plant'):
-        plant(replace(ROBOT, effects={name: values}))
 
 
 @pytest.mark.parametrize('name, values', [

@@ -35,7 +35,8 @@ def effects_with(robot: RobotParameters, named: list[dict]) -> dict[str, dict]:
                 all_four[member - 1] = value
                 value = all_four
             elif spec.of_each:
-                value = _of_each(values.get(parameter, spec.neutral), found)
+                own = number_of(robot, spec.number) if spec.number else spec.neutral
+                value = _of_each(values.get(parameter, own), found)
             low, high = spec.low, spec.high
             values[parameter] = [rounded(min(max(v, low), high)) for v in value] \
                 if isinstance(value, (list, tuple)) else rounded(min(max(value, low), high))
@@ -84,7 +85,7 @@ def _of_each(own, found):
     A log has a value for each joint (``each``). A flight has one for all, and differences between
     the joints of the file stay.
     """
-    each = found.get('each')
+    each, own = found.get('each'), own.tolist() if isinstance(own, np.ndarray) else own
     if each is None:
         if not isinstance(own, (list, tuple)):
             return found['value']

@@ -15,15 +15,14 @@ from beetle_omni_ros.identify.gap.ingest import (
     load_flight,
     UnusableFlight,
 )
-from beetle_omni_ros.identify.gap.joint_changes import change_grids
-from beetle_omni_ros.identify.gap.joint_gap import analyse_joint_log
 from beetle_omni_ros.identify.gap.page import gap_page
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.results import grids, headline, results
 from beetle_omni_ros.identify.gap.workers import Workers
 from beetle_omni_ros.identify.robot_file import check_outputs
+from beetle_omni_ros.identify.servo.compare import analyse_joint_logs, is_joint_log
+from beetle_omni_ros.identify.servo.page import change_grids, gap_log_page
 from beetle_omni_ros.pages.table import print_grids, Terminal
-from beetle_omni_ros.robot.effects import CONSUMERS, refusals
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.bag_files import names_of, runs_in
 from beetle_omni_ros.runs.json_file import write_json, write_text
@@ -62,8 +61,11 @@ def gap_results(runs, holdout=(), robot=None, apply=None, json_path=None, page=N
     check_outputs(apply, robot, json_path, page, 'page')
     check_apart([*runs, *holdout])
     robot_parameters, p = RobotParameters.load(robot), GapParameters.load(parameters)
-    if any(run.suffix.lower() == '.csv' for run in runs):
-        result, html = analyse_joint_log(runs, holdout, robot_parameters, robot, p)
+    if any(is_joint_log(run) for run in runs):
+        with console.status('comparing the servos'):
+            result, apart = analyse_joint_logs(runs, holdout, robot_parameters, robot)
+        html = gap_log_page(apart, result, [*grids(result), *change_grids(result['changes'])],
+                            robot_parameters) if page else ''
     else:
         meta = {'runs': [str(r) for r in runs], 'holdout': [str(h) for h in holdout],
                 'robot': str(robot) if robot else 'params/robot.yaml'}
@@ -87,10 +89,6 @@ def gap_results(runs, holdout=(), robot=None, apply=None, json_path=None, page=N
     if apply:
         console.print(f'corrected robot: {apply}' if result['effects'] else
                       'no effect is named: no robot file is written', highlight=False)
-        corrected = RobotParameters.load(apply).effects if result['effects'] else {}
-        for consumer in CONSUMERS:
-            for text in refusals(consumer, corrected):
-                console.print(f'note: {text}', highlight=False, markup=False)
     return result
 
 

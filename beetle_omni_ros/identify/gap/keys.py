@@ -15,7 +15,7 @@ import numpy as np
 
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.inference.prior import Prior
-from beetle_omni_ros.robot.effects import CATALOGUE, delaying
+from beetle_omni_ros.robot.effects import CATALOGUE, delaying, EffectParameter, treatment
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 MODULES = 'module_reaction'
@@ -86,6 +86,15 @@ def number_of(robot: RobotParameters, key: str) -> float | np.ndarray:
     return value
 
 
+def base_of(spec: EffectParameter, value) -> np.ndarray:
+    """
+    Base values (n,) of the keys of a parameter.
+
+    A flight fits the mean of the joints; differences between joints stay as in the file.
+    """
+    return np.atleast_1d(np.mean(value) if spec.of_each else np.array(value, dtype=float))
+
+
 def names_of(effect: str, parameter: str) -> list[str]:
     """Key names of a parameter."""
     neutral, text = CATALOGUE[effect].parameters[parameter].neutral, f'{effect}.{parameter}'
@@ -108,17 +117,18 @@ def all_keys(robot: RobotParameters) -> dict[str, Key]:
     """Keys of the whole catalogue with base values of ``robot``, by name."""
     keys, effects = {}, dict(robot.effects)
     if 'joint_friction' in effects:
-        # A flight fits the mean of the joints; differences between joints stay as in the file.
-        effects['joint_friction'] = {name: float(np.mean(value)) for name, value in zip(
-            CATALOGUE['joint_friction'].parameters, friction(robot), strict=True)}
+        effects['joint_friction'] = dict(zip(CATALOGUE['joint_friction'].parameters,
+                                             friction(robot), strict=True))
     for name, effect in CATALOGUE.items():
+        if not treatment('gap', name).acts:
+            continue
         # The file's modules load the joints by their share, so this entry is only the excess.
         groups = 'B' if name == MODULES and robot.multibody else effect.channels
         for parameter, spec in effect.parameters.items():
             absent = bool(np.isnan(spec.neutral).any())
             relative = absent or parameter == 'scale'
             own = number_of(robot, spec.number) if absent else spec.neutral
-            base = np.atleast_1d(np.array(effects.get(name, {}).get(parameter, own), dtype=float))
+            base = base_of(spec, effects.get(name, {}).get(parameter, own))
             texts = names_of(name, parameter)
             for k, (text, value) in enumerate(zip(texts, base, strict=True)):
                 low, high = (math.log(max(b / value, spec.least)) if relative else b - value

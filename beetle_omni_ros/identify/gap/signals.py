@@ -7,7 +7,7 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
 from beetle_omni_ros.identify.gap.ingest import Flight
-from beetle_omni_ros.identify.gap.keys import names_of, THRUST_BUS, TILT_BUS
+from beetle_omni_ros.identify.gap.keys import base_of, names_of, THRUST_BUS, TILT_BUS
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.series import (
     derivatives,
@@ -22,7 +22,7 @@ from beetle_omni_ros.identify.gap.series import (
     turned,
     within,
 )
-from beetle_omni_ros.robot.effects import CATALOGUE
+from beetle_omni_ros.robot.effects import CATALOGUE, treatment
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.servo import play
 
@@ -57,7 +57,8 @@ class Signals:
         # shift the IMU accordingly.
         self._imu = CubicSpline(*filled(*spread(flight.imu_t, flight.imu)))
         self._pose = CubicSpline(*filled(*spread(flight.pose_t, flight.pose)))
-        self._joint = CubicSpline(*filled(*spread(flight.joint_t, flight.joint)))
+        self._joint = CubicSpline(*filled(*spread(
+            flight.joint_t, robot.sensors.tilts(flight.joint))))
         self._command_t, command = spread(flight.command_t, flight.command)
         self._command = command
         limit = robot.joints.position_limit
@@ -73,7 +74,9 @@ class Signals:
         self.file = {key: float(value) for name, values in robot.effects.items()
                      for parameter, given in values.items()
                      if CATALOGUE[name].in_readings(parameter)
-                     for key, value in zip(names_of(name, parameter), np.atleast_1d(given))}
+                     if treatment('gap', name).acts
+                     for key, value in zip(names_of(name, parameter), base_of(
+                         CATALOGUE[name].parameters[parameter], given))}
         self._kept: dict = {}
         third = np.abs(np.diff(flight.joint, 3, axis=0))
         self.reading_noise = float(np.median(np.sqrt((np.minimum(third, np.quantile(

@@ -13,7 +13,7 @@ from beetle_omni_ros.identify.recording.clocks import begin_of, NORMAL
 from beetle_omni_ros.identify.recording.damage import changed, Damage
 from beetle_omni_ros.identify.recording.limits import RecordingLimits
 from beetle_omni_ros.identify.recording.motion import GRID
-from beetle_omni_ros.identify.servo_model import LONGEST_STEP
+from beetle_omni_ros.identify.servo.model import LONGEST_STEP
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.servo import NUMPY, Servo, Step
 
@@ -318,7 +318,7 @@ def _servo(robot, k, command, begin, end):
     limit, (coulomb, stiction) = robot.joints.position_limit, friction(robot)
     index = np.maximum(np.searchsorted(command.t, times, side='right') - 1, 0)
     targets = np.clip(command.values[index, k], -limit, limit)
-    step = Step(NUMPY, Servo.of(robot.joints, coulomb=coulomb[k], stiction=stiction[k]),
+    step = Step(NUMPY, Servo.of(robot.joints.of(k), coulomb=coulomb[k], stiction=stiction[k]),
                 LONGEST_STEP)
     tilts, rate = targets.copy(), 0.0       # at rest at the first target
     for i in range(len(times) - 1):

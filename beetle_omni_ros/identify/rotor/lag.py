@@ -15,7 +15,6 @@ from beetle_omni_ros.identify.inference.robust import consecutive, scatter
 from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.rotor.log import RotorLog
 
-P = shipped().rotor
 FIRST = 0.05            # [s] time constant to start from
 STARTS = (0.0, 0.05, 0.15, 0.3)     # [s] dead times to start from
 LIMITS = np.log([0.001, 1.0])       # [log s] of a time constant
@@ -62,7 +61,7 @@ def fit_lag(log: RotorLog) -> dict | None:
     smooth, rms = _static(log, curve, rest)
     time, windows = log.columns['time'], []
     for phase in np.arange(PHASES) / PHASES:
-        index = np.floor((time - time[0]) / P.gain_window + phase).astype(int)
+        index = np.floor((time - time[0]) / shipped().rotor.gain_window + phase).astype(int)
         basis = curve[0] * (index == np.unique(index)[:, None])
         windows.append((*_static(log, basis, rest), basis, index))
     fine, least, basis, index = min(windows, key=lambda one: one[1])
@@ -70,12 +69,14 @@ def fit_lag(log: RotorLog) -> dict | None:
                       for k in np.unique(index)]).T
     means = means[:, means[0] > STRONG * command.max()]
     ratio = means[2] / np.maximum(means[1], STRONG * smooth.max())
-    if ratio.size < 4 or ratio.std() < P.gain_scatter * ratio.mean() or least > P.gain_share * rms:
+    p = shipped().rotor
+    if ratio.size < 4 or ratio.std() < p.gain_scatter * ratio.mean() \
+            or least > p.gain_share * rms:
         return _fitted(log, curve, rest, '')
     gains = means[2] / means[0] if log.command == 'target' else ratio
     return _fitted(log, basis[basis.any(axis=1)], rest, (
         f'thrust and command do not belong together: their ratio jumps about every '
-        f'{P.gain_window:g} s ({gains.min():.2f} to {gains.max():.2f}); one curve leaves '
+        f'{p.gain_window:g} s ({gains.min():.2f} to {gains.max():.2f}); one curve leaves '
         f'{rms:.2f} N RMS, a gain for each window {least:.2f} N'))
 
 

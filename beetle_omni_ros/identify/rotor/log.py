@@ -11,7 +11,6 @@ from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.csv_table import LogError, missing, read_table
 
-P = shipped().rotor
 # Quantity -> columns with the factor to SI units. 2000 us are 100 % of duty. The sign of a torque
 # with the factor 0 becomes that of thrust.
 COLUMNS: dict[str, dict[str, float]] = {
@@ -80,12 +79,13 @@ def read_rotor_log(path: str | Path, columns: Mapping[str, tuple[str, float]] | 
     """
     source: dict[str, tuple[str, float]] = {}
     table = read_table(path, lambda header: _wanted(header, columns or {}, source), EXPECTED)
-    if len(table) < P.least_rows:
-        raise LogError(f'{path}: {len(table)} rows are too few; expected at least {P.least_rows}')
+    p = shipped().rotor
+    if len(table) < p.least_rows:
+        raise LogError(f'{path}: {len(table)} rows are too few; expected at least {p.least_rows}')
     data = {name: table.columns[column] * (factor or 1)
             for name, (column, factor) in source.items()}
-    for name, low, high in (('thrust', -P.largest_force / 10, P.largest_force),
-                            ('torque', -P.largest_torque, P.largest_torque), ('duty', *P.duty)):
+    for name, low, high in (('thrust', -p.largest_force / 10, p.largest_force),
+                            ('torque', -p.largest_torque, p.largest_torque), ('duty', *p.duty)):
         bad = np.flatnonzero((data.get(name, low) < low) | (data.get(name, low) > high))
         if bad.size:
             raise LogError(f'{path}: row {table.rows[bad[0]]}, column {source[name][0]}: found '
@@ -137,8 +137,8 @@ def _wanted(header, columns, source):
 
 def _telemetry(path, data, notes):
     """Replace impossible and held readings by interpolation between new ones."""
-    bounds = {'voltage': P.voltage, 'temperature': P.temperature,
-              'rpm': np.array([0, P.largest_speed])}
+    bounds = {'voltage': shipped().rotor.voltage, 'temperature': shipped().rotor.temperature,
+              'rpm': np.array([0, shipped().rotor.largest_speed])}
     there = [name for name in bounds if name in data]
     if not there:
         return
@@ -169,7 +169,7 @@ def _transient(path, command, thrust, rate):
     longest = np.argmax(np.diff(edges))
     count, held = np.diff(edges)[longest], thrust[edges[longest]:edges[longest + 1]]
     first, last = np.median(held[:count // 3 + 1]), np.median(held[-(count // 3) - 1:])
-    if count < P.least_rows or abs(last - first) < 0.3 * np.ptp(thrust):
+    if count < shipped().rotor.least_rows or abs(last - first) < 0.3 * np.ptp(thrust):
         return False
     if not rate:
         raise LogError(f'{path}: thrust goes from {first:.1f} to {last:.1f} N at one command, so '
@@ -180,9 +180,9 @@ def _transient(path, command, thrust, rate):
 def _settled(time, command):
     lagged, level = np.empty(len(command)), 0.0     # the command before the log is unknown
     for k, step in enumerate(np.diff(time, prepend=time[0])):
-        level += (command[k] - level) * -np.expm1(-4 * step / P.settling)
+        level += (command[k] - level) * -np.expm1(-4 * step / shipped().rotor.settling)
         lagged[k] = level
-    return np.abs(command - lagged) < P.still * np.abs(command).max()
+    return np.abs(command - lagged) < shipped().rotor.still * np.abs(command).max()
 
 
 def _checked(path, data, command, factor, series):

@@ -15,7 +15,6 @@ from beetle_omni_ros.identify.inference.robust import consecutive, interval, jac
 from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.rotor.log import RotorLog
 
-P = shipped().rotor
 FORMS: tuple[tuple[tuple[int, int], ...], ...] = (
     ((1, 0), (2, 0)), ((1, 0), (2, 0), (3, 0)),
     ((1, 0), (2, 0), (3, 0), (2, 1), (3, 1)))   # powers of u and of the duty
@@ -62,18 +61,19 @@ def settled_rows(logs: Sequence[RotorLog]) -> Rows | None:
     logs = [log for log in logs if log.command == 'duty']
     shared = [name for name in ('duty', 'voltage', 'thrust', 'torque', 'temperature')
               if all(name in log.columns for log in logs)]
-    if not logs or sum(log.settled.sum() for log in logs) < P.least_rows:
+    if not logs or sum(log.settled.sum() for log in logs) < shipped().rotor.least_rows:
         return None
     rows = {name: np.concatenate([log.columns[name][log.settled] for log in logs])
             for name in shared}
-    if np.ptp(rows['duty']) < P.least_sweep or np.unique(rows['duty'].round(2)).size < 5:
+    p = shipped().rotor
+    if np.ptp(rows['duty']) < p.least_sweep or np.unique(rows['duty'].round(2)).size < 5:
         return None
     # Without labels, each log has its own pack.
     pack = np.concatenate([log.columns.get('pack', np.full(len(log.settled), -k))[log.settled]
                            for k, log in enumerate(logs)])
     names, label = np.unique(pack, return_inverse=True)
     changes = np.append(True, (np.diff(rows['duty']) != 0) | (np.diff(label) != 0))
-    block = label if len(names) >= P.least_packs else consecutive(changes, P.blocks)
+    block = label if len(names) >= p.least_packs else consecutive(changes, p.blocks)
     group = label if len(names) > 2 else np.digitize(rows['voltage'], np.quantile(
         rows['voltage'], np.arange(1, GROUPS) / GROUPS))
     return rows | {'step': np.cumsum(changes) - 1, 'block': block,
@@ -89,7 +89,7 @@ def fit_surface(rows: Rows, name: str) -> Surface:
             out = rows['group'] == group
             error[out] = values[out] - x[out] @ linear(x[~out], values[~out])
         left_out = np.sqrt(np.mean(means(error, rows['step'])**2))
-        if left_out < P.simpler * least:
+        if left_out < shipped().rotor.simpler * least:
             best, least = form, left_out
     x = terms(best, rows['duty'], rows['voltage'])
     every = jackknife(lambda m: linear(x[m], values[m]), rows['block'])
@@ -133,7 +133,7 @@ def torque_ratio(rows: Rows) -> dict:
 
 def temperature_drift(rows: Rows, thrust: Surface) -> dict | None:
     """Relative change of thrust with temperature at equal duty and voltage; None: not shown."""
-    if 'temperature' not in rows or np.ptp(rows['temperature']) < P.least_heating:
+    if 'temperature' not in rows or np.ptp(rows['temperature']) < shipped().rotor.least_heating:
         return None
     heat = rows['temperature'] - rows['temperature'].mean()
     x = np.column_stack([terms(thrust.form, rows['duty'], rows['voltage']),

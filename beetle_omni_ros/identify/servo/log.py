@@ -13,6 +13,7 @@ from beetle_omni_ros.runs.csv_table import LogError, missing, read_table
 
 HEADER = 't_s,q1_rad,q2_rad,q3_rad,q4_rad,command_rad (or command1_rad to command4_rad)'
 JOINTS = (1, 2, 3, 4)
+NEIGHBOURS = 5      # readings on each side that determine the time of one
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,8 @@ class JointLog:
         joints: (n,) numbers of the joints, 1 to 4.
         measured: (n, N) encoder positions [rad].
         command: (n, N) commanded positions [rad].
+        fresh: (N,) rows with a new reading; the others repeat the last one.
+        read_t: (N,) times of the readings of fresh rows [s]; the others are nan.
 
     """
 
@@ -35,6 +38,8 @@ class JointLog:
     measured: np.ndarray
     command: np.ndarray
     period: float = field(init=False)
+    fresh: np.ndarray = field(init=False)
+    read_t: np.ndarray = field(init=False)
     start: np.ndarray = field(init=False)
     start_velocity: np.ndarray = field(init=False)
     _command_t: np.ndarray = field(init=False, repr=False)
@@ -46,7 +51,11 @@ class JointLog:
         """Derive sampling period [s], first positions [rad] and velocities [rad/s]."""
         period = float(np.median(np.diff(self.t)))
         count = max(4, int(round(0.04 / period)) + 1)
-        first = np.polyfit(self.t[:count] - self.t[0], self.measured[:, :count].T, 2)
+        fresh = fresh_rows(self.measured)
+        used = np.flatnonzero(fresh)[:max(4, int(fresh[:count].sum()))]
+        read_t = np.full(len(self.t), np.nan)
+        read_t[fresh] = reading_times(self.t[fresh], period)
+        first = np.polyfit(read_t[used] - self.t[0], self.measured[:, used].T, 2)
         slope = np.polyfit(self.t[:count] - self.t[0], self.command[:, :count].T, 1)[0]
         back = -period * np.arange(int(shipped().log.history / period) + 1, 0, -1)
         before = self.command[:, :1] + slope[:, None] * back
@@ -58,8 +67,8 @@ class JointLog:
         once = np.concatenate([np.zeros((len(command), 1)), once], axis=1)
         twice = np.cumsum(once[:, :-1] * steps + command[:, :-1] * steps**2 / 2, axis=1)
         twice = np.concatenate([np.zeros((len(command), 1)), twice], axis=1)
-        known = {'_once': once, '_twice': twice, 'period': period, 'start': first[2],
-                 'start_velocity': first[1],
+        known = {'_once': once, '_twice': twice, 'period': period, 'fresh': fresh,
+                 'read_t': read_t, 'start': first[2], 'start_velocity': first[1],
                  '_command_t': command_t, '_command': command}
         for name, value in known.items():
             object.__setattr__(self, name, value)
@@ -102,9 +111,7 @@ class JointLog:
     @property
     def quantum(self) -> float:
         """Step of the encoder [rad]: the smallest change of a reading."""
-        steps = np.abs(np.diff(self.measured, axis=1))
-        steps = steps[steps > 1e-5]
-        return float(np.quantile(steps, 0.01)) if steps.size else 0.0
+        return quantum(self.measured)
 
     def command_speed(self) -> np.ndarray:
         """(n,) speed of each command that 1 % of the samples exceed [rad/s]."""
@@ -115,6 +122,62 @@ class JointLog:
         span = max(1, int(round(0.05 / self.period)))
         travel = np.abs(self.measured[:, span:] - self.measured[:, :-span])
         return (travel / (self.t[span:] - self.t[:-span])).max(axis=1)
+
+
+def quantum(measured: np.ndarray) -> float:
+    """Smallest change of the readings (n, N) of encoders [rad]; 0 if they never change."""
+    steps = np.abs(np.diff(measured, axis=1))
+    steps = steps[steps > 1e-5]
+    return float(np.quantile(steps, 0.01)) if steps.size else 0.0
+
+
+def fresh_rows(measured: np.ndarray) -> np.ndarray:
+    """
+    (N,) rows with a new reading.
+
+    A logger may write rows faster than the bus delivers readings, and then repeats the last one.
+    The most frequent number of rows between two changes is the period of the readings. Before a
+    longer interval, or over it, joints that rest move by at most two encoder steps (a command may
+    start them quickly), so each of its periods has a reading. If they move by more, the readings
+    were held, so it has none.
+
+    Args:
+        measured: (n, N) readings of all joints [rad], delivered together.
+
+    """
+    changed = np.flatnonzero(np.r_[True, (np.diff(measured, axis=1) != 0).any(axis=0)])
+    if len(changed) < 3:
+        return np.ones(measured.shape[1], dtype=bool)
+    gaps = np.diff(changed)
+    period = int(np.bincount(gaps).argmax())
+    jumps = np.abs(np.diff(measured[:, changed], axis=1)).max(axis=0)
+    rested = (gaps > 1.5 * period) & (np.minimum(jumps, np.r_[0.0, jumps[:-1]])
+                                      <= 2.01 * quantum(measured))
+    fresh = np.zeros(measured.shape[1], dtype=bool)
+    fresh[changed] = True
+    for row, gap in zip(changed[:-1][rested], gaps[rested], strict=True):
+        fresh[row:row + gap:period] = True
+    fresh[changed[-1]::period] |= measured.shape[1] - changed[-1] <= 1.5 * period or \
+        bool((measured[:, changed[-1]:] == measured[:, -1:]).all())
+    return fresh
+
+
+def reading_times(t: np.ndarray, row: float) -> np.ndarray:
+    """
+    Times of periodic readings (K,) from the times of the rows in which they appear [s].
+
+    A reading can appear one row late or early. Its time is the median of the times of its
+    neighbours, moved by whole periods. ``row`` is the time between rows [s]; readings in every row
+    keep their times.
+    """
+    period = float(np.median(np.diff(t)))
+    if period < 1.5 * row:
+        return t
+    number = np.r_[0, np.cumsum(np.maximum(np.rint(np.diff(t) / period), 1))]
+    period = float(np.polyfit(number, t, 1)[0])
+    about = np.pad(t - number * period, NEIGHBOURS, mode='reflect')
+    windows = np.lib.stride_tricks.sliding_window_view(about, 2 * NEIGHBOURS + 1)
+    return np.median(windows, axis=1) + number * period
 
 
 def read_joint_log(path: str | Path) -> JointLog:

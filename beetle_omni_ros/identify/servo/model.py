@@ -1,7 +1,8 @@
 """
 Simulation of a tilt servo for many parameter sets at once.
 
-    q'' = limit(wn^2 (q*(t - delay) + offset - q) - 2 zeta wn q') - wn^2 (load(q) + friction)
+    q'' = limit(wn^2 (q*(t - delay) + offset - q) - 2 zeta wn q') - wn^2 (load(q) + friction(q'))
+    reading = play(q) + gain q + sine sin q + cosine cos q
 
 The step is that of :mod:`beetle_omni_ros.robot.servo` for an inertia of 1. A log without torque
 determines only ratios to the stiffness Kp, so friction, load and torque limit are angles: the
@@ -17,7 +18,7 @@ import logging
 import casadi as ca
 import numpy as np
 
-from beetle_omni_ros.identify.joint_log import JointLog
+from beetle_omni_ros.identify.servo.log import JointLog
 from beetle_omni_ros.robot.native import built, CompilerError, EXACT, generated
 from beetle_omni_ros.robot.parameters import JointParameters
 from beetle_omni_ros.robot.servo import CASADI, NUMPY, play, Servo, Step
@@ -61,19 +62,24 @@ TERMS = {
     'offset': Term('rad', 0.0, -0.5, 0.5, 0.002, in_step=False),   # measured minus commanded
     'coulomb_friction': Term('rad', 0.0, 0.0, 0.4, 0.002, words='friction'),  # half a dead band
     'stiction': Term('rad', 0.0, 0.0, 0.4, 0.002),                # breakaway above that
-    # of the decay of stiction
-    'stribeck_velocity': Term('rad/s', 0.1, 0.02, 3.0, 0.2, True, 'Stribeck velocity'),
     # play to each side, before the encoder
-    'backlash': Term('rad', 0.0, 0.0, 0.3, 0.002, in_step=False),
+    'backlash': Term('rad', 0.0, 0.0, 0.3, 0.002, words='play', in_step=False),
     'velocity_limit': Term('rad/s', NEVER, 0.2, NEVER, 0.05, True, 'speed limit'),
     'torque_limit': Term('rad', NEVER, 0.005, NEVER, 0.05, True,
                          'torque limit (an error of position)'),
-    # deflection ~ sin(q): a weight on the joint
+    # deflection ~ sin(q + phase): a weight on the joint
     'load_sine': Term('rad', 0.0, -0.3, 0.3, 0.002, words='load (sine)'),
     'load_cosine': Term('rad', 0.0, -0.3, 0.3, 0.002, words='load (cosine)'),
+    # Errors of the reading: gain q + sine sin q + cosine cos q; cosine is the first harmonic of an
+    # encoder whose axis is off the joint's, and so is sine.
+    'encoder_gain': Term('1', 0.0, -0.3, 0.3, 0.002, in_step=False),
+    'encoder_sine': Term('rad', 0.0, -0.3, 0.3, 0.002, in_step=False),
+    'encoder_cosine': Term('rad', 0.0, -0.3, 0.3, 0.002, in_step=False),
 }
 NAMES = tuple(TERMS)
 INDEX = {name: k for k, name in enumerate(NAMES)}
+READING_ERRORS = {'encoder_gain': lambda q: q, 'encoder_sine': np.sin,
+                  'encoder_cosine': lambda q: np.cos(q) - 1}
 OFF = np.array([term.off for term in TERMS.values()])
 STEP_TERMS = tuple(name for name, term in TERMS.items() if term.in_step)
 # Arrays (steps, sets), states (steps + 1, sets), numbers (NUMBERS, sets).
@@ -123,20 +129,30 @@ def simulate(log: JointLog, joint: np.ndarray | int, sets: np.ndarray,
         held: whether a command acts until the next sample; else it is interpolated.
 
     Returns:
-        (B, N) positions at the log's times [rad].
+        (B, N) positions at the log's times of readings, or of rows without one [rad].
 
     """
     sets = np.atleast_2d(sets)
     joint = np.broadcast_to(joint, len(sets))
     step = log.period / max(1, int(np.ceil(log.period / LONGEST_STEP - 1e-9)))
-    count = int(np.ceil((log.t[-1] - log.t[0]) / step - 1e-6))
+    times = np.maximum(np.where(log.fresh, log.read_t, log.t), log.t[0])
+    count = int(np.ceil((times.max() - log.t[0]) / step - 1e-6))
     value = dict(zip(NAMES, sets.T, strict=True))
     command, early = _commands(log, joint, value['delay'], log.t[0] + step * np.arange(count + 1),
                                held)
     command += value['offset']
     positions = _integrate(value, command, early, log.start[joint].copy(),
                            log.start_velocity[joint].copy(), step)
-    return _at_samples(positions, (log.t - log.t[0]) / step)
+    return with_encoder_errors(_at_samples(positions, (times - log.t[0]) / step), value)
+
+
+def with_encoder_errors(positions: np.ndarray, value: dict[str, np.ndarray]) -> np.ndarray:
+    """Readings (B, N) [rad] of the ``encoder_...`` terms (B,) at positions (B, N)."""
+    shown = positions
+    for name, shape in READING_ERRORS.items():
+        if value[name].any():
+            shown = shown + value[name][:, None] * shape(positions)
+    return shown
 
 
 def _commands(log, joint, delay, edges, held):
@@ -177,18 +193,15 @@ def _advance(space, value, step):
     coulomb, above, sine, cosine = (
         0.0 if value[name] is None else value[name] * stiffness
         for name in ('coulomb_friction', 'stiction', 'load_sine', 'load_cosine'))
-    has_friction = value['coulomb_friction'] is not None or value['stiction'] is not None
     loaded = value['load_sine'] is not None or value['load_cosine'] is not None
-    fading = value['stribeck_velocity']
+    has_friction = value['coulomb_friction'] is not None or value['stiction'] is not None
     move = Step(space, Servo(
         1.0, stiffness, damping, speed, None if torque is None else torque * stiffness,
-        coulomb=coulomb if has_friction else None, stiction=coulomb + above,
-        fading_rate=TERMS['stribeck_velocity'].off if fading is None else fading,
-        gaussian=False), step)
+        coulomb=coulomb if has_friction else None, stiction=coulomb + above), step)
     jump = move.gain * stiffness * step
 
     def advance(target, early, here, before):
-        load = -sine * space.sin(here) - cosine * space.cos(here) if loaded else None
+        load = -sine * space.sin(here) - cosine * (space.cos(here) - 1) if loaded else None
         after = move.kick(target, here, before, load)
         # The first moment has no effect on a joint held by friction or at a limit.
         free = after != 0

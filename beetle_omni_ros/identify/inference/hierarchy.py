@@ -1,0 +1,223 @@
+"""
+Fits of common values and of deviations of each group, with evidence and held-out blocks.
+
+A *unit* is one measured channel of one recording. Its parameters are ``theta = base + S x``: the
+columns of ``S`` are the prior standard deviations of a common value and of the deviations of the
+groups to which the unit belongs. So the prior of ``x`` is standard normal. The evidence is
+Laplace's approximation (MacKay 2003, chapter 28): a parameter that the data do not need lowers it.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+HUBER = 3.0         # standard deviations from which the loss is linear
+CONVERGED = 1e-4    # decrease of the cost, relative to the number of samples
+WIDTH = 1.96        # standard deviations of a 95 % interval
+
+
+@dataclass(frozen=True)
+class Spread:
+    """
+    Prior standard deviations of one parameter about its base value, in its coordinate.
+
+    Attributes:
+        common: of the value that all units share; 0: it has none.
+        groups: name of a grouping -> standard deviation of the deviations of its groups.
+
+    """
+
+    common: float
+    groups: dict[str, float]
+
+
+def design(spreads: Sequence[Spread], labels: dict[str, Sequence], active: np.ndarray
+           ) -> np.ndarray:
+    """
+    The matrices S (U, P, X) of all units.
+
+    Args:
+        spreads: P parameters.
+        labels: name of a grouping -> the group of each of the U units. A grouping with one group
+            has no deviations, unless the parameter has no common value.
+        active: (P,) parameters that may change.
+
+    """
+    count = len(next(iter(labels.values())))
+    columns = []
+    for p in np.flatnonzero(active):
+        spread = spreads[p]
+        parts = [(spread.common, np.ones(count))] if spread.common else []
+        for name, deviation in spread.groups.items():
+            groups = sorted(set(labels[name]))
+            if deviation and (len(groups) > 1 or not spread.common):
+                parts += [(deviation, np.array([label == group for label in labels[name]]))
+                          for group in groups]
+        for scale, member in parts:
+            column = np.zeros((count, len(spreads)))
+            column[:, p] = scale * member
+            columns.append(column)
+    return np.stack(columns, axis=-1) if columns else np.zeros((count, len(spreads), 0))
+
+
+def robust(white: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals whose sum of squares is Huber's loss, and their derivative."""
+    size = np.abs(white)
+    far = size > HUBER
+    root = np.sqrt(np.maximum(2 * HUBER * size - HUBER**2, HUBER**2))
+    return np.where(far, root * np.sign(white), white), np.where(far, HUBER / root, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """
+    Solution of a hierarchical problem.
+
+    Attributes:
+        x: (X,) standardised values.
+        s: (U, P, X) design.
+        theta: (U, P) parameters of each unit.
+        chi2: sum of squared whitened residuals, with Huber's loss.
+        information: (X, X) of data and prior.
+        held: (blocks,) chi2 of each block, predicted from the others.
+        deviations: (blocks, X) change of x without each block.
+        inflation: variance of the gradient over that of independent residuals, >= 1.
+
+    """
+
+    x: np.ndarray
+    s: np.ndarray
+    theta: np.ndarray
+    chi2: float
+    information: np.ndarray
+    held: np.ndarray
+    deviations: np.ndarray
+    inflation: float
+
+    def evidence(self, inflation: float) -> float:
+        """Logarithm of the evidence [nat], without constants, for an inflated noise."""
+        size = len(self.x)
+        inner = (self.information - np.eye(size)) / inflation + np.eye(size)
+        return float(-0.5 * (self.chi2 / inflation + self.x @ self.x)
+                     - 0.5 * np.linalg.slogdet(inner)[1])
+
+    def covariance(self) -> np.ndarray:
+        """
+        (X, X) covariance of x, from curvature and from the scatter between blocks.
+
+        The curvature holds for noise inflated by :attr:`inflation`. Where leaving out blocks
+        moves a value further, the jackknife's standard deviation applies.
+        """
+        size = len(self.x)
+        inner = (self.information - np.eye(size)) / self.inflation + np.eye(size)
+        curvature = np.linalg.inv(inner)
+        blocks = len(self.deviations)
+        about = self.deviations - self.deviations.mean(axis=0)
+        jackknife = (blocks - 1) / blocks * (about**2).sum(axis=0)
+        widen = np.sqrt(np.maximum(1.0, jackknife / np.diag(curvature)))
+        return curvature * widen[:, None] * widen
+
+    def spread(self) -> np.ndarray:
+        """(U, P, P) covariance of theta of each unit."""
+        return self.s @ self.covariance() @ self.s.transpose(0, 2, 1)
+
+
+Model = Callable[[np.ndarray, np.ndarray], tuple[list[np.ndarray], list[np.ndarray]]]
+
+
+def solve(model: Model, base: np.ndarray, s: np.ndarray, x: np.ndarray, groups: Sequence,
+          blocks: list[np.ndarray], low: np.ndarray, high: np.ndarray, memory: int = 20,
+          iterations: int = 15) -> Fit:
+    """
+    Levenberg-Marquardt in the standardised values.
+
+    Args:
+        model: (theta (U, P), active (P,)) -> whitened residuals of each unit (n_u,), and their
+            derivatives (P, n_u); rows of inactive parameters are ignored.
+        base: (U, P) values at x = 0.
+        s: (U, P, X) design.
+        x: (X,) start.
+        groups: recording of each unit; units of one recording have their samples together.
+        blocks: (n_u,) number of the block of each sample, from 0, for each unit.
+        low: (P,) lower bounds of theta; a value beyond is clipped.
+        high: (P,) upper bounds.
+        memory: samples over which residuals are correlated.
+        iterations: largest number of iterations.
+
+    """
+    active = (s != 0).any(axis=(0, 2))
+
+    def at(x):
+        theta = np.clip(base + s @ x, low, high)
+        residuals, slopes = model(theta, active)
+        own, ratio = zip(*map(robust, residuals), strict=True)
+        return theta, own, [j * r for j, r in zip(slopes, ratio, strict=True)]
+
+    def normal(slopes, residuals):
+        return (sum(part.T @ (j @ j.T) @ part for part, j in zip(s, slopes, strict=True)),
+                sum(part.T @ (j @ r) for part, j, r in zip(s, slopes, residuals, strict=True)))
+
+    def cost(x, residuals):
+        return sum(r @ r for r in residuals) + x @ x
+
+    damping, now = 0.01, at(x)
+    value, samples = cost(x, now[1]), sum(map(len, now[1]))
+    for _ in range(iterations if x.size else 0):
+        h, g = normal(now[2], now[1])
+        h, g = h + np.eye(len(x)), g + x
+        step = -np.linalg.solve(h + damping * np.diag(np.diag(h)), g)
+        tried = x + np.clip(step, -2.0, 2.0)
+        new = at(tried)
+        after = cost(tried, new[1])
+        if after < value:
+            fall, x, now, value = value - after, tried, new, after
+            damping = max(damping / 5, 1e-6)
+            if fall < CONVERGED * samples:
+                break
+        else:
+            damping *= 8
+            if damping > 1e5:
+                break
+    theta, residuals, slopes = now
+    return _judged(x, s, theta, residuals, slopes, groups, blocks, memory)
+
+
+def _judged(x, s, theta, residuals, slopes, groups, blocks, memory):
+    """The fit with its curvature, its scatter and the prediction of each block by the others."""
+    count = 1 + max(int(block.max(initial=0)) for block in blocks)
+    size = len(x)
+    parts, scores = np.zeros((count, size, size)), np.zeros((count, size))
+    series = {group: np.zeros((len(r), size)) for group, r in zip(groups, residuals, strict=True)}
+    for part, j, r, group, block in zip(s, slopes, residuals, groups, blocks, strict=True):
+        series[group] += (j * r).T @ part
+        for b in range(count):
+            own = j[:, block == b]
+            parts[b] += part.T @ (own @ own.T) @ part
+            scores[b] += part.T @ (own @ r[block == b])
+    information = parts.sum(axis=0) + np.eye(size)
+    gradient = scores.sum(axis=0) + x
+    deviations = np.array([-np.linalg.solve(information - h, gradient - g)
+                           for h, g in zip(parts, scores, strict=True)]).reshape(count, size)
+    held = np.zeros(count)
+    for part, j, r, block in zip(s, slopes, residuals, blocks, strict=True):
+        moved = j.T @ (part @ deviations.T) if size else np.zeros((len(r), count))
+        for b in range(count):
+            held[b] += (robust(r[block == b] + moved[block == b, b])[0]**2).sum()
+    ratio = 1.0
+    if size:
+        inverse = np.linalg.inv(information)
+        spread = sum(_long_run(g, memory) for g in series.values())
+        ratio = np.trace(inverse @ spread) / max(np.trace(inverse @ (information - np.eye(size))),
+                                                 1e-9)
+    return Fit(x, s, theta, float(sum(r @ r for r in residuals)), information, held, deviations,
+               float(max(ratio, 1.0)))
+
+
+def _long_run(scores, memory):
+    """Variance (X, X) of the sum of correlated scores (n, X) (Newey and West 1987)."""
+    total = scores.T @ scores
+    for lag in range(1, min(memory, len(scores) - 1) + 1):
+        part = scores[lag:].T @ scores[:-lag]
+        total += (1 - lag / (memory + 1)) * (part + part.T)
+    return total

@@ -1,0 +1,1 @@
+"""Identification of the tilt servos from response logs: fit, comparison with a robot file."""

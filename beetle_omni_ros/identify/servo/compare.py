@@ -1,0 +1,286 @@
+"""`beetle_omni gap LOG.csv`: response logs of the servos against a robot file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy.stats import norm
+
+from beetle_omni_ros import __version__
+from beetle_omni_ros.identify.gap.results import summary
+from beetle_omni_ros.identify.inference.hierarchy import WIDTH
+from beetle_omni_ros.identify.parameters import shipped
+from beetle_omni_ros.identify.servo.fit import (
+    decoded,
+    ENTRIES,
+    error_rms,
+    Found,
+    mask,
+    select,
+    Servos,
+)
+from beetle_omni_ros.identify.servo.joint import ALWAYS, identify, joint_results
+from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
+from beetle_omni_ros.identify.servo.model import INDEX
+from beetle_omni_ros.identify.servo.robot import catalogue_values, file_sets
+from beetle_omni_ros.robot.effects import CATALOGUE, separating_experiment
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.runs.bag_files import BagError, read_messages
+
+# [nat] gain of evidence of a named entry: a Bayes factor of 150, "very strong" in the scale of
+# Kass and Raftery (1995).
+CERTAIN = 5.0
+STEP = 1e-3         # of derivatives by the coordinates of a fit, in standard deviations
+NAMED = [name for name in ENTRIES if name in CATALOGUE]
+# Rows of a comparison of two logs. A log without a torque determines the dead band (friction over
+# stiffness) and the lag behind a ramp better than the parameters that they consist of.
+ROWS = (('joint_bandwidth', 'kp', 'N m/rad'), ('joint_bandwidth', 'kd', 'N m s/rad'),
+        ('joint_command_latency', 'delay', 's'), ('joint_command_latency', 'ramp_lag', 's'),
+        ('joint_friction', 'coulomb', 'N m'), ('joint_friction', 'dead_band', 'rad'),
+        ('joint_offset', 'offset', 'rad'))
+
+
+def analyse_joint_logs(runs: Sequence[Path], holdout: Sequence[Path], robot: RobotParameters,
+                       base: Path | None) -> tuple[dict, Found]:
+    """
+    Compare the first log with a robot file, and further ones and those of ``holdout`` with it.
+
+    ``base`` is the path of the robot file, for the record.
+
+    Returns:
+        results with the keys of flights, and the identified servos.
+
+    Raises:
+        LogError: unusable log.
+
+    """
+    log = read_joint_log(runs[0])
+    others = [read_joint_log(path) for path in [*runs[1:], *holdout]]
+    found, apart = compare(log, robot), identify([log], robot)
+    result, joints = gap_of(found, apart, robot), joint_results(apart, others, robot)
+    result['changes'] = [row for other in others for row in changes(log, other, robot)]
+    result['joints'], result['text'] = joints['joints'], joints['text']
+    sets = any(len(effect['names']) > 1 for effect in result['effects'])
+    plan = joints['joints'][0]['experiment']
+    result |= {'next_experiment': (
+        f'sine of {plan["frequency_Hz"]:g} Hz and {plan["amplitude_rad"]:.2f} rad for '
+        f'{plan["duration_s"]:g} s on the joints (separates latency from bandwidth)'
+        if sets else None),
+        'meta': {'runs': [str(r) for r in runs], 'holdout': [str(h) for h in holdout],
+                 'robot': str(base) if base else 'params/robot.yaml', 'version': __version__}}
+    result['summary'] = summary(result)
+    return result, apart
+
+
+def is_joint_log(path: Path) -> bool:
+    """Whether a run is a table, or a bag in which joints and commands were recorded alone."""
+    if path.suffix.lower() == '.csv':
+        return True
+    try:
+        recorded = {Path(raw.topic).name for raw in read_messages(path)}
+    except (BagError, OSError):
+        return False
+    return recorded >= {'joint_states', 'command'} and not recorded & {'pose', 'data_raw', 'odom'}
+
+
+def compare(log: JointLog, robot: RobotParameters) -> Found:
+    """The entries by which a log differs from the servos of a robot file."""
+    return select(Servos([log], file_sets(robot)), (), NAMED, CERTAIN, named=True)
+
+
+def gap_of(found: Found, apart: Found, robot: RobotParameters) -> dict:
+    """
+    Verdict, effects and errors, with the keys of INTERFACES.
+
+    Args:
+        found: comparison with the robot file.
+        apart: identification of the same log, whose error is the noise floor.
+        robot: the robot file.
+
+    """
+    log, units = found.servos.logs[0], range(len(found.servos.units))
+    last = slice(log.end_of(shipped().servo.fitted), None)
+    numbers = [number for *_, number in found.servos.units]
+    before, after, floor = (
+        np.array([error_rms(log, u, sets[u], part=last) for u in units])
+        for sets in (file_sets(robot)[np.array(numbers) - 1], found.values(), apart.values()))
+    floor = np.minimum(floor, after)
+    allowed = np.hypot(shipped().servo.as_well * floor, log.quantum)
+    effects = _effects(found, robot)
+    explained = bool((after <= allowed).all())
+    total = {key: float(np.sqrt(np.mean(values**2)))
+             for key, values in (('before', before), ('after', after), ('floor', floor))}
+    closure = None if total['before'] <= 1.1 * total['floor'] else float(
+        1 - max(total['after']**2 - total['floor']**2, 0.0)
+        / (total['before']**2 - total['floor']**2))
+    verdict = ('unknown' if not explained else 'no_gap' if not effects else
+               'named_set' if any(len(e['names']) > 1 for e in effects) else 'named')
+    ratio = {key: value / total['floor'] for key, value in total.items()}
+    worst = int(np.argmax(after / allowed))
+    reason = (f'error on the held-out part {1e3 * total["before"]:.1f} mrad before, '
+              f'{1e3 * total["after"]:.1f} mrad after') + ('' if explained else (
+                  f'; joint {numbers[worst]} keeps {1e3 * after[worst]:.1f} mrad, '
+                  f'{1e3 * floor[worst]:.1f} mrad with every term'))
+    return {
+        'verdict': verdict, 'reason': reason, 'closure': closure, 'gap_before': ratio['before'],
+        'gap_after': ratio['after'], 'noise_floor': 1.0,
+        'effects': effects if explained else [], 'partial': [] if explained else effects,
+        'candidates': _candidates(found), 'hidden': [],
+        'where': sorted(({'channel': f'joint_{number}', 'regime': 'log',
+                          'excess': float(before[u] / floor[u]),
+                          'excess_after': float(after[u] / floor[u])}
+                         for u, number in enumerate(numbers)), key=lambda row: -row['excess']),
+        'horizons': {'held-out part': {
+            'before': ratio['before'], 'after': ratio['after'], 'effects_alone': ratio['after'],
+            'placebo': None, 'closure': closure}},
+        'regimes': {}, 'held_out': True, 'findings': []}
+
+
+def _evidence(found, name):
+    """Evidence of an entry: with the others of the selected model, against that model without."""
+    gain, trial = found.gains[name], found.trials[name]
+    sign = 1 if name in found.chosen.entries else -1
+    held = sign * (trial.fit.held - found.chosen.fit.held) / found.servos.inflation
+    error = held.std(ddof=1) * np.sqrt(len(held))
+    return {'delta_bic': 2 * gain,      # both approximate twice the logarithm of a Bayes factor
+            'delta_chi2': sign * (trial.fit.chi2 - found.chosen.fit.chi2)
+            / found.servos.inflation,
+            'cv_gain': float(held.sum()),
+            'cv_gain_se': float(held.sum() / error) if error else 0.0,
+            'blocks_positive': int((held > 0).sum())}
+
+
+def _candidates(found):
+    """One row for each entry with its evidence, largest gain first."""
+    return [{'name': name, 'accepted': name in found.chosen.entries,
+             'evidence': _evidence(found, name), 'sigma_of_realistic_size': None,
+             'sigma_beside_rivals': {},
+             'reason': '' if name in found.chosen.entries else 'the evidence does not need it'}
+            for name in sorted(found.gains, key=lambda name: -found.gains[name])]
+
+
+def _effects(found, robot):
+    """Accepted entries, largest gain first; a zero is an effect of each joint that it moves."""
+    result = []
+    for name in sorted(found.chosen.entries, key=lambda name: -found.gains[name]):
+        rivals = _rivals(found, name)
+        effect = {'names': [name, *rivals], 'layer': 'joint', 'evidence': _evidence(found, name)}
+        if rivals:
+            effect['separated_by'] = separating_experiment(effect['names'])
+            effect['rivals'] = [{'name': rival, 'gain': found.gains.get(rival, 0.0),
+                                 'evidence': _evidence(found, rival),
+                                 'parameters': _parameters(found, found.trials[rival], rival,
+                                                           robot)} for rival in rivals]
+        parts = _parameters(found, found.chosen, name, robot)
+        if CATALOGUE[name].each != 'joint':
+            result.append(effect | {'parameters': parts})
+            continue
+        s = found.servos
+        moved = s.visible(found.chosen, name) & s.changed(found.chosen, name)
+        for unit in np.flatnonzero(moved):
+            number = s.units[unit][2]
+            own = {key: {'value': entry['each'][str(number)], 'unit': entry['unit'],
+                         'interval': entry['intervals'][str(number)],
+                         'file': entry['files'][str(number)]} for key, entry in parts.items()}
+            result.append(effect | {'joint': number, 'parameters': own})
+    return result
+
+
+def _rivals(found, name):
+    """Rejected entries that explain the log nearly as well in place of an accepted one."""
+    entries, s = found.chosen.entries, found.servos
+    rivals = {}
+    for other in (rival for rival in CATALOGUE[name].confused_with
+                  if rival in NAMED and rival not in entries and rival in found.trials):
+        swapped = s.fit([*(e for e in entries if e != name), other],
+                        starts=(found.trials[other], found.full))
+        if s.evidence(swapped) > s.evidence(found.chosen) - CERTAIN:
+            rivals[other] = s.evidence(swapped)
+            found.trials[other] = swapped
+    return sorted(rivals, key=lambda other: -rivals[other])
+
+
+def _parameters(found, trial, name, robot):
+    """Parameter -> value (median joint), unit, 95 % interval, value in the file, each joint's."""
+    s, spec, joined = found.servos, CATALOGUE[name].parameters, {}
+    file = file_sets(robot)
+    # An entry that the log neither needs nor excludes widens the intervals of the others.
+    possible = [trial, *(found.trials[other] for other in CATALOGUE[name].confused_with
+                         if trial is found.chosen and other not in trial.entries
+                         and found.gains.get(other, -np.inf) > -CERTAIN)]
+    for parameter in spec:
+        each, ends, files = {}, {}, {}
+        for unit, (*_, number) in enumerate(s.units):
+            estimates = [_derived(one, unit, lambda values: catalogue_values(
+                values, robot)[name][parameter]) for one in possible]
+            each[str(number)] = estimates[0][0]
+            ends[str(number)] = [min(value - WIDTH * error for value, error in estimates),
+                                 max(value + WIDTH * error for value, error in estimates)]
+            files[str(number)] = float(catalogue_values(file[number - 1], robot)[name][parameter])
+        low, high = np.median(list(ends.values()), axis=0)
+        joined[parameter] = {
+            'value': float(np.median(list(each.values()))), 'unit': spec[parameter].unit,
+            'file': float(np.median(list(files.values()))),
+            'interval': [max(float(low), spec[parameter].low), float(high)],
+            'each': each, 'intervals': ends, 'files': files}
+    return joined
+
+
+def _derived(trial, unit, function):
+    """A function of a unit's parameter set, and its standard error by the delta method."""
+    theta = trial.fit.theta[unit]
+    covariance = trial.fit.spread()[unit]
+    value, slopes = function(decoded(theta)), np.zeros(len(theta))
+    for p in np.flatnonzero(mask(trial.entries)):
+        step = STEP * max(np.sqrt(covariance[p, p]), 1e-9)
+        moved = theta.copy()
+        moved[p] += step
+        slopes[p] = (function(decoded(moved)) - value) / step
+    return float(value), float(np.sqrt(slopes @ covariance @ slopes))
+
+
+def changes(before: JointLog, after: JointLog, robot: RobotParameters) -> list[dict]:
+    """
+    Compare the servos of two logs; the robot file is the centre of both priors.
+
+    Returns:
+        a row for each joint of both logs and each of ``ROWS``: second ``log``, ``joint``, ``name``
+        of the catalogue entry, ``parameter``, ``unit``, ``before``, ``after``, ``difference``, its
+        95 % ``interval``, and ``significant``: at most 5 % of pairs of logs without a change have
+        any significant row.
+
+    """
+    entries = [*ALWAYS, 'joint_offset']
+    fits = []
+    for log in (before, after):
+        s = Servos([log], file_sets(robot))
+        full = s.estimate_noise(s.candidates())
+        chosen = s.fit(entries, starts=(full,))
+        fits.append(Found(s, full, chosen, {}, {}))
+    joints = [j for j in before.joints if j in after.joints]
+    rows, least = [], norm.isf(0.05 / 2 / max(len(joints) * len(ROWS), 1))
+    for number in joints:
+        for name, parameter, unit in ROWS:
+            (old, spread), (new, other) = (
+                _derived(f.chosen, f.servos.logs[0].joints.index(number),
+                         lambda values: row_value(values, robot, name, parameter)) for f in fits)
+            error, difference = float(np.hypot(spread, other)), new - old
+            rows.append({'log': after.name, 'joint': number, 'name': name,
+                         'parameter': parameter, 'unit': unit, 'before': old, 'after': new,
+                         'difference': difference,
+                         'interval': [difference - WIDTH * error, difference + WIDTH * error],
+                         'significant': bool(abs(difference) > least * error)})
+    return rows
+
+
+def row_value(values: np.ndarray, robot: RobotParameters, name: str, parameter: str) -> float:
+    """A parameter of ``ROWS`` for one parameter set (P,)."""
+    if parameter == 'dead_band':
+        return float(values[INDEX['coulomb_friction']])
+    own = catalogue_values(values, robot)
+    if parameter == 'ramp_lag':
+        return float(own[name]['delay'] + 2 * values[INDEX['damping_ratio']]
+                     / values[INDEX['natural_frequency']])
+    return float(own[name][parameter])

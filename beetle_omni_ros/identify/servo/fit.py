@@ -1,0 +1,326 @@
+"""
+One servo model for all joints and logs, and the terms that the logs need.
+
+Each joint of each log is a unit of :mod:`beetle_omni_ros.identify.inference.hierarchy`. Servos of
+one type share their values, and each has its own deviation. Two logs differ in their delays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from beetle_omni_ros.identify.inference.hierarchy import design, Fit, solve, Spread
+from beetle_omni_ros.identify.parameters import shipped
+from beetle_omni_ros.identify.servo.log import JointLog
+from beetle_omni_ros.identify.servo.model import (
+    INDEX,
+    NAMES,
+    READING_ERRORS,
+    simulate,
+    TERMS,
+)
+
+LOGARITHMIC = np.array([term.logarithmic for term in TERMS.values()])
+STEP = np.where(LOGARITHMIC, 0.01, 2e-4)      # of the derivatives
+# Prior standard deviations about the robot file: of the common value, of each joint, of each log,
+# of each joint in each log.
+# Logarithms for frequency, damping and limits. Servos of one type differ by 10 to 15 %.
+SPREADS = {
+    'natural_frequency': Spread(0.5, {'joint': 0.15}),
+    'damping_ratio': Spread(0.5, {'joint': 0.15}),
+    'delay': Spread(0.02, {'log': 0.01}),        # one bus
+    'offset': Spread(0.0, {'joint': 0.02, 'unit': 0.01}),
+    'coulomb_friction': Spread(0.02, {'joint': 0.01, 'unit': 0.004}),
+    'stiction': Spread(0.01, {}),
+    'backlash': Spread(0.02, {'joint': 0.01}),
+    'velocity_limit': Spread(1.0, {}),
+    'torque_limit': Spread(1.0, {}),
+    'load_sine': Spread(0.02, {'joint': 0.01}),
+    'load_cosine': Spread(0.02, {'joint': 0.01}),
+    'encoder_gain': Spread(0.0, {'joint': 0.02}),
+    'encoder_sine': Spread(0.0, {'joint': 0.02}),
+    'encoder_cosine': Spread(0.0, {'joint': 0.02}),
+}
+# Catalogue entry -> the terms that it changes.
+ENTRIES = {
+    'joint_bandwidth': ('natural_frequency', 'damping_ratio'),
+    'joint_command_latency': ('delay',),
+    'joint_friction': ('coulomb_friction', 'stiction'),
+    'joint_backlash': ('backlash',),
+    'joint_offset': ('offset',),
+    'joint_encoder_error': ('encoder_gain', 'encoder_sine', 'encoder_cosine'),
+    'joint_load': ('load_sine', 'load_cosine'),
+    'joint_velocity_limit': ('velocity_limit',),
+    'joint_torque_limit': ('torque_limit',),
+}
+LIMITS = ('joint_velocity_limit', 'joint_torque_limit')
+# Starts of terms whose chi2 has several minima, or no slope at zero.
+STARTS = ({'natural_frequency': 45.0, 'damping_ratio': 0.65, 'delay': 0.012,
+           'coulomb_friction': 0.012, 'backlash': 0.002},
+          {'natural_frequency': 75.0, 'damping_ratio': 0.75, 'delay': 0.026,
+           'coulomb_friction': 0.006, 'backlash': 0.01})
+
+
+def encoded(values: np.ndarray) -> np.ndarray:
+    """Coordinates of parameter sets (..., P): logarithms where the term is logarithmic."""
+    return np.where(LOGARITHMIC, np.log(np.where(LOGARITHMIC, values, 1.0)), values)
+
+
+def decoded(theta: np.ndarray) -> np.ndarray:
+    """Inverse of :func:`encoded`."""
+    return np.where(LOGARITHMIC, np.exp(np.where(LOGARITHMIC, theta, 0.0)), theta)
+
+
+LOW, HIGH = (encoded(np.array([getattr(term, side) for term in TERMS.values()]))
+             for side in ('low', 'high'))
+
+
+def mask(entries: Sequence[str]) -> np.ndarray:
+    """(P,) terms of catalogue entries."""
+    names = {name for entry in entries for name in ENTRIES[entry]}
+    return np.array([name in names for name in NAMES])
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A model: the entries that may differ from the base, and their fit."""
+
+    entries: tuple[str, ...]
+    fit: Fit
+
+
+class Servos:
+    """
+    The fitted parts of some logs, their noise, and fits of chosen entries.
+
+    Args:
+        logs: response logs.
+        base: (J, P) parameter sets of gimbal1 to gimbal4 from which the fits deviate.
+        fitted: fraction of each log that is fitted; by default that of params/identify.yaml.
+
+    """
+
+    def __init__(self, logs: Sequence[JointLog], base: np.ndarray, fitted: float | None = None):
+        p = shipped().servo
+        fitted = p.fitted if fitted is None else fitted
+        self.logs = list(logs)
+        self.units = [(k, j, number) for k, log in enumerate(logs)
+                      for j, number in enumerate(log.joints)]
+        self.base = encoded(np.array([base[number - 1] for _, _, number in self.units]))
+        self.labels = {'joint': [number for *_, number in self.units],
+                       'log': [k for k, *_ in self.units], 'unit': self.units}
+        self.rows, self.blocks = [], []
+        for log in self.logs:
+            settled = log.t >= log.t[0] + p.settling
+            rows = np.flatnonzero(log.fresh & settled & (np.arange(len(log.t))
+                                                         < int(round(fitted * len(log.t)))))
+            self.rows.append(rows)
+            self.blocks.append(np.arange(len(rows)) * p.blocks // max(len(rows), 1))
+        self.sigma = np.full(len(self.units), p.first_noise)
+        self._blocks = [self.blocks[k] for k, *_ in self.units]
+        self.inflation = 1.0
+
+    # ---- model of the core
+    def __call__(self, theta: np.ndarray, active: np.ndarray):
+        """Whitened residuals and their derivatives; see :func:`hierarchy.solve`."""
+        residuals, slopes = [], []
+        for k, log in enumerate(self.logs):
+            mine = np.flatnonzero(np.array(self.labels['log']) == k)
+            read, change = self._readings(k, theta[mine], active)
+            sigma = self.sigma[mine, None]
+            residuals += list((read - log.measured[:, self.rows[k]]) / sigma)
+            slopes += list((change / sigma).transpose(1, 0, 2))
+        return residuals, slopes
+
+    def _readings(self, k, theta, active):
+        """Readings (J, n) and their derivatives (P, J, n) at the fitted rows of a log."""
+        log, rows, count = self.logs[k], self.rows[k], len(theta)
+        moved = [p for p in np.flatnonzero(active) if NAMES[p] not in READING_ERRORS]
+        # Inward at an upper bound, and from a limit without effect.
+        steps = {p: np.where(theta[:, p] + STEP[p] > HIGH[p], -STEP[p], STEP[p]) for p in moved}
+        sets = [theta]
+        for p in moved:
+            sets.append(theta.copy())
+            sets[-1][:, p] += steps[p]
+        read = simulate(log, np.tile(np.arange(count), len(sets)), decoded(np.concatenate(sets)))
+        read = read.reshape(len(sets), count, -1)[:, :, rows]
+        change = np.zeros((len(NAMES), count, len(rows)))
+        for p, shown in zip(moved, read[1:], strict=True):
+            change[p] = (shown - read[0]) / steps[p][:, None]
+        for name, shape in READING_ERRORS.items():
+            if active[INDEX[name]]:
+                change[INDEX[name]] = shape(read[0])
+        return read[0], change
+
+    # ---- fits
+    def estimate_noise(self, entries: Sequence[str]) -> Trial:
+        """
+        Measure the noise around the most flexible model; call it before :meth:`fit`.
+
+        The errors are those of the free simulation, so they include what no term describes. They
+        are correlated, hence :attr:`inflation`.
+        """
+        trial = None
+        for _ in range(3):
+            trial = self.fit(entries, starts=STARTS if trial is None else (trial,))
+            residuals, _ = self(trial.fit.theta, np.zeros(len(NAMES), dtype=bool))
+            least = [self.logs[k].quantum / np.sqrt(12) for k, *_ in self.units]
+            self.sigma = np.maximum(self.sigma * [1.4826 * np.median(np.abs(r)) if len(r) else 1.0
+                                                  for r in residuals], least)
+        self.inflation = trial.fit.inflation
+        return trial
+
+    def fit(self, entries: Sequence[str], starts: Sequence = ()) -> Trial:
+        """
+        Fit the terms of some entries; the others have their base values.
+
+        Args:
+            entries: names in ``ENTRIES``.
+            starts: dictionaries of values, or trials of other entries to start from.
+
+        """
+        active = mask(entries)
+        s = design([SPREADS[name] for name in NAMES], self.labels, active)
+        fits = []
+        for start in starts or STARTS:
+            target = self.base.copy()
+            if isinstance(start, Trial):
+                target[:, active] = start.fit.theta[:, active]
+            else:
+                limits = {term: self._reached(term) for term in ('velocity_limit', 'torque_limit')}
+                for name, value in (start | limits).items():
+                    p = INDEX[name]
+                    if active[p]:
+                        target[:, p] = np.log(value) if LOGARITHMIC[p] else value
+            x = self._nearest(s, target)
+            fits.append(solve(self, self.base, s, x, self.labels['log'], self._blocks, LOW, HIGH))
+        return Trial(tuple(entries), min(fits, key=lambda fit: fit.chi2 + fit.x @ fit.x))
+
+    def evidence(self, trial: Trial) -> float:
+        """Logarithm of the evidence [nat] of a trial."""
+        return trial.fit.evidence(self.inflation)
+
+    def visible(self, trial: Trial, entry: str) -> np.ndarray:
+        """(U,) whether an entry moves the readings of a unit by an encoder count (RMS)."""
+        none, without = np.zeros(len(NAMES), dtype=bool), trial.fit.theta.copy()
+        without[:, mask([entry])] = self.base[:, mask([entry])]
+        reads = [self(theta, none)[0] for theta in (trial.fit.theta, without)]
+        return np.array([np.sqrt(np.mean((a - b)**2)) * sigma > self.logs[k].quantum
+                         for a, b, sigma, (k, *_) in zip(*reads, self.sigma, self.units,
+                                                         strict=True)])
+
+    def changed(self, trial: Trial, entry: str) -> np.ndarray:
+        """(U,) whether a unit differs from the base by an entry, by a Wald test at 5 %."""
+        terms = mask([entry])
+        off = (trial.fit.theta - self.base)[:, terms]
+        spread = trial.fit.spread()[:, terms][:, :, terms]
+        size = np.array([o @ np.linalg.pinv(c, rcond=1e-8, hermitian=True) @ o
+                         for o, c in zip(off, spread, strict=True)])
+        return size > chi2.isf(0.05 / len(off), terms.sum())
+
+    def _nearest(self, s, target):
+        """Standardised values x with base + S x near a target, of least norm."""
+        if not s.shape[2]:
+            return np.zeros(0)
+        flat = s.reshape(-1, s.shape[2])
+        off = (target - self.base).ravel()
+        return np.linalg.solve(flat.T @ flat + 1e-6 * np.trace(flat.T @ flat) / len(flat.T)
+                               * np.eye(len(flat.T)), flat.T @ off)
+
+    def _reached(self, name):
+        """Largest speed [rad/s], or position error [rad], of the logs."""
+        if name == 'velocity_limit':
+            return max(log.speed().max() for log in self.logs)
+        return max(np.abs(log.command - log.measured).max() for log in self.logs)
+
+    def candidates(self) -> list[str]:
+        """Entries that these logs can show: a limit only if the commands exceed it."""
+        least = shipped().servo.beyond
+        beyond = any((log.command_speed() > least * log.speed()).any() for log in self.logs)
+        return [name for name in ENTRIES if beyond or name not in LIMITS]
+
+
+@dataclass(frozen=True)
+class Found:
+    """
+    The selected model of some logs.
+
+    Attributes:
+        servos: the logs with their noise.
+        full: fit of all candidates.
+        chosen: the selected model.
+        trials: entry -> the selected model with it, if it is rejected, or without it.
+        gains: entry -> gain of evidence [nat] by it in the selected model.
+
+    """
+
+    servos: Servos
+    full: Trial
+    chosen: Trial
+    trials: dict[str, Trial]
+    gains: dict[str, float]
+
+    def values(self, trial: Trial | None = None) -> np.ndarray:
+        """(U, P) parameter sets of the units."""
+        return decoded((trial or self.chosen).fit.theta)
+
+    def of_log(self, index: int, trial: Trial | None = None) -> np.ndarray:
+        """(J, P) parameter sets of the joints of one log."""
+        return self.values(trial)[np.array(self.servos.labels['log']) == index]
+
+
+def select(servos: Servos, always: Sequence[str], allowed: Sequence[str], least: float = 0.0,
+           named: bool = False) -> Found:
+    """
+    Add the entries that raise the evidence, largest gain first, and remove those that do not.
+
+    Args:
+        servos: logs and base values.
+        always: entries of every model.
+        allowed: further entries.
+        least: least gain of evidence [nat] of an entry.
+        named: whether an entry must also move some joint's readings by an encoder count (RMS) and
+            improve the prediction of left-out blocks in total.
+
+    """
+    candidates = [name for name in servos.candidates() if name in {*always, *allowed}]
+    full = servos.estimate_noise(candidates)
+    gain = servos.evidence
+    chosen = servos.fit(always, starts=(full, *STARTS) if always else (full,))
+    def worth(name, more, fewer):
+        return gain(more) >= gain(fewer) + least and (not named or (
+            more.fit.held.sum() < fewer.fit.held.sum() and servos.visible(more, name).any()))
+
+    while True:
+        trials = {name: servos.fit([*chosen.entries, name], starts=(chosen, full))
+                  for name in candidates if name not in chosen.entries}
+        better = [trial for name, trial in trials.items() if worth(name, trial, chosen)]
+        if not better:
+            break
+        chosen = max(better, key=gain)
+    while True:
+        without = {name: servos.fit([other for other in chosen.entries if other != name],
+                                    starts=(chosen, full))
+                   for name in chosen.entries if name not in always}
+        useless = [name for name, fewer in without.items() if not worth(name, chosen, fewer)]
+        if not useless:
+            break
+        name = max(useless, key=lambda name: gain(without[name]))
+        chosen, trials[name] = without[name], chosen
+    trials |= without
+    gains = {name: (gain(chosen) - gain(trial)) * (1 if name in chosen.entries else -1)
+             for name, trial in trials.items()}
+    return Found(servos, full, chosen, trials, gains)
+
+
+def error_rms(log: JointLog, joint: int, values: np.ndarray, held: bool = True,
+              part: slice = slice(None)) -> float:
+    """RMS [rad] of prediction minus reading at fresh rows of the joint with this index."""
+    rows = np.arange(len(log.t))[part]
+    rows = rows[log.fresh[rows]]
+    error = simulate(log, joint, values[None], held)[0] - log.measured[joint]
+    return float(np.sqrt(np.mean(error[rows]**2)))

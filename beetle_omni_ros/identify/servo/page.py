@@ -1,0 +1,226 @@
+"""Tables, figures, pages and robot files about identified servos."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib
+from matplotlib.figure import Figure
+import numpy as np
+
+from beetle_omni_ros import __version__
+from beetle_omni_ros.identify.gap.page import head
+from beetle_omni_ros.identify.parameters import shipped
+from beetle_omni_ros.identify.robot_file import rounded, write_robot_file
+from beetle_omni_ros.identify.servo.fit import Found
+from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
+from beetle_omni_ros.identify.servo.model import simulate
+from beetle_omni_ros.identify.servo.robot import file_sets, held
+from beetle_omni_ros.pages.figures import COLOURS, FAINT, INK, legend, line, panels, STYLE, svg
+from beetle_omni_ros.pages.page import page, section
+from beetle_omni_ros.pages.table import Grid
+from beetle_omni_ros.robot.parameters import RobotParameters
+
+MILLI = 1e3
+UNITS = {'rad': ('mrad', MILLI), 's': ('ms', MILLI), 'N m': ('mN m', MILLI)}
+
+
+def write_joint_file(path: Path, results: dict, base: Path | None) -> None:
+    """
+    Write a robot file that extends ``base`` by the identified servo.
+
+    A robot file has one servo for all joints: the median. Terms without a key in its joint model
+    (delay, friction) are below ``provenance``, joint by joint.
+
+    Args:
+        path: output file.
+        results: results of :func:`joint_results`.
+        base: extended robot file; None: the shipped one.
+
+    Raises:
+        ParameterError: the file cannot be written.
+
+    """
+    joints = results['joints']
+    middle = {key: float(np.median([joint['derived'][key] for joint in joints]))
+              for key in ('kp_N_m_per_rad', 'kd_N_m_s_per_rad')}
+    servo = {'kp': rounded(middle['kp_N_m_per_rad']), 'kd': rounded(middle['kd_N_m_s_per_rad'])}
+    limits = [joint['terms']['velocity_limit'] for joint in joints]
+    if all(term['kept'] for term in limits):
+        servo['velocity_limit'] = rounded(float(np.median([t['value'] for t in limits])))
+    torque = [joint['terms']['torque_limit'] for joint in joints]
+    if all(term['kept'] for term in torque):
+        servo['effort_limit'] = rounded(servo['kp'] * float(np.median(
+            [term['value'] for term in torque])))
+    content = {'joints': servo,
+               'provenance': {'log': results['meta']['log'], 'version': __version__,
+                              'heldout_rms_rad': [rounded(j['heldout_rms_rad']) for j in joints],
+                              'joint_terms': {f'gimbal{j["joint"]}': {
+                                  name: rounded(term['value'])
+                                  for name, term in j['terms'].items() if term['kept']}
+                                              for j in joints}}}
+    head = ('# Tilt servos identified by `beetle_omni identify joint`. SI units: kp [N m/rad],\n'
+            '# kd [N m s/rad] for the inertia of the file below; angles [rad], delay [s].\n')
+    write_robot_file(path, head, content, base)
+
+
+def grids(results: dict, brief: bool = False) -> list[Grid]:
+    """Errors and terms, a column for each joint; ``brief``: only terms of some joint's model."""
+    joints = results['joints']
+    header = ['', *(f'joint {joint["joint"]}' for joint in joints)]
+    rows = [[text, *(_milli(joint[key]) for joint in joints)] for text, key in (
+        ('robot file, whole log', 'published_rms_rad'),
+        ('robot file, held-out part', 'published_heldout_rms_rad'),
+        ('identified, fitted part', 'fit_rms_rad'),
+        ('identified, held-out part', 'heldout_rms_rad'))]
+    for k, name in enumerate(results['meta']['validate']):
+        for text, key in (('robot file', 'published_validation_rms_rad'),
+                          ('identified', 'validation_rms_rad')):
+            rows.append([f'{text}, {name}', *(_milli(joint[key][k]) for joint in joints)])
+    errors = Grid('Prediction error, RMS [mrad]', header, rows)
+    names = [name for name in joints[0]['terms'] if not brief
+             or any(joint['terms'][name]['kept'] for joint in joints)]
+    rows = [[f'{name} [{_unit(joints[0]["terms"][name]["unit"])}]',
+             *(_value(joint['terms'][name]) for joint in joints)] for name in names]
+    unused = frozenset(k for k, name in enumerate(names)
+                       if not any(joint['terms'][name]['kept'] for joint in joints))
+    return [errors, Grid('Terms with 95 % interval; in brackets: not in the model, did not '
+                         'improve the prediction of held-out data', header, rows, unused)]
+
+
+def _milli(value):
+    return 'absent' if value is None else f'{MILLI * value:.2f}'
+
+
+def _unit(unit):
+    return {'s': 'ms', 'rad': 'mrad'}.get(unit, unit)
+
+
+def _value(term):
+    factor = MILLI if term['unit'] in ('s', 'rad') else 1.0
+    numbers = [None if v is None else factor * v for v in (term['value'], *term['interval'])]
+    value, low, high = ('inf' if v is None else f'{v:.{digits}g}' if abs(v) < 99.5 else f'{v:.0f}'
+                        for v, digits in zip(numbers, (3, 2, 2), strict=True))
+    text = f'{value},\n{low}..{high}'      # two lines: four joints fit into 80 columns
+    return text if term['kept'] else f'[{text}]'
+
+
+def joint_page(found: Found, validations: Sequence[JointLog], robot: RobotParameters,
+               results: dict) -> str:
+    """HTML page about an identification."""
+    log, logs = found.servos.logs[0], found.servos.logs
+    models = dict(zip(log.joints, found.of_log(0), strict=True))
+    with matplotlib.rc_context(STYLE):
+        sections = []
+        for k, other in enumerate([*logs, *validations]):
+            end = shipped().servo.fitted if k < len(logs) else None
+            title = other.name + (': fitted to the shaded part' if end else ': not fitted')
+            sections.append(section(title, 'Command, measured position, and simulations of the '
+                                    'robot file and of the identified model.',
+                                    svg(_responses(other, models, robot, end), title)))
+            sections.append(section(f'Errors, {other.name}', 'Model minus measurement.',
+                                    svg(_errors(other, models, robot, end), 'errors')))
+        sections.append(section('Friction and lag', 'Position error over commanded speed: a line '
+                                'means lag, a gap between the branches means a dead band.',
+                                svg(_loops(log, models), 'position error over speed')))
+    names = ', '.join(each.name for each in logs)
+    return page('Tilt servos', f'identified from {names}', grids(results), results['text'],
+                sections)
+
+
+def gap_log_page(apart: Found, result: dict, tables: Sequence[Grid], robot: RobotParameters
+                 ) -> str:
+    """HTML page about a log and a robot file; ``apart``: the identification of the log."""
+    others = [read_joint_log(path) for path in [*result['meta']['runs'][1:],
+                                                *result['meta']['holdout']]]
+    with matplotlib.rc_context(STYLE):
+        log = apart.servos.logs[0]
+        models = dict(zip(log.joints, apart.of_log(0), strict=True))
+        sections = [section(
+            f'Errors, {other.name}', 'Simulated servos of the robot file, and identified ones, '
+            'minus measurement.', svg(_errors(other, models, robot, shipped().servo.fitted
+                                              if k == 0 else None), 'errors'))
+            for k, other in enumerate([log, *others])]
+    return page('Tilt servos', f'{log.name} against the robot file',
+                [*tables, *grids(result | {'meta': {'validate': [o.name for o in others]}})],
+                result['text'], sections, head(result, ''))
+
+
+def _responses(log, models, robot, end) -> Figure:
+    pairs = [(k, number) for k, number in enumerate(log.joints) if number in models]
+    file, is_held = file_sets(robot), held(robot)
+    figure, axes = panels(len(pairs), height=1.9, sharex=True)
+    for axis, (k, number) in zip(axes[:, 0], pairs, strict=True):
+        t = log.t - log.t[0]
+        _shade(axis, t, end)
+        line(axis, t, log.command[k], color=FAINT, lw=1.0, label='command')
+        line(axis, t, log.measured[k], color=INK, lw=1.4, label='measured')
+        line(axis, t, simulate(log, k, file[number - 1][None], is_held)[0], color=COLOURS[1],
+             lw=0.9, label='robot file')
+        line(axis, t, simulate(log, k, models[number][None])[0], color=COLOURS[0], lw=0.9,
+             label='identified')
+        axis.set_ylabel(f'joint {number} [rad]')
+    axes[-1, 0].set_xlabel('time [s]')
+    legend(figure, axes[0, 0])
+    return figure
+
+
+def _errors(log, models, robot, end) -> Figure:
+    pairs = [(k, number) for k, number in enumerate(log.joints) if number in models]
+    file, is_held = file_sets(robot), held(robot)
+    figure, axes = panels(len(pairs), 2, height=1.5, sharex=True)
+    t = log.read_t[log.fresh] - log.t[0]
+    for row, (k, number) in zip(axes, pairs, strict=True):
+        for axis, values, hold, colour, name in (
+                (row[0], file[number - 1], is_held, COLOURS[1], 'robot file'),
+                (row[1], models[number], True, COLOURS[0], 'identified')):
+            _shade(axis, t, end)
+            error = MILLI * (simulate(log, k, values[None], hold)[0] - log.measured[k])
+            line(axis, t, error[log.fresh], color=colour, lw=0.8)
+            axis.set_title(f'joint {number}, {name}')
+            axis.set_ylabel('error [mrad]')
+    for axis in axes[-1]:
+        axis.set_xlabel('time [s]')
+    return figure
+
+
+def _loops(log, models) -> Figure:
+    figure, axes = panels(1, len(models), height=2.8, sharey=True)
+    for axis, (k, number) in zip(axes[0], enumerate(log.joints), strict=True):
+        speed, fresh = np.gradient(log.command[k], log.t), log.fresh
+        axis.plot(speed[fresh], MILLI * (log.measured[k] - log.command[k])[fresh], color=INK,
+                  lw=0.8, label='measured')
+        predicted = simulate(log, k, models[number][None])[0]
+        axis.plot(speed[fresh], MILLI * (predicted - log.command[k])[fresh], color=COLOURS[0],
+                  lw=0.8, label='identified')
+        axis.set_title(f'joint {number}')
+        axis.set_xlabel('commanded speed [rad/s]')
+    axes[0, 0].set_ylabel('position error [mrad]')
+    legend(figure, axes[0, 0])
+    return figure
+
+
+def _shade(axis, t, end):
+    if end is not None:
+        axis.axvspan(t[0], t[0] + end * (t[-1] - t[0]), color='#eef3f8', lw=0)
+
+
+def change_grids(rows: Sequence[dict]) -> list[Grid]:
+    """One table for each further log: before, after and difference."""
+    result = []
+    for log in dict.fromkeys(row['log'] for row in rows):
+        cells = []
+        for row in (r for r in rows if r['log'] == log):
+            unit, factor = UNITS.get(row['unit'], (row['unit'], 1.0))
+            old, new, difference, low, high = (factor * x for x in (
+                row['before'], row['after'], row['difference'], *row['interval']))
+            cells.append([str(row['joint']), f"{row['parameter']} [{unit}]", f'{old:.3g}',
+                          f'{new:.3g}', f'{difference:+.3g}', f'{low:.3g}..{high:.3g}',
+                          'yes' if row['significant'] else ''])
+        result.append(Grid(f'Changes to {log}', ['joint', 'parameter', 'before', 'after',
+                                                 'difference', '95 %', 'significant'], cells,
+                           note='dead_band: friction over stiffness. ramp_lag: lag behind a ramp, '
+                                'from delay and damping. significant: two logs without a change '
+                                'have any such row in at most 5 of 100 cases.'))
+    return result

@@ -1,0 +1,81 @@
+"""Servos of a robot file as parameter sets of the servo model, and back."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from beetle_omni_ros.identify.servo.model import INDEX, NAMES, OFF, TERMS
+from beetle_omni_ros.robot.effects_actuator import per_joint
+from beetle_omni_ros.robot.parameters import RobotParameters
+
+JOINTS = 4
+# Delays that a log does not separate from joint_command_latency.
+OTHER_DELAYS = ('command_latency', 'joint_feedback_delay')
+# Entries whose presence means that a file's numbers hold for commands that are held between rows.
+# The published gains come from a replay with interpolated commands.
+FOR_HELD = ('joint_bandwidth', 'joint_command_latency', 'joint_friction', 'joint_backlash',
+            'joint_offset', 'joint_encoder_error', 'joint_velocity_limit', 'joint_torque_limit',
+            *OTHER_DELAYS)
+
+
+def other_delays(robot: RobotParameters) -> float:
+    """Sum of the file's ``OTHER_DELAYS`` [s]."""
+    return sum(robot.effects.get(name, {}).get('delay', 0.0) for name in OTHER_DELAYS)
+
+
+def held(robot: RobotParameters) -> bool:
+    """Whether the file's servos hold a command until the next one."""
+    return any(name in robot.effects for name in FOR_HELD)
+
+
+def file_sets(robot: RobotParameters) -> np.ndarray:
+    """
+    Parameter sets (4, P) of the servos of a robot file with effects.
+
+    Sign of the zero: the true tilt is the encoder's plus ``joint_offset``. A servo at rest has the
+    commanded true tilt, so its encoder reads the command minus ``joint_offset``. Deflection is not
+    included, because it needs a thrust.
+    """
+    joint, effects = robot.joints, robot.effects
+    sets = np.tile(OFF, (JOINTS, 1))
+    friction = effects.get('joint_friction', {'coulomb': 0.0, 'stiction': 0.0})
+    encoder = effects.get('joint_encoder_error', {})
+    for j in range(JOINTS):
+        kp, kd = joint.of(j).kp, joint.of(j).kd
+        coulomb, stiction = (per_joint(friction[name], j) for name in ('coulomb', 'stiction'))
+        values = {
+            'natural_frequency': np.sqrt(kp / joint.inertia),
+            'damping_ratio': kd / (2 * np.sqrt(kp * joint.inertia)),
+            'delay': effects.get('joint_command_latency', {}).get('delay', 0.0)
+            + other_delays(robot),
+            'offset': -effects.get('joint_offset', {}).get('offset', (0.0,) * JOINTS)[j],
+            'coulomb_friction': coulomb / kp, 'stiction': max(stiction - coulomb, 0.0) / kp,
+            'backlash': per_joint(effects.get('joint_backlash', {}).get('gap', 0.0), j) / 2,
+            'velocity_limit': joint.velocity_limit, 'torque_limit': joint.effort_limit / kp,
+            **{f'encoder_{name}': encoder[name][j] for name in encoder}}
+        for name, value in values.items():
+            sets[j, INDEX[name]] = np.clip(value, TERMS[name].low, TERMS[name].high)
+    return sets
+
+
+def catalogue_values(values: np.ndarray, robot: RobotParameters) -> dict[str, dict[str, float]]:
+    """
+    Parameters of the catalogue's joint entries for one parameter set (P,).
+
+    Friction and torque limit of a log are position errors; times the stiffness they are torques.
+    """
+    value = dict(zip(NAMES, values, strict=True))
+    kp = robot.joints.inertia * value['natural_frequency']**2
+    band = value['coulomb_friction']
+    return {
+        'joint_bandwidth': {
+            'kp': kp, 'kd': 2 * value['damping_ratio'] * kp / value['natural_frequency']},
+        'joint_command_latency': {'delay': value['delay'] - other_delays(robot)},
+        'joint_friction': {'coulomb': kp * band, 'stiction': kp * (band + value['stiction'])},
+        # A log shows the play before the encoder only.
+        'joint_backlash': {'gap': 2 * value['backlash'], 'at_encoder': 1.0},
+        'joint_offset': {'offset': -value['offset']},
+        'joint_encoder_error': {name: value[f'encoder_{name}']
+                                for name in ('gain', 'sine', 'cosine')},
+        'joint_velocity_limit': {'velocity_limit': value['velocity_limit']},
+        'joint_torque_limit': {'effort_limit': kp * value['torque_limit']}}

@@ -1,0 +1,107 @@
+"""Joints as in measured logs: friction that holds, play, encoder errors, servos that differ."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.servo import NUMPY, Servo, Step
+from beetle_omni_ros.sim.parameters import SimulatorParameters
+from beetle_omni_ros.sim.plant import Plant
+
+ROBOT = RobotParameters.load()
+KP = ROBOT.joints.kp
+PARAMETERS = SimulatorParameters.load().plant
+
+
+def flown(targets, thrust=0.0, **effects):
+    """Encoder angles (K, 4), true tilts (K, 4) and the plant after commands (K, 4)."""
+    robot = replace(ROBOT, effects=effects)     # in free fall the modules load no joint
+    plant = Plant(robot, PARAMETERS)
+    plant.reset(np.array([0.0, 0.0, 500.0]))
+    encoder, tilt = np.empty((2, *targets.shape))
+    for k, target in enumerate(targets):
+        plant.set_targets(target, np.full(4, thrust))
+        plant.step()
+        encoder[k], tilt[k] = plant.encoder, plant.tilt
+    return encoder, tilt, plant
+
+
+def ticks(duration):
+    return np.arange(0.0, duration, PARAMETERS.tick)
+
+
+def test_a_joint_below_its_stiction_rests():
+    stiction = 0.012
+    targets = np.tile(0.9 * stiction / KP, (len(ticks(1.0)), 4))
+    encoder, _, _ = flown(targets, joint_friction={'coulomb': 0.008, 'stiction': stiction})
+    assert np.abs(encoder).max() < 1e-5
+    beyond, _, _ = flown(1.2 / 0.9 * targets, joint_friction={'coulomb': 0.008,
+                                                            'stiction': stiction})
+    assert beyond[-1].min() > 0.5 * targets[-1, 0]
+
+
+@pytest.mark.parametrize('friction', [0.003, 0.01])
+def test_a_slow_reversal_shows_a_dead_band_of_friction_over_stiffness(friction):
+    t = ticks(8.0)
+    ramp = np.tile(0.2 * np.interp(t, [0, 4, 8], [0, 1, 0])[:, None], (1, 4))
+    encoder, _, _ = flown(ramp, joint_friction={'coulomb': friction, 'stiction': friction})
+    middle = [np.argmin(np.abs(t - at)) for at in (2.0, 6.0)]
+    band = encoder[middle[1]] - encoder[middle[0]]
+    # Lag of the ramp in both directions; encoders are read at the end of a tick.
+    lag = 2 * 0.05 * (ROBOT.joints.kd / KP - PARAMETERS.tick / 2)
+    assert np.allclose(band, 2 * friction / KP + lag, atol=2e-4)
+
+
+def test_servos_with_friction_move_as_the_servo_model():
+    gains, damping = (0.18, 0.16, 0.2, 0.22), (0.0042, 0.004, 0.005, 0.0045)
+    coulomb = (0.002, 0.004, 0.003, 0.001)
+    t = ticks(3.0)
+    targets = np.tile(0.8 * np.sin(2 * np.pi * 0.8 * t)[:, None], (1, 4))
+    encoder, _, _ = flown(targets, joint_bandwidth={'kp': gains, 'kd': damping},
+                          joint_friction={'coulomb': coulomb, 'stiction': coulomb})
+    step = Step(NUMPY, Servo(ROBOT.joints.inertia, np.array(gains), np.array(damping),
+                             ROBOT.joints.velocity_limit, coulomb=np.array(coulomb),
+                             stiction=np.array(coulomb)), PARAMETERS.tick)
+    q, v, model = np.zeros(4), np.zeros(4), np.empty_like(encoder)
+    for k, target in enumerate(targets):
+        q, v = step(target, q, v)
+        model[k] = q
+    # The free body turns a little against the modules, which the servo model does not have.
+    assert np.sqrt(np.mean((encoder - model)**2)) < 2e-3
+    assert np.ptp(encoder[-1]) > 0.005          # each servo is its own
+
+
+@pytest.mark.parametrize('at_encoder', [0.0, 1.0])
+def test_the_rotor_follows_behind_the_play(at_encoder):
+    gap, t = 0.03, ticks(4.0)
+    targets = np.tile(0.3 * np.sin(2 * np.pi * 0.5 * t)[:, None], (1, 4))
+    encoder, tilt, plant = flown(targets, thrust=6.0,
+                                 joint_backlash={'gap': gap, 'at_encoder': at_encoder})
+    free, _, _ = flown(targets, thrust=6.0)
+    lag = (encoder if not at_encoder else free) - tilt
+    assert np.abs(lag).max() == pytest.approx(gap / 2, abs=2e-3)
+    assert at_encoder == float(np.array_equal(encoder, tilt))
+    # The thrust acts along the true tilts.
+    normals = np.cos(tilt[-1])[:, None] * [0, 0, 1.0] + np.sin(tilt[-1])[:, None] * np.cross(
+        ROBOT.tilt_axes, [0, 0, 1.0])
+    along = (plant.thrust[:, None] * normals).sum(axis=0) / ROBOT.mass
+    own = np.cos(encoder[-1])[:, None] * [0, 0, 1.0] + np.sin(encoder[-1])[:, None] * np.cross(
+        ROBOT.tilt_axes, [0, 0, 1.0])
+    wrong = (plant.thrust[:, None] * own).sum(axis=0) / ROBOT.mass
+    felt = plant.specific_force
+    if not at_encoder and np.abs(along - wrong).max() > 1e-3:
+        assert np.linalg.norm(felt - along) < np.linalg.norm(felt - wrong)
+    assert np.isfinite(rotations.log(plant.state[0][[4, 5, 6, 3]])).all()
+
+
+def test_readings_of_erring_encoders_are_corrected():
+    robot = replace(ROBOT, effects={'joint_encoder_error': {
+        'gain': (0.01, 0.0, -0.02, 0.0), 'sine': (0.02, -0.03, 0.0, 0.0),
+        'cosine': (0.0, 0.01, 0.02, 0.0)}})
+    tilt = np.random.default_rng(0).uniform(-3.9, 3.9, (200, 4))
+    read = robot.sensors.encoders(tilt)
+    assert np.abs(read - tilt).max() > 0.02
+    assert np.allclose(robot.sensors.tilts(read), tilt, atol=1e-5)
