@@ -36,27 +36,11 @@ class ServoFitParameters:
                                 high=10)
     first_noise: float = parameter(doc='White noise of the first fit.', unit='rad', low=1e-6,
                                    high=1)
-    nearly: float = parameter(doc='Ratio of the noise of two passes that ends the passes.',
-                              unit='1', low=0, high=1)
-    memory: float = parameter(doc='Memory of the whitening filter.', unit='s', low=0.01, high=10)
+    memory: float = parameter(doc='Time over which errors are correlated.', unit='s', low=0.01,
+                              high=10)
     beyond: float = parameter(doc='Least ratio of a command and a limit that it identifies.',
                               unit='1', low=1, high=10)
     blocks: int = parameter(doc='Number of blocks of the cross-validation.', low=2, high=100)
-    least_gain: float = parameter(doc='Least gain on held-out blocks for each parameter.',
-                                  unit='chi2', low=0, high=1e4)
-    least_delay: float = parameter(doc='Least delay.', unit='s', low=0, high=1)
-    published_deviation: float = parameter(
-        doc='Prior deviation (logarithm) of frequency and damping about published values.',
-        unit='1', low=0.01, high=10)
-    common_gains: float = parameter(
-        doc='Prior deviation (logarithm) of frequency and damping about the median of the joints.',
-        unit='1', low=0.001, high=10)
-    common_delay: float = parameter(
-        doc='Prior deviation of a delay about the median of the joints.', unit='s', low=1e-5,
-        high=1)
-    least_common: int = parameter(doc='Least number of joints for a median.', low=2, high=4)
-    restarts: np.ndarray = parameter(doc='Frequency [rad/s] and delay [s] of further starts.',
-                                     shape=(3, 2), low=0, high=1000)
     as_well: float = parameter(doc='Largest ratio of the errors of a correction and of the best '
                                    'model.', unit='1', low=1, high=10)
     traded: float = parameter(doc='Least correlation of a pair that the log does not separate.',
@@ -69,17 +53,6 @@ class ServoFitParameters:
     sine_amplitude: float = parameter(doc='Largest amplitude of a sine.', unit='rad', low=0.01,
                                       high=3)
     sine_speed: float = parameter(doc='Largest speed of a sine.', unit='rad/s', low=0.1, high=100)
-
-    @property
-    def published(self) -> dict[str, float]:
-        """Prior deviations about the published servo."""
-        return dict.fromkeys(('natural_frequency', 'damping_ratio'), self.published_deviation)
-
-    @property
-    def common(self) -> dict[str, float]:
-        """Prior deviations about the median of all joints."""
-        return {'natural_frequency': self.common_gains, 'damping_ratio': self.common_gains,
-                'delay': self.common_delay}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

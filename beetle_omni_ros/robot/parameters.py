@@ -216,8 +216,8 @@ class RobotParameters:
         object.__setattr__(self, 'effects', catalogue.validated(self.effects))
         for key, value in catalogue.settings(self.effects).items():
             part, name = key.split('.')
-            value = np.array(value) if isinstance(value, tuple) else value
-            object.__setattr__(self, part, replace(getattr(self, part), **{name: value}))
+            object.__setattr__(self, part, replace(getattr(self, part), **{
+                name: np.array(value) if np.ndim(value) else value}))
         hover = self.mass * self.gravity / 4
         if hover > self.rotors.thrust_max:
             raise ParameterError(f'mass {self.mass:g} kg needs {hover:.1f} N a rotor to hover, '

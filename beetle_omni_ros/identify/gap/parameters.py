@@ -181,21 +181,6 @@ class GapParameters:
     longest_gap: float = _time('Longest silence of a sensor.', 0.01)
     most_lost: float = _share('Largest share of a flight in silences.')
 
-    log_chance: float = parameter(
-        doc='Significance level of an entry in a joint log.', unit='1', low=1e-9, high=0.5)
-    log_effects: int = _count('Largest number of named entries of a joint log.', high=50)
-    log_offset: float = parameter(
-        doc='Least named zero of a joint log.', unit='rad', low=0, high=1)
-    log_friction: float = _factor('Least named change of friction over that of the robot file.')
-    log_dead_band: float = parameter(
-        doc='Least named change of its dead band.', unit='rad', low=0, high=1)
-    log_as_well: float = _factor(
-        'Error over that of the most flexible fit up to which a joint log shows no gap.')
-    log_changes_chance: float = _share(
-        'Probability that two logs without a change have a significant row.')
-    log_changes_factor: float = _factor(
-        'Prior deviation (factor) of frequency and damping about the median joint.')
-
     least_left: float = _chi2(
         'Remaining gain of known effects from which the verdict is unknown.')
     least_remainder: float = _chi2(

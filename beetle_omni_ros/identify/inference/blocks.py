@@ -4,17 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-SCATTER = 2.0, 6.0      # range of gradient_scatter; below 2, intervals miss slow drifts too often
-
-
-def block_masks(weight: np.ndarray, blocks: int) -> np.ndarray:
-    """(blocks, N) masks of consecutive blocks of the samples with a weight (N,)."""
-    used = np.flatnonzero(weight)
-    edges = np.linspace(used[0], used[-1] + 1, blocks + 1).astype(int)
-    index = np.arange(len(weight))
-    return np.array([(index >= a) & (index < b)
-                     for a, b in zip(edges[:-1], edges[1:], strict=True)], dtype=float)
-
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
@@ -72,24 +61,3 @@ def ridge_held_out(x: np.ndarray, r: np.ndarray, block: np.ndarray, blocks: int,
         w = np.linalg.solve(h - own, g - score)
         held[b] = 2 * score @ w - w @ own @ w
     return HeldOut(held), np.linalg.solve(h, g)
-
-
-def gradient_scatter(slopes: np.ndarray, residual: np.ndarray, covariance: np.ndarray,
-                     blocks: np.ndarray) -> float:
-    """
-    Mean variance of the gradient between blocks, relative to that of white residuals.
-
-    Chi2 divided by it has the distribution of independent residuals even if whitening is
-    imperfect.
-
-    Args:
-        slopes: (n, N) derivatives of the whitened residuals.
-        residual: (N,) whitened residual.
-        covariance: (n, n) covariance of the parameters for white residuals; 0 if not free.
-        blocks: (blocks, N) masks.
-
-    """
-    scores = np.array([(slopes * block) @ residual for block in blocks])
-    free = np.diag(covariance) > 0
-    ratio = np.trace(covariance @ (scores.T @ scores)) / free.sum()
-    return float(np.clip(ratio, *SCATTER))

@@ -47,7 +47,7 @@ def design(spreads: Sequence[Spread], labels: dict[str, Sequence], active: np.nd
     count = len(next(iter(labels.values())))
     columns = []
     for p in np.flatnonzero(active):
-        spread = spreads[p]
+        spread = spreads[int(p)]
         parts = [(spread.common, np.ones(count))] if spread.common else []
         for name, deviation in spread.groups.items():
             groups = sorted(set(labels[name]))
@@ -83,6 +83,7 @@ class Fit:
         held: (blocks,) chi2 of each block, predicted from the others.
         deviations: (blocks, X) change of x without each block.
         inflation: variance of the gradient over that of independent residuals, >= 1.
+        correlated: (X,) variances of x by the gradient's variance (sandwich estimator).
 
     """
 
@@ -94,6 +95,7 @@ class Fit:
     held: np.ndarray
     deviations: np.ndarray
     inflation: float
+    correlated: np.ndarray
 
     def evidence(self, inflation: float) -> float:
         """Logarithm of the evidence [nat], without constants, for an inflated noise."""
@@ -107,7 +109,7 @@ class Fit:
         (X, X) covariance of x, from curvature and from the scatter between blocks.
 
         The curvature holds for noise inflated by :attr:`inflation`. Where leaving out blocks
-        moves a value further, the jackknife's standard deviation applies.
+        moves a value further, or slow noise does, the larger standard deviation applies.
         """
         size = len(self.x)
         inner = (self.information - np.eye(size)) / self.inflation + np.eye(size)
@@ -115,7 +117,8 @@ class Fit:
         blocks = len(self.deviations)
         about = self.deviations - self.deviations.mean(axis=0)
         jackknife = (blocks - 1) / blocks * (about**2).sum(axis=0)
-        widen = np.sqrt(np.maximum(1.0, jackknife / np.diag(curvature)))
+        widen = np.sqrt(np.maximum(1.0, np.maximum(jackknife, self.correlated)
+                                   / np.diag(curvature)))
         return curvature * widen[:, None] * widen
 
     def spread(self) -> np.ndarray:
@@ -127,7 +130,7 @@ Model = Callable[[np.ndarray, np.ndarray], tuple[list[np.ndarray], list[np.ndarr
 
 
 def solve(model: Model, base: np.ndarray, s: np.ndarray, x: np.ndarray, groups: Sequence,
-          blocks: list[np.ndarray], low: np.ndarray, high: np.ndarray, memory: int = 20,
+          blocks: list[np.ndarray], low: np.ndarray, high: np.ndarray, memory: dict,
           iterations: int = 15) -> Fit:
     """
     Levenberg-Marquardt in the standardised values.
@@ -142,7 +145,7 @@ def solve(model: Model, base: np.ndarray, s: np.ndarray, x: np.ndarray, groups: 
         blocks: (n_u,) number of the block of each sample, from 0, for each unit.
         low: (P,) lower bounds of theta; a value beyond is clipped.
         high: (P,) upper bounds.
-        memory: samples over which residuals are correlated.
+        memory: group -> samples over which its residuals may be correlated.
         iterations: largest number of iterations.
 
     """
@@ -204,14 +207,15 @@ def _judged(x, s, theta, residuals, slopes, groups, blocks, memory):
         moved = j.T @ (part @ deviations.T) if size else np.zeros((len(r), count))
         for b in range(count):
             held[b] += (robust(r[block == b] + moved[block == b, b])[0]**2).sum()
-    ratio = 1.0
+    ratio, correlated = 1.0, np.zeros(size)
     if size:
         inverse = np.linalg.inv(information)
-        spread = sum(_long_run(g, memory) for g in series.values())
+        spread = sum(_long_run(g, memory[group]) for group, g in series.items())
         ratio = np.trace(inverse @ spread) / max(np.trace(inverse @ (information - np.eye(size))),
                                                  1e-9)
+        correlated = np.diag(inverse @ spread @ inverse)
     return Fit(x, s, theta, float(sum(r @ r for r in residuals)), information, held, deviations,
-               float(max(ratio, 1.0)))
+               float(max(ratio, 1.0)), correlated)
 
 
 def _long_run(scores, memory):

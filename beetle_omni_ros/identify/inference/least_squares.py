@@ -3,56 +3,17 @@ Nonlinear least squares with priors for many small problems at once.
 
 The chi2 of a problem is the sum of squared whitened residuals and of its prior's residuals. The
 method is Levenberg-Marquardt within bounds. A robust loss is applied to the residual
-(:func:`huber`, :func:`soft_l1`).
+(:func:`huber`).
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
 from beetle_omni_ros.identify.inference.prior import Prior
 
 HUBER = 3.0         # standard deviations from which the loss is linear
-
-
-@dataclass(frozen=True)
-class Coordinates:
-    """
-    Encoding of P parameters as points (..., P): values or logarithms, over their scales.
-
-    Attributes:
-        each: P parameters with ``low``, ``high``, ``scale`` (a relevant change) and
-            ``logarithmic``.
-        scale, logarithmic: (P,) attributes of each.
-        low, high: (P,) bounds of points.
-
-    """
-
-    each: Sequence[Any]
-    scale: np.ndarray = field(init=False)
-    logarithmic: np.ndarray = field(init=False)
-    low: np.ndarray = field(init=False)
-    high: np.ndarray = field(init=False)
-
-    def __post_init__(self):
-        for name in ('scale', 'logarithmic'):
-            object.__setattr__(self, name, np.array([getattr(one, name) for one in self.each]))
-        for side in ('low', 'high'):
-            object.__setattr__(self, side, self.encode(
-                np.array([getattr(one, side) for one in self.each])))
-
-    def encode(self, values: np.ndarray) -> np.ndarray:
-        """Points of values (..., P)."""
-        return np.where(self.logarithmic, np.log(np.where(self.logarithmic, values, 1.0)),
-                        values) / self.scale
-
-    def decode(self, points: np.ndarray) -> np.ndarray:
-        """Inverse of :meth:`encode`."""
-        values = points * self.scale
-        return np.where(self.logarithmic, np.exp(np.where(self.logarithmic, values, 0.0)),
-                        values)
 
 
 @dataclass(frozen=True)
@@ -81,12 +42,6 @@ def huber(white: np.ndarray) -> np.ndarray:
     size = np.abs(white)
     clipped = np.sqrt(np.maximum(2 * HUBER * size - HUBER**2, 0)) * np.sign(white)
     return np.where(size > HUBER, clipped, white)
-
-
-def soft_l1(residual: np.ndarray, scale: float) -> np.ndarray:
-    """Residuals whose squares sum to 2 scale^2 (sqrt(1 + (r / scale)^2) - 1)."""
-    size = np.sqrt(2 * (np.sqrt(1 + (residual / scale)**2) - 1))
-    return scale * size * np.sign(residual)
 
 
 @dataclass(frozen=True)
@@ -158,14 +113,6 @@ def minimise(points: np.ndarray, free: np.ndarray, low: np.ndarray, high: np.nda
     return Fits(points, chi2)
 
 
-def differences(residual: Callable[[np.ndarray, np.ndarray], np.ndarray], step: float) -> Callable:
-    """Jacobian for :func:`minimise` by one-sided differences of ``step`` in each coordinate."""
-    def jacobian(points, rows, base):
-        return np.stack([(residual(points + move, rows) - base) / step
-                         for move in step * np.eye(points.shape[1])], axis=1)
-    return jacobian
-
-
 def _step(points, normal, slope, free, low, high, damping):
     """Damped steps (B, P); coordinates at a bound with an outward gradient stay."""
     stuck = ((points <= low + 1e-9) & (slope > 0)) | ((points >= high - 1e-9) & (slope < 0))
@@ -187,15 +134,3 @@ def solved(h: np.ndarray, right: np.ndarray, ridge: float = 1e-9) -> np.ndarray:
     scale = 1 / np.sqrt(np.maximum(np.diag(h), 1e-12))
     inner = h * scale[:, None] * scale + ridge * np.eye(len(h))
     return (scale * np.linalg.solve(inner, (scale * right.T).T).T).T
-
-
-def covariance(information: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """
-    (P, P) inverse of the information on the free parameters; 0 for the others.
-
-    A direction without information gets a width of thousands of scales instead of inf.
-    """
-    result = np.zeros_like(information)
-    chosen = np.ix_(free, free)
-    result[chosen] = np.linalg.inv(information[chosen] + 1e-7 * np.eye(free.sum()))
-    return result

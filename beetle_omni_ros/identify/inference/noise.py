@@ -1,6 +1,5 @@
 """Coloured noise: autoregressions of residuals, and whitening filters."""
 
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import solve_toeplitz
@@ -43,52 +42,3 @@ def gain(taps: np.ndarray) -> float:
     # Mean over the whole circle; over a half circle, the zero frequency would count twice.
     response = np.fft.fft(taps, 4096)
     return float(np.mean(1 / np.maximum(np.abs(response)**2, 1e-9)))
-
-
-@dataclass(frozen=True)
-class Noise:
-    """
-    An autoregression for each of several channels.
-
-    Attributes:
-        taps: (n, order + 1) prediction-error filters; (n, 1) ones: white.
-        sigma: (n,) standard deviation of the innovation.
-
-    """
-
-    taps: np.ndarray
-    sigma: np.ndarray
-
-    @classmethod
-    def white(cls, channels: int, sigma: float = 1.0):
-        """White noise."""
-        return cls(np.ones((channels, 1)), np.full(channels, sigma))
-
-    @classmethod
-    def of(cls, residual: np.ndarray, order: int, floor: float):
-        """
-        Estimate the noise from residuals; outliers are clipped.
-
-        Args:
-            residual: (n, N) residuals.
-            order: order of the filters.
-            floor: least standard deviation, by the quantisation of the readings.
-
-        """
-        result = []
-        for row in residual:
-            middle = np.median(row)
-            reach = 6 * 1.4826 * np.median(np.abs(row - middle)) + 1e-9
-            result.append(autoregression([np.clip(row, middle - reach, middle + reach)], order,
-                                         1e-7))
-        taps, sigma = zip(*result, strict=True)
-        return cls(np.array(taps), np.maximum(sigma, floor))
-
-    def whiten(self, residual: np.ndarray, channel: np.ndarray) -> np.ndarray:
-        """(B, N) residuals of channels (B,) with unit variance; their first samples are 0."""
-        white = np.zeros_like(residual)
-        for k in np.unique(channel):
-            rows = channel == k
-            white[rows, self.taps.shape[1] - 1:] = whitened(
-                residual[rows].T, self.taps[k], self.sigma[k]).T
-        return white

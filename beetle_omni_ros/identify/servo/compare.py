@@ -87,7 +87,7 @@ def is_joint_log(path: Path) -> bool:
 
 def compare(log: JointLog, robot: RobotParameters) -> Found:
     """The entries by which a log differs from the servos of a robot file."""
-    return select(Servos([log], file_sets(robot)), (), NAMED, CERTAIN, named=True)
+    return select(Servos([log], file_sets(robot), one_delay=True), (), NAMED, CERTAIN, named=True)
 
 
 def gap_of(found: Found, apart: Found, robot: RobotParameters) -> dict:
@@ -113,7 +113,7 @@ def gap_of(found: Found, apart: Found, robot: RobotParameters) -> dict:
     total = {key: float(np.sqrt(np.mean(values**2)))
              for key, values in (('before', before), ('after', after), ('floor', floor))}
     closure = None if total['before'] <= 1.1 * total['floor'] else float(
-        1 - max(total['after']**2 - total['floor']**2, 0.0)
+        1.0 - max(total['after']**2 - total['floor']**2, 0.0)
         / (total['before']**2 - total['floor']**2))
     verdict = ('unknown' if not explained else 'no_gap' if not effects else
                'named_set' if any(len(e['names']) > 1 for e in effects) else 'named')
@@ -249,7 +249,7 @@ def changes(before: JointLog, after: JointLog, robot: RobotParameters) -> list[d
         a row for each joint of both logs and each of ``ROWS``: second ``log``, ``joint``, ``name``
         of the catalogue entry, ``parameter``, ``unit``, ``before``, ``after``, ``difference``, its
         95 % ``interval``, and ``significant``: at most 5 % of pairs of logs without a change have
-        any significant row.
+        any significant row. An angle must change by an encoder count.
 
     """
     entries = [*ALWAYS, 'joint_offset']
@@ -259,7 +259,7 @@ def changes(before: JointLog, after: JointLog, robot: RobotParameters) -> list[d
         full = s.estimate_noise(s.candidates())
         chosen = s.fit(entries, starts=(full,))
         fits.append(Found(s, full, chosen, {}, {}))
-    joints = [j for j in before.joints if j in after.joints]
+    joints, count = [j for j in before.joints if j in after.joints], before.quantum
     rows, least = [], norm.isf(0.05 / 2 / max(len(joints) * len(ROWS), 1))
     for number in joints:
         for name, parameter, unit in ROWS:
@@ -271,7 +271,8 @@ def changes(before: JointLog, after: JointLog, robot: RobotParameters) -> list[d
                          'parameter': parameter, 'unit': unit, 'before': old, 'after': new,
                          'difference': difference,
                          'interval': [difference - WIDTH * error, difference + WIDTH * error],
-                         'significant': bool(abs(difference) > least * error)})
+                         'significant': bool(abs(difference) > max(
+                             least * error, count if unit == 'rad' else 0.0))})
     return rows
 
 

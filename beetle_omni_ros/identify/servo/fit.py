@@ -8,7 +8,7 @@ one type share their values, and each has its own deviation. Two logs differ in 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2
@@ -32,7 +32,7 @@ STEP = np.where(LOGARITHMIC, 0.01, 2e-4)      # of the derivatives
 SPREADS = {
     'natural_frequency': Spread(0.5, {'joint': 0.15}),
     'damping_ratio': Spread(0.5, {'joint': 0.15}),
-    'delay': Spread(0.02, {'log': 0.01}),        # one bus
+    'delay': Spread(0.02, {'joint': 0.002, 'log': 0.01}),
     'offset': Spread(0.0, {'joint': 0.02, 'unit': 0.01}),
     'coulomb_friction': Spread(0.02, {'joint': 0.01, 'unit': 0.004}),
     'stiction': Spread(0.01, {}),
@@ -101,17 +101,21 @@ class Servos:
         logs: response logs.
         base: (J, P) parameter sets of gimbal1 to gimbal4 from which the fits deviate.
         fitted: fraction of each log that is fitted; by default that of params/identify.yaml.
+        one_delay: whether all joints have the same delay, as in a robot file.
 
     """
 
-    def __init__(self, logs: Sequence[JointLog], base: np.ndarray, fitted: float | None = None):
+    def __init__(self, logs: Sequence[JointLog], base: np.ndarray, fitted: float | None = None,
+                 one_delay: bool = False):
         p = shipped().servo
         fitted = p.fitted if fitted is None else fitted
         self.logs = list(logs)
         self.units = [(k, j, number) for k, log in enumerate(logs)
                       for j, number in enumerate(log.joints)]
         self.base = encoded(np.array([base[number - 1] for _, _, number in self.units]))
-        self.labels = {'joint': [number for *_, number in self.units],
+        self.spreads = [replace(SPREADS[name], groups={'log': 0.01})
+                        if one_delay and name == 'delay' else SPREADS[name] for name in NAMES]
+        self.labels: dict[str, Sequence] = {'joint': [number for *_, number in self.units],
                        'log': [k for k, *_ in self.units], 'unit': self.units}
         self.rows, self.blocks = [], []
         for log in self.logs:
@@ -123,6 +127,8 @@ class Servos:
         self.sigma = np.full(len(self.units), p.first_noise)
         self._blocks = [self.blocks[k] for k, *_ in self.units]
         self.inflation = 1.0
+        self.memory = {k: round(p.memory / float(np.median(np.diff(log.read_t[log.fresh]))))
+                       for k, log in enumerate(self.logs)}
 
     # ---- model of the core
     def __call__(self, theta: np.ndarray, active: np.ndarray):
@@ -164,9 +170,9 @@ class Servos:
         The errors are those of the free simulation, so they include what no term describes. They
         are correlated, hence :attr:`inflation`.
         """
-        trial = None
-        for _ in range(3):
-            trial = self.fit(entries, starts=STARTS if trial is None else (trial,))
+        trial = self.fit(entries)
+        for k in range(3):
+            trial = self.fit(entries, starts=(trial,)) if k else trial
             residuals, _ = self(trial.fit.theta, np.zeros(len(NAMES), dtype=bool))
             least = [self.logs[k].quantum / np.sqrt(12) for k, *_ in self.units]
             self.sigma = np.maximum(self.sigma * [1.4826 * np.median(np.abs(r)) if len(r) else 1.0
@@ -184,7 +190,7 @@ class Servos:
 
         """
         active = mask(entries)
-        s = design([SPREADS[name] for name in NAMES], self.labels, active)
+        s = design(self.spreads, self.labels, active)
         fits = []
         for start in starts or STARTS:
             target = self.base.copy()
@@ -197,7 +203,8 @@ class Servos:
                     if active[p]:
                         target[:, p] = np.log(value) if LOGARITHMIC[p] else value
             x = self._nearest(s, target)
-            fits.append(solve(self, self.base, s, x, self.labels['log'], self._blocks, LOW, HIGH))
+            fits.append(solve(self, self.base, s, x, self.labels['log'], self._blocks, LOW, HIGH,
+                              self.memory))
         return Trial(tuple(entries), min(fits, key=lambda fit: fit.chi2 + fit.x @ fit.x))
 
     def evidence(self, trial: Trial) -> float:

@@ -78,7 +78,7 @@ TERMS = {
 }
 NAMES = tuple(TERMS)
 INDEX = {name: k for k, name in enumerate(NAMES)}
-READING_ERRORS = {'encoder_gain': lambda q: q, 'encoder_sine': np.sin,
+READING_ERRORS: dict[str, Callable] = {'encoder_gain': lambda q: q, 'encoder_sine': np.sin,
                   'encoder_cosine': lambda q: np.cos(q) - 1}
 OFF = np.array([term.off for term in TERMS.values()])
 STEP_TERMS = tuple(name for name, term in TERMS.items() if term.in_step)
