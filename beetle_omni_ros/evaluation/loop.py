@@ -24,6 +24,7 @@ from beetle_omni_ros.evaluation.compute import collector_off, ComputeTimer
 from beetle_omni_ros.evaluation.processes import Processes
 from beetle_omni_ros.messages.values import Odom, Wrench
 from beetle_omni_ros.robot.actuator_health import ALL_HEALTHY
+from beetle_omni_ros.robot.effects import SensorErrors
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.target_checks import TargetChecks
 from beetle_omni_ros.runs.tasks import Task, TaskPlayer
@@ -70,8 +71,9 @@ class FlightLoop:
     def __init__(self, simulator: Simulator, estimator: ErrorStateEkf,
                  controllers: dict[str, Controller], supervisor: Supervisor, recorder,
                  gyroscope_noise: float, faults: Sequence[Fault] = (),
-                 check_target: Callable[[Target], str] = lambda target: ''):
-        self._gyroscope_noise = gyroscope_noise
+                 check_target: Callable[[Target], str] = lambda target: '',
+                 errors: SensorErrors = SensorErrors()):
+        self._gyroscope_noise, self._errors = gyroscope_noise, errors
         self._faults, self._check_target = tuple(faults), check_target
         self._processes = Processes(simulator.tick, supervisor)
         self._other_target: Target | None = None     # of a fault
@@ -115,7 +117,8 @@ class FlightLoop:
         loop = cls(
             Simulator(plant, SimulatorParameters.load(), conditions=conditions, seed=seed),
             ErrorStateEkf(estimator, robot.gravity), controllers, supervisor, recorder,
-            estimator.imu.gyroscope_noise, faults, TargetChecks(robot).why_not)
+            estimator.imu.gyroscope_noise, faults, TargetChecks(robot).why_not,
+            robot.sensors)
         supervisor.select(active)
         return loop
 
@@ -272,9 +275,9 @@ class FlightLoop:
             send('on_mocap', frame.mocap.stamp, frame.mocap.position, frame.mocap.quaternion)
             recorder.write('mocap/pose', frame.mocap, now)
         if frame.joints is not None:
-            self._joints = joints = frame.joints
+            self._joints = joints = frame.joints.corrected(self._errors)
             send('on_joints', joints.stamp, joints.position, joints.velocity)
-            recorder.write('joint_states', joints, now)
+            recorder.write('joint_states', frame.joints, now)
         if frame.battery is not None:
             send('on_battery', frame.battery.voltage)
             recorder.write('battery_state', frame.battery)

@@ -52,7 +52,7 @@ class ControllerNode(FlightNode):
         robot = RobotParameters.load(self.parameters.robot_file or None)
         controller = entry.make(robot, parameters=self.parameters if entry.parameters else None)
         self._host = ControllerHost(entry.name, controller, self.timed, self._log)
-        self._checks = TargetChecks(robot)
+        self._checks, self._sensors = TargetChecks(robot), robot.sensors
         self._joints = self._command = None
         self._last_step = 0.0
         self._reported_errors, self._logged = 0, ('', -math.inf)    # text, time of the line
@@ -71,7 +71,7 @@ class ControllerNode(FlightNode):
         self.health.report('controller', self._controller_status)
 
     def _on_joints(self, joints):
-        self._joints = joints
+        self._joints = joints.corrected(self._sensors)
 
     def _on_command(self, command):
         self._command = command

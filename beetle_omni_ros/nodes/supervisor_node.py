@@ -50,6 +50,7 @@ class SupervisorNode(FlightNode):
         super().__init__('supervisor_node', SupervisorNodeParameters, 'params/supervisor.yaml',
                          'supervisor_file', self._changed, changeable=('controller',))
         robot = RobotParameters.load(self.parameters.robot_file or None)
+        self._sensors = robot.sensors
         self._controllers = [registry.find(name).name if ':' in name else name
                              for name in self.parameters.controllers]
         if self.parameters.controller not in self._controllers:
@@ -111,6 +112,7 @@ class SupervisorNode(FlightNode):
         return handle
 
     def _on_joints(self, joints):
+        joints = joints.corrected(self._sensors)
         if not np.isnan(joints.position).any():
             self._joints = joints
         self._supervisor.on_joints(joints.stamp, joints.position, joints.velocity)

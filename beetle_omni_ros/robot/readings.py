@@ -1,11 +1,14 @@
 """Readings of sensors and devices, simulated or real: stamps of capture [s], SI units."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import sqrt
 
 import numpy as np
 
+from beetle_omni_ros.robot.effects import SensorErrors
 from beetle_omni_ros.robot.parameters import JOINT_NAMES
 
 
@@ -62,6 +65,11 @@ class JointReading:
     velocity: np.ndarray | None
     effort: np.ndarray | None = None
     names: Sequence[str] = JOINT_NAMES
+
+    def corrected(self, errors: SensorErrors) -> JointReading:
+        """The reading without the errors of the encoders that the robot file states."""
+        return replace(self, position=errors.tilts(self.position)) if errors.encoders_err \
+            else self
 
 
 @dataclass(frozen=True, slots=True)
