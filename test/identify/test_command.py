@@ -82,8 +82,12 @@ def test_a_bad_validation_log_is_refused_before_the_fit(logs, tmp_path, capsys):
     bad = tmp_path / 'bad.csv'
     bad.write_text('t_s,x\n1,2\n')
     assert 'bad.csv' in refused(capsys, 'identify', 'joint', logs[0], '--validate', bad)
-    message = refused(capsys, 'identify', 'joint', logs[0], logs[1])
-    assert str(logs[1]) in message and 'after --validate' in message
+
+
+def test_several_logs_are_fitted_together(logs, tmp_path):
+    path = tmp_path / 'r.json'
+    assert cli.main([str(a) for a in ('identify', 'joint', *logs[:2], '--json', path)]) == 0
+    assert json.loads(path.read_text())['meta']['logs'] == ['slow.csv', 'fast.csv']
 
 
 def test_help_lists_the_options(capsys):
