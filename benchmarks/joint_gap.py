@@ -34,6 +34,7 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 DATA = Path(__file__).resolve().parents[2] / 'shared' / 'data'
 COUNT = 2 * np.pi / 4096    # [rad] of the encoder
 BLOCK = 1.0                 # [s] of a drawn block of the residual
+WAYS = ('unchanged', 'shifted', 'blocks')       # of drawing the residual
 SIZE = (0.010, 0.020)       # [rad] of a change
 # Kind of change -> the entry that must be named; of a single joint's zero or encoder, with it.
 KINDS = {'nothing': None, 'zero': 'joint_offset', 'two zeros': 'joint_offset',
@@ -94,12 +95,11 @@ def changed(sets: np.ndarray, log: JointLog, kind: str, rng: np.random.Generator
         '' if which == slice(None) else f', joint {log.joints[joints[0]]}')
 
 
-def drawn(residual: np.ndarray, size: int, rng: np.random.Generator) -> np.ndarray:
+def drawn(residual: np.ndarray, size: int, way: str, rng: np.random.Generator) -> np.ndarray:
     """Noise (J, N) from a residual (J, N): unchanged, circularly shifted, or in blocks of size."""
-    way = rng.integers(3)
-    if way == 0:
+    if way == 'unchanged':
         return residual
-    if way == 1:
+    if way == 'shifted':
         return np.array([np.roll(row, rng.integers(len(row))) for row in residual])
     count = residual.shape[1]
     starts = rng.integers(count - size, size=(len(residual), -(-count // size)))
@@ -107,12 +107,12 @@ def drawn(residual: np.ndarray, size: int, rng: np.random.Generator) -> np.ndarr
                      for row, own in zip(residual, starts, strict=True)])
 
 
-def made_log(log: JointLog, before: np.ndarray, after: np.ndarray, rng) -> JointLog:
+def made_log(log: JointLog, before: np.ndarray, after: np.ndarray, way: str, rng) -> JointLog:
     """Log of servos ``after`` with commands, rows and residual to ``before`` of a real log."""
     joints, fresh = np.arange(len(log.joints)), np.flatnonzero(log.fresh)
     residual = (log.measured - simulate(log, joints, before))[:, fresh]
     size = round(BLOCK / float(np.median(np.diff(log.read_t[fresh]))))
-    read = simulate(log, joints, after)[:, fresh] + drawn(residual, size, rng)
+    read = simulate(log, joints, after)[:, fresh] + drawn(residual, size, way, rng)
     last = np.maximum(np.cumsum(log.fresh) - 1, 0)      # rows between readings repeat the last
     return JointLog('made.csv', log.t, log.joints, (np.round(read / COUNT) * COUNT)[:, last],
                     log.command)
@@ -167,9 +167,9 @@ def run(logs: Sequence[JointLog], cases: int, seed: int, console: Console) -> di
         kind, log = list(KINDS)[k % len(KINDS)], logs[k // len(KINDS) % len(logs)]
         before = sets[log.name]
         after, wanted, words = changed(before, log, kind, rng)
-        begin = time.process_time()
-        made = judged(made_log(log, before, after, rng), before, robot)
-        row = {'kind': kind, 'case': k, 'log': log.name, 'change': words,
+        begin, way = time.process_time(), WAYS[rng.integers(3)]
+        made = judged(made_log(log, before, after, way, rng), before, robot)
+        row = {'kind': kind, 'case': k, 'log': log.name, 'change': words, 'residual': way,
                **scored(made, wanted), 'reason': made['reason'],
                'effects': [[e['names'], e.get('joint'), {
                    key: e['parameters'][key].get('each', e['parameters'][key]['value'])
@@ -180,7 +180,7 @@ def run(logs: Sequence[JointLog], cases: int, seed: int, console: Console) -> di
                'seconds': time.process_time() - begin}
         rows.append(row)
         mark = '' if row['named'] and not row['wrong'] else '  <-'
-        console.print(f"{k} {log.name} {kind} {words}: {row['verdict']} "
+        console.print(f"{k} {log.name} {kind} {words} ({way}): {row['verdict']} "
                       f"{[e[:2] for e in row['effects']]}{mark}",
                       highlight=False, markup=False, soft_wrap=True)
     return {'seed': seed, 'real': real, 'cases': rows}

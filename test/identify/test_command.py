@@ -84,6 +84,12 @@ def test_a_bad_validation_log_is_refused_before_the_fit(logs, tmp_path, capsys):
     assert 'bad.csv' in refused(capsys, 'identify', 'joint', logs[0], '--validate', bad)
 
 
+def test_several_logs_are_fitted_together(logs, tmp_path):
+    path = tmp_path / 'r.json'
+    assert cli.main([str(a) for a in ('identify', 'joint', *logs[:2], '--json', path)]) == 0
+    assert json.loads(path.read_text())['meta']['logs'] == ['slow.csv', 'fast.csv']
+
+
 def test_help_lists_the_options(capsys):
     for command in (['identify'], ['identify', 'joint'], ['identify', 'rotor']):
         assert cli.main([*command, '--help']) == 0

@@ -9,10 +9,11 @@ import pytest
 from servo_logs import COUNT, log_of, sweep
 
 from beetle_omni_ros.identify.parameters import shipped
-from beetle_omni_ros.identify.servo.fit import encoded, error_rms, NAMES, Servos
-from beetle_omni_ros.identify.servo.joint import identify, interval, joint_results
+from beetle_omni_ros.identify.servo.fit import decoded, encoded, error_rms, NAMES, Servos
+from beetle_omni_ros.identify.servo.joint import ALWAYS, identify, interval, joint_results
 from beetle_omni_ros.identify.servo.log import read_joint_log
 from beetle_omni_ros.identify.servo.model import INDEX, published_set
+from beetle_omni_ros.identify.servo.robot import file_sets
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 ROBOT = RobotParameters.load()
@@ -22,8 +23,8 @@ REAL = [path for path in (DATA / f'joint_{name}.csv' for name in (
 PARTS = {'slow': {'duration': 6.0},
          'fast': {'duration': 4.0, 'periods': (0.3, 0.6), 'amplitudes': (0.3, 0.6)}}
 SERVOS = ({'coulomb': 0.013, 'frequency': 47.0, 'delay': 0.015},
-          {'backlash': 0.015, 'frequency': 44.0, 'delay': 0.016, 'coulomb': 0.013},
-          {'coulomb': 0.030, 'frequency': 52.0, 'delay': 0.014, 'offset': 0.012})
+          {'backlash': 0.015, 'frequency': 44.0, 'delay': 0.015, 'coulomb': 0.013},
+          {'coulomb': 0.030, 'frequency': 52.0, 'delay': 0.015, 'offset': 0.012})
 TRUE = {'natural_frequency': 'frequency', 'delay': 'delay', 'coulomb_friction': 'coulomb',
         'backlash': 'backlash', 'offset': 'offset'}
 WITHIN = {'natural_frequency': 4.0, 'delay': 0.003, 'coulomb_friction': 0.003,
@@ -70,11 +71,9 @@ def test_a_slow_log_determines_the_lag_and_the_friction():
     one = found('slow')
     lags = [servo['delay'] + 2 * 0.63 / servo['frequency'] for servo in SERVOS]
     assert ramp_lag(one.values()) == pytest.approx(lags, abs=1e-3)
-    # A slow log does not separate friction from play, only their sum.
-    for values, servo in zip(one.values(), SERVOS, strict=True):
-        band = values[INDEX['coulomb_friction']] + values[INDEX['backlash']]
-        assert band == pytest.approx(servo['coulomb'] + servo.get('backlash', 0.0), abs=0.004)
-        assert values[INDEX['offset']] == pytest.approx(servo.get('offset', 0.0), abs=0.004)
+    bands = [sum(servo.get(key, 0.0) for key in ('coulomb', 'backlash')) for servo in SERVOS]
+    assert one.values()[:, [INDEX['coulomb_friction'], INDEX['backlash']]].sum(axis=1) \
+        == pytest.approx(bands, abs=0.004)
 
 
 def test_unneeded_terms_are_rejected():
@@ -95,15 +94,17 @@ def test_only_a_slow_log_confounds_delay_and_bandwidth():
 def test_two_logs_with_different_delays_narrow_the_common_frequency():
     later = tuple({**servo, 'delay': servo['delay'] + 0.008} for servo in SERVOS)
     second = log_of(*sweep(**PARTS['fast']), later, seed=5, name='later')
-    both, first = identify([made('fast'), second], ROBOT), found('fast')
-    delays = [both.of_log(k)[:, INDEX['delay']].mean() for k in (0, 1)]
-    assert np.diff(delays) == pytest.approx(0.008, abs=5e-4)
-    # both logs share the frequencies
-    assert both.of_log(0)[:, 0] == pytest.approx(both.of_log(1)[:, 0])
-    wide, narrow = ([np.ptp(interval(one, one.chosen, unit, 'natural_frequency'))
-                     for unit in range(3)] for one in (first, both))
-    assert np.mean(narrow) < 0.9 * np.mean(wide)
-    assert both.of_log(0)[:, 0] == pytest.approx([s['frequency'] for s in SERVOS], abs=3.0)
+    fits = []
+    for logs in ([made('fast')], [made('fast'), second]):
+        servos = Servos(logs, file_sets(ROBOT))
+        fits.append(servos.fit([*ALWAYS, 'joint_offset', 'joint_backlash']).fit)
+    both = decoded(fits[1].theta)
+    assert both[3:, INDEX['delay']] - both[:3, INDEX['delay']] == pytest.approx(0.008, abs=5e-4)
+    assert both[:3, 0] == pytest.approx(both[3:, 0])        # both logs share the frequencies
+    assert both[:3, 0] == pytest.approx([servo['frequency'] for servo in SERVOS], abs=3.0)
+    wide, narrow = (np.mean([part[0] @ np.linalg.inv(fit.information) @ part[0]
+                             for part in fit.s]) for fit in fits)
+    assert narrow < 0.75 * wide     # variance; half with twice the data, but for the deviations
 
 
 def test_fits_of_the_slow_log_predict_the_fast_one():

@@ -207,8 +207,7 @@ def test_the_command_line_writes_a_file_that_explains_the_log(tmp_path, capsys):
         ('log.csv', 11, {}), ('later.csv', 12, {'offset': 0.02})))
     new, first, second = (tmp_path / name for name in ('new.yaml', 'a.json', 'b.json'))
     assert cli.main([str(a) for a in ('gap', log, later, '--apply', new, '--json', first)]) == 0
-    shown = capsys.readouterr().out
-    assert 'Changes to later.csv' in shown
+    assert 'Changes to later.csv' in capsys.readouterr().out
     result = json.loads(first.read_text())
     assert result['verdict'] in ('named', 'named_set')
     assert {'joint', 'name', 'parameter', 'before', 'after', 'difference', 'interval',

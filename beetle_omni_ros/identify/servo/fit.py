@@ -118,6 +118,7 @@ class Servos:
         self.labels: dict[str, Sequence] = {'joint': [number for *_, number in self.units],
                        'log': [k for k, *_ in self.units], 'unit': self.units}
         self.rows, self.blocks = [], []
+        self._parts = [log.first(fitted) for log in self.logs]
         for log in self.logs:
             settled = log.t >= log.t[0] + p.settling
             rows = np.flatnonzero(log.fresh & settled & (np.arange(len(log.t))
@@ -239,15 +240,15 @@ class Servos:
                                * np.eye(len(flat.T)), flat.T @ off)
 
     def _reached(self, name):
-        """Largest speed [rad/s], or position error [rad], of the logs."""
+        """Largest speed [rad/s], or position error [rad], of the fitted parts."""
         if name == 'velocity_limit':
-            return max(log.speed().max() for log in self.logs)
-        return max(np.abs(log.command - log.measured).max() for log in self.logs)
+            return max(log.speed().max() for log in self._parts)
+        return max(np.abs(log.command - log.measured).max() for log in self._parts)
 
     def candidates(self) -> list[str]:
         """Entries that these logs can show: a limit only if the commands exceed it."""
         least = shipped().servo.beyond
-        beyond = any((log.command_speed() > least * log.speed()).any() for log in self.logs)
+        beyond = any((log.command_speed() > least * log.speed()).any() for log in self._parts)
         return [name for name in ENTRIES if beyond or name not in LIMITS]
 
 
