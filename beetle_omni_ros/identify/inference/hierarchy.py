@@ -130,7 +130,7 @@ Model = Callable[[np.ndarray, np.ndarray], tuple[list[np.ndarray], list[np.ndarr
 
 
 def solve(model: Model, base: np.ndarray, s: np.ndarray, x: np.ndarray, groups: Sequence,
-          blocks: list[np.ndarray], low: np.ndarray, high: np.ndarray, memory: dict,
+          blocks: list[np.ndarray], low: np.ndarray, high: np.ndarray, memory: dict | int = 20,
           iterations: int = 15) -> Fit:
     """
     Levenberg-Marquardt in the standardised values.
@@ -145,7 +145,7 @@ def solve(model: Model, base: np.ndarray, s: np.ndarray, x: np.ndarray, groups: 
         blocks: (n_u,) number of the block of each sample, from 0, for each unit.
         low: (P,) lower bounds of theta; a value beyond is clipped.
         high: (P,) upper bounds.
-        memory: group -> samples over which its residuals may be correlated.
+        memory: samples over which residuals may be correlated, for all groups or by group.
         iterations: largest number of iterations.
 
     """
@@ -210,7 +210,8 @@ def _judged(x, s, theta, residuals, slopes, groups, blocks, memory):
     ratio, correlated = 1.0, np.zeros(size)
     if size:
         inverse = np.linalg.inv(information)
-        spread = sum(_long_run(g, memory[group]) for group, g in series.items())
+        spread = sum(_long_run(g, memory[group] if isinstance(memory, dict) else memory)
+                     for group, g in series.items())
         ratio = np.trace(inverse @ spread) / max(np.trace(inverse @ (information - np.eye(size))),
                                                  1e-9)
         correlated = np.diag(inverse @ spread @ inverse)
