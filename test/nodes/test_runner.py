@@ -44,7 +44,7 @@ def wait_until_it_spins(process):
     ('ekf_node', ['--params-file', '/nowhere.yaml'], '/nowhere.yaml: cannot be read'),
     ('ekf_node', ['-p', 'imu.rate'], 'imu.rate'),
     ('reference_node', ['-p', 'task:=somersault'], "task 'somersault': expected"),
-    ('ekf_node', ['-p', 'robot_file:=/nowhere.yaml'], '/nowhere.yaml: cannot be read'),
+    ('ekf_node', ['-p', 'robot_file:=/nowhere.yaml'], '/nowhere.yaml: no such file'),
 ])
 def test_unusable_parameters_end_in_one_line_and_status_2(ros_domain, node, arguments, named):
     status, error = finish(start(node, '--ros-args', *arguments))
