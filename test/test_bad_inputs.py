@@ -174,8 +174,6 @@ def rows():
     for value, fragment in (('times.csv', 'times.csv'), ('one_joint.csv', 'one_joint.csv'),
                         ('word_joint.csv', 'word_joint.csv')):
         yield ['identify', 'joint', value], fragment
-    yield (['identify', 'joint', 'times.csv', 'more.csv'],
-           'more.csv: the identification uses one log')
     for option, value, fragment in (
             ('--seconds', '0', "--seconds '0': expected"), ('--seconds', 'x', "--seconds 'x'"),
             ('--seconds', 'nan', "--seconds 'nan'"), ('--skip', 'legs', "--skip 'legs': expected"),

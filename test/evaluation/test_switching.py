@@ -172,6 +172,6 @@ def test_a_policy_of_another_robot_flies_with_permission(tmp_path):
     from hover_policy import write_hover_policy
     options = ControllerOptions(policy=write_hover_policy(tmp_path / 'p.onnx'))
     other = replace(ROBOT, mass=3.1)
-    with pytest.raises(ParameterError, match='robot_hash'):
+    with pytest.raises(ParameterError, match='mass 3.0386 in training, 3.1 here'):
         registry.make('rl', other, options)
     registry.make('rl', other, replace(options, allow_other_robot=True))

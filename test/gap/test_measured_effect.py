@@ -18,8 +18,7 @@ from beetle_omni_ros.identify.gap.command import gap_results
 from beetle_omni_ros.identify.gap.ingest import prepare
 from beetle_omni_ros.identify.gap.signals import Signals
 from beetle_omni_ros.robot import effects
-from beetle_omni_ros.robot.effects import CATALOGUE, Treatment
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.effects import CATALOGUE
 
 NAME, LOSS = 'charge_fade', 0.15
 made: dict = {}
@@ -42,14 +41,6 @@ def test_a_consumer_without_the_quantity_leaves_the_effect_out_with_a_reason(con
     assert not treatment.acts and 'no charge was drawn' in treatment.reason
     found = np.concatenate([np.ravel(part) for part in OUTPUTS[consumer](faded())])
     np.testing.assert_array_equal(found, plain(consumer))
-
-
-@pytest.mark.parametrize('consumer', ['nmpc', 'training'])
-def test_an_entry_may_have_a_consumer_refuse_it(consumer, monkeypatch):
-    monkeypatch.setitem(CATALOGUE, NAME, replace(FADE, treatments={
-        consumer: Treatment(False, 'it has no current of the pack', error=True)}))
-    with pytest.raises(ParameterError, match=f'{NAME}: .* it has no current of the pack'):
-        OUTPUTS[consumer](faded())
 
 
 def test_the_plant_applies_it():
@@ -80,16 +71,11 @@ def test_without_a_current_no_charge_is_drawn_and_the_voltage_is_kept():
     assert signals.voltage.max() < 1
 
 
-def test_the_gap_finder_identifies_it_with_an_interval_that_covers_the_truth(
-        tmp_path, monkeypatch):
+def test_the_gap_finder_identifies_it_with_an_interval_that_covers_the_truth(tmp_path):
     beetle_omni_ros.simulate('hover', THREE_POSES[:2], plant=faded(), seed=1,
                              bag=tmp_path / 'flight')
-    monkeypatch.setitem(CATALOGUE, NAME, replace(FADE, treatments={
-        'nmpc': Treatment(False, 'it has no current', error=True)}))
     console = Console(file=io.StringIO(), width=200)
     found = gap_results([tmp_path / 'flight'], apply=tmp_path / 'new.yaml', console=console)
-    assert 'note: charge_fade: refused by the NMPC and allocation: it has no current\n' \
-        in console.file.getvalue()
     assert found['verdict'] == 'named'
     effect, = found['effects']
     assert effect['names'] == [NAME]

@@ -55,9 +55,8 @@ def test_a_declaration_is_complete_and_consistent(name):
     assert effect.source and effect.excited_by and effect.separated_by
     assert all(other in CATALOGUE for other in effect.confused_with)
     assert set(effect.channels) <= set('BAWJ') and effect.channels
-    for other in ('same_response', 'log_rival'):
-        rival = getattr(effect, other)
-        assert not rival or getattr(CATALOGUE[rival], other) == name
+    rival = effect.same_response
+    assert not rival or CATALOGUE[rival].same_response == name
     for form in effect.forms:
         assert set(form) <= set(effect.parameters) - set(effect.numbers)
     if isinstance(effect.starts, tuple):

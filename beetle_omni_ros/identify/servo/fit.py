@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2
 
-from beetle_omni_ros.identify.inference.hierarchy import design, Fit, solve, Spread
+from beetle_omni_ros.identify.inference.hierarchy import design, Fit, solve
 from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.servo.log import JointLog
 from beetle_omni_ros.identify.servo.model import (
@@ -23,41 +23,10 @@ from beetle_omni_ros.identify.servo.model import (
     simulate,
     TERMS,
 )
+from beetle_omni_ros.identify.servo.robot import ENTRIES, LIMITS
 
 LOGARITHMIC = np.array([term.logarithmic for term in TERMS.values()])
 STEP = np.where(LOGARITHMIC, 0.01, 2e-4)      # of the derivatives
-# Prior standard deviations about the robot file: of the common value, of each joint, of each log,
-# of each joint in each log.
-# Logarithms for frequency, damping and limits. Servos of one type differ by 10 to 15 %.
-SPREADS = {
-    'natural_frequency': Spread(0.5, {'joint': 0.15}),
-    'damping_ratio': Spread(0.5, {'joint': 0.15}),
-    'delay': Spread(0.02, {'joint': 0.002, 'log': 0.01}),
-    'offset': Spread(0.0, {'joint': 0.02, 'unit': 0.01}),
-    'coulomb_friction': Spread(0.02, {'joint': 0.01, 'unit': 0.004}),
-    'stiction': Spread(0.01, {}),
-    'backlash': Spread(0.02, {'joint': 0.01}),
-    'velocity_limit': Spread(1.0, {}),
-    'torque_limit': Spread(1.0, {}),
-    'load_sine': Spread(0.02, {'joint': 0.01}),
-    'load_cosine': Spread(0.02, {'joint': 0.01}),
-    'encoder_gain': Spread(0.0, {'joint': 0.02}),
-    'encoder_sine': Spread(0.0, {'joint': 0.02}),
-    'encoder_cosine': Spread(0.0, {'joint': 0.02}),
-}
-# Catalogue entry -> the terms that it changes.
-ENTRIES = {
-    'joint_bandwidth': ('natural_frequency', 'damping_ratio'),
-    'joint_command_latency': ('delay',),
-    'joint_friction': ('coulomb_friction', 'stiction'),
-    'joint_backlash': ('backlash',),
-    'joint_offset': ('offset',),
-    'joint_encoder_error': ('encoder_gain', 'encoder_sine', 'encoder_cosine'),
-    'joint_load': ('load_sine', 'load_cosine'),
-    'joint_velocity_limit': ('velocity_limit',),
-    'joint_torque_limit': ('torque_limit',),
-}
-LIMITS = ('joint_velocity_limit', 'joint_torque_limit')
 # Starts of terms whose chi2 has several minima, or no slope at zero.
 STARTS = ({'natural_frequency': 45.0, 'damping_ratio': 0.65, 'delay': 0.012,
            'coulomb_friction': 0.012, 'backlash': 0.002},
@@ -113,8 +82,10 @@ class Servos:
         self.units = [(k, j, number) for k, log in enumerate(logs)
                       for j, number in enumerate(log.joints)]
         self.base = encoded(np.array([base[number - 1] for _, _, number in self.units]))
-        self.spreads = [replace(SPREADS[name], groups={'log': 0.01})
-                        if one_delay and name == 'delay' else SPREADS[name] for name in NAMES]
+        self.spreads = [term.spread for term in TERMS.values()]
+        if one_delay:
+            delay = self.spreads[INDEX['delay']]
+            self.spreads[INDEX['delay']] = replace(delay, groups={'log': delay.groups['log']})
         self.labels: dict[str, Sequence] = {'joint': [number for *_, number in self.units],
                        'log': [k for k, *_ in self.units], 'unit': self.units}
         self.rows, self.blocks = [], []

@@ -27,7 +27,7 @@ from beetle_omni_ros.identify.servo.model import INDEX, NAMES, simulate, TERMS
 from beetle_omni_ros.identify.servo.robot import catalogue_values, file_sets, held
 from beetle_omni_ros.robot.parameters import RobotParameters
 
-ALWAYS = ('joint_bandwidth', 'joint_command_latency', 'joint_friction')
+ALWAYS = tuple(ENTRIES)[:3]     # gains, delay and friction, which every servo has
 RATE = 100.0        # [Hz] of a proposed log
 
 

@@ -18,6 +18,7 @@ import logging
 import casadi as ca
 import numpy as np
 
+from beetle_omni_ros.identify.inference.hierarchy import Spread
 from beetle_omni_ros.identify.servo.log import JointLog
 from beetle_omni_ros.robot.native import built, CompilerError, EXACT, generated
 from beetle_omni_ros.robot.parameters import JointParameters
@@ -38,6 +39,7 @@ class Term:
         low: smallest value of a fit.
         high: largest value of a fit.
         scale: relevant change; of the logarithm if ``logarithmic``.
+        spread: prior standard deviations about the robot file.
         logarithmic: whether its logarithm is fitted.
         words: name in a sentence; default its name.
         in_step: whether it is in the integration step, not before (delay, offset) or after it
@@ -50,31 +52,49 @@ class Term:
     low: float
     high: float
     scale: float
+    spread: Spread
     logarithmic: bool = False
     words: str = ''
     in_step: bool = True
 
 
+# The spreads are prior standard deviations about the robot file: of the common value, of each
+# joint, of each log, of each joint in each log; of logarithms where the term is logarithmic.
+# Servos of one type differ by 10 to 15 %, and their delays on one bus by 2 ms.
 TERMS = {
-    'natural_frequency': Term('rad/s', 60.0, 8.0, 400.0, 0.05, True, 'bandwidth'),  # sqrt(Kp / J)
-    'damping_ratio': Term('1', 0.9, 0.05, 20.0, 0.05, True, 'damping'),   # Kd / (2 sqrt(Kp J))
-    'delay': Term('s', 0.0, 0.0, 0.12, 0.002, in_step=False),
-    'offset': Term('rad', 0.0, -0.5, 0.5, 0.002, in_step=False),   # measured minus commanded
-    'coulomb_friction': Term('rad', 0.0, 0.0, 0.4, 0.002, words='friction'),  # half a dead band
-    'stiction': Term('rad', 0.0, 0.0, 0.4, 0.002),                # breakaway above that
+    # sqrt(Kp / J) and Kd / (2 sqrt(Kp J))
+    'natural_frequency': Term('rad/s', 60.0, 8.0, 400.0, 0.05, Spread(0.5, {'joint': 0.15}), True,
+                              'bandwidth'),
+    'damping_ratio': Term('1', 0.9, 0.05, 20.0, 0.05, Spread(0.5, {'joint': 0.15}), True,
+                          'damping'),
+    'delay': Term('s', 0.0, 0.0, 0.12, 0.002, Spread(0.02, {'joint': 0.002, 'log': 0.01}),
+                  in_step=False),
+    # measured minus commanded
+    'offset': Term('rad', 0.0, -0.5, 0.5, 0.002, Spread(0.0, {'joint': 0.02, 'unit': 0.01}),
+                   in_step=False),
+    # half a dead band, and the breakaway above that
+    'coulomb_friction': Term('rad', 0.0, 0.0, 0.4, 0.002,
+                             Spread(0.02, {'joint': 0.01, 'unit': 0.004}), words='friction'),
+    'stiction': Term('rad', 0.0, 0.0, 0.4, 0.002, Spread(0.01, {})),
     # play to each side, before the encoder
-    'backlash': Term('rad', 0.0, 0.0, 0.3, 0.002, words='play', in_step=False),
-    'velocity_limit': Term('rad/s', NEVER, 0.2, NEVER, 0.05, True, 'speed limit'),
-    'torque_limit': Term('rad', NEVER, 0.005, NEVER, 0.05, True,
+    'backlash': Term('rad', 0.0, 0.0, 0.3, 0.002, Spread(0.02, {'joint': 0.01}), words='play',
+                     in_step=False),
+    'velocity_limit': Term('rad/s', NEVER, 0.2, NEVER, 0.05, Spread(1.0, {}), True,
+                           'speed limit'),
+    'torque_limit': Term('rad', NEVER, 0.005, NEVER, 0.05, Spread(1.0, {}), True,
                          'torque limit (an error of position)'),
     # deflection ~ sin(q + phase): a weight on the joint
-    'load_sine': Term('rad', 0.0, -0.3, 0.3, 0.002, words='load (sine)'),
-    'load_cosine': Term('rad', 0.0, -0.3, 0.3, 0.002, words='load (cosine)'),
-    # Errors of the reading: gain q + sine sin q + cosine cos q; cosine is the first harmonic of an
-    # encoder whose axis is off the joint's, and so is sine.
-    'encoder_gain': Term('1', 0.0, -0.3, 0.3, 0.002, in_step=False),
-    'encoder_sine': Term('rad', 0.0, -0.3, 0.3, 0.002, in_step=False),
-    'encoder_cosine': Term('rad', 0.0, -0.3, 0.3, 0.002, in_step=False),
+    'load_sine': Term('rad', 0.0, -0.3, 0.3, 0.002, Spread(0.02, {'joint': 0.01}),
+                      words='load (sine)'),
+    'load_cosine': Term('rad', 0.0, -0.3, 0.3, 0.002, Spread(0.02, {'joint': 0.01}),
+                        words='load (cosine)'),
+    # Errors of the reading: gain q + sine sin q + cosine (cos q - 1). The harmonics are those of
+    # an encoder whose axis is off the joint's.
+    'encoder_gain': Term('1', 0.0, -0.3, 0.3, 0.002, Spread(0.0, {'joint': 0.02}), in_step=False),
+    'encoder_sine': Term('rad', 0.0, -0.3, 0.3, 0.002, Spread(0.0, {'joint': 0.02}),
+                         in_step=False),
+    'encoder_cosine': Term('rad', 0.0, -0.3, 0.3, 0.002, Spread(0.0, {'joint': 0.02}),
+                           in_step=False),
 }
 NAMES = tuple(TERMS)
 INDEX = {name: k for k, name in enumerate(NAMES)}

@@ -5,17 +5,26 @@ from __future__ import annotations
 import numpy as np
 
 from beetle_omni_ros.identify.servo.model import INDEX, NAMES, OFF, TERMS
+from beetle_omni_ros.robot.effects import delaying
 from beetle_omni_ros.robot.effects_actuator import per_joint
 from beetle_omni_ros.robot.parameters import RobotParameters
 
+# Catalogue entry -> the terms that it changes.
+ENTRIES = {
+    'joint_bandwidth': ('natural_frequency', 'damping_ratio'),
+    'joint_command_latency': ('delay',),
+    'joint_friction': ('coulomb_friction', 'stiction'),
+    'joint_backlash': ('backlash',),
+    'joint_offset': ('offset',),
+    'joint_encoder_error': ('encoder_gain', 'encoder_sine', 'encoder_cosine'),
+    'joint_load': ('load_sine', 'load_cosine'),
+    'joint_velocity_limit': ('velocity_limit',),
+    'joint_torque_limit': ('torque_limit',),
+}
+LIMITS = tuple(name for name in ENTRIES if name.endswith('_limit'))
 JOINTS = 4
-# Delays that a log does not separate from joint_command_latency.
-OTHER_DELAYS = ('command_latency', 'joint_feedback_delay')
-# Entries whose presence means that a file's numbers hold for commands that are held between rows.
-# The published gains come from a replay with interpolated commands.
-FOR_HELD = ('joint_bandwidth', 'joint_command_latency', 'joint_friction', 'joint_backlash',
-            'joint_offset', 'joint_encoder_error', 'joint_velocity_limit', 'joint_torque_limit',
-            *OTHER_DELAYS)
+# Delays that a log does not separate from that of the entry above.
+OTHER_DELAYS = tuple(name for name in delaying('tilt', 'encoders') if name not in ENTRIES)
 
 
 def other_delays(robot: RobotParameters) -> float:
@@ -25,7 +34,8 @@ def other_delays(robot: RobotParameters) -> float:
 
 def held(robot: RobotParameters) -> bool:
     """Whether the file's servos hold a command until the next one."""
-    return any(name in robot.effects for name in FOR_HELD)
+    # The published gains come from a replay with interpolated commands; others hold for held ones.
+    return any(name in robot.effects for name in (*ENTRIES, *OTHER_DELAYS))
 
 
 def file_sets(robot: RobotParameters) -> np.ndarray:
