@@ -33,7 +33,8 @@ RobotOption = Annotated[Optional[Path], typer.Option(
 PublishedOption = Annotated[Optional[Path], typer.Option(
     '--robot', metavar='FILE', help='Robot file. Default: the shipped params/robot.yaml.')]
 PlantOption = Annotated[Optional[Path], typer.Option(
-    '--plant', metavar='FILE', help='Robot file of the simulated plant. Default: as --robot.')]
+    '--plant', metavar='FILE', help='Robot file of the simulated plant; measured: the shipped one '
+                                    'of the measured robot. Default: as --robot.')]
 NmpcOption = Annotated[Optional[Path], typer.Option(
     '--nmpc', metavar='FILE',
     help=f"Parameters of the controller '{registry.owner('--nmpc')}'. Default: the shipped "

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from copy import deepcopy
 from dataclasses import dataclass, replace
 import hashlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -196,6 +198,8 @@ class RobotParameters:
         gravity: [m/s^2].
         inertia: (3,) diagonal about the centre of gravity [kg m^2].
         effects: deviations from the model, effect -> parameter -> value.
+        intervals: 95 % intervals of measured values, dotted key -> (lowest, highest), each with
+            the value's shape.
 
     """
 
@@ -209,6 +213,8 @@ class RobotParameters:
         None, doc='parts; without them tilting parts have no mass')
     name: str = parameter('robot', doc='name of the robot')
     effects: dict = parameter({}, doc='known deviations from the model, by catalogue name')
+    intervals: dict = parameter(
+        {}, doc='95 % intervals of measured values, dotted key -> [lowest, highest]')
     provenance: dict = parameter({}, doc='origin of a written file, free text')
 
     def __post_init__(self):
@@ -222,6 +228,57 @@ class RobotParameters:
         if hover > self.rotors.thrust_max:
             raise ParameterError(f'mass {self.mass:g} kg needs {hover:.1f} N a rotor to hover, '
                                  f'above rotors.thrust_max {self.rotors.thrust_max:g} N')
+
+    def _checked_interval(self, key, pair):
+        try:
+            value = np.array(self._value(key), dtype=float)
+        except (AttributeError, KeyError, TypeError, ValueError):
+            raise ParameterError(f"key 'intervals': {quoted(key)}: expected the dotted key of a "
+                                 'number of this file') from None
+        try:
+            low, high = (np.broadcast_to(np.array(bound, dtype=float), value.shape)
+                         for bound in pair)
+            fits = bool(np.all((low <= value) & (value <= high)))
+        except (TypeError, ValueError):
+            fits = False
+        if not fits:
+            raise ParameterError(f"key 'intervals.{key}': expected [lowest, highest] around "
+                                 f'{value.tolist()}, found {quoted(pair)}')
+        return low, high
+
+    def _value(self, key):
+        """Value of a dotted key: of an effect, or of a section."""
+        at: Any = self
+        for name in key.split('.'):
+            at = at[name] if isinstance(at, dict) else getattr(at, name)
+        return at
+
+    def interval(self, key: str) -> tuple:
+        """95 % interval (lowest, highest) of a value by its dotted key; unmeasured: the value."""
+        if key in self.intervals:
+            return self.intervals[key]
+        value = np.array(self._value(key), dtype=float)
+        return value, value
+
+    def drawn(self, rng: np.random.Generator) -> RobotParameters:
+        """A robot with each measured value drawn uniformly from its interval."""
+        sections: dict[str, dict] = {}
+        effects = deepcopy(self.effects)
+        own: dict[str, Any] = {}
+        for key, (low, high) in self.intervals.items():
+            value = rng.uniform(low, high)
+            value = value.tolist() if np.ndim(value) else float(value)
+            section, *rest = key.split('.')
+            if section == 'effects':
+                effects[rest[0]][rest[1]] = value
+            elif rest:
+                sections.setdefault(section, {})[rest[0]] = value
+            else:
+                own[section] = value
+        own |= {name: replace(getattr(self, name), **{
+            each: np.array(value) if np.ndim(value) else value for each, value in values.items()})
+            for name, values in sections.items()}
+        return replace(self, **own, effects=effects, intervals={})
 
     @classmethod
     def load(cls, path: str | Path | None = None) -> RobotParameters:
@@ -242,7 +299,9 @@ class RobotParameters:
         robot = schema.bind(cls, _merged(path, ()), str(path))
         with _named(path):
             check_parts(robot)
-        return robot
+            # not in __post_init__, because copies without some effects keep the others' intervals
+            return replace(robot, intervals={
+                key: robot._checked_interval(key, pair) for key, pair in robot.intervals.items()})
 
     @property
     def parts(self) -> MultibodyParameters:
@@ -277,7 +336,7 @@ class RobotParameters:
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def as_dict(self) -> dict:
-        """All physical values as plain nested data, without name and provenance."""
+        """All physical values as plain nested data, without name, intervals and provenance."""
         def plain(value):
             if hasattr(value, '__dataclass_fields__'):
                 return {key: plain(getattr(value, key)) for key in value.__dataclass_fields__}
@@ -289,7 +348,7 @@ class RobotParameters:
                 return {key: plain(item) for key, item in value.items()}
             return value
         data = plain(self)
-        del data['name'], data['provenance']
+        del data['name'], data['intervals'], data['provenance']
         return data
 
 
@@ -298,7 +357,8 @@ def find_robot(name: str | Path, beside: Path | None = None) -> Path:
     Locate a robot file: the given path, else a shipped file of that name.
 
     Args:
-        name: path of a file, or the name of a file of the shipped params.
+        name: path of a file, or the name of a file of the shipped params, of which
+            ``robot_NAME.yaml`` is also found as ``NAME``.
         beside: the file that extends it; relative paths begin in its folder.
 
     Returns:
@@ -309,11 +369,12 @@ def find_robot(name: str | Path, beside: Path | None = None) -> Path:
     # `extends: robot.yaml` in a file named robot.yaml means the shipped file
     if path.is_file() and not (beside and path.resolve() == beside.resolve()):
         return path
-    try:
-        shipped = share_path(f'params/{name}')
-    except FileNotFoundError:
-        return path
-    return shipped if shipped.is_file() else path
+    for each in (name, f'robot_{name}.yaml'):
+        with suppress(FileNotFoundError):
+            shipped = share_path(f'params/{each}')
+            if shipped.is_file():
+                return shipped
+    return path
 
 
 def _merged(path: Path, seen: tuple[Path, ...]) -> dict:
@@ -344,6 +405,9 @@ def _extended(base: Path, below: dict, path: Path, content: dict) -> dict:
     rotors = content.get('rotors')
     if isinstance(rotors, dict) and 'arm_length' in rotors:
         content = content | {'rotors': _with_arms(base, below, path, rotors)}
+    if 'intervals' in below:    # those of values that the file replaces do not hold for it
+        below = below | {'intervals': {key: pair for key, pair in below['intervals'].items()
+                                       if not _states(content, key.split('.'))}}
     merged, own = _overlaid(below, content), content.get('multibody', {})
     moves = {'mass', 'multibody'} & set(content) or (
         isinstance(rotors, dict) and {'arm_length', 'positions'} & set(rotors))
@@ -355,6 +419,13 @@ def _extended(base: Path, below: dict, path: Path, content: dict) -> dict:
         with _named(path):
             merged['inertia'] = moved_inertia(*pair)
     return merged
+
+
+def _states(content: Any, names: list[str]) -> bool:
+    """Whether a file's content states the value of a dotted key, or replaces what held it."""
+    first, *rest = names
+    return isinstance(content, dict) and first in content and (
+        not rest or first == 'effects' or _states(content[first], rest))
 
 
 def _with_arms(base: Path, below: dict, path: Path, rotors: dict) -> dict:

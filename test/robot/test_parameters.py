@@ -8,7 +8,7 @@ import yaml
 
 from beetle_omni_ros.identify.robot_file import write_robot_file
 from beetle_omni_ros.robot.mass_properties import mass_properties
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.parameters import find_robot, RobotParameters
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
 
@@ -172,3 +172,47 @@ def test_the_weak_and_heavy_plant_is_weaker_and_heavier():
     plant = RobotParameters.load(share_path('params/robot_weak_and_heavy.yaml'))
     assert plant.mass == pytest.approx(1.05 * shipped.mass)
     assert plant.effects == {'thrust_coefficient': {'scale': 0.93}}
+
+
+MEASURED = """
+rotors: {time_constant: 0.05}
+effects: {joint_bandwidth: {kp: [0.3, 0.2, 0.3, 0.3], kd: 0.005}}
+intervals:
+  rotors.time_constant: [0.03, 0.07]
+  effects.joint_bandwidth.kp: [[0.2, 0.1, 0.2, 0.2], [0.4, 0.3, 0.4, 0.3]]
+"""
+
+
+def test_a_drawn_robot_lies_in_the_intervals_of_the_file(tmp_path):
+    (tmp_path / 'mine.yaml').write_text('extends: robot.yaml\n' + MEASURED)
+    robot = RobotParameters.load(tmp_path / 'mine.yaml')
+    drawn = [robot.drawn(np.random.default_rng(seed)) for seed in range(50)]
+    low, high = robot.interval('effects.joint_bandwidth.kp')
+    kp = np.array([each.joints.kp for each in drawn])
+    assert np.all((low <= kp) & (kp <= high))
+    lags = np.array([each.rotors.time_constant for each in drawn])
+    assert 0.03 <= lags.min() < 0.035 and 0.065 < lags.max() <= 0.07
+    assert {each.mass for each in drawn} == {robot.mass}
+    assert robot.interval('mass') == (robot.mass, robot.mass)
+
+
+def test_an_interval_belongs_to_the_value_of_its_file(tmp_path):
+    (tmp_path / 'mine.yaml').write_text('extends: robot.yaml\n' + MEASURED)
+    (tmp_path / 'other.yaml').write_text(
+        'extends: mine.yaml\nrotors: {time_constant: 0.2}\nmass: 3.1\n')
+    assert list(RobotParameters.load(tmp_path / 'other.yaml').intervals) == [
+        'effects.joint_bandwidth.kp']
+
+
+@pytest.mark.parametrize('text', [
+    'mass: [4, 5]', 'mass: 3', 'mass: [[1, 2], [4, 5]]', 'mass: [1, .nan]', 'name: [1, 2]',
+    'rotors.x: [0, 1]', 'effects.wind.force: [0, 1]'])
+def test_an_interval_that_does_not_hold_its_value_is_refused(tmp_path, text):
+    (tmp_path / 'mine.yaml').write_text(f'extends: robot.yaml\nintervals: {{{text}}}\n')
+    with pytest.raises(ParameterError, match=r'mine\.yaml: key .intervals.*expected') as error:
+        RobotParameters.load(tmp_path / 'mine.yaml')
+    assert text.partition(':')[0] in str(error.value)
+
+
+def test_a_shipped_robot_is_found_by_its_short_name():
+    assert find_robot('weak_and_heavy').name == 'robot_weak_and_heavy.yaml'
