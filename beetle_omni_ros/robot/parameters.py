@@ -295,7 +295,10 @@ class RobotParameters:
         """
         path = find_robot(path) if path else share_path('params/robot.yaml')
         if not path.is_file():
-            raise ParameterError(f'{path}: no such file')
+            shipped = sorted(each.stem.removeprefix('robot_')
+                             for each in share_path('params').glob('robot_*.yaml'))
+            raise ParameterError(f'{path}: no such file; expected a robot file, or one of the '
+                                 f"shipped {', '.join(shipped)}")
         robot = schema.bind(cls, _merged(path, ()), str(path))
         with _named(path):
             check_parts(robot)
