@@ -64,6 +64,7 @@ PARAMETER_FILES = {
     'motor_board.yaml': MotorBoardParameters, 'nmpc.yaml': NmpcParameters,
     'nmpc_published.yaml': NmpcParameters,
     'recording.yaml': RecordingLimits, 'rl.yaml': PolicyParameters, 'robot.yaml': RobotParameters,
+    'robot_measured.yaml': RobotParameters,
     'robot_weak_and_heavy.yaml': RobotParameters, 'servo_bus.yaml': ServoBusParameters,
     'simulator.yaml': SimulatorParameters, 'supervisor.yaml': SupervisorParameters,
     'targets.yaml': TargetLimits, 'train.yaml': TrainParameters}
