@@ -133,7 +133,8 @@ def run_identify_robot(paths: Sequence[Path], params: Path, *, rate: float | Non
         print_grids(of_rotor.grids(results['rotor']), console)
     results['robot'] = write_measured(params, robot_parameters, robot, _line(
         'robot', paths, robot, params, rate), paths, servo, rotor)
-    both = {robot.stem if robot else 'published': robot_parameters, 'measured': RobotParameters.load(params)}
+    both = {robot.stem if robot else 'published': robot_parameters,
+            'measured': RobotParameters.load(params)}
     if joints:
         print_grids([of_logs.errors(joints, both)], console)
     if picture:

@@ -110,8 +110,8 @@ def servo_values(found: Found, robot: RobotParameters) -> tuple[dict, dict, dict
               for k in (None, *range(len(servos.logs)))]
     effects: dict = {}
     intervals, origin = {}, {}
-    how = {'logs': [log.name for log in servos.logs], 'how': 'the same gains in all logs; '
-           'interval: also of each log, with gains that differ between logs'}
+    how = {'logs': [log.name for log in servos.logs], 'how': 'mean of the logs, '
+           'with the same gains; interval: also of each log, with gains that differ between logs'}
     for entry, parameters in best.items():
         effects[entry] = {}
         for name, drawn in parameters.items():
