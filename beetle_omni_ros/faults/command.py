@@ -71,7 +71,7 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
             'version': __version__, 'commit': commit(),
             'date': datetime.now(timezone.utc).strftime('%Y-%m-%d'), 'guidance': guidance,
             'plant': str(plant) if plant else None, 'limits': asdict(listed.limits)}
-    own = str(plant or '')
+    own = str(plant) if plant else None
     fly = _Flyer(console, jobs, output, file_digest(faults) if faults else '', true.hash())
     results: dict = {'meta': meta}
     if landings:

@@ -35,7 +35,7 @@ class Flight:
     """
 
     def __init__(self, *, controller: str, conditions: str, seed: int,
-                 plant: str = '', effects: dict | None = None, strike: tuple[Fault, ...] = (),
+                 plant: str | None = None, effects: dict | None = None, strike: tuple[Fault, ...] = (),
                  recorder=None):
         """
         Build robot and flight stack.
@@ -44,7 +44,7 @@ class Flight:
             controller: the active controller.
             conditions: 'nominal' or 'published'.
             seed: seed of the plan and the simulation.
-            plant: robot file of the simulated robot; '': that of the flight stack.
+            plant: robot file of the simulated robot; None: that of the flight stack.
             effects: further effects of the simulated robot.
             strike: faults, started by ``loop.start_faults``.
             recorder: recorder of the loop; by default nothing is recorded.

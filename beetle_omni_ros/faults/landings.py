@@ -27,7 +27,7 @@ class LandingTrial:
         conditions: 'nominal' or 'published'.
         controller: the active controller.
         without_mocap: whether motion capture is lost at the start of the landing.
-        plant: robot file of the simulated robot, '' for the shipped one.
+        plant: robot file of the simulated robot; None: the shipped one.
 
     """
 
@@ -35,7 +35,7 @@ class LandingTrial:
     conditions: str = 'nominal'
     controller: str = registry.DEFAULT
     without_mocap: bool = False
-    plant: str = ''
+    plant: str | None = None
 
 
 def fly_landing(trial: LandingTrial, listed: FaultList) -> dict:
@@ -93,14 +93,14 @@ class HealthyTrial:
         seed: seed of poses and simulation.
         conditions: one of CONDITIONS; 'effects' is nominal with the list's effects in the plant.
         controller: the active controller.
-        plant: robot file of the simulated robot, '' for the shipped one.
+        plant: robot file of the simulated robot; None: the shipped one.
 
     """
 
     seed: int
     conditions: str = 'nominal'
     controller: str = registry.DEFAULT
-    plant: str = ''
+    plant: str | None = None
 
 
 def fly_healthy(trial: HealthyTrial, listed: FaultList) -> dict:

@@ -30,7 +30,7 @@ class Trial:
         seed: seed of poses, time of the fault and simulation.
         conditions: 'nominal' or 'published'.
         controller: the active controller.
-        plant: robot file of the simulated robot, '' for the shipped one.
+        plant: robot file of the simulated robot; None: the shipped one.
 
     """
 
@@ -39,13 +39,13 @@ class Trial:
     seed: int = 0
     conditions: str = 'nominal'
     controller: str = registry.DEFAULT
-    plant: str = ''
+    plant: str | None = None
 
     def __str__(self) -> str:
         """Name of its bag."""
         controller = registry.find(self.controller).name
-        return f'{self.case}_{self.start}_{self.conditions}_{controller}_{self.seed}' \
-            + f'_{Path(self.plant).stem}' * bool(self.plant)
+        plant = f'_{Path(self.plant).stem}' if self.plant else ''
+        return f'{self.case}_{self.start}_{self.conditions}_{controller}_{self.seed}{plant}'
 
 
 def fly_trial(trial: Trial, listed: FaultList, bags: Path | None = None) -> dict:

@@ -12,7 +12,9 @@ import yaml
 
 from beetle_omni_ros import cli
 from beetle_omni_ros.control.base import Command
+from beetle_omni_ros.faults.flight import Flight
 from beetle_omni_ros.identify.measured import own_delay
+from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.dynamics import (
     DISTURBANCE_SIZE,
     integrator,
@@ -140,6 +142,17 @@ def test_every_interval_matters_to_plant_and_models(tmp_path, key):
         return
     for one, other in zip(predicted(low), predicted(high), strict=True):
         assert np.abs(one - other).max() > 1e-6
+
+
+def test_the_measured_robot_hovers_under_a_controller_that_believes_the_published_one():
+    flight = Flight(controller='nmpc', conditions='nominal', seed=0, plant='measured')
+    flight.loop.take_off()
+    flight.aim((0.0, 0.0, 1.0))
+    flight.fly(6.0)
+    truth = flight.simulator.truth
+    assert not truth.broken
+    assert truth.position == pytest.approx([0, 0, 1], abs=0.05)
+    assert rotations.geodesic_angle(truth.quaternion, [0, 0, 0, 1]) < 0.15
 
 
 def test_the_measured_map_hovers_and_reaches_as_far_as_the_published_one():
