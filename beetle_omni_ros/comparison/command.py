@@ -153,7 +153,7 @@ def _line(flight, result, kept):
     return f"{flight.name}: {', '.join(parts)}"
 
 
-def _results(flown, arguments, names, skipped, policy, plant):
+def _results(flown, arguments, names, skipped, policy, plant=None):
     """Content of the JSON file, from plain values, so that it is equal after reading."""
     _, tasks, conditions, seeds = arguments
     order = {name: k for k, name in enumerate((*tasks, *conditions, *names))}

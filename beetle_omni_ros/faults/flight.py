@@ -35,8 +35,8 @@ class Flight:
     """
 
     def __init__(self, *, controller: str, conditions: str, seed: int,
-                 plant: str | None = None, effects: dict | None = None, strike: tuple[Fault, ...] = (),
-                 recorder=None):
+                 plant: str | None = None, effects: dict | None = None,
+                 strike: tuple[Fault, ...] = (), recorder=None):
         """
         Build robot and flight stack.
 
