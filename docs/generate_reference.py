@@ -36,6 +36,8 @@ MADE = '<!-- Made by docs/generate_reference.py; changes by hand are lost. -->\n
 # Parameter file -> class that reads it, what it holds.
 FILES = {
     'robot.yaml': ('robot.parameters:RobotParameters', 'The robot.'),
+    'robot_measured.yaml': ('robot.parameters:RobotParameters',
+                            'The robot as measured logs show it.'),
     'robot_weak_and_heavy.yaml': ('robot.parameters:RobotParameters',
                                   'A robot with less thrust and more mass than in robot.yaml.'),
     'nmpc.yaml': ('control.nmpc_parameters:NmpcParameters', 'The NMPC.'),

@@ -121,14 +121,18 @@ def robot(logs: Annotated[list[Path], typer.Argument(
                                      'force-torque stand, recognised by their header.')],
           params: Annotated[Path, typer.Option(
               '--params', metavar='FILE', help='The robot file to write.')],
-          rate: RateOption = None, robot: PublishedOption = None, json_path: JsonOption = None):
+          rate: RateOption = None, robot: PublishedOption = None,
+          picture: Annotated[Optional[Path], typer.Option(
+              '--picture', metavar='FILE', help='Draw the logs with both robots (.png or .svg).')]
+          = None, json_path: JsonOption = None):
     """
     Write a robot file with intervals and origins from all logs of servos and rotors.
 
     Example: beetle_omni identify robot slow.csv fast.csv bench.csv --params my_robot.yaml
     """
     from beetle_omni_ros.identify.command import run_identify_robot
-    run_identify_robot(logs, params, rate=rate, robot=robot, json_path=json_path)
+    run_identify_robot(logs, params, rate=rate, robot=robot, picture=picture,
+                       json_path=json_path)
 
 
 def train(output: Annotated[Path, typer.Option(
