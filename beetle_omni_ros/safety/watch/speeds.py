@@ -171,8 +171,8 @@ class Rotor:
         judged = isfinite(square) and x > p.least_thrust
         known = judged and self._learnt_for >= LEARNT
         y = self._mean_thrust / self._mean_square * square if known else nan
-        # a comparison with nan is False
-        missing = 1 - y / least if least > p.least_thrust else nan
+        enough = least > p.least_thrust
+        missing = 1 - y / least if enough else nan      # a comparison with nan is False
         too_slow = missing > p.share
         self.measured, self.slow = y, missing > p.noticed
         self.slow_for = self.slow_for + dt if too_slow else 0.0
@@ -181,7 +181,7 @@ class Rotor:
         else:
             self._weight = self._x = self._y = self._xx = self._xy = 0.0
             self.deaf, self._deaf_for, self._more_for = False, 0.0, 0.0
-        if judged and not too_slow and square > 0:
+        if judged and enough and not too_slow and square > 0:
             gain = max(min(1.0, dt / max(self._learnt_for, dt)), min(1.0, dt / LEARNT))
             self._mean_thrust += gain * (x - self._mean_thrust)
             self._mean_square += gain * (square - self._mean_square)
