@@ -166,6 +166,7 @@ def compare(controllers: Annotated[Optional[str], typer.Option(
                 '--seeds', metavar='N,...',
                 help='Default: 0,1; only 0 for tasks of more than 50 s.')] = None,
             policy: PolicyOption = None,
+            plant: PlantOption = None,
             jobs: JobsOption = None,
             backend: Annotated[str, typer.Option(
                 '--backend', metavar='processes|ray', help='Run the flights on this computer, or '
@@ -199,7 +200,7 @@ def compare(controllers: Annotated[Optional[str], typer.Option(
     from beetle_omni_ros.comparison.sweep import SweepError
     try:
         run_compare(**arguments, output=output, jobs=jobs, backend=backend, address=address,
-                    cache=cache, fresh=fresh, policy=policy, json_path=json_path)
+                    cache=cache, fresh=fresh, policy=policy, plant=plant, json_path=json_path)
     except SweepError as error:
         raise typer.Exit(fail(error, FAILED)) from None
 
@@ -220,6 +221,7 @@ def faults(faults: Annotated[Optional[Path], typer.Option(
                help='Seed of the first flight; it grows by one with each further flight.')] = 0,
            conditions: ConditionsOption = 'nominal',
            controller: ControllerOption = DEFAULT,
+           plant: PlantOption = None,
            landings: Annotated[int, typer.Option(
                '--landings', metavar='N', min=0, help='Fly N landings from random attitudes '
                                                       'instead of the list.')] = 0,
@@ -258,8 +260,8 @@ def faults(faults: Annotated[Optional[Path], typer.Option(
         raise ParameterError('--without-mocap: expected --landings N with it')
     chosen, through_ros = names('--only', only), None
     if ros:
-        if landings or healthy:
-            raise ParameterError('--ros: expected without --landings and --healthy')
+        if landings or healthy or plant:
+            raise ParameterError('--ros: expected without --landings, --healthy and --plant')
         from beetle_omni_ros.nodes import process_faults
         wanted = process_faults.chosen(chosen)
 
@@ -270,7 +272,8 @@ def faults(faults: Annotated[Optional[Path], typer.Option(
     run_faults(faults=faults, only=chosen, starts=names('--from', starts),
                seeds=seeds, seed=seed, conditions=conditions, controller=controller, jobs=jobs,
                output=output, json_path=json_path, docs=docs, bags=bags, landings=landings,
-               without_mocap=without_mocap, healthy=healthy, through_ros=through_ros)
+               without_mocap=without_mocap, healthy=healthy, plant=plant,
+               through_ros=through_ros)
 
 
 def report(runs: Annotated[list[Path], typer.Argument(

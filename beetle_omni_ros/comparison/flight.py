@@ -53,10 +53,11 @@ def fly_flight(flight: Flight, task: Task, code: str | None = None) -> dict:
         return result
     try:
         robot = RobotParameters.load()
+        plant = RobotParameters.load(flight.plant) if flight.plant else robot
         with warnings.catch_warnings():
             # An unstable flight may overflow; its metrics show the failure.
             warnings.simplefilter('ignore', RuntimeWarning)
-            log = fly(flight.reference, task, robot=robot, plant=robot,
+            log = fly(flight.reference, task, robot=robot, plant=plant,
                       conditions=flight.conditions, seed=flight.seed,
                       options={flight.reference: ControllerOptions(
                           policy=Path(flight.policy) if flight.policy else None)},

@@ -158,6 +158,17 @@ def test_another_policy_file_is_another_flight(tmp_path):
     assert fingerprint.flight_key(flights[1]) == keys[0]
 
 
+def test_another_plant_is_another_flight_as_far_as_its_values_differ(tmp_path):
+    heavy = tmp_path / 'heavy.yaml'
+    keys = []
+    for text in ('name: same', 'mass: 3.3', 'name: other\nmass: 3.3'):
+        heavy.write_text(f'extends: robot.yaml\n{text}\n')
+        [flight] = plan(['nmpc'], ['hover'], ['nominal'], [0], plant=heavy)
+        keys.append(fingerprint.flight_key(flight))
+    assert keys[0] != keys[1] == keys[2]
+    assert 'heavy' in flight.name
+
+
 @pytest.mark.parametrize('name, controller, flies', [
     ('rl.yaml', 'rl', True), ('rl.yaml', 'nmpc', False), ('nmpc.yaml', 'nmpc', True),
     ('nmpc.yaml', 'hover', False), ('drive.yaml', None, False), ('check.yaml', None, False),
