@@ -8,8 +8,8 @@ controller that predicts with them has no steady error. The module also predicts
 sensor reports: the rotors' thrust, and the present tilts, because encoder readings are delayed.
 
 Friction holds a servo until its target is a band (friction over stiffness) away. In a loop around
-a floating body this play causes a limit cycle. The estimator therefore models the play of each
-servo, and learns its band: the model of too narrow a band travels farther than the reading.
+a floating body this play causes a limit cycle. For a robot file with ``joint_friction`` the
+estimator therefore models the play of each servo, and the targets overcome it.
 """
 
 from collections import deque
@@ -28,8 +28,6 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 LONGEST_STEP = 0.1  # [s] a longer gap between states restarts the actuator model
 SHORT = 0.002           # [s] a command change nearer to an end of a span is treated as at this end
 UNNOTICED = 0.3     # [s] before a fault is reported: the estimates contain the fault
-REST = 0.03         # [rad/s] of a servo at rest: its smallest reading is 0.024 rad/s
-SLOW = 0.3          # [rad/s] above it, the lag decides about a servo's travel, not its friction
 RESOLUTION = 0.001  # [rad] change of a target that turns a servo: less than an encoder count
 HISTORY = 64        # number of stored states and commands, more than any latency needs
 
@@ -51,7 +49,6 @@ class DisturbanceEstimator:
             delay, 27 mm with a longer servo lag in the horizon, and 8 mm without prediction. With
             80 ms it is 6 mm with the mean; without prediction the robot crashes.
         disturbance: (10,) force in world [N], torque in body [N m], servo offsets [rad].
-        band: (4,) friction over stiffness of each servo [rad].
 
     """
 
@@ -66,10 +63,8 @@ class DisturbanceEstimator:
         self._force_gain = p.force_bandwidth * robot.mass
         self._torque_gain = p.torque_bandwidth * robot.inertia
         self._tilt_bandwidth, self._tilt_correction = p.tilt_bandwidth, p.tilt_correction
-        self._friction_gain, self._friction_limit = p.friction_gain, p.friction_limit
         servos = [model.tilt_servo(robot, joint, 0.0)[0] for joint in range(4)]
-        self._known_band = np.array([(servo.coulomb or 0.0) / servo.kp for servo in servos]) \
-            if p.friction_gain else np.zeros(4)
+        self._band = np.array([(servo.coulomb or 0.0) / servo.kp for servo in servos])
         self._health = ALL_HEALTHY
         self._movable = np.ones(4)
         self.reset()
@@ -77,8 +72,6 @@ class DisturbanceEstimator:
     def reset(self):
         """Reset all estimates."""
         self.disturbance = np.zeros(model.DISTURBANCE_SIZE)
-        self.band = self._known_band.copy()
-        self._fastest = np.zeros(4)
         self._state: np.ndarray | None = None
         self._stamp = -np.inf
         self._commands: deque[Command] = deque(maxlen=HISTORY)
@@ -145,14 +138,14 @@ class DisturbanceEstimator:
         self._sent = command.tilt
         if self._commands:
             command = replace(command, tilt=clipped(
-                self._commands[-1].tilt, self._sent - self.band, self._sent + self.band))
+                self._commands[-1].tilt, self._sent - self._band, self._sent + self._band))
         return command
 
     def sent(self, tilt: np.ndarray) -> np.ndarray:
         """Targets (4,) [rad] that overcome the friction, for targets without friction."""
         if not self._commands:
             return tilt
-        return tilt + self.band * clipped((tilt - self._commands[-1].tilt) / RESOLUTION, -1, 1)
+        return tilt + self._band * clipped((tilt - self._commands[-1].tilt) / RESOLUTION, -1, 1)
 
     def _restart(self, state):
         thrust = np.zeros(4) if state.command is None else state.command.thrust
@@ -208,23 +201,13 @@ class DisturbanceEstimator:
         present[model.TILT] += self._tilt_correction * error
         change = self._tilt_bandwidth * step * error
         if self._commands:
-            self._learn_band(present[model.TILT_RATE], state.tilt_velocity, step)
             # Friction explains a reading within the band, the offset only what is beyond.
             newest = self._commands[-1]
-            rest = clipped(newest.tilt + change, self._sent - self.band, self._sent + self.band)
+            rest = clipped(newest.tilt + change, self._sent - self._band, self._sent + self._band)
             change = change - (rest - newest.tilt)
             self._commands[-1] = replace(newest, tilt=rest)
         offset = self.disturbance[model.TILT_OFFSET] + change
         self.disturbance[model.TILT_OFFSET] = clipped(offset, -limit, limit)
-
-    def _learn_band(self, modelled, measured, step):
-        """Compare the travel of model and reading, but during and shortly after fast motions."""
-        modelled = np.abs(modelled)
-        self._fastest = np.maximum(modelled, self._fastest * (1 - self._tilt_bandwidth * step))
-        farther = np.maximum(modelled, REST) - np.maximum(np.abs(measured), REST)
-        self.band = clipped(
-            self.band + self._friction_gain * step * farther * (self._fastest < SLOW),
-            0, self._friction_limit)
 
     def _modelled_tilt(self, stamp):
         later = None

@@ -139,12 +139,6 @@ class DisturbanceParameters:
     tilt_correction: float = parameter(
         0.2, doc='share of a measured tilt error that corrects the tilt model in each step', low=0,
         high=1)
-    friction_gain: float = parameter(
-        0.0, doc="change of a servo's friction band for each radian by which its model travels "
-        'farther than its reading', unit='1', low=0, high=5)
-    friction_limit: float = parameter(
-        0.06, doc='largest estimated friction band: the friction over the stiffness', unit='rad',
-        low=0, high=1)
     force_limit: float = parameter(60.0, doc='largest estimated force', unit='N', low=0, high=1000)
     torque_limit: float = parameter(
         5.0, doc='largest estimated torque', unit='N m', low=0, high=100)
