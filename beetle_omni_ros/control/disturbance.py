@@ -28,7 +28,7 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 LONGEST_STEP = 0.1  # [s] a longer gap between states restarts the actuator model
 SHORT = 0.002           # [s] a command change nearer to an end of a span is treated as at this end
 UNNOTICED = 0.3     # [s] before a fault is reported: the estimates contain the fault
-RESOLUTION = 0.001  # [rad] change of a target that turns a servo: less than an encoder count
+RESOLUTION = 0.0015  # [rad] change of a target that reverses a servo: an encoder count
 HISTORY = 64        # number of stored states and commands, more than any latency needs
 
 
@@ -73,6 +73,7 @@ class DisturbanceEstimator:
         """Reset all estimates."""
         self.disturbance = np.zeros(model.DISTURBANCE_SIZE)
         self._state: np.ndarray | None = None
+        self._direction = np.zeros(4)
         self._stamp = -np.inf
         self._commands: deque[Command] = deque(maxlen=HISTORY)
         self._tilts: deque[tuple[float, np.ndarray]] = deque(maxlen=HISTORY)
@@ -143,9 +144,11 @@ class DisturbanceEstimator:
 
     def sent(self, tilt: np.ndarray) -> np.ndarray:
         """Targets (4,) [rad] that overcome the friction, for targets without friction."""
-        if not self._commands:
-            return tilt
-        return tilt + self._band * clipped((tilt - self._commands[-1].tilt) / RESOLUTION, -1, 1)
+        if self._commands:
+            motion = tilt - self._commands[-1].tilt
+            self._direction = np.where(np.abs(motion) > RESOLUTION, np.sign(motion),
+                                       self._direction)
+        return tilt + self._band * self._direction
 
     def _restart(self, state):
         thrust = np.zeros(4) if state.command is None else state.command.thrust
