@@ -238,6 +238,9 @@ def _ends() -> dict[str, dict[str, list[str]]]:
                 entry[way] += [one for one in node.split(', ') if one not in entry[way]]
     # Read through the class that checks the publisher.
     found['supervisor/identity']['to'] = list(found['command']['to'])
+    found['/tf']['from'].append('robot_state_publisher')
+    for topic in ('/tf_static', 'robot_description'):
+        found[topic] = {'from': ['robot_state_publisher'], 'to': []}
     return found
 
 

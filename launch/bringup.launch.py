@@ -82,15 +82,6 @@ def options(given):
             'robot_file', 'task')})
 
 
-def has_state_publisher():
-    """Whether robot_state_publisher is installed."""
-    from ament_index_python.packages import get_package_prefix, PackageNotFoundError
-    try:
-        return bool(get_package_prefix('robot_state_publisher'))
-    except PackageNotFoundError:
-        return False
-
-
 def state_publisher(namespace):
     """The node that publishes description and frames of the links."""
     from launch_ros.parameter_descriptions import ParameterValue
@@ -141,8 +132,7 @@ def actions(context):
     for name, reason in planned.left_out.items():
         print(f'{name} does not stand by: {reason}', file=sys.stderr)
     processes = []
-    if 'viewer_node' in nodes and has_state_publisher():
-        nodes['viewer_node']['links'] = False
+    if 'viewer_node' in nodes:
         processes.append(state_publisher(given['namespace']))
     if given['record'] and 'recorder_node' not in nodes:
         controllers = nodes['supervisor_node'].get('controllers', ())

@@ -59,7 +59,6 @@ def bringup(monkeypatch):
                             lambda self, context: given[self.args[0]], raising=False)
         return module.actions(None)
 
-    monkeypatch.setattr(module, 'has_state_publisher', lambda: False)
     module.start = start
     return module
 
@@ -85,23 +84,19 @@ def test_composed_is_one_process_and_one_for_the_bridges(bringup):
 
 
 def test_separate_nodes_and_no_simulator_for_another_backend(bringup):
-    nodes = bringup.start(composed='false', backend='none', task='waypoints',
-                          viewer='true', namespace='robot1')
+    _, *nodes = bringup.start(composed='false', backend='none', task='waypoints',
+                              viewer='true', namespace='robot1')
     assert [n.kwargs['executable'] for n in nodes] == [
         'ekf_node', 'nmpc_node', 'rl_node', 'supervisor_node', 'reference_node', 'viewer_node']
     assert all(n.kwargs['namespace'] == 'robot1' for n in nodes)
 
 
-def test_robot_state_publisher_where_it_is_installed_has_the_links(bringup, monkeypatch):
-    monkeypatch.setattr(bringup, 'has_state_publisher', lambda: True)
+def test_robot_state_publisher_has_the_links(bringup):
     state_publisher, *_ = bringup.start(viewer='true', namespace='robot1', composed='false')
     given = state_publisher.kwargs
     assert (given['package'], given['namespace']) == ('robot_state_publisher', 'robot1')
     text = given['parameters'][0]['robot_description']
     assert text.args[0].startswith('<?xml') and text.kwargs == {'value_type': str}
-    viewer, = (n for n in bringup.start(viewer='true', composed='false')
-               if n.kwargs.get('name') == 'viewer_node')
-    assert viewer.kwargs['parameters'][0] == {'links': False}
     assert all(n.kwargs['package'] != 'robot_state_publisher'
                for n in bringup.start(composed='false'))
 
