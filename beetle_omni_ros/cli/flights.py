@@ -230,10 +230,6 @@ def faults(faults: Annotated[Optional[Path], typer.Option(
                '--healthy', metavar='HOURS', min=0.0, max=1000.0,
                help='Fly for this time without a fault under each of nominal, published and '
                     'effects, and count false alarms, instead of the list.')] = 0.0,
-           ros: Annotated[bool, typer.Option(
-               '--ros', help='Inject the faults that need the ROS graph, in real time and in '
-                             'hover: killed or stopped processes, and other programs that publish '
-                             'on its topics.')] = False,
            jobs: JobsOption = None,
            bags: Annotated[bool, typer.Option(
                '--bags', help='Record each flight in --output, and read its bag.')] = False,
@@ -256,21 +252,11 @@ def faults(faults: Annotated[Optional[Path], typer.Option(
     check_files(faults)
     if without_mocap and not landings:
         raise ParameterError('--without-mocap: expected --landings N with it')
-    chosen, through_ros = names('--only', only), None
-    if ros:
-        if landings or healthy:
-            raise ParameterError('--ros: expected without --landings and --healthy')
-        from beetle_omni_ros.nodes import process_faults
-        wanted = process_faults.chosen(chosen)
-
-        def through_ros(listed):
-            return (process_faults.fly_through_ros(name, listed) for name in wanted)
-
     from beetle_omni_ros.faults.command import run_faults
-    run_faults(faults=faults, only=chosen, starts=names('--from', starts),
+    run_faults(faults=faults, only=names('--only', only), starts=names('--from', starts),
                seeds=seeds, seed=seed, conditions=conditions, controller=controller, jobs=jobs,
                output=output, json_path=json_path, docs=docs, bags=bags, landings=landings,
-               without_mocap=without_mocap, healthy=healthy, through_ros=through_ros)
+               without_mocap=without_mocap, healthy=healthy)
 
 
 def report(runs: Annotated[list[Path], typer.Argument(

@@ -138,8 +138,7 @@ def _actuators_for(faults, actuators):
     for fault in faults:
         if fault.is_process:
             raise ParameterError(f"--faults: '{fault.kind}' affects a process; expected a fault "
-                                 'of the robot or its sensors; beetle_omni faults --ros kills '
-                                 'processes')
+                                 'of the robot or its sensors')
         if fault.changes(*listed.DEVICES):
             if actuators == 'emulated':
                 raise ParameterError(f"--faults: '{fault.kind}' affects a device; expected "
