@@ -18,7 +18,6 @@ import numpy as np
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import Command, PoseTarget, State
-from beetle_omni_ros.control.feasible import feasible_target
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
 from beetle_omni_ros.robot.holding import Holding
@@ -37,6 +36,7 @@ POSE_TIME = 8.0         # [s] between two poses of random100
 RECOVERY = 6.0          # [s] from the loss until the pose must be held
 HELD = 1.0              # [s] at the end of which the pose is measured
 POSITION, ATTITUDE = 0.03, np.radians(2)    # what counts as held
+MARGIN = 1.0            # [m/s^2, rad/s^2] of the pose flown to after the recovery
 SINK = 0.3              # [m/s]
 ABOVE = 1.0             # [m] above its first pose a flight begins, falling while rotors start
 POWERED = (True,) * 4
@@ -191,7 +191,8 @@ class Flight:
 
     def pose(self):
         """Fly to the nearest feasible pose; return the final errors, or None."""
-        target = feasible_target(self.case.second, self.reported, self.robot, self.holding)
+        target = PoseTarget(self.case.second.position, self.holding.nearest(
+            self.case.second.quaternion, MARGIN))
         if not self.fly(target, self.body.sim.time + RECOVERY, watch=True):
             return None
         last = np.array(self.trace)[-round(HELD / self.flying.period):, 7:]
