@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from datetime import datetime
+import os
 from pathlib import Path
 from typing import Annotated, Optional
 
@@ -279,40 +280,29 @@ def report(runs: Annotated[list[Path], typer.Argument(
 def film(runs: Annotated[list[Path], typer.Argument(
              metavar='RUN...', help='Recorded bags, side by side: rosbag2 folders, or one of '
                                     'their files.')],
-         output: Annotated[list[Path], typer.Option(
-             '--output', '-o', metavar='FILE', help='The film, .gif or .mp4; may be repeated.')],
+         output: Annotated[Path, typer.Option('--output', '-o', metavar='FILE',
+                                              help='The film, a .gif.')],
          model: Annotated[Optional[list[Path]], typer.Option(
              '--model', metavar='FILE',
              help='Robot file whose prediction is drawn over one RUN; it starts again from the '
                   'recorded state each second; one panel for each --model.')] = None,
          robot: Annotated[Optional[Path], typer.Option(
              '--robot', metavar='FILE', help='Robot file with the dimensions for drawing. '
-                                             'Default: the shipped params/robot.yaml.')] = None,
-         start: Annotated[float, typer.Option(
-             '--start', metavar='SECONDS', help='Start of the film, after the first '
-                                                'target.')] = 0.0,
-         duration: Annotated[Optional[float], typer.Option(
-             '--duration', metavar='SECONDS', help='Duration of the film. Default: to the end of '
-                                                   'the flight.')] = None,
-         speed: Annotated[float, typer.Option(
-             '--speed', metavar='FACTOR', min=0.05, max=50.0, help='Speed of the film; 1 is real '
-                                                                   'time.')] = 1.0,
-         size: Annotated[int, typer.Option(
-             '--size', metavar='PIXELS', min=160, max=1600, help='Width of a panel, even.')]
-         = 440):
+                                             'Default: the shipped params/robot.yaml.')] = None):
     """
     Render recorded flights as a film: robot, target, path, errors and thrusts.
 
     Needs OpenGL for off-screen rendering; without it, a message names the packages to install.
     Example: beetle_omni film my_run/rl my_run/nmpc --output flight.gif
     """
-    for path in output:
-        check_writable(path, 'film')
-    from beetle_omni_ros.film.graphics import choose_backend
-    choose_backend()
-    from beetle_omni_ros.film.command import run_film
-    run_film(runs, output, models=model or [], robot=robot, start=start, duration=duration,
-             speed=speed, size=size)
+    check_writable(output, 'film')
+    os.environ.setdefault('MUJOCO_GL', 'egl')       # MuJoCo reads it when it is imported
+    try:
+        from beetle_omni_ros.film.command import run_film
+    except (AttributeError, ImportError, RuntimeError) as error:
+        raise ParameterError(f'no off-screen OpenGL ({error}); install libegl1, libgl1-mesa-dri '
+                             'and libopengl0 (apt)') from None
+    run_film(runs, output, models=model or [], robot=robot)
 
 
 def controllers(json_path: JsonOption = None):

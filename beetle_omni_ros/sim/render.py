@@ -1,7 +1,7 @@
 """
 Pictures of robots without a display; the simulation does not use this module.
 
-It needs an off-screen OpenGL, see :func:`beetle_omni_ros.film.graphics.choose_backend`.
+It needs an off-screen OpenGL, which the variable MUJOCO_GL selects.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.sim.figure import Figure, HUB_HEIGHT, Look
 from beetle_omni_ros.sim.parameters import PlantParameters, SimulatorParameters
 
@@ -76,7 +77,7 @@ class Stage:
         plant: sizes of feet and propellers; default: params/simulator.yaml.
 
     Raises:
-        RuntimeError: no off-screen OpenGL.
+        ParameterError: no off-screen OpenGL.
 
     """
 
@@ -98,8 +99,8 @@ class Stage:
             self._renderer = mujoco.Renderer(self._model, height, width, MOST_GEOMS)
         except Exception as error:
             # The OpenGL back ends raise exceptions of different types.
-            raise RuntimeError(f'no off-screen OpenGL ({type(error).__name__}: {error})') \
-                from error
+            raise ParameterError(f'no off-screen OpenGL ({type(error).__name__}: {error}); '
+                                 'install libegl1, libgl1-mesa-dri and libopengl0 (apt)') from None
 
     def __enter__(self) -> Stage:
         return self
