@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 import re
 import signal
+import stat
 import subprocess
 import sys
 import time
@@ -18,7 +19,7 @@ from test_deploy import install, UNIT
 from witness import READY, Witness
 
 from beetle_omni_ros.messages.topics import TOPICS
-from beetle_omni_ros.nodes import discovery, plan, private
+from beetle_omni_ros.nodes import discovery, plan
 from beetle_omni_ros.nodes.plan import BRIDGES
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
@@ -245,8 +246,10 @@ def test_a_launch_is_visible_on_this_computer_only(bringup, monkeypatch):
 
 
 def test_the_ports_of_a_launch_are_in_a_private_folder(bringup):
-    nodes = {n.kwargs['name']: n.kwargs['parameters'][0] for n in bringup.start(composed='false')}
-    assert Path(nodes['sim_node']['servo_port']).parent.parent == private.folder()
+    folders = {Path(n.kwargs['parameters'][0]['servo_port']).parent for _ in range(2)
+               for n in bringup.start(composed='false') if n.kwargs['name'] == 'sim_node'}
+    assert len(folders) == 2
+    assert all(stat.S_IMODE(folder.stat().st_mode) == 0o700 for folder in folders)
 
 
 def test_the_browser_viewer_is_a_separate_process_without_targets(bringup):
