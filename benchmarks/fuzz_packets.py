@@ -132,8 +132,8 @@ class Servos:
         link = self._link
         link.fast = bool(rng.integers(2))
         parts = [(one, int(rng.integers(256)), rng.bytes(DATA)) for one in SERVOS]
-        answer = b''.join(fast_status(parts, (DATA + 4) * len(parts)) if link.fast else
-                          [status(*part) for part in parts])
+        answer = fast_status(parts, (DATA + 4) * len(parts)) if link.fast else \
+            b''.join(status(*part) for part in parts)
         self._wire.waiting = mutated(rng, answer) if rng.random() < 0.7 else answer
         for error, data in link.sync_read(132, DATA, SERVOS).values():
             if len(data) != DATA or not 0 <= error < 128:
