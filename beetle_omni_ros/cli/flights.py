@@ -285,10 +285,7 @@ def film(runs: Annotated[list[Path], typer.Argument(
          model: Annotated[Optional[list[Path]], typer.Option(
              '--model', metavar='FILE',
              help='Robot file whose prediction is drawn over one RUN; it starts again from the '
-                  'recorded state each second; one panel for each --model.')] = None,
-         robot: Annotated[Optional[Path], typer.Option(
-             '--robot', metavar='FILE', help='Robot file with the dimensions for drawing. '
-                                             'Default: the shipped params/robot.yaml.')] = None):
+                  'recorded state each second; one panel for each --model.')] = None):
     """
     Render recorded flights as a film: robot, target, path, errors and thrusts.
 
@@ -302,7 +299,7 @@ def film(runs: Annotated[list[Path], typer.Argument(
     except (AttributeError, ImportError, RuntimeError) as error:
         raise ParameterError(f'no off-screen OpenGL ({error}); install libegl1, libgl1-mesa-dri '
                              'and libopengl0 (apt)') from None
-    run_film(runs, output, models=model or [], robot=robot)
+    run_film(runs, output, models=model or [])
 
 
 def controllers(json_path: JsonOption = None):

@@ -22,8 +22,7 @@ from beetle_omni_ros.runs.bag import read_bag
 from beetle_omni_ros.runs.bag_files import no_pose, runs_in
 from beetle_omni_ros.runs.body import geodesic_angles, hold, Motion, motion
 from beetle_omni_ros.runs.log import FlightLog
-from beetle_omni_ros.sim.figure import Look
-from beetle_omni_ros.sim.render import Camera, HAZE, Pose, Stage, Trail
+from beetle_omni_ros.sim.render import Camera, HAZE, Look, Pose, Stage, Trail
 from beetle_omni_ros.sim.simulator import Simulator
 
 FPS = 12.5
@@ -61,7 +60,7 @@ class Panel:
 
 
 def run_film(paths: list[Path], output: Path, *, models: list[Path] = (),
-             robot: Path | None = None, console: Console | None = None) -> None:
+             console: Console | None = None) -> None:
     """
     Draw flights side by side, from the first target on.
 
@@ -79,17 +78,17 @@ def run_film(paths: list[Path], output: Path, *, models: list[Path] = (),
         raise ParameterError(f'--model: expected one RUN with it, found {len(paths)}')
     if max(len(paths), len(models)) > len(MODEL_COLOURS):
         raise ParameterError(f'a film has at most {len(MODEL_COLOURS)} panels')
-    drawn, logs = RobotParameters.load(robot), [_read(path) for path in paths]
+    logs = [_read(path) for path in paths]
     starts = [log.targets[0].stamp if log.targets else log.start for log in logs]
     times = np.arange(0.0, max(log.end - start for log, start in zip(logs, starts)), 1 / FPS)
     if models:
-        panels = [_panel(logs[0], file.stem.replace('_', ' '), colour, starts[0] + times, drawn,
+        panels = [_panel(logs[0], file.stem.replace('_', ' '), colour, starts[0] + times,
                          free_run(logs[0], RobotParameters.load(file)))
                   for file, colour in zip(models, MODEL_COLOURS)]
     else:
-        panels = [_panel(log, Path(path).absolute().name, colour, start + times, drawn)
+        panels = [_panel(log, Path(path).absolute().name, colour, start + times)
                   for log, path, colour, start in zip(logs, paths, COLOURS, starts)]
-    frames = list(track(_frames(panels, times, drawn), output.name, total=len(times),
+    frames = list(track(_frames(panels, times), output.name, total=len(times),
                         console=console, transient=True))
     # One palette for all frames: else the background flickers.
     sample = np.concatenate(frames[::max(1, len(frames) // PALETTE_FRAMES)])
@@ -148,7 +147,7 @@ def free_run(log: FlightLog, robot: RobotParameters) -> Motion:
     return Motion(*map(np.array, zip(*states, strict=True)))
 
 
-def _panel(log, label, colour, times, robot, expected=None):
+def _panel(log, label, colour, times, expected=None):
     """Panel at ``times`` (F,) [s] of the flight; the ghost is ``expected``, else the targets."""
     position, quaternion = _at(motion(log), times)
     still = np.zeros((1, 4))
@@ -161,7 +160,7 @@ def _panel(log, label, colour, times, robot, expected=None):
     if expected is not None:
         ghosts = [Pose(*row, time=t) for *row, t in zip(*_at(expected, times), tilt, times)]
     else:
-        ghosts = _targets(log, times, robot)
+        ghosts = _targets(log, times)
     return Panel(label, colour, poses, ghosts, TARGET_LOOK if expected is None else MODEL_LOOK)
 
 
@@ -170,9 +169,10 @@ def _at(body, times):
     return body.position[index], body.quaternion[index]
 
 
-def _targets(log, times, robot):
+def _targets(log, times):
     """Poses of the targets in force, with the tilts of hovering there; None before the first."""
     stamps, tilts, found = [target.stamp for target in log.targets], {}, []
+    robot = RobotParameters.load()
     for t, k in zip(times, np.searchsorted(stamps, times + 1e-6, side='right') - 1):
         if k < 0:
             found.append(None)
@@ -204,7 +204,7 @@ def camera(points: np.ndarray) -> Camera:
     return Camera(tuple(map(float, centre @ axes)), float(distance), AZIMUTH, ELEVATION)
 
 
-def _frames(panels, times, robot):
+def _frames(panels, times):
     """Yield pictures (height, width, 3), uint8."""
     view = camera(np.array([pose.position for panel in panels
                             for pose in (*panel.poses, *panel.ghosts) if pose is not None]))
@@ -212,7 +212,7 @@ def _frames(panels, times, robot):
     chart = _chart(len(panels), fonts)
     curves = [_curve(error[:, 0], len(panels)) for error in errors]
     with ExitStack() as stack:
-        stages = [stack.enter_context(Stage(robot, [Look(), panel.look], WIDTH, HEIGHT,
+        stages = [stack.enter_context(Stage([Look(), panel.look], WIDTH, HEIGHT,
                                             FIELD_OF_VIEW)) for panel in panels]
         for k, time in enumerate(times):
             frame = Image.new('RGB', (WIDTH * len(panels), HEIGHT + CHART), PAPER)
