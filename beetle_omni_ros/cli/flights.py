@@ -18,7 +18,6 @@ from beetle_omni_ros.cli.options import (
     ConditionsOption,
     ControllerOption,
     DiscoveryOption,
-    fail,
     FAILED,
     FaultsOption,
     JobsOption,
@@ -90,19 +89,16 @@ def fly(controller: ControllerOption = DEFAULT,
                  json_path=json_path, files=(nmpc_file, policy, faults))
     if allow_targets and not view:
         raise ParameterError('--allow-targets: expected --view with it')
-    from beetle_omni_ros.nodes.fly import FlightError, run_fly
+    from beetle_omni_ros.nodes.fly import run_fly
     if not given:
         typer.echo(f'bag: {bag}')
-    try:
-        code = run_fly(controller=controller, task=task, bag=bag, compression=compression,
-                       seed=seed, conditions=conditions, actuators=actuators, clock=clock,
-                       robot=robot, plant=plant, nmpc=nmpc_file, policy=policy,
-                       allow_other_robot=allow_other_robot, standby=standby,
-                       composed=composed, faults=faults, json_path=json_path,
-                       domain_id=domain_id, discovery=discovery,
-                       view=view, allow_targets=allow_targets)
-    except FlightError as error:
-        raise typer.Exit(fail(error, FAILED)) from None
+    code = run_fly(controller=controller, task=task, bag=bag, compression=compression,
+                   seed=seed, conditions=conditions, actuators=actuators, clock=clock,
+                   robot=robot, plant=plant, nmpc=nmpc_file, policy=policy,
+                   allow_other_robot=allow_other_robot, standby=standby,
+                   composed=composed, faults=faults, json_path=json_path,
+                   domain_id=domain_id, discovery=discovery,
+                   view=view, allow_targets=allow_targets)
     raise typer.Exit(code if isinstance(code, int) else 0)
 
 
@@ -142,14 +138,10 @@ def evaluate(controllers: Annotated[str, typer.Option(
     check_flight(task=task, seed=seed, conditions=conditions, bag=bag, compression=compression,
                  json_path=json_path, files=(nmpc_file, policy, faults))
     from beetle_omni_ros.evaluation.command import run_evaluate
-    from beetle_omni_ros.evaluation.loop import FlightError
     from beetle_omni_ros.runs.metrics import failed
-    try:
-        results = run_evaluate(controllers=chosen, task=task, conditions=conditions, robot=robot,
-                               plant=plant, seed=seed, bag=bag, compression=compression,
-                               json_path=json_path, faults=faults, options=options)
-    except FlightError as error:
-        raise typer.Exit(fail(error, FAILED)) from None
+    results = run_evaluate(controllers=chosen, task=task, conditions=conditions, robot=robot,
+                           plant=plant, seed=seed, bag=bag, compression=compression,
+                           json_path=json_path, faults=faults, options=options)
     if any(map(failed, results.values())):
         raise typer.Exit(FAILED)
 
@@ -197,12 +189,8 @@ def compare(controllers: Annotated[Optional[str], typer.Option(
     check_files(policy)
     check_writable(json_path)
     from beetle_omni_ros.comparison.command import run_compare
-    from beetle_omni_ros.comparison.sweep import SweepError
-    try:
-        run_compare(**arguments, output=output, jobs=jobs, backend=backend, address=address,
-                    cache=cache, fresh=fresh, policy=policy, json_path=json_path)
-    except SweepError as error:
-        raise typer.Exit(fail(error, FAILED)) from None
+    run_compare(**arguments, output=output, jobs=jobs, backend=backend, address=address,
+                cache=cache, fresh=fresh, policy=policy, json_path=json_path)
 
 
 def faults(faults: Annotated[Optional[Path], typer.Option(
