@@ -53,8 +53,7 @@ TESTS = ('test/estimation/test_noise.py', 'test/estimation/test_odometry.py',
          'test/control/test_rti.py', 'test/control/test_ocp.py', 'test/control/test_references.py',
          'test/control/test_observation.py', 'test/control/test_policy_file.py',
          'test/safety/test_limits.py', 'test/safety/test_watch.py', 'test/safety/test_ramp.py',
-         'test/drivers/test_mavlink_packets.py', 'test/drivers/test_mavlink_receiver.py',
-         'test/drivers/test_clock_offset.py')
+         'test/drivers/test_mavlink.py', 'test/drivers/test_motor_board_state.py')
 ENDINGS = 'failure', 'error', 'skipped'        # of a test case in pytest's report
 COMPILER = 'aarch64-linux-gnu-gcc'
 PARTS = {2: ('one NMPC cycle', 5.0), 4: ('one step of the policy, with guidance', None),

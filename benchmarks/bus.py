@@ -26,10 +26,12 @@ from rich.table import Table
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
+from beetle_omni_ros.drivers.device_parameters import (  # noqa: E402
+    MotorBoardParameters,
+    ServoBusParameters,
+)
 from beetle_omni_ros.drivers.motor_board import MotorBoard  # noqa: E402
-from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters  # noqa: E402
 from beetle_omni_ros.drivers.servo_bus import ServoBus  # noqa: E402
-from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters  # noqa: E402
 from beetle_omni_ros.robot.parameters import RobotParameters  # noqa: E402
 
 PERIOD = 0.005          # [s]
@@ -139,7 +141,7 @@ def servo_loop(bus, seconds, script=()):
         marks.append(time.perf_counter())
         np.add(lost, ~bus.read().valid, out=lost)
         marks.append(time.perf_counter())
-        bus.poll_health()
+        bus.upkeep()
         marks.append(time.perf_counter())
         for stage, spent in zip(stages.values(), [*np.diff(marks), marks[-1] - marks[0]]):
             stage.append(spent)
@@ -175,7 +177,8 @@ def measure_board(seconds):
     """Numbers of the motor board: one target in each cycle, telemetry polled as the node does."""
     device = Device(serve_board)
     sent, thrusts = [], np.random.default_rng(0).uniform(2, 15, (1000, 4))
-    with MotorBoard(replace(MotorBoardParameters.load(), port=device.port)) as board:
+    with MotorBoard(replace(MotorBoardParameters.load(), port=device.port),
+                    RobotParameters.load()) as board:
         if missing := board.wait_ready(5):
             raise SystemExit(missing)
         if not (answer := board.arm()).accepted:
@@ -184,12 +187,12 @@ def measure_board(seconds):
         def tick(k, _):
             begin = time.monotonic()
             result = board.send(thrusts[k % 1000], time.time())
-            sent.append((begin, time.monotonic(), board._last_stamp[1], result.sent))
+            sent.append((begin, time.monotonic(), board._last_stamp[1], not result.reason))
             if k % POLL_TICKS == 0:
                 board.poll()
 
         measured = run(tick, seconds)
-        lost = board.poll().link.received.lost
+        lost = board.poll().received['lost']
         device.sender('end')()
         arrivals, refused = device.pipe.recv()
     device.close()

@@ -16,10 +16,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters, ServoBusParameters
 from beetle_omni_ros.drivers.motor_board import MotorBoard
-from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
 from beetle_omni_ros.drivers.servo_bus import ServoBus
-from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
@@ -34,7 +33,7 @@ def drive(pipe, servo_port, board_port, seconds):
     """Do the work of the bridges; send 'begin' and then (times, incomplete readings)."""
     robot = RobotParameters.load()
     bus = ServoBus(replace(ServoBusParameters.load(), port=servo_port, guard=False), robot.joints)
-    board = MotorBoard(replace(MotorBoardParameters.load(), port=board_port))
+    board = MotorBoard(replace(MotorBoardParameters.load(), port=board_port), robot)
     bus.open()
     bus.configure()
     bus.enable()
@@ -50,7 +49,7 @@ def drive(pipe, servo_port, board_port, seconds):
         bus.write_goals(0.5 * np.sin(np.pi * k * PERIOD + np.arange(4)))
         board.send(np.full(4, robot.hover_thrust), time.time())
         incomplete += not bus.read().valid.all()
-        bus.poll_health()
+        bus.upkeep()
         board.poll()
         spent.append(time.monotonic() - start)
     pipe.send((spent, incomplete))

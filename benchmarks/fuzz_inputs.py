@@ -33,8 +33,10 @@ from beetle_omni_ros.control.hover import HoverParameters  # noqa: E402
 from beetle_omni_ros.control.nmpc_parameters import NmpcParameters  # noqa: E402
 from beetle_omni_ros.control.policy import PolicyParameters  # noqa: E402
 from beetle_omni_ros.control.policy_network import PolicyNetwork  # noqa: E402
-from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters  # noqa: E402
-from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters  # noqa: E402
+from beetle_omni_ros.drivers.device_parameters import (  # noqa: E402
+    MotorBoardParameters,
+    ServoBusParameters,
+)
 from beetle_omni_ros.estimation.parameters import EkfParameters  # noqa: E402
 from beetle_omni_ros.identify.gap.parameters import GapParameters  # noqa: E402
 from beetle_omni_ros.identify.parameters import IdentifyParameters  # noqa: E402

@@ -17,7 +17,7 @@ from beetle_omni_ros.bringup.finding import (
 from beetle_omni_ros.bringup.graph import ObservedGraph
 from beetle_omni_ros.bringup.limits import BatteryLimits, CheckLimits, LinkLimits
 from beetle_omni_ros.bringup.port import latency_finding, port_finding
-from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
+from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 BOARD, BRIDGE = 'motor board', 'rotor_bridge'
@@ -62,7 +62,7 @@ def _listen(board, seconds):
 
     Returns:
         the last update with the newest battery and rotors of all updates, and a list of
-        (number of packets sent, BoardReception) for each report of the board's reception.
+        (number of packets sent, the board's counts) for each report of the board's reception.
 
     """
     rotors = battery = None
@@ -71,22 +71,23 @@ def _listen(board, seconds):
     while True:
         update, now = board.poll(), time.monotonic()
         rotors, battery = update.rotors or rotors, update.battery or battery
-        reception = update.link.board
+        reception = update.reception
         # The restart of our sequence numbers looks like lost packets to the board.
         if reception is not None and now - started > SETTLING and \
                 (not receptions or reception is not receptions[-1][1]):
-            receptions.append((update.link.sent, reception))
+            receptions.append((update.sent, reception))
         if now - started >= seconds:
             return replace(update, rotors=rotors, battery=battery), receptions
         time.sleep(POLL_PERIOD)
 
 
 def _of_board(update, receptions, parameters, robot, limits):
-    from beetle_omni_ros.drivers.motor_board_messages import NO_HOST_HEARTBEAT
-    status, received = update.status, update.link.received
+    from beetle_omni_ros.drivers.motor_board_state import NO_HOST_HEARTBEAT
+    status, received = update.status, update.received
     if status is None:
-        return [Finding(BOARD, FAIL, f'no heartbeat; {received.bytes} bytes, '
-                        f'{received.messages} good packets, {received.foreign} of other senders',
+        return [Finding(BOARD, FAIL, f'no heartbeat; {received["bytes"]} bytes, '
+                        f'{received["messages"]} good packets, {received["foreign"]} of other '
+                        'senders',
                         _remedy_of_silence(received, parameters))]
     blocking = [condition for condition in status.conditions if condition != NO_HOST_HEARTBEAT]
     receives = NO_HOST_HEARTBEAT not in status.conditions
@@ -105,17 +106,17 @@ def _of_board(update, receptions, parameters, robot, limits):
 
 
 def _remedy_of_silence(received, parameters):
-    if received.foreign:
+    if received['foreign']:
         return (f'another device sends MAVLink; expected system '
                 f'{parameters.board_system}, component {parameters.board_component}: '
                 'params/motor_board.yaml')
-    if received.bytes:
+    if received['bytes']:
         return f'wrong baud rate (here {parameters.baud} bit/s), or another firmware or device'
     return "check the board's power, the cable, TX and RX swapped, another port"
 
 
 def _of_firmware(status):
-    from beetle_omni_ros.drivers.motor_board_messages import CONTRACT_VERSION
+    from beetle_omni_ros.drivers.motor_board_state import CONTRACT_VERSION
     values = {'contract': status.contract, 'state': status.state}
     if status.contract != CONTRACT_VERSION:
         return Finding('board firmware', FAIL, f'contract {status.contract}, this driver uses '
@@ -177,14 +178,14 @@ def _of_clock(update, parameters):
 
 
 def _of_link(received, receptions, limits: LinkLimits):
-    findings = [_of_direction('link from the board', received.lost, received.bad_crc,
-                              received.messages, limits)]
+    findings = [_of_direction('link from the board', received['lost'], received['bad_crc'],
+                              received['messages'], limits)]
     if len(receptions) < 2:
         return [*findings, Finding('link to the board', WARN, f'{len(receptions)} reports of the '
                                    "board's reception, two are needed",
                                    'increase the time: --seconds 4')]
     (before, first), (after, last) = receptions[0], receptions[-1]
-    lost, bad_crc = last.lost - first.lost, last.bad_crc - first.bad_crc
+    lost, bad_crc = (last[name] - first[name] for name in ('lost', 'bad_crc'))
     return [*findings, _of_direction('link to the board', lost, bad_crc,
                                      max(0, after - before - lost), limits)]
 

@@ -9,8 +9,7 @@ import time
 
 import numpy as np
 
-from beetle_omni_ros.drivers.servo_bus import ServoBus
-from beetle_omni_ros.drivers.servo_state import ServoHealth, ServoReadings
+from beetle_omni_ros.drivers.servo_bus import ServoBus, ServoReadings
 
 READ_AFTER = 0.001  # [s] start of a cycle after the arrival of goals, which find the bus free
 SLEW = 0.01         # largest relative change of a period by the phase control
@@ -23,7 +22,7 @@ EVENTS_KEPT = 200   # lines for the log
 
 class ServoPace:
     """
-    Times of the cycles on a monotonic clock.
+    Times of the cycles on a monotonic clock [s].
 
     A late cycle does not delay the next one, and a period without a cycle is missed. Goals arrive
     once in one or several periods. The phase of the cycles is controlled so that goals do not
@@ -31,37 +30,22 @@ class ServoPace:
 
     Attributes:
         missed: number of periods without a cycle.
+        due: time of the next cycle.
+        goals: time when goals arrived last.
 
     """
 
-    def __init__(self, period: float):
-        self.missed = 0
-        self._period = period
-        self._due = 0.0
-        self._goals = float('-inf')
-
-    def start(self, now: float):
-        """Set the next cycle to ``now`` [s]."""
-        self._due = now
-
-    def wait(self, now: float) -> float:
-        """Time until the next cycle [s]."""
-        return max(0.0, self._due - now)
-
-    def goals_arrived(self, now: float):
-        """Record goals that arrived at ``now`` [s]."""
-        self._goals = now
+    def __init__(self, now: float):
+        self.missed, self.due, self.goals = 0, now, float('-inf')
 
     def begin(self, now: float):
-        """Start a cycle at ``now`` [s] and set the time of the next one."""
-        passed = int(max(0.0, now - self._due) / self._period)
+        """Start a cycle at ``now`` and set the time of the next one."""
+        passed = int(max(0.0, now - self.due) / PERIOD)
         self.missed += passed
-        self._due += (passed + 1) * self._period
-        if now - self._goals < GOALS_KEPT:
-            period = self._period
-            late = (self._due - self._goals - READ_AFTER + period / 2) % period - period / 2
-            limit = SLEW * period
-            self._due -= min(max(GAIN * late, -limit), limit)
+        self.due += (passed + 1) * PERIOD
+        if now - self.goals < GOALS_KEPT:
+            late = (self.due - self.goals - READ_AFTER + PERIOD / 2) % PERIOD - PERIOD / 2
+            self.due -= min(max(GAIN * late, -SLEW * PERIOD), SLEW * PERIOD)
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,12 +86,11 @@ class ServoLoop:
         self.cycles = self.written = self.stale = self.incomplete = 0
         self.failure = ''
         self._bus, self._on_readings, self._on_written = bus, on_readings, on_written
-        self._clock = clock
-        self._pace = ServoPace(PERIOD)
+        self._clock, self._pace = clock, ServoPace(clock())
         self._lock = Lock()
         self._goal: Goal | None = None
         self._fresh = self._wrote = self._stopping = False
-        self._last_obeying = [clock()] * 4
+        self._last_obeying = np.full(4, clock())
         self._events: deque[str] = deque(maxlen=EVENTS_KEPT)
         self._thread = Thread(target=self._run, name='servo bus', daemon=True)
 
@@ -115,7 +98,7 @@ class ServoLoop:
 
     def start(self):
         """Start the thread."""
-        self._pace.start(self._clock())
+        self._pace.due = self._clock()
         self._thread.start()
 
     def stop(self):
@@ -126,7 +109,7 @@ class ServoLoop:
 
     def offer(self, goal: Goal):
         """Write goals now, or after the present transaction; newer goals replace older ones."""
-        self._pace.goals_arrived(self._clock())
+        self._pace.goals = self._clock()
         self._goal = goal
         self._fresh = True
         self._write_pending()
@@ -138,9 +121,8 @@ class ServoLoop:
             try:
                 yield self._bus
             finally:
-                now = self._clock()
-                self._last_obeying = [now] * len(self._last_obeying)
-                self._pace.start(now)
+                self._pace.due = now = self._clock()
+                self._last_obeying = np.full(4, now)
         self._write_pending()
 
     @property
@@ -148,38 +130,26 @@ class ServoLoop:
         """Number of periods without a cycle."""
         return self._pace.missed
 
-    def health(self) -> list[ServoHealth]:
-        """Last known health of each servo."""
-        with self._lock:
-            return self._bus.health()
-
     def lost(self, patience: float) -> str:
         """Servos that have not obeyed for ``patience`` [s], with reasons; '' if there is none."""
-        if self.failure:
+        gone = self._clock() - self._last_obeying > patience
+        if self.failure or not gone.any():
             return self.failure
-        limit = self._clock() - patience
-        gone = [k for k, seen in enumerate(self._last_obeying) if seen < limit]
-        if not gone:
-            return ''
-        if not self._bus.connected:
-            return f'{self._bus.parameters.port}: no connection'
-        health = self.health()
-        return '; '.join(health[k].message or f'{health[k].name}: being brought back'
-                         for k in gone)
+        if not self._bus.link.is_open:
+            return f'{self._bus.link.path}: no connection'
+        return '; '.join(servo.message or f'{servo.name}: being brought back'
+                         for servo, is_gone in zip(self._bus.servos, gone) if is_gone)
 
     def take_events(self) -> list[str]:
         """Return the lines for the log since the last call."""
-        events = []
-        while self._events:
-            events.append(self._events.popleft())
-        return events
+        return [self._events.popleft() for _ in range(len(self._events))]
 
     # --- the thread ---------------------------------------------------------------------------
 
     def _run(self):
         try:
             while not self._stopping:
-                time.sleep(self._pace.wait(self._clock()))
+                time.sleep(max(0.0, self._pace.due - self._clock()))
                 with self._lock:
                     if not self._stopping:
                         self._cycle()
@@ -194,23 +164,20 @@ class ServoLoop:
         """Goals, feedback and upkeep, with the lock held."""
         self._pace.begin(self._clock())
         self.cycles += 1
-        self._write()
+        if self._fresh:
+            self._write_fresh()
+        elif self._goal is not None and not self._wrote and self._clock() <= self._goal.expires:
+            self.written += self._bus.write_goals(self._goal.tilt)  # a whole period brought none
+        self._wrote = False
         readings = self._bus.read()
-        good = readings.valid
-        self.incomplete += not good.all()
+        self.incomplete += not readings.valid.all()
         obeying = self._bus.obeying
-        if self._bus.enabled:
-            good = good & obeying
-        self._on_readings(readings, good)
+        self._on_readings(readings, readings.valid & obeying if self._bus.enabled
+                          else readings.valid)
         self._write_fresh()
         self._bus.upkeep()
         self._events.extend(self._bus.take_events())
-        now = self._clock()
-        if obeying.all():
-            self._last_obeying = [now] * len(self._last_obeying)
-        else:
-            self._last_obeying = [now if obeys else seen
-                                  for obeys, seen in zip(obeying, self._last_obeying, strict=True)]
+        self._last_obeying = np.where(obeying, self._clock(), self._last_obeying)
 
     def _write_pending(self):
         """Write new goals if the bus is free; otherwise the holder of the lock does it later."""
@@ -219,14 +186,6 @@ class ServoLoop:
                 self._write_fresh()
             finally:
                 self._lock.release()
-
-    def _write(self):
-        """Write new goals, or repeat the last ones if a whole period brought none."""
-        if self._fresh:
-            self._write_fresh()
-        elif self._goal is not None and not self._wrote and self._clock() <= self._goal.expires:
-            self.written += self._bus.write_goals(self._goal.tilt)
-        self._wrote = False
 
     def _write_fresh(self):
         if not self._fresh:

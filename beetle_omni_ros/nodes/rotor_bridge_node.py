@@ -4,9 +4,8 @@ from dataclasses import dataclass, replace
 import math
 import time
 
-from beetle_omni_ros.drivers.motor_board import MotorBoard
-from beetle_omni_ros.drivers.motor_board_arming import Arming, FLIES
-from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
+from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters
+from beetle_omni_ros.drivers.motor_board import Arming, FLIES, MotorBoard
 from beetle_omni_ros.drivers.serial_port import SerialPortError
 from beetle_omni_ros.nodes.command_source import CommandSource
 from beetle_omni_ros.nodes.lifecycle_node import AUTOSTART, LifecycleFlightNode
@@ -159,7 +158,7 @@ class RotorBridgeNode(LifecycleFlightNode):
         sent = self._board.send(command.thrust, command.stamp)
         self._sent = time.monotonic()
         self._stream.add(sent, self._sent)
-        return sent.sent
+        return not sent.reason
 
     def _poll(self):
         update = self._board.poll()

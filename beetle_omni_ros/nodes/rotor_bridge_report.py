@@ -6,9 +6,7 @@ import math
 
 import numpy as np
 
-from beetle_omni_ros.drivers.motor_board import Sent
-from beetle_omni_ros.drivers.motor_board_arming import Arming, FLIES, LOST
-from beetle_omni_ros.drivers.motor_board_messages import BoardUpdate
+from beetle_omni_ros.drivers.motor_board import Arming, BoardUpdate, FLIES, LOST, Sent
 from beetle_omni_ros.nodes import health
 
 
@@ -45,7 +43,7 @@ class TargetStream:
 
     def add(self, sent: Sent, now: float) -> None:
         """Count the result of one target at monotonic time ``now`` [s]."""
-        if not sent.sent:
+        if sent.reason:
             self.unsent[sent.reason] += 1
             return
         if self._last is not None:
@@ -135,14 +133,12 @@ class RotorBridgeReport:
 
 def _link(update):
     """Counters of both directions of the link, and clock synchronisation."""
-    link, received = update.link, update.link.received
-    values = {'received': received.messages, 'lost': received.lost, 'bad_crc': received.bad_crc,
-              'skipped_bytes': received.skipped_bytes, 'sent': link.sent,
-              'buffer_full': link.dropped, 'connections': link.connections}
-    if link.board is not None:
-        values.update({'board lost': link.board.lost, 'board bad_crc': link.board.bad_crc,
-                       'board refused': link.board.refused,
-                       'board timeouts': link.board.timeouts})
+    counts = update.received
+    values = {'received': counts['messages'], 'lost': counts['lost'],
+              'bad_crc': counts['bad_crc'], 'skipped_bytes': counts['skipped_bytes'],
+              'sent': update.sent, 'buffer_full': update.dropped,
+              'connections': update.connections}
+    values.update((f'board {name}', n) for name, n in (update.reception or {}).items())
     values.update({'clock_offset_s': update.clock_offset,
                    'clock_uncertainty_ms': 1e3 * update.clock_uncertainty})
     return values

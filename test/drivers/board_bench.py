@@ -7,20 +7,22 @@ import time
 
 import numpy as np
 
+from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters
 from beetle_omni_ros.drivers.motor_board import MotorBoard
-from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
+from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.sim.emulated.board_parameters import EmulatedBoardParameters
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 
 QUICK = replace(EmulatedBoardParameters.load(), boot_time=0.05, heartbeat_timeout=0.5,
                 idle_timeout=1.0, throttle_low_time=0.3, reception_rate=10.0)
+ROBOT = RobotParameters.load()
 HOVER = np.array([7.0, 7.5, 8.0, 8.5])
 
 
 def driver(port, **changes):
     """Driver with a short reconnect period."""
     return MotorBoard(replace(MotorBoardParameters.load(), port=port, reconnect_period=0.05,
-                              **changes))
+                              **changes), ROBOT)
 
 
 def until(condition, timeout=3.0):
@@ -78,7 +80,7 @@ def flying(**changes):
     """Emulated board, driver and pilot, rotors following."""
     with connected(**changes) as (emulated, board):
         result = board.arm()
-        assert result.accepted, result
+        assert result.accepted, result.reason
         with Pilot(board) as pilot:
             assert until(lambda: emulated.commands.all() and pilot.results)
             yield emulated, board, pilot

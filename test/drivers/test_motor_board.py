@@ -18,10 +18,9 @@ pytest.importorskip('pymavlink')
 pytest.importorskip('serial')
 
 from board_bench import connected, driver, flying, HOVER, QUICK, until
+from pymavlink.dialects.v20 import common
 
-from beetle_omni_ros.drivers.mavlink_dialect import common
-from beetle_omni_ros.drivers.serial_port import SerialPort, SerialPortError
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.drivers.serial_port import SerialPort
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 
 pytestmark = pytest.mark.real_time
@@ -32,29 +31,20 @@ def test_commanded_thrusts_are_produced_at_the_measured_voltage():
         emulated.set_battery(22.9, 20.0)
         time.sleep(0.6)         # twelve time constants of the voltage filter
         assert board.arm().accepted
-        assert board.send(HOVER, time.time()).sent
+        assert not board.send(HOVER, time.time()).reason
         assert until(lambda: emulated.commands.all())
         np.testing.assert_allclose(emulated.thrust_targets, HOVER, rtol=1e-3)
 
 
-def test_saturation_is_reported_and_the_maximum_is_sent():
-    with flying() as (emulated, board, pilot):
-        emulated.set_battery(21.4, 40.0)
-        pilot.thrust = np.array([5.0, 19.5, 5.0, 30.0])
-        assert until(lambda: pilot.results[-1].saturated.tolist() == [False, True, False, True])
-        assert until(lambda: abs(emulated.thrust_targets[3] - 18.7075) < 1e-3)
-
-
 @pytest.mark.parametrize(('thrust', 'age', 'reason'), [
-    ([1, 2, 3], 0, 'expected 4 thrusts'), ('rubbish', 0, 'not numbers'),
-    ([1, 2, 3, math.nan], 0, 'not finite'), ([1, 2, 3, math.inf], 0, 'not finite'),
-    ([1, 2, 3, 4], math.nan, 'not finite'), ([1, 2, 3, 4], 0.2, 'stale stamp'),
-    ([1, 2, 3, 4], -0.2, 'stamp in the future')])
+    ([1, 2, 3], 0, 'not four finite numbers'), ([1, 2, 3, math.nan], 0, 'not four finite numbers'),
+    ([1, 2, 3, math.inf], 0, 'not four finite numbers'),
+    ([1, 2, 3, 4], math.nan, 'not four finite numbers'),
+    ([1, 2, 3, 4], 0.2, 'stale stamp'), ([1, 2, 3, 4], -0.2, 'stamp in the future')])
 def test_bad_thrusts_are_not_sent(thrust, age, reason):
     with connected() as (emulated, board):
         board.arm()
-        result = board.send(thrust, time.time() - age)
-        assert not result.sent and reason in result.reason
+        assert board.send(thrust, time.time() - age).reason == reason
         time.sleep(0.05)
         assert not emulated.commands.any()
 
@@ -77,20 +67,9 @@ def test_refused_arming_is_reported_with_the_reason():
 def test_disarming_is_acknowledged_and_stops_the_rotors():
     with flying() as (emulated, board, _):
         result = board.disarm()
-        assert result.accepted and result.attempts >= 1
+        assert result.accepted
         assert not emulated.armed and not emulated.commands.any()
-        assert until(lambda: not board.armed)
-
-
-def test_an_acknowledgement_of_another_command_is_ignored():
-    """The late acknowledgement of an arm command must not confirm a disarm command."""
-    with connected() as (_, board):
-        command = board.start_disarm()
-        late = common.MAVLink(None).decode(bytearray(reference.ACCEPTED))
-        other = type(command)(False, board.parameters, lambda _: None, 0.0)
-        other.acknowledge(late, 0.1)
-        assert other.result is None
-        assert command.wait(1.0) and command.result.accepted
+        assert until(lambda: not board.status.armed)
 
 
 def test_battery_and_rotor_states_have_si_units_and_stamps_of_the_computer():
@@ -102,22 +81,17 @@ def test_battery_and_rotor_states_have_si_units_and_stamps_of_the_computer():
         board.poll()
         time.sleep(0.1)
         update = board.poll()
+        emulated.faults.mute = True
+        time.sleep(0.05)
+        board.poll()
+        later = board.poll()
+        assert later.battery is None and later.rotors is None and later.status is not None
         assert (update.battery.voltage, update.battery.current) == (23.456, -12.34)
         rotors = update.rotors
         assert rotors.rpm.tolist() == [2700, 5400, 8100, 0]
         assert rotors.temperature.tolist() == [30, 40, 50, 60]
         assert rotors.current.sum() == pytest.approx(12.34, rel=1e-5)
         assert before - 0.02 < rotors.stamp <= time.time()
-
-
-def test_a_poll_returns_new_messages_only():
-    with connected() as (emulated, board):
-        emulated.faults.mute = True
-        time.sleep(0.05)
-        board.poll()
-        update = board.poll()
-        assert update.battery is None and update.rotors is None
-        assert update.status is not None
 
 
 def test_the_clock_offset_of_the_board_is_within_its_bound():
@@ -137,7 +111,7 @@ def test_an_independent_parser_accepts_all_output_of_the_driver():
     board = driver(os.ttyname(other))
     board.open()
     threading.Thread(target=board.disarm, daemon=True).start()
-    board._watch.clock.add(time.monotonic(), 1.0, time.monotonic())
+    board._state.clock.add(time.monotonic(), 1.0, time.monotonic())
     for _ in range(100):
         board.send(HOVER, time.time())
         time.sleep(0.005)
@@ -157,7 +131,10 @@ def test_an_independent_parser_accepts_all_output_of_the_driver():
         == [k % 256 for k in range(len(messages))]
     stamps = [values[0] for number, _, _, values in messages if number == 139]
     assert len(stamps) == 100 and np.all(np.diff(stamps) > 0)
-    assert messages[-1][0] in (0, 76, 111)
+    contents = [(number, values) for number, _, _, values in messages]
+    for frame in (reference.HOST_HEARTBEAT, reference.DISARM):
+        number, _, _, values = reference.parse(frame)
+        assert (number, values) in contents
     os.close(device)
     os.close(other)
 
@@ -189,8 +166,7 @@ def test_without_a_board_every_call_times_out_soon_with_a_message():
         assert board.wait_ready(0.1) == 'no message from the board'
         assert board.arm().reason == 'no message from the board'
         assert board.disarm().reason == 'no acknowledgement to 5 attempts'
-        assert not board.send(HOVER, time.time()).sent
-        assert not board.armed
+        assert board.send(HOVER, time.time()).reason == "offset of the board's clock unknown"
     os.close(device)
     os.close(other)
 
@@ -200,11 +176,6 @@ def test_another_firmware_is_refused():
         emulated._firmware._heartbeat = lambda state, now: (0, (1 | 9 << 24, 2, 0, 1, 3, 3))
         assert until(lambda: board.poll().status.contract == 9)
         assert board.arm().reason == 'firmware follows contract 9, this driver 1'
-
-
-def test_a_port_that_cannot_be_opened_is_refused_in_one_line(tmp_path):
-    with pytest.raises(SerialPortError, match='board: cannot be opened .no such port'):
-        driver(str(tmp_path / 'board')).open()
 
 
 def test_closing_disarms():
@@ -217,6 +188,39 @@ def test_closing_disarms():
         assert not emulated.armed
         board.close()
         assert emulated._firmware._stop_reason == 1
+
+
+def test_a_step_of_the_computers_clock_does_not_stop_the_rotors():
+    """Stamps and clock step together; the age of a stamp gives the board's clock."""
+    shift = [0.0]
+    with connected() as (emulated, board):
+        board._clock = lambda: time.time() + shift[0]
+        assert board.arm().accepted
+        for k in range(60):
+            shift[0] = 3600.0 * (k > 20) - 7200.0 * (k > 40)
+            assert not board.send(HOVER, time.time() + shift[0]).reason
+            time.sleep(0.005)
+            assert k < 10 or emulated.commands.all()
+        assert sum(emulated.refused.values()) <= 2
+
+
+def test_stamps_stay_monotonic_when_the_offset_is_corrected():
+    with connected() as (emulated, board):
+        stamps = []
+        emulated.on_target = lambda now, values: stamps.append(values[0])
+        assert board.arm().accepted
+        clock, begin = board._state.clock, time.time()
+        for k, correction in enumerate((0.0, -0.003, 0.002, -0.003)):
+            low, high, at = clock._bounds
+            clock._bounds = low + correction, high + correction, at
+            board.send(HOVER, begin + 0.001 * k)
+            board.send(HOVER, begin + 0.001 * k)
+            time.sleep(0.003)
+        time.sleep(0.03)
+        assert len(stamps) == 8
+        assert stamps[::2] == stamps[1::2]
+        assert stamps == sorted(stamps) and len(set(stamps)) == 4
+        assert emulated.refused == {}
 
 
 CHILD = """
@@ -281,8 +285,3 @@ def test_no_rotor_turns_100_ms_after_the_end_of_the_process(number):
             child.wait(10)
         assert emulated._firmware._stop_reason in (2, 3)
 
-
-def test_thrust_map_of_another_robot_is_used():
-    robot = RobotParameters.load()
-    with connected() as (_, board):
-        assert board.thrust_map.thrust_limits[-1] == robot.rotors.map[0].thrust_max

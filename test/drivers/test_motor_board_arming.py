@@ -9,8 +9,8 @@ pytest.importorskip('serial')
 
 from board_bench import connected, until
 
-from beetle_omni_ros.drivers.motor_board_arming import Arming, PATIENCE, STEP
-from beetle_omni_ros.drivers.motor_board_messages import BoardStatus, CommandResult
+from beetle_omni_ros.drivers.motor_board import Arming, PATIENCE, STEP
+from beetle_omni_ros.drivers.motor_board_state import BoardStatus
 
 CYCLE = 0.005
 DISARMED = BoardStatus(0.0, 'disarmed', 'none', (), 1)
@@ -19,10 +19,11 @@ ARMED = BoardStatus(0.0, 'armed', 'none', (), 1)
 
 @dataclass
 class Command:
-    """An arm or disarm command; ``result`` is None until it is answered."""
+    """An arm or disarm command; ``accepted`` is None until it is answered."""
 
     arm: bool
-    result: CommandResult | None = None
+    accepted: bool | None = None
+    reason: str = ''
 
 
 class BoardStub:
@@ -32,20 +33,14 @@ class BoardStub:
         self.ready, self.status, self.commands = '', DISARMED, []
         self.connected = True
 
-    def start_arm(self):
-        return self._start(Command(True))
-
-    def start_disarm(self):
-        return self._start(Command(False))
-
-    def _start(self, command):
-        self.commands.append(command)
-        return command
+    def start(self, arm):
+        self.commands.append(Command(arm))
+        return self.commands[-1]
 
     def answer(self, accepted=True, reason=''):
         """Answer the newest command."""
         command = self.commands[-1]
-        command.result = CommandResult(accepted, reason, 1)
+        command.accepted, command.reason = accepted, reason
         if accepted:
             self.status = ARMED if command.arm else DISARMED
 

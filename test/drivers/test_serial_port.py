@@ -47,7 +47,6 @@ def test_a_full_buffer_drops_whole_frames_without_waiting(ends):
     frames = [bytes([k % 256]) * 55 for k in range(2000)]
     taken = [k for k, frame in enumerate(frames) if port.write(frame)]
     assert 10 < len(taken) < 2000
-    assert port.dropped == 2000 - len(taken)
     received = b''
     while True:
         port.flush()
@@ -66,20 +65,17 @@ def test_an_unplugged_device_is_an_error_of_one_line(ends):
     port = SerialPort(name, 921600)
     os.close(device)
     for use in (port.read, lambda: port.write(b'x')):
-        with pytest.raises(SerialPortError, match='device is gone') as caught:
+        with pytest.raises(SerialPortError, match='unplugged') as caught:
             use()
         assert '\n' not in str(caught.value) and name in str(caught.value)
     port.close()
 
 
-def test_a_port_in_use_is_refused(ends):
+def test_a_port_that_cannot_be_opened_is_refused_with_the_remedy(ends, tmp_path):
     port = SerialPort(ends[1], 921600)
     with pytest.raises(SerialPortError, match='in use by another process'):
         SerialPort(ends[1], 921600)
     port.close()
-
-
-def test_a_port_that_cannot_be_opened_is_refused_with_the_remedy(tmp_path):
     with pytest.raises(SerialPortError, match='nowhere: cannot be opened .no such port'):
         SerialPort(str(tmp_path / 'nowhere'), 921600)
     (tmp_path / 'file').write_text('x')

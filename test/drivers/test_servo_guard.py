@@ -1,5 +1,6 @@
 """No servo keeps its torque after any end of the driver's process."""
 
+from contextlib import contextmanager
 import os
 from pathlib import Path
 import signal
@@ -18,7 +19,7 @@ DRIVER = """
 from dataclasses import replace
 import sys, time
 from beetle_omni_ros.drivers.servo_bus import ServoBus
-from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
+from beetle_omni_ros.drivers.device_parameters import ServoBusParameters
 from beetle_omni_ros.robot.parameters import RobotParameters
 shipped = ServoBusParameters.load()
 bus = ServoBus(replace(shipped, port=sys.argv[1], guard=sys.argv[2] == 'guard',
@@ -26,7 +27,7 @@ bus = ServoBus(replace(shipped, port=sys.argv[1], guard=sys.argv[2] == 'guard',
                RobotParameters.load().joints)
 bus.open(); bus.configure(); bus.enable()
 while True:
-    bus.write_goals([1.0, 1.0, 1.0, 1.0]); bus.read(); bus.poll_health()
+    bus.write_goals([1.0, 1.0, 1.0, 1.0]); bus.read(); bus.upkeep()
     print('tick', flush=True)
     time.sleep(0.005)
 """
@@ -40,53 +41,41 @@ def wait_for(condition, limit=10.0):
     assert condition()
 
 
-def driver(port, guard):
-    environment = {**os.environ, 'PYTHONPATH': str(ROOT)}
-    process = subprocess.Popen([sys.executable, '-c', DRIVER, port, guard], cwd=ROOT,
-                               env=environment, stdout=subprocess.PIPE, text=True)
-    for _ in range(5):
-        assert process.stdout.readline() == 'tick\n'
-    return process
-
-
-@pytest.mark.parametrize('how', [signal.SIGKILL, signal.SIGTERM, signal.SIGSEGV])
-def test_torque_is_off_after_the_process_is_killed(how):
+@contextmanager
+def driven(guard):
+    """Emulated servos and a process that drives them."""
     with EmulatedServoBus() as emulated:
-        process = driver(emulated.port, 'guard')
+        process = subprocess.Popen(
+            [sys.executable, '-c', DRIVER, emulated.port, guard], cwd=ROOT,
+            env={**os.environ, 'PYTHONPATH': str(ROOT)}, stdout=subprocess.PIPE, text=True)
         try:
-            assert emulated.torque_enabled.all()
-            process.send_signal(how)
-            process.wait(5)
-            wait_for(lambda: not emulated.torque_enabled.any())
+            for _ in range(5):
+                assert process.stdout.readline() == 'tick\n'
+            assert emulated.torque_enabled.all() and not emulated.stopped.any()
+            yield emulated, process
         finally:
             process.kill()
             process.communicate()
+
+
+@pytest.mark.parametrize('how', [signal.SIGKILL, signal.SIGTERM])
+def test_torque_is_off_after_the_process_is_killed(how):
+    with driven('guard') as (emulated, process):
+        process.send_signal(how)
+        wait_for(lambda: not emulated.torque_enabled.any())
 
 
 def test_the_watchdog_of_the_servos_stops_them_without_any_process():
-    with EmulatedServoBus() as emulated:
-        process = driver(emulated.port, 'alone')
-        try:
-            assert not emulated.stopped.any()
-            process.kill()
-            process.wait(5)
-            wait_for(lambda: emulated.stopped.all())
-            # They hold the angle set by the plant.
-            assert emulated.goals == pytest.approx([0, 0, 0, 0], abs=0.001)
-        finally:
-            process.kill()
-            process.communicate()
+    with driven('alone') as (emulated, process):
+        process.kill()
+        wait_for(lambda: emulated.stopped.all())
+        # They hold the angle set by the plant.
+        assert emulated.goals == pytest.approx([0, 0, 0, 0], abs=0.001)
 
 
 def test_the_servos_stop_while_the_process_is_frozen():
-    with EmulatedServoBus() as emulated:
-        process = driver(emulated.port, 'guard')
-        try:
-            process.send_signal(signal.SIGSTOP)
-            wait_for(lambda: emulated.stopped.all())
-            process.send_signal(signal.SIGCONT)
-            wait_for(lambda: not emulated.stopped.any())
-        finally:
-            process.kill()
-            process.communicate()
-            wait_for(lambda: not emulated.torque_enabled.any())
+    with driven('alone') as (emulated, process):
+        process.send_signal(signal.SIGSTOP)
+        wait_for(lambda: emulated.stopped.all())
+        process.send_signal(signal.SIGCONT)
+        wait_for(lambda: not emulated.stopped.any())
