@@ -192,7 +192,7 @@ def measure_board(seconds):
                 board.poll()
 
         measured = run(tick, seconds)
-        lost = board.poll().received['lost']
+        lost = board.link()['lost']
         device.sender('end')()
         arrivals, refused = device.pipe.recv()
     device.close()

@@ -17,7 +17,6 @@ from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters
 from beetle_omni_ros.drivers.motor_board_state import (
     BLOCKS_ARMING,
     BoardState,
-    BoardStatus,
     conditions_of,
     CONTRACT_VERSION,
     MavlinkReceiver,
@@ -48,15 +47,11 @@ class ArmCommand:
     """
     One arm or disarm command, repeated until the board acknowledges it.
 
-    Attributes:
-        arm: True to arm, False to disarm.
-        accepted: whether the board accepted it, None while it is pending.
-        reason: '' or the reason of the refusal, in one line.
-
+    ``send(message)`` sends it, first in the first :meth:`tick`. ``accepted`` is whether the board
+    accepted it, None while it is pending, and ``reason`` the reason of a refusal.
     """
 
     def __init__(self, arm: bool, parameters: MotorBoardParameters, send: Callable):
-        """``send(message)`` sends it; the first :meth:`tick` does so."""
         self.arm, self.reason = arm, ''
         self.accepted: bool | None = None
         self._parameters, self._send = parameters, send
@@ -96,59 +91,21 @@ class ArmCommand:
             self.accepted, self.reason = accepted, reason
             self._done.set()
 
-    def wait(self, timeout: float) -> bool:
-        """Wait for the result at most ``timeout`` [s]; return whether there is one."""
-        return self._done.wait(timeout)
+    def wait(self) -> ArmCommand:
+        """Return itself with the result, after half a second at most."""
+        p = self._parameters
+        if not self._done.wait(p.acknowledge_timeout * (p.acknowledge_attempts + 2)):
+            self.end(False, 'the thread of the link does not run')
+        return self
 
 
 @dataclass(frozen=True, slots=True)
 class Sent:
-    """
-    Result of sending one thrust target.
-
-    Attributes:
-        reason: reason why it was not sent, or ''.
-        saturated: (4,) whether the battery limits the thrust; the largest one was sent then.
-        command: (4,) normalised commands, 0 to 1.
-
-    """
+    """Result of sending one thrust target: the reason why it was not sent, or arrays (4,)."""
 
     reason: str = ''
-    saturated: np.ndarray | None = None
-    command: np.ndarray | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class BoardUpdate:
-    """
-    Measurements and events since the last poll, and the present state.
-
-    Attributes:
-        battery: newest reading since the last poll, or None.
-        rotors: newest telemetry since the last poll, or None.
-        events: (level, text) with level 'info', 'warning' or 'error', oldest first.
-        status: last heartbeat, or None before the first.
-        received: counts of the receiver.
-        reception: counts of the board, or None before its first report.
-        sent: number of frames written to the port.
-        dropped: number of frames dropped because the output buffer was full.
-        connections: number of times the port was opened.
-        clock_offset: board's clock minus monotonic clock [s]; NaN if unknown.
-        clock_uncertainty: bound of the offset's error [s]; inf if unknown.
-
-    """
-
-    battery: BatteryReading | None
-    rotors: RotorStates | None
-    events: tuple[tuple[str, str], ...]
-    status: BoardStatus | None
-    received: dict[str, int]
-    reception: dict[str, int] | None
-    sent: int
-    dropped: int
-    connections: int
-    clock_offset: float
-    clock_uncertainty: float
+    saturated: np.ndarray | None = None     # whether the battery limits the thrust to the one sent
+    command: np.ndarray | None = None       # normalised, 0 to 1
 
 
 class MotorBoard:
@@ -158,11 +115,7 @@ class MotorBoard:
     A thread reads, sends heartbeats and reconnects. :meth:`send` and :meth:`poll` do not wait.
     The board stops the rotors 100 ms after the last target, also if this process fails.
 
-    Args:
-        parameters: parameters of the link.
-        robot: robot with the rotor map and the battery.
-        clock: clock of all stamps, those given to :meth:`send` and those returned [s].
-
+    ``clock`` is that of all stamps, those given to :meth:`send` and those returned [s].
     """
 
     def __init__(self, parameters: MotorBoardParameters, robot: RobotParameters,
@@ -172,7 +125,7 @@ class MotorBoard:
         self._clock = clock
         self._lock = threading.Lock()           # of state and command
         self._write_lock = threading.Lock()     # of port and packer
-        self._state = BoardState(parameters, robot.battery.cells, clock)
+        self.state = BoardState(parameters, robot.battery.cells, clock)
         self._receiver = MavlinkReceiver(parameters.board_system, parameters.board_component)
         self._packer = common.MAVLink(None, parameters.host_system, parameters.host_component)
         self._port: SerialPort | None = None
@@ -184,13 +137,7 @@ class MotorBoard:
         self._last_stamp = (math.nan, 0)
 
     def open(self) -> None:
-        """
-        Open the port and start the thread; :meth:`wait_ready` waits for the board.
-
-        Raises:
-            SerialPortError: the port cannot be opened.
-
-        """
+        """Open the port, or raise SerialPortError, and start the thread."""
         if self._thread is not None:
             return
         self._connect()
@@ -206,7 +153,7 @@ class MotorBoard:
             return
         for _ in range(CLOSING_COMMANDS):
             command = self.start(False)
-        command.wait(self.parameters.acknowledge_timeout * self.parameters.acknowledge_attempts)
+        command.wait()
         self._stopping = True
         self._thread.join(2.0)
         self._thread = None
@@ -220,11 +167,6 @@ class MotorBoard:
         self.close()
 
     @property
-    def status(self) -> BoardStatus | None:
-        """Last heartbeat of the board, or None."""
-        return self._state.status
-
-    @property
     def connected(self) -> bool:
         """Whether the port is open, so that targets can be sent."""
         return self._port is not None
@@ -232,7 +174,7 @@ class MotorBoard:
     @property
     def ready(self) -> str:
         """Reason why this side cannot arm the board; '' if it can."""
-        state, status = self._state, self._state.status
+        state, status = self.state, self.state.status
         if self._port is None:
             return f'{self.parameters.port}: port is away'
         if state.silent(time.monotonic()):
@@ -270,18 +212,12 @@ class MotorBoard:
             return command
 
     def arm(self) -> ArmCommand:
-        """Arm and wait for the answer, half a second at most; needs :attr:`ready` to be ''."""
-        return self._finished(self.start(True))
+        """Arm and wait for the answer; needs :attr:`ready` to be ''."""
+        return self.start(True).wait()
 
     def disarm(self) -> ArmCommand:
-        """Disarm and wait for the answer, half a second at most."""
-        return self._finished(self.start(False))
-
-    def _finished(self, command):
-        timeout = self.parameters.acknowledge_timeout * (self.parameters.acknowledge_attempts + 2)
-        if not command.wait(timeout):
-            command.end(False, 'the thread of the link does not run')
-        return command
+        """Disarm and wait for the answer."""
+        return self.start(False).wait()
 
     def send(self, thrust: np.ndarray, stamp: float) -> Sent:
         """
@@ -298,10 +234,10 @@ class MotorBoard:
             return Sent('not four finite numbers')
         if abs(age) > self.parameters.stamp_age_limit:
             return Sent('stale stamp' if age > 0 else 'stamp in the future')
-        if not self._state.clock.known:
+        if not self.state.clock.known:
             return Sent("offset of the board's clock unknown")
         # Without a measurement use the highest voltage, which gives the smallest duty.
-        voltage = self._state.voltage or self.thrust_map.voltages[-1]
+        voltage = self.state.voltage or self.thrust_map.voltages[-1]
         command = self.thrust_map.command(thrust, voltage)
         if not self._write(common.MAVLink_set_actuator_control_target_message(
                 self._board_stamp(stamp, max(age, 0.0)), 0, self.parameters.board_system,
@@ -318,20 +254,25 @@ class MotorBoard:
         last_stamp, last = self._last_stamp
         if stamp == last_stamp:
             return last
-        micros = max(0, round(1e6 * (time.monotonic() - age + self._state.clock.offset())))
+        micros = max(0, round(1e6 * (time.monotonic() - age + self.state.clock.offset())))
         if stamp > last_stamp and last - CORRECTION < micros <= last:
             micros = last + 1   # the offset was corrected by more than the time between stamps
         self._last_stamp = stamp, micros
         return micros
 
-    def poll(self) -> BoardUpdate:
-        """Return measurements and events since the last call, and the present state."""
-        state, clock = self._state, self._state.clock
+    def poll(self) -> tuple[BatteryReading | None, RotorStates | None, tuple]:
+        """Return battery, rotors and (level, text) of each event since the last call."""
         with self._lock:
-            news = state.take()
-        return BoardUpdate(*news, state.status, dict(self._receiver.counts), state.reception,
-                           self._sent, self._dropped, self._connections, clock.offset(),
-                           clock.uncertainty(time.monotonic()))
+            return self.state.take()
+
+    def link(self) -> dict[str, float]:
+        """Counts of both directions of the link and synchronisation of the clocks, by name."""
+        clock = self.state.clock
+        return {**self._receiver.counts, 'sent': self._sent, 'buffer_full': self._dropped,
+                'connections': self._connections,
+                **{f'board {name}': count for name, count in self.state.reception.items()},
+                'clock_offset_s': clock.offset(),
+                'clock_uncertainty_ms': 1e3 * clock.uncertainty(time.monotonic())}
 
     # --- the port -----------------------------------------------------------------------------
 
@@ -376,7 +317,7 @@ class MotorBoard:
             except SerialPortError as error:
                 self._disconnect()
                 with self._lock:
-                    self._state.connection(str(error))
+                    self.state.connection(str(error))
             self._tick(time.monotonic())
 
     def _reconnect(self):
@@ -390,9 +331,8 @@ class MotorBoard:
             self._connect()
         except SerialPortError:
             return
-        self._next_open = 0.0
         with self._lock:
-            self._state.connection('')
+            self.state.connection('')
 
     def _serve(self, port):
         """Wait at most one tick for bytes and handle them."""
@@ -409,15 +349,15 @@ class MotorBoard:
     def _handle(self, message, now):
         if message.get_msgId() == common.MAVLINK_MSG_ID_COMMAND_ACK:
             if self._command and self._command.acknowledge(message):
-                self._state.acknowledged(self._command.arm)
+                self.state.acknowledged(self._command.arm)
             return
-        self._state.message(message, now)
+        self.state.message(message, now)
         if restarted(message):
             self._next_heartbeat = self._next_timesync = now
 
     def _tick(self, now):
         with self._lock:
-            self._state.tick(now, self.connected)
+            self.state.tick(now, self.connected)
             if self._command:
                 self._command.tick(now)
         if now >= self._next_heartbeat:
@@ -426,9 +366,9 @@ class MotorBoard:
                 common.MAV_TYPE_ONBOARD_CONTROLLER, common.MAV_AUTOPILOT_INVALID, 0, 0,
                 common.MAV_STATE_ACTIVE, 3))
         if now >= self._next_timesync:
-            factor = 1 if self._state.clock.known else 4
+            factor = 1 if self.state.clock.known else 4
             self._next_timesync = now + 1 / (factor * self.parameters.timesync_rate)
-            self._write(self._state.timesync_request())
+            self._write(self.state.timesync_request())
 
 
 class Arming:
@@ -439,9 +379,7 @@ class Arming:
     and not armed before the supervisor has been 'disarmed' again. A board that is only silent,
     while targets can be sent, remains armed, because its rotors carry the robot to the ground.
 
-    Attributes:
-        phase: 'rests', 'arms', 'flies' or 'lost'; targets are sent only in 'flies'.
-
+    ``phase`` is 'rests', 'arms', 'flies' or 'lost'; targets are sent only in 'flies'.
     """
 
     def __init__(self, board: MotorBoard):
@@ -476,7 +414,7 @@ class Arming:
 
     def update(self, elapsed: float) -> None:
         """Check the board, ``elapsed`` [s] after the last call."""
-        status, elapsed = self._board.status, min(elapsed, STEP)
+        status, elapsed = self._board.state.status, min(elapsed, STEP)
         if self.phase == ARMS:
             self._check_answer(elapsed)
         elif self.phase == FLIES:
@@ -517,12 +455,12 @@ class Arming:
         if not missing and self._disarm:
             missing = 'disarming is not confirmed yet'
         if not missing:
-            missing = ', '.join(text for text in self._board.status.conditions
+            missing = ', '.join(text for text in self._board.state.status.conditions
                                 if text in BLOCKS_ARMING)
         return missing or ('' if self._supervisor else 'no message from the supervisor')
 
     def _check_answer(self, elapsed):
-        command, status = self._command, self._board.status
+        command, status = self._command, self._board.state.status
         if command.accepted is None:
             return
         if not command.accepted:

@@ -1,10 +1,4 @@
-"""
-State of the motor board from the bytes that it sends (MAVLink 2, docs/reference/firmware.md).
-
-pymavlink decodes and checks each frame. Its own framing is not used, because after a bad checksum
-it drops the length announced by the corrupt header, up to 280 bytes with the valid messages in
-them.
-"""
+"""State of the motor board from the bytes that it sends (docs/reference/firmware.md)."""
 
 from collections import deque
 from collections.abc import Callable
@@ -33,7 +27,6 @@ SEVERE = ('ESC failure', 'targets timed out')
 ESC_FAILURES = {1: 'over-current', 2: 'over-voltage', 4: 'overheated', 8: 'over-rpm',
                 16: 'inconsistent command', 32: 'stuck', 64: 'generic'}
 UNKNOWN_TEMPERATURE, UNKNOWN_CELL, UNKNOWN_CURRENT = 32767, 65535, -1
-MARKER, HEADER, CHECKSUM = 0xFD, 10, 2  # [bytes] of an unsigned frame
 EVENTS_KEPT = 200
 REQUESTS_KEPT = 50      # TIMESYNC requests; later answers are ignored
 
@@ -72,71 +65,41 @@ class MavlinkReceiver:
     """
     Splits a byte stream into the messages of one sender with the IDs ``system``, ``component``.
 
-    Attributes:
-        counts: messages and bytes; lost: gaps in the sender's sequence numbers; bad_crc: frames
-            with a valid header and a wrong checksum; skipped_bytes: outside valid frames;
-            foreign: valid frames of another sender.
-
+    ``counts`` are messages received and bytes; lost: gaps in the sender's sequence numbers;
+    bad_crc: frames with a valid header and a wrong checksum; skipped_bytes: outside valid frames;
+    foreign: valid frames of another sender.
     """
 
     def __init__(self, system: int, component: int):
         self._sender = system, component
-        self._buffer = bytearray()
-        self._decoder = common.MAVLink(None)
-        self._sequence: int | None = None
         self.counts = dict.fromkeys(
-            ('messages', 'bytes', 'lost', 'bad_crc', 'skipped_bytes', 'foreign'), 0)
+            ('received', 'bytes', 'lost', 'bad_crc', 'skipped_bytes', 'foreign'), 0)
+        self.restart()
 
     def restart(self) -> None:
         """Forget an incomplete frame and the sequence number."""
-        self._buffer.clear()
-        self._sequence = None
+        self._parser = common.MAVLink(None)
+        self._parser.robust_parsing = True
+        self._sequence: int | None = None
 
     def feed(self, data: bytes) -> list:
         """Parse further bytes; return the messages that they complete."""
-        buffer, found = self._buffer, []
-        buffer += data
-        self.counts['bytes'] += len(data)
-        start, end = 0, len(buffer)
-        while True:
-            marker = buffer.find(MARKER, start)
-            self.counts['skipped_bytes'] += (end if marker < 0 else marker) - start
-            start = end if marker < 0 else marker
-            if end - start < HEADER:
-                break
-            # Incompatibility flags mark signed frames, which the firmware contract excludes.
-            number = int.from_bytes(buffer[start + 7:start + 10], 'little')
-            message = None
-            if not buffer[start + 2] and number in common.mavlink_map:
-                size = HEADER + buffer[start + 1] + CHECKSUM
-                if end - start < size:
-                    break
-                try:
-                    message = self._decoder.decode(buffer[start:start + size])
-                except common.MAVError:
-                    self.counts['bad_crc'] += 1
-            if message is None:
-                # The marker was data, or the header is corrupt: continue behind the marker.
-                self.counts['skipped_bytes'] += 1
-                start += 1
-                continue
-            start += size
-            if self._from_sender(message):
+        counts, found = self.counts, []
+        counts['bytes'] += len(data)
+        for message in self._parser.parse_buffer(data) or ():
+            if message.get_msgId() < 0:     # bad data, or an unknown message, which has no CRC
+                counts['skipped_bytes'] += len(message.data)
+                counts['bad_crc'] += 'CRC' in getattr(message, 'reason', '')
+            elif (message.get_srcSystem(), message.get_srcComponent()) != self._sender:
+                counts['foreign'] += 1
+            else:
+                counts['received'] += 1
+                sequence = message.get_seq()
+                if self._sequence is not None and not restarted(message):
+                    counts['lost'] += (sequence - self._sequence - 1) % 256
+                self._sequence = sequence
                 found.append(message)
-        del buffer[:start]
         return found
-
-    def _from_sender(self, message):
-        """Count a valid frame; return whether it is of the sender."""
-        if (message.get_srcSystem(), message.get_srcComponent()) != self._sender:
-            self.counts['foreign'] += 1
-            return False
-        self.counts['messages'] += 1
-        sequence = message.get_seq()
-        if self._sequence is not None and not restarted(message):
-            self.counts['lost'] += (sequence - self._sequence - 1) % 256
-        self._sequence = sequence
-        return True
 
 
 def restarted(message) -> bool:
@@ -173,9 +136,7 @@ class ClockOffset:
         """
         Use one exchange: local time of the request, time in the answer, local time of the answer.
 
-        Returns:
-            whether it contradicts the earlier exchanges, which are then forgotten.
-
+        Return whether it contradicts the earlier exchanges, which are then forgotten.
         """
         within = self._drift * (received - sent)
         low, high = remote - received - within, remote - sent + within
@@ -215,27 +176,15 @@ class BoardStatus:
 
 @dataclass(frozen=True, slots=True)
 class RotorStates:
-    """
-    Telemetry of the four ESCs.
+    """Telemetry of the four ESCs (4,)."""
 
-    Attributes:
-        stamp: host time of the measurement [s].
-        rpm: (4,) rotor speeds [1/min]; this and the next two are NaN if the ESC is offline.
-        voltage: (4,) [V].
-        current: (4,) [A].
-        temperature: (4,) [C] of the last ESC_INFO; NaN if unknown.
-        failures: for each ESC a tuple of its reported failures.
-        error_count: (4,) errors since the start of the board.
-
-    """
-
-    stamp: float
-    rpm: np.ndarray
-    voltage: np.ndarray
-    current: np.ndarray
-    temperature: np.ndarray
-    failures: tuple[tuple[str, ...], ...]
-    error_count: np.ndarray
+    stamp: float                # host time of the measurement [s]
+    rpm: np.ndarray             # [1/min]; this and the next two are NaN if the ESC is offline
+    voltage: np.ndarray         # [V]
+    current: np.ndarray         # [A]
+    temperature: np.ndarray     # [C] of the last ESC_INFO; NaN if unknown
+    failures: tuple[tuple[str, ...], ...]   # of each ESC
+    error_count: np.ndarray     # since the start of the board
 
 
 class BoardState:
@@ -246,8 +195,8 @@ class BoardState:
         status: last heartbeat, or None.
         battery, rotors: newest measurements since the last :meth:`take`, or None.
         voltage: filtered pack voltage [V] for the thrust map, or None.
-        reception: counts of the board since its start, or None: packets lost and with bad_crc,
-            targets refused, timeouts.
+        reception: counts of the board since its start: packets lost and with bad_crc, targets
+            refused, timeouts; empty before its first report.
         clock: offset of the board's clock against the monotonic clock.
 
     """
@@ -259,7 +208,7 @@ class BoardState:
         self.battery: BatteryReading | None = None
         self.rotors: RotorStates | None = None
         self.voltage: float | None = None
-        self.reception: dict[str, int] | None = None
+        self.reception: dict[str, int] = {}
         self._info = None       # last ESC_INFO
         self._events: deque[tuple[str, str]] = deque(maxlen=EVENTS_KEPT)
         self._requests: deque[int] = deque(maxlen=REQUESTS_KEPT)

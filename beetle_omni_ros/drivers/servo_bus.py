@@ -37,72 +37,47 @@ PING_PERIOD = 0.02      # [s]
 
 @dataclass(frozen=True, slots=True)
 class ServoReadings:
-    """
-    Feedback of the four servos.
+    """Feedback of the four servos (4,); the last one, or NaN, where it is not ``valid``."""
 
-    Attributes:
-        stamp: time of the request on the bus's clock [s].
-        position: (4,) tilt [rad], unwrapped; the last reading if not valid, NaN before the first.
-        velocity: (4,) [rad/s].
-        effort: (4,) torque estimated from the current [N m].
-        valid: (4,) bool: whether a servo was read in this call.
-
-    """
-
-    stamp: float
-    position: np.ndarray
-    velocity: np.ndarray
-    effort: np.ndarray
-    valid: np.ndarray
+    stamp: float            # time of the request on the bus's clock [s]
+    position: np.ndarray    # tilt [rad], unwrapped
+    velocity: np.ndarray    # [rad/s]
+    effort: np.ndarray      # torque estimated from the current [N m]
+    valid: np.ndarray       # whether a servo was read in this call
 
 
 @dataclass(slots=True, eq=False)
 class Servo:
-    """
-    State of one servo as last known, NaN or None if unknown.
-
-    Attributes:
-        where: joint, port and ID, for messages.
-        position, velocity, current: of the last feedback, with the sign of the tilt [rad, A].
-        turns: turns to add to its reading.
-        misses: consecutive missing answers; after several it is silent and only pinged.
-        wanted, torque: whether its motor should be powered, and is.
-        error: value of Hardware Error Status.
-        voltage, temperature: [V], [deg C].
-        recovery: its running recovery, or None.
-        restarting: whether it is silent because it restarts.
-        kept_off: whether it has shut down and stays off until it is rebooted.
-
-    """
+    """State of one servo as last known, NaN or None if unknown."""
 
     name: str
     identifier: int
     sign: int
     zero: int
-    where: str
+    where: str                          # joint, port and ID, for messages
     model: int | None = None
     firmware: int | None = None
-    position: float = float('nan')
-    velocity: float = 0.0
-    current: float = 0.0
-    updated: float = float('-inf')
-    turns: int = 0
+    position: float = float('nan')      # [rad], with the sign of the tilt, as the next two
+    velocity: float = 0.0               # [rad/s]
+    current: float = 0.0                # [A]
+    updated: float = float('-inf')      # monotonic time of the last feedback [s]
+    turns: int = 0                      # to add to its reading
     turns_known: bool = False
-    misses: int = 0
-    silent: bool = False
-    next_probe: float = 0.0
-    probe_wait: float = 0.0
-    wanted: bool = False
-    torque: bool | None = None
-    error: int = 0
+    misses: int = 0                     # consecutive missing answers
+    silent: bool = False                # after several of them: it is only pinged
+    next_probe: float = 0.0             # monotonic time of the next ping [s]
+    probe_wait: float = 0.0             # until the ping after it [s]
+    wanted: bool = False                # whether it should have torque
+    torque: bool | None = None          # whether it has
+    error: int = 0                      # Hardware Error Status
     watchdog_expired: bool = False
-    voltage: float = float('nan')
-    temperature: float = float('nan')
-    recovery: Iterator[None] | None = None
-    restarting: bool = False
-    boot_ends: float = 0.0
+    voltage: float = float('nan')       # [V]
+    temperature: float = float('nan')   # [deg C]
+    recovery: Iterator[None] | None = None      # while it is recovered
+    restarting: bool = False            # whether it is silent because of a restart,
+    boot_ends: float = 0.0              # which may last until this time [s]
     recoveries: int = 0
-    kept_off: bool = False
+    kept_off: bool = False              # it has shut down and stays off until it is rebooted
 
     def angle(self, counts: int) -> float:
         """Tilt of a reading without added turns [rad]."""
@@ -113,27 +88,18 @@ class Servo:
         return round(self.zero + self.sign * (tilt - TURN * self.turns) / registers.POSITION_UNIT)
 
     def update(self, data: bytes, now: float) -> bool:
-        """
-        Update position, velocity and current from feedback at monotonic time ``now`` [s].
-
-        Returns:
-            whether the turn count jumped because the servo has restarted.
-
-        """
+        """Update it from feedback at monotonic ``now`` [s]; return whether it has restarted."""
         current, velocity, counts = FEEDBACK_LAYOUT.unpack(data)
         self.current = self.sign * current * registers.CURRENT_UNIT
         self.velocity = self.sign * velocity * registers.VELOCITY_UNIT
-        angle = self.angle(counts)
-        jumped = False
+        angle, before = self.angle(counts), self.turns
         if self.wanted or now - self.updated < TRACKED:
             # A servo cannot move by half a turn between two readings. After a pause without
             # torque, in which it can be turned by hand, the servo's own count is used.
-            turns = nearest_turns(angle, self.position)
-            jumped = turns != self.turns
-            self.turns = turns
+            self.turns = nearest_turns(angle, self.position)
         self.position = angle + TURN * self.turns
         self.updated, self.misses = now, 0
-        return jumped
+        return self.turns != before
 
     @property
     def errors(self) -> tuple[str, ...]:
@@ -164,13 +130,7 @@ def make_servos(parameters: ServoBusParameters) -> list[Servo]:
 
 
 def examine(link: ServoLink, servo: Servo) -> tuple[str, str]:
-    """
-    Read model, firmware, supply, temperature, error and angle into ``servo``; change nothing.
-
-    Returns:
-        problem that prevents its use, and its remedy; '' without a problem.
-
-    """
+    """Read its state into ``servo`` and change nothing; return (problem or '', remedy)."""
     servo.model = servo.firmware = None
     try:
         servo.model = link.ping(servo.identifier, ATTEMPTS)
@@ -224,17 +184,9 @@ class ServoBus:
     the cable is unplugged or servos are silent, they raise nothing and report it in their
     results. Together they then take at most one reply time. They recover without further calls.
 
-    Args:
-        joints: joint parameters, for the travel of the tilts.
-        clock: clock of the stamps of readings [s].
-
-    Attributes:
-        parameters: may be replaced while torque is off.
-        servos: state of each servo as last known.
-        link: port and its counts.
-        enabled: whether the servos should have torque.
-        clipped: number of goals limited to the travel.
-
+    ``clock`` gives the stamps of readings [s]. ``parameters`` may be replaced while torque is off.
+    ``enabled`` is whether the servos should have torque, ``clipped`` the number of goals limited
+    to the travel.
     """
 
     def __init__(self, parameters: ServoBusParameters, joints: JointParameters,
@@ -255,11 +207,8 @@ class ServoBus:
     # --- lifecycle ----------------------------------------------------------------------------
 
     def open(self):
-        """Open the port; raises ServoBusError if it cannot be opened."""
-        try:
-            self.link.open()
-        except SerialPortError as error:
-            raise ServoBusError(str(error)) from None
+        """Open the port; raises SerialPortError, as the next two methods if it is lost."""
+        self.link.open()
 
     def close(self):
         """Switch the torque off and close the port; may be called at any time, repeatedly."""
@@ -331,18 +280,12 @@ class ServoBus:
                             servo.counts(servo.position))):
                         self.link.write(servo.identifier, register, value)
                     servo.torque, servo.watchdog_expired = True, False
-        except ServoBusError:
+        except (ServoBusError, SerialPortError):
             self.disable()
             raise
 
     def disable(self) -> bool:
-        """
-        Switch the torque of all servos off.
-
-        Returns:
-            whether every servo has confirmed it.
-
-        """
+        """Switch the torque of all servos off; return whether every servo has confirmed it."""
         was_enabled = self.enabled
         self._want_torque(False)
         self._drop_recoveries()
@@ -376,13 +319,10 @@ class ServoBus:
 
     def write_goals(self, tilt: np.ndarray) -> bool:
         """
-        Send tilt targets to all servos with one packet.
-
-        Args:
-            tilt: (4,) tilt targets [rad], limited to the travel.
+        Send tilt targets (4,) [rad], limited to the travel, to all servos with one packet.
 
         Returns:
-            whether the packet was sent; False without torque, port or finite numbers.
+            whether it was sent; False without torque, port or four finite numbers.
 
         """
         tilt = np.asarray(tilt, dtype=float)
@@ -409,8 +349,7 @@ class ServoBus:
             asked = sorted((servo for servo in self.servos if not servo.silent),
                            key=lambda servo: servo.misses)
             try:
-                answered = self._update(
-                    self._sync_read(asked, FEEDBACK, FEEDBACK_LAYOUT.size))
+                answered = self._read_feedback(asked)
             except SerialPortError as error:
                 self._port_lost(error)
         return ServoReadings(
@@ -465,13 +404,13 @@ class ServoBus:
 
     @contextmanager
     def _outside_the_loop(self):
-        """Context that waits longer for answers and raises ServoBusError if the port is lost."""
+        """Context that waits longer for answers."""
         try:
             with self.link.patient():
                 yield
         except SerialPortError as error:
             self._port_lost(error)
-            raise ServoBusError(str(error)) from None
+            raise
 
     def _port_lost(self, error):
         """Close the failed port; :meth:`_reconnect` opens it again."""
@@ -511,8 +450,7 @@ class ServoBus:
 
     @property
     def _watchdog_counts(self):
-        """Value of Bus Watchdog (98) for the watchdog time in the parameters."""
-        return max(1, min(127, round(self.parameters.timing.watchdog / registers.WATCHDOG_UNIT)))
+        return round(self.parameters.timing.watchdog / registers.WATCHDOG_UNIT)     # 1 to 127
 
     def _apply_settings(self, servo):
         given, identifier = self.parameters, servo.identifier
@@ -596,16 +534,20 @@ class ServoBus:
             found.append((servo, None if error & ~registers.ALERT else data))
         return found
 
-    def _update(self, answers):
-        """Update the servos; return those that answered. The first without answer is missed."""
-        answered, missing, now = set(), [], time.monotonic()
-        for servo, data in answers:
+    def _read_feedback(self, asked):
+        """Read and update servos; return those that answered. The first without answer missed."""
+        answered, now = set(), time.monotonic()
+        for servo, data in self._sync_read(asked, FEEDBACK, FEEDBACK_LAYOUT.size):
             if data is None:
-                missing.append(servo)
                 continue
             answered.add(servo)
             if servo.update(data, now):
-                self._handle_restart(servo)
+                servo.turns_known &= self.enabled
+                if servo.recovery is None:
+                    self._log(f'{servo.where}: lost its turn count, taken as '
+                              f'{servo.position:+.2f} rad')
+                    self._recover(servo)
+        missing = [servo for servo in asked if servo not in answered]
         if missing:
             self._count_miss(missing[0])
         return answered
@@ -619,14 +561,6 @@ class ServoBus:
             servo.probe_wait = timing.probe_first
             servo.next_probe = time.monotonic() + servo.probe_wait
             self._log(f'{servo.where}: silent; check its cable and power')
-
-    def _handle_restart(self, servo):
-        """Recover a servo whose reading jumped by whole turns, because it has restarted."""
-        if not self.enabled:
-            servo.turns_known = False
-        if servo.recovery is None:
-            self._log(f'{servo.where}: lost its turn count, taken as {servo.position:+.2f} rad')
-            self._recover(servo)
 
     def _probe(self, now):
         servo = min((servo for servo in self.servos if servo.silent),
@@ -708,18 +642,11 @@ class ServoBus:
 
     def _recovery(self, servo, forced):
         """
-        Read the state of a servo and recover it while the others continue.
+        Read the state of a servo and recover it; yields after each transaction.
 
         A restarted servo has lost gains, watchdog, torque and turn count. At the end it has
         torque if the bus is enabled. With ``forced``, and after a shutdown, it is restarted; the
         ping that it answers starts another recovery.
-
-        Yields:
-            after each transaction, so that no tick is late.
-
-        Raises:
-            ServoBusError, SerialPortError: it failed; another recovery may be started.
-
         """
         link, identifier, given = self.link, servo.identifier, self.parameters
         servo.error = link.read(identifier, registers.HARDWARE_ERROR)
@@ -747,8 +674,7 @@ class ServoBus:
             link.write(identifier, register, value, attempts=1)
             yield
         counts = link.read(identifier, registers.PRESENT_POSITION)
-        if servo.position == servo.position:
-            servo.turns = nearest_turns(servo.angle(counts), servo.position)
+        servo.turns = nearest_turns(servo.angle(counts), servo.position)
         yield
         servo.kept_off = False
         if not self.enabled:

@@ -28,11 +28,8 @@ class ServoPace:
     once in one or several periods. The phase of the cycles is controlled so that goals do not
     arrive during a transaction.
 
-    Attributes:
-        missed: number of periods without a cycle.
-        due: time of the next cycle.
-        goals: time when goals arrived last.
-
+    ``missed`` counts periods without a cycle, ``due`` is the time of the next one, ``goals`` that
+    of the last arrival.
     """
 
     def __init__(self, now: float):
@@ -72,10 +69,9 @@ class ServoLoop:
         clock: monotonic time [s].
 
     Attributes:
-        cycles: number of cycles.
-        written: number of packets with goals, repetitions included.
-        stale: number of goals that had expired when the bus was free.
-        incomplete: number of cycles without a valid reading of each servo.
+        cycles, incomplete: number of cycles, and of those without a valid reading of each servo.
+        written, stale: number of packets with goals, repetitions included, and of goals that had
+            expired when the bus was free.
         failure: error that ended the thread, or ''; torque is off then.
 
     """

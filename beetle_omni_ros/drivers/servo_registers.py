@@ -118,15 +118,12 @@ def unambiguous_limit(travel: float) -> float:
 
 def settle(servos: Sequence, travel: float, confirmed: Sequence[float] | None) -> str:
     """
-    Determine the unknown turn counts of servos.
+    Determine the unknown turn counts of servos; return '' or a message about ambiguous ones.
 
     Args:
         servos: servos whose ``position`` [rad], ``turns`` and ``turns_known`` are updated.
         travel: travel of the joints to each side [rad].
         confirmed: angles measured by the operator, correct to half a turn [rad], or None.
-
-    Returns:
-        '' or a message about the ambiguous servos.
 
     """
     doubts = []

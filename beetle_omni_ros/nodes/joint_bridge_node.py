@@ -7,6 +7,7 @@ import time
 from std_srvs.srv import Trigger
 
 from beetle_omni_ros.drivers.device_parameters import ServoBusParameters
+from beetle_omni_ros.drivers.serial_port import SerialPortError
 from beetle_omni_ros.drivers.servo_bus import ServoBus
 from beetle_omni_ros.drivers.servo_link import ServoBusError
 from beetle_omni_ros.drivers.servo_loop import Goal, ServoLoop
@@ -38,7 +39,7 @@ class JointBridgeNode(LifecycleFlightNode):
     """Lifecycle node: configure checks the servos, activate switches their torque on."""
 
     real_time = True
-    refusals = (ServoBusError,)
+    refusals = (ServoBusError, SerialPortError)
 
     def __init__(self):
         super().__init__('joint_bridge_node', JointBridgeNodeParameters, 'params/servo_bus.yaml',

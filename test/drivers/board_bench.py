@@ -52,7 +52,7 @@ class Pilot:
 
     def has_event(self, text):
         """Whether an event with this text arrived."""
-        self.events += self.board.poll().events
+        self.events += self.board.poll()[2]
         return any(text in event for _, event in self.events)
 
     def __enter__(self):

@@ -52,7 +52,7 @@ def test_bad_thrusts_are_not_sent(thrust, age, reason):
 def test_refused_arming_is_reported_with_the_reason():
     with connected() as (emulated, board):
         emulated.set_battery(20.0, 0.0)
-        assert until(lambda: 'battery low' in board.poll().status.conditions)
+        assert until(lambda: 'battery low' in board.state.status.conditions)
         assert board.arm().reason == 'refused by the board: battery low'
         emulated.set_battery(25.0, 0.0)
         for _ in range(20):
@@ -69,7 +69,7 @@ def test_disarming_is_acknowledged_and_stops_the_rotors():
         result = board.disarm()
         assert result.accepted
         assert not emulated.armed and not emulated.commands.any()
-        assert until(lambda: not board.status.armed)
+        assert until(lambda: not board.state.status.armed)
 
 
 def test_battery_and_rotor_states_have_si_units_and_stamps_of_the_computer():
@@ -80,14 +80,12 @@ def test_battery_and_rotor_states_have_si_units_and_stamps_of_the_computer():
         before = time.time()
         board.poll()
         time.sleep(0.1)
-        update = board.poll()
+        battery, rotors, _ = board.poll()
         emulated.faults.mute = True
         time.sleep(0.05)
         board.poll()
-        later = board.poll()
-        assert later.battery is None and later.rotors is None and later.status is not None
-        assert (update.battery.voltage, update.battery.current) == (23.456, -12.34)
-        rotors = update.rotors
+        assert board.poll()[:2] == (None, None)
+        assert (battery.voltage, battery.current) == (23.456, -12.34)
         assert rotors.rpm.tolist() == [2700, 5400, 8100, 0]
         assert rotors.temperature.tolist() == [30, 40, 50, 60]
         assert rotors.current.sum() == pytest.approx(12.34, rel=1e-5)
@@ -97,11 +95,9 @@ def test_battery_and_rotor_states_have_si_units_and_stamps_of_the_computer():
 def test_the_clock_offset_of_the_board_is_within_its_bound():
     with connected() as (emulated, board):
         time.sleep(0.5)
-        update = board.poll()
-        now = time.monotonic()
-        truth = emulated._firmware.clock(now) - now
-        assert abs(update.clock_offset - truth) <= update.clock_uncertainty
-        assert update.clock_uncertainty < 0.02
+        link, now = board.link(), time.monotonic()
+        truth, bound = emulated._firmware.clock(now) - now, link['clock_uncertainty_ms'] / 1e3
+        assert abs(link['clock_offset_s'] - truth) <= bound < 0.02
 
 
 def test_an_independent_parser_accepts_all_output_of_the_driver():
@@ -111,7 +107,7 @@ def test_an_independent_parser_accepts_all_output_of_the_driver():
     board = driver(os.ttyname(other))
     board.open()
     threading.Thread(target=board.disarm, daemon=True).start()
-    board._state.clock.add(time.monotonic(), 1.0, time.monotonic())
+    board.state.clock.add(time.monotonic(), 1.0, time.monotonic())
     for _ in range(100):
         board.send(HOVER, time.time())
         time.sleep(0.005)
@@ -174,7 +170,7 @@ def test_without_a_board_every_call_times_out_soon_with_a_message():
 def test_another_firmware_is_refused():
     with connected() as (emulated, board):
         emulated._firmware._heartbeat = lambda state, now: (0, (1 | 9 << 24, 2, 0, 1, 3, 3))
-        assert until(lambda: board.poll().status.contract == 9)
+        assert until(lambda: board.state.status.contract == 9)
         assert board.arm().reason == 'firmware follows contract 9, this driver 1'
 
 
@@ -209,7 +205,7 @@ def test_stamps_stay_monotonic_when_the_offset_is_corrected():
         stamps = []
         emulated.on_target = lambda now, values: stamps.append(values[0])
         assert board.arm().accepted
-        clock, begin = board._state.clock, time.time()
+        clock, begin = board.state.clock, time.time()
         for k, correction in enumerate((0.0, -0.003, 0.002, -0.003)):
             low, high, at = clock._bounds
             clock._bounds = low + correction, high + correction, at

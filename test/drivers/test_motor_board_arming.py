@@ -1,6 +1,7 @@
 """Rules of arming, disarming and loss of the board, on a simple substitute of the board."""
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import pytest
 
@@ -30,7 +31,7 @@ class BoardStub:
     """A board whose answers are set by the test."""
 
     def __init__(self):
-        self.ready, self.status, self.commands = '', DISARMED, []
+        self.ready, self.state, self.commands = '', SimpleNamespace(status=DISARMED), []
         self.connected = True
 
     def start(self, arm):
@@ -42,7 +43,7 @@ class BoardStub:
         command = self.commands[-1]
         command.accepted, command.reason = accepted, reason
         if accepted:
-            self.status = ARMED if command.arm else DISARMED
+            self.state.status = ARMED if command.arm else DISARMED
 
     @property
     def asked(self):
@@ -74,12 +75,12 @@ def in_flight(bench):
 
 def test_arming_waits_for_board_and_supervisor_and_names_which(bench):
     board, arming = bench
-    board.ready, board.status = 'port is away', None
+    board.ready, board.state.status = 'port is away', None
     assert arming.text == 'waiting: port is away'
-    board.ready, board.status = '', BoardStatus(0.0, 'disarmed', 'none',
+    board.ready, board.state.status = '', BoardStatus(0.0, 'disarmed', 'none',
                                                 ('battery low', 'saturated'), 1)
     assert arming.text == 'waiting: battery low'
-    board.status = DISARMED
+    board.state.status = DISARMED
     assert arming.text == 'waiting: no message from the supervisor'
     arming.follow('disarmed')
     assert arming.text == 'waiting: disarming is not confirmed yet'
@@ -137,12 +138,12 @@ def test_a_refusal_to_arm_is_reported_and_not_retried(bench):
 def test_a_board_that_stopped_in_flight_is_lost_until_the_supervisor_is_disarmed(
         bench, status, why):
     board, arming = in_flight(bench)
-    board.status = status
+    board.state.status = status
     arming.update(CYCLE)
     assert arming.text == f'lost: {why}' and board.asked is False
-    board.status = ARMED        # by another program: it is disarmed again
+    board.state.status = ARMED        # by another program: it is disarmed again
     board.answer()
-    board.status = ARMED
+    board.state.status = ARMED
     asked = len(board.commands)
     arming.update(CYCLE)
     assert len(board.commands) == asked + 1 and board.asked is False
@@ -194,7 +195,7 @@ def test_arming_in_flight_never_happens(bench, states):
 
 def test_a_board_found_armed_is_disarmed(bench):
     board, arming = bench
-    board.status = ARMED
+    board.state.status = ARMED
     arming.update(CYCLE)
     assert board.asked is False
 
@@ -204,7 +205,7 @@ def test_an_acknowledgement_contradicted_by_the_heartbeat_does_not_start_a_fligh
     arming.follow('disarmed')
     arming.follow('takeoff')
     board.answer()
-    board.status = BoardStatus(0.0, 'disarmed', 'heartbeat of the host lost', (), 1)
+    board.state.status = BoardStatus(0.0, 'disarmed', 'heartbeat of the host lost', (), 1)
     for _ in range(round(PATIENCE / CYCLE) + 1):
         assert arming.phase != 'flies'
         arming.update(CYCLE)

@@ -41,15 +41,14 @@ def test_a_poor_link_is_counted_and_tolerated(faults):
         for name, value in faults.items():
             setattr(emulated.faults, name, value)
         assert keeps_flying(emulated)
-        assert board.status.armed
+        assert board.state.status.armed
 
         def counted():
-            update = board.poll()
-            received, reception = update.received, update.reception
-            return (received['bad_crc'] > 10) == ('corrupt_out' in faults) \
-                and (received['lost'] > 10) == bool({'corrupt_out', 'drop_out'} & set(faults)) \
-                and (reception['bad_crc'] > 10) == ('corrupt_in' in faults) \
-                and (reception['lost'] > 10) == bool({'corrupt_in', 'drop_in'} & set(faults))
+            link = board.link()
+            return (link['bad_crc'] > 10) == ('corrupt_out' in faults) \
+                and (link['lost'] > 10) == bool({'corrupt_out', 'drop_out'} & set(faults)) \
+                and (link['board bad_crc'] > 10) == ('corrupt_in' in faults) \
+                and (link['board lost'] > 10) == bool({'corrupt_in', 'drop_in'} & set(faults))
 
         assert until(counted)
 
@@ -81,7 +80,7 @@ def test_a_board_that_does_not_transmit_is_reported_and_still_follows_targets():
         assert board.ready == 'no message from the board'
         emulated.faults.mute = False
         assert until(lambda: pilot.has_event('messages again'))
-        assert board.status.armed
+        assert board.state.status.armed
 
 
 def test_voltage_sag_is_compensated_or_reported_as_saturation():
@@ -110,7 +109,7 @@ def test_a_short_disconnection_stops_the_rotors_briefly():
         assert until(lambda: not emulated.commands.any())
         emulated.plug()
         assert until(lambda: emulated.commands.all(), 0.4)
-        assert pilot.has_event('port opened again') and board.poll().connections == 2
+        assert pilot.has_event('port opened again') and board.link()['connections'] == 2
 
 
 def test_a_long_disconnection_disarms_and_reconnecting_does_not_arm():
@@ -131,7 +130,7 @@ def test_a_hung_board_is_reset_by_its_watchdog_and_stays_disarmed():
         emulated.hang()
         assert until(lambda: not emulated.commands.any(), 0.15)
         assert until(lambda: pilot.has_event('restarted (watchdog reset)'))
-        assert stays_stopped(emulated) and not board.status.armed
+        assert stays_stopped(emulated) and not board.state.status.armed
 
 
 def test_a_reboot_in_flight_stops_and_needs_arming_again():
@@ -140,7 +139,7 @@ def test_a_reboot_in_flight_stops_and_needs_arming_again():
         assert not emulated.commands.any()
         assert until(lambda: pilot.has_event('restarted'))
         assert stays_stopped(emulated)
-        assert board.poll().received['lost'] == 0
+        assert board.link()['lost'] == 0
         pilot.thrust = np.zeros(4)
         time.sleep(QUICK.throttle_low_time)
         assert until(lambda: board.arm().accepted)
@@ -157,7 +156,7 @@ def test_a_failed_esc_is_named_and_the_other_rotors_continue():
         assert np.all(emulated.thrust_targets[[0, 1, 3]] > 5)
         rotors = None
         while rotors is None:
-            rotors = board.poll().rotors
+            rotors = board.poll()[1]
         assert np.isnan(rotors.rpm[2]) and rotors.failures[2] == ('generic',)
         assert np.all(rotors.rpm[[0, 1, 3]] > 1000)
         board.disarm()

@@ -11,6 +11,7 @@ from servo_bench import arrived, bench, COUNT, JOINTS, running, SHIPPED, tick, u
 
 from beetle_omni_ros.drivers import servo_registers as registers
 from beetle_omni_ros.drivers.device_parameters import ServoBusParameters
+from beetle_omni_ros.drivers.serial_port import SerialPortError
 from beetle_omni_ros.drivers.servo_bus import examine, scan, ServoBus
 from beetle_omni_ros.drivers.servo_link import ServoBusError
 from beetle_omni_ros.robot.resources import share_path
@@ -152,7 +153,7 @@ def test_scanning_finds_servos_at_another_baud_rate(baud_rate):
 
 def test_a_port_is_refused_in_one_line_and_its_absence_tolerated(tmp_path):
     bus = ServoBus(replace(SHIPPED, port=str(tmp_path / 'nothing')), JOINTS)
-    with pytest.raises(ServoBusError, match='nothing: cannot be opened .no such port; check plug'):
+    with pytest.raises(SerialPortError, match='nothing: cannot be opened .no such port; check'):
         bus.open()
     readings, _ = tick(bus, GOAL)
     assert not readings.valid.any()

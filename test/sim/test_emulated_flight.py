@@ -68,9 +68,9 @@ class Flight:
             self.board.send(self.thrust, time.time())
         self.readings, self.reports = self.bus.read(), self.bus.servos
         self.bus.upkeep()
-        update = self.board.poll()
-        for name in ('battery', 'rotors', 'status'):
-            news = getattr(update, name)
+        battery, rotors, _ = self.board.poll()
+        for name, news in (('battery', battery), ('rotors', rotors),
+                           ('status', self.board.state.status)):
             if news is not None:
                 self.latest[name] = news
         time.sleep(max(0.0, began + TICK - time.monotonic()))
