@@ -63,7 +63,8 @@ def _of_bus(link, parameters, joints, limits):
     findings = [_answers(link, present, limits)] if present else []
     misplaced = []
     if len(present) < len(servos):
-        misplaced = _misplaced(link, parameters)
+        link.close()
+        misplaced = _misplaced(parameters)
         if not present and not misplaced:
             return [Finding(BUS, FAIL, 'no servo answers at any baud rate',
                             "check the servos' supply (their LEDs blink once at power-up) "
@@ -102,12 +103,27 @@ def _of_servo(servo, baud_rate, problem, remedy):
     return Finding(servo.name, FAIL, found, remedy, values)
 
 
-def _misplaced(link, parameters):
+def _misplaced(parameters):
     """Find (baud rate, ID, model) of servos with an unexpected ID or baud rate."""
-    from beetle_omni_ros.drivers.servo_bus import scan
-    link.close()
-    expected = {(parameters.baud_rate, int(name)) for name in parameters.ids}
-    return [found for found in scan(parameters, OTHER_IDS) if found[:2] not in expected]
+    from beetle_omni_ros.drivers.serial_port import SerialPortError
+    from beetle_omni_ros.drivers.servo_link import ServoBusError, ServoLink
+    found, ids = [], {int(name) for name in parameters.ids}
+    for baud_rate in registers.BAUD_CODES:
+        link = ServoLink(parameters.port, baud_rate, max(parameters.timing.reply, 0.005))
+        try:
+            link.open()
+            for identifier in sorted(ids.union(OTHER_IDS)):
+                if baud_rate == parameters.baud_rate and identifier in ids:
+                    continue
+                try:
+                    found.append((baud_rate, identifier, link.ping(identifier)))
+                except ServoBusError:
+                    continue
+        except SerialPortError:
+            continue    # some adapters lack some baud rates
+        finally:
+            link.close()
+    return found
 
 
 def _remedy_of_missing(identifier, parameters, misplaced):

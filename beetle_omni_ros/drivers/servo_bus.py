@@ -1,9 +1,9 @@
 """Driver of the servo bus for the joint bridge: settings, torque, goals, feedback, recovery."""
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 import struct
 import time
 
@@ -27,9 +27,13 @@ HEALTH = ((registers.TORQUE_ENABLE, 2), (registers.STATUS_LEVEL, 3), (registers.
 # A value that only a configured servo has: a restart sets the register to its default, 1200. The
 # register has an effect only in velocity mode.
 MARK = (registers.VELOCITY_I, 1201)
+# Registers of the parameters of ServoGains, in their order.
+GAINS = (registers.POSITION_P, registers.POSITION_I, registers.POSITION_D,
+         registers.FEEDFORWARD_1, registers.FEEDFORWARD_2)
 ATTEMPTS = 3            # of reads outside the loop
 TRACKED = 0.2           # [s] half a turn takes longer at the servo's largest speed, 12 rad/s
 WATCHDOG_MARGIN = 0.8   # a pause above this share of the watchdog's time may have expired it
+EVENTS_KEPT = 200       # lines for the log
 REPEAT_AFTER = 1.0      # [s] until an equal line is logged again
 FIRST_PING = 0.2        # [s] after a reboot; a servo does not answer earlier
 PING_PERIOD = 0.02      # [s]
@@ -156,26 +160,6 @@ def examine(link: ServoLink, servo: Servo) -> tuple[str, str]:
     return '', ''
 
 
-def scan(parameters: ServoBusParameters,
-         others: Iterable[int] = ()) -> list[tuple[int, int, int]]:
-    """Search the bus's and ``others`` IDs at every baud rate: (baud rate, ID, model) of each."""
-    found = []
-    for baud_rate in registers.BAUD_CODES:
-        link = ServoLink(parameters.port, baud_rate, max(parameters.timing.reply, 0.005))
-        try:
-            link.open()
-            for identifier in sorted({*others, *(int(name) for name in parameters.ids)}):
-                try:
-                    found.append((baud_rate, identifier, link.ping(identifier)))
-                except ServoBusError:
-                    continue
-        except SerialPortError:
-            continue    # some adapters lack some baud rates
-        finally:
-            link.close()
-    return found
-
-
 class ServoBus:
     """
     Four tilt servos. Only one thread may use it, between :meth:`open` and :meth:`close`.
@@ -193,15 +177,14 @@ class ServoBus:
                  clock: Callable[[], float] = time.time):
         self.parameters, self.travel = parameters, joints.position_limit
         self.servos = make_servos(parameters)
-        self.enabled = False
-        self.clipped = 0
-        self._clock = clock
+        self.enabled, self.clipped, self._clock = False, 0, clock
         self.link = ServoLink(parameters.port, parameters.baud_rate, parameters.timing.reply)
         self._guard: Guard | None = None
+        self._torque_off = registers.TORQUE_ENABLE, {one.identifier: 0 for one in self.servos}
         self._recovering: deque[Servo] = deque()    # with a recovery, the next one first
         self._next_health = self._next_open = 0.0
         self._group = 0
-        self._events: list[str] = []
+        self._events: deque[str] = deque(maxlen=EVENTS_KEPT)
         self._logged: dict[str, float] = {}
 
     # --- lifecycle ----------------------------------------------------------------------------
@@ -270,8 +253,7 @@ class ServoBus:
                 'confirm_tilts')
         if self.parameters.guard and self._guard is None:
             self._guard = Guard(self.link.path, self.link.baud_rate,
-                                self.link.packet_of_sync_write(
-                                    registers.TORQUE_ENABLE, self._for_all(0)))
+                                self.link.packet_of_sync_write(*self._torque_off))
         self._want_torque(True)
         try:
             with self._outside_the_loop():
@@ -294,14 +276,14 @@ class ServoBus:
         confirmed = True
         try:
             with self.link.patient():
-                self.link.sync_write(registers.TORQUE_ENABLE, self._for_all(0))
+                self.link.sync_write(*self._torque_off)
                 for servo in self.servos:
                     try:
                         self.link.write(servo.identifier, registers.TORQUE_ENABLE, 0)
                         servo.torque = False
                     except ServoBusError as error:
                         confirmed = False
-                        self._log(f'torque off is not confirmed: {error}')
+                        self.log(f'torque off is not confirmed: {error}')
         except SerialPortError as error:
             self._port_lost(error)
             return False
@@ -389,11 +371,10 @@ class ServoBus:
                          for servo in self.servos])
 
     def take_events(self) -> list[str]:
-        """Return the lines for the log since the last call."""
-        events, self._events = self._events, []
-        return events
+        """Return the lines for the log since the last call, which may come from any thread."""
+        return [self._events.popleft() for _ in range(len(self._events))]
 
-    def _log(self, line):
+    def log(self, line):
         """Add a line to the log, unless an equal one was added within a second."""
         now = time.monotonic()
         if now - self._logged.get(line, -REPEAT_AFTER) >= REPEAT_AFTER:
@@ -415,7 +396,7 @@ class ServoBus:
     def _port_lost(self, error):
         """Close the failed port; :meth:`_reconnect` opens it again."""
         if self.link.is_open:
-            self._log(f'{error}; trying again every {self.parameters.timing.reconnect:g} s')
+            self.log(f'{error}; trying again every {self.parameters.timing.reconnect:g} s')
         self.link.close()
         self._drop_recoveries()
         self._next_open = time.monotonic() + self.parameters.timing.reconnect
@@ -427,19 +408,16 @@ class ServoBus:
         self._next_open = time.monotonic() + self.parameters.timing.reconnect
         try:
             self.link.open()
-            self._log(f'{self.link.path}: connected again')
+            self.log(f'{self.link.path}: connected again')
             if self.enabled:
                 # Their watchdogs have stopped them, and they may have restarted.
                 self._feed_watchdog()
                 for servo in self.servos:
                     self._recover(servo)
             else:
-                self.link.sync_write(registers.TORQUE_ENABLE, self._for_all(0))
+                self.link.sync_write(*self._torque_off)
         except SerialPortError:
             self.link.close()
-
-    def _for_all(self, value):
-        return {servo.identifier: value for servo in self.servos}
 
     def _want_torque(self, wanted):
         self.enabled = wanted
@@ -476,13 +454,8 @@ class ServoBus:
 
     def _volatile_settings(self):
         """RAM settings, lost by a restart, except torque and watchdog."""
-        gains = self.parameters.gains
         settings = [MARK, (registers.STATUS_LEVEL, 2),
-                    (registers.POSITION_P, gains.proportional),
-                    (registers.POSITION_I, gains.integral),
-                    (registers.POSITION_D, gains.derivative),
-                    (registers.FEEDFORWARD_1, gains.feedforward_velocity),
-                    (registers.FEEDFORWARD_2, gains.feedforward_acceleration),
+                    *zip(GAINS, astuple(self.parameters.gains), strict=True),
                     (registers.PROFILE_ACCELERATION, 0), (registers.PROFILE_VELOCITY, 0)]
         if self.parameters.mode == 'current_based_position':
             settings.append((registers.GOAL_CURRENT, round(
@@ -544,7 +517,7 @@ class ServoBus:
             if servo.update(data, now):
                 servo.turns_known &= self.enabled
                 if servo.recovery is None:
-                    self._log(f'{servo.where}: lost its turn count, taken as '
+                    self.log(f'{servo.where}: lost its turn count, taken as '
                               f'{servo.position:+.2f} rad')
                     self._recover(servo)
         missing = [servo for servo in asked if servo not in answered]
@@ -560,7 +533,7 @@ class ServoBus:
             servo.silent, servo.torque = True, None
             servo.probe_wait = timing.probe_first
             servo.next_probe = time.monotonic() + servo.probe_wait
-            self._log(f'{servo.where}: silent; check its cable and power')
+            self.log(f'{servo.where}: silent; check its cable and power')
 
     def _probe(self, now):
         servo = min((servo for servo in self.servos if servo.silent),
@@ -577,7 +550,7 @@ class ServoBus:
         except ServoBusError:
             pass
         if not servo.restarting:
-            self._log(f'{servo.where}: answers again')
+            self.log(f'{servo.where}: answers again')
             for other in self.servos:
                 other.next_probe = now  # the cause may have been the bus
         servo.silent = servo.restarting = False
@@ -598,13 +571,13 @@ class ServoBus:
                 elif servo.torque and not self.enabled:
                     # It did not answer when the torque was switched off.
                     self.link.sync_write(register, {servo.identifier: 0})
-                    self._log(f'{servo.where}: still had torque, switched off')
+                    self.log(f'{servo.where}: still had torque, switched off')
             elif register is registers.STATUS_LEVEL:
                 servo.error = data[2]  # Hardware Error Status is the third
             elif register is registers.WATCHDOG:
                 servo.watchdog_expired = data[0] == registers.WATCHDOG_EXPIRED
                 if servo.watchdog_expired and self.enabled:
-                    self._log(f'{servo.where}: was stopped by its watchdog, continues')
+                    self.log(f'{servo.where}: was stopped by its watchdog, continues')
                     self._restart_watchdog([servo])
             else:
                 servo.voltage = int.from_bytes(data[:2], 'little') * registers.VOLTAGE_UNIT
@@ -635,7 +608,7 @@ class ServoBus:
         except StopIteration:
             pass
         except ServoBusError as error:
-            self._log(f'{servo.name}: {error}')
+            self.log(f'{servo.name}: {error}')
             if isinstance(error, NoAnswer):
                 self._count_miss(servo)
         servo.recovery = None
@@ -657,12 +630,12 @@ class ServoBus:
             if not forced and not (self.enabled and given.reboot_after_overload
                                    and not servo.error & registers.OVERHEATING
                                    and servo.recoveries < given.recoveries):
-                self._log(f'{servo.where}: shut down ({", ".join(servo.errors)}); it stays off '
+                self.log(f'{servo.where}: shut down ({", ".join(servo.errors)}); it stays off '
                           'until it is rebooted')
                 servo.kept_off = True
                 return
             servo.recoveries += 1
-            self._log(f'{servo.where}: restarting it')
+            self.log(f'{servo.where}: restarting it')
             link.reboot(identifier)
             now = time.monotonic()
             servo.silent = servo.restarting = True  # so that reads of the others do not wait
@@ -679,14 +652,14 @@ class ServoBus:
         servo.kept_off = False
         if not self.enabled:
             servo.turns_known = False
-            self._log(f'{servo.where}: is back, without torque')
+            self.log(f'{servo.where}: is back, without torque')
             return
         # The goals of the running loop also use the new turn count.
         for register, value in self._power_on(counts):
             yield
             link.write(identifier, register, value, attempts=1)
         servo.torque, servo.watchdog_expired = True, False
-        self._log(f'{servo.where}: had restarted, is back at {servo.position:+.2f} rad')
+        self.log(f'{servo.where}: had restarted, is back at {servo.position:+.2f} rad')
 
     def _power_on(self, counts):
         """Settings that switch the torque on with a goal, which holds the servo."""

@@ -1,6 +1,5 @@
 """The 200 Hz loop of the servo bus in a thread; new goals are written at once."""
 
-from collections import deque
 from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,7 +16,6 @@ GAIN = 0.1          # of the phase control in each cycle, small against single l
 GOALS_KEPT = 0.1    # [s] older goals do not control the phase
 PERIOD = 0.005      # [s]
 STOP_TIMEOUT = 5.0  # [s] until the thread has ended; a cycle takes at most 0.02 s
-EVENTS_KEPT = 200   # lines for the log
 
 
 class ServoPace:
@@ -72,6 +70,7 @@ class ServoLoop:
         cycles, incomplete: number of cycles, and of those without a valid reading of each servo.
         written, stale: number of packets with goals, repetitions included, and of goals that had
             expired when the bus was free.
+        pace: counts missed periods.
         failure: error that ended the thread, or ''; torque is off then.
 
     """
@@ -82,19 +81,18 @@ class ServoLoop:
         self.cycles = self.written = self.stale = self.incomplete = 0
         self.failure = ''
         self._bus, self._on_readings, self._on_written = bus, on_readings, on_written
-        self._clock, self._pace = clock, ServoPace(clock())
+        self._clock, self.pace = clock, ServoPace(clock())
         self._lock = Lock()
         self._goal: Goal | None = None
         self._fresh = self._wrote = self._stopping = False
         self._last_obeying = np.full(4, clock())
-        self._events: deque[str] = deque(maxlen=EVENTS_KEPT)
         self._thread = Thread(target=self._run, name='servo bus', daemon=True)
 
     # --- from other threads -------------------------------------------------------------------
 
     def start(self):
         """Start the thread."""
-        self._pace.due = self._clock()
+        self.pace.due = self._clock()
         self._thread.start()
 
     def stop(self):
@@ -105,7 +103,7 @@ class ServoLoop:
 
     def offer(self, goal: Goal):
         """Write goals now, or after the present transaction; newer goals replace older ones."""
-        self._pace.goals = self._clock()
+        self.pace.goals = self._clock()
         self._goal = goal
         self._fresh = True
         self._write_pending()
@@ -117,14 +115,9 @@ class ServoLoop:
             try:
                 yield self._bus
             finally:
-                self._pace.due = now = self._clock()
+                self.pace.due = now = self._clock()
                 self._last_obeying = np.full(4, now)
         self._write_pending()
-
-    @property
-    def missed(self) -> int:
-        """Number of periods without a cycle."""
-        return self._pace.missed
 
     def lost(self, patience: float) -> str:
         """Servos that have not obeyed for ``patience`` [s], with reasons; '' if there is none."""
@@ -136,29 +129,25 @@ class ServoLoop:
         return '; '.join(servo.message or f'{servo.name}: being brought back'
                          for servo, is_gone in zip(self._bus.servos, gone) if is_gone)
 
-    def take_events(self) -> list[str]:
-        """Return the lines for the log since the last call."""
-        return [self._events.popleft() for _ in range(len(self._events))]
-
     # --- the thread ---------------------------------------------------------------------------
 
     def _run(self):
         try:
             while not self._stopping:
-                time.sleep(max(0.0, self._pace.due - self._clock()))
+                time.sleep(max(0.0, self.pace.due - self._clock()))
                 with self._lock:
                     if not self._stopping:
                         self._cycle()
                 self._write_pending()
         except Exception as error:  # also after a programming error torque must go off
             self.failure = f'the bus thread ended: {type(error).__name__}: {error}'
-            self._events.append(self.failure)
+            self._bus.log(self.failure)
             with self._lock:
                 self._bus.close()
 
     def _cycle(self):
         """Goals, feedback and upkeep, with the lock held."""
-        self._pace.begin(self._clock())
+        self.pace.begin(self._clock())
         self.cycles += 1
         if self._fresh:
             self._write_fresh()
@@ -172,7 +161,6 @@ class ServoLoop:
                           else readings.valid)
         self._write_fresh()
         self._bus.upkeep()
-        self._events.extend(self._bus.take_events())
         self._last_obeying = np.where(obeying, self._clock(), self._last_obeying)
 
     def _write_pending(self):

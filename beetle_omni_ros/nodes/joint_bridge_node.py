@@ -110,11 +110,9 @@ class JointBridgeNode(LifecycleFlightNode):
             self._lost_reason = 'no torque, the node was shut down'
         if loop is not None:
             loop.stop()
-            self._log(loop)
         bus.close()
         if loop is not None:    # without a loop, the refusal was logged
-            for line in bus.take_events():
-                self.get_logger().warning(line)
+            self._log(bus)
 
     def close(self):
         """Switch the torque off and publish the state."""
@@ -167,7 +165,7 @@ class JointBridgeNode(LifecycleFlightNode):
     def changed(self):
         """Log the thread's events; publish the state if it changed."""
         if self._loop is not None:
-            self._log(self._loop)
+            self._log(self._bus)
         text = self._state_text()
         if text != self._published:
             if text.startswith('lost') and not self._lost_reason:
@@ -177,8 +175,8 @@ class JointBridgeNode(LifecycleFlightNode):
             self._published = text
             self._state.publish(text)
 
-    def _log(self, loop):
-        for line in loop.take_events():
+    def _log(self, bus):
+        for line in bus.take_events():
             self.get_logger().warning(line)
 
     def _state_text(self):
@@ -201,13 +199,13 @@ class JointBridgeNode(LifecycleFlightNode):
         if loop is not before:
             cycles = missed = 0
         values = {
-            'stage': self.stage, 'cycles': loop.cycles, 'missed_cycles': loop.missed,
+            'stage': self.stage, 'cycles': loop.cycles, 'missed_cycles': loop.pace.missed,
             'rate_hz': (loop.cycles - cycles) / max(now - then, 1e-3),
             'connected': bus.link.is_open, 'goals_written': loop.written,
             'goals_stale': loop.stale, 'goals_clipped': bus.clipped,
             'incomplete': loop.incomplete, **bus.link.counts}
-        missed = loop.missed - missed
-        self._counted = (loop, loop.cycles, loop.missed, now)
+        missed = loop.pace.missed - missed
+        self._counted = (loop, loop.cycles, loop.pace.missed, now)
         if text.startswith('lost'):
             return health.ERROR, text, values
         if not bus.link.is_open:

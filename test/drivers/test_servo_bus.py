@@ -12,7 +12,7 @@ from servo_bench import arrived, bench, COUNT, JOINTS, running, SHIPPED, tick, u
 from beetle_omni_ros.drivers import servo_registers as registers
 from beetle_omni_ros.drivers.device_parameters import ServoBusParameters
 from beetle_omni_ros.drivers.serial_port import SerialPortError
-from beetle_omni_ros.drivers.servo_bus import examine, scan, ServoBus
+from beetle_omni_ros.drivers.servo_bus import examine, ServoBus
 from beetle_omni_ros.drivers.servo_link import ServoBusError
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import bind, load_yaml, ParameterError
@@ -140,15 +140,6 @@ def test_examining_changes_nothing_and_configuring_names_all_defects_in_one_line
         assert '\n' not in text and emulated.port in text and 'gimbal4' not in text
         assert 'gimbal2 (id 2): does not answer; check power' in text
         assert 'gimbal3 (id 3): overload; remove the cause, then reboot' in text
-
-
-@pytest.mark.real_time
-@pytest.mark.parametrize('baud_rate', [9600, 3_000_000])
-def test_scanning_finds_servos_at_another_baud_rate(baud_rate):
-    with bench(servos={'baud_rate': baud_rate, 'timing': True}) as (bus, emulated):
-        assert all(examine(bus.link, servo)[0] for servo in bus.servos)
-        bus.close()
-        assert scan(bus.parameters) == [(baud_rate, name, 1210) for name in (1, 2, 3, 4)]
 
 
 def test_a_port_is_refused_in_one_line_and_its_absence_tolerated(tmp_path):
