@@ -10,6 +10,7 @@ priority, as the nodes do.
 """
 
 import argparse
+from contextlib import closing
 from dataclasses import replace
 import json
 import multiprocessing
@@ -177,11 +178,12 @@ def measure_board(seconds):
     """Numbers of the motor board: one target in each cycle, telemetry polled as the node does."""
     device = Device(serve_board)
     sent, thrusts = [], np.random.default_rng(0).uniform(2, 15, (1000, 4))
-    with MotorBoard(replace(MotorBoardParameters.load(), port=device.port),
-                    RobotParameters.load()) as board:
+    with closing(MotorBoard(replace(MotorBoardParameters.load(), port=device.port),
+                            RobotParameters.load())) as board:
+        board.open()
         if missing := board.wait_ready(5):
             raise SystemExit(missing)
-        if not (answer := board.arm()).accepted:
+        if not (answer := board.start(True).wait()).accepted:
             raise SystemExit(answer.reason)
 
         def tick(k, _):

@@ -39,7 +39,7 @@ def drive(pipe, servo_port, board_port, seconds):
     bus.enable()
     board.open()
     missing = board.wait_ready(5)
-    if missing or not board.arm().accepted:
+    if missing or not board.start(True).wait().accepted:
         raise SystemExit(missing or 'not armed')
     pipe.send('begin')
     begin, spent, incomplete = time.monotonic(), [], 0

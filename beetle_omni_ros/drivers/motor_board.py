@@ -159,13 +159,6 @@ class MotorBoard:
         self._thread = None
         self._disconnect()
 
-    def __enter__(self) -> MotorBoard:
-        self.open()
-        return self
-
-    def __exit__(self, *_) -> None:
-        self.close()
-
     @property
     def connected(self) -> bool:
         """Whether the port is open, so that targets can be sent."""
@@ -211,14 +204,6 @@ class MotorBoard:
             command.tick(time.monotonic())
             return command
 
-    def arm(self) -> ArmCommand:
-        """Arm and wait for the answer; needs :attr:`ready` to be ''."""
-        return self.start(True).wait()
-
-    def disarm(self) -> ArmCommand:
-        """Disarm and wait for the answer."""
-        return self.start(False).wait()
-
     def send(self, thrust: np.ndarray, stamp: float) -> Sent:
         """
         Send thrust targets without waiting. Only one thread may call this.
@@ -246,14 +231,11 @@ class MotorBoard:
         return Sent('', self.thrust_map.saturated(thrust, voltage), command)
 
     def _board_stamp(self, stamp, age):
-        """
-        Board's clock [us] at a stamp; equal stamps give equal values, rising stamps rising ones.
-
-        It is computed from the age, so that a step of the host's clock affects one target only.
-        """
+        """Board's clock [us] at a stamp, equal for equal stamps and rising for rising ones."""
         last_stamp, last = self._last_stamp
         if stamp == last_stamp:
             return last
+        # From the age, so that a step of the host's clock affects one target only.
         micros = max(0, round(1e6 * (time.monotonic() - age + self.state.clock.offset())))
         if stamp > last_stamp and last - CORRECTION < micros <= last:
             micros = last + 1   # the offset was corrected by more than the time between stamps
@@ -273,8 +255,6 @@ class MotorBoard:
                 **{f'board {name}': count for name, count in self.state.reception.items()},
                 'clock_offset_s': clock.offset(),
                 'clock_uncertainty_ms': 1e3 * clock.uncertainty(time.monotonic())}
-
-    # --- the port -----------------------------------------------------------------------------
 
     def _write(self, message):
         """Pack and write a message without waiting; return whether it was written."""
@@ -303,9 +283,9 @@ class MotorBoard:
 
     def _disconnect(self):
         with self._write_lock:
-            port, self._port = self._port, None
-        if port:
-            port.close()
+            if self._port is not None:
+                self._port.close()
+            self._port = None
 
     def _run(self):
         while not self._stopping:
@@ -329,14 +309,14 @@ class MotorBoard:
         self._next_open = now + self.parameters.reconnect_period
         try:
             self._connect()
+            with self._lock:
+                self.state.connection('')
         except SerialPortError:
-            return
-        with self._lock:
-            self.state.connection('')
+            pass
 
     def _serve(self, port):
         """Wait at most one tick for bytes and handle them."""
-        readable, writable, _ = select.select([port], [port] if port.waiting else [], [], TICK)
+        readable, writable, _ = select.select([port], [port] if port.rest else [], [], TICK)
         if writable:
             with self._write_lock:
                 port.flush()

@@ -213,7 +213,7 @@ class BoardState:
         self._events: deque[tuple[str, str]] = deque(maxlen=EVENTS_KEPT)
         self._requests: deque[int] = deque(maxlen=REQUESTS_KEPT)
         self._received_at = self._opened = self._battery_at = -math.inf
-        self._was_silent = self._was_uncertain = self._was_implausible = False
+        self._conditions: dict[str, bool] = {}      # of the last call, for events about changes
         self._handlers = {
             'HEARTBEAT': self._on_heartbeat, 'TIMESYNC': self._on_timesync,
             'BATTERY_STATUS': self._on_battery, 'SYS_STATUS': self._on_reception,
@@ -239,17 +239,20 @@ class BoardState:
         # After a reconnection the board has the same time for its first message.
         silent = math.isfinite(self._received_at) and \
             now - max(self._received_at, self._opened) > self._parameters.silence
-        if silent != self._was_silent and connected:
-            self._was_silent = silent
+        if connected and self._changed('silent', silent):
             self._event('error' if silent else 'info',
                         f'no message for {self._parameters.silence:g} s' if silent
                         else 'messages again')
         uncertainty = self.clock.uncertainty(now)
         uncertain = self.clock.known and uncertainty > self._parameters.clock_uncertainty_limit
-        if uncertain != self._was_uncertain:
-            self._was_uncertain = uncertain
+        if self._changed('uncertain', uncertain):
             self._event('warning' if uncertain else 'info',
                         f'offset of its clock known to {1e3 * uncertainty:.1f} ms')
+
+    def _changed(self, name, value):
+        """Whether a condition differs from the last call."""
+        before, self._conditions[name] = self._conditions.get(name, False), value
+        return value != before
 
     def acknowledged(self, arm: bool) -> None:
         """Update the status after an acknowledged command, before the next heartbeat."""
@@ -311,8 +314,7 @@ class BoardState:
         voltage = sum(cells) / 1000 if cells else math.nan
         plausible = self._parameters.cell_voltage_low <= voltage / self._cells \
             <= self._parameters.cell_voltage_high
-        if plausible == self._was_implausible:
-            self._was_implausible = not plausible
+        if self._changed('implausible', not plausible):
             self._event('info' if plausible else 'warning',
                         'battery voltage plausible again' if plausible else
                         f'battery voltage {voltage:.1f} V not plausible, the last good one is '
@@ -335,11 +337,10 @@ class BoardState:
                           'refused': message.errors_count3, 'timeouts': message.errors_count4}
 
     def _on_info(self, message, now):
-        old, self._info = self._info, message
+        self._info = message
         for k in range(4):
-            before = old is None or bool(old.info >> k & 1)
             online = bool(message.info >> k & 1)
-            if online != before:
+            if self._changed(f'offline {k}', not online):
                 self._event('info' if online else 'error',
                             f"ESC of rotor {k + 1} {'online again' if online else 'offline'}")
 

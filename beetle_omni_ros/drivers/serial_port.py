@@ -20,30 +20,20 @@ class SerialPortError(OSError):
 CAUSES = {errno.ENOENT: 'no such port; check plug, power, name and udev rule',
           errno.EACCES: 'no permission; add the user to the group dialout and log in again, or '
                         'install the udev rule',
-          errno.EAGAIN: 'in use by another process; stop it',
-          errno.EBUSY: 'in use by another process; stop it',
-          errno.EIO: 'unplugged', errno.ENXIO: 'unplugged', errno.ENODEV: 'unplugged'}
+          **dict.fromkeys((errno.EAGAIN, errno.EBUSY), 'in use by another process; stop it'),
+          **dict.fromkeys((errno.EIO, errno.ENXIO, errno.ENODEV), 'unplugged')}
 
 
 class SerialPort:
     """
-    One open port, locked against other processes. A call raises SerialPortError if it is lost.
+    One open port, locked against other processes. Each call raises SerialPortError if it is lost.
 
-    Attributes:
-        waiting: whether part of a frame is not written yet.
-
+    ``rest`` is the part of a frame that is not written yet.
     """
 
     def __init__(self, name: str, baud: int):
-        """
-        Open ``name`` at ``baud`` [bit/s] and empty its buffers.
-
-        Raises:
-            SerialPortError: it is absent, in use, not permitted, or no serial port.
-
-        """
-        self.name = name
-        self._rest = b''
+        """Open ``name`` at ``baud`` [bit/s] and empty its buffers."""
+        self.name, self.rest = name, b''
         try:
             self._serial = serial.Serial(name, baud, timeout=0, exclusive=True)
         except (OSError, ValueError, termios.error) as error:
@@ -84,22 +74,16 @@ class SerialPort:
 
         A frame that fits only in part is completed before the next frame.
         """
-        if not self.flush():
-            return False
-        written = self._write(frame)
-        self._rest = frame[written:] if written else b''
+        written = self._write(frame) if self.flush() else 0
+        if written:
+            self.rest = frame[written:]
         return written > 0
 
     def flush(self) -> bool:
         """Continue a partly written frame; return whether it is complete."""
-        if self._rest:
-            self._rest = self._rest[self._write(self._rest):]
-        return not self._rest
-
-    @property
-    def waiting(self) -> bool:
-        """Whether part of a frame is not written yet."""
-        return bool(self._rest)
+        if self.rest:
+            self.rest = self.rest[self._write(self.rest):]
+        return not self.rest
 
     def _write(self, data):
         try:

@@ -187,8 +187,6 @@ class ServoBus:
         self._events: deque[str] = deque(maxlen=EVENTS_KEPT)
         self._logged: dict[str, float] = {}
 
-    # --- lifecycle ----------------------------------------------------------------------------
-
     def open(self):
         """Open the port; raises SerialPortError, as the next two methods if it is lost."""
         self.link.open()
@@ -424,8 +422,6 @@ class ServoBus:
         for servo in self.servos:
             servo.wanted = wanted
 
-    # --- settings -----------------------------------------------------------------------------
-
     @property
     def _watchdog_counts(self):
         return round(self.parameters.timing.watchdog / registers.WATCHDOG_UNIT)     # 1 to 127
@@ -463,7 +459,6 @@ class ServoBus:
         return settings
 
     def _is_marked(self, servo):
-        """Whether a servo has not restarted since it was configured; its turns are valid then."""
         return self.link.read(servo.identifier, MARK[0], ATTEMPTS) == MARK[1]
 
     def _locate(self):
@@ -476,8 +471,6 @@ class ServoBus:
             counts = self.link.read(servo.identifier, registers.PRESENT_POSITION, ATTEMPTS)
             servo.turns *= servo.turns_known
             servo.position = servo.angle(counts) + TURN * servo.turns
-
-    # --- the watchdog -------------------------------------------------------------------------
 
     def _feed_watchdog(self):
         """Clear the watchdogs after a pause, because expired ones refuse goals without answer."""

@@ -30,19 +30,15 @@ class ServoLink:
     The bus at one baud rate.
 
     It is also the port of the SDK's packet handler (methods in camelCase), because the SDK's own
-    port waits in a busy loop, uses the wall clock and may block in a write.
-
-    Args:
-        reply_time: time limit of an answer, without its time on the wire [s].
+    port waits in a busy loop, uses the wall clock and may block in a write. Each call raises
+    SerialPortError if the port is lost.
 
     Attributes:
+        reply_time: time limit of an answer, without its time on the wire [s].
         fast: whether to use fast sync read, which needs firmware 46 or later in every servo.
         late: whether an answer of the last transaction was missing or corrupt.
         last_sent: monotonic time of the last packet [s], which restarts the servos' watchdogs.
         counts: transactions, connections and errors since the creation of the link.
-
-    Raises:
-        SerialPortError: by any call, if the port is lost; open it again.
 
     """
 
@@ -62,7 +58,7 @@ class ServoLink:
         return self._port is not None
 
     def open(self):
-        """Open the port; raises SerialPortError if it cannot be opened."""
+        """Open the port."""
         self.close()
         self._port = SerialPort(self.path, self.baud_rate)
         self.is_using = False
@@ -159,12 +155,9 @@ class ServoLink:
         return self._status(identifier, length)
 
     def _status(self, identifier, length):
-        """
-        Receive the answer of one servo: data, the SDK's result, error byte.
-
-        An answer does not contain its address. An answer of another length is a late one of
-        another transaction, whose CRC the SDK's readRx would return as data.
-        """
+        """Receive the answer of one servo: data, the SDK's result, error byte."""
+        # An answer does not contain its address. An answer of another length is a late one of
+        # another transaction, whose CRC the SDK's readRx would return as data.
         while True:
             packet, result = self._handler.rxPacket(self, False)
             if result != COMM_SUCCESS:
@@ -201,11 +194,7 @@ class ServoLink:
 
         Each servo answers after the previous one in the list, so servos behind a silent one may
         not answer. The SDK's GroupSyncRead does not serve here: it drops the error bytes, and all
-        answers if one is missing or corrupt.
-
-        Returns:
-            ID -> (error byte, data) of each valid answer.
-
+        answers if one is missing or corrupt. Returned is ID -> (error byte, data) of the valid.
         """
         self.counts['transactions'] += 1
         self.late = False

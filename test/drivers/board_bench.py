@@ -1,6 +1,6 @@
 """An emulated motor board, its driver, and a loop that sends targets."""
 
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 import threading
 import time
@@ -23,6 +23,14 @@ def driver(port, **changes):
     """Driver with a short reconnect period."""
     return MotorBoard(replace(MotorBoardParameters.load(), port=port, reconnect_period=0.05,
                               **changes), ROBOT)
+
+
+@contextmanager
+def opened(port, **changes):
+    """Driver with its port open."""
+    with closing(driver(port, **changes)) as board:
+        board.open()
+        yield board
 
 
 def until(condition, timeout=3.0):
@@ -70,7 +78,7 @@ class Pilot:
 def connected(**changes):
     """Emulated board and driver, ready to arm."""
     with EmulatedMotorBoard(parameters=QUICK) as emulated, \
-            driver(emulated.port, **changes) as board:
+            opened(emulated.port, **changes) as board:
         assert board.wait_ready(3.0) == ''
         yield emulated, board
 
@@ -79,7 +87,7 @@ def connected(**changes):
 def flying(**changes):
     """Emulated board, driver and pilot, rotors following."""
     with connected(**changes) as (emulated, board):
-        result = board.arm()
+        result = board.start(True).wait()
         assert result.accepted, result.reason
         with Pilot(board) as pilot:
             assert until(lambda: emulated.commands.all() and pilot.results)

@@ -17,7 +17,7 @@ import reference_packets as reference
 pytest.importorskip('pymavlink')
 pytest.importorskip('serial')
 
-from board_bench import connected, driver, flying, HOVER, QUICK, until
+from board_bench import connected, driver, flying, HOVER, opened, QUICK, until
 from pymavlink.dialects.v20 import common
 
 from beetle_omni_ros.drivers.serial_port import SerialPort
@@ -30,7 +30,7 @@ def test_commanded_thrusts_are_produced_at_the_measured_voltage():
     with connected() as (emulated, board):
         emulated.set_battery(22.9, 20.0)
         time.sleep(0.6)         # twelve time constants of the voltage filter
-        assert board.arm().accepted
+        assert board.start(True).wait().accepted
         assert not board.send(HOVER, time.time()).reason
         assert until(lambda: emulated.commands.all())
         np.testing.assert_allclose(emulated.thrust_targets, HOVER, rtol=1e-3)
@@ -43,7 +43,7 @@ def test_commanded_thrusts_are_produced_at_the_measured_voltage():
     ([1, 2, 3, 4], 0.2, 'stale stamp'), ([1, 2, 3, 4], -0.2, 'stamp in the future')])
 def test_bad_thrusts_are_not_sent(thrust, age, reason):
     with connected() as (emulated, board):
-        board.arm()
+        board.start(True).wait()
         assert board.send(thrust, time.time() - age).reason == reason
         time.sleep(0.05)
         assert not emulated.commands.any()
@@ -53,20 +53,20 @@ def test_refused_arming_is_reported_with_the_reason():
     with connected() as (emulated, board):
         emulated.set_battery(20.0, 0.0)
         assert until(lambda: 'battery low' in board.state.status.conditions)
-        assert board.arm().reason == 'refused by the board: battery low'
+        assert board.start(True).wait().reason == 'refused by the board: battery low'
         emulated.set_battery(25.0, 0.0)
         for _ in range(20):
             board.send(HOVER, time.time())
             time.sleep(0.005)
-        result = board.arm()
+        result = board.start(True).wait()
         assert not result.accepted and result.reason.endswith('throttle not low')
         time.sleep(QUICK.throttle_low_time)
-        assert board.arm().accepted and emulated.armed
+        assert board.start(True).wait().accepted and emulated.armed
 
 
 def test_disarming_is_acknowledged_and_stops_the_rotors():
     with flying() as (emulated, board, _):
-        result = board.disarm()
+        result = board.start(False).wait()
         assert result.accepted
         assert not emulated.armed and not emulated.commands.any()
         assert until(lambda: not board.state.status.armed)
@@ -106,7 +106,7 @@ def test_an_independent_parser_accepts_all_output_of_the_driver():
     received = bytearray()
     board = driver(os.ttyname(other))
     board.open()
-    threading.Thread(target=board.disarm, daemon=True).start()
+    threading.Thread(target=lambda: board.start(False).wait(), daemon=True).start()
     board.state.clock.add(time.monotonic(), 1.0, time.monotonic())
     for _ in range(100):
         board.send(HOVER, time.time())
@@ -158,10 +158,10 @@ def test_pymavlink_accepts_all_output_of_the_emulated_board():
 
 def test_without_a_board_every_call_times_out_soon_with_a_message():
     device, other = pty.openpty()
-    with driver(os.ttyname(other), acknowledge_timeout=0.02) as board:
+    with opened(os.ttyname(other), acknowledge_timeout=0.02) as board:
         assert board.wait_ready(0.1) == 'no message from the board'
-        assert board.arm().reason == 'no message from the board'
-        assert board.disarm().reason == 'no acknowledgement to 5 attempts'
+        assert board.start(True).wait().reason == 'no message from the board'
+        assert board.start(False).wait().reason == 'no acknowledgement to 5 attempts'
         assert board.send(HOVER, time.time()).reason == "offset of the board's clock unknown"
     os.close(device)
     os.close(other)
@@ -171,14 +171,14 @@ def test_another_firmware_is_refused():
     with connected() as (emulated, board):
         emulated._firmware._heartbeat = lambda state, now: (0, (1 | 9 << 24, 2, 0, 1, 3, 3))
         assert until(lambda: board.state.status.contract == 9)
-        assert board.arm().reason == 'firmware follows contract 9, this driver 1'
+        assert board.start(True).wait().reason == 'firmware follows contract 9, this driver 1'
 
 
 def test_closing_disarms():
     with EmulatedMotorBoard(parameters=QUICK) as emulated:
         board = driver(emulated.port)
         board.open()
-        assert board.wait_ready(3) == '' and board.arm().accepted
+        assert board.wait_ready(3) == '' and board.start(True).wait().accepted
         board.send(HOVER, time.time())
         board.close()
         assert not emulated.armed
@@ -191,7 +191,7 @@ def test_a_step_of_the_computers_clock_does_not_stop_the_rotors():
     shift = [0.0]
     with connected() as (emulated, board):
         board._clock = lambda: time.time() + shift[0]
-        assert board.arm().accepted
+        assert board.start(True).wait().accepted
         for k in range(60):
             shift[0] = 3600.0 * (k > 20) - 7200.0 * (k > 40)
             assert not board.send(HOVER, time.time() + shift[0]).reason
@@ -204,7 +204,7 @@ def test_stamps_stay_monotonic_when_the_offset_is_corrected():
     with connected() as (emulated, board):
         stamps = []
         emulated.on_target = lambda now, values: stamps.append(values[0])
-        assert board.arm().accepted
+        assert board.start(True).wait().accepted
         clock, begin = board.state.clock, time.time()
         for k, correction in enumerate((0.0, -0.003, 0.002, -0.003)):
             low, high, at = clock._bounds
@@ -225,7 +225,7 @@ sys.path.insert(0, sys.argv[2])
 from board_bench import driver, HOVER
 board = driver(sys.argv[1])
 board.open()
-assert board.wait_ready(5) == '' and board.arm().accepted
+assert board.wait_ready(5) == '' and board.start(True).wait().accepted
 print('flying', flush=True)
 end = time.monotonic() + float(sys.argv[3])
 while time.monotonic() < end:

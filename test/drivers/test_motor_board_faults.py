@@ -56,7 +56,7 @@ def test_a_poor_link_is_counted_and_tolerated(faults):
 def test_commands_succeed_with_half_of_all_packets_lost():
     with flying() as (emulated, board, _):
         emulated.faults.drop_in = emulated.faults.drop_out = 0.5
-        results = [board.disarm() for _ in range(3)]
+        results = [board.start(False).wait() for _ in range(3)]
         assert not emulated.armed
         assert any(result.accepted for result in results)
 
@@ -122,7 +122,7 @@ def test_a_long_disconnection_disarms_and_reconnecting_does_not_arm():
         assert until(lambda: pilot.has_event('disarmed (heartbeat of the host lost)'))
         pilot.thrust = np.zeros(4)
         time.sleep(QUICK.throttle_low_time)
-        assert until(lambda: board.arm().accepted)
+        assert until(lambda: board.start(True).wait().accepted)
 
 
 def test_a_hung_board_is_reset_by_its_watchdog_and_stays_disarmed():
@@ -142,7 +142,7 @@ def test_a_reboot_in_flight_stops_and_needs_arming_again():
         assert board.link()['lost'] == 0
         pilot.thrust = np.zeros(4)
         time.sleep(QUICK.throttle_low_time)
-        assert until(lambda: board.arm().accepted)
+        assert until(lambda: board.start(True).wait().accepted)
         pilot.thrust = HOVER
         assert until(lambda: emulated.commands.all())
 
@@ -159,10 +159,10 @@ def test_a_failed_esc_is_named_and_the_other_rotors_continue():
             rotors = board.poll()[1]
         assert np.isnan(rotors.rpm[2]) and rotors.failures[2] == ('generic',)
         assert np.all(rotors.rpm[[0, 1, 3]] > 1000)
-        board.disarm()
+        board.start(False).wait()
         pilot.thrust = np.zeros(4)
         time.sleep(QUICK.throttle_low_time + 0.05)
-        assert board.arm().reason == 'refused by the board: ESC failure'
+        assert board.start(True).wait().reason == 'refused by the board: ESC failure'
 
 
 def test_several_faults_at_once_leave_no_rotor_spinning():

@@ -54,7 +54,7 @@ def test_a_full_buffer_drops_whole_frames_without_waiting(ends):
             os.set_blocking(device, False)
             received += os.read(device, 65536)
         except BlockingIOError:
-            if not port.waiting:
+            if not port.rest:
                 break
     assert received == b''.join(frames[k] for k in taken)
     port.close()

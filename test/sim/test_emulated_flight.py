@@ -49,7 +49,7 @@ class Flight:
         self.bus.enable()
         self.board.open()
         assert self.board.wait_ready(3.0) == ''
-        result = self.board.arm()
+        result = self.board.start(True).wait()
         assert result.accepted, result.reason
         return self
 
