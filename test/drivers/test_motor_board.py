@@ -17,10 +17,8 @@ import reference_packets as reference
 pytest.importorskip('pymavlink')
 pytest.importorskip('serial')
 
-from board_bench import connected, driver, flying, HOVER, opened, QUICK, until
-from pymavlink.dialects.v20 import common
+from board_bench import connected, driver, HOVER, opened, QUICK, until
 
-from beetle_omni_ros.drivers.serial_port import SerialPort
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 
 pytestmark = pytest.mark.real_time
@@ -36,15 +34,16 @@ def test_commanded_thrusts_are_produced_at_the_measured_voltage():
         np.testing.assert_allclose(emulated.thrust_targets, HOVER, rtol=1e-3)
 
 
-@pytest.mark.parametrize(('thrust', 'age', 'reason'), [
-    ([1, 2, 3], 0, 'not four finite numbers'), ([1, 2, 3, math.nan], 0, 'not four finite numbers'),
-    ([1, 2, 3, math.inf], 0, 'not four finite numbers'),
-    ([1, 2, 3, 4], math.nan, 'not four finite numbers'),
-    ([1, 2, 3, 4], 0.2, 'stale stamp'), ([1, 2, 3, 4], -0.2, 'stamp in the future')])
-def test_bad_thrusts_are_not_sent(thrust, age, reason):
+def test_bad_thrusts_are_not_sent():
     with connected() as (emulated, board):
         board.start(True).wait()
-        assert board.send(thrust, time.time() - age).reason == reason
+        for thrust, age, reason in (
+                ([1, 2, 3], 0, 'not four finite numbers'),
+                ([1, 2, 3, math.nan], 0, 'not four finite numbers'),
+                ([1, 2, 3, math.inf], 0, 'not four finite numbers'),
+                ([1, 2, 3, 4], math.nan, 'not four finite numbers'),
+                ([1, 2, 3, 4], 0.2, 'stale stamp'), ([1, 2, 3, 4], -0.2, 'stamp in the future')):
+            assert board.send(thrust, time.time() - age).reason == reason
         time.sleep(0.05)
         assert not emulated.commands.any()
 
@@ -62,17 +61,12 @@ def test_refused_arming_is_reported_with_the_reason():
         assert not result.accepted and result.reason.endswith('throttle not low')
         time.sleep(QUICK.throttle_low_time)
         assert board.start(True).wait().accepted and emulated.armed
+        emulated._firmware._heartbeat = lambda state, now: (0, (1 | 9 << 24, 2, 0, 1, 3, 3))
+        assert until(lambda: board.state.status.contract == 9)
+        assert board.start(True).wait().reason == 'firmware follows contract 9, this driver 1'
 
 
-def test_disarming_is_acknowledged_and_stops_the_rotors():
-    with flying() as (emulated, board, _):
-        result = board.start(False).wait()
-        assert result.accepted
-        assert not emulated.armed and not emulated.commands.any()
-        assert until(lambda: not board.state.status.armed)
-
-
-def test_battery_and_rotor_states_have_si_units_and_stamps_of_the_computer():
+def test_battery_rotors_and_clock_have_si_units_and_stamps_of_the_computer():
     with connected() as (emulated, board):
         emulated.set_battery(23.456, 12.34)
         emulated.set_rotors(np.array([1.0, 4.0, 9.0, 0.0]), np.array([30.0, 40.0, 50.0, 60.0]))
@@ -81,23 +75,18 @@ def test_battery_and_rotor_states_have_si_units_and_stamps_of_the_computer():
         board.poll()
         time.sleep(0.1)
         battery, rotors, _ = board.poll()
-        emulated.faults.mute = True
-        time.sleep(0.05)
-        board.poll()
-        assert board.poll()[:2] == (None, None)
         assert (battery.voltage, battery.current) == (23.456, -12.34)
         assert rotors.rpm.tolist() == [2700, 5400, 8100, 0]
         assert rotors.temperature.tolist() == [30, 40, 50, 60]
         assert rotors.current.sum() == pytest.approx(12.34, rel=1e-5)
         assert before - 0.02 < rotors.stamp <= time.time()
-
-
-def test_the_clock_offset_of_the_board_is_within_its_bound():
-    with connected() as (emulated, board):
-        time.sleep(0.5)
         link, now = board.link(), time.monotonic()
         truth, bound = emulated._firmware.clock(now) - now, link['clock_uncertainty_ms'] / 1e3
         assert abs(link['clock_offset_s'] - truth) <= bound < 0.02
+        emulated.faults.mute = True
+        time.sleep(0.05)
+        board.poll()
+        assert board.poll()[:2] == (None, None)
 
 
 def test_an_independent_parser_accepts_all_output_of_the_driver():
@@ -135,27 +124,6 @@ def test_an_independent_parser_accepts_all_output_of_the_driver():
     os.close(other)
 
 
-def test_pymavlink_accepts_all_output_of_the_emulated_board():
-    """Its strict parser raises at the first wrong byte."""
-    with EmulatedMotorBoard(parameters=QUICK) as emulated:
-        port = SerialPort(emulated.port, 921600)
-        parser, names, sequence = common.MAVLink(None), set(), None
-        packer = common.MAVLink(None, 1, 191)
-        end = time.monotonic() + 1.2
-        while time.monotonic() < end:
-            port.write(common.MAVLink_timesync_message(0, 5).pack(packer))
-            port.write(reference.ARM)
-            time.sleep(0.02)
-            for message in parser.parse_buffer(port.read()) or []:
-                names.add(message.get_type())
-                assert sequence is None or message.get_seq() == (sequence + 1) % 256
-                sequence = message.get_seq()
-        port.close()
-    assert names == {'HEARTBEAT', 'SYS_STATUS', 'COMMAND_ACK', 'TIMESYNC', 'BATTERY_STATUS',
-                     'ESC_INFO', 'ESC_STATUS'}
-    assert parser.total_receive_errors == 0
-
-
 def test_without_a_board_every_call_times_out_soon_with_a_message():
     device, other = pty.openpty()
     with opened(os.ttyname(other), acknowledge_timeout=0.02) as board:
@@ -165,25 +133,6 @@ def test_without_a_board_every_call_times_out_soon_with_a_message():
         assert board.send(HOVER, time.time()).reason == "offset of the board's clock unknown"
     os.close(device)
     os.close(other)
-
-
-def test_another_firmware_is_refused():
-    with connected() as (emulated, board):
-        emulated._firmware._heartbeat = lambda state, now: (0, (1 | 9 << 24, 2, 0, 1, 3, 3))
-        assert until(lambda: board.state.status.contract == 9)
-        assert board.start(True).wait().reason == 'firmware follows contract 9, this driver 1'
-
-
-def test_closing_disarms():
-    with EmulatedMotorBoard(parameters=QUICK) as emulated:
-        board = driver(emulated.port)
-        board.open()
-        assert board.wait_ready(3) == '' and board.start(True).wait().accepted
-        board.send(HOVER, time.time())
-        board.close()
-        assert not emulated.armed
-        board.close()
-        assert emulated._firmware._stop_reason == 1
 
 
 def test_a_step_of_the_computers_clock_does_not_stop_the_rotors():
@@ -256,7 +205,7 @@ def test_a_process_disarms_at_exit_and_after_an_exception(end):
         assert emulated._firmware._stop_reason == 1         # requested by the host
 
 
-@pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGTERM, signal.SIGSTOP])
+@pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGSTOP])
 def test_no_rotor_turns_100_ms_after_the_end_of_the_process(number):
     with EmulatedMotorBoard(parameters=QUICK) as emulated:
         arrivals = []
@@ -280,4 +229,3 @@ def test_no_rotor_turns_100_ms_after_the_end_of_the_process(number):
             child.kill()
             child.wait(10)
         assert emulated._firmware._stop_reason in (2, 3)
-

@@ -1,6 +1,5 @@
 """Rules of arming, disarming and loss of the board, on a simple substitute of the board."""
 
-from dataclasses import dataclass
 from types import SimpleNamespace
 
 import pytest
@@ -8,23 +7,12 @@ import pytest
 pytest.importorskip('pymavlink')
 pytest.importorskip('serial')
 
-from board_bench import connected, until
-
 from beetle_omni_ros.drivers.motor_board import Arming, PATIENCE, STEP
 from beetle_omni_ros.drivers.motor_board_state import BoardStatus
 
 CYCLE = 0.005
 DISARMED = BoardStatus(0.0, 'disarmed', 'none', (), 1)
 ARMED = BoardStatus(0.0, 'armed', 'none', (), 1)
-
-
-@dataclass
-class Command:
-    """An arm or disarm command; ``accepted`` is None until it is answered."""
-
-    arm: bool
-    accepted: bool | None = None
-    reason: str = ''
 
 
 class BoardStub:
@@ -35,7 +23,7 @@ class BoardStub:
         self.connected = True
 
     def start(self, arm):
-        self.commands.append(Command(arm))
+        self.commands.append(SimpleNamespace(arm=arm, accepted=None, reason=''))
         return self.commands[-1]
 
     def answer(self, accepted=True, reason=''):
@@ -57,12 +45,18 @@ def bench():
     return board, Arming(board)
 
 
-def in_flight(bench):
-    """Arm the board and enter 'flies'."""
-    board, arming = bench
+def disarmed(board, arming):
+    """The supervisor is disarmed and the board confirms it."""
     arming.follow('disarmed')
     board.answer()
     arming.update(CYCLE)
+    return arming.text
+
+
+def in_flight(bench):
+    """Arm the board and enter 'flies'."""
+    board, arming = bench
+    assert disarmed(board, arming) == 'ready'
     arming.follow('takeoff')
     assert arming.phase == 'arms' and board.asked is True
     arming.update(CYCLE)
@@ -122,10 +116,7 @@ def test_a_refusal_to_arm_is_reported_and_not_retried(bench):
     for _ in range(100):
         arming.update(CYCLE)
     assert board.asked is False
-    arming.follow('disarmed')
-    board.answer()
-    arming.update(CYCLE)
-    assert arming.text == 'ready'
+    assert disarmed(board, arming) == 'ready'
 
 
 @pytest.mark.parametrize(('status', 'why'), [
@@ -152,10 +143,7 @@ def test_a_board_that_stopped_in_flight_is_lost_until_the_supervisor_is_disarmed
         board.answer()
         arming.update(CYCLE)
         assert arming.text == f'lost: {why}' and board.asked is False
-    arming.follow('disarmed')
-    board.answer()
-    arming.update(CYCLE)
-    assert arming.text == 'ready'
+    assert disarmed(board, arming) == 'ready'
     arming.follow('takeoff')
     assert board.asked is True
 
@@ -210,25 +198,3 @@ def test_an_acknowledgement_contradicted_by_the_heartbeat_does_not_start_a_fligh
         assert arming.phase != 'flies'
         arming.update(CYCLE)
     assert arming.text == 'lost: disarmed (heartbeat of the host lost)'
-
-
-@pytest.mark.real_time
-def test_the_state_machine_drives_the_real_driver_and_board():
-    with connected() as (emulated, board):
-        arming = Arming(board)
-
-        def reaches(condition):
-            return until(lambda: arming.update(CYCLE) or condition())
-
-        arming.follow('disarmed')
-        assert reaches(lambda: arming.text == 'ready')
-        arming.follow('takeoff')
-        assert reaches(lambda: arming.phase == 'flies') and emulated.armed
-        emulated.reboot()
-        assert reaches(lambda: arming.text == 'lost: restarted')
-        arming.follow('disarmed')
-        assert reaches(lambda: arming.text == 'ready')
-        arming.follow('takeoff')
-        assert reaches(lambda: arming.phase == 'flies')
-        arming.follow('emergency_stop')
-        assert reaches(lambda: not emulated.armed)

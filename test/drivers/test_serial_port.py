@@ -2,7 +2,6 @@
 
 import os
 import pty
-import time
 import tty
 
 import pytest
@@ -25,19 +24,6 @@ def ends():
             os.close(descriptor)
         except OSError:
             pass
-
-
-def test_bytes_arrive_unchanged_in_both_directions(ends):
-    device, name = ends
-    data = bytes(range(256))
-    port = SerialPort(name, 921600)
-    assert port.write(data)
-    assert os.read(device, 1000) == data
-    os.write(device, data)
-    time.sleep(0.05)
-    assert port.read() == data
-    assert port.read() == b''
-    port.close()
 
 
 def test_a_full_buffer_drops_whole_frames_without_waiting(ends):

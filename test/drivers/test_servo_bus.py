@@ -112,17 +112,6 @@ def test_goals_beyond_the_travel_are_clipped_and_nan_is_refused():
 
 
 @pytest.mark.real_time
-def test_voltage_temperature_and_torque_are_read_in_turn():
-    with running() as (bus, emulated):
-        emulated.faults.supply_voltage = 11.1
-        _, servos = until(lambda _, servos: all(
-            one.voltage == pytest.approx(11.1) and one.temperature == 35 for one in servos),
-            bus, GOAL)
-        assert [one.name for one in servos] == ['gimbal1', 'gimbal2', 'gimbal3', 'gimbal4']
-        assert all(one.torque and not one.silent and not one.message for one in servos)
-
-
-@pytest.mark.real_time
 def test_examining_changes_nothing_and_configuring_names_all_defects_in_one_line():
     with bench() as (bus, emulated):
         emulated.servos[0]['Model Number'] = 1200
@@ -185,11 +174,6 @@ def test_the_true_angle_is_always_among_the_candidates(angle):
     assert any(option == pytest.approx(angle, abs=1e-9) for option in options)
     assert all(abs(option) <= TRAVEL for option in options)
     assert (len(options) == 1) == (abs(reading) < registers.unambiguous_limit(TRAVEL))
-
-
-@given(st.floats(-4, 4), st.integers(-2, 2), st.floats(-3, 3))
-def test_the_nearest_turn_is_found(angle, turns, apart):
-    assert registers.nearest_turns(angle - 2 * pi * turns, angle + apart) == turns
 
 
 @pytest.mark.real_time

@@ -117,8 +117,9 @@ def test_an_overheated_servo_is_left_off():
 def test_low_voltage_is_reported_and_tolerated():
     with running() as (bus, emulated):
         emulated.faults.supply_voltage = 5.0
-        _, servos = until(lambda _, servos: all('voltage' in one.message for one in servos),
-                           bus, GOAL)
+        until(lambda _, servos: all('voltage' in one.message and one.torque
+                                    and one.voltage == pytest.approx(5.0) for one in servos),
+              bus, GOAL)
         assert emulated.torque_enabled.all()
         until(arrived(GOAL), bus, GOAL)
 
@@ -142,65 +143,40 @@ def test_expired_watchdogs_are_cleared_and_goals_are_followed_again():
 def test_after_an_unplugged_cable_is_back_goals_are_followed_again():
     with running() as (bus, emulated):
         until(arrived(GOAL), bus, GOAL)
-        for _ in range(3):
+        for powered_off in (False, True):
             emulated.unplug()
             for _ in range(5):
                 readings, servos = tick(bus, GOAL)
                 assert not readings.valid.any()
                 assert readings.position == pytest.approx(GOAL, abs=2 * COUNT), 'the last known'
             assert not bus.write_goals(GOAL) and not bus.link.is_open
+            for index in range(4) if powered_off else ():
+                emulated.reboot(index)      # they lose settings and turns
             emulated.replug()
             until(lambda *now: powered(*now) and arrived(GOAL)(*now), bus, GOAL)
         lines = bus.take_events()
         assert any('unplugged' in line for line in lines)
         assert any('connected again' in line for line in lines)
-        assert bus.link.counts['connections'] == 4
-
-
-def test_servos_without_power_are_restored_with_settings_and_turns():
-    with running() as (bus, emulated):
-        until(arrived(GOAL), bus, GOAL)
-        emulated.unplug()
-        tick(bus, GOAL)
-        for index in range(4):
-            emulated.reboot(index)
-        emulated.replug()
-        until(lambda *now: powered(*now) and arrived(GOAL)(*now), bus, GOAL)
+        assert bus.link.counts['connections'] == 3
         assert np.allclose(emulated._motion.position, GOAL, atol=2 * COUNT)
         assert [servo['Bus Watchdog'] for servo in emulated.servos] == [5] * 4
 
 
-def test_pending_torque_off_is_executed_when_the_cable_is_back():
+def test_pending_torque_off_is_executed_when_cable_or_servo_are_back():
     with running() as (bus, emulated):
         emulated.unplug()
         assert not bus.disable()
         emulated.replug()
         until(lambda *_: not emulated.torque_enabled.any(), bus, GOAL)
-
-
-def test_pending_torque_off_is_executed_when_a_silent_servo_answers():
-    with running() as (bus, emulated):
-        emulated.faults.silent = {3}
-        assert not bus.disable()
-        emulated.faults.silent = set()
-        assert emulated.torque_enabled.tolist() == [False, False, True, False]
-        until(lambda *_: not emulated.torque_enabled.any(), bus, GOAL)
-        assert any('still had torque' in line for line in bus.take_events())
-
-
-def test_disabling_on_a_bad_line_servos_whether_it_is_confirmed():
-    with running(**BRISK) as (bus, emulated):
-        emulated.faults.dropped = 0.3
-        bus.disable()
-        assert not emulated.torque_enabled.any()
-        emulated.faults.dropped = 0.0
         bus.enable()
-        bus.take_events()
         emulated.faults.silent = {3}
         assert not bus.disable()
         assert any('torque off is not confirmed' in line and 'id 3' in line
                    for line in bus.take_events())
         emulated.faults.silent = set()
+        assert emulated.torque_enabled.tolist() == [False, False, True, False]
+        until(lambda *_: not emulated.torque_enabled.any(), bus, GOAL)
+        assert any('still had torque' in line for line in bus.take_events())
 
 
 def test_enabling_fails_for_all_servos_if_one_refuses():

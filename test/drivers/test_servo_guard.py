@@ -71,11 +71,3 @@ def test_the_watchdog_of_the_servos_stops_them_without_any_process():
         wait_for(lambda: emulated.stopped.all())
         # They hold the angle set by the plant.
         assert emulated.goals == pytest.approx([0, 0, 0, 0], abs=0.001)
-
-
-def test_the_servos_stop_while_the_process_is_frozen():
-    with driven('alone') as (emulated, process):
-        process.send_signal(signal.SIGSTOP)
-        wait_for(lambda: emulated.stopped.all())
-        process.send_signal(signal.SIGCONT)
-        wait_for(lambda: not emulated.stopped.any())
