@@ -78,8 +78,7 @@ class Servo:
     voltage: float = float('nan')       # [V]
     temperature: float = float('nan')   # [deg C]
     recovery: Iterator[None] | None = None      # while it is recovered
-    restarting: bool = False            # whether it is silent because of a restart,
-    boot_ends: float = 0.0              # which may last until this time [s]
+    boot_ends: float = 0.0              # until then it may be silent because of a restart [s]
     recoveries: int = 0
     kept_off: bool = False              # it has shut down and stays off until it is rebooted
 
@@ -104,6 +103,11 @@ class Servo:
         self.position = angle + TURN * self.turns
         self.updated, self.misses = now, 0
         return self.turns != before
+
+    @property
+    def restarting(self) -> bool:
+        """Whether it is silent because of a restart."""
+        return self.silent and time.monotonic() < self.boot_ends
 
     @property
     def errors(self) -> tuple[str, ...]:
@@ -535,10 +539,11 @@ class ServoBus:
             self.link.ping(servo.identifier)
         except NoAnswer:
             self.link.late = False
-            servo.restarting = servo.restarting and now < servo.boot_ends
-            servo.next_probe = now + (PING_PERIOD if servo.restarting else servo.probe_wait)
-            if not servo.restarting:
+            if servo.restarting:
+                servo.next_probe = now + PING_PERIOD
+            else:
                 servo.probe_wait = min(2 * servo.probe_wait, self.parameters.timing.probe_longest)
+                servo.next_probe = now + servo.probe_wait
             return
         except ServoBusError:
             pass
@@ -546,8 +551,7 @@ class ServoBus:
             self.log(f'{servo.where}: answers again')
             for other in self.servos:
                 other.next_probe = now  # the cause may have been the bus
-        servo.silent = servo.restarting = False
-        servo.misses = 0
+        servo.silent, servo.misses, servo.boot_ends = False, 0, 0.0
         self._recover(servo)
 
     def _read_health(self):
@@ -619,22 +623,23 @@ class ServoBus:
         yield
         servo.torque = bool(link.read(identifier, registers.TORQUE_ENABLE))
         yield
-        if forced or (servo.error and not servo.torque):
+        if servo.torque and not forced:
+            return
+        if forced or servo.error:
             if not forced and not (self.enabled and given.reboot_after_overload
                                    and not servo.error & registers.OVERHEATING
                                    and servo.recoveries < given.recoveries):
                 self.log(f'{servo.where}: shut down ({", ".join(servo.errors)}); it stays off '
-                          'until it is rebooted')
+                         'until it is rebooted')
                 servo.kept_off = True
                 return
             servo.recoveries += 1
             self.log(f'{servo.where}: restarting it')
             link.reboot(identifier)
             now = time.monotonic()
-            servo.silent = servo.restarting = True  # so that reads of the others do not wait
+            servo.silent = True     # so that reads of the others do not wait for it
             servo.probe_wait, servo.next_probe = given.timing.probe_first, now + FIRST_PING
             servo.boot_ends = now + given.timing.reboot
-        if servo.torque or servo.restarting:
             return
         for register, value in self._volatile_settings():
             link.write(identifier, register, value, attempts=1)

@@ -106,8 +106,6 @@ class ServoLink:
         """Whether the time limit has passed."""
         return time.monotonic() > self._deadline
 
-    # --- one servo ----------------------------------------------------------------------------
-
     def ping(self, identifier: int, attempts: int = 1) -> int:
         """Model number of a servo."""
         return self._ask(identifier, 'ping', attempts,
@@ -166,26 +164,22 @@ class ServoLink:
             if packet[4] == identifier and (size == length or (size == 0 and packet[8] & ~ALERT)):
                 return bytes(packet[9:9 + size]), result, packet[8]
 
-    # --- several servos -----------------------------------------------------------------------
-
-    def sync_write(self, register: Register, values: dict[int, int]) -> bool:
+    def sync_write(self, register: Register, values: dict[int, int], port=None) -> bool:
         """Write one register of several servos by one packet; return whether it was sent."""
         self.counts['transactions'] += 1
-        return self._sync_write(self, register, values) == COMM_SUCCESS
+        parameters = []
+        for identifier, value in values.items():
+            parameters += [identifier, *register.encoded(value)]
+        return self._handler.syncWriteTxOnly(
+            port or self, register.address, register.size, parameters,
+            len(parameters)) == COMM_SUCCESS
 
     def packet_of_sync_write(self, register: Register, values: dict[int, int]) -> bytes:
         """Packet that :meth:`sync_write` would send."""
         packet: list[int] = []
-        self._sync_write(SimpleNamespace(is_using=False, clearPort=lambda: None,
-                                         writePort=packet.extend), register, values)
+        self.sync_write(register, values, SimpleNamespace(
+            is_using=False, clearPort=lambda: None, writePort=packet.extend))
         return bytes(packet)
-
-    def _sync_write(self, port, register, values):
-        parameters = []
-        for identifier, value in values.items():
-            parameters += [identifier, *register.encoded(value)]
-        return self._handler.syncWriteTxOnly(port, register.address, register.size, parameters,
-                                             len(parameters))
 
     def sync_read(self, address: int, length: int,
                   identifiers: list[int]) -> dict[int, tuple[int, bytes]]:

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from contextlib import contextmanager
-from dataclasses import dataclass
 from threading import Lock, Thread
 import time
 
@@ -43,15 +42,6 @@ class ServoPace:
             self.due -= min(max(GAIN * late, -SLEW * PERIOD), SLEW * PERIOD)
 
 
-@dataclass(frozen=True, slots=True)
-class Goal:
-    """Tilt targets (4,) [rad], publication time [s], expiry on the monotonic clock [s]."""
-
-    tilt: np.ndarray
-    published: float
-    expires: float
-
-
 class ServoLoop:
     """
     Runs a bus: goals, feedback and upkeep in each cycle.
@@ -63,7 +53,7 @@ class ServoLoop:
         bus: configured bus; while the loop runs, other threads use it in :meth:`exclusive` only.
         on_readings: called in the thread with the readings and (4,) bool: whether a reading is
             valid and, with torque on, the servo obeys.
-        on_written: called with ``Goal.published`` after the goals were written.
+        on_written: called with their time of publication after the goals were written.
         clock: monotonic time [s].
 
     Attributes:
@@ -83,12 +73,10 @@ class ServoLoop:
         self._bus, self._on_readings, self._on_written = bus, on_readings, on_written
         self._clock, self.pace = clock, ServoPace(clock())
         self._lock = Lock()
-        self._goal: Goal | None = None
+        self._goal: tuple[np.ndarray, float, float] | None = None
         self._fresh = self._wrote = self._stopping = False
         self._last_obeying = np.full(4, clock())
         self._thread = Thread(target=self._run, name='servo bus', daemon=True)
-
-    # --- from other threads -------------------------------------------------------------------
 
     def start(self):
         """Start the thread."""
@@ -101,10 +89,14 @@ class ServoLoop:
         if self._thread.is_alive():
             self._thread.join(STOP_TIMEOUT)
 
-    def offer(self, goal: Goal):
-        """Write goals now, or after the present transaction; newer goals replace older ones."""
+    def offer(self, tilt: np.ndarray, published: float, expires: float):
+        """
+        Write tilt targets (4,) [rad] now, or after the present transaction instead of older ones.
+
+        They were ``published`` [s] and are valid until ``expires`` on the monotonic clock [s].
+        """
         self.pace.goals = self._clock()
-        self._goal = goal
+        self._goal = tilt, published, expires
         self._fresh = True
         self._write_pending()
 
@@ -129,8 +121,6 @@ class ServoLoop:
         return '; '.join(servo.message or f'{servo.name}: being brought back'
                          for servo, is_gone in zip(self._bus.servos, gone) if is_gone)
 
-    # --- the thread ---------------------------------------------------------------------------
-
     def _run(self):
         try:
             while not self._stopping:
@@ -151,8 +141,8 @@ class ServoLoop:
         self.cycles += 1
         if self._fresh:
             self._write_fresh()
-        elif self._goal is not None and not self._wrote and self._clock() <= self._goal.expires:
-            self.written += self._bus.write_goals(self._goal.tilt)  # a whole period brought none
+        elif self._goal is not None and not self._wrote and self._clock() <= self._goal[2]:
+            self.written += self._bus.write_goals(self._goal[0])  # a whole period brought none
         self._wrote = False
         readings = self._bus.read()
         self.incomplete += not readings.valid.all()
@@ -175,10 +165,10 @@ class ServoLoop:
         if not self._fresh:
             return
         self._fresh = False
-        goal = self._goal
-        if self._clock() > goal.expires:
+        tilt, published, expires = self._goal
+        if self._clock() > expires:
             self.stale += 1
-        elif self._bus.write_goals(goal.tilt):
-            self._on_written(goal.published)
+        elif self._bus.write_goals(tilt):
+            self._on_written(published)
             self.written += 1
             self._wrote = True

@@ -10,7 +10,7 @@ from beetle_omni_ros.drivers.device_parameters import ServoBusParameters
 from beetle_omni_ros.drivers.serial_port import SerialPortError
 from beetle_omni_ros.drivers.servo_bus import ServoBus
 from beetle_omni_ros.drivers.servo_link import ServoBusError
-from beetle_omni_ros.drivers.servo_loop import Goal, ServoLoop
+from beetle_omni_ros.drivers.servo_loop import ServoLoop
 from beetle_omni_ros.nodes import health
 from beetle_omni_ros.nodes.command_source import CommandSource
 from beetle_omni_ros.nodes.lifecycle_node import ACTIVE, AUTOSTART, INACTIVE, LifecycleFlightNode
@@ -146,7 +146,7 @@ class JointBridgeNode(LifecycleFlightNode):
             if math.isnan(published):
                 self._since, published = 'arrival', time.time()
             left = COMMAND_AGE - max(0.0, self.now() - command.stamp)
-            self._loop.offer(Goal(command.tilt, published, time.monotonic() + left))
+            self._loop.offer(command.tilt, published, time.monotonic() + left)
 
     def _on_written(self, published):
         self._latency.add(time.time() - published)

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from beetle_omni_ros.drivers.servo_loop import Goal, PERIOD, READ_AFTER, ServoLoop, ServoPace
+from beetle_omni_ros.drivers.servo_loop import PERIOD, READ_AFTER, ServoLoop, ServoPace
 
 FOREVER = float('inf')
 VALID = np.ones(4, bool)
@@ -53,7 +53,7 @@ def make(**options):
 
 
 def goal(number, expires=FOREVER):
-    return Goal(np.full(4, float(number)), published=float(number), expires=expires)
+    return np.full(4, float(number)), float(number), expires
 
 
 def wait_for(condition, limit=10.0):
@@ -66,14 +66,15 @@ def wait_for(condition, limit=10.0):
 def test_goals_between_cycles_are_written_at_once():
     published = []
     loop, bus, _, _ = make(on_written=published.append)
-    loop.offer(goal(1))
-    loop.offer(goal(2))
+    loop.offer(*goal(1))
+    loop.offer(*goal(2))
     assert bus.goals == [1, 2] == published
 
 
 def test_only_the_newest_goals_given_during_a_transaction_are_written():
     loop, bus, _, _ = make()
-    bus.during_read = lambda: (loop.offer(goal(1)), loop.offer(goal(2)), bus.goals.append('read'))
+    bus.during_read = lambda: (loop.offer(*goal(1)), loop.offer(*goal(2)),
+                               bus.goals.append('read'))
     loop._lock.acquire()
     loop._cycle()
     loop._lock.release()
@@ -82,7 +83,7 @@ def test_only_the_newest_goals_given_during_a_transaction_are_written():
 
 def test_goals_are_repeated_until_they_are_too_old():
     loop, bus, clock, _ = make()
-    loop.offer(goal(1, expires=clock.now + 0.1))
+    loop.offer(*goal(1, expires=clock.now + 0.1))
     loop._cycle()
     assert bus.goals == [1], 'written since the last cycle'
     loop._cycle()
@@ -90,7 +91,7 @@ def test_goals_are_repeated_until_they_are_too_old():
     clock.now += 0.2
     loop._cycle()
     assert bus.goals == [1, 1]
-    loop.offer(goal(2, expires=clock.now - 0.01))
+    loop.offer(*goal(2, expires=clock.now - 0.01))
     assert bus.goals == [1, 1] and loop.stale == 1
 
 
@@ -128,17 +129,17 @@ def test_goals_of_many_threads_are_all_handled():
     loop = ServoLoop(bus, lambda *_: None)
     loop.start()
 
-    threads = [Thread(target=lambda: [loop.offer(goal(k)) for k in range(200)]) for _ in range(3)]
+    threads = [Thread(target=lambda: [loop.offer(*goal(k)) for k in range(200)]) for _ in range(3)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    loop.offer(goal(-1))
+    loop.offer(*goal(-1))
     wait_for(lambda: bus.goals[-1:] == [-1])
     with loop.exclusive() as mine:
         count = loop.cycles
         assert mine is bus
-        loop.offer(goal(-2))
+        loop.offer(*goal(-2))
         assert bus.goals[-1] == -1, 'the bus is ours'
     wait_for(lambda: loop.cycles > count + 3)
     assert bus.goals[-1] == -2
