@@ -181,8 +181,7 @@ def measure_board(seconds):
     with closing(MotorBoard(replace(MotorBoardParameters.load(), port=device.port),
                             RobotParameters.load())) as board:
         board.open()
-        if missing := board.wait_ready(5):
-            raise SystemExit(missing)
+        time.sleep(1)
         if not (answer := board.start(True).wait()).accepted:
             raise SystemExit(answer.reason)
 

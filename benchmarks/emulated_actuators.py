@@ -38,9 +38,10 @@ def drive(pipe, servo_port, board_port, seconds):
     bus.configure()
     bus.enable()
     board.open()
-    missing = board.wait_ready(5)
-    if missing or not board.start(True).wait().accepted:
-        raise SystemExit(missing or 'not armed')
+    time.sleep(1)
+    answer = board.start(True).wait()
+    if not answer.accepted:
+        raise SystemExit(answer.reason)
     pipe.send('begin')
     begin, spent, incomplete = time.monotonic(), [], 0
     for k in range(round(seconds / PERIOD)):

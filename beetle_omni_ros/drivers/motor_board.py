@@ -13,18 +13,9 @@ import time
 import numpy as np
 from pymavlink.dialects.v20 import common
 
+from beetle_omni_ros.drivers import motor_board_state as messages
 from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters
-from beetle_omni_ros.drivers.motor_board_state import (
-    BLOCKS_ARMING,
-    BoardState,
-    conditions_of,
-    CONTRACT_VERSION,
-    MavlinkReceiver,
-    NO_HOST_HEARTBEAT,
-    restarted,
-    RotorStates,
-    WATCHDOG_RESET,
-)
+from beetle_omni_ros.drivers.motor_board_state import BoardState, MavlinkReceiver, RotorStates
 from beetle_omni_ros.drivers.serial_port import SerialPort, SerialPortError
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import BatteryReading
@@ -81,7 +72,7 @@ class ArmCommand:
             self.end(True)
             return True
         text = RESULTS.get(message.result, f'result {message.result}')
-        reason = ', '.join(conditions_of(message.result_param2 >> 8 & 0xFF))
+        reason = ', '.join(messages.conditions_of(message.result_param2 >> 8 & 0xFF))
         self.end(False, f'{text} by the board: {reason or "no reason given"}')
         return False
 
@@ -138,8 +129,6 @@ class MotorBoard:
 
     def open(self) -> None:
         """Open the port, or raise SerialPortError, and start the thread."""
-        if self._thread is not None:
-            return
         self._connect()
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name='motor_board', daemon=True)
@@ -174,21 +163,14 @@ class MotorBoard:
             return 'no message from the board'
         if status is None:
             return 'no heartbeat of the board'
-        if status.contract != CONTRACT_VERSION:
+        if status.contract != messages.CONTRACT_VERSION:
             return (f'firmware follows contract {status.contract}, '
-                    f'this driver {CONTRACT_VERSION}')
-        if NO_HOST_HEARTBEAT in status.conditions:
+                    f'this driver {messages.CONTRACT_VERSION}')
+        if messages.NO_HOST_HEARTBEAT in status.conditions:
             return 'the board receives no heartbeat of this computer'
         if state.voltage is None:
             return 'battery voltage unknown'
         return '' if state.clock.known else "offset of the board's clock unknown"
-
-    def wait_ready(self, timeout: float) -> str:
-        """Wait at most ``timeout`` [s] until :attr:`ready` is ''; return it."""
-        end = time.monotonic() + timeout
-        while (missing := self.ready) and time.monotonic() < end:
-            time.sleep(0.01)
-        return missing
 
     def start(self, arm: bool) -> ArmCommand:
         """Start to arm or disarm without waiting; the returned command gets the result."""
@@ -206,12 +188,10 @@ class MotorBoard:
 
     def send(self, thrust: np.ndarray, stamp: float) -> Sent:
         """
-        Send thrust targets without waiting. Only one thread may call this.
+        Send thrust targets (4,) [N] without waiting. Only one thread may call this.
 
-        Args:
-            thrust: (4,) thrust targets [N]; zero and negative values stop the rotor.
-            stamp: time of the state estimate that they answer [s].
-
+        Zero and negative values stop the rotor. ``stamp`` is the time of the state estimate that
+        they answer [s].
         """
         thrust = np.asarray(thrust, dtype=float)
         age = self._clock() - stamp
@@ -332,7 +312,7 @@ class MotorBoard:
                 self.state.acknowledged(self._command.arm)
             return
         self.state.message(message, now)
-        if restarted(message):
+        if messages.restarted(message):
             self._next_heartbeat = self._next_timesync = now
 
     def _tick(self, now):
@@ -436,7 +416,7 @@ class Arming:
             missing = 'disarming is not confirmed yet'
         if not missing:
             missing = ', '.join(text for text in self._board.state.status.conditions
-                                if text in BLOCKS_ARMING)
+                                if text in messages.BLOCKS_ARMING)
         return missing or ('' if self._supervisor else 'no message from the supervisor')
 
     def _check_answer(self, elapsed):
@@ -463,7 +443,8 @@ class Arming:
 
 def _disarm_cause(status):
     """Reason why an armed board is not armed any more."""
-    if status is None or status.state == 'boot' or status.stop_reason in ('none', WATCHDOG_RESET):
-        reset = status is not None and status.stop_reason != 'none'
-        return f'restarted ({WATCHDOG_RESET})' if reset else 'restarted'
+    if status is None or status.stop_reason == 'none':
+        return 'restarted'
+    if status.state == 'boot' or status.stop_reason == messages.WATCHDOG_RESET:
+        return f'restarted ({messages.WATCHDOG_RESET})'
     return f'{status.state} ({status.stop_reason})'

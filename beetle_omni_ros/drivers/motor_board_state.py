@@ -32,12 +32,7 @@ REQUESTS_KEPT = 50      # TIMESYNC requests; later answers are ignored
 
 
 def _declare(number, name, crc_extra, layout, fields, order):
-    """
-    Declare a message that is only received, in the form of pymavlink's generator.
-
-    ``fields`` are name -> length in the order of the payload, ``order`` names in that of the
-    definition.
-    """
+    """Declare a received message; fields in the order of the payload and of the definition."""
     def __init__(self, *values):
         common.MAVLink_message.__init__(self, number, name)
         self.__dict__.update(zip(order, values, strict=True))
@@ -133,11 +128,7 @@ class ClockOffset:
         return math.isfinite(self._bounds[0])
 
     def add(self, sent: float, remote: float, received: float) -> bool:
-        """
-        Use one exchange: local time of the request, time in the answer, local time of the answer.
-
-        Return whether it contradicts the earlier exchanges, which are then forgotten.
-        """
+        """Use one exchange; return whether it contradicts the earlier ones, then forgotten."""
         within = self._drift * (received - sent)
         low, high = remote - received - within, remote - sent + within
         known_low, known_high, at = self._bounds
@@ -191,14 +182,9 @@ class BoardState:
     """
     Newest state and measurements of the board, stamped by ``clock`` [s], and events.
 
-    Attributes:
-        status: last heartbeat, or None.
-        battery, rotors: newest measurements since the last :meth:`take`, or None.
-        voltage: filtered pack voltage [V] for the thrust map, or None.
-        reception: counts of the board since its start: packets lost and with bad_crc, targets
-            refused, timeouts; empty before its first report.
-        clock: offset of the board's clock against the monotonic clock.
-
+    ``status`` is the last heartbeat, ``voltage`` the filtered pack voltage [V] for the thrust map,
+    ``reception`` the last counts of the board, and ``clock`` the offset of the board's clock
+    against the monotonic clock.
     """
 
     def __init__(self, parameters: MotorBoardParameters, cells: int, clock: Callable[[], float]):

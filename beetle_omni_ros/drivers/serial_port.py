@@ -55,7 +55,7 @@ class SerialPort:
         except BlockingIOError:
             return b''
         except OSError as error:
-            raise self._lost(error) from None
+            raise SerialPortError(f'{self.name}: {_cause(error)}') from None
         if not data and select.select([self.fileno()], [], [], 0)[0]:
             # A tty whose other end is closed is readable and empty.
             raise SerialPortError(f'{self.name}: unplugged')
@@ -66,7 +66,7 @@ class SerialPort:
         try:
             termios.tcflush(self.fileno(), termios.TCIFLUSH)
         except (OSError, termios.error) as error:
-            raise self._lost(error) from None
+            raise SerialPortError(f'{self.name}: {_cause(error)}') from None
 
     def write(self, frame: bytes) -> bool:
         """
@@ -91,10 +91,7 @@ class SerialPort:
         except BlockingIOError:
             return 0
         except OSError as error:
-            raise self._lost(error) from None
-
-    def _lost(self, error):
-        return SerialPortError(f'{self.name}: {_cause(error)}')
+            raise SerialPortError(f'{self.name}: {_cause(error)}') from None
 
     def close(self) -> None:
         """Close the port and drop unsent bytes, for which closing would wait."""

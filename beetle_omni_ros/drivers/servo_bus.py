@@ -33,7 +33,6 @@ GAINS = (registers.POSITION_P, registers.POSITION_I, registers.POSITION_D,
 ATTEMPTS = 3            # of reads outside the loop
 TRACKED = 0.2           # [s] half a turn takes longer at the servo's largest speed, 12 rad/s
 WATCHDOG_MARGIN = 0.8   # a pause above this share of the watchdog's time may have expired it
-EVENTS_KEPT = 200       # lines for the log
 REPEAT_AFTER = 1.0      # [s] until an equal line is logged again
 FIRST_PING = 0.2        # [s] after a reboot; a servo does not answer earlier
 PING_PERIOD = 0.02      # [s]
@@ -112,7 +111,7 @@ class Servo:
     @property
     def errors(self) -> tuple[str, ...]:
         """Hardware errors in words."""
-        return registers.hardware_errors(self.error)
+        return tuple(text for bit, text in registers.HARDWARE_ERRORS.items() if self.error & bit)
 
     @property
     def message(self) -> str:
@@ -188,7 +187,7 @@ class ServoBus:
         self._recovering: deque[Servo] = deque()    # with a recovery, the next one first
         self._next_health = self._next_open = 0.0
         self._group = 0
-        self._events: deque[str] = deque(maxlen=EVENTS_KEPT)
+        self._events: deque[str] = deque(maxlen=200)    # lines for the log
         self._logged: dict[str, float] = {}
 
     def open(self):
@@ -207,9 +206,7 @@ class ServoBus:
         """
         Switch the torque off, write all settings, EEPROM only where it differs, read the angles.
 
-        Raises:
-            ServoBusError: servos are missing or wrong, or refuse a setting; the message names all.
-
+        ServoBusError names all servos that are missing or wrong, or refuse a setting.
         """
         with self._outside_the_loop():
             self.disable()
@@ -238,10 +235,7 @@ class ServoBus:
         """
         Switch the torque on with the present angles as goals.
 
-        Raises:
-            ServoBusError: an angle is ambiguous, or a servo is silent or shut down. No servo has
-                torque then.
-
+        ServoBusError: an angle is ambiguous, or a servo failed; then none has torque.
         """
         with self._outside_the_loop():
             self._locate()
@@ -299,15 +293,11 @@ class ServoBus:
         (servo,) = (servo for servo in self.servos if servo.identifier == identifier)
         self._recover(servo, forced=True)
 
-    # --- the loop -----------------------------------------------------------------------------
-
     def write_goals(self, tilt: np.ndarray) -> bool:
         """
         Send tilt targets (4,) [rad], limited to the travel, to all servos with one packet.
 
-        Returns:
-            whether it was sent; False without torque, port or four finite numbers.
-
+        Return whether it was sent; False without torque, port or four finite numbers.
         """
         tilt = np.asarray(tilt, dtype=float)
         if tilt.shape != (4,) or not np.all(np.isfinite(tilt)) or not self.enabled \
@@ -351,12 +341,11 @@ class ServoBus:
         """
         if not self.link.is_open:
             return
-        if self.link.late:
-            self.link.late = False
-            return
         now = time.monotonic()
         try:
-            if self._recovering:
+            if self.link.late:
+                self.link.late = False
+            elif self._recovering:
                 self._recover_step()
             elif any(servo.silent and now >= servo.next_probe for servo in self.servos):
                 self._probe(now)
@@ -382,8 +371,6 @@ class ServoBus:
         if now - self._logged.get(line, -REPEAT_AFTER) >= REPEAT_AFTER:
             self._logged[line] = now
             self._events.append(line)
-
-    # --- the port -----------------------------------------------------------------------------
 
     @contextmanager
     def _outside_the_loop(self):
@@ -517,9 +504,8 @@ class ServoBus:
                     self.log(f'{servo.where}: lost its turn count, taken as '
                               f'{servo.position:+.2f} rad')
                     self._recover(servo)
-        missing = [servo for servo in asked if servo not in answered]
-        if missing:
-            self._count_miss(missing[0])
+        for missing in [servo for servo in asked if servo not in answered][:1]:
+            self._count_miss(missing)
         return answered
 
     def _count_miss(self, servo):

@@ -1,10 +1,9 @@
 """
-Switches the servos' torque off if the process of their driver was killed.
+Switches the servos' torque off if their driver was killed; their own watchdog only stops them.
 
 :class:`Guard` starts this module as a separate process, which sleeps and has no port open. Its
 standard input is a pipe from the driver. A byte ends it without action. The end of the pipe
-without a byte means that the driver died with torque on. The servos' own watchdog would only stop
-them.
+without a byte means that the driver died with torque on.
 """
 
 import os

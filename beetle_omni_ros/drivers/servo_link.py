@@ -6,12 +6,11 @@ import select
 import time
 from types import SimpleNamespace
 
-from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, PacketHandler
+from dynamixel_sdk import BROADCAST_ID, COMM_RX_TIMEOUT, COMM_SUCCESS, PacketHandler
 
 from beetle_omni_ros.drivers.serial_port import SerialPort, SerialPortError
 from beetle_omni_ros.drivers.servo_registers import ALERT, PACKET_ERRORS, Register
 
-BROADCAST = 0xFE
 RELAXED_REPLY_TIME = 0.02   # [s] time limit of an answer outside the loop
 STATUS_SIZE = 11            # [B] of an answer without data
 FIRST_BLOCK = 8             # [B] before the first error byte in the answer to a fast sync read
@@ -213,7 +212,7 @@ class ServoLink:
         expected = 1 + step * len(identifiers)
         while True:
             packet, result = self._handler.rxPacket(self, True)
-            ours = len(packet) >= FIRST_BLOCK and packet[4] == BROADCAST \
+            ours = len(packet) >= FIRST_BLOCK and packet[4] == BROADCAST_ID \
                 and packet[5] | packet[6] << 8 == expected
             # A late answer of another transaction may come first.
             if ours or result != COMM_SUCCESS:

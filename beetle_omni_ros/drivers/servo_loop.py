@@ -58,9 +58,7 @@ class ServoLoop:
 
     Attributes:
         cycles, incomplete: number of cycles, and of those without a valid reading of each servo.
-        written, stale: number of packets with goals, repetitions included, and of goals that had
-            expired when the bus was free.
-        pace: counts missed periods.
+        written, stale: number of packets with goals, and of goals that had expired before.
         failure: error that ended the thread, or ''; torque is off then.
 
     """

@@ -91,11 +91,6 @@ PACKET_ERRORS = {
     7: 'no access (unknown or read-only register, or EEPROM while torque is on)'}
 
 
-def hardware_errors(status: int) -> tuple[str, ...]:
-    """Decode Hardware Error Status (70)."""
-    return tuple(text for bit, text in HARDWARE_ERRORS.items() if status & bit)
-
-
 # A servo counts turns only while it has power. After power-up or reboot its position is within
 # one turn. An angle beyond +-(2 pi - travel) then has a second solution, one turn away, within
 # the travel. With a travel of +-3.96 rad, readings beyond +-2.32 rad (0.74 pi) are ambiguous.
@@ -120,11 +115,8 @@ def settle(servos: Sequence, travel: float, confirmed: Sequence[float] | None) -
     """
     Determine the unknown turn counts of servos; return '' or a message about ambiguous ones.
 
-    Args:
-        servos: servos whose ``position`` [rad], ``turns`` and ``turns_known`` are updated.
-        travel: travel of the joints to each side [rad].
-        confirmed: angles measured by the operator, correct to half a turn [rad], or None.
-
+    Their ``position`` [rad], ``turns`` and ``turns_known`` are updated. ``travel`` is that of the
+    joints to each side [rad], ``confirmed`` angles measured by the operator to half a turn [rad].
     """
     doubts = []
     for k, servo in enumerate(servos):

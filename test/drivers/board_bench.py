@@ -79,7 +79,7 @@ def connected(**changes):
     """Emulated board and driver, ready to arm."""
     with EmulatedMotorBoard(parameters=QUICK) as emulated, \
             opened(emulated.port, **changes) as board:
-        assert board.wait_ready(3.0) == ''
+        assert until(lambda: not board.ready), board.ready
         yield emulated, board
 
 

@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip('dynamixel_sdk')
 pytest.importorskip('pymavlink')
 
-from board_bench import driver, QUICK
+from board_bench import driver, QUICK, until
 from servo_bench import PATIENT, SHIPPED
 from sim_robots import HIGH, ROBOT, WORLD
 
@@ -48,7 +48,7 @@ class Flight:
         self.bus.configure()
         self.bus.enable()
         self.board.open()
-        assert self.board.wait_ready(3.0) == ''
+        assert until(lambda: not self.board.ready), self.board.ready
         result = self.board.start(True).wait()
         assert result.accepted, result.reason
         return self
