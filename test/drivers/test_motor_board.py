@@ -24,16 +24,6 @@ from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 pytestmark = pytest.mark.real_time
 
 
-def test_commanded_thrusts_are_produced_at_the_measured_voltage():
-    with connected() as (emulated, board):
-        emulated.set_battery(22.9, 20.0)
-        time.sleep(0.6)         # twelve time constants of the voltage filter
-        assert board.start(True).wait().accepted
-        assert not board.send(HOVER, time.time()).reason
-        assert until(lambda: emulated.commands.all())
-        np.testing.assert_allclose(emulated.thrust_targets, HOVER, rtol=1e-3)
-
-
 def test_bad_thrusts_are_not_sent():
     with connected() as (emulated, board):
         board.start(True).wait()
