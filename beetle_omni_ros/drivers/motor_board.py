@@ -296,7 +296,7 @@ class MotorBoard:
 
     def _serve(self, port):
         """Wait at most one tick for bytes and handle them."""
-        readable, writable, _ = select.select([port], [port] if port.rest else [], [], TICK)
+        readable, writable, _ = select.select([port.fd], [port.fd] if port.rest else [], [], TICK)
         if writable:
             with self._write_lock:
                 port.flush()

@@ -28,7 +28,7 @@ class SerialPort:
     """
     One open port, locked against other processes. Each call raises SerialPortError if it is lost.
 
-    ``rest`` is the part of a frame that is not written yet.
+    ``fd`` is its descriptor, ``rest`` the part of a frame that is not written yet.
     """
 
     def __init__(self, name: str, baud: int):
@@ -42,21 +42,18 @@ class SerialPort:
             self._serial.set_low_latency_mode(True)
         except (OSError, ValueError, AttributeError, NotImplementedError):
             pass        # pseudo-terminals and USB CDC do not need this setting
-        os.set_blocking(self._serial.fileno(), False)
-
-    def fileno(self) -> int:
-        """Descriptor, for select."""
-        return self._serial.fileno()
+        self.fd = self._serial.fileno()
+        os.set_blocking(self.fd, False)
 
     def read(self, size: int = 4096) -> bytes:
         """Return the received bytes, at most ``size``, also if there are none."""
         try:
-            data = os.read(self.fileno(), size)
+            data = os.read(self.fd, size)
         except BlockingIOError:
             return b''
         except OSError as error:
             raise SerialPortError(f'{self.name}: {_cause(error)}') from None
-        if not data and select.select([self.fileno()], [], [], 0)[0]:
+        if not data and select.select([self.fd], [], [], 0)[0]:
             # A tty whose other end is closed is readable and empty.
             raise SerialPortError(f'{self.name}: unplugged')
         return data
@@ -64,7 +61,7 @@ class SerialPort:
     def clear(self) -> None:
         """Drop received bytes."""
         try:
-            termios.tcflush(self.fileno(), termios.TCIFLUSH)
+            termios.tcflush(self.fd, termios.TCIFLUSH)
         except (OSError, termios.error) as error:
             raise SerialPortError(f'{self.name}: {_cause(error)}') from None
 
@@ -87,7 +84,7 @@ class SerialPort:
 
     def _write(self, data):
         try:
-            return os.write(self.fileno(), data)
+            return os.write(self.fd, data)
         except BlockingIOError:
             return 0
         except OSError as error:

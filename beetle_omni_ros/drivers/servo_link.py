@@ -93,7 +93,7 @@ class ServoLink:
 
     def readPort(self, length):
         """Wait for bytes, at most until the packet's time limit."""
-        select.select([self._port], [], [], max(0.0, self._deadline - time.monotonic()))
+        select.select([self._port.fd], [], [], max(0.0, self._deadline - time.monotonic()))
         return self._port.read(length)
 
     def setPacketTimeout(self, packet_length):
