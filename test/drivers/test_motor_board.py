@@ -4,7 +4,6 @@ import math
 import os
 from pathlib import Path
 import pty
-import signal
 import subprocess
 import sys
 import threading
@@ -164,57 +163,22 @@ from board_bench import driver, HOVER, until
 board = driver(sys.argv[1])
 board.open()
 assert until(lambda: not board.ready) and board.start(True).wait().accepted
-print('flying', flush=True)
-end = time.monotonic() + float(sys.argv[3])
-while time.monotonic() < end:
+for _ in range(40):
     board.send(HOVER, time.time())
     time.sleep(0.005)
-if sys.argv[4] == 'fail':
+if sys.argv[3]:
     raise RuntimeError('a bug in the bridge')
 """
-
-
-def process(emulated, seconds=60, end=''):
-    """A process that flies for some seconds and ends without closing."""
-    folder = Path(__file__).parent
-    child = subprocess.Popen(
-        [sys.executable, '-c', CHILD, emulated.port, str(folder), str(seconds), end],
-        stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
-        env={**os.environ, 'PYTHONPATH': os.pathsep.join([str(folder.parents[1]), *sys.path])})
-    assert child.stdout.readline() == 'flying\n'
-    return child
 
 
 @pytest.mark.parametrize('end', ['', 'fail'])
 def test_a_process_disarms_at_exit_and_after_an_exception(end):
     with EmulatedMotorBoard(parameters=QUICK) as emulated:
-        child = process(emulated, 0.2, end)
-        child.wait(20)
-        assert not emulated.armed
-        assert emulated._firmware._stop_reason == 1         # requested by the host
-
-
-@pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGSTOP])
-def test_no_rotor_turns_100_ms_after_the_end_of_the_process(number):
-    with EmulatedMotorBoard(parameters=QUICK) as emulated:
-        arrivals = []
+        arrivals, folder = [], Path(__file__).parent
         emulated.on_target = lambda now, values: arrivals.append(now)
-        child = process(emulated)
-        assert until(lambda: emulated.commands.all())
-        try:
-            os.kill(child.pid, number)
-            killed = time.monotonic()
-            assert until(lambda: not emulated.commands.any())
-            stopped = time.monotonic()
-            assert arrivals[-1] - killed < 0.05
-            # The board's rule is exact; the rest is this test's own polling.
-            assert stopped - arrivals[-1] < QUICK.target_timeout + 0.05
-            assert until(lambda: not emulated.armed, 2.0)
-            if number == signal.SIGSTOP:
-                os.kill(child.pid, signal.SIGCONT)
-                time.sleep(0.3)
-                assert not emulated.commands.any() and not emulated.armed
-        finally:
-            child.kill()
-            child.wait(10)
-        assert emulated._firmware._stop_reason in (2, 3)
+        subprocess.run(
+            [sys.executable, '-c', CHILD, emulated.port, str(folder), end], timeout=20,
+            stderr=subprocess.DEVNULL, env={**os.environ, 'PYTHONPATH': os.pathsep.join(
+                [str(folder.parents[1]), *sys.path])})
+        assert arrivals and not emulated.armed
+        assert emulated._firmware._stop_reason == 1         # requested by the host
