@@ -18,8 +18,7 @@ from beetle_omni_ros.control.hover import HoverParameters
 from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
 from beetle_omni_ros.control.policy import PolicyParameters
 from beetle_omni_ros.drive.parameters import DriveParameters
-from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
-from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
+from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters, ServoBusParameters
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.parameters import IdentifyParameters

@@ -17,12 +17,6 @@ sdk = pytest.importorskip('dynamixel_sdk')
 ALL = (1, 2, 3, 4)
 
 
-@pytest.fixture(autouse=True)
-def patience(monkeypatch):
-    """Restore the default time limit of the SDK, which the driver changes globally."""
-    monkeypatch.setattr(sdk.port_handler, 'LATENCY_TIMER', 16)
-
-
 @pytest.fixture
 def bus():
     with EmulatedServoBus(reboot_time=0.05) as made:
