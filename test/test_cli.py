@@ -11,7 +11,6 @@ import pytest
 from synthetic_flights import fly, write_imu
 
 from beetle_omni_ros import __version__, cli
-from beetle_omni_ros.film import graphics
 from beetle_omni_ros.runs.bag import BagWriter
 from beetle_omni_ros.runs.tasks import make_task
 
@@ -137,8 +136,7 @@ def test_fly_refuses_an_unregistered_controller(capsys, tmp_path):
 
 
 @pytest.mark.parametrize('command', ['report', 'film', 'view', 'gap', 'identify joint'])
-def test_each_command_reads_the_bags_in_a_folder(capsys, monkeypatch, bag, tmp_path, command):
-    monkeypatch.setattr(graphics, 'choose_backend', lambda: 'none')
+def test_each_command_reads_the_bags_in_a_folder(capsys, bag, tmp_path, command):
     for name, size in (('first', 300), ('second', 400)):
         (tmp_path / name).mkdir()
         (tmp_path / name / 'cut.mcap').write_bytes((bag / 'flight.mcap').read_bytes()[:size])

@@ -15,7 +15,6 @@ import beetle_omni_ros
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.tasks import TaskError
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / 'examples'
@@ -139,9 +138,9 @@ def test_a_class_flies_under_its_own_name_and_may_be_defined_again():
 
 
 def test_tasks_of_wrong_shape_are_refused():
-    with pytest.raises(TaskError, match=r'\(N, 6\)'):
+    with pytest.raises(ParameterError, match=r'\(N, 6\)'):
         beetle_omni_ros.simulate('hover', [[0, 0, 1]])
-    with pytest.raises(TaskError, match='at least 3'):
+    with pytest.raises(ParameterError, match='at least 3'):
         beetle_omni_ros.trajectory([0, 1], np.zeros((2, 3)), np.ones((2, 4)))
 
 

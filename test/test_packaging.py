@@ -18,8 +18,7 @@ from beetle_omni_ros.control.hover import HoverParameters
 from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
 from beetle_omni_ros.control.policy import PolicyParameters
 from beetle_omni_ros.drive.parameters import DriveParameters
-from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
-from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
+from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters, ServoBusParameters
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.parameters import IdentifyParameters
@@ -40,7 +39,7 @@ HAS_ROS = importlib.util.find_spec('rclpy') is not None
 
 # Import name -> distribution on PyPI, where they differ; import name -> rosdep key.
 DISTRIBUTION = {'yaml': 'pyyaml', 'serial': 'pyserial', 'dynamixel_sdk': 'dynamixel-sdk',
-                'rsl_rl': 'rsl-rl-lib', 'PIL': 'pillow', 'imageio_ffmpeg': 'imageio-ffmpeg'}
+                'rsl_rl': 'rsl-rl-lib', 'PIL': 'pillow'}
 KEY = {'yaml': 'python3-yaml', 'mcap': 'mcap-ros2-support', 'casadi': 'casadi-pip',
        'serial': 'python3-serial', 'PIL': 'python3-pil'}
 PARAMETER_CLASSES = {
@@ -168,7 +167,7 @@ def test_data_files_are_in_the_folders_of_ros(setup_arguments):
 def test_every_import_is_a_declared_requirement(setup_arguments):
     extras = setup_arguments['extras_require']
     lines = [*setup_arguments['install_requires'],
-             *(line for extra in ('hardware', 'train', 'ray', 'film') for line in extras[extra])]
+             *(line for extra in ('hardware', 'train', 'ray') for line in extras[extra])]
     declared = {re.split(r'[\[<>=~;! ]', line)[0] for line in lines}
     keys = dependencies('exec_depend', 'depend')
     for module in third_party_imports():
@@ -176,10 +175,10 @@ def test_every_import_is_a_declared_requirement(setup_arguments):
             assert module in keys, f'{module}: not in package.xml'
             continue
         assert DISTRIBUTION.get(module, module) in declared, f'{module}: not in setup.py'
-        # rosdep has no key for the modules of the viewer. The last two are optional: without
-        # them the code is slower, and films have no MP4.
+        # rosdep has no key for the modules of the viewer. Without the last one
+        # the code is slower.
         if module not in ('torch', 'tensordict', 'onnx', 'rsl_rl', 'ray', 'viser', 'trimesh',
-                          'threadpoolctl', 'imageio_ffmpeg'):
+                          'threadpoolctl'):
             candidates = {KEY.get(module), f'python3-{module}', f'python3-{module}-pip', module}
             assert keys & candidates, f'{module}: no rosdep key in package.xml'
 

@@ -7,7 +7,7 @@ from typing import Annotated, Optional
 
 import typer
 
-from beetle_omni_ros.cli.options import fail, FAILED, JsonOption, PublishedOption
+from beetle_omni_ros.cli.options import JsonOption, PublishedOption
 
 PageOption = Annotated[Optional[Path], typer.Option(
     '--report', metavar='FILE', help='Write a self-contained HTML page with plots.')]
@@ -167,11 +167,8 @@ def train(output: Annotated[Path, typer.Option(
 
     Several GPUs: torchrun --nproc-per-node N -m beetle_omni_ros.cli train --output DIR
     """
-    from beetle_omni_ros.train.command import run_train, TrainingError
+    from beetle_omni_ros.train.command import run_train
     from beetle_omni_ros.train.run_folder import parse_changes
-    try:
-        run_train(output=output, config=config, robot=robot, device=device, resume=resume,
-                  changes=parse_changes(changes or [], seed=seed, memory=memory),
-                  smoke=smoke, stop_after=stop_after, json_path=json_path)
-    except TrainingError as error:
-        raise typer.Exit(fail(error, FAILED)) from None
+    run_train(output=output, config=config, robot=robot, device=device, resume=resume,
+              changes=parse_changes(changes or [], seed=seed, memory=memory),
+              smoke=smoke, stop_after=stop_after, json_path=json_path)

@@ -57,7 +57,7 @@ def run_compare(*, output: Path, controllers: list[str] | None = None,
 
     Raises:
         ParameterError: unusable input.
-        SweepError: a worker was lost.
+        RunError: a worker was lost.
 
     """
     console = console or Terminal()

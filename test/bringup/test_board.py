@@ -9,7 +9,7 @@ pytest.importorskip('dynamixel_sdk')
 
 from check_helpers import board, levels, QUICK, repeated
 
-from beetle_omni_ros.drivers import motor_board_messages
+from beetle_omni_ros.drivers import motor_board_state
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 
 pytestmark = pytest.mark.real_time
@@ -72,7 +72,7 @@ def test_losses_are_reported_for_each_direction(emulated):
 
 
 def test_firmware_with_another_protocol_version_is_refused(emulated, monkeypatch):
-    monkeypatch.setattr(motor_board_messages, 'CONTRACT_VERSION', 2)
+    monkeypatch.setattr(motor_board_state, 'CONTRACT_VERSION', 2)
     found = board_with(emulated, {'board firmware': 'fail'})
     assert 'contract 1, this driver uses 2' in found['board firmware'].found
 
@@ -96,7 +96,7 @@ def test_a_silent_or_foreign_board_ends_the_checks(emulated):
 
 
 def test_without_pymavlink_the_extra_is_named(emulated, monkeypatch):
-    for name in ('motor_board', 'mavlink_dialect'):
+    for name in ('motor_board', 'motor_board_state'):
         monkeypatch.delitem(sys.modules, f'beetle_omni_ros.drivers.{name}')
     monkeypatch.setitem(sys.modules, 'pymavlink', None)
     monkeypatch.setitem(sys.modules, 'pymavlink.dialects.v20', None)

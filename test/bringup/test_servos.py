@@ -50,7 +50,7 @@ def test_the_check_writes_no_register():
 
 def test_torque_that_was_on_before_stays_on_and_is_reported():
     with running() as (bus, emulated):
-        bus._link.close()       # the driver has ended, and the guard is not used
+        bus.link.close()       # the driver has ended, and the guard is not used
         found = servos(emulated.port)
         assert emulated.torque_enabled.all()
     assert levels(found) == {f'{name} torque': 'warn' for name in NAMES}
@@ -103,7 +103,7 @@ def test_a_wrong_supply_voltage_is_reported(volts, level):
 
 def test_a_servo_that_has_shut_down_is_reported():
     with running(reboot_after_overload=False) as (bus, emulated):
-        bus._link.close()
+        bus.link.close()
         emulated.servos[2].trip(0x20)
         found = servos(emulated.port)
     assert found['gimbal3'].level == 'fail' and 'overload' in found['gimbal3'].found
@@ -147,8 +147,7 @@ def test_a_missing_port_ends_the_checks():
 
 
 def test_without_the_sdk_the_extra_is_named(monkeypatch):
-    for name in ('servo_link', 'servo_port'):
-        monkeypatch.delitem(sys.modules, f'beetle_omni_ros.drivers.{name}')
+    monkeypatch.delitem(sys.modules, 'beetle_omni_ros.drivers.servo_link')
     with EmulatedServoBus(motion=JOINTS) as emulated:
         monkeypatch.setitem(sys.modules, 'dynamixel_sdk', None)
         found = servos(emulated.port)

@@ -11,10 +11,10 @@ from beetle_omni_ros.control.registry import ControllerOptions
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.evaluation import command, loop
-from beetle_omni_ros.evaluation.loop import FlightError, FlightLoop
+from beetle_omni_ros.evaluation.loop import FlightLoop
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.schema import ParameterError, RunError
 from beetle_omni_ros.runs.metrics import metrics
 from beetle_omni_ros.runs.recorder import LogRecorder
 from beetle_omni_ros.runs.tasks import make_task
@@ -163,7 +163,7 @@ def test_implausible_commands_never_get_control(tmp_path, monkeypatch):
     monkeypatch.setattr(loop, 'TAKEOFF_TIMEOUT', 10.0)      # s; others fly after 4
     from policy_files import write
     absurd = write(tmp_path / 'absurd.onnx', bias=np.r_[np.zeros(4), np.full(4, 1e6)])
-    with pytest.raises(FlightError, match="'fallback'.*rl_node.*thrust out of range"):
+    with pytest.raises(RunError, match="'fallback'.*rl_node.*thrust out of range"):
         fly_poses(tmp_path, absurd, 1.0)
 
 

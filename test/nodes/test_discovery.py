@@ -114,3 +114,22 @@ def test_an_argument_of_fly_reaches_every_node_of_the_plan(tmp_path, unset, monk
     graph.start()
     assert len(graph.processes) == (2 if composed else len(nodes))
     assert {value for value, _ in started.values()} == {'SUBNET'}
+
+
+def test_a_name_is_free_again_when_its_process_ends():
+    name = f'test/{os.getpid()}'
+    with discovery.claim(name):
+        assert discovery.claim(name) is None
+    code = f'from beetle_omni_ros.nodes import discovery; print(discovery.claim({name!r}))'
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
+                          check=True, timeout=60)
+    assert 'socket' in done.stdout
+    with discovery.claim(name):
+        pass
+
+
+def test_two_reserved_domains_differ(monkeypatch):
+    with discovery.reserved_domain() as first:
+        monkeypatch.setattr(discovery, '_starts', iter([discovery.DOMAINS.index(first)]))
+        with discovery.reserved_domain() as second:
+            assert second != first

@@ -1,7 +1,7 @@
 """
 Flights of real processes, and consequences of a killed process.
 
-Each test has its own ROS domain, lock files and folders, so that tests can run at the same
+Each test has its own ROS domain and folders, so that tests can run at the same
 time. The robot is observed through ground_truth/odom, which does not depend on other nodes.
 """
 

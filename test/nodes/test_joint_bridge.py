@@ -261,7 +261,7 @@ def test_a_composed_bridge_waits_for_its_port_and_reports_why(tmp_path):
     port = tmp_path / 'servo_bus'
     with joint_bridge(tmp_path, ['ekf_node'], port=str(port), autostart='activate') \
             as (graph, witness):
-        witness.until(lambda: f'waiting: {port}: no such port' in witness.now)
+        witness.until(lambda: f'waiting: {port}: cannot be opened (no such port' in witness.now)
         with EmulatedServoBus(port=str(port)) as emulated:
             emulated.faults.silent = {2}
             witness.until(lambda: 'waiting: ' in witness.now and 'gimbal2 (id 2): does not answer'

@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 import re
 import signal
+import stat
 import subprocess
 import sys
 import time
@@ -18,7 +19,7 @@ from test_deploy import install, UNIT
 from witness import READY, Witness
 
 from beetle_omni_ros.messages.topics import TOPICS
-from beetle_omni_ros.nodes import discovery, plan, private
+from beetle_omni_ros.nodes import discovery, plan
 from beetle_omni_ros.nodes.plan import BRIDGES
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
@@ -59,7 +60,6 @@ def bringup(monkeypatch):
                             lambda self, context: given[self.args[0]], raising=False)
         return module.actions(None)
 
-    monkeypatch.setattr(module, 'has_state_publisher', lambda: False)
     module.start = start
     return module
 
@@ -85,23 +85,19 @@ def test_composed_is_one_process_and_one_for_the_bridges(bringup):
 
 
 def test_separate_nodes_and_no_simulator_for_another_backend(bringup):
-    nodes = bringup.start(composed='false', backend='none', task='waypoints',
-                          viewer='true', namespace='robot1')
+    _, *nodes = bringup.start(composed='false', backend='none', task='waypoints',
+                              viewer='true', namespace='robot1')
     assert [n.kwargs['executable'] for n in nodes] == [
         'ekf_node', 'nmpc_node', 'rl_node', 'supervisor_node', 'reference_node', 'viewer_node']
     assert all(n.kwargs['namespace'] == 'robot1' for n in nodes)
 
 
-def test_robot_state_publisher_where_it_is_installed_has_the_links(bringup, monkeypatch):
-    monkeypatch.setattr(bringup, 'has_state_publisher', lambda: True)
+def test_robot_state_publisher_has_the_links(bringup):
     state_publisher, *_ = bringup.start(viewer='true', namespace='robot1', composed='false')
     given = state_publisher.kwargs
     assert (given['package'], given['namespace']) == ('robot_state_publisher', 'robot1')
     text = given['parameters'][0]['robot_description']
     assert text.args[0].startswith('<?xml') and text.kwargs == {'value_type': str}
-    viewer, = (n for n in bringup.start(viewer='true', composed='false')
-               if n.kwargs.get('name') == 'viewer_node')
-    assert viewer.kwargs['parameters'][0] == {'links': False}
     assert all(n.kwargs['package'] != 'robot_state_publisher'
                for n in bringup.start(composed='false'))
 
@@ -250,8 +246,10 @@ def test_a_launch_is_visible_on_this_computer_only(bringup, monkeypatch):
 
 
 def test_the_ports_of_a_launch_are_in_a_private_folder(bringup):
-    nodes = {n.kwargs['name']: n.kwargs['parameters'][0] for n in bringup.start(composed='false')}
-    assert Path(nodes['sim_node']['servo_port']).parent.parent == private.folder()
+    folders = {Path(n.kwargs['parameters'][0]['servo_port']).parent for _ in range(2)
+               for n in bringup.start(composed='false') if n.kwargs['name'] == 'sim_node'}
+    assert len(folders) == 2
+    assert all(stat.S_IMODE(folder.stat().st_mode) == 0o700 for folder in folders)
 
 
 def test_the_browser_viewer_is_a_separate_process_without_targets(bringup):

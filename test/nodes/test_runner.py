@@ -27,7 +27,7 @@ def finish(process, timeout=20):
 
 
 def wait_until_it_spins(process):
-    """Wait until a node has its lock; from then on it handles signals."""
+    """Wait until a node publishes; from then on it handles signals."""
     from beetle_omni_ros.nodes.operator import Operator
     operator = Operator(int(os.environ['ROS_DOMAIN_ID']))
     try:
@@ -76,7 +76,7 @@ def test_a_node_names_missing_inputs_is_unique_and_ends_cleanly(ros_domain):
         status, error = finish(start('ekf_node'))
         assert status == 1
         assert len(error.strip().splitlines()) == 1
-        assert '/ekf_node runs already' in error and str(first.pid) in error
+        assert '/ekf_node runs already' in error
         first.send_signal(signal.SIGINT)
         first.send_signal(signal.SIGINT)     # as a launch system does
         status, error = finish(first)

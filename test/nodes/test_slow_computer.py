@@ -11,7 +11,8 @@ from rich.console import Console
 from rich.progress import Progress
 
 from beetle_omni_ros.nodes import fly, speed
-from beetle_omni_ros.nodes.flight import Flight, FlightError, PACING, TooSlowError
+from beetle_omni_ros.nodes.flight import Flight, PACING, TooSlowError
+from beetle_omni_ros.robot.schema import RunError
 from beetle_omni_ros.runs.tasks import make_task
 
 NODES = ('sim_node', 'ekf_node', 'nmpc_node')
@@ -58,16 +59,16 @@ def flown(nodes, **options):
 def test_a_simulator_that_falls_behind_is_detected_before_arming():
     with pytest.raises(TooSlowError, match='the simulator fell 0.5 s behind in 2 s'):
         flown(Nodes(lost=0.5), may_be_slow=False)
-    with pytest.raises(FlightError, match='refuses to arm: not level') as raised:
+    with pytest.raises(RunError, match='refuses to arm: not level') as raised:
         flown(Nodes(lost=0.5))              # with may_be_slow, it is attempted
-    assert raised.type is FlightError
+    assert raised.type is RunError
 
 
 @pytest.mark.real_time
 def test_a_failed_flight_reports_the_time_that_the_simulator_lost():
-    with pytest.raises(FlightError, match='refuses to arm: not level$') as raised:
+    with pytest.raises(RunError, match='refuses to arm: not level$') as raised:
         flown(Nodes(), may_be_slow=False)
-    assert raised.type is FlightError
+    assert raised.type is RunError
     with pytest.raises(TooSlowError, match='refuses to arm: not level; the simulator fell 0.2 s'):
         flown(Nodes(lost=0.1), may_be_slow=False)
 
@@ -78,7 +79,7 @@ def test_a_flight_that_fails_after_a_pause_reports_the_pause(may_be_slow):
     class Paused(Nodes):
         states = ['fallback:supervisor_paused', 'emergency_stop:crash']
 
-    with pytest.raises(FlightError, match='refuses to arm: not level; the simulator fell 0.0 s '
+    with pytest.raises(RunError, match='refuses to arm: not level; the simulator fell 0.0 s '
                        'behind in .* s, and supervisor_node was not scheduled') as raised:
         flown(Paused(), may_be_slow=may_be_slow)
     assert (raised.type is TooSlowError) != may_be_slow
@@ -101,7 +102,7 @@ def test_a_fault_that_prevents_take_off_ends_the_attempt_at_once():
             yield from range(100)
 
     nodes = Jammed()
-    with pytest.raises(FlightError, match='no take-off in 3 attempts'):
+    with pytest.raises(RunError, match='no take-off in 3 attempts'):
         flown(nodes)
     assert nodes.waited < 20
 

@@ -14,7 +14,7 @@ NONE = np.zeros(4, dtype=bool)
 
 
 def sent(saturated=NONE, reason=''):
-    return Sent(not reason, reason, np.array(saturated), np.full(4, 0.5))
+    return Sent(reason, np.array(saturated), np.full(4, 0.5))
 
 
 @pytest.mark.parametrize(('gaps', 'cycles', 'missed'), [

@@ -7,7 +7,8 @@ from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.runs.pose_file import COLUMNS, read_poses, TaskError
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.runs.pose_file import COLUMNS, read_poses
 from beetle_omni_ros.runs.target_checks import TargetChecks
 
 CHECKS = TargetChecks(RobotParameters.load())
@@ -66,7 +67,7 @@ def test_a_trajectory_is_checked_point_by_point():
 def test_a_row_with_an_invalid_target_is_named(tmp_path):
     file = tmp_path / 'task.csv'
     file.write_text('x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg\n0,0,1,0,0,0\n0,0,0.05,180,0,0\n')
-    with pytest.raises(TaskError, match=r'task.csv: row 3: z = 0.05 m, expected at least'):
+    with pytest.raises(ParameterError, match=r'task.csv: row 3: z = 0.05 m, expected at least'):
         read_poses(file)
 
 
@@ -86,7 +87,7 @@ def test_a_row_beyond_the_reach_of_the_controller_is_named(tmp_path, reach, row)
     file = tmp_path / 'far.csv'
     file.write_text(f'{",".join(COLUMNS)}\n0.5,0,1,0,0,0\n3,0,1,0,0,0\n17.9,0,1,0,0,0\n')
     assert len(read_poses(file)) == 3
-    with pytest.raises(TaskError, match=rf'row {row}: .* m from .*expected at most {reach:g} m'):
+    with pytest.raises(ParameterError, match=rf'row {row}: .* m from .* at most {reach:g} m'):
         read_poses(file, reach)
 
 

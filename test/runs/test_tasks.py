@@ -5,13 +5,13 @@ import pytest
 
 from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
 from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs import lemniscate
 from beetle_omni_ros.runs.tasks import (
     control_lost,
     make_task,
     NAMES,
     pose_target,
-    TaskError,
     TaskPlayer,
 )
 
@@ -196,7 +196,7 @@ def test_a_pose_file_is_read_with_blank_lines_spaces_and_columns_in_any_order(tm
 def test_a_bad_pose_file_is_refused_with_file_and_row(tmp_path, content, expected):
     file = tmp_path / 'poses.csv'
     file.write_text(content)
-    with pytest.raises(TaskError) as error:
+    with pytest.raises(ParameterError) as error:
         make_task(file)
     assert str(error.value).startswith(f'{file}: ')
     assert expected in str(error.value)
@@ -206,10 +206,10 @@ def test_a_binary_file_a_folder_and_a_missing_file_are_refused(tmp_path):
     binary = tmp_path / 'image.csv'
     binary.write_bytes(bytes(range(256)))
     for path in (binary, tmp_path, tmp_path / 'none.csv'):
-        with pytest.raises(TaskError, match=str(path)):
+        with pytest.raises(ParameterError, match=str(path)):
             make_task(path)
 
 
 def test_an_unknown_task_is_refused_with_the_known_names():
-    with pytest.raises(TaskError, match='waypoints, random100'):
+    with pytest.raises(ParameterError, match='waypoints, random100'):
         make_task('random')
