@@ -34,23 +34,20 @@ def vector(value, size=3):
 
 
 BAD_IMU = {
-    'not_finite': [{'stamp': NAN}, {'stamp': INF}, {'specific_force': vector(NAN)},
-                   {'specific_force': vector(INF)}, {'angular_velocity': vector(NAN)}],
-    'out_of_range': [{'specific_force': vector(500.0)}, {'specific_force': vector(HUGE)},
-                     {'angular_velocity': vector(100.0)}, {'angular_velocity': vector(-HUGE)}],
+    'not_finite': [{'stamp': NAN}, {'specific_force': vector(INF)},
+                   {'angular_velocity': vector(NAN)}],
+    'out_of_range': [{'specific_force': vector(HUGE)}, {'angular_velocity': vector(-100.0)}],
     'duplicate': [{'ahead': 0.0}],
-    'backwards': [{'ahead': -0.001}, {'ahead': -1000.0}],
-    'forward_gap': [{'ahead': 0.5}, {'ahead': 1e9}],
+    'backwards': [{'ahead': -0.001}],
+    'forward_gap': [{'ahead': 0.5}],
 }
 BAD_POSE = {
-    'not_finite': [{'stamp': NAN}, {'stamp': -INF}, {'position': vector(NAN)},
-                   {'quaternion': vector(NAN, 4)}, {'quaternion': vector(INF, 4)}],
-    'out_of_range': [{'position': vector(1e6)}, {'position': vector(-HUGE)}],
-    'quaternion_norm': [{'quaternion': np.zeros(4)}, {'quaternion': np.array([0, 0, 0, 1.1])},
-                        {'quaternion': np.full(4, HUGE)}],
+    'not_finite': [{'stamp': -INF}, {'position': vector(NAN)}, {'quaternion': vector(INF, 4)}],
+    'out_of_range': [{'position': vector(-HUGE)}],
+    'quaternion_norm': [{'quaternion': np.zeros(4)}, {'quaternion': np.array([0, 0, 0, 1.1])}],
     'duplicate': [{'ahead': 0.0}],
     'backwards': [{'ahead': -0.02}],
-    'future': [{'ahead': 5.0}, {'ahead': 1e9}],
+    'future': [{'ahead': 5.0}],
 }
 
 
@@ -111,12 +108,6 @@ def test_a_pose_older_than_the_history_is_refused():
     refused(ekf, stale, 'too_old')
 
 
-def test_a_pose_without_any_imu_is_refused():
-    ekf = ErrorStateEkf(EkfParameters.load(), GRAVITY)
-    assert ekf.pose(PoseReading(0.0, np.zeros(3), np.array([0, 0, 0, 1.0]))) is False
-    assert ekf.rejected == {'no_imu': 1}
-
-
 def test_the_sign_of_the_quaternion_has_no_influence():
     flight, flipped = fly(3, 2.0), fly(3, 2.0)
     flipped.poses = [replace(s, quaternion=s.quaternion * (-1) ** k)
@@ -125,13 +116,6 @@ def test_the_sign_of_the_quaternion_has_no_influence():
     assert not b.rejected
     np.testing.assert_allclose(a.estimate.position, b.estimate.position, atol=1e-12)
     assert abs(abs(a.estimate.quaternion @ b.estimate.quaternion) - 1) < 1e-12
-
-
-def test_slightly_unnormalised_quaternions_are_normalised():
-    flight = fly(4, 1.0)
-    flight.poses = [replace(s, quaternion=1.002 * s.quaternion) for s in flight.poses]
-    ekf = run(ErrorStateEkf(EkfParameters.load(), GRAVITY), flight)
-    assert ekf.status == 'tracking' and not ekf.rejected
 
 
 def test_the_caller_may_reuse_its_buffers():
