@@ -71,11 +71,6 @@ def test_totals_equal_those_of_the_robot_file():
     np.testing.assert_allclose(inertia, np.diag(ROBOT.inertia), atol=1e-9)
 
 
-def test_all_links_exist():
-    assert set(LINKS) == {'base_link', 'main_body', 'end_effector', 'imu',
-                          *(f'module{k}' for k in range(1, 5)), *ROTOR_NAMES}
-
-
 def test_rotor_positions_and_axes_agree_with_the_robot_file():
     placed = poses()
     for k, name in enumerate(ROTOR_NAMES):
