@@ -9,6 +9,8 @@ import pytest
 
 pytest.importorskip('rclpy')
 
+import rclpy
+
 from beetle_omni_ros.nodes import discovery
 
 
@@ -18,3 +20,20 @@ def ros_domain(monkeypatch):
     with discovery.reserved_domain() as number:
         monkeypatch.setenv('ROS_DOMAIN_ID', str(number))
         yield number
+
+
+@pytest.fixture
+def make(ros_domain):
+    """Make one node in this process, with parameters such as 'seed:=3'."""
+    nodes = []
+
+    def build(node_class, *overrides):
+        arguments = [a for override in overrides for a in ('-p', override)]
+        rclpy.init(args=['--ros-args', *arguments], domain_id=ros_domain)
+        nodes.append(node_class())
+        return nodes[0]
+
+    yield build
+    for node in nodes:
+        node.destroy_node()
+    rclpy.try_shutdown()

@@ -11,13 +11,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from rclpy.parameter import Parameter
-from rclpy.parameter_client import AsyncParameterClient
 from std_srvs.srv import Trigger
-from witness import PATIENT, READY, Witness
+from witness import PATIENT, running_graph, Witness
 
 from beetle_omni_ros.nodes import discovery
-from beetle_omni_ros.nodes.graph import BRIDGES_COMPOSED, Graph
+from beetle_omni_ros.nodes.graph import BRIDGES_COMPOSED
 from beetle_omni_ros.nodes.plan import bridge_parameters, BRIDGES
 
 pytestmark = pytest.mark.alone
@@ -31,17 +29,10 @@ class FaultOperator(Witness):
 
     sound = False
 
-    def __init__(self, number):
-        super().__init__(number)
-        self._client = AsyncParameterClient(self._node, 'sim_node')
-
     def set(self, name, value):
         """Set a parameter of sim_node."""
-        assert self.wait(self._client.services_are_ready, 10), 'sim_node is not there'
-        future = self._client.set_parameters([Parameter(name, value=value)])
-        assert self.wait(future.done, 5), 'sim_node does not answer'
-        result = future.result().results[0]
-        assert result.successful, result.reason
+        accepted, reason = super().set('sim_node', name, value)
+        assert accepted, reason
 
     def device(self, key):
         """Newest value of the devices' diagnostics, as number or text."""
@@ -75,19 +66,10 @@ def flying_graph(folder):
         parameters[node] = {**parameters.get(node, {}), **values}
     with discovery.reserved_domain() as number, pytest.MonkeyPatch.context() as patch:
         patch.setenv('ROS_DOMAIN_ID', str(number))
-        graph, operator = Graph(parameters, folder, number), None
-        try:
-            graph.start()
-            operator = FaultOperator(number)
-            assert operator.wait(lambda: operator.ready, READY), graph.dead()
-            operator.can_judge(graph)
-            operator.start()
-            yield graph, operator
-        finally:
-            stubborn = graph.stop()
-            if operator:
-                operator.close()
-        assert not stubborn
+        with running_graph(parameters, folder, number, operator=FaultOperator) as robot:
+            robot[1].can_judge(robot[0])
+            robot[1].start()
+            yield robot
 
 
 @pytest.fixture(scope='module')
@@ -110,37 +92,34 @@ def robot(shared_flight, tmp_path):
         shared_flight.stack.close()
 
 
-# parameters of sim_node, set and reset; bridge, status and counter of the fault
+# parameters of sim_node, set and reset; bridge, status and counters of the faults
 BEARABLE = [
-    ({'servo_faults.bad_crc': 0.05}, {'servo_faults.bad_crc': 0.0}, 'joint', 'bus', 'corrupt'),
-    ({'servo_faults.dropped': 0.05}, {'servo_faults.dropped': 0.0}, 'joint', 'bus', 'unanswered'),
-    ({'servo_faults.delayed': 0.03}, {'servo_faults.delayed': 0.0}, 'joint', 'bus', 'unanswered'),
-    ({'servo_faults.supply_voltage': 14.5}, {'servo_faults.supply_voltage': 12.0}, 'joint',
-     'bus', 'cycles'),
-    ({'servo_faults.expire_watchdog': 3}, {}, 'joint', 'bus', 'cycles'),
-    ({'board_faults.corrupt_out': 0.1}, {'board_faults.corrupt_out': 0.0}, 'rotor', 'board',
-     'bad_crc'),
-    ({'board_faults.corrupt_in': 0.1}, {'board_faults.corrupt_in': 0.0}, 'rotor', 'board',
-     'board bad_crc'),
-    ({'board_faults.drop_out': 0.1}, {'board_faults.drop_out': 0.0}, 'rotor', 'board', 'lost'),
-    ({'board_faults.drop_in': 0.1}, {'board_faults.drop_in': 0.0}, 'rotor', 'board',
-     'board lost'),
+    ({'servo_faults.bad_crc': 0.03, 'servo_faults.dropped': 0.03, 'servo_faults.delayed': 0.01,
+      'servo_faults.supply_voltage': 14.5, 'servo_faults.expire_watchdog': 3},
+     {'servo_faults.bad_crc': 0.0, 'servo_faults.dropped': 0.0, 'servo_faults.delayed': 0.0,
+      'servo_faults.supply_voltage': 12.0}, 'joint', 'bus', ('corrupt', 'unanswered')),
+    ({'board_faults.corrupt_out': 0.05, 'board_faults.corrupt_in': 0.05,
+      'board_faults.drop_out': 0.05, 'board_faults.drop_in': 0.05,
+      'board_faults.voltage_sag': 1.5},
+     {f'board_faults.{name}': 0.0 for name in (
+         'corrupt_out', 'corrupt_in', 'drop_out', 'drop_in', 'voltage_sag')}, 'rotor', 'board',
+     ('bad_crc', 'board bad_crc', 'lost', 'board lost')),
     ({'board_faults.delay_in': 0.01, 'board_faults.delay_out': 0.01},
-     {'board_faults.delay_in': 0.0, 'board_faults.delay_out': 0.0}, 'rotor', 'board', 'cycles'),
-    ({'board_faults.voltage_sag': 1.5}, {'board_faults.voltage_sag': 0.0}, 'rotor', 'board',
-     'cycles'),
-]
+     {'board_faults.delay_in': 0.0, 'board_faults.delay_out': 0.0}, 'rotor', 'board',
+     ('cycles',))]
 
 
 def test_faults_with_recovery_in_the_drivers_do_not_end_a_flight(robot):
     graph, operator = robot
-    for switched, mended, bridge, status, counter in BEARABLE:
-        where = f'{bridge}_bridge_node', status, counter
-        before = operator.count(*where)
+    for switched, mended, bridge, status, counters in BEARABLE:
+        def counts(node=f'{bridge}_bridge_node', status=status, counters=counters):
+            return np.array([operator.count(node, status, counter) for counter in counters])
+
+        before = counts()
         for name, value in switched.items():
             operator.set(name, value)
         assert operator.stays_in_the_air(1.0), switched
-        assert operator.wait(lambda w=where, n=before: operator.count(*w) > n, 10), switched
+        assert operator.wait(lambda n=before, now=counts: np.all(now() > n), 10), switched
         for name, value in mended.items():
             operator.set(name, value)
         assert operator.state == FLYING, (switched, operator.states)
@@ -152,9 +131,7 @@ def test_faults_with_recovery_in_the_drivers_do_not_end_a_flight(robot):
 # fault, value without fault; state of the bridge; whether it needs a reboot
 LANDING = [
     ('servo_faults.silent', [2], [], 'lost: gimbal2', False),
-    ('servo_faults.overload', [1], [], 'lost: gimbal1', True),
     ('servo_faults.overheated', [3], [], 'lost: gimbal3', True),
-    ('servo_faults.unplugged', True, False, 'lost: ', False),
     ('board_faults.mute', True, False, 'silent: no message', False),
 ]
 
@@ -185,7 +162,7 @@ def rests(operator):
     return operator.device('armed') == 'False' and not np.any(operator.last_command[1].thrust)
 
 
-@pytest.mark.parametrize('fault', ['reboot', 'hang', 'unplugged'])
+@pytest.mark.parametrize('fault', ['hang', 'unplugged'])
 def test_a_board_that_stopped_is_not_armed_again_in_the_fall_or_after_it(robot, fault):
     graph, operator = robot
     before = len(graph.log('composed').read_text())

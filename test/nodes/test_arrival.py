@@ -1,27 +1,25 @@
-"""The time of publication reaches the callback, under either executor."""
+"""The time of publication reaches the callback."""
 
-import math
 import time
 
 import pytest
 import rclpy
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import String
 
 from beetle_omni_ros.messages.topics import COMMAND
 from beetle_omni_ros.nodes import runner, wire
 
+pytestmark = pytest.mark.real_time
 PATIENCE = 20           # s
 
 
-@pytest.mark.parametrize('make', [runner.make_executor, SingleThreadedExecutor])
-def test_a_callback_gets_the_time_at_which_its_message_was_published(make, ros_domain):
+def test_a_callback_gets_the_time_at_which_its_message_was_published(ros_domain):
     context = rclpy.Context()
     rclpy.init(args=[], context=context, domain_id=ros_domain,
                signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node('listener', context=context)
-    executor = make(context=context)
+    executor = runner.make_executor(context=context)
     executor.add_node(node)
     received = []
     node.create_subscription(String, 'word', wire.with_publication(
@@ -40,12 +38,3 @@ def test_a_callback_gets_the_time_at_which_its_message_was_published(make, ros_d
     finally:
         node.destroy_node()
         context.try_shutdown()
-
-
-def test_a_middleware_without_publication_times_gives_nan():
-    received = []
-    take = wire.with_publication(lambda message, published: received.append(published))
-    take('message', {'source_timestamp': 0})
-    take(('message', {}))
-    take('message', {'source_timestamp': 2_500_000_000})
-    assert math.isnan(received[0]) and math.isnan(received[1]) and received[2] == 2.5

@@ -17,27 +17,27 @@ pytest.importorskip('serial')
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import JointState
+from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.control.registry import ControllerEntry
 from beetle_omni_ros.messages import conversions
-from beetle_omni_ros.messages.topics import COMMAND, EVENT, LATCHED
+from beetle_omni_ros.messages.topics import COMMAND, EVENT, LATCHED, SENSOR
 from beetle_omni_ros.messages.values import MessageError
 from beetle_omni_ros.nodes import command_source, wire
 from beetle_omni_ros.nodes.controller_node import ControllerNode
 from beetle_omni_ros.nodes.ekf_node import EkfNode
 from beetle_omni_ros.nodes.joint_bridge_node import JointBridgeNode
 from beetle_omni_ros.nodes.recorder_node import RecorderNode
-from beetle_omni_ros.nodes.reference_node import ReferenceNode
 from beetle_omni_ros.nodes.rotor_bridge_node import RotorBridgeNode
 from beetle_omni_ros.nodes.sim_node import SimNode
 from beetle_omni_ros.nodes.supervisor_node import SupervisorNode
-from beetle_omni_ros.nodes.viewer_node import ViewerNode
+from beetle_omni_ros.robot.readings import ImuReading
 from beetle_omni_ros.runs.bag import read_messages
 
+pytestmark = pytest.mark.real_time
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 SOON = 10       # s; a busy test machine must not cause a fault
 
@@ -113,10 +113,12 @@ def test_a_bad_target_pose_is_refused_with_its_reason_and_the_old_one_stays(benc
     poses.publish(pose())
     assert bench.wait(lambda: node._host.target is not None)
     first, now = node._host.target, time.time()
+    node._host.controller.reach = 6.5
+    node._host.on_estimate(PoseTarget(np.array([0.0, 0.0, 1.0]), LEVEL))
+    node._on_mode('flying:nmpc')
     for message, expected in (
-            (pose(-5.0), 'z = -5 m, expected at least'),
-            (pose(0.05), 'z = 0.05 m, expected at least'), (pose(1e300), 'the fence'),
-            (pose(x=25.0), '|x| = 25 m, expected at most'), (pose(frame='map'), "frame_id 'map'"),
+            (pose(-5.0), 'z = -5 m, expected at least'), (pose(frame='map'), "frame_id 'map'"),
+            (pose(x=12.0), '12 m from the robot, expected at most 6.5 m'),
             (pose(stamp=1.5), 's old, expected at most 10 s'),
             (pose(stamp=now + 100), 's ahead, expected at most')):
         received = len(node.refusals)
@@ -124,17 +126,12 @@ def test_a_bad_target_pose_is_refused_with_its_reason_and_the_old_one_stays(benc
         assert bench.wait(lambda received=received: len(node.refusals) > received), expected
         assert node.refusals[-1].startswith('target_pose: ') and expected in node.refusals[-1]
         assert node._host.target is first
-    kinds = node.health._inputs['target_pose'].rejected
-    assert kinds['cannot be flown'] == 6 and kinds.total() == 7
-
-
-def test_a_target_from_a_clock_ahead_does_not_block_later_ones(bench):
-    node = bench.add(StillNode())
-    poses = bench.publisher(PoseStamped, 'target_pose')
-    poses.publish(pose(1.0, time.time() + 0.8))
-    assert bench.wait(lambda: node._host.target is not None)
+    poses.publish(pose(1.4, now + 0.8))     # of a clock ahead, which does not block later ones
+    assert bench.wait(lambda: node._host.target.position[2] == 1.4)
     poses.publish(pose(1.5, time.time()))
     assert bench.wait(lambda: node._host.target.position[2] == 1.5)
+    kinds = node.health._inputs['target_pose'].rejected
+    assert kinds['cannot be flown'] == 4 and kinds.total() == 5
 
 
 def test_a_stamp_of_1970_is_refused_in_simulated_time_too(bench, monkeypatch):
@@ -153,33 +150,6 @@ def test_a_stamp_of_1970_is_refused_in_simulated_time_too(bench, monkeypatch):
                 node._check_target(target, now)
 
 
-def test_a_latched_target_stays_good_for_a_node_that_starts_later(bench, monkeypatch):
-    node = bench.add(StillNode())
-    late = time.time() + 60
-    monkeypatch.setattr(node, 'now', lambda: late)
-    latched = bench.user.create_publisher(PoseStamped, 'target_pose', wire.profile(LATCHED))
-    latched.publish(pose(1.2, time.time()))
-    assert bench.wait(lambda: node._host.target is not None)
-
-
-def test_a_target_beyond_the_reach_of_the_active_controller_is_refused_and_not_taken_over(bench):
-    node = bench.add(StillNode())
-    node._host.controller.reach = 6.5
-    node._host.on_estimate(PoseTarget(np.array([0.0, 0.0, 1.0]), LEVEL))
-    poses = bench.publisher(PoseStamped, 'target_pose')
-    poses.publish(pose(x=12.0))
-    assert bench.wait(lambda: node._host.target is not None)     # others may reach it
-    node._on_mode('flying:nmpc')
-    assert node._host.target is None and 'the present pose is held' in node.refusals[-1]
-    poses.publish(pose(x=3.0))
-    assert bench.wait(lambda: node._host.target is not None)
-    near, received = node._host.target, len(node.refusals)
-    poses.publish(pose(x=12.0))
-    assert bench.wait(lambda: len(node.refusals) > received)
-    assert node._host.target is near
-    assert '12 m from the robot, expected at most 6.5 m' in node.refusals[-1]
-
-
 def trajectory(heights, stamp):
     count = len(heights)
     positions = np.column_stack([np.zeros((count, 2)), heights])
@@ -194,21 +164,21 @@ def test_every_point_of_a_target_trajectory_is_checked(bench):
     paths.publish(trajectory([1.0, 1.1, -5.0], time.time()))
     assert bench.wait(lambda: node.refusals)
     assert node.refusals[0].startswith('target_trajectory: point 3: z = -5 m, expected')
-    fast = trajectory([1.0, 1.1], time.time())
-    fast.points[1].velocities[0].linear.x = 1e300
-    paths.publish(fast)
-    assert bench.wait(lambda: len(node.refusals) > 1)
-    assert 'point 2: velocity 1e+300 m/s, expected within +-10 m/s' in node.refusals[1]
     assert node._host.target is None
     paths.publish(trajectory([1.0, 1.1, 1.2], time.time()))
     assert bench.wait(lambda: node._host.target is not None)
 
 
-def test_refusals_of_many_kinds_take_no_memory(bench):
-    node = bench.add(StillNode())
-    for k in range(500):
-        node.health.rejected('target_pose', f'reason {k}')
-    assert len(node.health._inputs['target_pose'].rejected) < 30
+def test_bad_and_stale_samples_are_refused_and_counted_by_reason(bench):
+    node = bench.add(EkfNode())
+    samples = bench.publisher(Imu, 'imu/data_raw', wire.profile(SENSOR))
+    rejected = node.health._inputs['imu/data_raw'].rejected
+    for specific_force, age in (([np.nan, 0, 9.8], 0.0), ([0, 0, 9.8], 30.0)):
+        before = rejected.total()
+        samples.publish(wire.message('imu/data_raw', ImuReading(
+            time.time() - age, specific_force, [0, 0, 0])))
+        assert bench.wait(lambda before=before: rejected.total() > before)
+    assert rejected == {'linear_acceleration is not finite': 1, 'stale stamp': 1}
 
 
 @pytest.mark.parametrize(('kind', 'overrides'), [
@@ -267,31 +237,13 @@ def test_the_supervisor_signs_its_commands_and_publishes_its_identity(bench):
     assert re.fullmatch('supervisor_node:[0-9a-f]{8}', received[0])
 
 
-@pytest.mark.parametrize('kind', [
-    EkfNode, SimNode, SupervisorNode, ReferenceNode, StillNode, RecorderNode, ViewerNode,
-    JointBridgeNode, RotorBridgeNode])
-def test_read_only_parameters_cannot_be_set_in_flight(ros_domain, tmp_path, kind):
-    own = {JointBridgeNode: ('port:=/tmp/none/a',), RotorBridgeNode: ('port:=/tmp/none/b',),
-           RecorderNode: (f'bag:={tmp_path}/bag',)}
-    bench = Bench(ros_domain, *own.get(kind, ()))
-    try:
-        node = bench.add(kind())
-        before = node.now()
-        for simulated in (True, False):
-            new = Parameter('use_sim_time', value=simulated)
-            for answer in (node.set_parameters([new])[0],
-                           node.set_parameters_atomically([new])):
-                assert not answer.successful and '\n' not in answer.reason
-                assert 'read-only parameter: use_sim_time' in answer.reason
-        assert node.now() > before and not node.get_parameter('use_sim_time').value
-        assert node.describe_parameter('use_sim_time').read_only
-        for name in node._parameters:
-            if node.describe_parameter(name).read_only:
-                answer = node.set_parameters([Parameter(name, value=node.get_parameter(
-                    name).value)])[0]
-                assert not answer.successful and 'read-only' in answer.reason, name
-    finally:
-        bench.close()
+@pytest.mark.parametrize('kind', [EkfNode, JointBridgeNode])
+def test_the_clock_cannot_be_changed_in_flight(make, kind):
+    node = make(kind, *(('port:=/tmp/none/a',) if kind is JointBridgeNode else ()))
+    new = Parameter('use_sim_time', value=True)
+    for answer in (node.set_parameters([new])[0], node.set_parameters_atomically([new])):
+        assert not answer.successful
+        assert 'read-only parameter: use_sim_time' in answer.reason
 
 
 def test_messages_from_before_the_first_simulated_time_are_recorded_with_that_time(

@@ -12,9 +12,9 @@ from beetle_omni_ros.control.base import Command, PoseTarget
 from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes import runner, wire
 from beetle_omni_ros.nodes.live_view import LiveGraph
-from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.view.frames import COLUMNS, pose, Sampler
 
+pytestmark = pytest.mark.real_time
 TIMEOUT = 20.0      # [s]
 TURNED = np.array([0.0, 0.0, np.sin(0.3), np.cos(0.3)])
 
@@ -119,8 +119,3 @@ def test_a_read_only_graph_publishes_no_target(graph, ros_domain):
         assert not graph.count_publishers('target_pose')
     finally:
         silent.close()
-
-
-def test_an_impossible_namespace_is_refused():
-    with pytest.raises(ParameterError, match="--namespace '7 up'"):
-        LiveGraph('7 up')

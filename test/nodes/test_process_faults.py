@@ -32,10 +32,9 @@ BROKEN = {'broken': '1', 'impact_m_s': '4.1'}
     (seen(SOFT, on=6.0), True, False, 'flies_on'), (seen(SOFT, on=6.0), True, True, 'refused'),
     (seen(SOFT, on=6.0), False, False, 'lands'), (seen(HARD), False, False, 'hard'),
     (seen({**SOFT, 'inclination_deg': '40'}), False, False, 'tilted'),
-    (seen(BROKEN), False, False, 'stops'), (seen(BROKEN, on=5.2), False, False, 'stops'),
+    (seen(BROKEN, on=5.2), False, False, 'stops'),
     (seen(BROKEN, on=6.0), False, False, 'crash, motors on'),
     (seen(SOFT, touched=None), True, False, 'does not land'),
-    (seen(SOFT, on=1e9), True, False, 'does not land'),
     (seen(BROKEN, takeoffs=1), False, False, 'takes off')])
 def test_the_outcome_is_determined_from_truth_and_commands(observer, flying, refused, outcome):
     result = process_faults._outcome(observer, flying, refused, LIMITS)
@@ -62,10 +61,7 @@ def test_a_take_off_from_the_floor_is_counted_and_a_bounce_is_not(monkeypatch):
 
 
 def test_the_fault_names_equal_those_of_the_docs():
-    text = share_path('docs/faults.md').read_text() if share_path('.').joinpath(
-        'docs', 'faults.md').exists() else None
-    if text is None:
-        pytest.skip('the docs are not installed')
+    text = share_path('docs/faults.md').read_text()
     for name, fault in process_faults.FAULTS.items():
         assert fault.expected in BETTER
         assert f'| `{name}` | ' in text and f'| {fault.expected} |' in text
