@@ -95,18 +95,20 @@ def test_robot_state_publisher_where_it_is_installed_has_the_links(bringup, monk
                for n in bringup.start(composed='false'))
 
 
-def test_simulator_and_bridges_meet_at_the_same_ports(bringup):
-    nodes = {n.kwargs['name']: n.kwargs['parameters'][0]
-             for n in bringup.start(composed='false')}
+def given_to(nodes):
+    """Name -> parameters of separate nodes."""
+    return {node.kwargs['name']: node.kwargs['parameters'][0] for node in nodes}
+
+
+def test_simulator_and_bridges_meet_at_the_same_ports_in_a_private_folder(bringup):
+    nodes = given_to(bringup.start(composed='false'))
     assert nodes['sim_node']['actuators'] == 'emulated'
     assert nodes['sim_node']['servo_port'] == nodes['joint_bridge_node']['port']
     assert nodes['sim_node']['board_port'] == nodes['rotor_bridge_node']['port']
     assert nodes['joint_bridge_node']['autostart'] == 'activate'
     assert Path(nodes['sim_node']['servo_port']).parent.parent == private.folder()
-    direct = bringup.start(composed='false', actuators='direct')
-    assert not set(BRIDGES) & {n.kwargs['name'] for n in direct}
-    assert 'actuators' not in next(n for n in direct if n.kwargs['name'] == 'sim_node'
-                                   ).kwargs['parameters'][0]
+    direct = given_to(bringup.start(composed='false', actuators='direct'))
+    assert not set(BRIDGES) & set(direct) and 'actuators' not in direct['sim_node']
 
 
 @pytest.mark.real_time
@@ -127,20 +129,18 @@ def test_the_bridges_of_the_service_start_and_wait_for_their_ports(tmp_path, ros
 
 
 def test_the_plant_may_differ_from_the_robot_file(bringup):
-    nodes = bringup.start(composed='false', robot_file='a.yaml', plant_file='b.yaml',
-                          actuators='direct')
-    given = {n.kwargs['name']: n.kwargs['parameters'][0].get('robot_file') for n in nodes}
-    assert given == {'sim_node': 'b.yaml', 'ekf_node': 'a.yaml', 'nmpc_node': 'a.yaml',
+    nodes = given_to(bringup.start(composed='false', robot_file='a.yaml', plant_file='b.yaml',
+                                   actuators='direct'))
+    files = {name: parameters.get('robot_file') for name, parameters in nodes.items()}
+    assert files == {'sim_node': 'b.yaml', 'ekf_node': 'a.yaml', 'nmpc_node': 'a.yaml',
                      'rl_node': 'a.yaml', 'supervisor_node': 'a.yaml'}
 
 
 def test_each_controller_can_be_active_with_the_other_on_standby(bringup, capsys, monkeypatch):
     def controllers(**arguments):
-        nodes = bringup.start(composed='false', **arguments)
-        active = next(n.kwargs['parameters'][0]['controller'] for n in nodes
-                      if n.kwargs['name'] == 'supervisor_node')
-        return active, {n.kwargs['name']: n.kwargs['parameters'][0] for n in nodes
-                        if n.kwargs['name'] in ('nmpc_node', 'rl_node')}
+        nodes = given_to(bringup.start(composed='false', **arguments))
+        return nodes['supervisor_node']['controller'], {
+            name: nodes[name] for name in ('nmpc_node', 'rl_node') if name in nodes}
 
     assert controllers() == ('nmpc', {'nmpc_node': {}, 'rl_node': {}})
     assert controllers(controller='rl', standby='false') == ('rl', {'rl_node': {}})

@@ -66,15 +66,15 @@ def test_stamps_follow_a_clock_that_was_set(pacing, clock):
 
 
 def test_a_preemption_between_the_clock_readings_changes_no_stamp(clock):
-    readings = SimpleNamespace(hold=0.0)
+    hold = [0.0]
 
     def ros():
-        clock.now += readings.hold          # preempted between the two clock readings
+        clock.now += hold[0]
         return clock.now + ROS
 
     pacing = RealTimePacing(TICK, lambda: clock.now, ros)
     run(pacing, clock, 0.5)
-    readings.hold = 0.02
+    hold[0] = 0.02
     pacing.due()
     assert pacing.clock_steps == 0
 

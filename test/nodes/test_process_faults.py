@@ -42,22 +42,16 @@ def test_the_outcome_is_determined_from_truth_and_commands(observer, flying, ref
 
 
 def test_a_take_off_from_the_floor_is_counted_and_a_bounce_is_not(monkeypatch):
-    now = [0.0]
+    observer, now = Observer.__new__(Observer), [0.0]
     monkeypatch.setattr(process_faults.time, 'monotonic', lambda: now[0])
-    observer = Observer.__new__(Observer)
     observer._limits, observer.states = LIMITS, []
     observer.begin()
-
-    def at(seconds, height):
-        now[0] = seconds
+    for now[0], height, takeoffs in (
+            (0.0, 1.0, 0), (1.0, 0.2, 0), (1.2, 0.4, 0), (1.4, 0.2, 0), (1.6, 1.0, 0),
+            (2.0, 0.2, 0), (2.6, 0.2, 0), (3.0, 0.9, 1)):
         observer._on_truth(SimpleNamespace(position=(0.0, 0.0, height)))
-
-    for moment in ((0.0, 1.0), (1.0, 0.2), (1.2, 0.4), (1.4, 0.2), (1.6, 1.0)):
-        at(*moment)
-    assert observer.takeoffs == 0 and observer.touched == 1.0
-    for moment in ((2.0, 0.2), (2.6, 0.2), (3.0, 0.9)):
-        at(*moment)
-    assert observer.takeoffs == 1
+        assert observer.takeoffs == takeoffs
+    assert observer.touched == 1.0
 
 
 def test_the_fault_names_equal_those_of_the_docs():
