@@ -1,5 +1,6 @@
 """Fixtures of ROS tests: checked field types, a reserved local ROS domain for each test."""
 
+from contextlib import ExitStack
 import os
 
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
@@ -37,3 +38,21 @@ def make(ros_domain):
     for node in nodes:
         node.destroy_node()
     rclpy.try_shutdown()
+
+
+@pytest.fixture
+def make_bench(ros_domain):
+    """Make a bench of nodes in this process, with parameters as for ``make``."""
+    from witness import Bench
+    with ExitStack() as stack:
+        def build(*overrides, **options):
+            made = Bench(ros_domain, *overrides, **options)
+            stack.callback(made.close)
+            return made
+        yield build
+
+
+@pytest.fixture
+def bench(make_bench):
+    """A bench without parameters."""
+    return make_bench()

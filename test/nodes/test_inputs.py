@@ -9,13 +9,13 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 import numpy as np
 import pytest
-import rclpy
 
 pytest.importorskip('pymavlink')
 pytest.importorskip('serial')
 
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import String
@@ -35,7 +35,7 @@ from beetle_omni_ros.nodes.rotor_bridge_node import RotorBridgeNode
 from beetle_omni_ros.nodes.sim_node import SimNode
 from beetle_omni_ros.nodes.supervisor_node import SupervisorNode
 from beetle_omni_ros.robot.readings import ImuReading
-from beetle_omni_ros.runs.bag import read_messages
+from beetle_omni_ros.runs.bag import read_bag, read_messages
 
 pytestmark = pytest.mark.real_time
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
@@ -49,56 +49,6 @@ class StillNode(ControllerNode):
         super().__init__(ControllerEntry(name='nmpc', controller=lambda: SimpleNamespace(
             period=0.01, step=lambda state, target: None, reset=lambda: None,
             set_health=lambda health: None)))
-
-
-class Bench:
-    """A node in this process, and another that publishes to it."""
-
-    def __init__(self, domain, *overrides):
-        arguments = [a for override in overrides for a in ('-p', override)]
-        rclpy.init(args=['--ros-args', *arguments], domain_id=domain)
-        self.user = rclpy.create_node('user')
-        self.executor = SingleThreadedExecutor()
-        self.executor.add_node(self.user)
-        self.nodes = [self.user]
-
-    def add(self, node):
-        """Spin this node too; log lines of its refusals are kept in ``node.refusals``."""
-        node.refusals = []
-        before = node.health.rejected
-        node.health.rejected = lambda topic, reason, kind='': (
-            node.refusals.append(f'{topic}: {reason}'), before(topic, reason, kind))
-        self.executor.add_node(node)
-        self.nodes.append(node)
-        return node
-
-    def publisher(self, kind, topic, profile=wire.profile(EVENT), readers=1):
-        """Make a publisher and wait for its subscription."""
-        made = self.user.create_publisher(kind, topic, profile)
-        assert self.wait(lambda: made.get_subscription_count() >= readers)
-        return made
-
-    def wait(self, condition, timeout=SOON):
-        """Spin until a condition holds."""
-        end = time.monotonic() + timeout
-        while not condition() and time.monotonic() < end:
-            self.executor.spin_once(timeout_sec=0.02)
-        return condition()
-
-    def close(self):
-        """Destroy the nodes."""
-        for node in self.nodes:
-            self.executor.remove_node(node)
-            node.destroy_node()
-        rclpy.try_shutdown()
-
-
-@pytest.fixture
-def bench(ros_domain):
-    """A bench without a node."""
-    made = Bench(ros_domain)
-    yield made
-    made.close()
 
 
 def pose(height=1.0, stamp=0.0, frame='world', x=0.0):
@@ -184,17 +134,10 @@ def test_bad_and_stale_samples_are_refused_and_counted_by_reason(bench):
 @pytest.mark.parametrize(('kind', 'overrides'), [
     (SimNode, ()), (JointBridgeNode, ('port:=/tmp/none/a',)),
     (RotorBridgeNode, ('port:=/tmp/none/b',)), (StillNode, ())])
-def test_only_the_supervisors_commands_are_executed_and_others_are_named(ros_domain, kind,
+def test_only_the_supervisors_commands_are_executed_and_others_are_named(make_bench, kind,
                                                                          overrides):
-    bench = Bench(ros_domain, *overrides)
-    try:
-        _fly_with_an_intruder(bench, bench.add(kind()))
-    finally:
-        bench.close()
-
-
-def _fly_with_an_intruder(bench, node):
-    texts = []
+    bench, texts = make_bench(*overrides), []
+    node = bench.add(kind())
     bench.user.create_subscription(
         DiagnosticArray, 'diagnostics', lambda m: texts.extend(s.message for s in m.status), 10)
     commands = bench.publisher(JointState, 'command', wire.profile(COMMAND))
@@ -247,21 +190,44 @@ def test_the_clock_cannot_be_changed_in_flight(make, kind):
 
 
 def test_messages_from_before_the_first_simulated_time_are_recorded_with_that_time(
-        ros_domain, tmp_path):
-    bench = Bench(ros_domain, 'use_sim_time:=true', f'bag:={tmp_path}/bag')
-    try:
-        node = bench.add(RecorderNode())
-        bench.publisher(String, 'supervisor/state', wire.profile(LATCHED)).publish(
-            String(data='disarmed'))
-        assert bench.wait(lambda: node._held) and not node.now()
-        bench.publisher(Clock, '/clock', wire.profile(EVENT)).publish(
-            Clock(clock=Time(sec=1_700_000_000)))
-        assert bench.wait(node.now)
-        bench.publisher(String, 'reference/state', wire.profile(LATCHED)).publish(
-            String(data='waiting'))
-        assert bench.wait(lambda: not node._held)
-        node.close()
-        assert [(one.topic, one.received) for one in read_messages(tmp_path / 'bag')] == [
-            ('/supervisor/state', 1.7e9), ('/reference/state', 1.7e9)]
-    finally:
-        bench.close()
+        make_bench, tmp_path):
+    bench = make_bench('use_sim_time:=true', f'bag:={tmp_path}/bag')
+    node = bench.add(RecorderNode())
+    bench.publisher(String, 'supervisor/state', wire.profile(LATCHED)).publish(
+        String(data='disarmed'))
+    assert bench.wait(lambda: node._held) and not node.now()
+    bench.publisher(Clock, '/clock', wire.profile(EVENT)).publish(
+        Clock(clock=Time(sec=1_700_000_000)))
+    assert bench.wait(node.now)
+    bench.publisher(String, 'reference/state', wire.profile(LATCHED)).publish(
+        String(data='waiting'))
+    assert bench.wait(lambda: not node._held)
+    node.close()
+    assert [(one.topic, one.received) for one in read_messages(tmp_path / 'bag')] == [
+        ('/supervisor/state', 1.7e9), ('/reference/state', 1.7e9)]
+
+
+BEST_EFFORT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+@pytest.mark.parametrize('profile', [wire.profile(EVENT), wire.profile(LATCHED), BEST_EFFORT])
+def test_each_target_is_recorded_once_with_any_quality_of_service(make_bench, tmp_path, profile):
+    bench, incompatible, heights = make_bench(f'bag:={tmp_path}/bag'), [], [1.0, 1.1, 1.2]
+    publisher = bench.user.create_publisher(
+        PoseStamped, 'target_pose', profile, event_callbacks=PublisherEventCallbacks(
+            incompatible_qos=incompatible.append))
+    if profile.durability == wire.profile(LATCHED).durability:
+        heights.insert(0, 0.9)
+        publisher.publish(pose(0.9))    # before the subscription
+    recorder = bench.add(RecorderNode())
+    bench.wait(lambda: False, 1.2)      # the required subscriptions exist
+    for height in heights[-3:]:
+        before = recorder._bag.counts['/target_pose']
+        publisher.publish(pose(height))
+        assert bench.wait(lambda n=before: recorder._bag.counts['/target_pose'] == n + 1)
+    bench.wait(lambda: False, 0.3)
+    assert not incompatible or profile is BEST_EFFORT
+    recorder.close()
+    targets = read_bag(tmp_path / 'bag').targets
+    assert [target.position[2] for target in targets] == heights
+    assert targets[-1].stamp == pytest.approx(time.time(), abs=60)   # time of receipt
