@@ -108,11 +108,6 @@ def test_the_file_equals_the_output_of_the_generator():
                                [float(x) for x in number.findall(written)], rtol=1e-6, atol=1e-9)
 
 
-def test_mujoco_reads_the_description():
-    mujoco = pytest.importorskip('mujoco')
-    assert mujoco.MjModel.from_xml_path(str(URDF)).njnt == 4
-
-
 def test_every_mesh_is_shipped_closed_and_faces_outwards():
     trimesh = pytest.importorskip('trimesh')
     prefix = 'package://beetle_omni_ros/'

@@ -14,7 +14,6 @@ from beetle_omni_ros import cli
 from beetle_omni_ros.evaluation import command, loop
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.runs import tasks
 from beetle_omni_ros.runs.bag_reader import read_bag
 from beetle_omni_ros.runs.metrics import metrics
 from beetle_omni_ros.runs.tasks import make_task, Task, TaskError
@@ -45,15 +44,6 @@ def flown(poses, tmp_path_factory):
     folder = tmp_path_factory.mktemp('flown')
     return evaluate(poses, ('nmpc', 'hover'), seed=3, bag=folder / 'bags',
                     json_path=folder / 'result.json'), folder
-
-
-def test_a_finished_flight_is_one_line_if_the_output_is_no_terminal(poses, monkeypatch):
-    monkeypatch.setattr(loop.FlightLoop, 'fly', lambda *_: True)    # any flight
-    for terminal in (False, True):
-        text = io.StringIO()
-        command.run_evaluate(controllers=['hover'], task=str(poses), console=Console(
-            file=text, width=200, force_terminal=terminal))
-        assert (f'hover: {poses} flown in ' in text.getvalue()) != terminal
 
 
 def without_times(results):
@@ -178,17 +168,6 @@ def test_an_exception_in_flight_falls_back_and_is_in_the_results(until, tmp_path
     error = results['controller_error']
     assert "controller 'bad': step raised AttributeError: 'Bad' object has no attribute" in error
     assert '(bad.py:8)' in error and error in text.getvalue()
-
-
-def test_a_force_task_ends_with_the_level_of_lost_control(monkeypatch):
-    monkeypatch.setattr(tasks, 'FORCE_LEVELS', (10.0, 60.0, 70.0))     # [N]
-    task = make_task('force')
-    log = command.fly('nmpc', task, robot=ROBOT, plant=ROBOT)
-    assert np.isfinite(log.truth_position).all()
-    force = metrics(log, task)['force']
-    assert [(row['level_N'], row['lost']) for row in force['levels']] == [
-        (10.0, False), (60.0, True)]
-    assert force['withstood_N'] == 10.0 and force['lost_at_N'] == 60.0
 
 
 def test_an_empty_pack_is_swapped_at_the_next_target(monkeypatch):
