@@ -2,14 +2,12 @@
 
 from pathlib import Path
 import re
-import runpy
 import subprocess
 import sys
 
 from flown_once import flight
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 import beetle_omni_ros
 from beetle_omni_ros.control import registry
@@ -57,12 +55,6 @@ def test_an_own_trajectory_is_followed_by_both_controllers():
     errors = dict(re.findall(r'^(nmpc|rl): ([\d.]+) mm', printed, re.MULTILINE))
     assert {'nmpc', 'rl'} == set(errors) and max(map(float, errors.values())) < 100
     assert 'Trajectory tracking' in printed and 'poses reached' not in printed
-
-
-def test_the_rolls_of_the_own_trajectory_do_not_wind_up_the_joints():
-    _, _, attitudes = runpy.run_path(str(EXAMPLES / 'own_trajectory.py'))['circle'](24.0)
-    rolls = np.unwrap(Rotation.from_quat(attitudes).as_euler('xyz')[:, 0])
-    assert np.pi / 2 < np.abs(rolls).max() < beetle_omni_ros.robot().joints.position_limit
 
 
 def test_an_own_robot_flies_with_known_and_unknown_parameters(poses):

@@ -4,7 +4,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import rclpy
 
 from beetle_omni_ros.control.base import Command, PoseTarget
 from beetle_omni_ros.messages import conversions
@@ -19,19 +18,18 @@ class Sent(list):
     """A publisher that stores its messages."""
 
     publish = list.append
+    subscribed = 1
 
     def get_subscription_count(self):
-        return 1
+        return self.subscribed
 
 
 @pytest.fixture
-def viewer(ros_domain):
-    rclpy.init(domain_id=ros_domain)
-    node = ViewerNode()
-    node._markers, node._transforms = Sent(), Sent()
-    yield node
-    node.destroy_node()
-    rclpy.try_shutdown()
+def viewer(make, monkeypatch):
+    node = make(ViewerNode)
+    monkeypatch.setattr(node, '_markers', Sent())
+    monkeypatch.setattr(node, '_transforms', Sent(), raising=False)
+    return node
 
 
 def test_thrust_arrows_point_along_the_tilted_rotors(viewer):
@@ -43,6 +41,11 @@ def test_thrust_arrows_point_along_the_tilted_rotors(viewer):
     viewer._joints = JointReading(5.0, tilt, np.zeros(4))
     viewer._command = Command(5.0, tilt, np.array([8.0, 4.0, 0.0, 20.0]))
     viewer._target = PoseTarget(position, rotation)
+    viewer._markers.subscribed = viewer._transforms.subscribed = 0
+    viewer._draw()
+    viewer._move()
+    assert not viewer._markers and not viewer._transforms
+    viewer._markers.subscribed = 1
     viewer._draw()
     markers = {marker.ns: marker for marker in viewer._markers[-1].markers}
     assert set(markers) == {'body', 'rotor1', 'rotor2', 'rotor3', 'rotor4', 'target'}
@@ -69,13 +72,3 @@ def test_the_frame_of_the_body_is_sent_once_for_each_estimate(viewer, monkeypatc
     assert frame.header.stamp.sec == 5
     assert conversions.xyz(frame.transform.translation) == pytest.approx(position)
     assert conversions.xyzw(frame.transform.rotation) == pytest.approx(rotation)
-
-
-def test_nothing_is_drawn_without_subscriptions(viewer):
-    viewer._odom = Odom(5.0, np.zeros(3), np.zeros(3), np.array([0, 0, 0, 1.0]),
-                                np.zeros(3))
-    for publisher in (viewer._markers, viewer._transforms):
-        publisher.get_subscription_count = lambda: 0
-    viewer._draw()
-    viewer._move()
-    assert not viewer._markers and not viewer._transforms
