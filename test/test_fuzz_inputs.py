@@ -5,7 +5,7 @@ from pathlib import Path
 import struct
 
 import numpy as np
-from test_packaging import PARAMETER_CLASSES
+from test_packaging import parameter_classes
 
 from beetle_omni_ros.control.base import Command, PoseTarget
 from beetle_omni_ros.control.policy_network import PolicyNetwork
@@ -177,9 +177,10 @@ def refusals(count, folder, suffix, sources, mutate, read):
 
 
 def test_a_damaged_parameter_file_is_refused_in_one_line(tmp_path):
-    sources = {name: share_path(f'params/{name}').read_bytes() for name in PARAMETER_CLASSES}
+    classes = parameter_classes()
+    sources = {name: share_path(f'params/{name}').read_bytes() for name in classes}
     assert refusals(80, tmp_path, '.yaml', sources, mutate_yaml,
-                    lambda path, name: PARAMETER_CLASSES[name].load(path))
+                    lambda path, name: classes[name].load(path))
 
 
 def test_a_damaged_list_of_faults_is_refused_in_one_line(tmp_path):

@@ -158,17 +158,22 @@ def test_every_requirement_is_imported_and_listed_once(setup_arguments):
             assert set(names) - imported == {'etils'}      # bounds a requirement of mujoco
 
 
-def test_each_parameter_file_is_read_by_the_class_of_its_reference():
+def parameter_classes():
+    """Shipped parameter file -> the class of its reference."""
     spec = importlib.util.spec_from_file_location('reference', ROOT / 'docs/generate_reference.py')
     reference = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(reference)
     shipped = {path.name for path in (ROOT / 'params').glob('*.yaml')}
     robots = {name for name in shipped if name.startswith('robot_')}    # without a table
     assert shipped - robots == set(reference.FILES) - robots
-    for name in shipped:
-        place, _ = reference.FILES.get(name, reference.FILES['robot.yaml'])
-        module, kind = place.split(':')
-        kind = getattr(import_module(f'{PACKAGE}.{module}'), kind)
+    places = {name: reference.FILES.get(name, reference.FILES['robot.yaml'])[0].split(':')
+              for name in shipped}
+    return {name: getattr(import_module(f'{PACKAGE}.{module}'), kind)
+            for name, (module, kind) in places.items()}
+
+
+def test_each_parameter_file_is_read_by_the_class_of_its_reference():
+    for name, kind in parameter_classes().items():
         assert isinstance(kind.load(share_path(f'params/{name}')), kind)
 
 
