@@ -14,10 +14,9 @@ from PIL import Image
 
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.urdf import Model
-from beetle_omni_ros.view.command import names
 from beetle_omni_ros.view.page import Page
 from beetle_omni_ros.view.playback import Player
-from beetle_omni_ros.view.recording import Recording
+from beetle_omni_ros.view.recording import names, Recording
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.append(str(ROOT / 'test' / 'view'))

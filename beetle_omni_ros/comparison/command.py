@@ -20,18 +20,24 @@ from rich.text import Text
 from beetle_omni_ros import __version__
 from beetle_omni_ros.comparison import grids, page
 from beetle_omni_ros.comparison.fingerprint import commit, file_digest, policy_file, versions
-from beetle_omni_ros.comparison.grid import Grid, Number
-from beetle_omni_ros.comparison.plan import CONDITIONS, Flight, plan, TASKS
-from beetle_omni_ros.comparison.style import look
-from beetle_omni_ros.comparison.summary import summarise
-from beetle_omni_ros.comparison.sweep import check_backend, Store, sweep
+from beetle_omni_ros.comparison.flights import (
+    check_backend,
+    CONDITIONS,
+    Flight,
+    plan,
+    Store,
+    sweep,
+    TASKS,
+)
+from beetle_omni_ros.comparison.grids import Grid, Number
+from beetle_omni_ros.comparison.summary import look, summarise
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import guidance_of
 from beetle_omni_ros.control.registry import ControllerOptions
-from beetle_omni_ros.pages.table import Terminal
+from beetle_omni_ros.pages.page import Terminal
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.json_file import write_json
+from beetle_omni_ros.runs.files import write_json
 from beetle_omni_ros.runs.metrics import failed
 
 PAGE, NUMBERS, TEXT = 'comparison.html', 'comparison.json', 'README.md'

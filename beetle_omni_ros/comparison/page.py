@@ -10,9 +10,9 @@ import matplotlib
 from matplotlib.figure import Figure
 from PIL import Image
 
-from beetle_omni_ros.comparison import grid, grids, plots
-from beetle_omni_ros.comparison.grid import Grid
-from beetle_omni_ros.comparison.style import CONDITIONS, look, task_title
+from beetle_omni_ros.comparison import grids, plots
+from beetle_omni_ros.comparison.grids import Grid
+from beetle_omni_ros.comparison.summary import CONDITIONS, look, task_title
 from beetle_omni_ros.pages import figures
 from beetle_omni_ros.pages.page import frame, shipped
 
@@ -182,7 +182,7 @@ def _anchor(title):
 
 
 def _html_section(section, results):
-    blocks = ''.join(grid.html(block, results) if isinstance(block, Grid) else
+    blocks = ''.join(grids.html(block, results) if isinstance(block, Grid) else
                      f'<figure><div class="scroll"><img alt="{escape(block.caption)}" '
                      f'src="data:image/png;base64,{b64encode(block.data).decode()}"></div>'
                      f'<p class="note">{escape(block.caption)}.</p></figure>'
@@ -206,7 +206,7 @@ def markdown(results: dict, made: list[Section], how: str = '') -> str:
     for section in made:
         parts.append(f'## {section.title}\n')
         parts += [section.text + '\n'] if section.text else []
-        parts += [grid.markdown(block, results) if isinstance(block, Grid) else
+        parts += [grids.markdown(block, results) if isinstance(block, Grid) else
                   f'![{block.caption}]({block.name}.png)\n\n{block.caption}.\n'
                   for block in section.blocks]
     return '\n'.join(parts)

@@ -4,13 +4,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 import numpy as np
 
-from beetle_omni_ros.comparison.plan import Flight
-from beetle_omni_ros.comparison.style import look
-from beetle_omni_ros.comparison.summary import PUBLISHED
+from beetle_omni_ros.comparison.flights import Flight
+from beetle_omni_ros.comparison.summary import look, PUBLISHED
 from beetle_omni_ros.pages.figures import FAINT, INK, panels, WIDTH
 from beetle_omni_ros.runs import lemniscate as curve
 from beetle_omni_ros.runs import published
-from beetle_omni_ros.runs.body import roll_pitch_yaw
+from beetle_omni_ros.runs.log import roll_pitch_yaw
 from beetle_omni_ros.runs.metrics import L_WINDOW, REACHED_ORIENTATION, REACHED_POSITION, U_WINDOW
 from beetle_omni_ros.runs.tasks import make_task, POSE_DURATION, WAYPOINTS
 

@@ -12,16 +12,16 @@ import numpy as np
 from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.yaml_file import shortened
-from beetle_omni_ros.runs.body import (
+from beetle_omni_ros.runs.log import (
     errors,
     estimate_errors,
+    FlightLog,
     hold,
     inside,
     Motion,
     motion,
     target_ends,
 )
-from beetle_omni_ros.runs.log import FlightLog
 from beetle_omni_ros.runs.tasks import (
     control_lost,
     GROUND_HEIGHT,

@@ -4,7 +4,7 @@ from itertools import zip_longest
 
 from rich.console import Console
 
-from beetle_omni_ros.pages.table import ABSENT, Grid, print_grids, Terminal
+from beetle_omni_ros.pages.page import ABSENT, Grid, print_grids, Terminal
 from beetle_omni_ros.runs import published
 
 FILES, SHIPPED_ROBOT = ('robot', 'plant'), 'params/robot.yaml'    # keys in the metadata

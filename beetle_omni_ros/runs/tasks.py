@@ -10,7 +10,7 @@ import numpy as np
 from beetle_omni_ros.control.base import PoseTarget, Target, TrajectoryTarget
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs import lemniscate, pose_file
+from beetle_omni_ros.runs import lemniscate, targets
 
 POSE_DURATION = 8.0  # [s] of one pose
 HOVER_DURATION = 60.0  # [s]
@@ -210,7 +210,7 @@ def make_task(name: str | Path, seed: int = 0, reach: float = np.inf) -> Task:
         return {'hover': _hover_task, 'force': _force_task, 'torque': _torque_task,
                 'payload': _payload_task}[name](name)
     if name.lower().endswith('.csv') or name and Path(name).exists():
-        return _pose_task(name, pose_file.read_poses(name, reach))
+        return _pose_task(name, targets.read_poses(name, reach))
     raise ParameterError(f"task '{name}': expected a CSV file of poses, random1 to random999999 "
                          f"or one of {', '.join(NAMES)}")
 

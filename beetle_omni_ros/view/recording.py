@@ -1,6 +1,7 @@
-"""A recorded run, read by a separate process while its first seconds are already displayed."""
+"""Recorded runs in the browser, read by a process each while their first seconds are shown."""
 
 from collections.abc import Iterator
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 import os
 from pathlib import Path
@@ -10,9 +11,12 @@ import sys
 import threading
 
 import numpy as np
+from rich.console import Console
 
 import beetle_omni_ros
-from beetle_omni_ros.runs.bag_files import bag_files, BagError, no_pose
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.urdf import Model
+from beetle_omni_ros.runs.bag import bag_files, BagError, names_of, no_pose, runs_in
 from beetle_omni_ros.view.frames import COLUMNS, Rows, Sampler
 
 STEP = 0.02         # [s] between rows
@@ -52,7 +56,7 @@ def parts(path: str | Path) -> Iterator[Part]:
         BagError: the bag is unreadable, or contains no pose of the robot.
 
     """
-    from beetle_omni_ros.runs.bag_reader import replay  # 0.1 s, not needed by the page
+    from beetle_omni_ros.runs.bag import replay  # 0.1 s, not needed by the page
     sampler, warnings, size = Sampler(), [], 0
     tables, due = [], None
     for times in replay(path, sampler, warnings, leave_out=SKIPPED):
@@ -171,3 +175,52 @@ if __name__ == '__main__':
     # Import again: pickled classes must belong to this module, not to __main__.
     from beetle_omni_ros.view import recording
     recording.main(sys.argv[1])
+
+
+FIRST_ROWS = 60.0       # [s] timeout for the first rows of a run
+
+
+def names(paths: list[Path]) -> list[str]:
+    """Return distinct names of runs: their folders, if necessary with the folders above."""
+    found = names_of(paths)
+    if len(set(found)) == len(found):
+        return found
+    return [f'{name} ({k + 1})' for k, name in enumerate(found)]
+
+
+def run_view(runs: list[Path], *, robot: Path | None = None, urdf: Path | None = None,
+             host: str, port: int, dark: bool = False, start: float = 0.0,
+             play: bool = True, console: Console | None = None) -> None:
+    """
+    Play recorded runs until Ctrl-C; arguments are the options of `beetle_omni view`.
+
+    Raises:
+        BagError: unusable run.
+        ParameterError: other unusable input.
+
+    """
+    console, runs = console or Console(), runs_in(runs)
+    model, parameters = Model.load(urdf), RobotParameters.load(robot)
+    with ExitStack() as stack:
+        recordings = []
+        for path, name in zip(runs, names(runs), strict=True):
+            recordings.append(Recording(path, name))
+            stack.callback(recordings[-1].close)
+        from beetle_omni_ros.view.page import Page  # slow import, while the first rows are read
+        from beetle_omni_ros.view.playback import Player
+        page = Page([recording.name for recording in recordings], model, parameters, host=host,
+                    port=port, dark=dark)
+        stack.callback(page.close)
+        for recording in recordings:
+            recording.wait(FIRST_ROWS)
+        player = Player(page, recordings, start, play)
+        player.look()
+        player.draw()
+        with suppress(KeyboardInterrupt):       # the regular end
+            announce(page.url, console)
+            player.run()
+
+
+def announce(url: str, console: Console) -> None:
+    """Print the address of the page."""
+    console.print(f'{url}  (Ctrl-C ends it)', markup=False, highlight=False, soft_wrap=True)
