@@ -7,17 +7,14 @@ Flights are read into a log, or incrementally into a recorder.
 from collections import Counter
 from collections.abc import Container, Iterable, Iterator
 from dataclasses import replace
-from io import BytesIO
+from itertools import islice
 import json
 from pathlib import Path
-import struct
 from typing import NamedTuple
 
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Message, Schema
-from mcap.stream_reader import get_chunk_data_stream, MAGIC_SIZE, StreamReader
+from mcap.records import Channel, Message, Schema
+from mcap.stream_reader import MAGIC_SIZE, StreamReader
 from mcap.writer import MCAP0_MAGIC
 import numpy as np
 
@@ -35,12 +32,12 @@ from beetle_omni_ros.messages.topics import (
 from beetle_omni_ros.robot.yaml_file import quoted, read_yaml, YamlError
 from beetle_omni_ros.runs.log import FlightLog, LogRecorder, Recorder, SERIES_OF
 
-AT_ONCE = 4096      # messages outside chunks, or of a series, that are read together
-LENGTH = struct.Struct('<Q')
-DECLARED = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel}
-PREFIX = 9          # bytes of a record before its content: kind and length
-HEAD = np.dtype([('channel', '<u2'), ('sequence', '<u4'), ('log_time', '<u8'),
-                 ('publish_time', '<u8')])      # of the content of a message, before its data
+AT_ONCE = 4096      # messages that are read together
+META_KEY = 'beetle_omni'  # under custom_data of metadata.yaml
+
+# Text entries of the metadata that readers of a log rely on, and their longest length.
+META_TEXTS = ('task', 'conditions', 'robot', 'plant', 'controller', 'guidance', 'version')
+LONGEST_TEXT = 250
 
 
 class BagError(ValueError):
@@ -159,55 +156,31 @@ def read_messages(path: str | Path, warnings: list[str] | None = None) -> Iterat
         BagError: no such bag, unreadable, or not MCAP.
 
     """
-    for part in _parts(path, warnings):
-        for channel, data, received in zip(part.channels.tolist(), part.data,
-                                           part.received.tolist(), strict=True):
-            yield RawMessage(*part.known[channel], data, received)
-
-
-def read_together(path: str | Path, warnings: list[str] | None = None
-                  ) -> Iterator[list[Messages]]:
-    """
-    Yield the messages of a bag by topic, a few seconds at a time; much faster than one by one.
-
-    Arguments and errors are as in :func:`read_messages`. Topics are in the order of their first
-    message.
-    """
-    for part in _parts(path, warnings):
-        found, first = np.unique(part.channels, return_index=True)
-        together = []
-        for channel in found[np.argsort(first)].tolist():
-            rows = np.flatnonzero(part.channels == channel)
-            together.append(Messages(*part.known[channel], [part.data[row] for row in rows],
-                                     part.received[rows]))
-        yield together
-
-
-class _Part(NamedTuple):
-    """Messages in order: (N,) channel, data, (N,) time [s]; channel -> topic and type."""
-
-    channels: np.ndarray
-    data: list[bytes]
-    received: np.ndarray
-    known: dict[int, tuple[str, str]]
-
-
-def _parts(path, warnings) -> Iterator[_Part]:
     found, broken = 0, ''
     for file in bag_files(path):
-        count = 0
+        count, schemas, known = 0, {0: ''}, {}
         try:
             with file.open('rb') as stream:
-                _check_magic(file, stream)
-                for part in _Reader().parts(stream):
-                    count += len(part.data)
-                    yield part
+                # A shorter file may be an MCAP file that was cut off.
+                if not MCAP0_MAGIC.startswith(stream.read(MAGIC_SIZE)):
+                    raise BagError(f'{file}: not an MCAP file')
+                stream.seek(0)
+                for record in _Records(_WholeReads(stream), validate_crcs=True).records:
+                    if isinstance(record, Message):
+                        count += 1
+                        yield RawMessage(*known[record.channel_id], record.data,
+                                         from_nanoseconds(record.log_time))
+                    elif isinstance(record, Schema):
+                        schemas[record.id] = record.name
+                    elif isinstance(record, Channel):
+                        known[record.id] = record.topic, schemas[record.schema_id]
         except OSError as error:
             raise BagError(f'{file}: {error.strerror}') from None
-        except (BagError, GeneratorExit):
+        except BagError:
             raise
         except Exception as error:  # broken bytes raise anything in the library
-            kind = 'cut off' if isinstance(error, EOFError) else f'damaged ({error})'
+            kind = 'cut off' if isinstance(error, EOFError) else \
+                f'damaged ({type(error).__name__}: {error})'
             broken = f'{file.name}: {kind} after {count} readable messages'
             if warnings is not None:
                 warnings.append(broken)
@@ -216,87 +189,22 @@ def _parts(path, warnings) -> Iterator[_Part]:
         raise BagError(f"{path}: {broken}; 'mcap recover' of the mcap tool may save more")
 
 
-def _check_magic(file, stream):
-    """Refuse another kind of file; a shorter one may be an MCAP file that was cut off."""
-    if not MCAP0_MAGIC.startswith(stream.read(MAGIC_SIZE)):
-        raise BagError(f'{file}: not an MCAP file')
-    stream.seek(0)
+def read_together(path: str | Path, warnings: list[str] | None = None
+                  ) -> Iterator[list[Messages]]:
+    """
+    Yield the messages of a bag by topic, a few seconds at a time.
 
-
-class _Reader:
-    """Reader of one file."""
-
-    def __init__(self):
-        self._schemas: dict[int, str] = {}
-        self._known: dict[int, tuple[str, str]] = {}
-
-    def parts(self, stream) -> Iterator[_Part]:
-        """Yield the parts, also the messages before an error."""
-        loose: list[Message] = []
-        try:
-            for record in _Records(_WholeReads(stream), emit_chunks=True,
-                                   validate_crcs=True).records:
-                if isinstance(record, Message):
-                    self._check(record.channel_id)
-                    loose.append(record)
-                if loose and (len(loose) == AT_ONCE or not isinstance(record, Message)):
-                    yield self._of_loose(loose)
-                    loose = []
-                if isinstance(record, Chunk):
-                    yield self._of_chunk(record)
-                elif isinstance(record, (Schema, Channel)):
-                    self._declare(record)
-        except GeneratorExit:
-            raise
-        except Exception:
-            if loose:
-                yield self._of_loose(loose)
-            raise
-
-    def _of_loose(self, messages):
-        return _Part(np.array([one.channel_id for one in messages]),
-                     [one.data for one in messages],
-                     np.array([from_nanoseconds(one.log_time) for one in messages]), self._known)
-
-    def _of_chunk(self, chunk):
-        stream, size = get_chunk_data_stream(chunk, validate_crc=True)
-        data, at, begins, ends = stream.read(size), 0, [], []
-        while at < size:
-            kind, begin = data[at], at + PREFIX
-            at = begin + LENGTH.unpack_from(data, at + 1)[0]
-            if at > size:
-                raise McapError('a record is longer than its chunk')
-            if kind == Opcode.MESSAGE:
-                begins.append(begin)
-                ends.append(at)
-            elif kind in DECLARED:
-                self._declare(DECLARED[kind].read(ReadDataStream(BytesIO(data[begin:at]))))
-        rows = np.array(begins, dtype=int)[:, None] + np.arange(HEAD.itemsize)
-        heads = np.frombuffer(data, np.uint8)[rows].view(HEAD)[:, 0]
-        for channel in np.unique(heads['channel']).tolist():
-            self._check(channel)
-        return _Part(heads['channel'], [data[begin + HEAD.itemsize:end]
-                                        for begin, end in zip(begins, ends, strict=True)],
-                     from_nanoseconds(heads['log_time']), self._known)
-
-    def _declare(self, record):
-        if isinstance(record, Schema):
-            self._schemas[record.id] = record.name
-        elif record.schema_id and record.schema_id not in self._schemas:
-            raise McapError(f'no schema record found with id {record.schema_id}')
-        else:
-            self._known[record.id] = record.topic, self._schemas.get(record.schema_id, '')
-
-    def _check(self, channel):
-        if channel not in self._known:
-            raise McapError(f'no channel record found with id {channel}')
-
-
-META_KEY = 'beetle_omni'  # under custom_data of metadata.yaml
-
-# Text entries of the metadata that readers of a log rely on, and their longest length.
-META_TEXTS = ('task', 'conditions', 'robot', 'plant', 'controller', 'guidance', 'version')
-LONGEST_TEXT = 250
+    Arguments and errors are as in :func:`read_messages`. Topics are in the order of their first
+    message.
+    """
+    messages = read_messages(path, warnings)
+    while part := list(islice(messages, AT_ONCE)):
+        groups: dict[tuple[str, str], tuple[list, list]] = {}
+        for topic, kind, data, received in part:
+            all_data, times = groups.setdefault((topic, kind), ([], []))
+            all_data.append(data)
+            times.append(received)
+        yield [Messages(*name, data, np.array(times)) for name, (data, times) in groups.items()]
 
 
 def read_bag(path: str | Path, *, namespace: str | None = None) -> FlightLog:
@@ -314,20 +222,17 @@ def read_bag(path: str | Path, *, namespace: str | None = None) -> FlightLog:
         BagError: no such bag, unreadable, not MCAP, or several robots in it.
 
     """
-    recorder = LogRecorder()
-    reading = _Reading(str(path), namespace, recorder)
-    for together in read_together(path, reading.warnings):
-        reading.take(together)
-    reading.take_waiting()
-    recorder.write_meta(_metadata(path, reading.warnings))
+    recorder, warnings = LogRecorder(), []
+    for _ in replay(path, recorder, warnings, namespace=namespace):
+        pass
     log = recorder.log()
-    log.warnings = reading.finish()
-    log.source = str(path)
+    log.warnings, log.source = warnings, str(path)
     return log
 
 
 def replay(path: str | Path, recorder: Recorder, warnings: list[str], *,
-           namespace: str | None = None, leave_out: Container[str] = ()) -> Iterator[np.ndarray]:
+           namespace: str | None = None, leave_out: Container[str] | None = None
+           ) -> Iterator[np.ndarray]:
     """
     Pass the messages of a bag to a recorder, a few seconds at a time.
 
@@ -337,7 +242,7 @@ def replay(path: str | Path, recorder: Recorder, warnings: list[str], *,
             come one by one.
         warnings: list to which missing and unusable data are added at the end.
         namespace: namespace of the robot, if the bag contains several.
-        leave_out: topics without namespace to skip; commands of controllers are always skipped.
+        leave_out: topics without namespace to skip, beside commands of controllers; None: none.
 
     Yields:
         (N,) times of recording of the messages so far passed on [s].
@@ -348,9 +253,10 @@ def replay(path: str | Path, recorder: Recorder, warnings: list[str], *,
     """
     reading = _Reading(str(path), namespace, recorder, leave_out)
     for together in read_together(path, reading.warnings):
-        reading.take(together)
-        reading.take_waiting()
-        yield np.concatenate([np.zeros(0), *(messages.received for messages in together)])
+        # Ambiguous names last: the other topics may determine the namespace.
+        for messages in sorted(together, key=lambda one: is_ambiguous(one.topic)):
+            reading.take(messages)
+        yield np.concatenate([messages.received for messages in together])
     recorder.write_meta(_metadata(path, reading.warnings))
     warnings += reading.finish()
 
@@ -358,63 +264,44 @@ def replay(path: str | Path, recorder: Recorder, warnings: list[str], *,
 class _Reading:
     """Sorts messages by topic and namespace, and counts unusable ones."""
 
-    def __init__(self, path, namespace, recorder, leave_out=None):
+    def __init__(self, path, namespace, recorder, leave_out):
         self.warnings: list[str] = []
         self._recorder, self._left_out = recorder, leave_out
         self._path = path
-        self._namespace = None if namespace is None else _rooted(namespace)
+        self._namespace = namespace and f"/{namespace.strip('/')}".rstrip('/')
         self._chosen = namespace is not None
         self._split = {}
         self._counts: Counter = Counter()
         self._bad: Counter = Counter()
         self._reason: dict[str, str] = {}
-        self._waiting: dict[str, tuple[list[bytes], list[np.ndarray]]] = {}
 
-    def take(self, together: list[Messages]) -> None:
-        """Read messages; those of a series are collected first, to be read together."""
-        # Ambiguous names last: the other topics may determine the namespace.
-        for messages in sorted(together, key=lambda one: is_ambiguous(one.topic)):
-            name = self._name(messages.topic)
-            if name is None:
-                continue
-            if self._left_out is not None and (name in self._left_out or controller_of(name)):
-                self._counts[name] += len(messages.data)
-                continue
-            kind = topic_of(name).type
-            if messages.type != kind:
-                self._refuse(name, f'type is {messages.type}, not {kind}', len(messages.data))
-            elif name in SERIES_OF or controller_of(name):
-                waiting, times = self._waiting.setdefault(name, ([], []))
-                waiting += messages.data
-                times.append(messages.received)
-                if len(waiting) >= AT_ONCE:
-                    self.take_waiting(name)
-            else:
-                for data, received in zip(messages.data, messages.received.tolist(),
-                                          strict=True):
-                    self._take_one(name, data, received)
-
-    def _take_one(self, name, data, received):
-        topic = topic_of(name)
-        try:
-            value = topic.read(from_bytes(data, topic.type))
-            self._recorder.write(name, _stamped(value, received), received)
-            self._counts[name] += 1
-        except Exception as error:  # an unusable message must not prevent reading the others
-            self._refuse(name, str(error) or type(error).__name__)
-
-    def take_waiting(self, *names: str) -> None:
-        """Read the collected messages of these topics, or of all."""
-        for name in names or list(self._waiting):
-            waiting, times = self._waiting.pop(name)
-            rows, value, refused = read_all(topic_of(name), waiting)
+    def take(self, messages: Messages) -> None:
+        """Read messages of one topic; those of a series together."""
+        name = self._name(messages.topic)
+        if name is None:
+            return
+        topic, count = topic_of(name), len(messages.data)
+        if self._left_out is not None and (name in self._left_out or controller_of(name)):
+            self._counts[name] += count
+        elif messages.type != topic.type:
+            self._refuse(name, f'type is {messages.type}, not {topic.type}', count)
+        elif name in SERIES_OF or controller_of(name):
+            rows, value, refused = read_all(topic, messages.data)
             if len(rows):
-                received = np.concatenate(times)[rows]
+                received = messages.received[rows]
                 stamp = np.where(value.stamp == 0, received, value.stamp)
                 self._recorder.write(name, replace(value, stamp=stamp), received)
             self._counts[name] += len(rows)
-            for reason, count in refused.items():
-                self._refuse(name, reason, count)
+            for reason, number in refused.items():
+                self._refuse(name, reason, number)
+        else:
+            for data, received in zip(messages.data, messages.received.tolist(), strict=True):
+                try:
+                    value = topic.read(from_bytes(data, topic.type))
+                    self._recorder.write(name, _stamped(value, received), received)
+                    self._counts[name] += 1
+                except Exception as error:  # must not prevent reading the others
+                    self._refuse(name, str(error) or type(error).__name__)
 
     def _name(self, topic):
         """Name without namespace; None for a topic that is unknown or still ambiguous."""
@@ -465,10 +352,6 @@ def _stamped(value, received):
     if isinstance(value, TrajectoryTarget):
         return replace(value, stamp=received, times=value.times + received)
     return replace(value, stamp=received)
-
-
-def _rooted(namespace):
-    return '/' + namespace.strip('/') if namespace.strip('/') else ''
 
 
 def _metadata(path, warnings):

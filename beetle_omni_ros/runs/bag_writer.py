@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from array import array
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from io import BytesIO
 import json
 from math import isfinite
 import os
 from pathlib import Path
 import struct
-import tempfile
 from typing import Any, ClassVar
 
 from rosbags.interfaces import Connection
@@ -39,46 +37,8 @@ def _from_jazzy(metadata):
     return metadata.replace('ros_distro: rosbags', f'ros_distro: {DISTRIBUTION}')
 
 
-class ChunkIndex:
-    """
-    Replaces the MCAP writer's list of index records by a temporary file.
-
-    A flight of an hour has 9000 chunks, whose records need 4 MB of memory. The file has no name
-    and is deleted with the process.
-    """
-
-    def __init__(self, folder: Path):
-        self._file = tempfile.TemporaryFile(dir=folder)
-        self._sizes = array('L')
-
-    def append(self, record: BytesIO) -> None:
-        """Store a record."""
-        self._file.write(record.getbuffer())
-        self._sizes.append(record.tell())
-
-    def __iter__(self) -> Iterator[BytesIO]:
-        """Yield all records, each positioned at its end."""
-        self._file.seek(0)
-        for size in self._sizes:
-            record = BytesIO()
-            record.write(self._file.read(size))
-            yield record
-
-    def __len__(self) -> int:
-        return len(self._sizes)
-
-    def close(self) -> None:
-        """Delete the file."""
-        self._file.close()
-
-
 class JazzyStorage(McapWriter):
-    """MCAP with the hash of each type, and an index outside memory."""
-
-    def __init__(self, path: Path, compression: CompressionMode):
-        """Create the file in the folder ``path``."""
-        super().__init__(path, compression)
-        self.chunks = ChunkIndex(path)
+    """MCAP with the hash of each type."""
 
     def add_connection(self, connection: Connection, offered_qos_profiles: str) -> None:
         """Declare a topic."""
@@ -111,19 +71,13 @@ class JazzyWriter(Writer):
 
     def close(self) -> None:
         """Finish the bag."""
-        index = self.storage.chunks
-        try:
-            super().close()
-        finally:
-            index.close()
+        super().close()
         self.metapath.write_text(_from_jazzy(self.metapath.read_text('utf8')), 'utf8')
 
 
 TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 TEXT = 'std_msgs/msg/String'
 PERIOD = 0.02       # [s] between transforms
-STAMP, POSE = struct.Struct('<iI'), struct.Struct('<7d')
-MARK = 1e3          # placeholder of a pose; its bytes occur in no frame name
 
 
 class FrameWriter:
@@ -151,10 +105,6 @@ class FrameWriter:
         self._moving = {joint.name: joint for joint in tree if joint.axis is not None}
         self._latest = None     # message of joint_states
         self._due = None
-        # Only stamps and poses of the message change, so only these are serialised.
-        self._frame = _Template([(WORLD, BODY),
-                                 *((joint.parent, joint.child)
-                                   for joint in self._moving.values())])
 
     def take(self, topic: str, data: bytes | memoryview, t: float) -> None:
         """Process a message recorded at ``t`` [s], and write transforms if they are due."""
@@ -177,47 +127,34 @@ class FrameWriter:
             self._begin(odom.header.stamp, t)
         self._due = t + PERIOD if self._due is None else max(self._due + PERIOD, t)
         at, turn = odom.pose.pose.position, odom.pose.pose.orientation
-        poses = [(odom.header.stamp, (at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w)),
-                 *((stamp, (*joint.position, *joint.turned(angles[name])))
-                   for name, joint in self._moving.items())]
-        if all(isfinite(x) for _, pose in poses for x in pose):
-            self._write('/tf', TRANSFORMS, self._frame.filled(poses), t)
+        frames = [(WORLD, BODY, odom.header.stamp, (at.x, at.y, at.z),
+                   (turn.x, turn.y, turn.z, turn.w)),
+                  *((joint.parent, joint.child, stamp, joint.position, joint.turned(angles[name]))
+                    for name, joint in self._moving.items())]
+        if all(isfinite(x) for *_, position, quaternion in frames for x in (
+                *position, *quaternion)):
+            self._write('/tf', TRANSFORMS, _transforms(frames), t)
 
     def _begin(self, stamp, t):
-        fixed = _Template([(joint.parent, joint.child) for joint in self._fixed])
-        self._write('/tf_static', TRANSFORMS, fixed.filled(
-            [(stamp, (*joint.position, *joint.quaternion)) for joint in self._fixed]), t)
+        self._write('/tf_static', TRANSFORMS, _transforms(
+            [(joint.parent, joint.child, stamp, joint.position, joint.quaternion)
+             for joint in self._fixed]), t)
         text = BAG.new(TEXT)
         text.data = self._text
         self._write(list(self.topics)[-1], TEXT, to_bytes(text, TEXT), t)
 
 
-class _Template:
-    """CDR of transforms between given frames, with exchangeable stamps and poses."""
-
-    def __init__(self, frames):
-        message = BAG.new(TRANSFORMS)
-        for k, (parent, child) in enumerate(frames):
-            frame = BAG.new('geometry_msgs/msg/TransformStamped')
-            stamp, at, turn = frame.header.stamp, frame.transform.translation, \
-                frame.transform.rotation
-            stamp.sec, stamp.nanosec = k, 0xBEEF
-            frame.header.frame_id, frame.child_frame_id = parent, child
-            at.x = at.y = at.z = turn.x = turn.y = turn.z = turn.w = MARK
-            message.transforms.append(frame)
-        self._data = bytearray(to_bytes(message, TRANSFORMS))
-        self._places, start = [], 0
-        for k in range(len(frames)):
-            header = self._data.index(STAMP.pack(k, 0xBEEF), start)
-            start = self._data.index(POSE.pack(*[MARK] * 7), header)
-            self._places.append((header, start))
-
-    def filled(self, poses):
-        """Return the CDR with (stamp, seven numbers of the pose) for each transform."""
-        for (header, place), (stamp, pose) in zip(self._places, poses, strict=True):
-            STAMP.pack_into(self._data, header, stamp.sec, stamp.nanosec)
-            POSE.pack_into(self._data, place, *pose)
-        return bytes(self._data)
+def _transforms(frames):
+    """CDR of frames: parent, child, stamp, position, quaternion."""
+    message = BAG.new(TRANSFORMS)
+    for parent, child, stamp, position, quaternion in frames:
+        frame = BAG.new('geometry_msgs/msg/TransformStamped')
+        frame.header.frame_id, frame.child_frame_id, frame.header.stamp = parent, child, stamp
+        at, turn = frame.transform.translation, frame.transform.rotation
+        at.x, at.y, at.z = map(float, position)
+        turn.x, turn.y, turn.z, turn.w = map(float, quaternion)
+        message.transforms.append(frame)
+    return to_bytes(message, TRANSFORMS)
 
 
 class BagWriter(Recorder):
