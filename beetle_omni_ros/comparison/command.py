@@ -5,6 +5,7 @@ import platform
 import sys
 
 import joblib
+import numpy as np
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -14,8 +15,6 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
-from rich.table import Table
-from rich.text import Text
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.comparison import grids, page
@@ -29,12 +28,11 @@ from beetle_omni_ros.comparison.flights import (
     sweep,
     TASKS,
 )
-from beetle_omni_ros.comparison.grids import Grid, Number
 from beetle_omni_ros.comparison.summary import look, summarise
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import guidance_of
 from beetle_omni_ros.control.registry import ControllerOptions
-from beetle_omni_ros.pages.page import Terminal
+from beetle_omni_ros.pages.page import Grid, print_grids, Terminal
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.files import write_json
@@ -219,7 +217,7 @@ def _write(results, flown, output, console):
     except OSError as error:
         raise ParameterError(f'{output}: cannot write the page ({error.strerror})') from None
     write_json(output / NUMBERS, results)
-    console.print(_rich(grids.glance(results), results, console.width))
+    print_grids([_for_terminal(grids.glance(results), results, console.width)], console)
     failed = sum(bool(result['failure']) for result in flown.values())
     if failed:
         console.print(f'{failed} of {len(flown)} flights failed, see above and on the page',
@@ -227,23 +225,17 @@ def _write(results, flown, output, console):
     console.print(f'{output / PAGE}', highlight=False)
 
 
-def _rich(grid: Grid, results: dict, width: int) -> Table:
-    """Table for the terminal, without the published columns if it is narrow."""
+def _for_terminal(grid, results, width):
+    """The table as text, without the published columns if the terminal is narrow."""
     shown = [k for k, column in enumerate(grid.columns)
              if column.group != 'published' or width >= WIDE]
-    table = Table(title=grid.title, title_justify='left', title_style='bold', box=None,
-                  header_style='dim', padding=(0, 2, 0, 0))
-    table.add_column('', ratio=1)
-    for column in (grid.columns[k] for k in shown):
-        is_ours = column.group != 'published'
-        name = look(column.controller).label
-        table.add_column(Text(name if is_ours else f'published {name}'), justify='right',
-                         style=None if is_ours else 'dim')
-    for name, cells in grid.rows:
-        table.add_row(Text(name), *(Text(''.join(
-            part.text(results) if isinstance(part, Number) else part
-            for part in [*cells[k].main, *cells[k].small])) for k in shown))
-    return table
+    published = [grid.columns[k].group == 'published' for k in shown]
+    names = [look(grid.columns[k].controller).label for k in shown]
+    return Grid(grid.title, ['', *(f'published {name}' if theirs else name
+                                   for name, theirs in zip(names, published, strict=True))],
+                [[name, *(grids.text_of(cells[k].main + cells[k].small, results) for k in shown)]
+                 for name, cells in grid.rows],
+                faint_columns=frozenset(np.flatnonzero([False, *published]).tolist()))
 
 
 __all__ = ['Flight', 'run_compare']

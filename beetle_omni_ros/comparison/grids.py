@@ -7,6 +7,7 @@ cannot differ.
 
 from dataclasses import dataclass, field
 from html import escape
+from itertools import groupby
 from math import isfinite
 
 from beetle_omni_ros.comparison.summary import look, PUBLISHED, task_title
@@ -83,22 +84,9 @@ class Grid:
     commands: list[str] = field(default_factory=list)
 
 
-def numbers(grid: Grid):
-    """All numbers of a table."""
-    for _, cells in grid.rows:
-        for cell in cells:
-            yield from (part for part in (*cell.main, *cell.small) if isinstance(part, Number))
-
-
-def _groups(grid):
-    """(group, number of its columns) of adjacent columns."""
-    groups: list[list] = []
-    for column in grid.columns:
-        if groups and groups[-1][0] == column.group:
-            groups[-1][1] += 1
-        else:
-            groups.append([column.group, 1])
-    return groups
+def text_of(parts: list, results: dict) -> str:
+    """Text of a cell's main or small parts."""
+    return ''.join(part.text(results) if isinstance(part, Number) else part for part in parts)
 
 
 def html(grid: Grid, results: dict) -> str:
@@ -108,8 +96,8 @@ def html(grid: Grid, results: dict) -> str:
              for k, column in enumerate(grid.columns)]
     classes = [kind + (' first' if new else '') for kind, new in zip(kinds, first, strict=True)]
     top = '<th></th>' + ''.join(
-        f'<th colspan="{count}" class="group {_kind(group)}">{escape(group)}</th>'
-        for group, count in _groups(grid))
+        f'<th colspan="{len(list(columns))}" class="group {_kind(group)}">{escape(group)}</th>'
+        for group, columns in groupby(grid.columns, lambda column: column.group))
     head = '<th></th>' + ''.join(
         f'<th class="{name}"><i style="background: {look(column.controller).colour}"></i>'
         f'{escape(look(column.controller).label)}</th>'
@@ -119,9 +107,12 @@ def html(grid: Grid, results: dict) -> str:
             f'<td class="{kind}{" best" if cell.best else ""}">{_html_cell(cell, results)}</td>'
             for kind, cell in zip(classes, cells, strict=True)) + '</tr>\n'
         for name, cells in grid.rows)
+    notes, commands = escape(' '.join(grid.notes)), escape('\n'.join(grid.commands))
     return (f'<figure class="table"><figcaption>{escape(grid.title)}</figcaption>'
             f'<div class="scroll"><table><thead><tr class="groups">{top}</tr><tr>{head}</tr>'
-            f'</thead>\n<tbody>{body}</tbody></table></div>{_html_notes(grid)}</figure>\n')
+            f'</thead>\n<tbody>{body}</tbody></table></div>'
+            + (f'<p class="note">{notes}</p>' if notes else '')
+            + (f'<pre>{commands}</pre>' if commands else '') + '</figure>\n')
 
 
 def _kind(group):
@@ -129,30 +120,18 @@ def _kind(group):
 
 
 def _html_cell(cell, results):
-    small = ''.join(_html_part(part, results) for part in cell.small)
-    return ''.join(_html_part(part, results) for part in cell.main) + \
-        (f'<small>{small}</small>' if small else '')
-
-
-def _html_part(part, results):
-    if not isinstance(part, Number):
-        return escape(part)
-    key = '/'.join(str(entry) for entry in part.path)
-    return f'<span data-key="{escape(key)}">{part.text(results)}</span>'
-
-
-def _html_notes(grid):
-    notes = ' '.join(escape(note) for note in grid.notes)
-    commands = escape('\n'.join(grid.commands))
-    return (f'<p class="note">{notes}</p>' if notes else '') + \
-        (f'<pre>{commands}</pre>' if commands else '')
+    main, small = (''.join(
+        f'<span data-key="{escape("/".join(map(str, part.path)))}">{part.text(results)}</span>'
+        if isinstance(part, Number) else escape(part) for part in parts)
+        for parts in (cell.main, cell.small))
+    return main + (f'<small>{small}</small>' if small else '')
 
 
 def markdown(grid: Grid, results: dict) -> str:
     """Table, notes and commands as GitHub Markdown."""
-    multiple = len(_groups(grid)) > 1
+    several = len({column.group for column in grid.columns}) > 1
     head = [f'{look(column.controller).label}'
-            + (f' ({column.group})' if multiple and column.group != OURS else '')
+            + (f' ({column.group})' if column.group != OURS and several else '')
             for column in grid.columns]
     rows = [[name, *(_markdown_cell(cell, results) for cell in cells)]
             for name, cells in grid.rows]
@@ -163,8 +142,7 @@ def markdown(grid: Grid, results: dict) -> str:
 
 
 def _markdown_cell(cell, results):
-    main, small = (''.join(part.text(results) if isinstance(part, Number) else part
-                           for part in parts) for parts in (cell.main, cell.small))
+    main, small = text_of(cell.main, results), text_of(cell.small, results)
     main = f'**{main}**' if cell.best else main
     return f'{main} {small}'.strip()
 

@@ -135,13 +135,13 @@ def _split_number(file):
 
 
 def names_of(runs: list[Path]) -> list[str]:
-    """Shortest endings of the paths that are all different."""
+    """Shortest endings of the paths that are all different, numbered if none are."""
     paths = [run.absolute().parts for run in runs]
     for depth in range(1, max((len(parts) for parts in paths), default=1) + 1):
         names = ['/'.join(parts[-depth:]) for parts in paths]
         if len(set(names)) == len(names):
-            break
-    return names
+            return names
+    return [f'{name} ({k + 1})' for k, name in enumerate(names)] if runs else []
 
 
 def read_messages(path: str | Path, warnings: list[str] | None = None) -> Iterator[RawMessage]:

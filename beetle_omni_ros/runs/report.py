@@ -46,11 +46,14 @@ def run_report(paths: list[Path], output: Path, *, json_path: Path | None = None
     logs = []
     for path in paths:
         log = read_bag(path)
-        _has_a_pose(log, path)
+        if not len(motion(log).t):
+            raise no_pose(path, log.warnings)
         for warning in log.warnings:
             print(f'{path}: {warning}', file=sys.stderr)
         logs.append(log)
-    runs = make_runs(logs, [_name(path) for path in paths])
+    runs = make_runs(logs, [
+        path.absolute().parent.name if path.is_file() else path.absolute().name
+        for path in paths])
     results = results_of(runs)
     table.print_results(results, console)
     page = make_page(runs, results)
@@ -60,27 +63,10 @@ def run_report(paths: list[Path], output: Path, *, json_path: Path | None = None
     return results
 
 
-def _name(path):
-    path = Path(path).absolute()
-    return path.parent.name if path.is_file() else path.name
-
-
-def _has_a_pose(log, name):
-    if not len(motion(log).t):
-        raise no_pose(name, log.warnings)
-
-
 def make_runs(logs: list[FlightLog], names: list[str]) -> list[Run]:
-    """
-    Compute the metrics of flights, and give each a label and a colour; equal names are numbered.
-
-    Raises:
-        BagError: a flight without a pose.
-
-    """
+    """Compute the metrics of flights; give each a label, numbered if equal, and a colour."""
     runs = []
     for k, (log, name) in enumerate(zip(logs, names, strict=True)):
-        _has_a_pose(log, name)
         if names.count(name) > 1:
             name = f'{name} ({names[:k + 1].count(name)})'
         task = task_of(log)

@@ -9,6 +9,7 @@ from pathlib import Path
 import socket
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import viser
@@ -38,32 +39,19 @@ SCRIPT = """<script>(() => {
 })();</script>""".replace('RENDERERS', SOFTWARE_RENDERERS)
 
 
-class _Index:
-    """The client's page with the script, in place of its file."""
-
-    def __init__(self, path: Path):
-        self._path = path
-
-    def is_file(self) -> bool:
-        """Whether the page is there."""
-        return self._path.is_file()
-
-    def read_bytes(self) -> bytes:
-        """Content of the page."""
-        head, begin, rest = self._path.read_bytes().partition(b'<head>')
-        return head + begin + SCRIPT.encode() + rest
-
-
 class _Folder:
-    """The folder of the client, as far as viser's HTTP server uses it."""
+    """The folder of the client, as far as viser's HTTP server uses it, with the script."""
 
     def __init__(self, path: Path):
         self._path = path
 
-    def __truediv__(self, name: str) -> Path | _Index:
+    def __truediv__(self, name: str):
         """File of this name."""
         path = self._path / name
-        return _Index(path) if name == 'index.html' else path
+        if name != 'index.html':
+            return path
+        page = path.read_bytes().replace(b'<head>', b'<head>' + SCRIPT.encode(), 1)
+        return SimpleNamespace(is_file=lambda: True, read_bytes=lambda: page)
 
 
 @contextlib.contextmanager

@@ -180,14 +180,6 @@ if __name__ == '__main__':
 FIRST_ROWS = 60.0       # [s] timeout for the first rows of a run
 
 
-def names(paths: list[Path]) -> list[str]:
-    """Return distinct names of runs: their folders, if necessary with the folders above."""
-    found = names_of(paths)
-    if len(set(found)) == len(found):
-        return found
-    return [f'{name} ({k + 1})' for k, name in enumerate(found)]
-
-
 def run_view(runs: list[Path], *, robot: Path | None = None, urdf: Path | None = None,
              host: str, port: int, dark: bool = False, start: float = 0.0,
              play: bool = True, console: Console | None = None) -> None:
@@ -203,7 +195,7 @@ def run_view(runs: list[Path], *, robot: Path | None = None, urdf: Path | None =
     model, parameters = Model.load(urdf), RobotParameters.load(robot)
     with ExitStack() as stack:
         recordings = []
-        for path, name in zip(runs, names(runs), strict=True):
+        for path, name in zip(runs, names_of(runs), strict=True):
             recordings.append(Recording(path, name))
             stack.callback(recordings[-1].close)
         from beetle_omni_ros.view.page import Page  # slow import, while the first rows are read
