@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite, radians
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -225,24 +226,21 @@ class WordError(ValueError):
     """A typed line is not a command; the message has the expected input."""
 
 
-@dataclass(frozen=True)
-class Shift:
+class Shift(NamedTuple):
     """Shift of the goal: (3,) in world [m], (3,) roll, pitch, yaw [rad]."""
 
     way: np.ndarray
     turn: np.ndarray
 
 
-@dataclass(frozen=True)
-class Go:
+class Go(NamedTuple):
     """A goal: (3,) in world [m], (4,) body to world, xyzw, or None to keep the attitude."""
 
     position: np.ndarray
     quaternion: np.ndarray | None
 
 
-@dataclass(frozen=True)
-class Order:
+class Order(NamedTuple):
     """Another command: its name and its argument."""
 
     name: str
@@ -263,21 +261,19 @@ def parse(line: str, poses: Mapping[str, Sequence[float]]) -> Shift | Go | Order
     word = word.lower()
     if not word:
         return None
+    shift = Shift(np.zeros(3), np.zeros(3))
     if word in WAYS:
         axis, direction = WAYS[word]
-        way = np.zeros(3)
-        way[axis] = direction * _numbers(word, rest, 'METRES', (1,))[0]
-        return Shift(way, np.zeros(3))
+        shift.way[axis] = direction * _numbers(word, rest, 'METRES', (1,))[0]
+        return shift
     if word in TURNS:
         degrees, = _numbers(word, rest, 'DEGREES', (1,))
         if abs(degrees) > MAX_TURN:
             raise WordError(f"'{line.strip()}': expected at most {MAX_TURN:g} degrees")
-        turn = np.zeros(3)
-        turn[TURNS[word]] = radians(degrees)
-        return Shift(np.zeros(3), turn)
+        shift.turn[TURNS[word]] = radians(degrees)
+        return shift
     if word == 'goto':
-        values = _numbers(word, rest, 'X Y Z [ROLL PITCH YAW]', (3, 6))
-        return _pose(values)
+        return _pose(_numbers(word, rest, 'X Y Z [ROLL PITCH YAW]', (3, 6)))
     if word == 'controller':
         if len(rest) != 1:
             raise WordError("'controller': expected one NAME after it")
@@ -287,24 +283,17 @@ def parse(line: str, poses: Mapping[str, Sequence[float]]) -> Shift | Go | Order
         if any(one < 0 for one in seconds):
             raise WordError(f"'{line.strip()}': expected SECONDS from 0")
         return Order(word, str(seconds[0]) if seconds else '')
+    if word not in ORDERS and word not in poses:
+        raise WordError(f"'{word}': expected {HELP}, or a pose of {', '.join(poses)}")
     if rest:
-        raise WordError(f"'{line.strip()}': expected nothing after '{word}'" if word in (
-            *ORDERS, *poses) else _unknown(word, poses))
-    if word in ORDERS:
-        return Order(word)
-    if word in poses:
-        return _pose(poses[word])
-    raise WordError(_unknown(word, poses))
+        raise WordError(f"'{line.strip()}': expected nothing after '{word}'")
+    return Order(word) if word in ORDERS else _pose(poses[word])
 
 
 def _pose(values):
     position = np.array(values[:3], dtype=float)
     return Go(position, rotations.from_rpy(*map(radians, values[3:])) if len(values) == 6
               else None)
-
-
-def _unknown(word, poses):
-    return f"'{word}': expected {HELP}, or a pose of {', '.join(poses)}"
 
 
 def _numbers(word, texts, wanted, counts):

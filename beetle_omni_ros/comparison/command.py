@@ -35,7 +35,7 @@ from beetle_omni_ros.control.registry import ControllerOptions
 from beetle_omni_ros.pages.page import Grid, print_grids, Terminal
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.files import write_json
+from beetle_omni_ros.runs.files import write_json, write_text
 from beetle_omni_ros.runs.metrics import failed
 
 PAGE, NUMBERS, TEXT = 'comparison.html', 'comparison.json', 'README.md'
@@ -209,13 +209,10 @@ def _write(results, flown, output, console):
     try:
         for picture in page.pictures(made):
             (output / f'{picture.name}.png').write_bytes(picture.data)
-        for name, text in ((PAGE, page.page(results, made)),
-                           (TEXT, page.markdown(results, made, how))):
-            temporary = output / f'{name}.tmp'
-            temporary.write_text(text, encoding='utf-8')
-            temporary.replace(output / name)
     except OSError as error:
         raise ParameterError(f'{output}: cannot write the page ({error.strerror})') from None
+    write_text(output / PAGE, page.page(results, made), 'page')
+    write_text(output / TEXT, page.markdown(results, made, how), 'page')
     write_json(output / NUMBERS, results)
     print_grids([_for_terminal(grids.glance(results), results, console.width)], console)
     failed = sum(bool(result['failure']) for result in flown.values())

@@ -77,40 +77,39 @@ def _kind(task):
 
 def _blocks(results, flown, task, conditions):
     """Pictures and table of a task under one set of conditions."""
-    def picture(name, caption, figure):
-        return [Picture(f'{Path(_kind(task)).stem}_{name}_{conditions}',
+    kind, groups = _kind(task), plots.of(flown, task, conditions)
+
+    def picture(name, caption, draw, *more):
+        figure = draw(groups, *more) if groups else None
+        return [Picture(f'{Path(kind).stem}_{name}_{conditions}',
                         f'{caption} ({conditions} conditions)', png(figure))] if figure else []
 
-    kind = _kind(task)
     if kind == 'waypoints':
         return [grids.waypoints(results, conditions), *picture(
             'states', 'States in a round: mean of all rounds, least to largest as a band',
-            plots.waypoints(flown, conditions))]
+            plots.waypoints)]
     if kind == 'lemniscate':
-        return [grids.lemniscate(results, conditions), *picture(
-            'path', 'Path, mean of all rounds', plots.lemniscate_path(flown, conditions)),
-            *picture('errors', 'Tracking errors in a round: mean of all rounds, least to largest '
-                     'as a band', plots.lemniscate_errors(flown, conditions))]
+        return [grids.lemniscate(results, conditions),
+                *picture('path', 'Path, mean of all rounds', plots.lemniscate_path),
+                *picture('errors', 'Tracking errors in a round: mean of all rounds, least to '
+                         'largest as a band', plots.lemniscate_errors)]
     if kind in ('force', 'torque'):
+        short = '; each torque lasts 0.05 s' if kind == 'torque' else ''
         return [*picture('errors', 'Errors in time, the disturbance dashed; × where control was '
-                         'lost; thin lines: further seeds' + (
-                             '; each torque lasts 0.05 s' if kind == 'torque' else ''),
-                         plots.disturbance(flown, kind, conditions)),
+                         f'lost; thin lines: further seeds{short}', plots.disturbance, kind),
                 grids.disturbance(results, kind, conditions)]
     if kind == 'payload':
         return [*picture('errors', 'Errors against the payload, range over the seeds; right: '
-                         'height in time', plots.payload(flown, conditions)),
-                grids.payload(results, conditions)]
+                         'height in time', plots.payload), grids.payload(results, conditions)]
     if kind == 'hover':
         return [grids.hover(results, conditions), *picture(
             'commands', 'Commands at the end of the hover, four joints and four rotors',
-            plots.hover_commands(flown, conditions))]
+            plots.hover_commands)]
     return [grids.poses(results, task, conditions),
             *picture('errors', 'Errors at the target; stars: published means, with their ranges',
-                     plots.distributions(flown, task, conditions)),
+                     plots.distributions, task),
             *picture('convergence', 'Errors after a pose was asked for: median and 10 to '
-                     '90 % band over all poses',
-                     plots.convergence(flown, task, conditions))]
+                     '90 % band over all poses', plots.convergence)]
 
 
 def pictures(made: list[Section]) -> list[Picture]:

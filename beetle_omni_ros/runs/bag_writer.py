@@ -31,6 +31,9 @@ DISTRIBUTION = 'jazzy'
 # Compression of the chunks in the MCAP file, which every reader supports; 'zstd' is like the
 # preset `zstd_fast` of rosbag2.
 COMPRESSIONS = ('none', 'zstd')
+TRANSFORMS = 'tf2_msgs/msg/TFMessage'
+TEXT = 'std_msgs/msg/String'
+PERIOD = 0.02       # [s] between transforms
 
 
 def _from_jazzy(metadata):
@@ -73,11 +76,6 @@ class JazzyWriter(Writer):
         """Finish the bag."""
         super().close()
         self.metapath.write_text(_from_jazzy(self.metapath.read_text('utf8')), 'utf8')
-
-
-TRANSFORMS = 'tf2_msgs/msg/TFMessage'
-TEXT = 'std_msgs/msg/String'
-PERIOD = 0.02       # [s] between transforms
 
 
 class FrameWriter:
@@ -191,7 +189,13 @@ class BagWriter(Recorder):
         self._epoch = int(epoch)
         self._connections: dict[str, Connection] = {}
         self._prefix = '/' + namespace.strip('/') + '/' if namespace.strip('/') else '/'
-        self._writer = _open(self.path, compression)
+        check_new(self.path, compression)
+        try:
+            self._writer: JazzyWriter | None = JazzyWriter(self.path, compression)
+            self._writer.open()
+        except (OSError, WriterError) as error:
+            reason = getattr(error, 'strerror', None) or error
+            raise BagError(f'{path}: cannot write a bag there ({reason})') from None
         for name in topics:
             self._declare(self._prefix + name, topic_of(name).type, topic_of(name).qos)
         self._frames = None
@@ -324,17 +328,6 @@ def check_new(path: str | Path, compression: str = 'none') -> None:
         raise BagError(f'{path}: {parent} is not a folder')
     if not os.access(parent, os.W_OK | os.X_OK):
         raise BagError(f'{path}: no permission to write in {parent}')
-
-
-def _open(path, compression):
-    check_new(path, compression)
-    try:
-        writer = JazzyWriter(path, compression)
-        writer.open()
-    except (OSError, WriterError) as error:
-        reason = getattr(error, 'strerror', None) or error
-        raise BagError(f'{path}: cannot write a bag there ({reason})') from None
-    return writer
 
 
 def add_meta(path: str | Path, meta: dict) -> None:

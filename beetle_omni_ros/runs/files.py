@@ -81,7 +81,8 @@ def read_table(path: str | Path, wanted: Callable[[list[str]], list[str]], expec
         raise error(f'{path}: row {number}: {cause}; expected {expected}') from None
     for name in names:
         if header.count(name) > 1:
-            raise error(f"{path}: row {number}: column '{name}' occurs twice")
+            raise error(f"{path}: row {number}: column '{name}' occurs twice; "
+                        f'expected {expected}')
     index, values = [header.index(name) for name in names], []
     for line, row in lines:
         reason = _unusable(row, header, index)

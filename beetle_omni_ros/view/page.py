@@ -5,11 +5,10 @@ import contextlib
 from dataclasses import dataclass
 import html
 import io
-from pathlib import Path
+from pathlib import PosixPath
 import socket
 import threading
 import time
-from types import SimpleNamespace
 
 import numpy as np
 import viser
@@ -39,19 +38,14 @@ SCRIPT = """<script>(() => {
 })();</script>""".replace('RENDERERS', SOFTWARE_RENDERERS)
 
 
-class _Folder:
-    """The folder of the client, as far as viser's HTTP server uses it, with the script."""
+class _Client(PosixPath):
+    """Folder and files of viser's client, with the script in its page."""
 
-    def __init__(self, path: Path):
-        self._path = path
-
-    def __truediv__(self, name: str):
-        """File of this name."""
-        path = self._path / name
-        if name != 'index.html':
-            return path
-        page = path.read_bytes().replace(b'<head>', b'<head>' + SCRIPT.encode(), 1)
-        return SimpleNamespace(is_file=lambda: True, read_bytes=lambda: page)
+    def read_bytes(self) -> bytes:
+        """Content of the file."""
+        data = super().read_bytes()
+        return data.replace(b'<head>', b'<head>' + SCRIPT.encode(), 1) \
+            if self.name == 'index.html' else data
 
 
 @contextlib.contextmanager
@@ -61,7 +55,7 @@ def served_with_script() -> Iterator[None]:
 
     def with_script(*args, **kwargs):
         if 'http_server_root' in kwargs:    # a keyword of viser's internal call
-            kwargs['http_server_root'] = _Folder(kwargs['http_server_root'])
+            kwargs['http_server_root'] = _Client(kwargs['http_server_root'])
         return server(*args, **kwargs)
 
     viser.infra.WebsockServer = with_script     # type: ignore[assignment, misc]
@@ -106,20 +100,13 @@ def _field(name, scale=1.0):
     return lambda rows: scale * rows[:, COLUMNS[name]]
 
 
-def _position_error(rows):
-    return np.linalg.norm(rows[:, COLUMNS['position']] - rows[:, COLUMNS['target_position']],
-                          axis=1, keepdims=True)
-
-
-def _orientation_error(rows):
-    return np.degrees(geodesic_angles(rows[:, COLUMNS['quaternion']],
-                                      rows[:, COLUMNS['target_quaternion']]))[:, None]
-
-
 FOUR = ('1', '2', '3', '4')
 PLOTS = (
-    Plot('position error [m]', ('',), _position_error, True),
-    Plot('orientation error [deg]', ('',), _orientation_error, True),
+    Plot('position error [m]', ('',), lambda rows: np.linalg.norm(
+        rows[:, COLUMNS['position']] - rows[:, COLUMNS['target_position']], axis=1,
+        keepdims=True), True),
+    Plot('orientation error [deg]', ('',), lambda rows: np.degrees(geodesic_angles(
+        rows[:, COLUMNS['quaternion']], rows[:, COLUMNS['target_quaternion']]))[:, None], True),
     Plot('position [m]', ('x', 'y', 'z'), _field('position')),
     Plot('tilt [deg]', FOUR, _field('tilt', 180 / np.pi)),
     Plot('thrust command [N]', FOUR, _field('thrust')),
@@ -385,16 +372,25 @@ class Page:
                 wanted = not self._run_boxes or self._run_boxes[k].value
                 robot.show(run.row, passed=passed) if wanted else robot.hide()
                 if self._labels:
-                    self._place_label(k, pose(run.row) if wanted else None)
+                    _place(self._labels[k], pose(run.row) if wanted else None,
+                           [0, 0, LABEL_HEIGHT + LABEL_STEP * k])
             # An estimate at the true pose would only tint the robot.
-            if self._show_estimate.value and _differ(*_apart(first.row, 'estimate_')):
+            metres, degrees = _apart(first.row, 'estimate_')
+            if self._show_estimate.value and (
+                    metres > ESTIMATE_SEEN[0] or degrees > ESTIMATE_SEEN[1]):
                 self._estimate.show(first.row, 'estimate_')
             else:
                 self._estimate.hide()
-            self._show_target(pose(first.row, 'target_'))
-            self._show_shadow(pose(first.row))
-            self._show_force(first.row)
-            self._move_cameras(pose(first.row))
+            placed, target = pose(first.row), pose(first.row, 'target_')
+            _place(self._target, target)
+            if target is not None:
+                self._target.wxyz = wxyz(target[1])
+            _place(self._shadow, placed and (placed[0] * [1, 1, 0], None), [0, 0, 0.001])
+            force = known(first.row, 'force')
+            self._force.visible = force is not None and placed is not None
+            if self._force.visible:
+                self._force.points = [[placed[0], placed[0] + force / WORLD_NEWTON_PER_METRE]]
+            self._move_cameras(placed)
         if time.monotonic() - self._last_panel > 1 / PANEL_RATE:
             self._last_panel = time.monotonic()
             self._status.content = status(first, headline, self._model, self._names)
@@ -420,27 +416,6 @@ class Page:
     def settling(self) -> bool:
         """Whether a browser connected a short time ago."""
         return time.monotonic() < self._newcomer + SETTLING
-
-    def _place_label(self, k, placed):
-        self._labels[k].visible = placed is not None
-        if placed is not None:
-            self._labels[k].position = placed[0] + [0, 0, LABEL_HEIGHT + LABEL_STEP * k]
-
-    def _show_target(self, target):
-        self._target.visible = target is not None
-        if target is not None:
-            self._target.position, self._target.wxyz = target[0], wxyz(target[1])
-
-    def _show_shadow(self, placed):
-        self._shadow.visible = placed is not None
-        if placed is not None:
-            self._shadow.position = (*placed[0][:2], 0.001)
-
-    def _show_force(self, row):
-        force, placed = known(row, 'force'), pose(row)
-        self._force.visible = force is not None and placed is not None
-        if self._force.visible:
-            self._force.points = [[placed[0], placed[0] + force / WORLD_NEWTON_PER_METRE]]
 
     def _move_cameras(self, placed):
         if not self._follow.value or placed is None:
@@ -475,8 +450,11 @@ def _apart(row, prefix):
             float(np.degrees(rotations.geodesic_angle(body[1], other[1]))))
 
 
-def _differ(metres, degrees):
-    return metres > ESTIMATE_SEEN[0] or degrees > ESTIMATE_SEEN[1]
+def _place(handle, placed, shift=(0, 0, 0)):
+    """Show a handle at a pose, or hide it without one."""
+    handle.visible = placed is not None
+    if placed is not None:
+        handle.position = placed[0] + shift
 
 
 def status(run: Shown, headline: str, model: Model, names: list[str]) -> str:

@@ -1,14 +1,14 @@
 """Recorded runs in the browser, read by a process each while their first seconds are shown."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field
 import os
 from pathlib import Path
 import pickle
 import subprocess
 import sys
 import threading
+from typing import NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -25,8 +25,7 @@ PART = 1000         # rows that are passed on together, after a shorter first pa
 SKIPPED = ('imu/data_raw', 'mocap/pose', 'rotor_states')
 
 
-@dataclass
-class Part:
+class Part(NamedTuple):
     """
     New data of a run.
 
@@ -40,11 +39,11 @@ class Part:
 
     """
 
-    rows: np.ndarray = field(default_factory=lambda: Rows().table)
-    states: list[tuple[float, str]] = field(default_factory=list)
-    faults: dict[str, float] = field(default_factory=dict)
-    meta: dict = field(default_factory=dict)
-    warnings: list[str] = field(default_factory=list)
+    rows: np.ndarray
+    states: Sequence[tuple[float, str]] = ()
+    faults: Mapping[str, float] = {}
+    meta: Mapping = {}
+    warnings: Sequence[str] = ()
     error: str = ''
 
 
@@ -104,11 +103,8 @@ class Recording:
         bag_files(path)
         self.path, self.name = Path(path), name or Path(path).absolute().name
         self.rows = Rows()
-        self.states: list[tuple[float, str]] = []
-        self.faults: dict[str, float] = {}
-        self.meta: dict = {}
-        self.warnings: list[str] = []
-        self.done, self._error = False, ''
+        self._take(Part(self.rows.table))
+        self.done = False
         self._changed = threading.Condition()
         root = str(Path(beetle_omni_ros.__file__).resolve().parents[1])
         self._process = subprocess.Popen(
@@ -140,15 +136,16 @@ class Recording:
         self._process.kill()
         self._process.wait()
 
+    def _take(self, part):
+        rows, self.states, self.faults, self.meta, self.warnings, self._error = part
+        self.rows.append(rows)
+
     def _take_in(self):
         try:
             while True:
                 part = pickle.load(self._process.stdout)
                 with self._changed:
-                    self._error = part.error
-                    self.rows.append(part.rows)
-                    self.states, self.faults = part.states, part.faults
-                    self.meta, self.warnings = part.meta, part.warnings
+                    self._take(part)
                     self._changed.notify_all()
         except (EOFError, pickle.UnpicklingError, OSError):
             if not len(self.rows) and not self._error:
@@ -166,7 +163,7 @@ def main(path: str) -> None:
             pickle.dump(part, output)
             output.flush()
     except BagError as error:
-        pickle.dump(Part(error=str(error)), output)
+        pickle.dump(Part(Rows().table, error=str(error)), output)
     except (BrokenPipeError, KeyboardInterrupt):
         os._exit(1)     # the reader has ended; a regular exit would report the closed output
 
