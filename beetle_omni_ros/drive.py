@@ -13,6 +13,24 @@ from beetle_omni_ros.robot.schema import parameter, ParameterError, ParameterFil
 from beetle_omni_ros.robot.yaml_file import quoted
 
 BUTTONS = ('arm', 'land', 'hold', 'home')
+NEAR = 1e-9     # [m, rad] distance from the goal that counts as arrived
+# Key -> (axis of x, y, z, roll, pitch, yaw, direction).
+MOVES = {'w': (0, 1), 's': (0, -1), 'a': (1, 1), 'd': (1, -1), 'r': (2, 1), 'f': (2, -1),
+         'o': (3, 1), 'u': (3, -1), 'i': (4, 1), 'k': (4, -1), 'j': (5, 1), 'l': (5, -1)}
+KEY_WORDS = {'t': 'arm', 'x': 'land', ' ': 'hold', 'h': 'home', '0': 'level',
+             '!': 'emergency_stop', 'c': 'controller', 'q': 'quit'}
+KEY_HELP = ('w s a d r f: forth, back, left, right, up, down    o u i k j l: roll, pitch, yaw\n'
+        't arm and take off, x land, space hold, h home, 0 level, c other controller, '
+        '! emergency stop, q quit')
+ORDER = (0, 1, 2, 5, 4, 3)      # DriveParameters.axes -> index in x, y, z, roll, pitch, yaw
+WAYS = {'forth': (0, 1), 'back': (0, -1), 'left': (1, 1), 'right': (1, -1), 'up': (2, 1),
+        'down': (2, -1)}
+TURNS = {'roll': 0, 'pitch': 1, 'yaw': 2}
+ORDERS = ('arm', 'land', 'emergency_stop', 'hold', 'level', 'where', 'help', 'quit')
+HELP = ('forth|back|left|right|up|down METRES, roll|pitch|yaw DEGREES, '
+        'goto X Y Z [ROLL PITCH YAW], controller NAME, wait [SECONDS], arm, land, hold, level, '
+        'where, emergency_stop, quit')
+MAX_TURN = 180.0    # [deg]; the shortest path to a larger rotation has the other direction
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,9 +85,6 @@ def read_named_poses(path: str | Path) -> dict:
     poses = schema.load_yaml(path)
     check_poses(poses, f"{path}: key '")
     return poses
-
-
-NEAR = 1e-9     # [m, rad] distance from the goal that counts as arrived
 
 
 class Steering:
@@ -160,17 +175,6 @@ class Steering:
         return ''
 
 
-# Key -> (axis of x, y, z, roll, pitch, yaw, direction).
-MOVES = {'w': (0, 1), 's': (0, -1), 'a': (1, 1), 'd': (1, -1), 'r': (2, 1), 'f': (2, -1),
-         'o': (3, 1), 'u': (3, -1), 'i': (4, 1), 'k': (4, -1), 'j': (5, 1), 'l': (5, -1)}
-KEY_WORDS = {'t': 'arm', 'x': 'land', ' ': 'hold', 'h': 'home', '0': 'level',
-             '!': 'emergency_stop', 'c': 'controller', 'q': 'quit'}
-KEY_HELP = ('w s a d r f: forth, back, left, right, up, down    o u i k j l: roll, pitch, yaw\n'
-        't arm and take off, x land, space hold, h home, 0 level, c other controller, '
-        '! emergency stop, q quit')
-ORDER = (0, 1, 2, 5, 4, 3)      # DriveParameters.axes -> index in x, y, z, roll, pitch, yaw
-
-
 def shift_of_key(key: str, p: DriveParameters) -> tuple[np.ndarray, np.ndarray] | None:
     """Shift by a key: (3,) [m] and (3,) roll, pitch, yaw [rad]; None for another key."""
     if key not in MOVES:
@@ -210,16 +214,6 @@ def pressed(before: Sequence[int], now: Sequence[int], p: DriveParameters) -> li
     """Names of the buttons pressed since ``before``."""
     return [name for name, number in p.buttons.items() if number < len(now) and now[number]
             and not (number < len(before) and before[number])]
-
-
-WAYS = {'forth': (0, 1), 'back': (0, -1), 'left': (1, 1), 'right': (1, -1), 'up': (2, 1),
-        'down': (2, -1)}
-TURNS = {'roll': 0, 'pitch': 1, 'yaw': 2}
-ORDERS = ('arm', 'land', 'emergency_stop', 'hold', 'level', 'where', 'help', 'quit')
-HELP = ('forth|back|left|right|up|down METRES, roll|pitch|yaw DEGREES, '
-        'goto X Y Z [ROLL PITCH YAW], controller NAME, wait [SECONDS], arm, land, hold, level, '
-        'where, emergency_stop, quit')
-MAX_TURN = 180.0    # [deg]; the shortest path to a larger rotation has the other direction
 
 
 class WordError(ValueError):

@@ -48,6 +48,13 @@ SEEDS = (0, 1)  # default; a long task is flown with the first one only
 LONG = 50.0  # [s]
 
 START_COST = 2.0  # core seconds to build simulator and controller
+TRACE_PERIOD = 0.02  # [s] between samples of a trace
+LONG_TRACE_PERIOD = 0.05  # [s] between samples in a long task
+TRACED_FINELY = 300.0  # [s] longest task with TRACE_PERIOD
+COMMAND_WINDOW = 2.0  # [s] of commands kept at the end of a flight
+BACKENDS = ('processes', 'ray')
+OBJECT_STORE = 200 * 2**20  # [byte] shared memory of a local Ray; traces are far smaller
+REACH_TIMEOUT = 5.0  # [s] for an answer of a cluster
 
 
 @dataclass(frozen=True, order=True)
@@ -145,12 +152,6 @@ def seeds_of(task: str) -> Sequence[int]:
     return SEEDS[:1] if make_task(task).duration > LONG else SEEDS
 
 
-TRACE_PERIOD = 0.02  # [s] between samples of a trace
-LONG_TRACE_PERIOD = 0.05  # [s] between samples in a long task
-TRACED_FINELY = 300.0  # [s] longest task with TRACE_PERIOD
-COMMAND_WINDOW = 2.0  # [s] of commands kept at the end of a flight
-
-
 def fly_flight(flight: Flight, task: Task, code: str | None = None) -> dict:
     """
     Fly a flight and compute its metrics; a failed flight has a result, too.
@@ -233,11 +234,6 @@ def trace(log: FlightLog, task: Task) -> dict[str, np.ndarray]:
             'command_tilt': log.command_tilt[recent],
             'command_thrust': log.command_thrust[recent]}
     return {name: values.astype(np.float32) for name, values in kept.items()}
-
-
-BACKENDS = ('processes', 'ray')
-OBJECT_STORE = 200 * 2**20  # [byte] shared memory of a local Ray; traces are far smaller
-REACH_TIMEOUT = 5.0  # [s] for an answer of a cluster
 
 
 def flight_key(flight: Flight) -> str:

@@ -15,6 +15,17 @@ from beetle_omni_ros.control import registry
 from beetle_omni_ros.pages import page
 from beetle_omni_ros.pages.page import ABSENT
 
+OURS = 'ours, simulated'
+GAZEBO = 'published, simulated (Gazebo)'
+REAL = 'published, real robot'
+PAPER = tuple(PUBLISHED)
+GROUP = {'random': GAZEBO, 'force': GAZEBO, 'torque': GAZEBO, 'waypoints': REAL,
+         'lemniscate': REAL}
+# Key of a pose error -> displayed digits, and its name.
+SINGLE = {'U_position_m': 4, 'U_orientation_deg': 2, 'L_position_m': 3, 'L_orientation_deg': 2}
+NAMES = {'U_position_m': 'U ‖p error‖ [m]', 'U_orientation_deg': 'U ‖θ error‖ [deg]',
+         'L_position_m': 'L ‖p error‖ [m]', 'L_orientation_deg': 'L ‖θ error‖ [deg]'}
+
 
 @dataclass(frozen=True)
 class Number:
@@ -56,11 +67,6 @@ class Column:
 
     controller: str
     group: str
-
-
-OURS = 'ours, simulated'
-GAZEBO = 'published, simulated (Gazebo)'
-REAL = 'published, real robot'
 
 
 @dataclass(frozen=True)
@@ -145,15 +151,6 @@ def _markdown_cell(cell, results):
     main, small = text_of(cell.main, results), text_of(cell.small, results)
     main = f'**{main}**' if cell.best else main
     return f'{main} {small}'.strip()
-
-
-PAPER = tuple(PUBLISHED)
-GROUP = {'random': GAZEBO, 'force': GAZEBO, 'torque': GAZEBO, 'waypoints': REAL,
-         'lemniscate': REAL}
-# Key of a pose error -> displayed digits, and its name.
-SINGLE = {'U_position_m': 4, 'U_orientation_deg': 2, 'L_position_m': 3, 'L_orientation_deg': 2}
-NAMES = {'U_position_m': 'U ‖p error‖ [m]', 'U_orientation_deg': 'U ‖θ error‖ [deg]',
-         'L_position_m': 'L ‖p error‖ [m]', 'L_orientation_deg': 'L ‖θ error‖ [deg]'}
 
 
 class Task:

@@ -17,6 +17,25 @@ from beetle_omni_ros.control import registry
 from beetle_omni_ros.runs import published
 from beetle_omni_ros.runs.metrics import POSE_KEYS
 
+PREFIX = 'published_'    # prefix of a controller in the publication
+# Colours of controllers outside the package, chosen by name.
+SPARE = ('#2a9d4b', '#7b4fb0', '#008c95', '#a0522d', '#6b7f1e')
+CONDITIONS = {
+    'nominal': 'simulator as measured: multibody plant, second-order servos, rotor lag, sensor '
+               'noise, every delay, state estimation by the EKF',
+    'published': "the same with the publication's randomisation, drawn from the seed: mass, "
+                 'inertia, centre of mass, sensor biases, more noise, latencies',
+}
+# Column of the publication's numbers -> its name there.
+PUBLISHED = {f'{PREFIX}{name}': entry.label for name, entry in reversed(
+    registry.SHIPPED.items()) if entry.label in published.RANDOM_POSES}
+# Key of the summary -> keys of mean and standard deviation in the metrics of a flight.
+EFFORT = {'hover_speed_m_s': ('hover_speed_mean_m_s', 'hover_speed_std_m_s'),
+          'hover_angular_speed_rad_s': ('hover_angular_speed_mean_rad_s',
+                                        'hover_angular_speed_std_rad_s'),
+          'joint_error_rad': ('joint_error_mean_rad', 'joint_error_std_rad'),
+          'thrust_N': ('thrust_mean_N', 'thrust_std_N')}
+
 
 @dataclass(frozen=True)
 class Look:
@@ -27,18 +46,6 @@ class Look:
     colour: str
     dashes: str | tuple = '-'
     marker: str = 'o'
-
-
-PREFIX = 'published_'    # prefix of a controller in the publication
-# Colours of controllers outside the package, chosen by name.
-SPARE = ('#2a9d4b', '#7b4fb0', '#008c95', '#a0522d', '#6b7f1e')
-
-CONDITIONS = {
-    'nominal': 'simulator as measured: multibody plant, second-order servos, rotor lag, sensor '
-               'noise, every delay, state estimation by the EKF',
-    'published': "the same with the publication's randomisation, drawn from the seed: mass, "
-                 'inertia, centre of mass, sensor biases, more noise, latencies',
-}
 
 
 def look(controller: str) -> Look:
@@ -61,17 +68,6 @@ def task_title(task: str) -> str:
     if task.startswith('random') and task[6:].isdigit():
         return f'{task[6:]} random poses'
     return titles.get(task, f'Poses of {Path(task).name}')
-
-
-# Column of the publication's numbers -> its name there.
-PUBLISHED = {f'{PREFIX}{name}': entry.label for name, entry in reversed(
-    registry.SHIPPED.items()) if entry.label in published.RANDOM_POSES}
-# Key of the summary -> keys of mean and standard deviation in the metrics of a flight.
-EFFORT = {'hover_speed_m_s': ('hover_speed_mean_m_s', 'hover_speed_std_m_s'),
-          'hover_angular_speed_rad_s': ('hover_angular_speed_mean_rad_s',
-                                        'hover_angular_speed_std_rad_s'),
-          'joint_error_rad': ('joint_error_mean_rad', 'joint_error_std_rad'),
-          'thrust_N': ('thrust_mean_N', 'thrust_std_N')}
 
 
 def summarise(flown: dict[Flight, dict]) -> dict:

@@ -36,6 +36,23 @@ from beetle_omni_ros.runs.metrics import L_WINDOW, REACHED_ORIENTATION, REACHED_
 from beetle_omni_ros.runs.tasks import POSE_DURATION, Task
 
 STEPS, ABSENT = 65534, -32768
+STEP = 0.01             # [s] of the time axis, or more for long flights
+MOST = 12_000           # samples of the time axis
+BEFORE = 3.0            # [s] before the first target
+STALE = 0.3             # [s] after which a value without a newer one is not drawn
+TRAJECTORY_STEP = 0.05  # [s] between the drawn poses of a trajectory
+FEW_POSES = 20          # up to this number, L and U windows are shaded
+MOST_FAULTS = 12        # marked in a chart
+MILLI = 1e3
+TINY = {'m': 1e-4, 'deg': 1e-2}  # floor of logarithmic errors
+L_COLOUR, U_COLOUR = '#eef1f5', '#cfe3d4'
+PERIOD = 10.0           # [ms] of a controller's step
+AXES = ('x [m]', 'y [m]', 'z [m]', 'roll [deg]', 'pitch [deg]', 'yaw [deg]')
+ABSURD = 1e6            # [rad, rad/s, N] values that are left out of histograms
+NARROW = 1e-9           # [rad, rad/s, N] range of a histogram below which it is widened
+BINS = 60               # of a histogram
+FEW = 3                 # poses below which no distribution is shown
+SHARES = 200            # points of a distribution
 
 
 @dataclass(frozen=True)
@@ -154,13 +171,6 @@ def scripts() -> str:
             f'<script type="module">{shipped("charts.js")}{shipped("scene.js")}</script>\n')
 
 
-STEP = 0.01             # [s] of the time axis, or more for long flights
-MOST = 12_000           # samples of the time axis
-BEFORE = 3.0            # [s] before the first target
-STALE = 0.3             # [s] after which a value without a newer one is not drawn
-TRAJECTORY_STEP = 0.05  # [s] between the drawn poses of a trajectory
-
-
 @dataclass(frozen=True)
 class Run:
     """
@@ -267,20 +277,6 @@ def target_poses(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     if not times:
         return np.zeros(0), np.zeros((0, 3)), np.zeros((0, 4))
     return np.concatenate(times), np.concatenate(positions), np.concatenate(quaternions)
-
-
-FEW_POSES = 20          # up to this number, L and U windows are shaded
-MOST_FAULTS = 12        # marked in a chart
-MILLI = 1e3
-TINY = {'m': 1e-4, 'deg': 1e-2}  # floor of logarithmic errors
-L_COLOUR, U_COLOUR = '#eef1f5', '#cfe3d4'
-PERIOD = 10.0           # [ms] of a controller's step
-AXES = ('x [m]', 'y [m]', 'z [m]', 'roll [deg]', 'pitch [deg]', 'yaw [deg]')
-ABSURD = 1e6            # [rad, rad/s, N] values that are left out of histograms
-NARROW = 1e-9           # [rad, rad/s, N] range of a histogram below which it is widened
-BINS = 60               # of a histogram
-FEW = 3                 # poses below which no distribution is shown
-SHARES = 200            # points of a distribution
 
 
 def pose(runs: list[Run], axis: TimeAxis) -> list[Chart]:

@@ -44,6 +44,11 @@ SUPERVISOR_STATUS, FAULT_KEY = 'supervisor_node: supervisor', 'fault.'
 COMPUTE_KEYS = {'median_ms': 'median', 'p99_ms': 'p99', 'max_ms': 'max',
                 'deadline_misses': 'deadline_misses', 'count': 'count'}
 """Diagnostic key -> key in ``FlightLog.compute``; the times are CPU milliseconds."""
+CHANNELS = {series: tuple(channels.items()) for series, channels in SERIES.items()}
+# [s] tolerance of a window's edges. Stamps are integer nanoseconds in a bag and floats in memory,
+# where UNIX time has a resolution of 0.24 us.
+EDGE = 1e-5
+SAME_TIME = 2.5e-3  # [s] between stamps of an estimate and of the truth that are compared
 
 
 def _empty(width):
@@ -196,9 +201,6 @@ class FlightLog:
             if not changes or changes[-1][1] != name:
                 changes.append((float(t), name))
         return changes
-
-
-CHANNELS = {series: tuple(channels.items()) for series, channels in SERIES.items()}
 
 
 class Recorder:
@@ -377,12 +379,6 @@ class Tee(Recorder):
         """Add metadata of the flight."""
         for recorder in self._recorders:
             recorder.write_meta(meta)
-
-
-# [s] tolerance of a window's edges. Stamps are integer nanoseconds in a bag and floats in memory,
-# where UNIX time has a resolution of 0.24 us.
-EDGE = 1e-5
-SAME_TIME = 2.5e-3  # [s] between stamps of an estimate and of the truth that are compared
 
 
 @dataclass(frozen=True)

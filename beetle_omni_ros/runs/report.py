@@ -22,6 +22,13 @@ from beetle_omni_ros.runs.log import FlightLog, motion
 from beetle_omni_ros.runs.metrics import metrics_by_controller, task_of
 
 MAX_RUNS = len(COLOURS)  # each run has its own colour
+MOST_ROWS = 40      # of states, faults and warnings
+DISC_RADIUS = 0.4   # of the distance between neighbouring rotors
+BALL = 0.29         # [m] height of the end-effector if the robot file has none
+SPEEDS = (0.1, 0.25, 0.5, 1, 2, 4, 8)
+VIEWS = (('angle', 'Angle'), ('top', 'Top'), ('side', 'Side'), ('front', 'Front'))
+STATE_COLOURS = {'flying': '#9cc7a8', 'takeoff': '#b9cfe6', 'landing': '#f0d29a',
+                 'fallback': '#efb08a', 'emergency_stop': '#d9534f', 'disarmed': '#dfe3e8'}
 
 
 def run_report(paths: list[Path], output: Path, *, json_path: Path | None = None,
@@ -87,15 +94,6 @@ def results_of(runs: list[Run]) -> dict:
     for run in runs:
         results.update(run.results)
     return results
-
-
-MOST_ROWS = 40      # of states, faults and warnings
-DISC_RADIUS = 0.4   # of the distance between neighbouring rotors
-BALL = 0.29         # [m] height of the end-effector if the robot file has none
-SPEEDS = (0.1, 0.25, 0.5, 1, 2, 4, 8)
-VIEWS = (('angle', 'Angle'), ('top', 'Top'), ('side', 'Side'), ('front', 'Front'))
-STATE_COLOURS = {'flying': '#9cc7a8', 'takeoff': '#b9cfe6', 'landing': '#f0d29a',
-                 'fallback': '#efb08a', 'emergency_stop': '#d9534f', 'disarmed': '#dfe3e8'}
 
 
 def make_page(runs: list[Run], results: dict) -> str:

@@ -16,6 +16,8 @@ from beetle_omni_ros.robot.yaml_file import quoted
 from beetle_omni_ros.runs.files import read_table
 
 UNIT_TOLERANCE = 0.02   # of a quaternion's squared length
+START = (0.0, 0.0, 1.0)     # [m] position after the take-off
+COLUMNS = ('x_m', 'y_m', 'z_m', 'roll_deg', 'pitch_deg', 'yaw_deg')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,10 +139,6 @@ class TargetChecks:
             return f'the stamp is {-age:.4g} s ahead, expected at most ' \
                    f'{self._p.farthest_ahead:g} s'
         return ''
-
-
-START = (0.0, 0.0, 1.0)     # [m] position after the take-off
-COLUMNS = ('x_m', 'y_m', 'z_m', 'roll_deg', 'pitch_deg', 'yaw_deg')
 
 
 def read_poses(path: str | Path, reach: float = np.inf) -> np.ndarray:

@@ -18,6 +18,14 @@ LONGEST_ARC = 5.8               # [rad]
 SEGMENTS = 16                   # lines of an arc, without the two of its tip
 TIP = 0.025                     # [m]
 WORLD_NEWTON_PER_METRE = 40.0   # external force that is drawn as one metre
+Colour = tuple[int, int, int]
+THRUST, TORQUE, FORCE = (240, 140, 30), (120, 90, 220), (210, 40, 60)
+STL_HEADER = 80         # bytes of a binary STL file before the number of triangles
+TRIANGLE = np.dtype([('normal', '<f4', 3), ('corners', '<f4', (3, 3)), ('attribute', '<u2')])
+BLADE = (40, 40, 46)
+BLADE_WIDTH, BLADE_HEIGHT = 0.14, 1.3   # of a disc's radius and height
+SIDES = 24
+EYE_RATE = 9.0      # [rad/s] highest drawn rotor speed; the real speed would flicker
 
 
 def rotor_frames(robot: RobotParameters, tilt: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -78,16 +86,6 @@ def _arc(swept):
     wings = [end - size * along + side * 0.6 * size * outward for side in (1, -1)]
     return np.concatenate([np.stack([points[:-1], points[1:]], axis=1),
                            [[end, wing] for wing in wings]])
-
-
-Colour = tuple[int, int, int]
-THRUST, TORQUE, FORCE = (240, 140, 30), (120, 90, 220), (210, 40, 60)
-STL_HEADER = 80         # bytes of a binary STL file before the number of triangles
-TRIANGLE = np.dtype([('normal', '<f4', 3), ('corners', '<f4', (3, 3)), ('attribute', '<u2')])
-BLADE = (40, 40, 46)
-BLADE_WIDTH, BLADE_HEIGHT = 0.14, 1.3   # of a disc's radius and height
-SIDES = 24
-EYE_RATE = 9.0      # [rad/s] highest drawn rotor speed; the real speed would flicker
 
 
 def wxyz(quaternion: np.ndarray) -> np.ndarray:

@@ -24,6 +24,8 @@ from beetle_omni_ros.view.drawing import FORCE, RobotDrawing, WORLD_NEWTON_PER_M
 from beetle_omni_ros.view.frames import COLUMNS, known, pose, T
 
 SOFTWARE_RENDERERS = 'SwiftShader|llvmpipe|softpipe|software|Basic Render'
+# Draws without antialiasing if the browser has no graphics card: it takes half of the time of a
+# picture that the CPU renders. viser's client requests it and has no option for it.
 SCRIPT = """<script>(() => {
   const gl = document.createElement('canvas').getContext('webgl');
   const info = gl && gl.getExtension('WEBGL_debug_renderer_info');
@@ -36,6 +38,30 @@ SCRIPT = """<script>(() => {
       ? {...options, antialias: false} : options);
   };
 })();</script>""".replace('RENDERERS', SOFTWARE_RENDERERS)
+COLOURS = ('#e4572e', '#17a398', '#5b6ee1', '#d4a017')     # of x, y, z; of rotors and joints
+RUN_COLOURS = ((228, 87, 46), (23, 163, 152), (91, 110, 225), (212, 160, 23))
+NOW = '#8a8f98'
+BEHIND, AHEAD = 6.0, 6.0        # [s] around the present that a plot shows
+HEIGHT = 150                    # [px]
+FOUR = ('1', '2', '3', '4')
+RATE = 30.0             # [Hz] of the scene
+PANEL_RATE, PLOT_RATE = 4.0, 4.0
+SHOWN_PLOTS = ('position error [m]', 'thrust command [N]')      # at the start
+ESTIMATE = ((70, 140, 250), 0.35)
+GHOST_OPACITY = 0.35
+TARGET_AXES = 0.28      # [m]
+TRAIL_POINTS = 800
+SHADOW_RADIUS, SHADOW_OPACITY = 0.24, 0.15     # of the spot below the robot [m]
+VIEW_FROM, SMALLEST_VIEW = np.array([-0.5, -0.8, 0.36]), 2.0     # [m]
+NARROW, PHONE_DISTANCE, PANEL_SHARE = 0.8, 1.6, 0.35
+SETTLING = 5.0      # [s] after a browser connects in which the page is redrawn
+NUDGE = 1e-6        # [s] added to the plots' times so that they change
+ROOM = 3.5          # [m]
+SKY = 4.0           # brightness of the ambient light, instead of reflections
+FLOOR = 10.0        # [m] to each side, with a line at each metre
+LABEL_HEIGHT, LABEL_STEP = 0.38, 0.1    # [m] above base_link; for each further run
+ESTIMATE_SEEN = 0.01, 1.0   # [m], [deg] error above which the estimate is drawn
+LOCAL = '127.0.0.1'
 
 
 class _Client(PosixPath):
@@ -63,13 +89,6 @@ def served_with_script() -> Iterator[None]:
         yield
     finally:
         viser.infra.WebsockServer = server      # type: ignore[misc]
-
-
-COLOURS = ('#e4572e', '#17a398', '#5b6ee1', '#d4a017')     # of x, y, z; of rotors and joints
-RUN_COLOURS = ((228, 87, 46), (23, 163, 152), (91, 110, 225), (212, 160, 23))
-NOW = '#8a8f98'
-BEHIND, AHEAD = 6.0, 6.0        # [s] around the present that a plot shows
-HEIGHT = 150                    # [px]
 
 
 @dataclass(frozen=True)
@@ -100,7 +119,6 @@ def _field(name, scale=1.0):
     return lambda rows: scale * rows[:, COLUMNS[name]]
 
 
-FOUR = ('1', '2', '3', '4')
 PLOTS = (
     Plot('position error [m]', ('',), lambda rows: np.linalg.norm(
         rows[:, COLUMNS['position']] - rows[:, COLUMNS['target_position']], axis=1,
@@ -148,26 +166,6 @@ def _over(times, own, values):
     """Values interpolated at other times, without NaN; None without values."""
     there = np.isfinite(values)
     return np.interp(times, own[there], values[there]) if there.any() else None
-
-
-RATE = 30.0             # [Hz] of the scene
-PANEL_RATE, PLOT_RATE = 4.0, 4.0
-SHOWN_PLOTS = ('position error [m]', 'thrust command [N]')      # at the start
-ESTIMATE = ((70, 140, 250), 0.35)
-GHOST_OPACITY = 0.35
-TARGET_AXES = 0.28      # [m]
-TRAIL_POINTS = 800
-SHADOW_RADIUS, SHADOW_OPACITY = 0.24, 0.15     # of the spot below the robot [m]
-VIEW_FROM, SMALLEST_VIEW = np.array([-0.5, -0.8, 0.36]), 2.0     # [m]
-NARROW, PHONE_DISTANCE, PANEL_SHARE = 0.8, 1.6, 0.35
-SETTLING = 5.0      # [s] after a browser connects in which the page is redrawn
-NUDGE = 1e-6        # [s] added to the plots' times so that they change
-ROOM = 3.5          # [m]
-SKY = 4.0           # brightness of the ambient light, instead of reflections
-FLOOR = 10.0        # [m] to each side, with a line at each metre
-LABEL_HEIGHT, LABEL_STEP = 0.38, 0.1    # [m] above base_link; for each further run
-ESTIMATE_SEEN = 0.01, 1.0   # [m], [deg] error above which the estimate is drawn
-LOCAL = '127.0.0.1'
 
 
 def moments(stop: threading.Event) -> Iterator[tuple[float, float]]:

@@ -23,6 +23,7 @@ STEP = 0.02         # [s] between rows
 GAP = 1.0           # [s] without any message in which no rows are made
 PART = 1000         # rows that are passed on together, after a shorter first part
 SKIPPED = ('imu/data_raw', 'mocap/pose', 'rotor_states')
+FIRST_ROWS = 60.0       # [s] timeout for the first rows of a run
 
 
 class Part(NamedTuple):
@@ -172,9 +173,6 @@ if __name__ == '__main__':
     # Import again: pickled classes must belong to this module, not to __main__.
     from beetle_omni_ros.view import recording
     recording.main(sys.argv[1])
-
-
-FIRST_ROWS = 60.0       # [s] timeout for the first rows of a run
 
 
 def run_view(runs: list[Path], *, robot: Path | None = None, urdf: Path | None = None,
