@@ -117,7 +117,7 @@ def read_run(path: str | Path) -> FlightLog:
         BagError: the bag cannot be read; the message has one line.
 
     """
-    from beetle_omni_ros.runs.bag_reader import read_bag
+    from beetle_omni_ros.runs.bag import read_bag
     return read_bag(path)
 
 

@@ -33,7 +33,7 @@ from beetle_omni_ros.nodes.graph import Graph
 from beetle_omni_ros.nodes.operator import Operator
 from beetle_omni_ros.nodes.plan import bridge_parameters, BRIDGES
 from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.runs.pose_file import COLUMNS
+from beetle_omni_ros.runs.targets import COLUMNS
 from beetle_omni_ros.runs.tasks import POSE_DURATION, WAYPOINTS
 
 PERIOD = 10.0           # s between two samples

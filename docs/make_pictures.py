@@ -19,7 +19,7 @@ import numpy as np
 import beetle_omni_ros as bo
 from beetle_omni_ros.pages.figures import COLOURS, FAINT, STYLE
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.runs.body import motion
+from beetle_omni_ros.runs.log import motion
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / 'docs' / 'tutorials' / 'pictures'

@@ -14,7 +14,7 @@ from PIL import Image
 
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.urdf import Model
-from beetle_omni_ros.view.command import names
+from beetle_omni_ros.runs.bag import names_of
 from beetle_omni_ros.view.page import Page
 from beetle_omni_ros.view.playback import Player
 from beetle_omni_ros.view.recording import Recording
@@ -33,7 +33,7 @@ def main():
     parser.add_argument('--size', type=int, nargs=2, default=(1280, 800), help='pixels')
     parser.add_argument('--output', type=Path, default=ROOT / 'docs' / 'pictures' / 'view.png')
     given = parser.parse_args()
-    recordings = [Recording(path, name) for path, name in zip(given.runs, names(given.runs))]
+    recordings = [Recording(path, name) for path, name in zip(given.runs, names_of(given.runs))]
     for recording in recordings:
         recording.wait(whole=True)
     page = Page([recording.name for recording in recordings], Model.load(),

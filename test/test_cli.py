@@ -10,7 +10,7 @@ import pytest
 from synthetic_flights import fly
 
 from beetle_omni_ros import __version__, cli
-from beetle_omni_ros.runs.bag import BagWriter
+from beetle_omni_ros.runs.bag_writer import BagWriter
 from beetle_omni_ros.runs.tasks import make_task
 
 ROOT = Path(__file__).parents[1]

@@ -14,9 +14,10 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import BatteryReading, ImuReading, JointReading, PoseReading
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.bag import BagError, BagWriter, read_bag, read_messages
-from beetle_omni_ros.runs.pose_file import COLUMNS
+from beetle_omni_ros.runs.bag import BagError, read_bag, read_messages
+from beetle_omni_ros.runs.bag_writer import BagWriter
 from beetle_omni_ros.runs.report import make_page, make_runs, results_of
+from beetle_omni_ros.runs.targets import COLUMNS
 from beetle_omni_ros.runs.tasks import make_task, WAYPOINTS
 from beetle_omni_ros.sim.faults.listed import load_faults
 

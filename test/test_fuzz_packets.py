@@ -21,7 +21,7 @@ from beetle_omni_ros.messages.values import MessageError, Odom, Wrench
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import BatteryReading, ImuReading, JointReading, RotorReading
-from beetle_omni_ros.runs.target_checks import TargetChecks
+from beetle_omni_ros.runs.targets import TargetChecks
 from beetle_omni_ros.sim.emulated import mavlink
 from beetle_omni_ros.sim.emulated.dynamixel import fast_status, packet, Receiver, status
 

@@ -18,7 +18,7 @@ from beetle_omni_ros.bringup.topics import check_topics
 from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters, ServoBusParameters
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.json_file import check_writable, write_json
+from beetle_omni_ros.runs.files import check_writable, write_json
 
 SERVOS, BOARD, ROS = PARTS = ('servos', 'board', 'ros')
 STYLES = {OK: 'green', WARN: 'yellow', FAIL: 'bold red'}

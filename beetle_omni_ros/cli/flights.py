@@ -36,7 +36,7 @@ from beetle_omni_ros.cli.options import (
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.registry import ControllerOptions, DEFAULT, owner
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.json_file import check_writable, write_json
+from beetle_omni_ros.runs.files import check_writable, write_json
 
 
 def fly(controller: ControllerOption = DEFAULT,
@@ -285,7 +285,7 @@ def film(runs: Annotated[list[Path], typer.Argument(
     check_writable(output, 'film')
     os.environ.setdefault('MUJOCO_GL', 'egl')       # MuJoCo reads it when it is imported
     try:
-        from beetle_omni_ros.film.command import run_film
+        from beetle_omni_ros.film import run_film
     except (AttributeError, ImportError, RuntimeError) as error:
         raise ParameterError(f'no off-screen OpenGL ({error}); install libegl1, libgl1-mesa-dri '
                              'and libopengl0 (apt)') from None

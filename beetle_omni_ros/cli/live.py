@@ -118,7 +118,7 @@ def view(runs: Annotated[Optional[list[Path]], typer.Argument(
                               ('--discovery', discovery)):
             if given:
                 raise ParameterError(f'{option}: expected without RUN, which is a recording')
-        from beetle_omni_ros.view.command import run_view
+        from beetle_omni_ros.view.recording import run_view
         run_view(runs, start=at, play=not paused, **shared)
         return
     if at or paused:

@@ -85,7 +85,7 @@ def joint(logs: Annotated[list[Path], typer.Argument(
 
     Example: beetle_omni identify joint slow.csv --validate fast.csv --report servos.html
     """
-    from beetle_omni_ros.runs.bag_files import runs_in
+    from beetle_omni_ros.runs.bag import runs_in
     logs = runs_in(logs)
     more = logs[1:] if validate else []     # `--validate a.csv b.csv` puts b.csv here
     from beetle_omni_ros.identify.command import run_identify_joint

@@ -8,7 +8,7 @@ import typer
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.json_file import check_writable
+from beetle_omni_ros.runs.files import check_writable
 
 UNUSABLE, FAILED, INTERRUPTED = 2, 1, 130
 CONDITIONS = ('nominal', 'published')
@@ -109,7 +109,7 @@ def check_files(*files: Path | None):
 
 def check_flight(*, task, seed, conditions, bag, compression, json_path, files):
     """Refuse unusable input before the flight starts."""
-    from beetle_omni_ros.runs.rosbag2_writer import COMPRESSIONS
+    from beetle_omni_ros.runs.bag_writer import COMPRESSIONS
     from beetle_omni_ros.runs.tasks import make_task
     if conditions not in CONDITIONS:
         raise ParameterError(f"--conditions '{conditions}': expected {' or '.join(CONDITIONS)}")
@@ -120,7 +120,7 @@ def check_flight(*, task, seed, conditions, bag, compression, json_path, files):
     make_task(task, seed)
     check_writable(json_path)
     if bag:
-        from beetle_omni_ros.runs.bag import check_new
+        from beetle_omni_ros.runs.bag_writer import check_new
         check_new(bag, compression)
 
 

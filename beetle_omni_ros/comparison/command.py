@@ -5,6 +5,7 @@ import platform
 import sys
 
 import joblib
+import numpy as np
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -14,24 +15,27 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
-from rich.table import Table
-from rich.text import Text
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.comparison import grids, page
 from beetle_omni_ros.comparison.fingerprint import commit, file_digest, policy_file, versions
-from beetle_omni_ros.comparison.grid import Grid, Number
-from beetle_omni_ros.comparison.plan import CONDITIONS, Flight, plan, TASKS
-from beetle_omni_ros.comparison.style import look
-from beetle_omni_ros.comparison.summary import summarise
-from beetle_omni_ros.comparison.sweep import check_backend, Store, sweep
+from beetle_omni_ros.comparison.flights import (
+    check_backend,
+    CONDITIONS,
+    Flight,
+    plan,
+    Store,
+    sweep,
+    TASKS,
+)
+from beetle_omni_ros.comparison.summary import look, summarise
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import guidance_of
 from beetle_omni_ros.control.registry import ControllerOptions
-from beetle_omni_ros.pages.table import Terminal
+from beetle_omni_ros.pages.page import Grid, print_grids, Terminal
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.json_file import write_json
+from beetle_omni_ros.runs.files import write_json, write_text
 from beetle_omni_ros.runs.metrics import failed
 
 PAGE, NUMBERS, TEXT = 'comparison.html', 'comparison.json', 'README.md'
@@ -205,15 +209,12 @@ def _write(results, flown, output, console):
     try:
         for picture in page.pictures(made):
             (output / f'{picture.name}.png').write_bytes(picture.data)
-        for name, text in ((PAGE, page.page(results, made)),
-                           (TEXT, page.markdown(results, made, how))):
-            temporary = output / f'{name}.tmp'
-            temporary.write_text(text, encoding='utf-8')
-            temporary.replace(output / name)
     except OSError as error:
         raise ParameterError(f'{output}: cannot write the page ({error.strerror})') from None
+    write_text(output / PAGE, page.page(results, made), 'page')
+    write_text(output / TEXT, page.markdown(results, made, how), 'page')
     write_json(output / NUMBERS, results)
-    console.print(_rich(grids.glance(results), results, console.width))
+    print_grids([_for_terminal(grids.glance(results), results, console.width)], console)
     failed = sum(bool(result['failure']) for result in flown.values())
     if failed:
         console.print(f'{failed} of {len(flown)} flights failed, see above and on the page',
@@ -221,23 +222,17 @@ def _write(results, flown, output, console):
     console.print(f'{output / PAGE}', highlight=False)
 
 
-def _rich(grid: Grid, results: dict, width: int) -> Table:
-    """Table for the terminal, without the published columns if it is narrow."""
+def _for_terminal(grid, results, width):
+    """The table as text, without the published columns if the terminal is narrow."""
     shown = [k for k, column in enumerate(grid.columns)
              if column.group != 'published' or width >= WIDE]
-    table = Table(title=grid.title, title_justify='left', title_style='bold', box=None,
-                  header_style='dim', padding=(0, 2, 0, 0))
-    table.add_column('', ratio=1)
-    for column in (grid.columns[k] for k in shown):
-        is_ours = column.group != 'published'
-        name = look(column.controller).label
-        table.add_column(Text(name if is_ours else f'published {name}'), justify='right',
-                         style=None if is_ours else 'dim')
-    for name, cells in grid.rows:
-        table.add_row(Text(name), *(Text(''.join(
-            part.text(results) if isinstance(part, Number) else part
-            for part in [*cells[k].main, *cells[k].small])) for k in shown))
-    return table
+    published = [grid.columns[k].group == 'published' for k in shown]
+    names = [look(grid.columns[k].controller).label for k in shown]
+    return Grid(grid.title, ['', *(f'published {name}' if theirs else name
+                                   for name, theirs in zip(names, published, strict=True))],
+                [[name, *(grids.text_of(cells[k].main + cells[k].small, results) for k in shown)]
+                 for name, cells in grid.rows],
+                faint_columns=frozenset(np.flatnonzero([False, *published]).tolist()))
 
 
 __all__ = ['Flight', 'run_compare']

@@ -10,14 +10,12 @@ import platform
 import re
 import subprocess
 
-from beetle_omni_ros.comparison.plan import Flight
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import PACKAGE, share_path
 
 LIBRARIES = ('casadi', 'filterpy', 'mujoco', 'numpy', 'onnxruntime', 'scipy')
 SOURCE = Path(__file__).resolve().parents[1]
-COMPARED = (SOURCE / 'comparison' / 'flight.py',)
+COMPARED = (SOURCE / 'comparison' / 'flights.py',)
 LENGTH = 16  # hexadecimal digits kept
 # How a module names the shipped parameter file that it reads.
 READ = re.compile(r"\bfile='([\w.]+\.yaml)'|share_path\('params/([\w.]+)'\)")
@@ -132,21 +130,6 @@ def own_files(controller: str) -> tuple[Path, ...]:
         top = top.parent
     return (file,) if top == file.parent else tuple(sorted(
         (top / file.relative_to(top).parts[0]).rglob('*.py')))
-
-
-def flight_key(flight: Flight) -> str:
-    """Digest of everything that determines a flight's numbers."""
-    own = own_files(flight.reference)
-    parts = [code_fingerprint(None if own else flight.reference, (*COMPARED, *own)),
-             flight.reference, flight.conditions, str(flight.seed),
-             *(file_digest(path) for path in own)]      # anew, because it may change meanwhile
-    is_file = Path(flight.task).is_file()
-    parts.append(file_digest(flight.task) if is_file else flight.task)
-    if policy := policy_file(flight.reference, flight.policy):
-        parts.append(file_digest(policy))
-    if flight.plant:
-        parts.append(RobotParameters.load(flight.plant).hash())
-    return hashlib.sha256('\n'.join(parts).encode()).hexdigest()[:LENGTH]
 
 
 def commit() -> str | None:

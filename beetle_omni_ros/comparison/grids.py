@@ -1,12 +1,23 @@
-"""Tables of a comparison, in the publication's layout where it has them."""
+"""
+Tables of a comparison, in the publication's layout where it has them.
 
+A cell is a list of texts and numbers. A number is a path in the JSON, so that page and JSON
+cannot differ.
+"""
+
+from dataclasses import dataclass, field
 from html import escape
+from itertools import groupby
+from math import isfinite
 
-from beetle_omni_ros.comparison.grid import Cell, Column, GAZEBO, Grid, Number, OURS, REAL
-from beetle_omni_ros.comparison.style import task_title
-from beetle_omni_ros.comparison.summary import PUBLISHED
+from beetle_omni_ros.comparison.summary import look, PUBLISHED, task_title
 from beetle_omni_ros.control import registry
+from beetle_omni_ros.pages import page
+from beetle_omni_ros.pages.page import ABSENT
 
+OURS = 'ours, simulated'
+GAZEBO = 'published, simulated (Gazebo)'
+REAL = 'published, real robot'
 PAPER = tuple(PUBLISHED)
 GROUP = {'random': GAZEBO, 'force': GAZEBO, 'torque': GAZEBO, 'waypoints': REAL,
          'lemniscate': REAL}
@@ -14,6 +25,132 @@ GROUP = {'random': GAZEBO, 'force': GAZEBO, 'torque': GAZEBO, 'waypoints': REAL,
 SINGLE = {'U_position_m': 4, 'U_orientation_deg': 2, 'L_position_m': 3, 'L_orientation_deg': 2}
 NAMES = {'U_position_m': 'U ‖p error‖ [m]', 'U_orientation_deg': 'U ‖θ error‖ [deg]',
          'L_position_m': 'L ‖p error‖ [m]', 'L_orientation_deg': 'L ‖θ error‖ [deg]'}
+
+
+@dataclass(frozen=True)
+class Number:
+    """A number of the results: path of keys and indices; digits None: printed with '%g'."""
+
+    path: tuple
+    digits: int | None = None
+
+    def value(self, results: dict) -> float | None:
+        """Value in the results; None if absent."""
+        for key in self.path:
+            try:
+                results = results[key]
+            except (KeyError, IndexError, TypeError):
+                return None
+        return results
+
+    def text(self, results: dict) -> str:
+        """Printed text."""
+        value = self.value(results)
+        if value is None or not isfinite(value):
+            return ABSENT
+        text = f'{value:g}' if self.digits is None else f'{value:.{self.digits}f}'
+        return text.removeprefix('-') if float(text) == 0 else text
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Main parts, small parts below, each text or Number, and whether it is the row's best."""
+
+    main: list = field(default_factory=lambda: [ABSENT])
+    small: list = field(default_factory=list)
+    best: bool = False
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column: a controller, and the group with the source of its numbers."""
+
+    controller: str
+    group: str
+
+
+@dataclass(frozen=True)
+class Grid:
+    """
+    A table.
+
+    Attributes:
+        title: one line.
+        columns: controllers, to the right of the column of row names.
+        rows: (name, cells).
+        notes: sentences below.
+        commands: shell lines that fly the table's flights.
+
+    """
+
+    title: str
+    columns: list[Column]
+    rows: list[tuple[str, list[Cell]]]
+    notes: list[str] = field(default_factory=list)
+    commands: list[str] = field(default_factory=list)
+
+
+def text_of(parts: list, results: dict) -> str:
+    """Text of a cell's main or small parts."""
+    return ''.join(part.text(results) if isinstance(part, Number) else part for part in parts)
+
+
+def html(grid: Grid, results: dict) -> str:
+    """Table, notes and commands as HTML; numbers have their path in ``data-key``."""
+    kinds = [_kind(column.group) for column in grid.columns]
+    first = [k == 0 or grid.columns[k - 1].group != column.group
+             for k, column in enumerate(grid.columns)]
+    classes = [kind + (' first' if new else '') for kind, new in zip(kinds, first, strict=True)]
+    top = '<th></th>' + ''.join(
+        f'<th colspan="{len(list(columns))}" class="group {_kind(group)}">{escape(group)}</th>'
+        for group, columns in groupby(grid.columns, lambda column: column.group))
+    head = '<th></th>' + ''.join(
+        f'<th class="{name}"><i style="background: {look(column.controller).colour}"></i>'
+        f'{escape(look(column.controller).label)}</th>'
+        for name, column in zip(classes, grid.columns, strict=True))
+    body = ''.join(
+        f'<tr><th scope="row">{escape(name)}</th>' + ''.join(
+            f'<td class="{kind}{" best" if cell.best else ""}">{_html_cell(cell, results)}</td>'
+            for kind, cell in zip(classes, cells, strict=True)) + '</tr>\n'
+        for name, cells in grid.rows)
+    notes, commands = escape(' '.join(grid.notes)), escape('\n'.join(grid.commands))
+    return (f'<figure class="table"><figcaption>{escape(grid.title)}</figcaption>'
+            f'<div class="scroll"><table><thead><tr class="groups">{top}</tr><tr>{head}</tr>'
+            f'</thead>\n<tbody>{body}</tbody></table></div>'
+            + (f'<p class="note">{notes}</p>' if notes else '')
+            + (f'<pre>{commands}</pre>' if commands else '') + '</figure>\n')
+
+
+def _kind(group):
+    return {GAZEBO: 'gazebo', REAL: 'real'}.get(group, 'ours')
+
+
+def _html_cell(cell, results):
+    main, small = (''.join(
+        f'<span data-key="{escape("/".join(map(str, part.path)))}">{part.text(results)}</span>'
+        if isinstance(part, Number) else escape(part) for part in parts)
+        for parts in (cell.main, cell.small))
+    return main + (f'<small>{small}</small>' if small else '')
+
+
+def markdown(grid: Grid, results: dict) -> str:
+    """Table, notes and commands as GitHub Markdown."""
+    several = len({column.group for column in grid.columns}) > 1
+    head = [f'{look(column.controller).label}'
+            + (f' ({column.group})' if column.group != OURS and several else '')
+            for column in grid.columns]
+    rows = [[name, *(_markdown_cell(cell, results) for cell in cells)]
+            for name, cells in grid.rows]
+    lines = [f'**{grid.title}**', '', page.markdown(['', *head], rows, numeric=True).rstrip()]
+    lines += ['', ' '.join(grid.notes)] if grid.notes else []
+    lines += ['', '```sh', *grid.commands, '```'] if grid.commands else []
+    return '\n'.join(lines) + '\n'
+
+
+def _markdown_cell(cell, results):
+    main, small = text_of(cell.main, results), text_of(cell.small, results)
+    main = f'**{main}**' if cell.best else main
+    return f'{main} {small}'.strip()
 
 
 class Task:

@@ -10,9 +10,9 @@ import matplotlib
 from matplotlib.figure import Figure
 from PIL import Image
 
-from beetle_omni_ros.comparison import grid, grids, plots
-from beetle_omni_ros.comparison.grid import Grid
-from beetle_omni_ros.comparison.style import CONDITIONS, look, task_title
+from beetle_omni_ros.comparison import grids, plots
+from beetle_omni_ros.comparison.grids import Grid
+from beetle_omni_ros.comparison.summary import CONDITIONS, look, task_title
 from beetle_omni_ros.pages import figures
 from beetle_omni_ros.pages.page import frame, shipped
 
@@ -77,40 +77,39 @@ def _kind(task):
 
 def _blocks(results, flown, task, conditions):
     """Pictures and table of a task under one set of conditions."""
-    def picture(name, caption, figure):
-        return [Picture(f'{Path(_kind(task)).stem}_{name}_{conditions}',
+    kind, groups = _kind(task), plots.of(flown, task, conditions)
+
+    def picture(name, caption, draw, *more):
+        figure = draw(groups, *more) if groups else None
+        return [Picture(f'{Path(kind).stem}_{name}_{conditions}',
                         f'{caption} ({conditions} conditions)', png(figure))] if figure else []
 
-    kind = _kind(task)
     if kind == 'waypoints':
         return [grids.waypoints(results, conditions), *picture(
             'states', 'States in a round: mean of all rounds, least to largest as a band',
-            plots.waypoints(flown, conditions))]
+            plots.waypoints)]
     if kind == 'lemniscate':
-        return [grids.lemniscate(results, conditions), *picture(
-            'path', 'Path, mean of all rounds', plots.lemniscate_path(flown, conditions)),
-            *picture('errors', 'Tracking errors in a round: mean of all rounds, least to largest '
-                     'as a band', plots.lemniscate_errors(flown, conditions))]
+        return [grids.lemniscate(results, conditions),
+                *picture('path', 'Path, mean of all rounds', plots.lemniscate_path),
+                *picture('errors', 'Tracking errors in a round: mean of all rounds, least to '
+                         'largest as a band', plots.lemniscate_errors)]
     if kind in ('force', 'torque'):
+        short = '; each torque lasts 0.05 s' if kind == 'torque' else ''
         return [*picture('errors', 'Errors in time, the disturbance dashed; × where control was '
-                         'lost; thin lines: further seeds' + (
-                             '; each torque lasts 0.05 s' if kind == 'torque' else ''),
-                         plots.disturbance(flown, kind, conditions)),
+                         f'lost; thin lines: further seeds{short}', plots.disturbance, kind),
                 grids.disturbance(results, kind, conditions)]
     if kind == 'payload':
         return [*picture('errors', 'Errors against the payload, range over the seeds; right: '
-                         'height in time', plots.payload(flown, conditions)),
-                grids.payload(results, conditions)]
+                         'height in time', plots.payload), grids.payload(results, conditions)]
     if kind == 'hover':
         return [grids.hover(results, conditions), *picture(
             'commands', 'Commands at the end of the hover, four joints and four rotors',
-            plots.hover_commands(flown, conditions))]
+            plots.hover_commands)]
     return [grids.poses(results, task, conditions),
             *picture('errors', 'Errors at the target; stars: published means, with their ranges',
-                     plots.distributions(flown, task, conditions)),
+                     plots.distributions, task),
             *picture('convergence', 'Errors after a pose was asked for: median and 10 to '
-                     '90 % band over all poses',
-                     plots.convergence(flown, task, conditions))]
+                     '90 % band over all poses', plots.convergence)]
 
 
 def pictures(made: list[Section]) -> list[Picture]:
@@ -151,7 +150,7 @@ def facts(results: dict) -> list[str]:
     lines = [code, f"{len(results['flights'])} flights, {failed} failed; seeds "
                    f"{', '.join(map(str, meta['seeds']))}",
              f"{meta['cpu_s'] / 60:.1f} core minutes on {meta['machine']['processor']}"]
-    lines += [f"simulated plant: {meta['plant']}"] * bool(meta.get('plant'))
+    lines += [f'simulated plant: {plant}' for plant in filter(None, [meta.get('plant')])]
     lines += [f'{look(name).label}: policy {digest}' for name, digest in meta['policies'].items()]
     return lines
 
@@ -182,7 +181,7 @@ def _anchor(title):
 
 
 def _html_section(section, results):
-    blocks = ''.join(grid.html(block, results) if isinstance(block, Grid) else
+    blocks = ''.join(grids.html(block, results) if isinstance(block, Grid) else
                      f'<figure><div class="scroll"><img alt="{escape(block.caption)}" '
                      f'src="data:image/png;base64,{b64encode(block.data).decode()}"></div>'
                      f'<p class="note">{escape(block.caption)}.</p></figure>'
@@ -206,7 +205,7 @@ def markdown(results: dict, made: list[Section], how: str = '') -> str:
     for section in made:
         parts.append(f'## {section.title}\n')
         parts += [section.text + '\n'] if section.text else []
-        parts += [grid.markdown(block, results) if isinstance(block, Grid) else
+        parts += [grids.markdown(block, results) if isinstance(block, Grid) else
                   f'![{block.caption}]({block.name}.png)\n\n{block.caption}.\n'
                   for block in section.blocks]
     return '\n'.join(parts)

@@ -4,13 +4,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 import numpy as np
 
-from beetle_omni_ros.comparison.plan import Flight
-from beetle_omni_ros.comparison.style import look
-from beetle_omni_ros.comparison.summary import PUBLISHED
+from beetle_omni_ros.comparison.flights import Flight
+from beetle_omni_ros.comparison.summary import look, PUBLISHED
 from beetle_omni_ros.pages.figures import FAINT, INK, panels, WIDTH
 from beetle_omni_ros.runs import lemniscate as curve
 from beetle_omni_ros.runs import published
-from beetle_omni_ros.runs.body import roll_pitch_yaw
+from beetle_omni_ros.runs.log import roll_pitch_yaw
 from beetle_omni_ros.runs.metrics import L_WINDOW, REACHED_ORIENTATION, REACHED_POSITION, U_WINDOW
 from beetle_omni_ros.runs.tasks import make_task, POSE_DURATION, WAYPOINTS
 
@@ -23,9 +22,12 @@ SHOWN = {'position': 2.0, 'orientation': 180.0}  # largest limit of a disturbanc
 HOVER_SHOWN = 0.5  # [s] of commands
 
 
-def of(flown: dict[Flight, dict], task: str, conditions: str) -> dict[str, list[dict]]:
-    """Results with a trace: controller -> one result for each seed."""
-    chosen: dict[str, list[dict]] = {}
+Groups = dict[str, list[dict]]      # controller -> one result with a trace for each seed
+
+
+def of(flown: dict[Flight, dict], task: str, conditions: str) -> Groups:
+    """Results with a trace of a task under one set of conditions."""
+    chosen: Groups = {}
     for flight, result in flown.items():
         if (flight.task, flight.conditions) == (task, conditions) and result['trace']:
             chosen.setdefault(flight.controller, []).append(result)
@@ -45,9 +47,8 @@ def label_once(figure: Figure, axes, columns: int = 6) -> None:
                   handlelength=2.4, columnspacing=1.4, borderaxespad=0.2)
 
 
-def distributions(flown: dict, task: str, conditions: str) -> Figure | None:
+def distributions(groups: Groups, task: str) -> Figure | None:
     """Position against orientation errors at the target, and their histograms."""
-    groups = of(flown, task, conditions)
     points = {name: _points(results) for name, results in groups.items()}
     points = {name: values for name, values in points.items() if len(values)}
     if not points:
@@ -119,11 +120,8 @@ def _reached_box(panel):
     panel.set_ylabel('U orientation error [deg]')
 
 
-def convergence(flown: dict, task: str, conditions: str) -> Figure | None:
+def convergence(groups: Groups) -> Figure:
     """Errors in the 8 s of a pose: median and 10 to 90 % band over all poses."""
-    groups = of(flown, task, conditions)
-    if not groups:
-        return None
     figure, axes = panels(1, 2, height=2.8)
     grid = np.arange(0.0, POSE_DURATION, STEP)
     for name, results in groups.items():
@@ -162,11 +160,8 @@ def _folded(results, key, grid):
     return np.array(rows)
 
 
-def waypoints(flown: dict, conditions: str) -> Figure | None:
+def waypoints(groups: Groups) -> Figure:
     """States over one round of the waypoints: mean of all rounds, minimum to maximum as a band."""
-    groups = of(flown, 'waypoints', conditions)
-    if not groups:
-        return None
     duration = len(WAYPOINTS) * POSE_DURATION
     grid = np.arange(0.0, duration, STEP)
     figure, axes = panels(4, 2, height=1.35, sharex=True)
@@ -212,11 +207,8 @@ def _rounds(results, grid, duration):
     return np.array(rounds)
 
 
-def disturbance(flown: dict, kind: str, conditions: str) -> Figure | None:
+def disturbance(groups: Groups, kind: str) -> Figure:
     """Errors over time with the disturbance dashed, as in the publication."""
-    groups = of(flown, kind, conditions)
-    if not groups:
-        return None
     unit = 'N' if kind == 'force' else 'N m'
     figure, axes = panels(2, height=2.1, sharex=True)
     times, levels = _levels(make_task(kind))
@@ -270,11 +262,8 @@ def _error_curve(panel, result, what, name, k):
     return float(np.max(shown)) if shown.size else 0.0
 
 
-def payload(flown: dict, conditions: str) -> Figure | None:
+def payload(groups: Groups) -> Figure:
     """Steady errors against the mass, and the height over time."""
-    groups = of(flown, 'payload', conditions)
-    if not groups:
-        return None
     figure, axes = panels(1, 3, height=2.7, width_ratios=(1, 1, 1.5))
     for number, (name, results) in enumerate(groups.items()):
         style = look(name)
@@ -332,18 +321,18 @@ def _laps(results, keys):
     return grid, np.array(rounds)
 
 
-def lemniscate_path(flown: dict, conditions: str) -> Figure | None:
+def lemniscate_path(groups: Groups) -> Figure | None:
     """Mean path of all rounds in space, from above and from the side."""
-    groups = {name: rounds for name, results in of(flown, 'lemniscate', conditions).items()
-              if len((rounds := _laps(results, ('position',))[1]))}
-    if not groups:
+    laps = {name: rounds for name, results in groups.items()
+            if len((rounds := _laps(results, ('position',))[1]))}
+    if not laps:
         return None
     figure = Figure(figsize=(WIDTH, 4.1), layout='constrained')
     parts = figure.add_gridspec(2, 2, width_ratios=(1.15, 1), height_ratios=(1.75, 1))
     space = figure.add_subplot(parts[:, 0], projection='3d')
     above = figure.add_subplot(parts[0, 1])
     side = figure.add_subplot(parts[1, 1], sharex=above)
-    for name, rounds in groups.items():
+    for name, rounds in laps.items():
         path = np.vstack([rounds.mean(axis=0), rounds.mean(axis=0)[:1]])
         _path(space, above, side, path, look(name).colour, ls=look(name).dashes, lw=1.5,
               label=look(name).label)
@@ -370,9 +359,8 @@ def _path(space, above, side, path, colour, **style):
     side.plot(path[:, 0], path[:, 2], color=colour, **style)
 
 
-def lemniscate_errors(flown: dict, conditions: str) -> Figure | None:
+def lemniscate_errors(groups: Groups) -> Figure | None:
     """Tracking errors over a round: mean of all rounds, minimum to maximum as a band."""
-    groups = of(flown, 'lemniscate', conditions)
     figure, axes = panels(2, height=1.6, sharex=True)
     drawn = False
     for name, results in groups.items():
@@ -395,9 +383,8 @@ def lemniscate_errors(flown: dict, conditions: str) -> Figure | None:
     return figure
 
 
-def hover_commands(flown: dict, conditions: str) -> Figure | None:
+def hover_commands(groups: Groups) -> Figure | None:
     """Commands in the last half second of a hover, which show chatter."""
-    groups = of(flown, 'hover', conditions)
     groups = {name: results for name, results in groups.items()
               if len(results[0]['trace']['command_t'])}
     if not groups:

@@ -5,18 +5,29 @@ The summary is part of the JSON file, and the page takes each of its numbers fro
 """
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from math import isfinite
+from pathlib import Path
+from zlib import crc32
 
 import numpy as np
 
-from beetle_omni_ros.comparison import style
-from beetle_omni_ros.comparison.plan import Flight
+from beetle_omni_ros.comparison.flights import Flight
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.runs import published
 from beetle_omni_ros.runs.metrics import POSE_KEYS
 
+PREFIX = 'published_'    # prefix of a controller in the publication
+# Colours of controllers outside the package, chosen by name.
+SPARE = ('#2a9d4b', '#7b4fb0', '#008c95', '#a0522d', '#6b7f1e')
+CONDITIONS = {
+    'nominal': 'simulator as measured: multibody plant, second-order servos, rotor lag, sensor '
+               'noise, every delay, state estimation by the EKF',
+    'published': "the same with the publication's randomisation, drawn from the seed: mass, "
+                 'inertia, centre of mass, sensor biases, more noise, latencies',
+}
 # Column of the publication's numbers -> its name there.
-PUBLISHED = {f'{style.PUBLISHED}{name}': entry.label for name, entry in reversed(
+PUBLISHED = {f'{PREFIX}{name}': entry.label for name, entry in reversed(
     registry.SHIPPED.items()) if entry.label in published.RANDOM_POSES}
 # Key of the summary -> keys of mean and standard deviation in the metrics of a flight.
 EFFORT = {'hover_speed_m_s': ('hover_speed_mean_m_s', 'hover_speed_std_m_s'),
@@ -24,6 +35,39 @@ EFFORT = {'hover_speed_m_s': ('hover_speed_mean_m_s', 'hover_speed_std_m_s'),
                                         'hover_angular_speed_std_rad_s'),
           'joint_error_rad': ('joint_error_mean_rad', 'joint_error_std_rad'),
           'thrust_N': ('thrust_mean_N', 'thrust_std_N')}
+
+
+@dataclass(frozen=True)
+class Look:
+    """Label and text of a controller, and its line: colour, dashes, marker."""
+
+    label: str
+    text: str
+    colour: str
+    dashes: str | tuple = '-'
+    marker: str = 'o'
+
+
+def look(controller: str) -> Look:
+    """Look of a controller, or of its published counterpart."""
+    name = controller.removeprefix(PREFIX)
+    entry = registry.SHIPPED.get(name)
+    if entry is None:
+        return Look(name, '', SPARE[crc32(name.encode()) % len(SPARE)], (0, (4, 1, 1, 1)), 'X')
+    line = entry.line
+    if name != controller:
+        return Look(entry.label, 'the publication', line.colour, ':', '*')
+    return Look(entry.label, entry.description, line.colour, line.dashes, line.marker)
+
+
+def task_title(task: str) -> str:
+    """Heading of a task."""
+    titles = {'waypoints': 'Five waypoints', 'lemniscate': '3D lemniscate',
+              'force': 'Force disturbance', 'torque': 'Torque disturbance',
+              'payload': 'Payload', 'hover': 'Steady hover'}
+    if task.startswith('random') and task[6:].isdigit():
+        return f'{task[6:]} random poses'
+    return titles.get(task, f'Poses of {Path(task).name}')
 
 
 def summarise(flown: dict[Flight, dict]) -> dict:

@@ -20,11 +20,10 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.urdf import description
 from beetle_omni_ros.runs import metrics as metrics_of_runs
 from beetle_omni_ros.runs import table
-from beetle_omni_ros.runs.bag import BagWriter
-from beetle_omni_ros.runs.json_file import write_json
-from beetle_omni_ros.runs.log import FlightLog
-from beetle_omni_ros.runs.pose_file import check_steps
-from beetle_omni_ros.runs.recorder import LogRecorder, Tee
+from beetle_omni_ros.runs.bag_writer import BagWriter
+from beetle_omni_ros.runs.files import write_json
+from beetle_omni_ros.runs.log import FlightLog, LogRecorder, Tee
+from beetle_omni_ros.runs.targets import check_steps
 from beetle_omni_ros.runs.tasks import make_task, Task
 from beetle_omni_ros.sim.faults import Fault
 from beetle_omni_ros.sim.faults.listed import load_faults

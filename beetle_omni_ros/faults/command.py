@@ -26,10 +26,10 @@ from beetle_omni_ros.faults.landings import (
     LandingTrial,
 )
 from beetle_omni_ros.faults.trial import fly_trial, Trial
-from beetle_omni_ros.pages.table import print_grids
+from beetle_omni_ros.pages.page import print_grids
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.json_file import check_writable, write_json
+from beetle_omni_ros.runs.files import check_writable, write_json
 from beetle_omni_ros.sim.faults.listed import FaultList
 
 PAGE = 'faults.html'

@@ -13,7 +13,7 @@ from beetle_omni_ros.evaluation.loop import FlightLoop
 from beetle_omni_ros.faults.watch import FlightWatch
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.runs.recorder import Tee
+from beetle_omni_ros.runs.log import Tee
 from beetle_omni_ros.safety.events import INFO
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.sim.faults import Fault

@@ -8,8 +8,7 @@ from urllib.parse import quote
 import numpy as np
 
 from beetle_omni_ros.faults.trial import Trial
-from beetle_omni_ros.pages.page import frame, section, verdict_head
-from beetle_omni_ros.pages.table import ABSENT, Grid, html, markdown
+from beetle_omni_ros.pages.page import ABSENT, frame, Grid, html, markdown, section, verdict_head
 from beetle_omni_ros.sim.faults.listed import OutcomeLimits
 
 BEGIN = '<!-- faults: begin, written by beetle_omni faults --docs -->'

@@ -12,8 +12,8 @@ from beetle_omni_ros.evaluation.compute import collector_off
 from beetle_omni_ros.faults.flight import ALL_STARTS, Flight, OFF, Watcher
 from beetle_omni_ros.faults.watch import as_expected
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.runs.bag import BagWriter
-from beetle_omni_ros.runs.bag_reader import read_bag
+from beetle_omni_ros.runs.bag import read_bag
+from beetle_omni_ros.runs.bag_writer import BagWriter
 from beetle_omni_ros.sim.faults.listed import FaultList, FlightPlan
 
 IN_FLIGHT = ('flying', 'fallback')

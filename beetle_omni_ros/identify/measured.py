@@ -25,7 +25,7 @@ from beetle_omni_ros.robot.effects import CATALOGUE, settings
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import load_yaml
-from beetle_omni_ros.runs.csv_table import LogError
+from beetle_omni_ros.runs.files import LogError
 
 MILLI = 1e3
 DRAWS = 4000            # of the parameters, whose quantiles are the intervals

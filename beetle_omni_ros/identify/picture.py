@@ -12,7 +12,7 @@ from beetle_omni_ros.identify.servo.log import JointLog
 from beetle_omni_ros.identify.servo.model import INDEX, simulate
 from beetle_omni_ros.identify.servo.robot import file_sets
 from beetle_omni_ros.pages.figures import COLOURS, FAINT, INK, legend, panels, STYLE
-from beetle_omni_ros.pages.table import Grid
+from beetle_omni_ros.pages.page import Grid
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 

@@ -7,7 +7,7 @@ import yaml
 from beetle_omni_ros.robot.parameters import find_robot
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.json_file import check_writable, write_text
+from beetle_omni_ros.runs.files import check_writable, write_text
 
 SHIPPED = 'robot.yaml'
 

@@ -15,7 +15,7 @@ from beetle_omni_ros.nodes.command_source import CommandSource
 from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import parameter, ParameterError
-from beetle_omni_ros.runs.target_checks import TargetChecks
+from beetle_omni_ros.runs.targets import TargetChecks
 
 ODOM_AGE = 0.05         # s, no command answers an older estimate
 JOINT_AGE = 0.1         # s

@@ -12,12 +12,18 @@ import numpy as np
 from rich.console import Console
 from sensor_msgs.msg import Joy
 
+from beetle_omni_ros import drive
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import PoseTarget
-from beetle_omni_ros.drive import keys, words
-from beetle_omni_ros.drive.parameters import DriveParameters, read_named_poses
-from beetle_omni_ros.drive.steering import Steering
-from beetle_omni_ros.drive.words import Go, Order, Shift, WordError
+from beetle_omni_ros.drive import (
+    DriveParameters,
+    Go,
+    Order,
+    read_named_poses,
+    Shift,
+    Steering,
+    WordError,
+)
 from beetle_omni_ros.messages.topics import SENSOR
 from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes import wire
@@ -27,7 +33,7 @@ from beetle_omni_ros.nodes.runner import sigterm_as_interrupt
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.target_checks import TargetChecks
+from beetle_omni_ros.runs.targets import TargetChecks
 
 OK, FAILED = 0, 1
 PERIOD = 0.05           # s between two targets
@@ -202,7 +208,7 @@ def run_drive(source: str, *, parameters: Path | None = None, poses: Path | None
 class _Keyboard:
     """Actions from single keys of a terminal."""
 
-    help = keys.HELP
+    help = drive.KEY_HELP
 
     def __init__(self, driver, p, poses, say):
         self._p, self._poses, self.done = p, poses, False
@@ -222,14 +228,14 @@ class _Keyboard:
         found = []
         while select.select([sys.stdin], [], [], 0)[0]:
             for key in os.read(sys.stdin.fileno(), 64).decode(errors='replace') or 'q':
-                shift, word = keys.shift_of_key(key, self._p), keys.WORDS.get(key)
+                shift, word = drive.shift_of_key(key, self._p), drive.KEY_WORDS.get(key)
                 if word == 'quit':
                     self.done = True
                     return found
                 if shift:
                     found.append(Shift(*shift))
                 elif word in self._poses:
-                    found.append(words.parse(word, self._poses))
+                    found.append(drive.parse(word, self._poses))
                 elif word:
                     found.append(Order(word))
         return found
@@ -250,8 +256,9 @@ class _Joystick:
         if driver.time() - driver.joy_at > p.joystick_timeout:
             return []
         before, self._buttons = self._buttons, tuple(driver.buttons)
-        found = [words.parse(name, self._poses) for name in keys.pressed(before, self._buttons, p)]
-        way, turn = keys.shift_of_sticks(driver.axes, seconds, p)
+        found = [drive.parse(name, self._poses)
+                 for name in drive.pressed(before, self._buttons, p)]
+        way, turn = drive.shift_of_sticks(driver.axes, seconds, p)
         if driver.steering is not None and (way.any() or turn.any()):
             found.append(Shift(way, turn))
         return found
@@ -260,7 +267,7 @@ class _Joystick:
 class _Terminal:
     """Actions from lines of standard input; at its end the last one is carried out."""
 
-    help = f'{words.HELP}, or the name of a pose'
+    help = f'{drive.HELP}, or the name of a pose'
     open = staticmethod(nullcontext)
 
     def __init__(self, driver, p, poses, say):
@@ -276,7 +283,7 @@ class _Terminal:
             if line is None:
                 break
             try:
-                action = words.parse(line, self._poses)
+                action = drive.parse(line, self._poses)
             except WordError as error:
                 self._say(str(error))
                 continue

@@ -26,8 +26,9 @@ from beetle_omni_ros.nodes.runner import signals_ignored, sigterm_as_interrupt
 from beetle_omni_ros.robot.parameters import find_robot, RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError, RunError
 from beetle_omni_ros.runs import table
-from beetle_omni_ros.runs.bag import add_meta, BagError, check_new, read_bag
-from beetle_omni_ros.runs.json_file import check_writable, write_json
+from beetle_omni_ros.runs.bag import BagError, read_bag
+from beetle_omni_ros.runs.bag_writer import add_meta, check_new
+from beetle_omni_ros.runs.files import check_writable, write_json
 from beetle_omni_ros.runs.metrics import failed, metrics
 from beetle_omni_ros.runs.tasks import make_task, Task
 from beetle_omni_ros.sim.faults import listed

@@ -23,9 +23,9 @@ from beetle_omni_ros.nodes.wire import AnyQosSubscription
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.robot.urdf import Model
-from beetle_omni_ros.view.command import announce
 from beetle_omni_ros.view.frames import Sampler
 from beetle_omni_ros.view.live import Live
+from beetle_omni_ros.view.recording import announce
 
 # Only the newest message of these is read for each picture. Of EVENTS and TARGETS, every message
 # is read.

@@ -11,8 +11,8 @@ from beetle_omni_ros.nodes import health, wire
 from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.robot.schema import NAMES, parameter, ParameterError
 from beetle_omni_ros.robot.urdf import description
-from beetle_omni_ros.runs.bag import BagError, BagWriter
-from beetle_omni_ros.runs.rosbag2_writer import COMPRESSIONS
+from beetle_omni_ros.runs.bag import BagError
+from beetle_omni_ros.runs.bag_writer import BagWriter, COMPRESSIONS
 
 FLUSH_PERIOD = 0.4      # s; a crash loses only messages after the last flush
 HELD = 1000             # messages at most that wait for the first simulated time

@@ -1,10 +1,126 @@
-"""HTML structure and style of a page."""
+"""Tables of text for the terminal, as Markdown and as HTML, and structure and style of pages."""
 
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
+import os
+import sys
 
-from beetle_omni_ros.pages.table import Grid, html
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
 from beetle_omni_ros.robot.resources import PACKAGE
+
+ABSENT = '–'
+SPACE = 2               # characters between columns
+LONGEST_TITLE = 78      # characters that fit on one line of a terminal
+PUBLISHED = ' class="published"'
+LONG = ' class="long"'
+LONGEST_CELL = 45       # characters that fit on one line of a page's cell
+
+
+class Terminal(Console):
+    """The console of a command, which still writes its files after `| head` has ended."""
+
+    def on_broken_pipe(self) -> None:
+        """Discard all further output."""
+        self.quiet = True
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+@dataclass(frozen=True)
+class Grid:
+    """
+    A table of text.
+
+    Attributes:
+        title: one line.
+        header: titles of the columns.
+        rows: cells of each row.
+        faint: indices of rows with published results.
+        faint_columns: indices of columns with published results.
+        note: meaning of the columns, below the title.
+
+    """
+
+    title: str
+    header: list[str]
+    rows: list[list[str]]
+    faint: frozenset[int] = frozenset()
+    faint_columns: frozenset[int] = frozenset()
+    note: str = ''
+
+
+def print_grids(shown: list[Grid], console: Console) -> None:
+    """Print tables to the terminal."""
+    for grid in shown:
+        console.print(_rich(grid, console.width), crop=False)
+        if grid.note:
+            console.print(grid.note, style='dim', highlight=False, markup=False)
+
+
+def _rich(grid, available):
+    widths = _widths(list(zip(grid.header, *grid.rows, strict=True)), available)
+    total = _total(widths)
+    table = Table(title=Text(grid.title), title_justify='left', title_style='', box=None,
+                  min_width=min(len(grid.title), LONGEST_TITLE), header_style='dim',
+                  padding=(0, SPACE, 0, 0), width=total if total > available else None)
+    for k, (name, width) in enumerate(zip(grid.header, widths, strict=True)):
+        table.add_column(Text(name), justify='left' if k == 0 else 'right', width=width,
+                         style='dim' if k in grid.faint_columns else None)
+    for k, row in enumerate(grid.rows):
+        table.add_row(*(Text(cell) for cell in row),
+                      style='dim' if k in grid.faint else None)
+    return table
+
+
+def _widths(columns, available):
+    """
+    Widths with which lines break between words only.
+
+    Headers are broken before cells. The sum exceeds ``available`` if words alone need more. The
+    first column is never broken.
+    """
+    words = [[max(map(len, cell.split() or [''])) for cell in column] for column in columns]
+    widths = [max(map(len, column)) for column in columns]
+    for least in ([max(head[0], *map(len, column[1:]), 0)
+                   for head, column in zip(words, columns, strict=True)], list(map(max, words))):
+        least[0] = widths[0]
+        while _total(widths) > available and widths != least:
+            k = max(range(len(widths)), key=lambda k: (widths[k] > least[k], widths[k]))
+            widths[k] -= 1
+    return widths
+
+
+def _total(widths):
+    return sum(widths) + SPACE * len(widths)
+
+
+def markdown(header: Sequence[str], rows: Iterable[Sequence[str]], numeric: bool = False) -> str:
+    """Return GitHub Markdown; ``numeric`` aligns all columns but the first to the right."""
+    rule = ['---'] + ['---:' if numeric else '---'] * (len(header) - 1)
+    return ''.join('| ' + ' | '.join(cell.replace('|', '\\|') for cell in line) + ' |\n'
+                   for line in (header, rule, *rows))
+
+
+def html(grid: Grid) -> str:
+    """Return a table as HTML."""
+    def cell(tag, text, row, column):
+        faint = row in grid.faint or column in grid.faint_columns
+        style = PUBLISHED if faint else LONG if len(text) > LONGEST_CELL else ''
+        return f'<{tag}{style}>{escape(text)}</{tag}>'
+
+    head = ''.join(cell('th', text, None, k) for k, text in enumerate(grid.header))
+    body = ''.join(
+        '<tr>' + ''.join(cell('td', text, row, k) for k, text in enumerate(cells)) + '</tr>\n'
+        for row, cells in enumerate(grid.rows))
+    note = f'<p class="note">{escape(grid.note)}</p>' if grid.note else ''
+    title = f'<figcaption>{escape(grid.title)}</figcaption>' if grid.title else ''
+    return (f'<figure class="table">{title}{note}'
+            f'<div class="scroll"><table><thead><tr>{head}</tr></thead>\n'
+            f'<tbody>{body}</tbody></table></div></figure>\n')
 
 
 def shipped(name: str) -> str:

@@ -1,231 +1,384 @@
-"""Writing rosbag2 folders (metadata.yaml and MCAP) without ROS."""
+"""
+Reading of rosbag2 folders (metadata.yaml and MCAP) without ROS, also of truncated files.
 
-from __future__ import annotations
+Flights are read into a log, or incrementally into a recorder.
+"""
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Container, Iterable, Iterator
+from dataclasses import replace
+from itertools import islice
 import json
-import os
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
-from rosbags.interfaces import Connection
-from rosbags.rosbag2 import WriterError
-import yaml
+from mcap.opcode import Opcode
+from mcap.records import Channel, Message, Schema
+from mcap.stream_reader import MAGIC_SIZE, StreamReader
+from mcap.writer import MCAP0_MAGIC
+import numpy as np
 
-from beetle_omni_ros.messages.bag_types import BAG, offered, to_bytes, TYPESTORE
-from beetle_omni_ros.messages.conversions import nanoseconds
-from beetle_omni_ros.messages.topics import ALL, EVENT, Qos, topic_of, TOPICS
-from beetle_omni_ros.robot.yaml_file import read_yaml
-from beetle_omni_ros.runs.bag_files import BagError, read_messages
-from beetle_omni_ros.runs.bag_reader import META_KEY, read_bag
-from beetle_omni_ros.runs.frames import FrameWriter
-from beetle_omni_ros.runs.log import RUN_STATUS
-from beetle_omni_ros.runs.recorder import Recorder
-from beetle_omni_ros.runs.rosbag2_writer import COMPRESSIONS, JazzyWriter
+from beetle_omni_ros.control.base import TrajectoryTarget
+from beetle_omni_ros.messages.bag_types import from_bytes
+from beetle_omni_ros.messages.columns import read_all
+from beetle_omni_ros.messages.conversions import from_nanoseconds
+from beetle_omni_ros.messages.topics import (
+    controller_of,
+    is_ambiguous,
+    split_topic,
+    topic_of,
+    TOPICS,
+)
+from beetle_omni_ros.robot.yaml_file import quoted, read_yaml, YamlError
+from beetle_omni_ros.runs.log import FlightLog, LogRecorder, Recorder, SERIES_OF
+
+AT_ONCE = 4096      # messages that are read together
+META_KEY = 'beetle_omni'  # under custom_data of metadata.yaml
+
+# Text entries of the metadata that readers of a log rely on, and their longest length.
+META_TEXTS = ('task', 'conditions', 'robot', 'plant', 'controller', 'guidance', 'version')
+LONGEST_TEXT = 250
 
 
-class BagWriter(Recorder):
+class BagError(ValueError):
+    """A bag cannot be written or read; the text names the folder or file."""
+
+
+class RawMessage(NamedTuple):
+    """One message: full topic, ROS type, CDR, time of recording [s]."""
+
+    topic: str
+    type: str
+    data: bytes
+    received: float
+
+
+class Messages(NamedTuple):
+    """Messages of one topic in the order of the file: CDR, (N,) times of recording [s]."""
+
+    topic: str
+    type: str
+    data: list[bytes]
+    received: np.ndarray
+
+
+class _WholeReads:
+    """A stream whose reads are complete or raise EOFError, to detect the end of a cut file."""
+
+    def __init__(self, stream):
+        self._stream = stream
+
+    def read(self, size):
+        data = self._stream.read(size)
+        if len(data) < size:
+            raise EOFError
+        return data
+
+
+class _Records(StreamReader):
+    """Records of a file, without the content of message indices, which is not needed."""
+
+    def _read_record(self, opcode, length):
+        return None if opcode == Opcode.MESSAGE_INDEX else super()._read_record(opcode, length)
+
+
+def bag_files(path: str | Path) -> list[Path]:
     """
-    Writes one bag; a context manager, or call :meth:`close`.
+    Find the MCAP files of a RUN.
 
-    Topics are declared before the first message, because rosbag2 cannot read a chunk in which a
-    declaration follows messages. A topic that is declared later starts a new chunk.
-    """
-
-    keeps_covariances = True
-
-    def __init__(self, path: str | Path, meta: dict | None = None, *, namespace: str = '',
-                 topics: Sequence[str] = tuple(TOPICS), compression: str = 'none',
-                 description: str = '', epoch: int = 0):
-        """
-        Create the folder and the bag in it.
-
-        Args:
-            path: folder to create; it must not exist.
-            meta: metadata of the flight: task, conditions, seed, robot, version.
-            namespace: namespace of the topics, '' or e.g. '/robot1'.
-            topics: names to declare, see :func:`~beetle_omni_ros.messages.topics.topic_of`.
-            compression: compression of the chunks in the file, 'none' or 'zstd'.
-            description: URDF of the robot, to record its frames; '' for none.
-            epoch: UNIX time of time 0 [s], so that a flight that begins at 0 s gets a real date.
-
-        Raises:
-            BagError: the folder exists or cannot be made; unknown compression.
-
-        """
-        self.path = Path(path)
-        self.meta: dict = {}
-        self._epoch = int(epoch)
-        self._connections: dict[str, Connection] = {}
-        self._prefix = '/' + namespace.strip('/') + '/' if namespace.strip('/') else '/'
-        self._writer = _open(self.path, compression)
-        for name in topics:
-            self._declare(self._prefix + name, topic_of(name).type, topic_of(name).qos)
-        self._frames = None
-        if description:
-            self._frames = FrameWriter(self.write_raw, description, self._prefix)
-            for name, (msgtype, qos) in self._frames.topics.items():
-                self._declare(name, msgtype, qos)
-        self._last_t = None      # [s] of the newest message
-        if meta:
-            self.write_meta(meta)
-
-    def __enter__(self) -> BagWriter:
-        return self
-
-    def __exit__(self, *exception) -> None:
-        """Close the bag, also after an error, so that it is readable."""
-        self.close()
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """Topic -> number of messages written so far."""
-        return {topic: self._writer.counts[c.id] for topic, c in self._connections.items()}
-
-    def _declare(self, topic: str, msgtype: str, qos: Qos) -> Connection:
-        storage = self._writer.storage
-        if storage.chunk.msgs:
-            storage.close_chunk()
-        self._connections[topic] = self._writer.add_connection(
-            topic, msgtype, typestore=TYPESTORE, offered_qos_profiles=[offered(qos)])
-        return self._connections[topic]
-
-    def write(self, topic: str, value: Any, received: float | None = None) -> None:
-        """Write one value, see :class:`Recorder`."""
-        name, entry = self._prefix + topic, topic_of(topic)
-        if name not in self._connections and self._writer is not None:
-            self._declare(name, entry.type, entry.qos)
-        if received is None:
-            received = value[0].t if isinstance(value, list) else value.stamp
-        message = entry.write(BAG, value)
-        if self._epoch and hasattr(message, 'header'):
-            message.header.stamp.sec += self._epoch
-        self.write_raw(name, entry.type, to_bytes(message, entry.type), received)
-
-    def write_raw(self, topic: str, msgtype: str, data: bytes | memoryview, t: float) -> None:
-        """
-        Write one serialised message.
-
-        Args:
-            topic: full name.
-            msgtype: ROS type such as 'sensor_msgs/msg/Imu'; one of Jazzy's common types.
-            data: CDR.
-            t: time of recording since ``epoch`` [s].
-
-        Raises:
-            BagError: unknown type, or the file cannot be written.
-
-        """
-        if self._writer is None:
-            raise BagError(f'{self.path}: the bag is closed')
-        connection = self._connections.get(topic)
-        if connection is None:
-            if msgtype not in TYPESTORE.types:
-                raise BagError(f'{self.path}: topic {topic} has the unknown type {msgtype}')
-            ours = ALL.get(topic.removeprefix(self._prefix))
-            connection = self._declare(topic, msgtype, ours.qos if ours else EVENT)
-        first, self._last_t = self._last_t is None, t
-        if first and self.meta:     # now a time of the flight is known
-            self._tell_meta()
-        try:
-            self._writer.write(connection, max(0, nanoseconds(t)) + self._epoch * 1_000_000_000,
-                               data)
-        except OSError as error:
-            raise BagError(f'{self.path}: {error.strerror}') from error
-        if self._frames is not None:
-            self._frames.take(topic, data, t)
-
-    def flush(self) -> None:
-        """Pass the written data to the operating system, so that it survives a SIGKILL."""
-        if self._writer is None:
-            return
-        storage = self._writer.storage
-        try:
-            if storage.chunk.msgs:
-                storage.close_chunk()
-            storage.bio.flush()
-        except OSError as error:
-            raise BagError(f'{self.path}: {error.strerror}') from error
-
-    def close(self) -> None:
-        """Write index and metadata.yaml. A second call does nothing."""
-        writer, self._writer = self._writer, None
-        if writer is None:
-            return
-        if self.meta:
-            writer.set_custom_data(META_KEY, json.dumps(self.meta))
-        if not any(writer.counts.values()):
-            writer.min_timestamp = writer.storage.message_start_time = 0
-            writer.storage.chunk.message_start_time = 0
-        try:
-            writer.close()
-        except OSError as error:
-            raise BagError(f'{self.path}: {error.strerror}') from error
-
-    def write_meta(self, meta: dict) -> None:
-        """Add metadata; also written as a message, for a bag without metadata.yaml."""
-        self.meta.update(meta)
-        if self._last_t is not None:
-            self._tell_meta()
-
-    def _tell_meta(self):
-        self.write_diagnostic(self._last_t, f'recorder_node: {RUN_STATUS}', self.meta)
-
-
-def check_new(path: str | Path, compression: str = 'none') -> None:
-    """
-    Check before a flight that its bag can be written.
+    Args:
+        path: rosbag2 folder, its metadata.yaml or one of its ``.mcap`` files.
 
     Raises:
-        BagError: the folder exists, its nearest existing parent is no writable folder, or unknown
-            compression.
+        BagError: no such path, or no MCAP file there.
 
     """
-    if compression not in COMPRESSIONS:
-        raise BagError(f"compression '{compression}': expected {' or '.join(COMPRESSIONS)}")
     path = Path(path)
-    if path.exists() or path.is_symlink():
-        raise BagError(f'{path}: exists already; a bag needs a new folder')
-    parent = next(folder for folder in path.absolute().parents if folder.exists())
-    if not parent.is_dir():
-        raise BagError(f'{path}: {parent} is not a folder')
-    if not os.access(parent, os.W_OK | os.X_OK):
-        raise BagError(f'{path}: no permission to write in {parent}')
+    if not path.exists():
+        raise BagError(f'{path}: no such bag')
+    if path.name == 'metadata.yaml':
+        path = path.absolute().parent
+    if path.is_file():
+        if path.suffix != '.mcap':
+            raise BagError(f'{path}: expected a rosbag2 folder or a .mcap file')
+        return [path]
+    files = sorted(path.glob('*.mcap'), key=_split_number)
+    if not files:
+        other = sorted(p.name for pattern in ('*.db3', '*.mcap.*', '*.bag')
+                       for p in path.glob(pattern))
+        hint = f' (found {other[0]}; convert it with ros2 bag convert)' if other else ''
+        raise BagError(f'{path}: no .mcap file in this folder{hint}')
+    return files
 
 
-def _open(path, compression):
-    check_new(path, compression)
-    try:
-        writer = JazzyWriter(path, compression)
-        writer.open()
-    except (OSError, WriterError) as error:
-        reason = getattr(error, 'strerror', None) or error
-        raise BagError(f'{path}: cannot write a bag there ({reason})') from None
-    return writer
+def runs_in(paths: Iterable[str | Path]) -> list[Path]:
+    """Paths of RUN arguments, with the bags in a folder of bags in its place."""
+    runs: list[Path] = []
+    for path in map(Path, paths):
+        inside = []
+        if path.is_dir() and not any(path.glob('*.mcap')):
+            inside = sorted({file.parent for file in path.glob('*/*.mcap')})
+        runs += inside or [path]
+    return runs
 
 
-def add_meta(path: str | Path, meta: dict) -> None:
+def no_pose(path: str | Path, warnings: list[str]) -> BagError:
+    """Error for a bag without a pose; ``warnings`` of its reading may give the reason."""
+    return BagError('; '.join([f'{path}: no pose of the robot; expected ground_truth/odom or '
+                               'odom', *warnings]))
+
+
+def _split_number(file):
+    """Sort key of a split bag: name_2.mcap comes before name_10.mcap."""
+    number = file.stem.rpartition('_')[2]
+    return (int(number) if number.isdigit() else -1, file.name)
+
+
+def names_of(runs: list[Path]) -> list[str]:
+    """Shortest endings of the paths that are all different, numbered if none are."""
+    paths = [run.absolute().parts for run in runs]
+    for depth in range(1, max((len(parts) for parts in paths), default=1) + 1):
+        names = ['/'.join(parts[-depth:]) for parts in paths]
+        if len(set(names)) == len(names):
+            return names
+    return [f'{name} ({k + 1})' for k, name in enumerate(names)] if runs else []
+
+
+def read_messages(path: str | Path, warnings: list[str] | None = None) -> Iterator[RawMessage]:
     """
-    Add metadata of the flight to a finished bag: task, conditions, seed, robot.
+    Yield the messages of a bag in the order of recording, up to a truncation.
+
+    Args:
+        path: folder or file, see :func:`bag_files`.
+        warnings: list to which a line is added for each truncated or damaged file.
 
     Raises:
-        BagError: the folder has no usable metadata.yaml.
+        BagError: no such bag, unreadable, or not MCAP.
 
     """
-    file = Path(path) / 'metadata.yaml'
+    found, broken = 0, ''
+    for file in bag_files(path):
+        count, schemas, known = 0, {0: ''}, {}
+        try:
+            with file.open('rb') as stream:
+                # A shorter file may be an MCAP file that was cut off.
+                if not MCAP0_MAGIC.startswith(stream.read(MAGIC_SIZE)):
+                    raise BagError(f'{file}: not an MCAP file')
+                stream.seek(0)
+                for record in _Records(_WholeReads(stream), validate_crcs=True).records:
+                    if isinstance(record, Message):
+                        count += 1
+                        yield RawMessage(*known[record.channel_id], record.data,
+                                         from_nanoseconds(record.log_time))
+                    elif isinstance(record, Schema):
+                        schemas[record.id] = record.name
+                    elif isinstance(record, Channel):
+                        known[record.id] = record.topic, schemas[record.schema_id]
+        except OSError as error:
+            raise BagError(f'{file}: {error.strerror}') from None
+        except BagError:
+            raise
+        except Exception as error:  # broken bytes raise anything in the library
+            kind = 'cut off' if isinstance(error, EOFError) else \
+                f'damaged ({type(error).__name__}: {error})'
+            broken = f'{file.name}: {kind} after {count} readable messages'
+            if warnings is not None:
+                warnings.append(broken)
+        found += count
+    if broken and not found:
+        raise BagError(f"{path}: {broken}; 'mcap recover' of the mcap tool may save more")
+
+
+def read_together(path: str | Path, warnings: list[str] | None = None
+                  ) -> Iterator[list[Messages]]:
+    """
+    Yield the messages of a bag by topic, a few seconds at a time.
+
+    Arguments and errors are as in :func:`read_messages`. Topics are in the order of their first
+    message.
+    """
+    messages = read_messages(path, warnings)
+    while part := list(islice(messages, AT_ONCE)):
+        groups: dict[tuple[str, str], tuple[list, list]] = {}
+        for topic, kind, data, received in part:
+            all_data, times = groups.setdefault((topic, kind), ([], []))
+            all_data.append(data)
+            times.append(received)
+        yield [Messages(*name, data, np.array(times)) for name, (data, times) in groups.items()]
+
+
+def read_bag(path: str | Path, *, namespace: str | None = None) -> FlightLog:
+    """
+    Read a flight.
+
+    Args:
+        path: rosbag2 folder, or one of its files.
+        namespace: namespace of the robot, if the bag contains several.
+
+    Returns:
+        The flight; its ``warnings`` list missing and unusable data.
+
+    Raises:
+        BagError: no such bag, unreadable, not MCAP, or several robots in it.
+
+    """
+    recorder, warnings = LogRecorder(), []
+    for _ in replay(path, recorder, warnings, namespace=namespace):
+        pass
+    log = recorder.log()
+    log.warnings, log.source = warnings, str(path)
+    return log
+
+
+def replay(path: str | Path, recorder: Recorder, warnings: list[str], *,
+           namespace: str | None = None, leave_out: Container[str] | None = None
+           ) -> Iterator[np.ndarray]:
+    """
+    Pass the messages of a bag to a recorder, a few seconds at a time.
+
+    Args:
+        path: rosbag2 folder, or one of its files.
+        recorder: recorder that accepts series as values whose fields are arrays; other values
+            come one by one.
+        warnings: list to which missing and unusable data are added at the end.
+        namespace: namespace of the robot, if the bag contains several.
+        leave_out: topics without namespace to skip, beside commands of controllers; None: none.
+
+    Yields:
+        (N,) times of recording of the messages so far passed on [s].
+
+    Raises:
+        BagError: no such bag, unreadable, not MCAP, or several robots in it.
+
+    """
+    reading = _Reading(str(path), namespace, recorder, leave_out)
+    for together in read_together(path, reading.warnings):
+        # Ambiguous names last: the other topics may determine the namespace.
+        for messages in sorted(together, key=lambda one: is_ambiguous(one.topic)):
+            reading.take(messages)
+        yield np.concatenate([messages.received for messages in together])
+    recorder.write_meta(_metadata(path, reading.warnings))
+    warnings += reading.finish()
+
+
+class _Reading:
+    """Sorts messages by topic and namespace, and counts unusable ones."""
+
+    def __init__(self, path, namespace, recorder, leave_out):
+        self.warnings: list[str] = []
+        self._recorder, self._left_out = recorder, leave_out
+        self._path = path
+        self._namespace = namespace and f"/{namespace.strip('/')}".rstrip('/')
+        self._chosen = namespace is not None
+        self._split = {}
+        self._counts: Counter = Counter()
+        self._bad: Counter = Counter()
+        self._reason: dict[str, str] = {}
+
+    def take(self, messages: Messages) -> None:
+        """Read messages of one topic; those of a series together."""
+        name = self._name(messages.topic)
+        if name is None:
+            return
+        topic, count = topic_of(name), len(messages.data)
+        if self._left_out is not None and (name in self._left_out or controller_of(name)):
+            self._counts[name] += count
+        elif messages.type != topic.type:
+            self._refuse(name, f'type is {messages.type}, not {topic.type}', count)
+        elif name in SERIES_OF or controller_of(name):
+            rows, value, refused = read_all(topic, messages.data)
+            if len(rows):
+                received = messages.received[rows]
+                stamp = np.where(value.stamp == 0, received, value.stamp)
+                self._recorder.write(name, replace(value, stamp=stamp), received)
+            self._counts[name] += len(rows)
+            for reason, number in refused.items():
+                self._refuse(name, reason, number)
+        else:
+            for data, received in zip(messages.data, messages.received.tolist(), strict=True):
+                try:
+                    value = topic.read(from_bytes(data, topic.type))
+                    self._recorder.write(name, _stamped(value, received), received)
+                    self._counts[name] += 1
+                except Exception as error:  # must not prevent reading the others
+                    self._refuse(name, str(error) or type(error).__name__)
+
+    def _name(self, topic):
+        """Name without namespace; None for a topic that is unknown or still ambiguous."""
+        if topic not in self._split:
+            if self._namespace is None and is_ambiguous(topic):
+                return None     # until another topic determines the robot's namespace
+            self._split[topic] = self._recognise(topic)
+        return self._split[topic]
+
+    def _refuse(self, name, reason, count=1):
+        self._bad[name] += count
+        self._reason.setdefault(name, reason)
+
+    def _recognise(self, topic):
+        split = split_topic(topic, () if self._namespace is None else (self._namespace,))
+        if split is None:
+            return None
+        namespace, name = split
+        if name == 'diagnostics' and namespace == '':
+            return name
+        if self._namespace is None:
+            self._namespace = namespace
+        if namespace != self._namespace:
+            if self._chosen or name == 'diagnostics':
+                return None
+            raise BagError(f"{self._path}: holds several robots ('{self._namespace}' and "
+                           f"'{namespace}'); choose one namespace")
+        return name
+
+    def finish(self):
+        missing = [name for name, topic in TOPICS.items()
+                   if topic.required and not self._counts[name]]
+        if 'target_pose' in missing and self._counts['target_trajectory']:
+            missing.remove('target_pose')
+        if missing:
+            self.warnings.append(f"no message on {', '.join(missing)}")
+        for name, count in self._bad.items():
+            self.warnings.append(f'{name}: {count} messages not used ({self._reason[name]})')
+        return self.warnings
+
+
+def _stamped(value, received):
+    """The value; without a stamp (`ros2 topic pub`), it gets the time of receipt."""
+    if isinstance(value, list):
+        return [entry if entry.t else replace(entry, t=received) for entry in value]
+    if isinstance(value, str) or value.stamp:
+        return value
+    if isinstance(value, TrajectoryTarget):
+        return replace(value, stamp=received, times=value.times + received)
+    return replace(value, stamp=received)
+
+
+def _metadata(path, warnings):
+    """Metadata of a finished bag; empty if there is none."""
+    path = Path(path)
+    file = (path if path.is_dir() else path.absolute().parent) / 'metadata.yaml'
+    if not file.is_file():
+        warnings.append('metadata.yaml is missing: the recorder did not finish')
+        return {}
     try:
-        content = read_yaml(file)
-        information = content['rosbag2_bagfile_information']
-        custom = information['custom_data'] or {}
-        known = json.loads(custom.get(META_KEY, '{}'))
-        information['custom_data'] = {**custom, META_KEY: json.dumps({**known, **meta})}
-        temporary = file.with_suffix('.yaml.tmp')
-        temporary.write_text(yaml.safe_dump(content))
-        temporary.replace(file)
-    except OSError as error:
-        raise BagError(f'{file}: {error.strerror}') from None
-    except (AttributeError, KeyError, RecursionError, TypeError, ValueError):
-        raise BagError(f'{file}: not the metadata of a rosbag2 folder') from None
+        custom = read_yaml(file)['rosbag2_bagfile_information']['custom_data']
+        meta = dict(json.loads((custom or {}).get(META_KEY, '{}')))
+    except (YamlError, KeyError, TypeError, AttributeError, ValueError, RecursionError):
+        warnings.append('metadata.yaml is not readable')
+        return {}
+    unusable = [key for key, value in meta.items() if not _usable(key, value)]
+    warnings.extend(f'metadata.yaml: {quoted(key)} is not usable, found {quoted(meta[key])}'
+                    for key in unusable)
+    return {key: value for key, value in meta.items() if key not in unusable}
 
 
-__all__ = ['add_meta', 'BagError', 'BagWriter', 'check_new', 'read_bag', 'read_messages']
+def _usable(key, value):
+    """Whether a value has the type that readers of the log rely on."""
+    if value is None:
+        return True
+    if key == 'seed':
+        return isinstance(value, int) and 0 <= value < 1 << 63
+    if key in META_TEXTS:
+        return isinstance(value, str) and len(value) <= LONGEST_TEXT and value.isprintable()
+    return True

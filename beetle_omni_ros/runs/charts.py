@@ -1,17 +1,46 @@
-"""Charts of a report: pose, errors, commands, compute time, estimate, battery, disturbances."""
+"""
+Charts of a report, and their data for pages/charts.js.
+
+Numbers are stored as 16-bit integers between minimum and maximum of their series, which is finer
+than the width of a line. Differences of neighbours are compressed, all series together.
+"""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import dataclass, field
+import gzip
+from html import escape
+import json
 
 import numpy as np
 
-from beetle_omni_ros.control.base import PoseTarget
-from beetle_omni_ros.pages.charts import Chart, Series
+from beetle_omni_ros.control.base import PoseTarget, Target
 from beetle_omni_ros.pages.figures import INK, PARTS
+from beetle_omni_ros.pages.page import shipped
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.yaml_file import shortened
-from beetle_omni_ros.runs.body import EDGE, errors, estimate_errors, hold, inside, roll_pitch_yaw
+from beetle_omni_ros.runs.log import (
+    EDGE,
+    errors,
+    estimate_errors,
+    FlightLog,
+    hold,
+    inside,
+    Motion,
+    motion,
+    reference_poses,
+    roll_pitch_yaw,
+)
 from beetle_omni_ros.runs.metrics import L_WINDOW, REACHED_ORIENTATION, REACHED_POSITION, U_WINDOW
-from beetle_omni_ros.runs.report_runs import error_series, Run, target_poses, TimeAxis
-from beetle_omni_ros.runs.tasks import POSE_DURATION
+from beetle_omni_ros.runs.tasks import POSE_DURATION, Task
 
+STEPS, ABSENT = 65534, -32768
+STEP = 0.01             # [s] of the time axis, or more for long flights
+MOST = 12_000           # samples of the time axis
+BEFORE = 3.0            # [s] before the first target
+STALE = 0.3             # [s] after which a value without a newer one is not drawn
+TRAJECTORY_STEP = 0.05  # [s] between the drawn poses of a trajectory
 FEW_POSES = 20          # up to this number, L and U windows are shaded
 MOST_FAULTS = 12        # marked in a chart
 MILLI = 1e3
@@ -24,6 +53,230 @@ NARROW = 1e-9           # [rad, rad/s, N] range of a histogram below which it is
 BINS = 60               # of a histogram
 FEW = 3                 # poses below which no distribution is shown
 SHARES = 200            # points of a distribution
+
+
+@dataclass(frozen=True)
+class Series:
+    """
+    One line of a chart.
+
+    Attributes:
+        label: text in the legend.
+        colour: '#rrggbb'.
+        y: (N,) values, NaN for missing ones.
+        run: index of its run, whose switch hides the line, or None.
+        style: 'line', 'dash', 'dot', 'step' or 'points'.
+        band: whether to fill the area to the previous series.
+
+    """
+
+    label: str
+    colour: str
+    y: np.ndarray
+    run: int | None = None
+    style: str = 'line'
+    band: bool = False
+
+
+@dataclass(frozen=True)
+class Chart:
+    """
+    Lines over one axis.
+
+    Attributes:
+        label: label of the vertical axis, with its unit.
+        series: lines of the chart.
+        x: (N,) increasing values of the horizontal axis; None: the time of the page.
+        xlabel: label of the horizontal axis.
+        log: whether the (horizontal, vertical) axis is logarithmic.
+        upright: (x, text) of vertical marks.
+        level: (y, text) of horizontal marks.
+        windows: (from, to, colour) of shaded ranges of the horizontal axis.
+        wide: whether the chart has the full width of the page.
+
+    """
+
+    label: str
+    series: list[Series]
+    x: np.ndarray | None = None
+    xlabel: str = ''
+    log: tuple[bool, bool] = (False, False)
+    upright: list[tuple[float, str]] = field(default_factory=list)
+    level: list[tuple[float, str]] = field(default_factory=list)
+    windows: list[tuple[float, float, str]] = field(default_factory=list)
+    wide: bool = True
+
+    def spec(self, numbers: Numbers) -> dict:
+        """Return the data of the chart for the script; adds its series to ``numbers``."""
+        return {
+            'label': self.label, 'xlabel': self.xlabel, 'log': self.log, 'level': self.level,
+            'upright': self.upright, 'windows': self.windows, 'wide': self.wide,
+            'x': None if self.x is None else numbers.add(self.x, self.log[0]),
+            'series': [{'label': s.label, 'colour': s.colour, 'run': s.run, 'style': s.style,
+                        'band': s.band, 'y': numbers.add(s.y, self.log[1])} for s in self.series]}
+
+
+class Numbers:
+    """All series of a page, encoded for the script."""
+
+    def __init__(self):
+        self._parts: list[np.ndarray] = []
+        self._count = 0
+
+    def add(self, values: np.ndarray, log: bool = False) -> dict:
+        """
+        Add a series (N,), NaN for missing values; return its position and scale.
+
+        With ``log``, logarithms are stored and only positive values are kept.
+        """
+        values = np.asarray(values, dtype=float)
+        if log:
+            values = np.log10(np.where(values > 0, values, np.nan))
+        known = values[np.isfinite(values)]
+        low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
+        step = (high - low) / STEPS or 1.0
+        scaled = np.full(len(values), ABSENT)
+        fine = np.isfinite(values)
+        scaled[fine] = np.rint((values[fine] - low) / step) - STEPS // 2
+        where = {'at': self._count, 'count': len(values), 'low': low, 'step': step, 'log': log}
+        # Differences wrap round within 16 bits, and so do their sums in the script.
+        self._parts.append(np.diff(scaled, prepend=0).astype('<i8').astype('<i2'))
+        self._count += len(values)
+        return where
+
+    def blob(self) -> str:
+        """Return all series, compressed, in base64."""
+        data = np.concatenate([*self._parts, np.zeros(0, '<i2')])
+        planes = data.view(np.uint8).reshape(-1, 2).T     # high bytes together: mostly equal
+        return base64.b64encode(gzip.compress(planes.tobytes(), 9, mtime=0)).decode()
+
+
+def data_block(data: dict, numbers: Numbers) -> str:
+    """Return the HTML of the data for the script; no text in it can end the block."""
+    text = json.dumps(data, separators=(',', ':'), allow_nan=False).replace('<', '\\u003c')
+    return (f'<script type="application/json" id="data">{text}</script>\n'
+            f'<script type="text/plain" id="numbers">{numbers.blob()}</script>\n')
+
+
+def place(identifier: str, wide: bool = True) -> str:
+    """Return the HTML element that the script fills with a chart."""
+    return f'<div class="chart{"" if wide else " part"}" data-chart="{escape(identifier)}"></div>'
+
+
+def scripts() -> str:
+    """Return libraries and script of an interactive page as HTML."""
+    libraries = ''.join(f'<script>{shipped(f"vendor/{name}.js")}</script>\n'
+                        for name in ('uplot', 'three'))
+    return (f'<style>{shipped("vendor/uplot.css")}</style>\n{libraries}'
+            f'<script type="module">{shipped("charts.js")}{shipped("scene.js")}</script>\n')
+
+
+@dataclass(frozen=True)
+class Run:
+    """
+    One flight of a report.
+
+    Attributes:
+        label: name on the page.
+        colour: colour of its lines.
+        log: the flight.
+        task: flown task, or None if the log does not name it.
+        results: label -> metrics, one entry for each controller that flew.
+
+    """
+
+    label: str
+    colour: str
+    log: FlightLog
+    task: Task | None
+    results: dict[str, dict]
+
+    @property
+    def start(self) -> float:
+        """Time of the first target [s], which is 0 in the charts."""
+        return self.log.targets[0].stamp if self.log.targets else self.log.start
+
+    @property
+    def target_spans(self) -> list[tuple[Target, float]]:
+        """(target, its end [s]) of each target; empty if none was recorded."""
+        targets = self.log.targets
+        return list(zip(targets, [t.stamp for t in targets[1:]] + [self.log.end], strict=False))
+
+    @property
+    def body(self) -> Motion:
+        """The motion that the metrics use."""
+        return motion(self.log)
+
+
+@dataclass(frozen=True)
+class TimeAxis:
+    """Times since the first target of each run: ``count`` of them, ``step`` [s] apart."""
+
+    start: float
+    step: float
+    count: int
+
+    @classmethod
+    def of(cls, runs: list[Run]) -> TimeAxis:
+        """Make an axis that covers all flights."""
+        start = max(-BEFORE, min(run.body.t[0] - run.start for run in runs))
+        end = max(run.body.t[-1] - run.start for run in runs)
+        step = max(STEP, (end - start) / MOST)
+        return cls(float(start), float(step), int((end - start) / step) + 1)
+
+    @property
+    def times(self) -> np.ndarray:
+        """(count,) [s]."""
+        return self.start + self.step * np.arange(self.count)
+
+    def sampled(self, run: Run, t: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """
+        Return the latest values of a series at the times of the axis.
+
+        Args:
+            run: run of the series.
+            t: (N,) times on the clock of the flight [s].
+            values: (N, ...) values.
+
+        Returns:
+            (count, ...) values, NaN before the series, after it and in its gaps.
+
+        """
+        if not len(t):
+            return np.full((self.count, *values.shape[1:]), np.nan)
+        at = self.times + run.start
+        index = np.searchsorted(t, at + EDGE, side='right') - 1
+        made = np.array(values[np.maximum(index, 0)], dtype=float)
+        usual = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
+        made[(index < 0) | (at - t[np.maximum(index, 0)] > max(STALE, 3 * usual))] = np.nan
+        return made
+
+
+def error_series(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return (n,) times [s], (n,) position errors [m], (n,) orientation errors [deg]."""
+    body, parts = run.body, []
+    for target, end in run.target_spans:
+        window = body.window(target.stamp, end - 1e-3)
+        if body.t[window].size:
+            parts.append((body.t[window], *errors(body, target, window)))
+    if not parts:
+        return np.zeros(0), np.zeros(0), np.zeros(0)
+    return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
+
+
+def target_poses(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return (n,) times since the first target [s] and (n, 3), (n, 4) poses of the targets."""
+    times, positions, quaternions = [], [], []
+    for target, end in run.target_spans:
+        t = np.array([target.stamp]) if isinstance(target, PoseTarget) else \
+            np.arange(target.times[0], min(end, target.times[-1]), TRAJECTORY_STEP)
+        position, quaternion = reference_poses(target, t)
+        times.append(t - run.start)
+        positions.append(position)
+        quaternions.append(quaternion)
+    if not times:
+        return np.zeros(0), np.zeros((0, 3)), np.zeros((0, 4))
+    return np.concatenate(times), np.concatenate(positions), np.concatenate(quaternions)
 
 
 def pose(runs: list[Run], axis: TimeAxis) -> list[Chart]:

@@ -1,16 +1,21 @@
 """
-One flight as numpy arrays.
+One flight as numpy arrays, its recording, and the motion and errors in it.
 
 Times are float seconds on the flight's clock: ROS time in the graph, from 0 in the in-process
-loop.
+loop. A loop records into memory (:class:`LogRecorder`), onto disk
+(:class:`~beetle_omni_ros.runs.bag_writer.BagWriter`), or both with :class:`Tee`.
 """
 
+from array import array
 from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
 
-from beetle_omni_ros.control.base import Target
+from beetle_omni_ros.control.base import PoseTarget, Target, TrajectoryTarget
+from beetle_omni_ros.messages.topics import controller_of
 from beetle_omni_ros.messages.values import Diagnostic
+from beetle_omni_ros.robot import rotations
 
 SERIES = {
     'truth': {'position': 3, 'quaternion': 4, 'velocity': 3, 'angular_velocity': 3},
@@ -39,6 +44,11 @@ SUPERVISOR_STATUS, FAULT_KEY = 'supervisor_node: supervisor', 'fault.'
 COMPUTE_KEYS = {'median_ms': 'median', 'p99_ms': 'p99', 'max_ms': 'max',
                 'deadline_misses': 'deadline_misses', 'count': 'count'}
 """Diagnostic key -> key in ``FlightLog.compute``; the times are CPU milliseconds."""
+CHANNELS = {series: tuple(channels.items()) for series, channels in SERIES.items()}
+# [s] tolerance of a window's edges. Stamps are integer nanoseconds in a bag and floats in memory,
+# where UNIX time has a resolution of 0.24 us.
+EDGE = 1e-5
+SAME_TIME = 2.5e-3  # [s] between stamps of an estimate and of the truth that are compared
 
 
 def _empty(width):
@@ -191,3 +201,306 @@ class FlightLog:
             if not changes or changes[-1][1] != name:
                 changes.append((float(t), name))
         return changes
+
+
+class Recorder:
+    """
+    Interface of recorders: :meth:`write` for every topic, and shorter calls for some.
+
+    Attributes:
+        keeps_covariances: whether the covariances of ``odom`` are recorded.
+
+    """
+
+    keeps_covariances = False
+
+    def write(self, topic: str, value: Any, received: float | None = None) -> None:
+        """
+        Record one value.
+
+        Args:
+            topic: name without namespace, see
+                :func:`~beetle_omni_ros.messages.topics.topic_of`.
+            value: value of the topic's class.
+            received: time of recording [s]; default: the value's stamp. Required for text.
+
+        """
+        raise NotImplementedError
+
+    def write_meta(self, meta: dict) -> None:
+        """Add metadata of the flight: task, conditions, seed, robot, version."""
+        raise NotImplementedError
+
+    def write_target(self, target: Target, received=None) -> None:
+        """Record a pose or trajectory target, valid from its stamp."""
+        self.write('target_pose' if isinstance(target, PoseTarget) else 'target_trajectory',
+                   target, received)
+
+    def write_compute(self, t, controller: str, **times) -> None:
+        """
+        Record the CPU time of a controller's steps since its start, reported at ``t`` [s].
+
+        ``times`` are median, p99, max [ms], deadline_misses, count.
+        """
+        self.write_diagnostic(t, f'{controller}_node: {COMPUTE_STATUS}',
+                              {key: times[name] for key, name in COMPUTE_KEYS.items()})
+
+    def write_diagnostic(self, t, name: str, values: dict, level: int = 0,
+                         message: str = '') -> None:
+        """Record one status such as 'ekf_node: estimator', with numbers or text as values."""
+        self.write('diagnostics', [Diagnostic(t, name, int(level), message, {
+            str(key): str(value) for key, value in values.items()})])
+
+
+class LogRecorder(Recorder):
+    """Collects a :class:`FlightLog`; see there for units and frames."""
+
+    def __init__(self, meta: dict | None = None):
+        self._rows = {name: array('d') for name in SERIES}  # flat: hours of flight fit
+        self._requests: dict[str, array] = {}
+        self._log = FlightLog(meta=dict(meta or {}))
+        self._states: list[tuple[float, str]] = []
+
+    def write(self, topic: str, value: Any, received: float | None = None) -> None:
+        """Record one value; other topics than those of a log are ignored."""
+        series = SERIES_OF.get(topic)
+        if series:
+            self._add(series, self._rows[series], value, received)
+        elif controller_of(topic):
+            rows = self._requests.setdefault(controller_of(topic), array('d'))
+            self._add('command', rows, value, received)
+        elif topic in ('target_pose', 'target_trajectory'):
+            self._log.targets.append(value)
+        elif topic == 'supervisor/state':
+            self._states.append((received, value))
+        elif topic == 'diagnostics':
+            for entry in value:
+                self._take(entry)
+
+    def _add(self, series, rows, value, received):
+        stamp = value.stamp
+        if isinstance(stamp, np.ndarray) and stamp.ndim:
+            self._add_all(series, rows, value, received)
+            return
+        row = [stamp]
+        for channel, width in CHANNELS[series]:
+            if not width:
+                row.append(getattr(value, channel) if channel != 'received' else
+                           stamp if received is None else received)
+                continue
+            part = getattr(value, channel)
+            if isinstance(part, np.ndarray):
+                row += part.tolist()    # floats are added faster than numpy's numbers
+            else:
+                row += [np.nan] * width if part is None else part
+        if len(row) != WIDTHS[series]:
+            raise ValueError(f'{series}: expected {WIDTHS[series]} values, found {len(row)}')
+        rows.extend(row)
+
+    def _add_all(self, series, rows, value, received):
+        """Add a value whose fields are arrays over several messages."""
+        count = len(value.stamp)
+        parts = [value.stamp]
+        for channel, width in SERIES[series].items():
+            part = received if channel == 'received' else getattr(value, channel)
+            parts.append(np.full((count, width), np.nan) if part is None else part)
+        rows.frombytes(np.column_stack(parts).astype(float).tobytes())
+
+    def write_meta(self, meta: dict) -> None:
+        """Add metadata of the flight."""
+        self._log.meta.update(meta)
+
+    def _take(self, entry):
+        values = entry.values
+        node, _, kind = entry.name.rpartition(': ')
+        if kind == RUN_STATUS:
+            seed = values.get('seed', '')
+            self.write_meta({**values, 'seed': int(seed)} if seed.isdigit() else values)
+        elif kind == COMPUTE_STATUS and set(COMPUTE_KEYS) <= set(values):
+            report = {name: int(values[key]) if name in ('deadline_misses', 'count')
+                      else float(values[key]) for key, name in COMPUTE_KEYS.items()}
+            name = node.rpartition('/')[2].removesuffix('_node')
+            self._log.compute[name] = report
+            self._log.compute_history.setdefault(name, []).append((entry.t, report))
+        else:
+            self._log.diagnostics.append(entry)
+
+    def log(self) -> FlightLog:
+        """Return the flight so far, each series sorted by time."""
+        log = self._log
+        for series, channels in SERIES.items():
+            _unpack(log, series + '_', self._rows[series], channels, WIDTHS[series])
+        log.requests = {name: _unpack(Commands(), '', rows, SERIES['command'], WIDTHS['command'])
+                        for name, rows in self._requests.items()}
+        log.targets = _in_order(log.targets)
+        states = sorted(self._states, key=lambda entry: entry[0])
+        log.state_t = np.array([t for t, _ in states], dtype=float)
+        log.states = [state for _, state in states]
+        log.diagnostics.sort(key=lambda entry: entry.t)
+        return log
+
+
+def _unpack(into, prefix, rows, channels, width):
+    table = np.array(rows, dtype=float).reshape(-1, width)
+    table = table[np.argsort(table[:, 0], kind='stable')]
+    setattr(into, prefix + 't', table[:, 0].copy())
+    column = 1
+    for name, w in channels.items():
+        values = table[:, column:column + w] if w else table[:, column]
+        setattr(into, prefix + name, values.copy())
+        column += max(1, w)
+    return into
+
+
+def _in_order(targets):
+    """Sort by stamp; of several targets with the same stamp (latched topics), keep one."""
+    kept: list[Target] = []
+    for target in sorted(targets, key=lambda entry: entry.stamp):
+        if kept and target.stamp == kept[-1].stamp and type(target) is type(kept[-1]):
+            kept[-1] = target
+        else:
+            kept.append(target)
+    return kept
+
+
+class Tee(Recorder):
+    """Records with several recorders."""
+
+    def __init__(self, *recorders: Recorder):
+        self._recorders = recorders
+        self.keeps_covariances = any(recorder.keeps_covariances for recorder in recorders)
+
+    def write(self, topic: str, value: Any, received: float | None = None) -> None:
+        """Record one value."""
+        for recorder in self._recorders:
+            recorder.write(topic, value, received)
+
+    def write_meta(self, meta: dict) -> None:
+        """Add metadata of the flight."""
+        for recorder in self._recorders:
+            recorder.write_meta(meta)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """
+    Motion of a body.
+
+    Attributes:
+        t: (N,) [s].
+        position: (N, 3) in world [m].
+        quaternion: (N, 4) body to world (x, y, z, w).
+        velocity: (N, 3) in world [m/s].
+        angular_velocity: (N, 3) in base_link [rad/s].
+
+    """
+
+    t: np.ndarray
+    position: np.ndarray
+    quaternion: np.ndarray
+    velocity: np.ndarray
+    angular_velocity: np.ndarray
+
+    def window(self, begin: float, end: float) -> slice:
+        """Slice of the samples from ``begin`` to ``end`` [s], both included."""
+        return slice(int(np.searchsorted(self.t, begin - EDGE, side='left')),
+                     int(np.searchsorted(self.t, end + EDGE, side='right')))
+
+    def covers(self, begin: float, end: float, gap: float = 0.1) -> bool:
+        """Whether the first and last sample in the window are within ``gap`` [s] of its edges."""
+        times = self.t[self.window(begin, end)]
+        return len(times) > 0 and times[0] <= begin + gap and times[-1] >= end - gap
+
+
+def motion(log: FlightLog, series: str | None = None) -> Motion:
+    """Return the motion of a series, by default of the truth if recorded, else the estimate."""
+    name = series or log.body
+    return Motion(*(getattr(log, f'{name}_{channel}') for channel in
+                    ('t', 'position', 'quaternion', 'velocity', 'angular_velocity')))
+
+
+def geodesic_angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Angles (N,) [rad] between the rotations of (N, 4) and (N, 4) or (4,) quaternions."""
+    bx, by, bz, bw = np.asarray(b).T
+    x, y, z, w = rotations.product(-bx, -by, -bz, bw, *np.asarray(a).T)
+    return 2 * np.arctan2(np.sqrt(x * x + y * y + z * z), np.abs(w))
+
+
+def roll_pitch_yaw(quaternions: np.ndarray) -> np.ndarray:
+    """(N, 3) roll, pitch, yaw [deg] of (N, 4) quaternions, R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    x, y, z, w = np.asarray(quaternions).T
+    return np.degrees(np.stack([
+        np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+        np.arcsin(np.clip(2 * (w * y - z * x), -1, 1)),
+        np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))], axis=1))
+
+
+def errors(body: Motion, target: Target, window: slice = slice(None)):
+    """
+    Compute the errors from a target over the samples of a window.
+
+    Returns:
+        (n,) position error [m] and (n,) orientation error [deg].
+
+    """
+    if isinstance(target, PoseTarget):
+        position, quaternion = target.position, target.quaternion
+    else:
+        position, quaternion = reference_poses(target, body.t[window])
+    return (np.linalg.norm(body.position[window] - position, axis=1),
+            np.degrees(geodesic_angles(body.quaternion[window], quaternion)))
+
+
+def estimate_errors(log: FlightLog) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """
+    Compute the errors of the estimate from the truth, where their stamps agree within 2.5 ms.
+
+    Returns:
+        (n,) times [s], (n,) position errors [m], (n,) orientation errors [deg].
+
+    """
+    if not len(log.truth_t):
+        return np.zeros(0), np.zeros(0), np.zeros(0)
+    index = np.clip(np.searchsorted(log.truth_t, log.odom_t - SAME_TIME), 0, len(log.truth_t) - 1)
+    near = np.abs(log.truth_t[index] - log.odom_t) < SAME_TIME
+    index = index[near]
+    distance = np.linalg.norm(log.odom_position[near] - log.truth_position[index], axis=1)
+    angle = np.degrees(geodesic_angles(log.odom_quaternion[near], log.truth_quaternion[index]))
+    return log.odom_t[near], distance, angle
+
+
+def reference_poses(target: Target, times: np.ndarray):
+    """Return (n, 3) positions and (n, 4) quaternions of a target at ``times`` (n,) [s]."""
+    references = [target.at(float(t)) for t in times]
+    return (np.array([r.position for r in references]).reshape(-1, 3),
+            np.array([r.quaternion for r in references]).reshape(-1, 4))
+
+
+def target_ends(log: FlightLog, last: float) -> list[float]:
+    """
+    Return the time at which each target of a log ended.
+
+    Args:
+        log: the flight.
+        last: duration of the last target if it is a pose [s].
+
+    """
+    ends = [target.stamp for target in log.targets[1:]]
+    if log.targets:
+        final = log.targets[-1]
+        ends.append(final.times[-1] if isinstance(final, TrajectoryTarget) else final.stamp + last)
+    return ends
+
+
+def hold(times: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Return the latest values at the times ``at``; before the first sample, the first one."""
+    index = np.searchsorted(times, at + EDGE, side='right') - 1
+    return values[np.maximum(index, 0)]
+
+
+def inside(times: np.ndarray, intervals: list[tuple[float, float]]) -> np.ndarray:
+    """Return a mask of the times that are in one of the intervals."""
+    mask = np.zeros(len(times), dtype=bool)
+    for begin, end in intervals:
+        mask |= (times >= begin - EDGE) & (times <= end + EDGE)
+    return mask

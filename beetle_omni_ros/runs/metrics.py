@@ -5,23 +5,23 @@ A pose lasts 8 s. U, the mean error over 7.0 to 7.5 s, measures the accuracy of 
 mean error over 1.0 to 7.0 s, measures how fast the pose is reached (docs/reference/metrics.md).
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.yaml_file import shortened
-from beetle_omni_ros.runs.body import (
+from beetle_omni_ros.runs.log import (
     errors,
     estimate_errors,
+    FlightLog,
     hold,
     inside,
     Motion,
     motion,
     target_ends,
 )
-from beetle_omni_ros.runs.log import FlightLog
 from beetle_omni_ros.runs.tasks import (
     control_lost,
     GROUND_HEIGHT,
@@ -41,16 +41,12 @@ SUMMARY = (('mean', np.mean), ('std', np.std), ('min', np.min), ('max', np.max))
 POSE_KEYS = ('U_position_m', 'U_orientation_deg', 'L_position_m', 'L_orientation_deg')
 
 
-@dataclass(frozen=True)
-class ControllerPart:
+class ControllerPart(NamedTuple):
     """
     Part of a flight with one controller.
 
-    Attributes:
-        name: name of the controller.
-        poses: indices of pose targets in the log's targets that lasted to the end of U.
-        intervals: (begin, end) of the flight towards targets [s].
-
+    ``poses`` are indices of pose targets in the log that lasted to the end of U, ``intervals``
+    (begin, end) of the flight towards targets [s].
     """
 
     name: str

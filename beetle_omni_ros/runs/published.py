@@ -60,14 +60,6 @@ LEMNISCATE = {
                        'orientation_mean_deg': 8.06, 'orientation_std_deg': 2.45},
 }
 
-
-def pose_results(task: str) -> dict[str, dict]:
-    """Return the published results of a pose task in the form of our metrics, if any."""
-    if task == 'random100':
-        return RANDOM_POSES
-    return WAYPOINTS if task == 'waypoints' else {}
-
-
-def tracking_results(task: str) -> dict[str, dict]:
-    """Return the published tracking results of a task, if any."""
-    return LEMNISCATE if task == 'lemniscate' else {}
+# Task -> published results of poses, and of tracking, in the form of our metrics.
+POSES = {'random100': RANDOM_POSES, 'waypoints': WAYPOINTS}
+TRACKING = {'lemniscate': LEMNISCATE}

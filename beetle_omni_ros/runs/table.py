@@ -4,7 +4,7 @@ from itertools import zip_longest
 
 from rich.console import Console
 
-from beetle_omni_ros.pages.table import ABSENT, Grid, print_grids, Terminal
+from beetle_omni_ros.pages.page import ABSENT, Grid, print_grids, Terminal
 from beetle_omni_ros.runs import published
 
 FILES, SHIPPED_ROBOT = ('robot', 'plant'), 'params/robot.yaml'    # keys in the metadata
@@ -76,7 +76,7 @@ def _same_poses(by_label):
 
 def _summary(by_label, task):
     """Table with a column for each controller and published result, a row for each metric."""
-    others = published.pose_results(task)
+    others = published.POSES.get(task, {})
     columns = [*by_label.values(), *others.values()]
     # The only pose of a trajectory is its start: to reach it says nothing about the path.
     posed = not all('trajectory' in result for result in by_label.values())
@@ -131,7 +131,7 @@ def _tracking(by_label, task):
         rows.append([name, 'all', *_tracking_cells(tracking)])
     ours = len(rows)
     rows += [[f'published {name}', 'all', *_tracking_cells(part)]
-             for name, part in published.tracking_results(task).items()]
+             for name, part in published.TRACKING.get(task, {}).items()]
     return Grid('Trajectory tracking', header, rows, frozenset(range(ours, len(rows))))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from beetle_omni_ros.control.base import PoseTarget, Target, TrajectoryTarget
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs import lemniscate, pose_file
+from beetle_omni_ros.runs import lemniscate, targets
 
 POSE_DURATION = 8.0  # [s] of one pose
 HOVER_DURATION = 60.0  # [s]
@@ -23,7 +23,9 @@ LOST_POSITION = 1.5  # [m] position error above which control is lost
 LOST_ORIENTATION = np.radians(90)  # [rad] the same for the orientation, at the end of a level
 GROUND_HEIGHT = 0.25  # [m] height of base_link below which the robot is on the ground
 
-# The poses of the real-world experiment: x, y, z [m], roll, pitch, yaw [deg].
+# Poses: x, y, z [m], roll, pitch, yaw [deg]. WAYPOINTS are of the real-world experiment.
+HOVER = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+DISTURBED = np.array([0.0, 0.0, 1.5, 25.0, 0.0, 0.0])
 WAYPOINTS = np.array([[0.0, 0.0, 0.8, 0.0, 0.0, 0.0],
                       [1.0, 0.0, 1.0, 45.0, 0.0, 0.0],
                       [0.0, 1.0, 1.0, 0.0, -25.0, 0.0],
@@ -206,11 +208,18 @@ def make_task(name: str | Path, seed: int = 0, reach: float = np.inf) -> Task:
         return _pose_task(name, random_poses(int(match[1]), seed))
     if name == 'lemniscate':
         return _lemniscate_task(name)
-    if name in ('hover', 'force', 'torque', 'payload'):
-        return {'hover': _hover_task, 'force': _force_task, 'torque': _torque_task,
-                'payload': _payload_task}[name](name)
+    if name == 'hover':
+        return Task(name, name, (Segment(HOVER_DURATION, _builder(HOVER)),), HOVER[None])
+    if name == 'payload':
+        return Task(name, name, tuple(
+            Segment(POSE_DURATION, _builder(HOVER), payload=mass, level=mass)
+            for mass in PAYLOADS), np.tile(HOVER, (len(PAYLOADS), 1)))
+    if name in ('force', 'torque'):
+        levels = _force_levels() if name == 'force' else _torque_levels()
+        return Task(name, name, (Segment(POSE_DURATION, _builder(DISTURBED)), *levels),
+                    DISTURBED[None])
     if name.lower().endswith('.csv') or name and Path(name).exists():
-        return _pose_task(name, pose_file.read_poses(name, reach))
+        return _pose_task(name, targets.read_poses(name, reach))
     raise ParameterError(f"task '{name}': expected a CSV file of poses, random1 to random999999 "
                          f"or one of {', '.join(NAMES)}")
 
@@ -237,36 +246,15 @@ def _pose_task(name, poses):
     return Task(name, 'poses', segments, poses)
 
 
-def _hover_task(name):
-    pose = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-    return Task(name, 'hover', (Segment(HOVER_DURATION, _builder(pose)),), pose[None])
+def _force_levels():
+    return [Segment(DISTURBANCE_PERIOD, force_world=np.array([0.0, 0.0, level]), level=level)
+            for level in FORCE_LEVELS]
 
 
-def _disturbance_pose():
-    return np.array([0.0, 0.0, 1.5, 25.0, 0.0, 0.0])
-
-
-def _force_task(name):
-    pose = _disturbance_pose()
-    levels = (Segment(DISTURBANCE_PERIOD, force_world=np.array([0.0, 0.0, level]), level=level)
-              for level in FORCE_LEVELS)
-    return Task(name, 'force', (Segment(POSE_DURATION, _builder(pose)), *levels), pose[None])
-
-
-def _torque_task(name):
-    pose = _disturbance_pose()
-    segments = [Segment(POSE_DURATION, _builder(pose))]
-    for level in TORQUE_LEVELS:
-        segments += [Segment(TORQUE_IMPULSE, torque_body=np.array([level, 0.0, 0.0]), level=level),
-                     Segment(DISTURBANCE_PERIOD - TORQUE_IMPULSE, level=level)]
-    return Task(name, 'torque', tuple(segments), pose[None])
-
-
-def _payload_task(name):
-    pose = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-    segments = tuple(Segment(POSE_DURATION, _builder(pose), payload=mass, level=mass)
-                     for mass in PAYLOADS)
-    return Task(name, 'payload', segments, np.tile(pose, (len(PAYLOADS), 1)))
+def _torque_levels():
+    return [segment for level in TORQUE_LEVELS for segment in (
+        Segment(TORQUE_IMPULSE, torque_body=np.array([level, 0.0, 0.0]), level=level),
+        Segment(DISTURBANCE_PERIOD - TORQUE_IMPULSE, level=level))]
 
 
 def _lemniscate_task(name):
@@ -326,7 +314,3 @@ def poses_task(name: str, poses: np.ndarray) -> Task:
         raise ParameterError(f"task '{name}': expected finite poses (N, 6), found shape "
                              f'{poses.shape}')
     return _pose_task(name, poses)
-
-
-__all__ = ['control_lost', 'make_task', 'Moment', 'NAMES', 'pose_target', 'poses_task',
-           'random_poses', 'Segment', 'Task', 'TaskPlayer', 'trajectory_task']

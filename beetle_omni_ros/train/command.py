@@ -10,7 +10,7 @@ import torch
 
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError, RunError
-from beetle_omni_ros.runs.json_file import check_writable, write_json
+from beetle_omni_ros.runs.files import check_writable, write_json
 from beetle_omni_ros.train.assess import assess
 from beetle_omni_ros.train.export import export_policy
 from beetle_omni_ros.train.run_folder import (

@@ -7,8 +7,7 @@ import numpy as np
 
 from beetle_omni_ros.control.base import Target
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.runs.log import FAULT_KEY, FlightLog, SUPERVISOR_STATUS
-from beetle_omni_ros.runs.recorder import Recorder
+from beetle_omni_ros.runs.log import FAULT_KEY, FlightLog, Recorder, SUPERVISOR_STATUS
 
 FIELDS = {'t': 1, 'position': 3, 'quaternion': 4, 'estimate_position': 3,
           'estimate_quaternion': 4, 'target_position': 3, 'target_quaternion': 4, 'tilt': 4,

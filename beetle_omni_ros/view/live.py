@@ -10,11 +10,10 @@ import numpy as np
 from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.runs.target_checks import TargetChecks
-from beetle_omni_ros.view import plots
+from beetle_omni_ros.runs.targets import TargetChecks
 from beetle_omni_ros.view.drawing import wxyz
 from beetle_omni_ros.view.frames import pose, Rows, Sampler, T
-from beetle_omni_ros.view.page import moments, Page, Shown
+from beetle_omni_ros.view.page import BEHIND, moments, Page, Shown
 
 KEPT = 60.0             # [s] of rows
 ANSWER_TIME = 3.0       # [s] to wait for a refusal of a target; diagnostics come every 1 s
@@ -100,7 +99,7 @@ class Live:
         if self._begin is None:
             self._begin = sampler.clock
         now = sampler.clock - self._begin
-        window = self._rows.window(sampler.clock - 2 * plots.BEHIND, np.inf).copy()
+        window = self._rows.window(sampler.clock - 2 * BEHIND, np.inf).copy()
         window[:, T] -= self._begin
         state = sampler.states[-1][1] if sampler.states else ''
         self._page.show([Shown(row, window, state, sampler.faults)], now, passed,

@@ -1,10 +1,11 @@
 """The page in the browser: 3D scene, panel and plots."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 import contextlib
 from dataclasses import dataclass
 import html
 import io
+from pathlib import PosixPath
 import socket
 import threading
 import time
@@ -12,17 +13,37 @@ import time
 import numpy as np
 import viser
 from viser import uplot
+import viser.infra
 
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.robot.urdf import Model
-from beetle_omni_ros.view import plots
-from beetle_omni_ros.view.arrows import WORLD_NEWTON_PER_METRE
-from beetle_omni_ros.view.client import served_with_script
-from beetle_omni_ros.view.drawing import FORCE, RobotDrawing, wxyz
-from beetle_omni_ros.view.frames import known, pose
+from beetle_omni_ros.runs.log import geodesic_angles
+from beetle_omni_ros.view.drawing import FORCE, RobotDrawing, WORLD_NEWTON_PER_METRE, wxyz
+from beetle_omni_ros.view.frames import COLUMNS, known, pose, T
 
+SOFTWARE_RENDERERS = 'SwiftShader|llvmpipe|softpipe|software|Basic Render'
+# Draws without antialiasing if the browser has no graphics card: it takes half of the time of a
+# picture that the CPU renders. viser's client requests it and has no option for it.
+SCRIPT = """<script>(() => {
+  const gl = document.createElement('canvas').getContext('webgl');
+  const info = gl && gl.getExtension('WEBGL_debug_renderer_info');
+  const renderer = info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : '';
+  gl?.getExtension('WEBGL_lose_context')?.loseContext();
+  if (!/RENDERERS/i.test(renderer)) return;
+  const original = HTMLCanvasElement.prototype.getContext;
+  HTMLCanvasElement.prototype.getContext = function (kind, options) {
+    return original.call(this, kind, String(kind).startsWith('webgl')
+      ? {...options, antialias: false} : options);
+  };
+})();</script>""".replace('RENDERERS', SOFTWARE_RENDERERS)
+COLOURS = ('#e4572e', '#17a398', '#5b6ee1', '#d4a017')     # of x, y, z; of rotors and joints
+RUN_COLOURS = ((228, 87, 46), (23, 163, 152), (91, 110, 225), (212, 160, 23))
+NOW = '#8a8f98'
+BEHIND, AHEAD = 6.0, 6.0        # [s] around the present that a plot shows
+HEIGHT = 150                    # [px]
+FOUR = ('1', '2', '3', '4')
 RATE = 30.0             # [Hz] of the scene
 PANEL_RATE, PLOT_RATE = 4.0, 4.0
 SHOWN_PLOTS = ('position error [m]', 'thrust command [N]')      # at the start
@@ -41,6 +62,110 @@ FLOOR = 10.0        # [m] to each side, with a line at each metre
 LABEL_HEIGHT, LABEL_STEP = 0.38, 0.1    # [m] above base_link; for each further run
 ESTIMATE_SEEN = 0.01, 1.0   # [m], [deg] error above which the estimate is drawn
 LOCAL = '127.0.0.1'
+
+
+class _Client(PosixPath):
+    """Folder and files of viser's client, with the script in its page."""
+
+    def read_bytes(self) -> bytes:
+        """Content of the file."""
+        data = super().read_bytes()
+        return data.replace(b'<head>', b'<head>' + SCRIPT.encode(), 1) \
+            if self.name == 'index.html' else data
+
+
+@contextlib.contextmanager
+def served_with_script() -> Iterator[None]:
+    """Let a viser server that is created in this context serve the page with the script."""
+    server = viser.infra.WebsockServer
+
+    def with_script(*args, **kwargs):
+        if 'http_server_root' in kwargs:    # a keyword of viser's internal call
+            kwargs['http_server_root'] = _Client(kwargs['http_server_root'])
+        return server(*args, **kwargs)
+
+    viser.infra.WebsockServer = with_script     # type: ignore[assignment, misc]
+    try:
+        yield
+    finally:
+        viser.infra.WebsockServer = server      # type: ignore[misc]
+
+
+@dataclass(frozen=True)
+class Plot:
+    """
+    One plot.
+
+    Attributes:
+        title: title with unit.
+        labels: labels of its series.
+        values: rows (N, WIDTH) -> (N, len(labels)).
+        compares: whether it shows all runs; otherwise the first run only.
+
+    """
+
+    title: str
+    labels: tuple[str, ...]
+    values: Callable[[np.ndarray], np.ndarray]
+    compares: bool = False
+
+
+def colour(run: int) -> str:
+    """Return the HTML colour of a run."""
+    return '#{:02x}{:02x}{:02x}'.format(*RUN_COLOURS[run % len(RUN_COLOURS)])
+
+
+def _field(name, scale=1.0):
+    return lambda rows: scale * rows[:, COLUMNS[name]]
+
+
+PLOTS = (
+    Plot('position error [m]', ('',), lambda rows: np.linalg.norm(
+        rows[:, COLUMNS['position']] - rows[:, COLUMNS['target_position']], axis=1,
+        keepdims=True), True),
+    Plot('orientation error [deg]', ('',), lambda rows: np.degrees(geodesic_angles(
+        rows[:, COLUMNS['quaternion']], rows[:, COLUMNS['target_quaternion']]))[:, None], True),
+    Plot('position [m]', ('x', 'y', 'z'), _field('position')),
+    Plot('tilt [deg]', FOUR, _field('tilt', 180 / np.pi)),
+    Plot('thrust command [N]', FOUR, _field('thrust')),
+    Plot('battery [V]', ('V',), _field('voltage')),
+)
+
+
+def window(plot: Plot, runs: list[np.ndarray], now: float) -> tuple[np.ndarray, ...] | None:
+    """
+    Return the series of a plot around the present time.
+
+    Args:
+        plot: plot to draw.
+        runs: rows (N, WIDTH) of each run, on the time base of the first.
+        now: present time [s].
+
+    Returns:
+        Times, the series, and a vertical line at ``now`` from 0 to 1 on its own scale. All have
+        equal length. The series contain no NaN, at which the plotting library would stop. None
+        without data.
+
+    """
+    series = [plot.values(rows) for rows in (runs if plot.compares else runs[:1])]
+    own = [rows[:, T] for rows in runs][:len(series)]
+    times = np.unique(np.concatenate(own))
+    if not any(np.isfinite(values).any() for values in series):
+        return None
+    columns = [_over(times, t, column) for t, values in zip(own, series, strict=True)
+               for column in values.T]
+    spare = next(column for column in columns if column is not None)
+    k = int(np.searchsorted(times, now))
+    mark = np.insert(np.full(len(times), np.nan), [k, k], [0.0, 1.0])
+    return (np.insert(times, [k, k], now),
+            *(np.insert(column, [k, k], np.interp(now, times, column))
+              for column in (spare if column is None else column for column in columns)), mark)
+
+
+def _over(times, own, values):
+    """Values interpolated at other times, without NaN; None without values."""
+    there = np.isfinite(values)
+    return np.interp(times, own[there], values[there]) if there.any() else None
 
 
 def moments(stop: threading.Event) -> Iterator[tuple[float, float]]:
@@ -133,7 +258,7 @@ class Page:
         self._set_theme(dark)
         self._robots = [RobotDrawing(
             scene, f'/run{k}', self._model, self._robot,
-            None if k == 0 else (plots.RUN_COLOURS[k % 4], GHOST_OPACITY))
+            None if k == 0 else (RUN_COLOURS[k % 4], GHOST_OPACITY))
             for k in range(len(self._names))]
         self._estimate = RobotDrawing(scene, '/estimate', self._model, self._robot, ESTIMATE)
         self._target = scene.add_frame('/target', axes_length=TARGET_AXES, axes_radius=0.008,
@@ -179,7 +304,7 @@ class Page:
         points = positions[np.searchsorted(flown, np.linspace(0, flown[-1], TRAIL_POINTS))]
         lines = np.stack([points[:-1], points[1:]], axis=1)
         self._trails[k] = self.server.scene.add_line_segments(
-            f'/trail{k}', lines, plots.RUN_COLOURS[k % 4] if len(self._names) > 1
+            f'/trail{k}', lines, RUN_COLOURS[k % 4] if len(self._names) > 1
             else (150, 158, 170), thickness=1.5, thickness_units='screen',
             visible=self._show_trail.value)
 
@@ -207,22 +332,22 @@ class Page:
                 trail.visible = self._show_trail.value
         with gui.add_folder('Plots', expand_by_default=True):
             self._plots = [(gui.add_checkbox(plot.title, plot.title in SHOWN_PLOTS),
-                            self._add_plot(plot)) for plot in plots.PLOTS]
+                            self._add_plot(plot)) for plot in PLOTS]
 
     def _add_plot(self, plot):
         if plot.compares:
             labels = self._names
-            colours = [plots.colour(k) for k in range(len(labels))]
+            colours = [colour(k) for k in range(len(labels))]
         else:
-            labels, colours = plot.labels, plots.COLOURS
+            labels, colours = plot.labels, COLOURS
         series = [uplot.Series(label='t')]
         series += [uplot.Series(label=label, stroke=colour, width=2, points={'show': False})
                    for label, colour in zip(labels, colours)]
-        series += [uplot.Series(label='', stroke=plots.NOW, width=1, scale='now',
+        series += [uplot.Series(label='', stroke=NOW, width=1, scale='now',
                                 points={'show': False})]
         empty = np.zeros(0)
         return self.server.gui.add_uplot(
-            (empty,) * len(series), tuple(series), height=plots.HEIGHT,
+            (empty,) * len(series), tuple(series), height=HEIGHT,
             scales={'x': uplot.Scale(time=False, auto=True), 'now': uplot.Scale(range=(0, 1))},
             visible=False, legend=uplot.Legend(show=False), padding=(4, 8, 0, 0))
 
@@ -245,16 +370,25 @@ class Page:
                 wanted = not self._run_boxes or self._run_boxes[k].value
                 robot.show(run.row, passed=passed) if wanted else robot.hide()
                 if self._labels:
-                    self._place_label(k, pose(run.row) if wanted else None)
+                    _place(self._labels[k], pose(run.row) if wanted else None,
+                           [0, 0, LABEL_HEIGHT + LABEL_STEP * k])
             # An estimate at the true pose would only tint the robot.
-            if self._show_estimate.value and _differ(*_apart(first.row, 'estimate_')):
+            metres, degrees = _apart(first.row, 'estimate_')
+            if self._show_estimate.value and (
+                    metres > ESTIMATE_SEEN[0] or degrees > ESTIMATE_SEEN[1]):
                 self._estimate.show(first.row, 'estimate_')
             else:
                 self._estimate.hide()
-            self._show_target(pose(first.row, 'target_'))
-            self._show_shadow(pose(first.row))
-            self._show_force(first.row)
-            self._move_cameras(pose(first.row))
+            placed, target = pose(first.row), pose(first.row, 'target_')
+            _place(self._target, target)
+            if target is not None:
+                self._target.wxyz = wxyz(target[1])
+            _place(self._shadow, placed and (placed[0] * [1, 1, 0], None), [0, 0, 0.001])
+            force = known(first.row, 'force')
+            self._force.visible = force is not None and placed is not None
+            if self._force.visible:
+                self._force.points = [[placed[0], placed[0] + force / WORLD_NEWTON_PER_METRE]]
+            self._move_cameras(placed)
         if time.monotonic() - self._last_panel > 1 / PANEL_RATE:
             self._last_panel = time.monotonic()
             self._status.content = status(first, headline, self._model, self._names)
@@ -265,8 +399,8 @@ class Page:
             self._last_plot = time.monotonic()
             # A chart that is opened during a pause draws its time axis only when the data change.
             self._nudge = NUDGE - self._nudge
-            for plot, (wanted, handle) in zip(plots.PLOTS, self._plots, strict=True):
-                data = plots.window(plot, windows, now) if wanted.value else None
+            for plot, (wanted, handle) in zip(PLOTS, self._plots, strict=True):
+                data = window(plot, windows, now) if wanted.value else None
                 handle.visible = data is not None
                 if data is not None:
                     data[0][0] += self._nudge
@@ -280,27 +414,6 @@ class Page:
     def settling(self) -> bool:
         """Whether a browser connected a short time ago."""
         return time.monotonic() < self._newcomer + SETTLING
-
-    def _place_label(self, k, placed):
-        self._labels[k].visible = placed is not None
-        if placed is not None:
-            self._labels[k].position = placed[0] + [0, 0, LABEL_HEIGHT + LABEL_STEP * k]
-
-    def _show_target(self, target):
-        self._target.visible = target is not None
-        if target is not None:
-            self._target.position, self._target.wxyz = target[0], wxyz(target[1])
-
-    def _show_shadow(self, placed):
-        self._shadow.visible = placed is not None
-        if placed is not None:
-            self._shadow.position = (*placed[0][:2], 0.001)
-
-    def _show_force(self, row):
-        force, placed = known(row, 'force'), pose(row)
-        self._force.visible = force is not None and placed is not None
-        if self._force.visible:
-            self._force.points = [[placed[0], placed[0] + force / WORLD_NEWTON_PER_METRE]]
 
     def _move_cameras(self, placed):
         if not self._follow.value or placed is None:
@@ -335,8 +448,11 @@ def _apart(row, prefix):
             float(np.degrees(rotations.geodesic_angle(body[1], other[1]))))
 
 
-def _differ(metres, degrees):
-    return metres > ESTIMATE_SEEN[0] or degrees > ESTIMATE_SEEN[1]
+def _place(handle, placed, shift=(0, 0, 0)):
+    """Show a handle at a pose, or hide it without one."""
+    handle.visible = placed is not None
+    if placed is not None:
+        handle.position = placed[0] + shift
 
 
 def status(run: Shown, headline: str, model: Model, names: list[str]) -> str:
@@ -344,7 +460,7 @@ def status(run: Shown, headline: str, model: Model, names: list[str]) -> str:
     lines = [f'<b>{html.escape(headline)}</b>']
     if len(names) > 1:
         lines.append('<div style="font-size:.85em">' + ' &nbsp; '.join(
-            f'<span style="color:{plots.colour(k)}">&#9632;</span> {html.escape(name)}'
+            f'<span style="color:{colour(k)}">&#9632;</span> {html.escape(name)}'
             for k, name in enumerate(names)) + '</div>')
     voltage, current = known(run.row, 'voltage'), known(run.row, 'current')
     entries = [('state', html.escape(run.state or 'unknown'))]
@@ -378,7 +494,7 @@ def _winding(row, model):
         ends = [tilt[k], tilt[k] if command is None else command[k]]
         share = 100 * (np.clip(ends, low, high) - low) / (high - low)
         left, width = min(share[0], 50.0), abs(share[0] - 50.0)
-        colour = '#e03131' if abs(share[0] - 50) > 42 else plots.COLOURS[k]
+        colour = '#e03131' if abs(share[0] - 50) > 42 else COLOURS[k]
         bars.append(
             f'<div style="display:flex;align-items:center;gap:.5em;font-size:.8em">'
             f'<span style="opacity:.65;width:4.4em">{name}</span>'

@@ -4,9 +4,8 @@ import threading
 
 import numpy as np
 
-from beetle_omni_ros.view import plots
 from beetle_omni_ros.view.frames import COLUMNS, state_at, T
-from beetle_omni_ros.view.page import moments, Page, RATE, Shown
+from beetle_omni_ros.view.page import AHEAD, BEHIND, moments, Page, RATE, Shown
 from beetle_omni_ros.view.recording import Recording
 
 SPEEDS = {'x 1/4': 0.25, 'x 1/2': 0.5, 'x 1': 1.0, 'x 2': 2.0, 'x 5': 5.0, 'x 10': 10.0}
@@ -88,7 +87,7 @@ class Player:
             # Between the run's own clock and the time base of the page.
             shift = run.origin() - (first.origin() - begin)
             at = self.time + shift
-            window = run.rows.window(at - plots.BEHIND, at + plots.AHEAD).copy()
+            window = run.rows.window(at - BEHIND, at + AHEAD).copy()
             window[:, T] -= shift
             shown.append(Shown(run.rows.at(at), window, state_at(run.states, at),
                                {name: t for name, t in run.faults.items() if t <= at}))

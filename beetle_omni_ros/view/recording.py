@@ -1,28 +1,32 @@
-"""A recorded run, read by a separate process while its first seconds are already displayed."""
+"""Recorded runs in the browser, read by a process each while their first seconds are shown."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, suppress
 import os
 from pathlib import Path
 import pickle
 import subprocess
 import sys
 import threading
+from typing import NamedTuple
 
 import numpy as np
+from rich.console import Console
 
 import beetle_omni_ros
-from beetle_omni_ros.runs.bag_files import bag_files, BagError, no_pose
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.urdf import Model
+from beetle_omni_ros.runs.bag import bag_files, BagError, names_of, no_pose, runs_in
 from beetle_omni_ros.view.frames import COLUMNS, Rows, Sampler
 
 STEP = 0.02         # [s] between rows
 GAP = 1.0           # [s] without any message in which no rows are made
 PART = 1000         # rows that are passed on together, after a shorter first part
 SKIPPED = ('imu/data_raw', 'mocap/pose', 'rotor_states')
+FIRST_ROWS = 60.0       # [s] timeout for the first rows of a run
 
 
-@dataclass
-class Part:
+class Part(NamedTuple):
     """
     New data of a run.
 
@@ -36,11 +40,11 @@ class Part:
 
     """
 
-    rows: np.ndarray = field(default_factory=lambda: Rows().table)
-    states: list[tuple[float, str]] = field(default_factory=list)
-    faults: dict[str, float] = field(default_factory=dict)
-    meta: dict = field(default_factory=dict)
-    warnings: list[str] = field(default_factory=list)
+    rows: np.ndarray
+    states: Sequence[tuple[float, str]] = ()
+    faults: Mapping[str, float] = {}
+    meta: Mapping = {}
+    warnings: Sequence[str] = ()
     error: str = ''
 
 
@@ -52,7 +56,7 @@ def parts(path: str | Path) -> Iterator[Part]:
         BagError: the bag is unreadable, or contains no pose of the robot.
 
     """
-    from beetle_omni_ros.runs.bag_reader import replay  # 0.1 s, not needed by the page
+    from beetle_omni_ros.runs.bag import replay  # 0.1 s, not needed by the page
     sampler, warnings, size = Sampler(), [], 0
     tables, due = [], None
     for times in replay(path, sampler, warnings, leave_out=SKIPPED):
@@ -100,11 +104,8 @@ class Recording:
         bag_files(path)
         self.path, self.name = Path(path), name or Path(path).absolute().name
         self.rows = Rows()
-        self.states: list[tuple[float, str]] = []
-        self.faults: dict[str, float] = {}
-        self.meta: dict = {}
-        self.warnings: list[str] = []
-        self.done, self._error = False, ''
+        self._take(Part(self.rows.table))
+        self.done = False
         self._changed = threading.Condition()
         root = str(Path(beetle_omni_ros.__file__).resolve().parents[1])
         self._process = subprocess.Popen(
@@ -136,15 +137,16 @@ class Recording:
         self._process.kill()
         self._process.wait()
 
+    def _take(self, part):
+        rows, self.states, self.faults, self.meta, self.warnings, self._error = part
+        self.rows.append(rows)
+
     def _take_in(self):
         try:
             while True:
                 part = pickle.load(self._process.stdout)
                 with self._changed:
-                    self._error = part.error
-                    self.rows.append(part.rows)
-                    self.states, self.faults = part.states, part.faults
-                    self.meta, self.warnings = part.meta, part.warnings
+                    self._take(part)
                     self._changed.notify_all()
         except (EOFError, pickle.UnpicklingError, OSError):
             if not len(self.rows) and not self._error:
@@ -162,7 +164,7 @@ def main(path: str) -> None:
             pickle.dump(part, output)
             output.flush()
     except BagError as error:
-        pickle.dump(Part(error=str(error)), output)
+        pickle.dump(Part(Rows().table, error=str(error)), output)
     except (BrokenPipeError, KeyboardInterrupt):
         os._exit(1)     # the reader has ended; a regular exit would report the closed output
 
@@ -171,3 +173,41 @@ if __name__ == '__main__':
     # Import again: pickled classes must belong to this module, not to __main__.
     from beetle_omni_ros.view import recording
     recording.main(sys.argv[1])
+
+
+def run_view(runs: list[Path], *, robot: Path | None = None, urdf: Path | None = None,
+             host: str, port: int, dark: bool = False, start: float = 0.0,
+             play: bool = True, console: Console | None = None) -> None:
+    """
+    Play recorded runs until Ctrl-C; arguments are the options of `beetle_omni view`.
+
+    Raises:
+        BagError: unusable run.
+        ParameterError: other unusable input.
+
+    """
+    console, runs = console or Console(), runs_in(runs)
+    model, parameters = Model.load(urdf), RobotParameters.load(robot)
+    with ExitStack() as stack:
+        recordings = []
+        for path, name in zip(runs, names_of(runs), strict=True):
+            recordings.append(Recording(path, name))
+            stack.callback(recordings[-1].close)
+        from beetle_omni_ros.view.page import Page  # slow import, while the first rows are read
+        from beetle_omni_ros.view.playback import Player
+        page = Page([recording.name for recording in recordings], model, parameters, host=host,
+                    port=port, dark=dark)
+        stack.callback(page.close)
+        for recording in recordings:
+            recording.wait(FIRST_ROWS)
+        player = Player(page, recordings, start, play)
+        player.look()
+        player.draw()
+        with suppress(KeyboardInterrupt):       # the regular end
+            announce(page.url, console)
+            player.run()
+
+
+def announce(url: str, console: Console) -> None:
+    """Print the address of the page."""
+    console.print(f'{url}  (Ctrl-C ends it)', markup=False, highlight=False, soft_wrap=True)

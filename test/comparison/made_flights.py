@@ -4,10 +4,9 @@ import json
 
 from synthetic_flights import fly
 
-from beetle_omni_ros.comparison.flight import trace
-from beetle_omni_ros.comparison.plan import Flight
+from beetle_omni_ros.comparison.flights import Flight, trace
+from beetle_omni_ros.runs.log import LogRecorder
 from beetle_omni_ros.runs.metrics import metrics
-from beetle_omni_ros.runs.recorder import LogRecorder
 from beetle_omni_ros.runs.tasks import make_task
 
 TASKS = ('random3', 'waypoints', 'lemniscate', 'force', 'torque', 'payload', 'hover')

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from beetle_omni_ros.comparison import command, summary
 from beetle_omni_ros.comparison import page as comparison_page
-from beetle_omni_ros.comparison.plan import Flight
+from beetle_omni_ros.comparison.flights import Flight
 from beetle_omni_ros.runs import published
 
 CONTROLLERS = ('rl', 'nmpc', 'nmpc_published')

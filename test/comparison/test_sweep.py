@@ -11,10 +11,9 @@ import sys
 import pytest
 from rich.console import Console
 
-from beetle_omni_ros.comparison import command, fingerprint, sweep
-from beetle_omni_ros.comparison import flight as flight_module
-from beetle_omni_ros.comparison.plan import CONDITIONS, Flight, plan, TASKS
-from beetle_omni_ros.comparison.sweep import Store
+from beetle_omni_ros.comparison import command, fingerprint
+from beetle_omni_ros.comparison import flights as flights_module
+from beetle_omni_ros.comparison.flights import CONDITIONS, Flight, plan, Store, TASKS
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.runs.tasks import make_task
@@ -55,9 +54,9 @@ def test_a_plan_contains_each_combination_once_longest_first():
 
 def test_worker_processes_give_the_same_numbers_as_this_process(poses, tmp_path):
     flights = plan(['hover'], [poses], ['published'], [3, 4])
-    flown = sweep.sweep(flights, store=Store(tmp_path / 'kept'), jobs=2)
+    flown = flights_module.sweep(flights, store=Store(tmp_path / 'kept'), jobs=2)
     assert list(flown) == flights
-    here = flight_module.fly_flight(flights[1], flights[1].make_task())
+    here = flights_module.fly_flight(flights[1], flights[1].make_task())
     assert without_times(here) == without_times(flown[flights[1]])
 
 
@@ -65,8 +64,8 @@ def test_worker_processes_give_the_same_numbers_as_this_process(poses, tmp_path)
 @pytest.mark.timeout(180)
 def test_ray_gives_the_same_numbers_as_processes(poses, tmp_path):
     flights = plan(['hover'], [poses], ['nominal'], [0, 1])
-    by_ray = sweep.sweep(flights, store=Store(tmp_path / 'ray'), backend='ray', jobs=2)
-    by_processes = sweep.sweep(flights, store=Store(tmp_path / 'processes'), jobs=2)
+    by_ray = flights_module.sweep(flights, store=Store(tmp_path / 'ray'), backend='ray', jobs=2)
+    by_processes = flights_module.sweep(flights, store=Store(tmp_path / 'processes'), jobs=2)
     assert list(by_ray) == list(by_processes) == flights
     for flight in flights:
         assert by_ray[flight]['failure'] is None
@@ -78,7 +77,7 @@ def test_ray_gives_the_same_numbers_as_processes(poses, tmp_path):
 def test_finished_flights_are_cached_and_only_missing_ones_are_flown(poses, tmp_path, monkeypatch):
     store = Store(tmp_path / 'kept')
     flights = plan(['hover'], [poses], ['nominal'], [0, 1])
-    first = sweep.sweep(flights[:1], store=store, jobs=1)
+    first = flights_module.sweep(flights[:1], store=store, jobs=1)
     calls = []
 
     def interrupt(flight, result, kept):
@@ -87,14 +86,14 @@ def test_finished_flights_are_cached_and_only_missing_ones_are_flown(poses, tmp_
             raise KeyboardInterrupt     # which keeps the finished flights
 
     with pytest.raises(KeyboardInterrupt):
-        sweep.sweep(flights, store=store, jobs=1, done=interrupt)
+        flights_module.sweep(flights, store=store, jobs=1, done=interrupt)
     assert calls == [(flights[0], True), (flights[1], False)]
-    monkeypatch.setattr(sweep, 'fly_flight', never)
-    both = sweep.sweep(flights, store=store, jobs=1)
+    monkeypatch.setattr(flights_module, 'fly_flight', never)
+    both = flights_module.sweep(flights, store=store, jobs=1)
     assert without_times(first[flights[0]]) == without_times(both[flights[0]])
     assert both[flights[0]]['metrics']['compute_ms'] == first[flights[0]]['metrics']['compute_ms']
     with pytest.raises(AssertionError, match='flown again'):
-        sweep.sweep(flights, store=store, jobs=1, fresh=True)
+        flights_module.sweep(flights, store=store, jobs=1, fresh=True)
 
 
 def test_a_cached_flight_is_reused_for_equal_inputs_only(poses, tmp_path, monkeypatch):
@@ -106,7 +105,7 @@ def test_a_cached_flight_is_reused_for_equal_inputs_only(poses, tmp_path, monkey
         file.write('0,0,1,0,0,0\n')
     assert store.load(flight) is None
     store.save(flight, {'failure': None, 'metrics': {}, 'trace': {}})
-    monkeypatch.setattr(fingerprint, 'code_fingerprint', lambda *_: 'other code')
+    monkeypatch.setattr(flights_module, 'code_fingerprint', lambda *_: 'other code')
     assert store.load(flight) is None
 
 
@@ -116,10 +115,10 @@ def test_another_policy_file_is_another_flight(tmp_path):
         file = tmp_path / f'{text}.onnx'
         file.write_text(text)
         flights += plan(['rl'], ['hover'], ['nominal'], [0], policy=file)
-    keys = [fingerprint.flight_key(flight) for flight in flights]
+    keys = [flights_module.flight_key(flight) for flight in flights]
     assert keys[0] != keys[1]
     (tmp_path / 'two.onnx').write_text('one')
-    assert fingerprint.flight_key(flights[1]) == keys[0]
+    assert flights_module.flight_key(flights[1]) == keys[0]
 
 
 def test_another_plant_is_another_flight_as_far_as_its_values_differ(tmp_path):
@@ -128,7 +127,7 @@ def test_another_plant_is_another_flight_as_far_as_its_values_differ(tmp_path):
     for text in ('name: same', 'mass: 3.3', 'name: other\nmass: 3.3'):
         heavy.write_text(f'extends: robot.yaml\n{text}\n')
         [flight] = plan(['nmpc'], ['hover'], ['nominal'], [0], plant=heavy)
-        keys.append(fingerprint.flight_key(flight))
+        keys.append(flights_module.flight_key(flight))
     assert keys[0] != keys[1] == keys[2]
     assert 'heavy' in flight.name
 
@@ -153,8 +152,7 @@ def test_all_that_a_flight_loads_is_in_its_fingerprint(poses, controller):
             if event == 'open' and str(given[0]).endswith('.yaml'):
                 print(given[0])
         sys.addaudithook(opened)
-        from beetle_omni_ros.comparison.flight import fly_flight
-        from beetle_omni_ros.comparison.plan import Flight
+        from beetle_omni_ros.comparison.flights import Flight, fly_flight
         flight = Flight({poses!r}, 'published', {controller!r}, 0)
         assert fly_flight(flight, flight.make_task())['metrics']
         print(*(module.__file__ for name, module in list(sys.modules.items())
@@ -183,8 +181,8 @@ def test_a_failed_flight_is_a_result_with_its_reason_and_not_cached(poses, tmp_p
             raise ZeroDivisionError('no way\nout')
         return real(controller, *arguments, **options)
 
-    real = flight_module.fly
-    monkeypatch.setattr(flight_module, 'fly', fly)
+    real = flights_module.fly
+    monkeypatch.setattr(flights_module, 'fly', fly)
     results = command.run_compare(
         output=tmp_path / 'out', controllers=['nmpc', 'hover'], tasks=[poses],
         conditions=['nominal'], seeds=[0], jobs=1, console=Console(file=io.StringIO()))
@@ -196,7 +194,7 @@ def test_a_failed_flight_is_a_result_with_its_reason_and_not_cached(poses, tmp_p
 
 
 def test_a_worker_with_different_code_is_refused(monkeypatch):
-    monkeypatch.setattr(flight_module, 'fly', never)
+    monkeypatch.setattr(flights_module, 'fly', never)
     flight = Flight('hover', 'nominal', 'hover', 0)
-    result = flight_module.fly_flight(flight, make_task('hover'), code='another')
+    result = flights_module.fly_flight(flight, make_task('hover'), code='another')
     assert 'another version of the code' in result['failure']

@@ -14,7 +14,7 @@ from beetle_omni_ros.evaluation.loop import FlightLoop
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.parameters import find_robot, RobotParameters
 from beetle_omni_ros.robot.servo import NUMPY, Servo, Step
-from beetle_omni_ros.runs.recorder import LogRecorder
+from beetle_omni_ros.runs.log import LogRecorder
 
 ROBOT = RobotParameters.load()
 HOVER = ROBOT.hover_thrust

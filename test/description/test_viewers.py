@@ -15,7 +15,8 @@ from beetle_omni_ros.nodes import plan
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, ROTOR_NAMES
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.urdf import description, SHIPPED
-from beetle_omni_ros.runs.bag import BagWriter, read_messages
+from beetle_omni_ros.runs.bag import read_messages
+from beetle_omni_ros.runs.bag_writer import BagWriter
 from beetle_omni_ros.runs.tasks import make_task
 
 VIEWERS = share_path('viewers')

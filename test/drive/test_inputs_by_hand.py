@@ -5,9 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from beetle_omni_ros.drive import keys
-from beetle_omni_ros.drive.parameters import DriveParameters, read_named_poses
-from beetle_omni_ros.drive.words import Go, Order, parse, Shift, WordError
+from beetle_omni_ros import drive
+from beetle_omni_ros.drive import (
+    DriveParameters,
+    Go,
+    Order,
+    parse,
+    read_named_poses,
+    Shift,
+    WordError,
+)
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.schema import ParameterError
 
@@ -19,43 +26,43 @@ def p():
 
 def test_each_axis_has_two_opposite_keys(p):
     total = [np.zeros(3), np.zeros(3)]
-    for key in keys.MOVES:
-        for sum_, part in zip(total, keys.shift_of_key(key, p)):
+    for key in drive.MOVES:
+        for sum_, part in zip(total, drive.shift_of_key(key, p)):
             sum_ += part
-    assert not np.any(total) and {axis for axis, _ in keys.MOVES.values()} == set(range(6))
-    assert keys.shift_of_key('w', p)[0] == pytest.approx([p.step, 0, 0])
-    assert keys.shift_of_key('j', p)[1] == pytest.approx([0, 0, p.turn])
-    assert keys.shift_of_key('z', p) is None
-    assert not set(keys.MOVES) & set(keys.WORDS)
+    assert not np.any(total) and {axis for axis, _ in drive.MOVES.values()} == set(range(6))
+    assert drive.shift_of_key('w', p)[0] == pytest.approx([p.step, 0, 0])
+    assert drive.shift_of_key('j', p)[1] == pytest.approx([0, 0, p.turn])
+    assert drive.shift_of_key('z', p) is None
+    assert not set(drive.MOVES) & set(drive.KEY_WORDS)
 
 
 def test_full_deflection_gives_the_speed_and_the_dead_zone_gives_zero(p):
     axes = np.zeros(8)
     for number, sign in zip(p.axes.astype(int), p.signs):
         axes[number] = sign
-    way, turn = keys.shift_of_sticks(axes, 0.1, p)
+    way, turn = drive.shift_of_sticks(axes, 0.1, p)
     assert way == pytest.approx([0.1 * p.speed] * 3) and turn == pytest.approx([0.1 * p.rate] * 3)
-    way, turn = keys.shift_of_sticks(axes * p.dead_zone * 0.99, 0.1, p)
+    way, turn = drive.shift_of_sticks(axes * p.dead_zone * 0.99, 0.1, p)
     assert not way.any() and not turn.any()
-    half = keys.shift_of_sticks(axes * (p.dead_zone + (1 - p.dead_zone) / 2), 0.1, p)[0]
+    half = drive.shift_of_sticks(axes * (p.dead_zone + (1 - p.dead_zone) / 2), 0.1, p)[0]
     assert half == pytest.approx([0.05 * p.speed] * 3)
 
 
 def test_axes_that_are_missing_or_not_finite_count_as_released(p):
     for axes in ((), [np.nan] * 8, (0.0,)):
-        way, turn = keys.shift_of_sticks(axes, 0.1, p)
+        way, turn = drive.shift_of_sticks(axes, 0.1, p)
         assert not way.any() and not turn.any()
     without = replace(p, axes=np.full(6, -1.0))
-    assert not keys.shift_of_sticks([1.0] * 8, 0.1, without)[0].any()
-    way, _ = keys.shift_of_sticks([9.0] * 8, 0.1, p)
+    assert not drive.shift_of_sticks([1.0] * 8, 0.1, without)[0].any()
+    way, _ = drive.shift_of_sticks([9.0] * 8, 0.1, p)
     assert np.abs(way).max() == pytest.approx(0.1 * p.speed)
 
 
 def test_a_button_counts_once_when_pressed(p):
     down = [0] * 11
     down[p.buttons['arm']] = 1
-    assert keys.pressed((), down, p) == ['arm'] and keys.pressed(down, down, p) == []
-    assert keys.pressed(down, (), p) == []
+    assert drive.pressed((), down, p) == ['arm'] and drive.pressed(down, down, p) == []
+    assert drive.pressed(down, (), p) == []
 
 
 @pytest.mark.parametrize(('line', 'way', 'turn'), [

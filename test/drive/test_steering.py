@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from beetle_omni_ros.drive.parameters import DriveParameters
-from beetle_omni_ros.drive.steering import Steering
+from beetle_omni_ros.drive import DriveParameters, Steering
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.runs.target_checks import TargetChecks
+from beetle_omni_ros.runs.targets import TargetChecks
 
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 START = np.array([0.0, 0.0, 1.0])

@@ -15,7 +15,7 @@ from beetle_omni_ros.evaluation import command, loop
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError, RunError
-from beetle_omni_ros.runs.bag_reader import read_bag
+from beetle_omni_ros.runs.bag import read_bag
 from beetle_omni_ros.runs.metrics import metrics
 from beetle_omni_ros.runs.tasks import make_task, Task
 from beetle_omni_ros.safety.parameters import SupervisorParameters

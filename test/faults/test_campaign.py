@@ -22,7 +22,7 @@ from beetle_omni_ros.faults.landings import (
 )
 from beetle_omni_ros.faults.trial import fly_to_start, fly_trial, Trial
 from beetle_omni_ros.faults.watch import BETTER
-from beetle_omni_ros.pages.table import print_grids
+from beetle_omni_ros.pages.page import print_grids
 
 ROOT = Path(__file__).parents[2]
 

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from beetle_omni_ros import cli
 from beetle_omni_ros.evaluation.command import run_evaluate
-from beetle_omni_ros.film.command import (
+from beetle_omni_ros.film import (
     camera,
     CAPTION,
     FIELD_OF_VIEW,
@@ -23,7 +23,7 @@ from beetle_omni_ros.film.command import (
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.runs.bag import read_bag
-from beetle_omni_ros.runs.body import geodesic_angles, motion
+from beetle_omni_ros.runs.log import geodesic_angles, motion
 from beetle_omni_ros.runs.tasks import pose_target, Segment, Task
 
 POSES = np.array([[0, 0, 1.0, 0, 0, 0], [0.6, 0.3, 1.2, 0, 30, 40]])

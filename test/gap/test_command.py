@@ -16,8 +16,8 @@ from beetle_omni_ros.identify.gap import workers
 from beetle_omni_ros.identify.gap.command import gap_results, run_gap
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.bag import BagWriter
-from beetle_omni_ros.runs.bag_files import read_messages
+from beetle_omni_ros.runs.bag import read_messages
+from beetle_omni_ros.runs.bag_writer import BagWriter
 
 TRUE = np.array(WIND)
 

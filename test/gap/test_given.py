@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from beetle_omni_ros.runs.bag_files import names_of
+from beetle_omni_ros.runs.bag import names_of
 
 
 @pytest.mark.parametrize('paths, names', [

@@ -11,7 +11,7 @@ from beetle_omni_ros.identify.gap.ingest import load_flight, prepare, UnusableFl
 from beetle_omni_ros.identify.gap.noise import Noise
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.series import LEAST_SAMPLES, shortest_flight
-from beetle_omni_ros.runs.bag_files import BagError
+from beetle_omni_ros.runs.bag import BagError
 
 
 def recording(duration=16.0):

@@ -18,7 +18,7 @@ from beetle_omni_ros.identify.recording.limits import RecordingLimits
 from beetle_omni_ros.identify.recording.motion import Motion
 from beetle_omni_ros.identify.recording.readings import reading_damages
 from beetle_omni_ros.messages import columns as message_columns
-from beetle_omni_ros.runs.bag import BagWriter
+from beetle_omni_ros.runs.bag_writer import BagWriter
 
 P = GapParameters.load()
 IMU, POSE, JOINTS, COMMAND = 'imu/data_raw', 'mocap/pose', 'joint_states', 'command'

@@ -10,8 +10,8 @@ from synthetic_flights import write_command, write_joints
 from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.servo import log as servo_log
 from beetle_omni_ros.identify.servo.log import read_joint_log
-from beetle_omni_ros.runs.bag import BagWriter
-from beetle_omni_ros.runs.csv_table import LogError
+from beetle_omni_ros.runs.bag_writer import BagWriter
+from beetle_omni_ros.runs.files import LogError
 
 
 def recorded(folder, t, command, sent=None, joints=True):

@@ -5,7 +5,7 @@ import pytest
 from servo_logs import COUNT, log_of, sweep, write
 
 from beetle_omni_ros.identify.servo.log import fresh_rows, JointLog, read_joint_log, reading_times
-from beetle_omni_ros.runs.csv_table import LogError
+from beetle_omni_ros.runs.files import LogError
 
 HEADER = ['t_s', 'q1_rad', 'q2_rad', 'command_rad']
 

@@ -13,7 +13,7 @@ from beetle_omni_ros.identify.rotor.results import identify_rotor, rotor_results
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.robot.thrust_map import ThrustMap
-from beetle_omni_ros.runs.csv_table import LogError
+from beetle_omni_ros.runs.files import LogError
 
 DATA = Path(__file__).resolve().parents[3] / 'shared' / 'data'
 STAND = (*HEADER, 'temperature', 'file_voltage')

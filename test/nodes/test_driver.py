@@ -17,7 +17,7 @@ from sensor_msgs.msg import Joy
 from witness import running_graph
 
 from beetle_omni_ros import cli
-from beetle_omni_ros.drive.parameters import DriveParameters
+from beetle_omni_ros.drive import DriveParameters
 from beetle_omni_ros.messages.topics import EVENT
 from beetle_omni_ros.nodes import discovery, driver, wire
 from beetle_omni_ros.robot import rotations

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from beetle_omni_ros.pages.charts import data_block, Numbers, STEPS
+from beetle_omni_ros.runs.charts import data_block, Numbers, STEPS
 
 # On a busy computer the time of an example is meaningless.
 BUSY = settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.too_slow])

@@ -15,8 +15,7 @@ from beetle_omni_ros.comparison import grids
 from beetle_omni_ros.comparison.page import page as comparison_page
 from beetle_omni_ros.comparison.page import Section
 from beetle_omni_ros.faults.page import as_page
-from beetle_omni_ros.pages.page import page, section, verdict_head
-from beetle_omni_ros.pages.table import Grid
+from beetle_omni_ros.pages.page import Grid, page, section, verdict_head
 from beetle_omni_ros.sim.faults.listed import FaultList
 
 ROOT = Path(__file__).parents[2]

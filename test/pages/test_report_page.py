@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 from synthetic_flights import fly, write_state
 
-from beetle_omni_ros.runs.bag import BagWriter
+from beetle_omni_ros.runs.bag_writer import BagWriter
 from beetle_omni_ros.runs.report import run_report
 from beetle_omni_ros.runs.tasks import make_task
 

@@ -9,7 +9,7 @@ import sys
 import pytest
 from rich.console import Console
 
-from beetle_omni_ros.pages.table import Grid, print_grids
+from beetle_omni_ros.pages.page import Grid, print_grids
 
 
 @pytest.mark.parametrize('width', [40, 80, 200])

@@ -18,16 +18,9 @@ from synthetic_flights import (
 from beetle_omni_ros.messages import conversions
 from beetle_omni_ros.messages.bag_types import BAG, to_bytes, TYPESTORE
 from beetle_omni_ros.robot.readings import ImuReading
-from beetle_omni_ros.runs.bag import (
-    add_meta,
-    BagError,
-    BagWriter,
-    read_bag,
-    read_messages,
-)
-from beetle_omni_ros.runs.bag_reader import replay
-from beetle_omni_ros.runs.log import FlightLog
-from beetle_omni_ros.runs.recorder import LogRecorder, Tee
+from beetle_omni_ros.runs.bag import BagError, read_bag, read_messages, replay
+from beetle_omni_ros.runs.bag_writer import add_meta, BagWriter
+from beetle_omni_ros.runs.log import FlightLog, LogRecorder, Tee
 from beetle_omni_ros.runs.tasks import make_task
 
 META = {'task': 'lemniscate', 'conditions': 'nominal', 'seed': 4, 'version': '0.1.0'}

@@ -16,11 +16,11 @@ from synthetic_flights import (
 
 from beetle_omni_ros.control.base import TrajectoryTarget
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.runs.bag import BagWriter, read_bag
-from beetle_omni_ros.runs.body import geodesic_angles, roll_pitch_yaw
-from beetle_omni_ros.runs.json_file import write_json
+from beetle_omni_ros.runs.bag import read_bag
+from beetle_omni_ros.runs.bag_writer import BagWriter
+from beetle_omni_ros.runs.files import write_json
+from beetle_omni_ros.runs.log import geodesic_angles, LogRecorder, roll_pitch_yaw, Tee
 from beetle_omni_ros.runs.metrics import metrics, metrics_by_controller, task_of
-from beetle_omni_ros.runs.recorder import LogRecorder, Tee
 from beetle_omni_ros.runs.tasks import make_task, pose_target
 
 LEVEL = np.array([0, 0, 0, 1.0])

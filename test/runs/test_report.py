@@ -10,7 +10,8 @@ from synthetic_flights import write_odom, write_state, write_truth
 import yaml
 
 from beetle_omni_ros.control.base import PoseTarget
-from beetle_omni_ros.runs.bag import BagWriter, read_bag
+from beetle_omni_ros.runs.bag import read_bag
+from beetle_omni_ros.runs.bag_writer import BagWriter
 from beetle_omni_ros.runs.report import make_page, make_runs, results_of, run_report
 from beetle_omni_ros.runs.table import grids
 

@@ -20,7 +20,8 @@ from beetle_omni_ros.messages.bag_types import BAG, to_bytes
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.robot.urdf import description, joints
-from beetle_omni_ros.runs.bag import BagWriter, read_bag
+from beetle_omni_ros.runs.bag import read_bag
+from beetle_omni_ros.runs.bag_writer import BagWriter
 from beetle_omni_ros.runs.tasks import make_task
 
 INTERFACES = Path(sys.prefix) / 'share'     # of the message packages, where ROS is of PyPI

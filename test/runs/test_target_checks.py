@@ -7,8 +7,7 @@ from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.pose_file import COLUMNS, read_poses
-from beetle_omni_ros.runs.target_checks import TargetChecks
+from beetle_omni_ros.runs.targets import COLUMNS, read_poses, TargetChecks
 
 CHECKS = TargetChecks(RobotParameters.load())
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])

@@ -5,9 +5,10 @@ import pytest
 from synthetic_flights import fly, write_battery, write_odom, write_state, write_truth
 
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.runs.bag import BagError, BagWriter, read_bag
+from beetle_omni_ros.runs.bag import BagError, read_bag
+from beetle_omni_ros.runs.bag_writer import BagWriter
 from beetle_omni_ros.runs.tasks import make_task
-from beetle_omni_ros.view import plots
+from beetle_omni_ros.view import page as plots
 from beetle_omni_ros.view.frames import COLUMNS, known, pose, Rows, Sampler, state_at, T, WIDTH
 from beetle_omni_ros.view.recording import parts, Recording, STEP
 

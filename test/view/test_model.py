@@ -9,14 +9,14 @@ from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters, ROTOR
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.robot.urdf import Model
-from beetle_omni_ros.view.arrows import (
+from beetle_omni_ros.view.drawing import (
+    _mesh,
     NEWTON_PER_METRE,
     rotor_frames,
     SEGMENTS,
     thrust_arrows,
     torque_arcs,
 )
-from beetle_omni_ros.view.drawing import _mesh
 
 SMALL = """<robot name="r">
 <material name="red"><color rgba="1 0 0 0.5"/></material>

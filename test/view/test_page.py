@@ -11,7 +11,7 @@ from view_browser import at_rest, opened, rendered, started, until
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.urdf import Model
-from beetle_omni_ros.runs.bag import BagWriter
+from beetle_omni_ros.runs.bag_writer import BagWriter
 from beetle_omni_ros.runs.tasks import make_task
 from beetle_omni_ros.view.live import Live
 from beetle_omni_ros.view.page import Page

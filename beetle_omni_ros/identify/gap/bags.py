@@ -11,7 +11,7 @@ from beetle_omni_ros.messages.bag_types import from_bytes
 from beetle_omni_ros.messages.columns import read_all
 from beetle_omni_ros.messages.topics import is_ambiguous, split_topic, TOPICS
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, ROTOR_NAMES
-from beetle_omni_ros.runs.bag_files import BagError, read_together
+from beetle_omni_ros.runs.bag import BagError, read_together
 
 # Topic -> columns of its table; PARTS: fields of the message that they come from.
 NEEDED = {'imu/data_raw': 6, 'mocap/pose': 7, 'joint_states': 4, 'command': 8}

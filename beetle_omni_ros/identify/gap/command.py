@@ -22,10 +22,10 @@ from beetle_omni_ros.identify.gap.workers import Workers
 from beetle_omni_ros.identify.robot_file import check_outputs
 from beetle_omni_ros.identify.servo.compare import analyse_joint_logs, is_joint_log
 from beetle_omni_ros.identify.servo.page import change_grids, gap_log_page
-from beetle_omni_ros.pages.table import print_grids, Terminal
+from beetle_omni_ros.pages.page import print_grids, Terminal
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.runs.bag_files import names_of, runs_in
-from beetle_omni_ros.runs.json_file import write_json, write_text
+from beetle_omni_ros.runs.bag import names_of, runs_in
+from beetle_omni_ros.runs.files import write_json, write_text
 
 BAD_DATA = 3        # exit status
 LEAST_FITTED = 2    # with more flights, the last one is held out if none is given

@@ -14,7 +14,7 @@ from beetle_omni_ros.identify.recording.check import damages, repaired
 from beetle_omni_ros.identify.recording.damage import Damage
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.bag_files import bag_files
+from beetle_omni_ros.runs.bag import bag_files
 
 
 class UnusableFlight(ValueError):

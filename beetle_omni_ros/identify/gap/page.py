@@ -11,8 +11,7 @@ from beetle_omni_ros.identify.gap.rollouts import STATES
 from beetle_omni_ros.identify.gap.rollouts import UNITS as STATE_UNITS
 from beetle_omni_ros.identify.recording.picture import damage_figure
 from beetle_omni_ros.pages.figures import COLOURS, FAINT, legend, line, panels, STYLE, svg
-from beetle_omni_ros.pages.page import page, section, verdict_head
-from beetle_omni_ros.pages.table import Grid, html
+from beetle_omni_ros.pages.page import Grid, html, page, section, verdict_head
 
 BARS = 16
 BEFORE, AFTER = COLOURS[1], COLOURS[0]

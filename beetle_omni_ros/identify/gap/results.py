@@ -11,7 +11,7 @@ from beetle_omni_ros.identify.gap.candidates import Trial
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.rollouts import HORIZONS
 from beetle_omni_ros.identify.gap.verdict import hidden
-from beetle_omni_ros.pages.table import ABSENT, Grid
+from beetle_omni_ros.pages.page import ABSENT, Grid
 from beetle_omni_ros.robot.effects import CATALOGUE, separating_experiment
 from beetle_omni_ros.robot.parameters import RobotParameters
 

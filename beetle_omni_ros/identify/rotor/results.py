@@ -19,10 +19,9 @@ from beetle_omni_ros.identify.rotor.surface import (
     torque_ratio,
 )
 from beetle_omni_ros.pages.figures import FAINT, INK, legend, panels, STYLE, svg
-from beetle_omni_ros.pages.page import page, section
-from beetle_omni_ros.pages.table import Grid
+from beetle_omni_ros.pages.page import Grid, page, section
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.runs.csv_table import LogError
+from beetle_omni_ros.runs.files import LogError
 
 LEVELS = (0.25, 0.5, 0.75, 1.0)     # of the largest duty, for which the ratio is listed
 QUANTITIES = {'thrust': 'N', 'torque': 'N_m'}

@@ -27,7 +27,7 @@ from beetle_omni_ros.identify.servo.model import INDEX
 from beetle_omni_ros.identify.servo.robot import catalogue_values, file_sets
 from beetle_omni_ros.robot.effects import CATALOGUE, separating_experiment
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.runs.bag_files import BagError, read_messages
+from beetle_omni_ros.runs.bag import BagError, read_messages
 
 # [nat] gain of evidence of a named entry: a Bayes factor of 150, "very strong" in the scale of
 # Kass and Raftery (1995).

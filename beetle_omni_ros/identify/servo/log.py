@@ -9,7 +9,7 @@ import numpy as np
 
 from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.runs.bag import BagError, read_bag
-from beetle_omni_ros.runs.csv_table import LogError, missing, read_table
+from beetle_omni_ros.runs.files import LogError, missing, read_table
 
 HEADER = 't_s,q1_rad,q2_rad,q3_rad,q4_rad,command_rad (or command1_rad to command4_rad)'
 JOINTS = (1, 2, 3, 4)

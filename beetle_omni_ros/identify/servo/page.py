@@ -15,8 +15,7 @@ from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
 from beetle_omni_ros.identify.servo.model import simulate
 from beetle_omni_ros.identify.servo.robot import file_sets, held
 from beetle_omni_ros.pages.figures import COLOURS, FAINT, INK, legend, line, panels, STYLE, svg
-from beetle_omni_ros.pages.page import page, section
-from beetle_omni_ros.pages.table import Grid
+from beetle_omni_ros.pages.page import Grid, page, section
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 MILLI = 1e3

@@ -1,9 +1,11 @@
-"""CSV tables with units in the column names, and errors with row and column."""
+"""CSV tables with units in the column names, and result files in strict JSON."""
 
 from collections.abc import Callable
 import csv
 from dataclasses import dataclass
+import json
 from math import isfinite
+import os
 from pathlib import Path
 
 import numpy as np
@@ -79,7 +81,8 @@ def read_table(path: str | Path, wanted: Callable[[list[str]], list[str]], expec
         raise error(f'{path}: row {number}: {cause}; expected {expected}') from None
     for name in names:
         if header.count(name) > 1:
-            raise error(f"{path}: row {number}: column '{name}' occurs twice")
+            raise error(f"{path}: row {number}: column '{name}' occurs twice; "
+                        f'expected {expected}')
     index, values = [header.index(name) for name in names], []
     for line, row in lines:
         reason = _unusable(row, header, index)
@@ -115,3 +118,65 @@ def missing(name: str, header: list[str]) -> LogError:
     other = [cell for cell in header if stem and cell.rpartition('_')[0] == stem]
     hint = f" ('{other[0]}' has another unit)" if other else ''
     return LogError(f"column '{name}' is missing{hint}")
+
+
+def check_writable(path: str | Path | None, what: str = 'result file') -> None:
+    """
+    Check that a file can be written, before its content is computed; None: none is wanted.
+
+    Raises:
+        ParameterError: it cannot; names the file and the reason.
+
+    """
+    if path is None:
+        return
+    path = Path(path)
+    folder = path.absolute().parent
+    if path.is_dir():
+        reason = 'it is a folder'
+    elif not folder.is_dir():
+        reason = f'there is no folder {folder}'
+    elif not os.access(path if path.exists() else folder, os.W_OK):
+        reason = 'no permission'
+    else:
+        return
+    raise ParameterError(f'{path}: cannot write the {what} there ({reason})')
+
+
+def write_json(path: str | Path | None, results: dict) -> None:
+    """
+    Write results as strict JSON: non-finite numbers become null; None: no file is wanted.
+
+    Raises:
+        ParameterError: the file cannot be written.
+
+    """
+    if path is not None:
+        write_text(path, json.dumps(_strict(results), indent=1) + '\n')
+
+
+def write_text(path: str | Path, text: str, what: str = 'result file') -> None:
+    """
+    Write a file atomically.
+
+    Raises:
+        ParameterError: the file cannot be written.
+
+    """
+    path = Path(path)
+    temporary = path.with_name(path.name + '.tmp')
+    try:
+        temporary.write_text(text, encoding='utf-8')
+        temporary.replace(path)
+    except OSError as error:
+        raise ParameterError(f'{path}: cannot write the {what} ({error.strerror})') from None
+
+
+def _strict(value):
+    if isinstance(value, dict):
+        return {str(key): _strict(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_strict(entry) for entry in value]
+    if isinstance(value, float) and not isfinite(value):
+        return None
+    return value

@@ -14,14 +14,12 @@ from rich.progress import track
 
 from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.pages.figures import COLOURS
-from beetle_omni_ros.pages.table import Terminal
+from beetle_omni_ros.pages.page import Terminal
 from beetle_omni_ros.robot.allocation import hover_allocation
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.bag import read_bag
-from beetle_omni_ros.runs.bag_files import no_pose, runs_in
-from beetle_omni_ros.runs.body import geodesic_angles, hold, Motion, motion
-from beetle_omni_ros.runs.log import FlightLog
+from beetle_omni_ros.runs.bag import no_pose, read_bag, runs_in
+from beetle_omni_ros.runs.log import FlightLog, geodesic_angles, hold, Motion, motion
 from beetle_omni_ros.sim.render import Camera, HAZE, Look, Pose, Stage, Trail
 from beetle_omni_ros.sim.simulator import Simulator
 

@@ -1,16 +1,23 @@
-"""Checks of targets, for messages and for rows of a pose file."""
+"""Checks of targets, for messages and for the rows of a pose file, and pose files."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from math import isfinite
+from pathlib import Path
 
 import numpy as np
 
 from beetle_omni_ros.control.base import PoseTarget, Target
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import parameter, ParameterFile
+from beetle_omni_ros.robot.schema import parameter, ParameterError, ParameterFile
+from beetle_omni_ros.robot.yaml_file import quoted
+from beetle_omni_ros.runs.files import read_table
 
 UNIT_TOLERANCE = 0.02   # of a quaternion's squared length
+START = (0.0, 0.0, 1.0)     # [m] position after the take-off
+COLUMNS = ('x_m', 'y_m', 'z_m', 'roll_deg', 'pitch_deg', 'yaw_deg')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,3 +139,66 @@ class TargetChecks:
             return f'the stamp is {-age:.4g} s ahead, expected at most ' \
                    f'{self._p.farthest_ahead:g} s'
         return ''
+
+
+def read_poses(path: str | Path, reach: float = np.inf) -> np.ndarray:
+    """
+    Read a pose file with the header ``x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg``.
+
+    Blank lines and spaces around fields are ignored; columns may be in any order.
+
+    Args:
+        path: CSV file.
+        reach: largest step between poses, and from the take-off to the first pose [m].
+
+    Returns:
+        (N, 6) x, y, z [m], roll, pitch, yaw [deg].
+
+    Raises:
+        ParameterError: unusable file; names file, row (as in an editor), column and expectation.
+
+    """
+    table = read_table(path, _columns, ','.join(COLUMNS), rows=' and poses', comment=None,
+                       error=ParameterError, check=_unusable)
+    if not len(table):
+        raise ParameterError(f'{path}: no pose below the header; expected at least one row')
+    poses = np.stack(list(table.columns.values()), axis=1)
+    check_steps(poses, reach, lambda k: f'{path}: row {table.rows[k]}')
+    return poses
+
+
+def check_steps(poses: np.ndarray, reach: float, where: Callable[[int], str]) -> None:
+    """
+    Check that the steps between poses (N, 6) are at most ``reach`` [m].
+
+    Raises:
+        ParameterError: a longer step to pose k; the text begins with ``where(k)``.
+
+    """
+    steps = np.linalg.norm(np.diff(poses[:, :3], axis=0, prepend=[START]), axis=1)
+    if np.any(steps > reach):
+        k = int(np.argmax(steps > reach))
+        raise ParameterError(f'{where(k)}: {steps[k]:.4g} m from '
+                             f"{'the pose before' if k else 'the take-off'}, expected at most "
+                             f'{reach:g} m: the reach of the controller')
+
+
+def _columns(header):
+    if unknown := [cell for cell in header if cell not in COLUMNS]:
+        raise ParameterError(f'unknown column {quoted(unknown[0])}')
+    if missing := [name for name in COLUMNS if name not in header]:
+        raise ParameterError(f"column '{missing[0]}' is missing")
+    return list(COLUMNS)    # a column that occurs twice is refused by read_table
+
+
+def _unusable(pose):
+    if pose[2] <= 0:
+        return f', column z_m: expected a height above the floor, found {pose[2]:g}'
+    reason = _checks().why_not_pose(pose[:3], rotations.from_rpy(*np.radians(pose[3:])))
+    return f': {reason}' if reason else ''
+
+
+@cache
+def _checks():
+    """Checks with the shipped robot, because a task is for any robot of its kind."""
+    return TargetChecks(RobotParameters.load())

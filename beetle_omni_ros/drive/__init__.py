@@ -1,1 +1,0 @@
-"""Driving by hand: target poses from keys, joystick axes and typed commands; no ROS."""
