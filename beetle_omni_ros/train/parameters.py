@@ -102,6 +102,12 @@ class RandomParameters:
                                          unit='s', shape=(2,), low=0, high=0.02)
     command_latency: np.ndarray = parameter([0.005, 0.015], doc='delay of commands', unit='s',
                                             shape=(2,), low=0, high=0.02)
+    actuators: str = parameter(
+        'measured', doc='robot file whose measured intervals of servos, rotors and delays the '
+        'robots cover; empty: that of the trained robot')
+    actuator_spread: np.ndarray = parameter(
+        [0.0, 1.25], doc='place of a robot between the nominal one (0) and one drawn from these '
+        'intervals (1)', shape=(2,), low=0, high=2)
     thrust_limit: np.ndarray = parameter(
         [18.0, 22.0], doc='largest thrust that the battery allows while four rotors hover',
         unit='N', shape=(2,), low=0, high=100)
@@ -132,7 +138,7 @@ class RandomParameters:
     def __post_init__(self):
         """Check the ranges."""
         _check_ranges(self, 'velocity_latency', 'tilt_latency', 'command_latency',
-                      'thrust_limit')
+                      'actuator_spread', 'thrust_limit')
 
 
 @dataclass(frozen=True, kw_only=True)
