@@ -33,7 +33,7 @@ for command in (flights.fly, flights.evaluate, flights.compare, flights.faults, 
     app.command()(command)
 identify = typer.Typer(no_args_is_help=True, context_settings=HELP,
                        help='Fit the actuator models from measured data.')
-for command in (models.joint, models.rotor):
+for command in (models.joint, models.rotor, models.robot):
     identify.command()(command)
 app.add_typer(identify, name='identify')
 

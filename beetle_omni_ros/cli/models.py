@@ -13,6 +13,8 @@ PageOption = Annotated[Optional[Path], typer.Option(
     '--report', metavar='FILE', help='Write a self-contained HTML page with plots.')]
 ParamsOption = Annotated[Optional[Path], typer.Option(
     '--params', metavar='FILE', help='Write a robot file with the result.')]
+RateOption = Annotated[Optional[float], typer.Option(
+    '--rate', min=1, metavar='HZ', help='Rows a second of time series without a column of times.')]
 HOLDOUT = '--holdout'
 
 
@@ -98,9 +100,7 @@ def rotor(logs: Annotated[list[Path], typer.Argument(
               '--column', metavar='QUANTITY=[-]COLUMN[*FACTOR]',
               help='Column of a quantity with sign and factor to SI units, e.g. thrust=-fz or '
                    'thrust=load_g*0.00981; may be repeated.')] = None,
-          rate: Annotated[Optional[float], typer.Option(
-              '--rate', min=1, metavar='HZ', help='Rows a second of time series without a column '
-                                                  'of times.')] = None,
+          rate: RateOption = None,
           robot: PublishedOption = None, report: PageOption = None, params: ParamsOption = None,
           json_path: JsonOption = None):
     """
@@ -114,6 +114,21 @@ def rotor(logs: Annotated[list[Path], typer.Argument(
     results = run_identify_rotor(logs, columns=columns or (), rate=rate, robot=robot,
                                  report=report, params=params, json_path=json_path)
     raise typer.Exit(3 if results['verdict'] == 'bad_data' else 0)
+
+
+def robot(logs: Annotated[list[Path], typer.Argument(
+              metavar='LOG...', help='Response logs of the joints (CSV or bag) and logs of a '
+                                     'force-torque stand, recognised by their header.')],
+          params: Annotated[Path, typer.Option(
+              '--params', metavar='FILE', help='The robot file to write.')],
+          rate: RateOption = None, robot: PublishedOption = None, json_path: JsonOption = None):
+    """
+    Write a robot file with intervals and origins from all logs of servos and rotors.
+
+    Example: beetle_omni identify robot slow.csv fast.csv bench.csv --params my_robot.yaml
+    """
+    from beetle_omni_ros.identify.command import run_identify_robot
+    run_identify_robot(logs, params, rate=rate, robot=robot, json_path=json_path)
 
 
 def train(output: Annotated[Path, typer.Option(

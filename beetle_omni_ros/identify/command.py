@@ -2,9 +2,16 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+import shlex
 
 from rich.console import Console
 
+from beetle_omni_ros.identify.measured import (
+    read_logs,
+    rotor_values,
+    servo_values,
+    write_measured,
+)
 from beetle_omni_ros.identify.robot_file import check_outputs
 from beetle_omni_ros.identify.rotor import results as of_rotor
 from beetle_omni_ros.identify.rotor.log import chosen, read_rotor_log
@@ -48,7 +55,8 @@ def run_identify_joint(paths: Sequence[Path], *, validate: Sequence[Path] = (),
         write_text(report, of_joints.joint_page(found, validations, robot_parameters, results),
                    'report')
     if params:
-        of_joints.write_joint_file(params, results, robot)
+        write_measured(params, robot_parameters, robot, _line('joint', paths, robot, params),
+                       paths, servo_values(found, robot_parameters), None)
     return results
 
 
@@ -83,8 +91,57 @@ def run_identify_rotor(paths: Sequence[Path], *, columns: Sequence[str] = (),
     if report:
         write_text(report, of_rotor.rotor_page(model, robot_parameters, results), 'report')
     if params:
-        of_rotor.write_rotor_file(params, results, robot)
+        write_measured(params, robot_parameters, robot,
+                       _line('rotor', paths, robot, params, rate, columns), paths, None,
+                       rotor_values(results))
     return results
+
+
+def run_identify_robot(paths: Sequence[Path], params: Path, *, rate: float | None = None,
+                       robot: Path | None = None, json_path: Path | None = None,
+                       console: Console | None = None) -> dict:
+    """
+    Write a robot file from logs of servos and rotors.
+
+    Arguments are those of `beetle_omni identify robot`.
+
+    Returns:
+        ``robot``, the content of the file; ``servos`` and ``rotor``, the results of `identify
+        joint` and `identify rotor`; ``warnings``.
+
+    Raises:
+        LogError, ParameterError: unusable input.
+
+    """
+    console = console or Terminal()
+    check_outputs(params, robot, json_path, None, 'report')
+    robot_parameters = RobotParameters.load(robot)
+    joints, rotors, notes = read_logs(paths, rate)
+    results: dict = {'servos': None, 'rotor': None, 'warnings': notes}
+    servo = rotor = None
+    if joints:
+        with console.status('identifying the servos'):
+            found = identify(joints, robot_parameters)
+            servo = servo_values(found, robot_parameters)
+        results['servos'] = joint_results(found, [], robot_parameters)
+        print_grids(of_joints.grids(results['servos'], brief=True), console)
+    if rotors:
+        results['rotor'] = of_rotor.rotor_results(of_rotor.identify_rotor(rotors))
+        rotor = rotor_values(results['rotor'])
+        print_grids(of_rotor.grids(results['rotor']), console)
+    results['robot'] = write_measured(params, robot_parameters, robot, _line(
+        'robot', paths, robot, params, rate), paths, servo, rotor)
+    _print(console, [], [f'warning: {note}' for note in notes])
+    write_json(json_path, results)
+    return results
+
+
+def _line(what, paths, robot, params, rate=None, columns=()):
+    """The command, for the written file."""
+    options = (('--rate', f'{rate:g}' if rate else None), ('--robot', robot), ('--params', params))
+    return shlex.join(map(str, (
+        'beetle_omni', 'identify', what, *paths, *(x for c in columns for x in ('--column', c)),
+        *(x for name, value in options if value for x in (name, value)))))
 
 
 def _print(console, tables, notes):

@@ -38,6 +38,8 @@ class ServoFitParameters:
                                    high=1)
     memory: float = parameter(doc='Time over which errors are correlated.', unit='s', low=0.01,
                               high=10)
+    between: float = parameter(doc='Relative difference of the gains between logs, for intervals.',
+                               unit='1', low=0.001, high=1)
     beyond: float = parameter(doc='Least ratio of a command and a limit that it identifies.',
                               unit='1', low=1, high=10)
     blocks: int = parameter(doc='Number of blocks of the cross-validation.', low=2, high=100)

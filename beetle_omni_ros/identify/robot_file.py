@@ -12,6 +12,11 @@ from beetle_omni_ros.runs.json_file import check_writable, write_text
 SHIPPED = 'robot.yaml'
 
 
+class _Plain(yaml.SafeDumper):
+    def ignore_aliases(self, data):
+        return True         # a person reads the file
+
+
 def check_outputs(path: Path | None, base: Path | None, json_path: Path | None,
                   page: Path | None, page_name: str) -> None:
     """
@@ -50,10 +55,11 @@ def write_robot_file(path: Path, head: str, content: dict, base: Path | None) ->
     else:
         # A file of that name in the same folder would take precedence over the shipped one.
         beside = path.with_name(SHIPPED)
-        hidden = beside.is_file() and beside.resolve() != path.resolve()
-        extends = str(share_path(f'params/{SHIPPED}')) if hidden else SHIPPED
-    text = yaml.safe_dump({'extends': extends, **content}, sort_keys=False,
-                          default_flow_style=None, width=99)
+        shipped = share_path(f'params/{SHIPPED}')
+        hidden = beside.is_file() and beside.resolve() not in (path.resolve(), shipped.resolve())
+        extends = str(shipped) if hidden else SHIPPED
+    text = yaml.dump({'extends': extends, **content}, Dumper=_Plain, sort_keys=False,
+                     default_flow_style=None, width=99)
     write_text(path, head + text, 'parameter file')
 
 

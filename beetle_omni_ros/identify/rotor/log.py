@@ -25,6 +25,10 @@ UNITS = {'thrust': 'newtons, thrust positive (grams?); see --column', 'torque': 
          'duty': 'duty of 2000 us, stop at 1000 us or 50 percent'}
 
 
+class UntimedError(LogError):
+    """A time series without times, whose rows a second are not given."""
+
+
 @dataclass(frozen=True, eq=False)
 class RotorLog:
     """
@@ -172,8 +176,9 @@ def _transient(path, command, thrust, rate):
     if count < shipped().rotor.least_rows or abs(last - first) < 0.3 * np.ptp(thrust):
         return False
     if not rate:
-        raise LogError(f'{path}: thrust goes from {first:.1f} to {last:.1f} N at one command, so '
-                       'this is a time series; expected a column t_s, or --rate ROWS_A_SECOND')
+        raise UntimedError(f'{path}: thrust goes from {first:.1f} to {last:.1f} N at one command, '
+                           'so this is a time series; expected a column t_s, or --rate '
+                           'ROWS_A_SECOND')
     return True
 
 

@@ -1,14 +1,12 @@
-"""Results of a rotor identification: numbers, tables, figures and a robot file."""
+"""Results of a rotor identification: numbers, tables and figures."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import matplotlib
 import numpy as np
 
 from beetle_omni_ros import __version__
-from beetle_omni_ros.identify.robot_file import rounded, write_robot_file
 from beetle_omni_ros.identify.rotor.lag import fit_lag
 from beetle_omni_ros.identify.rotor.log import RotorLog
 from beetle_omni_ros.identify.rotor.surface import (
@@ -171,41 +169,3 @@ def _lag(log, lag):
     axes[0, 0].set(xlabel='time [s]', ylabel='thrust [N]')
     legend(figure, axes[0, 0])
     return figure
-
-
-def write_rotor_file(path: Path, results: dict, base: Path | None) -> None:
-    """
-    Write a robot file that extends ``base`` by what was identified; comments have intervals.
-
-    Raises:
-        LogError: the logs show nothing for it.
-        ParameterError: the file cannot be written.
-
-    """
-    rotors: dict = {}
-    log, lag, ratio = results['meta']['log'], results['lag'], results['torque_to_thrust_ratio']
-    lines = [f'identified by `beetle_omni identify rotor` {__version__} from {log}']
-    if ratio:
-        rotors = {'torque_to_thrust_ratio': rounded(ratio['value']), 'map': [
-            {'voltage': round(p['voltage_V'], 3), 'thrust_max': round(p['thrust_max_N'], 4),
-             'coefficients': [round(p['coefficients'][f'c{k}']['value'], 8) for k in range(4)]}
-            for p in results['plateaus']]}
-        band = max(p['thrust_half_width_N'] for p in results['plateaus'])
-        lines += ['map: duty [% of 2000 us] = c0 + c1 g + c2 g^2 + c3 g^3, g = thrust / 10 N;',
-                  f'  95 % band of thrust {band:.2f} N, error at a voltage left out '
-                  f'{results["surface"]["left_out_rms_N"]:.2f} N RMS',
-                  _line('torque_to_thrust_ratio [m]', ratio)]
-    if lag and 'value' in lag and results['verdict'] != 'bad_data':
-        rotors['time_constant'] = rounded(lag['value'], 4)
-        lines += [_line(f'{name} [s], {lag["log"]}', one) for name, one in (
-            ('time_constant', lag), ('  rising', lag['up']), ('  falling', lag['down'])) if one]
-        lines += ['  with a gain for each window, as thrust and command do not belong together'
-                  ] * bool(lag['reason'])
-    if not rotors:
-        raise LogError(f'{log}: no robot file written: verdict {results["verdict"]}')
-    write_robot_file(path, ''.join(f'# {line}\n' for line in lines), {'rotors': rotors}, base)
-
-
-def _line(name, one):
-    low, high = (rounded(end, 4) for end in one['interval'])
-    return f'{name}: {rounded(one["value"], 4)} (95 %: {low} to {high})'

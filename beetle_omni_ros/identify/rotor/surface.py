@@ -146,9 +146,10 @@ def map_rows(rows: Rows, thrust: Surface) -> list[dict]:
     """
     Rows of a robot file's map: cubics of the duty in thrust at voltages within the measured range.
 
-    A row ends at the largest measured duty or mean voltage, whichever it reaches first.
+    A row ends at the largest measured duty, mean voltage or thrust, whichever it reaches first.
     """
     top, u = rows['duty'].max(), (rows['duty'] * rows['voltage']).max()
+    most = means(rows['thrust'], rows['step']).max()
     running, found = rows['voltage'][rows['duty'] > 0.01], []
     for voltage in np.linspace(running.max(), running.min(), MAP_ROWS):
         duty = GRID * min(top, u / voltage)
@@ -159,7 +160,7 @@ def map_rows(rows: Rows, thrust: Surface) -> list[dict]:
             np.polyval(cubics[0], levels[:, 0] / 10) - 50 - 50 * duty)
         slope = np.polyval(np.polyder(cubics[0]), np.linspace(0, levels[-1, 0] / 10, 100))
         found.append({
-            'voltage_V': float(voltage), 'thrust_max_N': float(levels[-1, 0]),
+            'voltage_V': float(voltage), 'thrust_max_N': float(min(levels[-1, 0], most)),
             'coefficients': {f'c{k}': estimate(cubics[:, 3 - k], '%') for k in range(4)},
             'rms_N': float(np.sqrt(np.mean(error**2))), 'monotone': bool(slope.min() > 0),
             'thrust_half_width_N': float(max(np.ptp(interval(one)) for one in levels) / 2)})

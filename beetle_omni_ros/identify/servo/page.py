@@ -1,18 +1,15 @@
-"""Tables, figures, pages and robot files about identified servos."""
+"""Tables, figures and pages about identified servos."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import matplotlib
 from matplotlib.figure import Figure
 import numpy as np
 
-from beetle_omni_ros import __version__
 from beetle_omni_ros.identify.gap.page import head
 from beetle_omni_ros.identify.parameters import shipped
-from beetle_omni_ros.identify.robot_file import rounded, write_robot_file
 from beetle_omni_ros.identify.servo.fit import Found
 from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
 from beetle_omni_ros.identify.servo.model import simulate
@@ -24,45 +21,6 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 
 MILLI = 1e3
 UNITS = {'rad': ('mrad', MILLI), 's': ('ms', MILLI), 'N m': ('mN m', MILLI)}
-
-
-def write_joint_file(path: Path, results: dict, base: Path | None) -> None:
-    """
-    Write a robot file that extends ``base`` by the identified servo.
-
-    A robot file has one servo for all joints: the median. Terms without a key in its joint model
-    (delay, friction) are below ``provenance``, joint by joint.
-
-    Args:
-        path: output file.
-        results: results of :func:`joint_results`.
-        base: extended robot file; None: the shipped one.
-
-    Raises:
-        ParameterError: the file cannot be written.
-
-    """
-    joints = results['joints']
-    middle = {key: float(np.median([joint['derived'][key] for joint in joints]))
-              for key in ('kp_N_m_per_rad', 'kd_N_m_s_per_rad')}
-    servo = {'kp': rounded(middle['kp_N_m_per_rad']), 'kd': rounded(middle['kd_N_m_s_per_rad'])}
-    limits = [joint['terms']['velocity_limit'] for joint in joints]
-    if all(term['kept'] for term in limits):
-        servo['velocity_limit'] = rounded(float(np.median([t['value'] for t in limits])))
-    torque = [joint['terms']['torque_limit'] for joint in joints]
-    if all(term['kept'] for term in torque):
-        servo['effort_limit'] = rounded(servo['kp'] * float(np.median(
-            [term['value'] for term in torque])))
-    content = {'joints': servo,
-               'provenance': {'log': results['meta']['log'], 'version': __version__,
-                              'heldout_rms_rad': [rounded(j['heldout_rms_rad']) for j in joints],
-                              'joint_terms': {f'gimbal{j["joint"]}': {
-                                  name: rounded(term['value'])
-                                  for name, term in j['terms'].items() if term['kept']}
-                                              for j in joints}}}
-    head = ('# Tilt servos identified by `beetle_omni identify joint`. SI units: kp [N m/rad],\n'
-            '# kd [N m s/rad] for the inertia of the file below; angles [rad], delay [s].\n')
-    write_robot_file(path, head, content, base)
 
 
 def grids(results: dict, brief: bool = False) -> list[Grid]:
