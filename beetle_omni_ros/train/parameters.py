@@ -106,7 +106,7 @@ class RandomParameters:
         'measured', doc='robot file whose measured intervals of servos, rotors and delays the '
         'robots cover; empty: that of the trained robot')
     actuator_spread: np.ndarray = parameter(
-        [0.0, 1.25], doc='place of a robot between the nominal one (0) and one drawn from these '
+        [0.0, 1.1], doc='place of a robot between the nominal one (0) and one drawn from these '
         'intervals (1)', shape=(2,), low=0, high=2)
     thrust_limit: np.ndarray = parameter(
         [18.0, 22.0], doc='largest thrust that the battery allows while four rotors hover',
