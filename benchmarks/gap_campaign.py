@@ -3,8 +3,8 @@ Blind campaign of the gap workflow: ``python benchmarks/gap_campaign.py --set fa
 
 ``benchmarks/gap_data`` makes flights with hidden effects, with its own robot, controller and
 formulas. The workflow runs on each flight in a process that gets only bags and a robot file. Its
-answers and those of three simple baselines are compared with the labels. Flights and answers are
-kept; the same command continues an interrupted campaign.
+answers are compared with the labels. Flights and answers are kept; the same command continues an
+interrupted campaign.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ from gap_data.campaign import code_key, make_report, run_campaign  # noqa: E402
 from gap_data.cases import DIFFICULTIES, KINDS, load_settings, make_cases  # noqa: E402
 from gap_data.effects import CATALOGUE, OUTSIDE  # noqa: E402
 from gap_data.make import ROBOT_FILE  # noqa: E402
-from gap_data.page import html, markdown, number, target  # noqa: E402
+from gap_data.page import markdown, number, target  # noqa: E402
 from gap_data.truth import load_numbers  # noqa: E402
-from gap_data.workflow import BASELINES, Workflow, WorkflowError  # noqa: E402
+from gap_data.workflow import Workflow, WorkflowError  # noqa: E402
 
 WORKFLOW = 'gap=beetle_omni_ros.identify.gap.command:run_gap'
 PACKAGE = HERE.parent / 'beetle_omni_ros'
@@ -56,7 +56,6 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument('--workflow', action='append', metavar='[NAME=]TEXT',
                         help='MODULE:FUNCTION, or a command with {runs} {holdout} {robot} '
                              f'{{apply}} {{json}} {{page}}; again for more (default {WORKFLOW})')
-    parser.add_argument('--no-baselines', action='store_true', help='leave the baselines out')
     parser.add_argument('--flights-only', action='store_true', help='make the flights, ask nobody')
     parser.add_argument('--folder', type=Path, default=Path('runs_out/gap_campaign'))
     parser.add_argument('--sealed', type=Path, help='where labels are kept (FOLDER/sealed)')
@@ -73,21 +72,15 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
 
 
 def choose_workflows(given: argparse.Namespace) -> list[Workflow]:
-    """Workflows of the command line, then the baselines."""
+    """Workflows of the command line."""
     if given.flights_only:
         return []
-    texts = given.workflow or [WORKFLOW]
-    if not given.no_baselines:
-        texts = texts + [name for name in BASELINES if name not in texts]
     # kept answers depend on the present code of the package
-    robot = hashlib.sha256(given.robot.read_bytes()).hexdigest()
-    version, plain = (code_key([root]) + robot
-                      for root in (PACKAGE, HERE / 'gap_data' / 'baselines'))
-    workflows = [Workflow.parse(text, given.timeout) for text in texts]
+    version = code_key([PACKAGE]) + hashlib.sha256(given.robot.read_bytes()).hexdigest()
+    workflows = [Workflow.parse(text, given.timeout) for text in given.workflow or [WORKFLOW]]
     for workflow in workflows:
         check_exists(workflow)
-    return [replace(w, version=plain if w.text in BASELINES.values() else version)
-            for w in workflows]
+    return [replace(workflow, version=version) for workflow in workflows]
 
 
 def check_exists(workflow: Workflow) -> None:
@@ -126,7 +119,7 @@ def select(cases, only: str | None):
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run a campaign and write report.json, report.html and report.md."""
+    """Run a campaign and write report.json and report.md."""
     given = parse(arguments)
     console = Console(stderr=True)
     # for the workers and for the workflow's process
@@ -193,14 +186,13 @@ def command_of(given: argparse.Namespace) -> str:
             words += ['--' + option.replace('_', '-'), str(value)]
     for text in given.workflow or []:
         words += ['--workflow', text]
-    return shlex.join(words + ['--no-baselines'] * given.no_baselines)
+    return shlex.join(words)
 
 
 def write(report: dict, output: Path) -> None:
-    """Write the three files of a report, and print the table."""
+    """Write the two files of a report, and print the table."""
     output.mkdir(parents=True, exist_ok=True)
     (output / 'report.json').write_text(json.dumps(report, indent=1))
-    (output / 'report.html').write_text(html(report))
     (output / 'report.md').write_text(markdown(report))
     names = list(report['workflows'])
     for difficulty in ('clean', 'hard'):
@@ -212,7 +204,7 @@ def write(report: dict, output: Path) -> None:
                     f'{escape(number(r))}[/]' for r in rows))
         if table.row_count:
             Console().print(table)
-    print(f'{output}/report.html, report.md, report.json')
+    print(f'{output}/report.md, report.json')
 
 
 if __name__ == '__main__':

@@ -7,7 +7,6 @@ Write the pages of docs/reference that are made from code: ``python docs/generat
 | topics.md | messages/topics.py, and the publishers and subscribers in nodes/*.py |
 | command_line.md | the options of ``beetle_omni`` and its subcommands |
 | effects.md | the catalogue of effects |
-| faults.md | params/faults.yaml |
 | python.md | the docstrings of the public module and of a flight's arrays |
 
 ``--check`` writes nothing and exits with status 1 where a page is out of date. ROS is not needed:
@@ -28,7 +27,6 @@ import numpy as np
 
 from beetle_omni_ros.messages import topics as message_topics
 from beetle_omni_ros.messages.topics import controller_of, TABLE
-from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.resources import PACKAGE
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -168,7 +166,7 @@ def parameters() -> str:
     for name, (kind, what) in FILES.items():
         text.append(f'\n## {name}\n\n{what}\n\n')
         if name == 'faults.yaml':
-            text.append('The faults themselves are in [the list of faults](faults.md).\n\n')
+            text.append('[Safety](../safety.md#every-fault-of-the-list) lists the faults.\n\n')
         if name == 'robot.yaml':
             text.append(ROBOT_FILE)
         if kind in seen:
@@ -349,50 +347,45 @@ def _wrapped(text: str) -> str:
 def effects() -> str:
     """The catalogue of effects."""
     from beetle_omni_ros.robot.effects import CATALOGUE, CONSUMERS, treatment
-    treatments = {(name, key): treatment(key, name) for name in CATALOGUE for key in CONSUMERS}
     apart: dict[tuple, list] = {}
-    for (name, key), found in treatments.items():
-        if not found.acts:
-            apart.setdefault((CONSUMERS[key], found.reason), []).append(f'[{name}](#{name})')
-    text = [f'# Effects\n\n{MADE}\n'
+    for name in CATALOGUE:
+        for key, consumer in CONSUMERS.items():
+            if not (found := treatment(key, name)).acts:
+                apart.setdefault((consumer, found.reason), []).append(f'`{name}`')
+    rows = [[f'`{name}`', f'`{key}`', spec.unit, _neutral(spec.neutral),
+             f'{_number(spec.low)} to {_number(spec.high)}', 'not fitted' if spec.form
+             else _known(spec.typical), _known(spec.smallest),
+             '' if spec.default is None else _neutral(spec.default),
+             entry.settings.get(key) and f'`{entry.settings[key]}`' or '',
+             '4, one for each ' + entry.each if entry.each
+             else '1, or 4 for each joint' if spec.of_each
+             else str(len(spec.neutral)) if isinstance(spec.neutral, tuple) else '1']
+            for name, entry in CATALOGUE.items()
+            for key, spec in entry.parameters.items()]
+    return (f'# Effects\n\n{MADE}\n'
             'An effect is a deviation of the robot from the model. The key `effects` of a robot '
             'file switches\neffects on, for example `effects: {thrust_coefficient: {scale: '
             '0.93}}`. [The gap\nfinder](../gap.md) searches the same entries. [Add an '
             'effect](../how-to/add_an_effect.md) shows how\nto add an entry.\n\n'
+            + table(['effect', 'layer', 'equation, source', 'acts through', 'shows in',
+                     'channels', 'confused with', 'separated by'],
+                    [[f'`{name}`', entry.layer, entry.source, _acts(entry), entry.excited_by,
+                      _channels(entry), ', '.join(f'`{other}`' for other in entry.confused_with),
+                      entry.separated_by] for name, entry in CATALOGUE.items()])
+            + '\n## Parameters\n\n'
             '*Typical* is a realistic deviation from the neutral value. *Smallest* is the '
             'smallest relevant\ndeviation. If the neutral value is the number of the robot '
             'file, both are fractions of this number.\nA robot file may leave out a parameter '
-            'that has a *default*.\n\n## Consumers\n\n'
-            'A consumer acts on an effect or ignores it for a reason, which is below the table.\n'
-            '`test/gap/test_consumers.py` tests every pair.\n\n'
-            + table(['effect', 'layer', 'acts through', *CONSUMERS.values()],
-                    [[f'[{name}](#{name})', entry.layer, _acts(entry),
-                      *('acts' if treatments[name, key].acts else 'ignores' for key in CONSUMERS)]
-                     for name, entry in CATALOGUE.items()])
-            + '\n' + table(['consumer', 'ignores', 'reason'],
-                           [[who, ', '.join(names), reason]
-                            for (who, reason), names in sorted(apart.items())])]
-    for name, entry in CATALOGUE.items():
-        rows = [[f'`{key}`', spec.unit, _neutral(spec.neutral),
-                 f'{_number(spec.low)} to {_number(spec.high)}', 'not fitted' if spec.form
-                 else _known(spec.typical), _known(spec.smallest),
-                 '' if spec.default is None else _neutral(spec.default),
-                 entry.settings.get(key) and f'`{entry.settings[key]}`' or '',
-                 '4, one for each ' + entry.each if entry.each
-                 else '1, or 4 for each joint' if spec.of_each
-                 else str(len(spec.neutral)) if isinstance(spec.neutral, tuple) else '1']
-                for key, spec in entry.parameters.items()]
-        text.append(f'\n## {name}\n\n'
-                    + table(['', ''], [['equation, source', entry.source],
-                                       ['shows in', entry.excited_by],
-                                       ['channels', _channels(entry)],
-                                       ['confused with', ', '.join(
-                                           f'[{other}](#{other})'
-                                           for other in entry.confused_with)],
-                                       ['separated by', entry.separated_by]])
-                    + '\n' + table(['parameter', 'unit', 'neutral', 'range', 'typical',
-                                    'smallest', 'default', 'replaces', 'numbers'], rows))
-    return ''.join(text)
+            'that has a *default*.\n\n'
+            + table(['effect', 'parameter', 'unit', 'neutral', 'range', 'typical', 'smallest',
+                     'default', 'replaces', 'numbers'], rows)
+            + '\n## Consumers\n\n'
+            + _wrapped(f'The consumers are {", ".join(CONSUMERS.values())}. Every effect acts in '
+                       'each of them, except for these. `test/gap/test_consumers.py` tests every '
+                       'pair.') + '\n\n'
+            + table(['consumer', 'ignores', 'reason'],
+                    [[who, ', '.join(names), reason]
+                     for (who, reason), names in sorted(apart.items())]))
 
 
 def _channels(entry) -> str:
@@ -417,24 +410,6 @@ def _neutral(value) -> str:
 
 def _known(value) -> str:
     return '' if value != value else _number(value)
-
-
-def faults() -> str:
-    """The listed faults."""
-    from beetle_omni_ros.sim.faults.listed import FaultList
-    cases = FaultList.load().cases
-    rows = []
-    for name, case in cases.items():
-        strikes = '; '.join(' '.join([f'`{fault["kind"]}`', *(f'{key}={_value(value)}' for
-                            key, value in fault.items() if key != 'kind')])
-                            for fault in schema.load_yaml(ROOT / 'params' / 'faults.yaml')[
-                                'faults'][name]['strike'])
-        rows.append([f'`{name}`', case.what, f'`{case.expected}`', strikes])
-    return (f'# The listed faults\n\n{MADE}\n'
-            f'`beetle_omni faults` flies the {len(rows)} faults of `params/faults.yaml`. '
-            '[Faults](../faults.md) explains\nkinds, outcomes and campaigns. '
-            '[Safety](../safety.md) lists the measured outcomes.\n\n'
-            + table(['fault', 'event', 'expected', 'kinds'], rows))
 
 
 def python() -> str:
@@ -500,7 +475,7 @@ def _sections(documented) -> dict[str, str]:
 
 
 PAGES = {'parameters.md': parameters, 'topics.md': topics, 'command_line.md': command_line,
-         'effects.md': effects, 'faults.md': faults, 'python.md': python}
+         'effects.md': effects, 'python.md': python}
 
 
 def out_of_date() -> list[str]:

@@ -300,8 +300,10 @@ class RobotParameters:
         with _named(path):
             check_parts(robot)
             # not in __post_init__, because copies without some effects keep the others' intervals
+            replaced = catalogue.settings(robot.effects)
             return replace(robot, intervals={
-                key: robot._checked_interval(key, pair) for key, pair in robot.intervals.items()})
+                key: robot._checked_interval(key, pair) for key, pair in robot.intervals.items()
+                if key not in replaced})
 
     @property
     def parts(self) -> MultibodyParameters:

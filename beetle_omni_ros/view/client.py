@@ -2,7 +2,7 @@
 viser's client, drawn without antialiasing if the browser has no graphics card.
 
 Antialiasing takes half of the time of a picture that the CPU renders, see
-docs/explanation/viewer.md. The client requests it when it creates its canvas. viser has no option
+docs/how-to/view.md. The client requests it when it creates its canvas. viser has no option
 for it, therefore a script at the beginning of the page changes the request.
 """
 

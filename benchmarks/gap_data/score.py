@@ -12,7 +12,7 @@ DELAY_LIMIT = 0.003  # [s]
 
 def score(judged: list[dict]) -> dict:
     """
-    Criteria by difficulty, confusion, power and details.
+    Criteria by difficulty, confusion and power.
 
     Args:
         judged: of :func:`gap_data.judge.judge`, one for each case.
@@ -22,7 +22,7 @@ def score(judged: list[dict]) -> dict:
                          for d in DIFFICULTIES},
             'confusion': {d: confusion([j for j in judged if j['difficulty'] == d])
                           for d in DIFFICULTIES},
-            'power': power(judged), 'effects': by_effect(judged), 'slices': slices(judged)}
+            'power': power(judged)}
 
 
 def criteria(judged: list[dict], difficulty: str) -> list[dict]:
@@ -128,34 +128,4 @@ def power(judged: list[dict]) -> list[dict]:
         rows.append({'multiple': multiple, 'named': share([j['right'] for j in chosen]),
                      'wrong': share([bool(j['wrong']) for j in chosen]),
                      'effects': {j['truth'][0]: j['right'] for j in chosen}})
-    return rows
-
-
-def by_effect(judged: list[dict]) -> list[dict]:
-    """What became of each single case, for the page's table."""
-    rows = []
-    for j in judged:
-        if j['kind'] not in ('singles', 'power'):
-            continue
-        known = [p for p in j['parameters'] if not p['missing']]
-        rows.append({'effect': j['truth'][0], 'difficulty': j['difficulty'],
-                     'shape': j['shapes'][0], 'size': j['sizes'][0], 'right': j['right'],
-                     'answer': ['/'.join(names) for names in j['answers']] or [j['verdict']],
-                     'error': max((p['of_effect'] for p in known
-                                   if p['of_effect'] is not None), default=None),
-                     'closure': j['closure'], 'wall_s': j['wall_s']})
-    return sorted(rows, key=lambda row: (row['effect'], row['difficulty']))
-
-
-def slices(judged: list[dict]) -> list[dict]:
-    """The two cheapest numbers where it is harder: by noise, gust, conditions, body, course."""
-    rows = []
-    for field in ('noise', 'gust', 'conditions', 'multibody', 'course'):
-        for value in sorted({j[field] for j in judged}, key=str):
-            chosen = [j for j in judged if j[field] == value]
-            rows.append({'field': field, 'value': value,
-                         'single_right': share([j['right'] for j in chosen
-                                                if j['kind'] == 'singles']),
-                         'false_alarm': share([bool(j['wrong']) for j in chosen
-                                               if j['kind'] == 'none'])})
     return rows

@@ -20,9 +20,6 @@ import tempfile
 import time
 
 HERE = Path(__file__).parent
-BASELINES = {'everything': 'gap_data.baselines.everything:run_gap',
-             'bic': 'gap_data.baselines.white_bic:run_gap',
-             'sparse': 'gap_data.baselines.sparse:run_gap'}
 VERDICTS = ('no_gap', 'named', 'named_set', 'unknown', 'not_decidable', 'bad_data')
 KEYS = ('verdict', 'effects', 'where', 'gap_before', 'gap_after', 'noise_floor', 'closure',
         'candidates', 'next_experiment')
@@ -39,8 +36,8 @@ class Workflow:
 
     Attributes:
         name: in tables.
-        text: 'package.module:function', a name in ``BASELINES``, or a command in which
-            ``{runs} {holdout} {robot} {apply} {json} {page}`` are replaced by paths.
+        text: 'package.module:function', or a command in which ``{runs} {holdout} {robot} {apply}
+            {json} {page}`` are replaced by paths.
         timeout: [s] for a case.
         version: of its code; answers of another one are not kept for this.
 
@@ -56,12 +53,11 @@ class Workflow:
         """From the command line: ``[NAME=]TEXT``."""
         name, mark, rest = text.partition('=')
         if not mark or not name.replace('_', '').isalnum():
-            name, rest = text if text in BASELINES else 'gap', text
-        rest = BASELINES.get(rest, rest)
+            name, rest = 'gap', text
         if '{' not in rest and not rest.replace('.', '').replace(':', '').replace(
                 '_', '').isalnum():
-            raise WorkflowError(f"workflow '{text}': expected MODULE:FUNCTION, one of "
-                                f"{', '.join(BASELINES)}, or a command with {{runs}} and {{json}}")
+            raise WorkflowError(f"workflow '{text}': expected MODULE:FUNCTION, or a command with "
+                                '{runs} and {json}')
         if '{' in rest and not ('{runs}' in rest and '{json}' in rest):
             raise WorkflowError(f"workflow '{text}': a command needs {{runs}} and {{json}}")
         return cls(name, rest, timeout)

@@ -15,8 +15,7 @@ from beetle_omni_ros.runs.log import FlightLog
 
 ROOT = Path(__file__).resolve().parents[2]
 # Pages with a style of their own: made by a command.
-MADE = ('docs/comparison/', 'docs/gap_campaign', 'docs/reference/parameters.md',
-        'docs/reference/effects.md')
+MADE = ('docs/comparison/', 'docs/reference/parameters.md', 'docs/reference/effects.md')
 
 
 def module(name):

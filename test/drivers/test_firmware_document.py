@@ -13,8 +13,7 @@ DOCUMENT = (Path(__file__).resolve().parents[2] / 'docs' / 'reference' / 'firmwa
 
 
 def test_documented_packets_equal_the_tested_packets():
-    blocks = re.findall(r'```\n((?:[0-9a-f]{2}\s+)+)```', DOCUMENT)
-    shown = [bytes.fromhex(''.join(block.split())) for block in blocks]
+    shown = [bytes.fromhex(row) for row in re.findall(r'`(fd(?: [0-9a-f]{2})+)`', DOCUMENT)]
     assert shown == [*reference.BY_HOST, *reference.BY_BOARD]
 
 

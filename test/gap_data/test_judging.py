@@ -177,7 +177,6 @@ def test_an_answer_is_checked_against_the_interface(tmp_path):
 
 
 def test_workflows_are_parsed_from_the_command_line():
-    assert Workflow.parse('bic').text.endswith('white_bic:run_gap')
     assert Workflow.parse('mine=a.b:c').name == 'mine'
     assert Workflow.parse('tool {runs} --json {json}').name == 'gap'
     for wrong in ('tool --json x', 'tool {runs}'):

@@ -202,6 +202,9 @@ def test_an_interval_belongs_to_the_value_of_its_file(tmp_path):
         'extends: mine.yaml\nrotors: {time_constant: 0.2}\nmass: 3.1\n')
     assert list(RobotParameters.load(tmp_path / 'other.yaml').intervals) == [
         'effects.joint_bandwidth.kp']
+    (tmp_path / 'effect.yaml').write_text(
+        'extends: mine.yaml\neffects: {rotor_lag: {time_constant: 0.2}}\n')
+    assert RobotParameters.load(tmp_path / 'effect.yaml').intervals == {}
 
 
 @pytest.mark.parametrize('text', [

@@ -7,6 +7,7 @@ import numpy as np
 
 from beetle_omni_ros.robot.allocation import ROTORS
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.response import Responses
 from beetle_omni_ros.safety.watch.parameters import ServoLimits
 
 KEPT = 64               # commands, 0.3 s at 200 Hz
@@ -17,7 +18,10 @@ AT_REST = 0.05          # [rad] by which a jammed joint may move during the deci
 
 class JointWatch:
     """
-    Compares encoders with a first-order servo that follows the commands at its limited rate.
+    Compares encoders with the fastest and the slowest servo that the robot file allows.
+
+    Both follow the commands with a first-order lag, at a limited rate and after a delay. A joint
+    between them, or within the noise and its friction beside them, follows its commands.
 
     Args:
         limits: thresholds.
@@ -28,23 +32,24 @@ class JointWatch:
         astray: joints (4,) bool whose motion differs from the command.
         jump: (4,) [rad] jump of the last reading relative to the motion before it, if it is larger
             than a joint can turn, else 0.
-        model: (4,) readings by the servo model [rad], None before the first.
-        stamp: time of the last reading, or of the model without readings [s].
+        stamp: time of the last reading, or of the models without readings [s].
 
     """
 
     def __init__(self, limits: ServoLimits, robot: RobotParameters):
-        joints = robot.joints
-        self._p, self._rate_limit = limits, joints.velocity_limit
-        self._lag = joints.time_constant
-        self._delay = limits.delay + robot.command_delays[0] + robot.sensors.encoder_delay
+        allowed = Responses.of(robot)
+        self._p, self._rate_limit = limits, robot.joints.velocity_limit
+        self._lags, (low, high) = allowed.servo_lag, allowed.servo_delay
+        self._delays = (max(0.0, limits.delay - limits.spread + low),
+                        limits.delay + limits.spread + high)
+        self._error = limits.error + allowed.friction
         self.reset()
 
     def reset(self) -> None:
         """Reset; start again at the next reading."""
         self._commands: deque = deque(maxlen=KEPT)
         self.stamp, self._change = -np.inf, np.zeros(ROTORS)
-        self.model: np.ndarray | None = None
+        self._models: np.ndarray | None = None      # (2, 4) fastest and slowest [rad]
         self._for = np.zeros(ROTORS)
         self._low = self._high = np.zeros(ROTORS)
         self.jammed = np.zeros(ROTORS, dtype=bool)
@@ -56,6 +61,11 @@ class JointWatch:
     def well(self) -> bool:
         """Whether no joint jumped or differed from its model at the last reading."""
         return self.jump is NO_JUMP and not self._suspects
+
+    @property
+    def model(self) -> np.ndarray | None:
+        """Readings (4,) midway between the models [rad], None before the first."""
+        return None if self._models is None else 0.5 * (self._models[0] + self._models[1])
 
     def on_command(self, stamp: float, tilt: np.ndarray) -> None:
         """Receive the joint targets (4,) [rad] of the time ``stamp`` [s]."""
@@ -69,41 +79,44 @@ class JointWatch:
             return False
         before, self.stamp = getattr(self, '_tilt', tilt), stamp
         self._tilt = tilt
-        asked = self._asked(stamp - self._delay)
-        if dt > LONGEST or asked is None or self.model is None:
-            self.model, self._for = tilt.copy(), np.zeros(ROTORS)
+        if dt > LONGEST or not self._follow(stamp, dt):
+            self._models, self._for = np.array([tilt, tilt]), np.zeros(ROTORS)
             self._change, self.jump = np.zeros(ROTORS), NO_JUMP
             return True
         change = tilt - before
-        step = self._step(asked - self.model, dt)
         furthest = self._rate_limit * dt + self._p.jump
         if max(map(abs, change.tolist())) > furthest:
             jumped = np.abs(change) > furthest
             self.jump = np.where(jumped, change - self._change, 0.0)
             self._change = np.where(jumped, self._change, change)
-            self.model = np.where(jumped, tilt, self.model + step)
+            self._models = np.where(jumped, tilt, self._models)
         else:
-            self.jump, self._change, self.model = NO_JUMP, change, self.model + step
-        self._judge(tilt, dt, step)
+            self.jump, self._change = NO_JUMP, change
+        self._judge(tilt, dt)
         return True
 
     def advance(self, stamp: float) -> None:
         """Continue with the model to ``stamp`` [s], without readings."""
-        dt, asked = stamp - self.stamp, self._asked(stamp - self._delay)
-        if self.model is None or asked is None or dt <= 0:
-            return
-        self.stamp = stamp
-        self.model = self.model + self._step(asked - self.model, min(dt, LONGEST))
+        dt = stamp - self.stamp
+        if dt > 0 and self._follow(stamp, min(dt, LONGEST)):
+            self.stamp = stamp
 
-    def _step(self, error, dt):
-        """Motion (4,) [rad] of servos of first order with a limited rate in ``dt`` [s]."""
-        reach, share = self._rate_limit * dt, -expm1(-dt / self._lag)
-        return np.array([min(max(each * share, -reach), reach) for each in error.tolist()])
+    def _follow(self, stamp, dt):
+        """Move both models by ``dt`` [s] to ``stamp``; False if they or commands are missing."""
+        asked = [self._asked(stamp - delay) for delay in self._delays]
+        if self._models is None or asked[1] is None:
+            return False
+        reach = self._rate_limit * dt
+        for model, target, lag in zip(self._models, asked, self._lags):
+            share = -expm1(-dt / lag)
+            model += [min(max(error * share, -reach), reach)
+                      for error in (target - model).tolist()]
+        return True
 
-    def _judge(self, tilt, dt, step):
-        p = self._p
-        each = [abs(error) > p.error + p.spread * (abs(motion) / dt) for error, motion in zip(
-            (tilt - self.model).tolist(), step.tolist())]
+    def _judge(self, tilt, dt):
+        p, error = self._p, self._error
+        each = [reading < min(pair) - error or reading > max(pair) + error
+                for reading, pair in zip(tilt.tolist(), self._models.T.tolist())]
         if not self._suspects and not any(each):
             return
         off = np.array(each)

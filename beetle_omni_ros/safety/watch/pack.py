@@ -5,6 +5,7 @@ import numpy as np
 from beetle_omni_ros.robot.allocation import Allocator, ROTORS
 from beetle_omni_ros.robot.holding import sphere
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.response import Responses
 from beetle_omni_ros.robot.thrust_map import ThrustMap
 from beetle_omni_ros.safety.watch.parameters import PackLimits
 
@@ -43,7 +44,8 @@ class PackWatch:
                  rotor_map: ThrustMap):
         """See the class."""
         self._p, self._map = limits, rotor_map
-        self._lag, self._thrust_max = robot.rotors.time_constant, robot.rotors.thrust_max
+        self._lags = np.array(Responses.of(robot).rotor_lag)[:, None]
+        self._thrust_max = robot.rotors.thrust_max
         _, thrusts = allocator.upright(sphere(DIRECTIONS))
         self._loads = _load(thrusts)
         self._needs = np.minimum(thrusts.max(axis=1), self._thrust_max)
@@ -52,7 +54,8 @@ class PackWatch:
     def reset(self) -> None:
         """Reset for a new flight, perhaps with another pack."""
         self.limit: float | None = None
-        self._thrust, self._commanded_at = np.zeros(ROTORS), -np.inf
+        # with the shortest and with the longest lag of the rotors
+        self._thrusts, self._commanded_at = np.zeros((2, ROTORS)), -np.inf
         self._state = np.array([np.nan, 0.0])      # rest [V], drop [ohm W/N^1.5]
         self._covariance = np.diag([self._p.noise ** 2, UNKNOWN ** 2])
         self._read_at, self._weak_for = -np.inf, 0.0
@@ -60,7 +63,7 @@ class PackWatch:
     def on_command(self, stamp: float, thrust: np.ndarray) -> None:
         """Receive the commanded thrusts (4,) [N] from ``stamp`` [s] on."""
         since = max(0.0, stamp - self._commanded_at)
-        self._thrust = self._thrust - np.expm1(-since / self._lag) * (thrust - self._thrust)
+        self._thrusts -= np.expm1(-since / self._lags) * (thrust - self._thrusts)
         self._commanded_at = stamp
 
     def on_voltage(self, stamp: float, voltage: float) -> None:
@@ -79,10 +82,12 @@ class PackWatch:
 
     def _estimate(self, voltage, since):
         """One step of the filter."""
-        load = float(_load(self._thrust)) / voltage
+        one, other = (_load(self._thrusts) / voltage).tolist()
+        load, unsure = 0.5 * (one + other), 0.5 * abs(one - other)
         sensitivity = np.array([1.0, -load])
         self._covariance[0, 0] += self._p.discharge ** 2 * since
-        noise = self._p.noise ** 2 + (self._p.load_error * self._state[1] * load) ** 2
+        noise = self._p.noise ** 2 + self._state[1] ** 2 * (
+            (self._p.load_error * load) ** 2 + unsure ** 2)
         error = voltage - float(sensitivity @ self._state)
         variance = float(sensitivity @ self._covariance @ sensitivity) + noise
         if load > 0 and error ** 2 > SURPRISE ** 2 * variance:

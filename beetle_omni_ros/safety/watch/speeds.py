@@ -8,6 +8,7 @@ import numpy as np
 
 from beetle_omni_ros.robot.allocation import ROTORS
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.response import Responses
 from beetle_omni_ros.safety.watch.parameters import RotorLimits
 
 LEARNT = 1.0            # [s] time constant of the learnt factor between speed and thrust
@@ -22,11 +23,16 @@ class SpeedWatch:
     """
     Thrust is proportional to the squared speed; the factor of each rotor is learnt in flight.
 
+    The thrust is modelled with the shortest and with the longest lag that the robot file allows. A
+    rotor is too slow if it gives too little for both, and its factor is the ratio of mean thrust
+    and mean squared speed, which no lag changes.
+
     A rotor that does not follow commands is detected by the slope of the measured over the
-    modelled thrust, a regression over the last half second. The slope is 1 for a healthy rotor,
-    less for a weak rotor, and 0 for a rotor that holds its thrust. It is used if the modelled
-    thrust has varied enough. A rotor that gives clearly more thrust than commanded is detected at
-    once, because neither lag nor weakness causes this.
+    modelled thrust with the longest lag, a regression over the last half second. The slope is at
+    least 1 for a healthy rotor (a shorter lag passes more of each frequency), less for a weak
+    rotor, and 0 for a rotor that holds its thrust. It is used if the modelled thrust has varied
+    enough. A rotor that gives clearly more thrust than commanded is detected at once, because
+    neither lag nor weakness causes this.
 
     If the reports of the motor board pause, its commands were probably late, too. For SETTLED
     seconds the thrusts then differ from the model, and no rotor is suspected.
@@ -44,7 +50,9 @@ class SpeedWatch:
     """
 
     def __init__(self, limits: RotorLimits, robot: RobotParameters):
-        self._p, self._lag = limits, robot.rotors.time_constant
+        self._p, allowed = limits, Responses.of(robot)
+        self._responses = [(lag, DELAY + delay)
+                           for lag, delay in zip(allowed.rotor_lag, allowed.rotor_delay)]
         self.reset()
 
     def reset(self) -> None:
@@ -64,7 +72,7 @@ class SpeedWatch:
 
     def on_command(self, stamp: float, thrust: np.ndarray) -> None:
         """Receive the commanded thrusts (4,) [N] of the time ``stamp`` [s]."""
-        self._commands.append((stamp + DELAY, thrust.tolist()))
+        self._commands.append((stamp, thrust.tolist()))
 
     def forget(self) -> None:
         """Suspect no rotor."""
@@ -76,15 +84,16 @@ class SpeedWatch:
     def _follow(self, start, end):
         """Thrusts that the commands build up between two times [s]."""
         commands = self._commands
-        while len(commands) > 1 and commands[1][0] <= start:
+        while len(commands) > 1 and commands[1][0] + self._responses[-1][1] <= start:
             commands.popleft()
-        for k, (stamp, asked) in enumerate(commands):
-            until = commands[k + 1][0] if k + 1 < len(commands) else end
-            span = min(until, end) - max(stamp, start)
-            if span > 0:
-                gain = -expm1(-span / self._lag)
-                for rotor, thrust in zip(self._rotors, asked):
-                    rotor.modelled += gain * (thrust - rotor.modelled)
+        for which, (lag, delay) in enumerate(self._responses):
+            for k, (stamp, asked) in enumerate(commands):
+                until = commands[k + 1][0] + delay if k + 1 < len(commands) else end
+                span = min(until, end) - max(stamp + delay, start)
+                if span > 0:
+                    gain = -expm1(-span / lag)
+                    for rotor, thrust in zip(self._rotors, asked):
+                        rotor.modelled[which] += gain * (thrust - rotor.modelled[which])
 
     def on_speeds(self, stamp: float, speed: np.ndarray) -> None:
         """
@@ -106,7 +115,7 @@ class SpeedWatch:
         if dt > LONGEST:
             if self._commands:
                 for rotor, thrust in zip(rotors, self._commands[-1][1]):
-                    rotor.modelled = thrust
+                    rotor.modelled = [thrust, thrust]
             return self.forget()
         self._follow(before, stamp)
         if stamp < self._settled_at:
@@ -126,7 +135,7 @@ class Rotor:
     One rotor of :class:`SpeedWatch`; plain floats, because numpy is slower for single numbers.
 
     Attributes:
-        modelled: thrust by the commands [N].
+        modelled: thrust by the commands with the shortest and with the longest lag [N].
         measured: thrust by the speed [N], nan if unknown.
         slow: whether it turns noticeably too slowly at the last report.
         slow_for: time for which it has turned too slowly [s].
@@ -136,7 +145,8 @@ class Rotor:
 
     def __init__(self, limits: RotorLimits):
         self._p = limits
-        self.modelled, self._factor, self._learnt_for = 0.0, 0.0, 0.0   # factor in N s^2/rad^2
+        self.modelled = [0.0, 0.0]
+        self._learnt_for = self._mean_thrust = self._mean_square = 0.0
         self.forget()
 
     def forget(self) -> None:
@@ -156,21 +166,25 @@ class Rotor:
             decay: factor of the moments in this time.
 
         """
-        p, x = self._p, self.modelled
+        p, x = self._p, self.modelled[1]
+        least, most = min(self.modelled), max(self.modelled)
         judged = isfinite(square) and x > p.least_thrust
         known = judged and self._learnt_for >= LEARNT
-        y = self._factor * square if known else nan
-        too_slow = known and y < (1 - p.share) * x
-        self.measured, self.slow = y, known and y < (1 - p.noticed) * x
+        y = self._mean_thrust / self._mean_square * square if known else nan
+        # a comparison with nan is False
+        missing = 1 - y / least if least > p.least_thrust else nan
+        too_slow = missing > p.share
+        self.measured, self.slow = y, missing > p.noticed
         self.slow_for = self.slow_for + dt if too_slow else 0.0
         if known:
-            self._regress(x, y, dt, decay)
+            self._regress(x, y, most, dt, decay)
         else:
             self._weight = self._x = self._y = self._xx = self._xy = 0.0
             self.deaf, self._deaf_for, self._more_for = False, 0.0, 0.0
         if judged and not too_slow and square > 0:
             gain = max(min(1.0, dt / max(self._learnt_for, dt)), min(1.0, dt / LEARNT))
-            self._factor += gain * (x / square - self._factor)
+            self._mean_thrust += gain * (x - self._mean_thrust)
+            self._mean_square += gain * (square - self._mean_square)
             self._learnt_for += dt
 
     @property
@@ -178,7 +192,7 @@ class Rotor:
         """Whether the last reports do not follow the commands."""
         return self._deaf_for > 0
 
-    def _regress(self, x, y, dt, decay):
+    def _regress(self, x, y, most, dt, decay):
         """Whether the measured thrust ``y`` does not follow the modelled thrust ``x``."""
         p = self._p
         self._weight = self._weight * decay + dt
@@ -190,6 +204,6 @@ class Rotor:
         deaf = w > 0.5 * p.slope_window and variance > p.least_variation**2 \
             and covariance < p.least_slope * variance
         self._deaf_for = self._deaf_for + dt if deaf else 0.0
-        more = y > (1 + p.share) * x and y - x > p.excess
+        more = y > (1 + p.share) * most and y - most > p.excess
         self._more_for = self._more_for + dt if more else 0.0
         self.deaf = self._deaf_for >= p.deaf_time or self._more_for >= p.speed_time

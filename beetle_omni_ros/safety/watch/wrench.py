@@ -8,6 +8,7 @@ import numpy as np
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth
 from beetle_omni_ros.robot.allocation import Allocator, ROTORS
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.response import Responses
 from beetle_omni_ros.safety.watch.parameters import ContactLimits, RotorLimits
 
 LONGEST = 0.05          # [s] between two IMU samples; a longer gap resets the filters
@@ -15,6 +16,7 @@ AFTER_HIT = 1.0         # [s] after an impact, in which a push at any height is 
 SPAN, LONGEST_TRACK = 3, 0.12   # poses of either velocity; [s] of both
 USUAL = 1.0             # [s] time constant of the learnt steady push in the air
 BETWEEN = 0.05          # [s] between two updates of the slower filter
+TINY = 1e-12            # squared difference of two models that are equal
 
 
 class WrenchWatch:
@@ -22,8 +24,9 @@ class WrenchWatch:
     Compares accelerometer and gyroscope with the wrench of the commanded thrusts.
 
     The thrusts follow their commands with the rotors' lag and point along the measured tilts.
-    Model and measurement pass the same first-order filter. The residual, weighted by that of
-    healthy flights, is fitted by another thrust vector of each rotor, one rotor at a time. A
+    Model and measurement pass the same first-order filter. The residual is the smallest between
+    those with the shortest and with the longest lag that the robot file allows. Weighted by that
+    of healthy flights, it is fitted by another thrust vector of each rotor, one at a time. A
     vector near zero is a lost rotor, one of about the same length a tilt that differs from its
     encoder. A second, slower filter finds a smaller loss that lasts, as of a broken propeller:
     averaged over a manoeuvre the residual of a healthy robot is small.
@@ -46,23 +49,26 @@ class WrenchWatch:
 
     def __init__(self, rotor: RotorLimits, contact: ContactLimits, robot: RobotParameters,
                  allocator: Allocator):
-        self._p, self._contact, self._robot, self._allocator = rotor, contact, robot, allocator
-        rotors, self._inertia = robot.rotors, robot.inertia.tolist()
-        self._reach = ROTORS * rotors.thrust_max / allocator.mass
+        self._p, self._contact, self._allocator = rotor, contact, allocator
+        self._inertia = robot.inertia.tolist()
+        self._lags = np.array(Responses.of(robot).rotor_lag)[:, None]
+        self._reach = ROTORS * robot.rotors.thrust_max / allocator.mass
         self._units = np.concatenate([np.full(3, allocator.mass), robot.inertia])
         self._weights = 1 / np.repeat([rotor.force_noise, rotor.torque_noise], 3)
-        weighted = allocator.matrix / self._units[:, None] * self._weights[:, None]
-        self._bases = [weighted[:, 2 * i:2 * i + 2] for i in range(ROTORS)]
+        # (8, 6): weighted accelerations by each rotor's thrust along and across its arm
+        self._model = (allocator.matrix / self._units[:, None] * self._weights[:, None]).T.copy()
+        self._bases = [self._model[2 * i:2 * i + 2].T for i in range(ROTORS)]
         self._fits = [np.linalg.pinv(basis) for basis in self._bases]
         self.reset()
 
     def reset(self) -> None:
         """Reset, with stopped rotors."""
-        self._thrust = np.zeros(ROTORS)
+        # The first of two rows is that of the shortest lag.
+        self._thrust = np.zeros((2, ROTORS))
         self._stamp: float | None = None
         self.supported = np.zeros(ROTORS, dtype=bool)
-        self._filtered, self._vectors = np.zeros(6), np.zeros((ROTORS, 2))
-        self._steady, self._steady_vectors = np.zeros(6), np.zeros((ROTORS, 2))
+        self._measured, self._vectors = np.zeros(6), np.zeros((2, 2 * ROTORS))
+        self._steady, self._steady_vectors = np.zeros(6), np.zeros((2, 2 * ROTORS))
         self._waited = 0.0
         self.forget()
         self.impact = 0.0
@@ -100,20 +106,18 @@ class WrenchWatch:
         if dt > LONGEST or tilt is None:
             impact = self.impact
             self.reset()
-            self._thrust, self._stamp, self._rate = commanded.copy(), stamp, rate
+            self._thrust, self._stamp, self._rate = np.array([commanded] * 2), stamp, rate
             self.impact = impact
             return
-        self._thrust += -expm1(-dt / self._robot.rotors.time_constant) \
-            * (commanded - self._thrust)
+        self._thrust -= np.expm1(-dt / self._lags) * (commanded - self._thrust)
         measured = np.array(force.tolist() + self._angular_acceleration(rate.tolist(), dt))
         self._rate = rate
-        vectors = np.empty((ROTORS, 2))
-        vectors[:, 0] = np.cos(tilt) * self._thrust
-        vectors[:, 1] = np.sin(tilt) * self._thrust
-        modelled = self._allocator.matrix.dot(vectors.ravel()) / self._units
+        vectors = np.empty((2, ROTORS, 2))
+        vectors[:, :, 0] = np.cos(tilt) * self._thrust
+        vectors[:, :, 1] = np.sin(tilt) * self._thrust
         gain = 1 - exp(-dt / self._contact.filter)
-        self._filtered += gain * (measured - modelled - self._filtered)
-        self._vectors += gain * (vectors - self._vectors)
+        self._measured += gain * (measured * self._weights - self._measured)
+        self._vectors += gain * (vectors.reshape(2, -1) - self._vectors)
         self._waited += dt
         if self._waited >= BETWEEN:
             self._judge_steady(self._waited)
@@ -131,19 +135,32 @@ class WrenchWatch:
         """Count the time for which a rotor has lost a smaller share."""
         p = self._p
         gain = -expm1(-dt / p.steady_filter)
-        self._steady += gain * (self._filtered - self._steady)
+        self._steady += gain * (self._measured - self._steady)
         self._steady_vectors += gain * (self._vectors - self._steady_vectors)
-        residual = self._steady * self._weights
+        vectors, residual = self._closest(self._steady_vectors, self._steady)
         size = float(residual @ residual)
         weak = np.zeros(ROTORS, dtype=bool)
         if size > p.steady_evidence**2:
             i, rest = self._culprit(residual)
-            length = float(np.hypot(*self._steady_vectors[i]))
-            true = self._steady_vectors[i] + self._fits[i] @ residual
+            length = float(np.hypot(*vectors[i]))
+            true = vectors[i] + self._fits[i] @ residual
             weak[i] = rest @ rest < (1 - p.steady_explained) * size \
                 and length > p.least_thrust \
                 and float(np.hypot(*true)) < (1 - p.steady_share) * length
         self._weak_for = self._counted(self._weak_for, weak, dt)
+
+    def _closest(self, vectors, measured):
+        """
+        Thrust vectors (4, 2) [N] between two lags that explain most, and the residual (6,).
+
+        Vectors of lags between are close to a line: a first-order lag is a point on a half circle
+        from 1 to 0, and the line cuts off at most 8 % of the circle for lags of one to three.
+        """
+        residuals = measured - vectors.dot(self._model)
+        change = residuals[0] - residuals[1]
+        share = min(1.0, max(0.0, -residuals[1].dot(change) / (change.dot(change) + TINY)))
+        return ((vectors[1] + share * (vectors[0] - vectors[1])).reshape(ROTORS, 2),
+                residuals[1] + share * change)
 
     def _culprit(self, residual):
         """The rotor (0 to 3) that explains most of a weighted residual, and the rest of it."""
@@ -155,9 +172,9 @@ class WrenchWatch:
     def _judge(self, dt):
         """The rotor whose thrust vector explains the residual, and this vector."""
         p = self._p
-        residual = self._filtered * self._weights
+        vectors, residual = self._closest(self._vectors, self._measured)
         size = float(residual.dot(residual))
-        self.unexplained = self._filtered[:3]
+        self.unexplained = residual[:3] / self._weights[:3]
         self.lost = self._first(self._weak_for >= p.steady_time)
         if size <= p.least_evidence**2 and not self._suspects:
             return
@@ -165,7 +182,7 @@ class WrenchWatch:
         angle = 0.0
         if size > p.least_evidence**2:
             i, rest = self._culprit(residual)
-            modelled = self._vectors[i]
+            modelled = vectors[i]
             length = float(np.hypot(*modelled))
             if rest @ rest < (1 - p.explained) * size and length > p.least_thrust:
                 true = modelled + self._fits[i] @ residual

@@ -1,6 +1,0 @@
-"""Make the kinds of damage in benchmarks/ importable."""
-
-from pathlib import Path
-import sys
-
-sys.path.append(str(Path(__file__).resolve().parents[2] / 'benchmarks'))
