@@ -23,8 +23,9 @@ AT_TARGET, ON_THE_WAY = (7.0, 7.5), (1.0, 7.0)
 NOMINAL = {'command_latency': [0.010, 0.010], 'velocity_latency': [0.0, 0.0],
            'tilt_latency': [0.010, 0.010], 'actuator_spread': [0.0, 0.0]}
 MEASURED = {**NOMINAL, 'actuator_spread': [1.0, 1.0]}
-PUBLISHED = {'actuator_spread': [0.0, 0.0], 'command_latency': [0.005, 0.015], 'velocity_latency': [0.015, 0.025],
-             'tilt_latency': [0.005, 0.010], 'carried_share': 1.0, 'noise_power': 0.0}
+PUBLISHED = {'command_latency': [0.005, 0.015], 'velocity_latency': [0.015, 0.025],
+             'tilt_latency': [0.005, 0.010], 'carried_share': 1.0, 'noise_power': 0.0,
+             'actuator_spread': [0.0, 0.0]}
 SILENT = {'force_bias': 0.0, 'torque_bias': 0.0, 'force_noise': 0.0, 'torque_noise': 0.0}
 DISTURBANCES = ('force_share', 'strong_share', 'payload_share', 'push_share')
 

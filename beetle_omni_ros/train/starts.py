@@ -150,8 +150,8 @@ class Starts:
         """
         Quantities of servos and rotors (N, 21), and delays by effects beyond the nominal (N, 2).
 
-        A robot lies between the nominal one and one that is drawn from the measured intervals, or
-        somewhat beyond the latter; with one share for the servos, one for the rotors.
+        A robot lies on the line from the nominal one to one that is drawn from the measured
+        intervals, also somewhat beyond both; with one place for its servos, one for its rotors.
         """
         low, high = self._measured
         count = low.shape[0]

@@ -95,7 +95,7 @@ def test_an_unknown_operation_is_refused_by_name():
 def test_the_kernel_loads_uses_and_stores_each_number():
     source = physics._kernel_source(model.substep(EVERYTHING, 0.0025))
     ast.parse(source)
-    for name, array, size in (('x', 'x_in', 25), ('wrench', 'wrench', 6), ('body', 'body', 7),
+    for name, array, size in (('x', 'x_in', 25), ('wrench', 'wrench', 6), ('body', 'body', 28),
                               ('newest', 'newest', 8), ('previous', 'previous', 8),
                               ('oldest', 'oldest', 8)):
         for k in range(size):

@@ -129,7 +129,7 @@ def test_drawn_actuators_lie_between_the_nominal_robot_and_the_measured_interval
     middle = 0.5 * (low + high)
     torch.testing.assert_close(body.mean(0), middle, rtol=0.05, atol=1e-4)
     assert later.min() >= -1e-6 and later[:, 0].max() > 0.004 and not later[:, 1].any()
-    # one robot in the file's interval is the file's robot drawn likewise
+    # as the robot file draws its robots
     drawn = [nominal_body(RobotParameters.load('measured').drawn(np.random.default_rng(seed)))
              for seed in range(20)]
     drawn = torch.tensor(drawn).float()[:, ACTUATORS]
