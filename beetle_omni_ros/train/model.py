@@ -3,9 +3,9 @@ Model of the robot in the training environment, as one CasADi function.
 
 Rigid-body equations, rotor lag and effects come from :mod:`robot.dynamics`. This module adds the
 integration over a short substep, the limits of the servos and the quantities that differ between
-robots: mass, inertia, centre of mass, servos and rotor lag. With a multibody section in the robot file, the model
-includes the reaction of the tilting modules and their shift of the centre of mass. Without these a
-policy does not hold level attitudes on the multibody plant.
+robots: mass, inertia, centre of mass, servos and rotor lag. With a multibody section in the robot
+file, the model includes the reaction of the tilting modules and their shift of the centre of mass.
+Without these a policy does not hold level attitudes on the multibody plant.
 """
 
 from dataclasses import replace

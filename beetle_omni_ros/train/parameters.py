@@ -104,7 +104,7 @@ class RandomParameters:
                                             shape=(2,), low=0, high=0.02)
     actuators: str = parameter(
         'measured', doc='robot file whose measured intervals of servos, rotors and delays the '
-        'robots cover; empty: that of the trained robot')
+        'robots cover')
     actuator_spread: np.ndarray = parameter(
         [-0.3, 1.1], doc='place of a robot on the line from the nominal one (0) to one drawn from '
         'these intervals (1)', shape=(2,), low=-1, high=2)

@@ -8,8 +8,8 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.train import batch
 from beetle_omni_ros.train.model import (
-    ACTUATORS,
     actuator_intervals,
+    ACTUATORS,
     delay_intervals,
     nominal_body,
 )
@@ -87,7 +87,7 @@ class Starts:
         self._latencies = latencies(parameters, robot)
         self._longest_delay = HISTORY * parameters.episode.period
         self._spread = [float(share) for share in r.actuator_spread]
-        measured = RobotParameters.load(r.actuators) if r.actuators else robot
+        measured = RobotParameters.load(r.actuators)
         self._nominal = tensor([*nominal_body(robot)[ACTUATORS], *robot.command_delays])
         self._measured = tensor(np.hstack([actuator_intervals(measured),
                                            delay_intervals(measured)]))

@@ -10,8 +10,8 @@ from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.train.batch import Draw
 from beetle_omni_ros.train.model import (
-    ACTUATORS,
     actuator_intervals,
+    ACTUATORS,
     LAG,
     nominal_body,
     STIFFNESS,
