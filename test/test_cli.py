@@ -133,7 +133,7 @@ def test_compare_refuses_unusable_input_before_anything_flies(
 def test_fly_refuses_an_unregistered_controller(capsys, tmp_path):
     pytest.importorskip('rclpy')
     line = refused(capsys, 'fly', '--controller', 'nmpc_publish', '--bag', tmp_path / 'bag')
-    assert "controller 'nmpc_publish': expected one of nmpc, rl, rl_memory" in line
+    assert "controller 'nmpc_publish': expected one of nmpc, rl, rl_bare" in line
 
 
 @pytest.mark.parametrize('command', ['report', 'film', 'view', 'gap', 'identify joint'])

@@ -134,7 +134,12 @@ def evaluate(controllers: Annotated[str, typer.Option(
     Example: beetle_omni evaluate --controllers nmpc --task random100 --json result.json
     """
     chosen = names('--controllers', controllers)
-    options = {name: ControllerOptions(allow_other_robot=allow_other_robot, without=without)
+    guided = [name for name in chosen if registry.find(name).guidance != 'none']
+    if without and not guided:
+        raise ParameterError(f'--without {without}: no controller with guidance among '
+                             f"{', '.join(chosen)}")
+    options = {name: ControllerOptions(allow_other_robot=allow_other_robot,
+                                       without=without if name in guided else '')
                for name in chosen}
     for option, file, key in (('--nmpc', nmpc_file, 'parameters'), ('--policy', policy, 'policy')):
         name = owner(option)

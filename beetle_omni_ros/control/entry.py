@@ -158,7 +158,10 @@ class ControllerEntry:
         mapping = schema.load_yaml(file) if file else {}
         parameters = schema.bind(kind, self.completed(mapping, bool(options.parameters)),
                                  str(file or ''))
-        if options.without and hasattr(parameters, 'without'):
+        if options.without:
+            if not hasattr(parameters, 'without'):
+                raise ParameterError(f"--without {options.without}: controller "
+                                     f"'{self.reference}' has no layers of guidance")
             parameters = replace(parameters, without=options.without)
         if not (self.policy_file and hasattr(parameters, 'policy')):
             return parameters
