@@ -59,9 +59,7 @@ report: setup  ## one HTML page about the runs in runs_out/ (or RUNS='DIR...')
 	if [ -z "$$runs" ]; then echo 'no runs in runs_out/: make fly first, or RUNS=DIR' >&2; exit 2; fi; \
 	mkdir -p runs_out; $(TOOL) report $$runs --output runs_out/report.html $(ARGS)
 
-film: setup  ## fly and draw the films of the pages: docs/pictures/*.gif, runs_out/film/*.mp4
-	@.venv/bin/python -c 'import imageio_ffmpeg' 2>/dev/null || \
-	    .venv/bin/python -m pip install --quiet --editable '.[film]'
+film: setup  ## fly and draw the films of the pages, docs/pictures/*.gif
 	.venv/bin/python benchmarks/film.py $(ARGS)
 
 clean:  ## remove the environment and files of builds and tools; keep runs_out/

@@ -94,11 +94,6 @@ RAY = [
     'ray>=2.45',
 ]
 
-# MP4 of `beetle_omni film`: an encoder in a wheel; GIF needs nothing more.
-FILM = [
-    'imageio-ffmpeg>=0.4.9,<1',
-]
-
 # colcon looks for pytest under the name `test` before it runs pytest.
 TEST = [
     'hypothesis>=6.100',
@@ -146,7 +141,6 @@ setup(
         'hardware': HARDWARE,
         'train': TRAIN,
         'ray': RAY,
-        'film': FILM,
         'test': TEST,
         'dev': DEVELOPMENT,
     },

@@ -53,7 +53,7 @@ def simulate(controller: str | Callable = 'nmpc', task: Any = 'waypoints', *,
         The flight; ``log.meta['crashed']`` is true if the robot touched the ground.
 
     Raises:
-        ParameterError, TaskError, BagError, FlightError: with a message of one line.
+        ParameterError, BagError, RunError: with a message of one line.
 
     """
     from pathlib import Path

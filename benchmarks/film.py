@@ -73,7 +73,7 @@ def main():
     console.print('fly')
     bags = [fly(folder, name, controller, task=task()) for name, controller in
             CONTROLLERS.items()]
-    draw(*bags, '-o', given.output / 'flight.gif', '-o', folder / 'flight.mp4')
+    draw(*bags, '-o', given.output / 'flight.gif')
     old, plant = folder / 'old_model.yaml', folder / 'plant.yaml'
     base = f"extends: {share_path('params/robot.yaml')}\n"
     old.write_text(base)
@@ -81,8 +81,7 @@ def main():
     console.print('fly the robot with a weak rotor, find the gap')
     measured = fly(folder, 'weak rotor', 'nmpc', task=task(), plant=plant)
     corrected = find_gap(folder, plant, Console(quiet=True))
-    draw(measured, '--model', old, '--model', corrected, '-o', given.output / 'gap.gif',
-         '-o', folder / 'gap.mp4')
+    draw(measured, '--model', old, '--model', corrected, '-o', given.output / 'gap.gif')
 
 
 if __name__ == '__main__':

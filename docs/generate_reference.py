@@ -36,6 +36,8 @@ MADE = '<!-- Made by docs/generate_reference.py; changes by hand are lost. -->\n
 # Parameter file -> class that reads it, what it holds.
 FILES = {
     'robot.yaml': ('robot.parameters:RobotParameters', 'The robot.'),
+    'robot_measured.yaml': ('robot.parameters:RobotParameters',
+                            'The robot as measured logs show it.'),
     'robot_weak_and_heavy.yaml': ('robot.parameters:RobotParameters',
                                   'A robot with less thrust and more mass than in robot.yaml.'),
     'nmpc.yaml': ('control.nmpc_parameters:NmpcParameters', 'The NMPC.'),
@@ -50,8 +52,8 @@ FILES = {
                         'Checks of commands, takeoff, landing, detection of faults.'),
     'targets.yaml': ('runs.target_checks:TargetLimits', 'What a target pose must keep to.'),
     'drive.yaml': ('drive.parameters:DriveParameters', 'Driving by hand.'),
-    'servo_bus.yaml': ('drivers.servo_parameters:ServoBusParameters', 'The bus of tilt servos.'),
-    'motor_board.yaml': ('drivers.motor_board_parameters:MotorBoardParameters',
+    'servo_bus.yaml': ('drivers.device_parameters:ServoBusParameters', 'The bus of tilt servos.'),
+    'motor_board.yaml': ('drivers.device_parameters:MotorBoardParameters',
                          'The motor board.'),
     'emulated_board.yaml': ('sim.emulated.board_parameters:EmulatedBoardParameters',
                             'The emulated motor board.'),
@@ -84,7 +86,7 @@ A file that extends another moves what depends on its numbers:
 # Nodes whose code is not in a file of their own name; '' is no node of its own.
 SHARED = {'controller_node': 'nmpc_node, rl_node', 'health': 'every node', 'operator': '',
           'driver': '', 'listener': '', 'node': '', 'recorder_node': '', 'command_source': '',
-          'graph': '', 'process_faults': '', 'wire': ''}
+          'graph': '', 'wire': ''}
 
 # Topics that viewers and clocks need, which no other part of the package reads.
 OTHERS = {
@@ -236,6 +238,9 @@ def _ends() -> dict[str, dict[str, list[str]]]:
                 entry[way] += [one for one in node.split(', ') if one not in entry[way]]
     # Read through the class that checks the publisher.
     found['supervisor/identity']['to'] = list(found['command']['to'])
+    found['/tf']['from'].append('robot_state_publisher')
+    for topic in ('/tf_static', 'robot_description'):
+        found[topic] = {'from': ['robot_state_publisher'], 'to': []}
     return found
 
 

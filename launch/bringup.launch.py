@@ -4,9 +4,11 @@ Start the flight stack: ``ros2 launch beetle_omni_ros bringup.launch.py``.
 The robot stays on the ground until ``supervisor_node/arm`` is called.
 """
 
+import atexit
 import shutil
 import subprocess
 import sys
+import tempfile
 
 from launch.actions import DeclareLaunchArgument, ExecuteProcess, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
@@ -62,33 +64,29 @@ def has_ros2_bag():
                           check=False).returncode == 0
 
 
+def ports():
+    """Make a private folder of this launch, so that the ports of two simulations do not meet."""
+    made = tempfile.mkdtemp(prefix='beetle_omni_ports_')
+    atexit.register(shutil.rmtree, made, ignore_errors=True)
+    return made
+
+
 def options(given):
     """Put the arguments into the terms of the graph's plan."""
     from beetle_omni_ros.nodes.plan import GraphOptions
-    from beetle_omni_ros.nodes.private import process_folder
     simulated = given['backend'] == 'sim'
     actuators = given['actuators'] or (
         'direct' if given['clock'] == 'simulated' else 'bridges')
     emulated = simulated and actuators == 'bridges'
-    # in a folder of its own: ports of two simulations must not meet
     return GraphOptions(
         simulated=simulated, actuators=actuators,
-        ports=str(process_folder('ports')) if emulated else '',
+        ports=ports() if emulated else '',
         bag=given['record'] if given['record'] and not has_ros2_bag() else '',
         seed=int(given['seed']),
         **{key: given[key] == 'true' for key in ('standby', 'allow_other_robot', 'viewer')},
         **{key: given[key] for key in (
             'clock', 'compression', 'conditions', 'controller', 'plant_file', 'policy',
             'robot_file', 'task')})
-
-
-def has_state_publisher():
-    """Whether robot_state_publisher is installed."""
-    from ament_index_python.packages import get_package_prefix, PackageNotFoundError
-    try:
-        return bool(get_package_prefix('robot_state_publisher'))
-    except PackageNotFoundError:
-        return False
 
 
 def state_publisher(namespace):
@@ -141,8 +139,7 @@ def actions(context):
     for name, reason in planned.left_out.items():
         print(f'{name} does not stand by: {reason}', file=sys.stderr)
     processes = []
-    if 'viewer_node' in nodes and has_state_publisher():
-        nodes['viewer_node']['links'] = False
+    if 'viewer_node' in nodes:
         processes.append(state_publisher(given['namespace']))
     if given['record'] and 'recorder_node' not in nodes:
         controllers = nodes['supervisor_node'].get('controllers', ())

@@ -26,17 +26,16 @@ for folder in sorted(Path(__file__).parent.iterdir()):
 sys.path.append(str(Path(__file__).parent))
 
 # Tests that depend on the system clock have the mark real_time: nodes, buses and devices, some
-# with limits of milliseconds. Flights in simulated time have another mark, because they wait for
-# late nodes. A short stall of a shared computer fails the former without a defect of the code.
-# They are repeated alone, which the summary shows (R); a defect fails twice. If the computer
-# stalls in the repetition too, the test is skipped with the length of the stall.
+# with limits of milliseconds. A short stall of a shared computer fails them without a defect of
+# the code. They are repeated alone, which the summary shows (R); a defect fails twice. If the
+# computer stalls in the repetition too, the test is skipped with the length of the stall.
 RERUNS = 1
 STALL = 0.05        # s; the limits of silence in these tests are 50 to 80 ms
 MARKS = {'alone': re.compile(r'\bmark\.alone\b'),      # part of the suite -> in a file of it
-         'real_time': re.compile(r'\bmark\.(real_time|alone)\b|\bros_domain\b')}
+         'real_time': re.compile(r'\bmark\.(real_time|alone)\b')}
 # Files of tests that wait for other processes, with timeouts; all others only compute.
 PROCESSES = re.compile(r'/(nodes|tutorials|view|pages)/test_\w+\.py$'
-                       r'|/test_(start|stillness|workers)\.py$')
+                       r'|/test_(start|workers)\.py$')
 LANES = 'processes', 'computing'
 BEAT, BEGIN = pytest.StashKey(), pytest.StashKey[float]()
 
@@ -61,15 +60,9 @@ def _has_mark(path, part):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config, items):
-    """Mark tests with a ROS domain, permit a repetition, and watch for stalls."""
-    waiting = [item for item in items if item.get_closest_marker('simulated_time')]
+    """Permit a repetition of tests in real time, and watch for stalls."""
     real_time = [item for item in items if item.get_closest_marker('alone')
-                 or item.get_closest_marker('real_time')
-                 or ('ros_domain' in item.fixturenames and item not in waiting)]
-    for path, part in {(item.path, 'alone' if item.get_closest_marker('alone') else 'real_time')
-                       for item in real_time}:
-        if not _has_mark(path, part):      # it would be in neither part
-            raise pytest.UsageError(f'{path}: has tests in real time: name the mark in the file')
+                 or item.get_closest_marker('real_time')]
     for item in real_time:
         item.add_marker(pytest.mark.real_time)
     for item in set(items).difference(real_time):
@@ -80,7 +73,7 @@ def pytest_collection_modifyitems(config, items):
     else:       # The longest file first: at the end it would leave other workers idle.
         items.sort(key=lambda item: item.path.parent.name != 'tutorials')
     # A repetition beside other tests is of little use in real time; .ci/test repeats alone.
-    for item in [*waiting, *(() if WORKER else real_time)]:
+    for item in () if WORKER else real_time:
         item.add_marker(pytest.mark.flaky(reruns=RERUNS))
     if real_time and not WORKER and not config.getoption('markexpr').endswith('not real_time') \
             and not config.getoption('numprocesses', None):

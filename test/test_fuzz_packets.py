@@ -12,11 +12,9 @@ pytest.importorskip('pymavlink')
 pytest.importorskip('dynamixel_sdk')
 
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
-from beetle_omni_ros.drivers.mavlink_receiver import MavlinkReceiver
-from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
-from beetle_omni_ros.drivers.motor_board_watch import BoardWatch, restarted
+from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters
+from beetle_omni_ros.drivers.motor_board_state import BoardState, MavlinkReceiver
 from beetle_omni_ros.drivers.servo_link import ServoLink
-from beetle_omni_ros.drivers.servo_port import ServoPort
 from beetle_omni_ros.messages import conversions
 from beetle_omni_ros.messages.topics import ALL
 from beetle_omni_ros.messages.values import MessageError, Odom, Wrench
@@ -57,9 +55,10 @@ class Board:
     """Frames to the driver's receiver and watch, and to the emulated board's parser."""
 
     def __init__(self):
-        self._receiver = MavlinkReceiver(1, 1, restarted)
+        self._receiver = MavlinkReceiver(1, 1)
         self._parser = mavlink.Parser()
-        self._watch = BoardWatch(MotorBoardParameters.load(), RobotParameters.load(), time.time)
+        self._state = BoardState(
+            MotorBoardParameters.load(), RobotParameters.load().battery.cells, time.time)
         self._sequence, self._asked = count(), 0
 
     def __call__(self, rng):
@@ -74,21 +73,20 @@ class Board:
             frame = mutated(rng, frame)
         now = time.monotonic()
         for message in self._receiver.feed(frame):
-            self._watch.message(message, now)
+            self._state.message(message, now)
         self._parser.feed(frame)
-        self._watch.tick(now, True)
+        self._state.tick(now, True)
         if rng.random() < 0.1:
-            self._asked = self._watch.timesync_request().ts1
-            self._watch.take()
+            self._asked = self._state.timesync_request().ts1
+            self._state.take()
 
 
-class Wire(ServoPort):
-    """A port that plays back answers and times out at once after the last one."""
+class Wire(ServoLink):
+    """A bus that plays back answers and times out at once after the last one."""
 
     def __init__(self):
         super().__init__('wire', 1_000_000, 0.001)
-        self.waiting, self._late = b'', 0.0
-        self.tx_time_per_byte = 0.01
+        self.waiting = b''
 
     def clearPort(self):
         """Discard nothing, for there is no buffer."""
@@ -100,21 +98,18 @@ class Wire(ServoPort):
     def readPort(self, length):
         """Return the remaining bytes."""
         taken, self.waiting = self.waiting[:length], self.waiting[length:]
-        if not taken:
-            self._late += 100.0
         return taken
 
-    def getCurrentTime(self):
-        """Milliseconds."""
-        return self._late
+    def isPacketTimeout(self):
+        """Whether all bytes are read."""
+        return not self.waiting
 
 
 class Servos:
     """Answers to the servo driver's reads, and packets to an emulated servo's receiver."""
 
     def __init__(self):
-        self._link = ServoLink('wire', 1_000_000, 0.001)
-        self._link._port = self._wire = Wire()
+        self._link = Wire()
         self._receiver = Receiver()
 
     def __call__(self, rng):
@@ -122,11 +117,11 @@ class Servos:
         link = self._link
         link.fast = bool(rng.integers(2))
         parts = [(one, int(rng.integers(256)), rng.bytes(DATA)) for one in SERVOS]
-        answer = b''.join(fast_status(parts, (DATA + 4) * len(parts)) if link.fast else
-                          [status(*part) for part in parts])
-        self._wire.waiting = mutated(rng, answer) if rng.random() < 0.7 else answer
+        answer = (fast_status(parts, (DATA + 4) * len(parts)) if link.fast
+                  else b''.join(status(*part) for part in parts))
+        link.waiting = mutated(rng, answer) if rng.random() < 0.7 else answer
         for error, data in link.sync_read(132, DATA, SERVOS).values():
-            if len(data) != DATA or not 0 <= error < 128:
+            if len(data) != DATA or not 0 <= error < 256:
                 raise AssertionError(f'an answer of {len(data)} bytes, error {error}')
         sent = packet(int(rng.integers(1, 253)), int(rng.integers(1, 160)), rng.bytes(8))
         for _ in self._receiver.feed(mutated(rng, sent)):

@@ -13,26 +13,7 @@ import pytest
 
 import beetle_omni_ros
 from beetle_omni_ros import start
-from beetle_omni_ros.bringup.limits import CheckLimits
-from beetle_omni_ros.control.hover import HoverParameters
-from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
-from beetle_omni_ros.control.policy import PolicyParameters
-from beetle_omni_ros.drive.parameters import DriveParameters
-from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
-from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
-from beetle_omni_ros.estimation.parameters import EkfParameters
-from beetle_omni_ros.identify.gap.parameters import GapParameters
-from beetle_omni_ros.identify.parameters import IdentifyParameters
-from beetle_omni_ros.identify.recording.limits import RecordingLimits
-from beetle_omni_ros.robot.holding import HoldingParameters
-from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import PACKAGE, share_path
-from beetle_omni_ros.runs.target_checks import TargetLimits
-from beetle_omni_ros.safety.parameters import SupervisorParameters
-from beetle_omni_ros.sim.emulated.board_parameters import EmulatedBoardParameters
-from beetle_omni_ros.sim.faults.listed import FaultList
-from beetle_omni_ros.sim.parameters import SimulatorParameters
-from beetle_omni_ros.train.parameters import TrainParameters
 
 ROOT = Path(__file__).resolve().parents[1]
 MANIFEST = ElementTree.parse(ROOT / 'package.xml').getroot()
@@ -40,25 +21,9 @@ HAS_ROS = importlib.util.find_spec('rclpy') is not None
 
 # Import name -> distribution on PyPI, where they differ; import name -> rosdep key.
 DISTRIBUTION = {'yaml': 'pyyaml', 'serial': 'pyserial', 'dynamixel_sdk': 'dynamixel-sdk',
-                'rsl_rl': 'rsl-rl-lib', 'PIL': 'pillow', 'imageio_ffmpeg': 'imageio-ffmpeg'}
+                'rsl_rl': 'rsl-rl-lib', 'PIL': 'pillow'}
 KEY = {'yaml': 'python3-yaml', 'mcap': 'mcap-ros2-support', 'casadi': 'casadi-pip',
        'serial': 'python3-serial', 'PIL': 'python3-pil'}
-PARAMETER_CLASSES = {
-    'check.yaml': CheckLimits, 'degraded.yaml': HoldingParameters,
-    'drive.yaml': DriveParameters, 'ekf.yaml': EkfParameters,
-    'emulated_board.yaml': EmulatedBoardParameters, 'faults.yaml': FaultList,
-    'gap.yaml': GapParameters,
-    'hover.yaml': HoverParameters,
-    'motor_board.yaml': MotorBoardParameters,
-    'nmpc.yaml': NmpcParameters,
-    'nmpc_published.yaml': NmpcParameters, 'rl.yaml': PolicyParameters,
-    'identify.yaml': IdentifyParameters,
-    'recording.yaml': RecordingLimits,
-    'robot.yaml': RobotParameters, 'robot_weak_and_heavy.yaml': RobotParameters,
-    'servo_bus.yaml': ServoBusParameters,
-    'simulator.yaml': SimulatorParameters, 'supervisor.yaml': SupervisorParameters,
-    'targets.yaml': TargetLimits,
-    'train.yaml': TrainParameters}
 
 
 @pytest.fixture(scope='module')
@@ -167,7 +132,7 @@ def test_data_files_are_in_the_folders_of_ros(setup_arguments):
 def test_every_import_is_a_declared_requirement(setup_arguments):
     extras = setup_arguments['extras_require']
     lines = [*setup_arguments['install_requires'],
-             *(line for extra in ('hardware', 'train', 'ray', 'film') for line in extras[extra])]
+             *(line for extra in ('hardware', 'train', 'ray') for line in extras[extra])]
     declared = {re.split(r'[\[<>=~;! ]', line)[0] for line in lines}
     keys = dependencies('exec_depend', 'depend')
     for module in third_party_imports():
@@ -175,10 +140,10 @@ def test_every_import_is_a_declared_requirement(setup_arguments):
             assert module in keys, f'{module}: not in package.xml'
             continue
         assert DISTRIBUTION.get(module, module) in declared, f'{module}: not in setup.py'
-        # rosdep has no key for the modules of the viewer. The last two are optional: without
-        # them the code is slower, and films have no MP4.
+        # rosdep has no key for the modules of the viewer. Without the last one
+        # the code is slower.
         if module not in ('torch', 'tensordict', 'onnx', 'rsl_rl', 'ray', 'viser', 'trimesh',
-                          'threadpoolctl', 'imageio_ffmpeg'):
+                          'threadpoolctl'):
             candidates = {KEY.get(module), f'python3-{module}', f'python3-{module}-pip', module}
             assert keys & candidates, f'{module}: no rosdep key in package.xml'
 
@@ -193,10 +158,17 @@ def test_every_requirement_is_imported_and_listed_once(setup_arguments):
             assert set(names) - imported == {'etils'}      # bounds a requirement of mujoco
 
 
-def test_each_parameter_file_is_read_by_its_class():
-    shipped = sorted(path.name for path in (ROOT / 'params').glob('*.yaml'))
-    assert shipped == sorted(PARAMETER_CLASSES)
-    for name, kind in PARAMETER_CLASSES.items():
+def test_each_parameter_file_is_read_by_the_class_of_its_reference():
+    spec = importlib.util.spec_from_file_location('reference', ROOT / 'docs/generate_reference.py')
+    reference = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(reference)
+    shipped = {path.name for path in (ROOT / 'params').glob('*.yaml')}
+    robots = {name for name in shipped if name.startswith('robot_')}    # without a table
+    assert shipped - robots == set(reference.FILES) - robots
+    for name in shipped:
+        place, _ = reference.FILES.get(name, reference.FILES['robot.yaml'])
+        module, kind = place.split(':')
+        kind = getattr(import_module(f'{PACKAGE}.{module}'), kind)
         assert isinstance(kind.load(share_path(f'params/{name}')), kind)
 
 

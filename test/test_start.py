@@ -7,13 +7,9 @@ import subprocess
 import sys
 import time
 
-import pytest
-
 from beetle_omni_ros import cli, start
-from beetle_omni_ros.nodes.plan import NODES
 
 ROOT = Path(__file__).resolve().parents[1]
-SLOW = 'import time\nprint("loading", flush=True)\ntime.sleep(30)\n'
 INTERRUPTED = 'def main():\n    raise KeyboardInterrupt\n'
 
 
@@ -26,14 +22,6 @@ def launch(tmp_path, text, before=''):
          'sys.exit(start.run("program"))'],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler))
-
-
-def test_an_interrupt_while_modules_load_ends_without_a_traceback(tmp_path):
-    process = launch(tmp_path, SLOW)
-    assert process.stdout.readline() == 'loading\n'
-    process.send_signal(signal.SIGINT)
-    assert process.communicate(timeout=10) == ('', '')
-    assert process.returncode == -signal.SIGINT
 
 
 def test_an_interrupt_at_a_random_moment_shows_no_traceback():
@@ -69,20 +57,5 @@ def test_an_unhandled_interrupt_gives_status_130(tmp_path):
     assert process.communicate(timeout=10) == ('', '') and process.returncode == 130
 
 
-def test_a_signal_that_the_shell_ignores_stays_ignored(tmp_path):
-    process = launch(tmp_path, 'import signal\ndef main():\n    return int('
-                     'signal.getsignal(signal.SIGINT) == signal.SIG_IGN)\n',
-                     'signal.signal(signal.SIGINT, signal.SIG_IGN)')
-    process.communicate(timeout=10)
-    assert process.returncode == 1
-
-
 def test_a_program_is_the_main_of_its_module():
     assert start.beetle_omni.args == ('beetle_omni',) and start.load('beetle_omni') is cli.main
-
-
-@pytest.mark.parametrize('name', NODES)
-def test_every_other_executable_runs_the_node_of_its_name(name):
-    runner = pytest.importorskip('beetle_omni_ros.nodes.runner', exc_type=ImportError)
-    entry = start.load(name)
-    assert entry.func is runner.main and runner.executable(*entry.args) == name

@@ -17,7 +17,7 @@ from beetle_omni_ros.bringup.finding import (
 from beetle_omni_ros.bringup.graph import ObservedGraph
 from beetle_omni_ros.bringup.limits import BatteryLimits, CheckLimits, LinkLimits
 from beetle_omni_ros.bringup.port import latency_finding, port_finding
-from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
+from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 BOARD, BRIDGE = 'motor board', 'rotor_bridge'
@@ -48,12 +48,20 @@ def check_board(parameters: MotorBoardParameters, robot: RobotParameters, limits
         port = replace(port, level=FAIL, found=str(error), remedy='docs/how-to/hardware.md')
         return bridge_findings(port, BRIDGE, graph)
     try:
-        update, receptions = _listen(board, seconds)
+        battery, rotors, receptions = _listen(board, seconds)
         latency = latency_finding('board port latency timer', parameters.port,
                                   limits.link.latency_timer)
+        status, link = board.state.status, board.link()
     finally:
         board.close()
-    return [port, latency, *_of_board(update, receptions, parameters, robot, limits)]
+    if status is None:
+        return [port, latency, Finding(
+            BOARD, FAIL, f"no heartbeat; {link['bytes']} bytes, {link['received']} good packets, "
+            f"{link['foreign']} of other senders", _remedy_of_silence(link, parameters))]
+    return [port, latency, *_of_status(status), _of_battery(battery, robot.battery.cells,
+                                                            limits.battery),
+            *_of_escs(rotors), _of_clock(link, parameters),
+            *_of_link(link, receptions, limits.link)]
 
 
 def _listen(board, seconds):
@@ -61,33 +69,28 @@ def _listen(board, seconds):
     Poll the board.
 
     Returns:
-        the last update with the newest battery and rotors of all updates, and a list of
-        (number of packets sent, BoardReception) for each report of the board's reception.
+        the newest battery and rotors, and a list of (number of packets sent, the board's counts)
+        for each report of the board's reception.
 
     """
     rotors = battery = None
     receptions = []
     started = time.monotonic()
     while True:
-        update, now = board.poll(), time.monotonic()
-        rotors, battery = update.rotors or rotors, update.battery or battery
-        reception = update.link.board
+        (new_battery, new_rotors, _), now = board.poll(), time.monotonic()
+        rotors, battery = new_rotors or rotors, new_battery or battery
+        reception = board.state.reception
         # The restart of our sequence numbers looks like lost packets to the board.
-        if reception is not None and now - started > SETTLING and \
+        if reception and now - started > SETTLING and \
                 (not receptions or reception is not receptions[-1][1]):
-            receptions.append((update.link.sent, reception))
+            receptions.append((board.link()['sent'], reception))
         if now - started >= seconds:
-            return replace(update, rotors=rotors, battery=battery), receptions
+            return battery, rotors, receptions
         time.sleep(POLL_PERIOD)
 
 
-def _of_board(update, receptions, parameters, robot, limits):
-    from beetle_omni_ros.drivers.motor_board_messages import NO_HOST_HEARTBEAT
-    status, received = update.status, update.link.received
-    if status is None:
-        return [Finding(BOARD, FAIL, f'no heartbeat; {received.bytes} bytes, '
-                        f'{received.messages} good packets, {received.foreign} of other senders',
-                        _remedy_of_silence(received, parameters))]
+def _of_status(status):
+    from beetle_omni_ros.drivers.motor_board_state import NO_HOST_HEARTBEAT
     blocking = [condition for condition in status.conditions if condition != NO_HOST_HEARTBEAT]
     receives = NO_HOST_HEARTBEAT not in status.conditions
     return [
@@ -98,24 +101,21 @@ def _of_board(update, receptions, parameters, robot, limits):
                 'host_component in params/motor_board.yaml'),
         Finding('board ready to arm', FAIL if blocking else OK, ', '.join(blocking) or 'yes',
                 'charge the battery, check the ESCs, stop programs that command thrust'
-                if blocking else ''),
-        _of_battery(update.battery, robot.battery.cells, limits.battery),
-        *_of_escs(update.rotors), _of_clock(update, parameters),
-        *_of_link(received, receptions, limits.link)]
+                if blocking else '')]
 
 
-def _remedy_of_silence(received, parameters):
-    if received.foreign:
+def _remedy_of_silence(link, parameters):
+    if link['foreign']:
         return (f'another device sends MAVLink; expected system '
                 f'{parameters.board_system}, component {parameters.board_component}: '
                 'params/motor_board.yaml')
-    if received.bytes:
+    if link['bytes']:
         return f'wrong baud rate (here {parameters.baud} bit/s), or another firmware or device'
     return "check the board's power, the cable, TX and RX swapped, another port"
 
 
 def _of_firmware(status):
-    from beetle_omni_ros.drivers.motor_board_messages import CONTRACT_VERSION
+    from beetle_omni_ros.drivers.motor_board_state import CONTRACT_VERSION
     values = {'contract': status.contract, 'state': status.state}
     if status.contract != CONTRACT_VERSION:
         return Finding('board firmware', FAIL, f'contract {status.contract}, this driver uses '
@@ -163,28 +163,28 @@ def _of_escs(rotors):
     return findings
 
 
-def _of_clock(update, parameters):
-    uncertainty, values = update.clock_uncertainty, {
-        'offset_s': update.clock_offset, 'uncertainty_s': update.clock_uncertainty}
+def _of_clock(link, parameters):
+    offset, uncertainty = link['clock_offset_s'], link['clock_uncertainty_ms'] / 1e3
+    values = {'offset_s': offset, 'uncertainty_s': uncertainty}
     if not np.isfinite(uncertainty):
         return Finding('board clock', FAIL, 'offset unknown: no answer to TIMESYNC',
                        "check the computer's TX wire; the firmware must answer TIMESYNC", values)
-    return graded('board clock', f'offset {update.clock_offset:.3f} s +- '
+    return graded('board clock', f'offset {offset:.3f} s +- '
                   f'{1e3 * uncertainty:.2f} ms', uncertainty, 'slow answers to TIMESYNC: check '
                   'the latency timer of the adapter and the load of the computer', values=values,
                   warn=parameters.clock_uncertainty_limit / 2,
                   fail=parameters.clock_uncertainty_limit)
 
 
-def _of_link(received, receptions, limits: LinkLimits):
-    findings = [_of_direction('link from the board', received.lost, received.bad_crc,
-                              received.messages, limits)]
+def _of_link(link, receptions, limits: LinkLimits):
+    findings = [_of_direction('link from the board', link['lost'], link['bad_crc'],
+                              link['received'], limits)]
     if len(receptions) < 2:
         return [*findings, Finding('link to the board', WARN, f'{len(receptions)} reports of the '
                                    "board's reception, two are needed",
                                    'increase the time: --seconds 4')]
     (before, first), (after, last) = receptions[0], receptions[-1]
-    lost, bad_crc = last.lost - first.lost, last.bad_crc - first.bad_crc
+    lost, bad_crc = (last[name] - first[name] for name in ('lost', 'bad_crc'))
     return [*findings, _of_direction('link to the board', lost, bad_crc,
                                      max(0, after - before - lost), limits)]
 

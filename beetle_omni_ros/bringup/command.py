@@ -15,8 +15,7 @@ from beetle_omni_ros.bringup.graph import BRIDGES, ObservedGraph
 from beetle_omni_ros.bringup.limits import CheckLimits
 from beetle_omni_ros.bringup.servos import check_servos
 from beetle_omni_ros.bringup.topics import check_topics
-from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
-from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
+from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters, ServoBusParameters
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.json_file import check_writable, write_json

@@ -15,8 +15,8 @@ from beetle_omni_ros.bringup.graph import ObservedGraph
 from beetle_omni_ros.bringup.limits import CheckLimits, ServoLimits
 from beetle_omni_ros.bringup.port import latency_finding, port_finding
 from beetle_omni_ros.drivers import servo_registers as registers
-from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
-from beetle_omni_ros.drivers.servo_turns import settle, unambiguous_limit
+from beetle_omni_ros.drivers.device_parameters import ServoBusParameters
+from beetle_omni_ros.drivers.servo_registers import settle, unambiguous_limit
 from beetle_omni_ros.robot.parameters import JointParameters
 
 BUS, BRIDGE = 'servo bus', 'joint_bridge'
@@ -35,8 +35,8 @@ def check_servos(parameters: ServoBusParameters, joints: JointParameters, limits
     if port.level != OK:
         return bridge_findings(port, BRIDGE, graph)
     try:
+        from beetle_omni_ros.drivers.serial_port import SerialPortError
         from beetle_omni_ros.drivers.servo_link import ServoLink
-        from beetle_omni_ros.drivers.servo_port import PortLost
     except ModuleNotFoundError as error:
         return [port, missing_library(BUS, error, 'hardware')]
     link = ServoLink(parameters.port, parameters.baud_rate, parameters.timing.reply)
@@ -45,36 +45,37 @@ def check_servos(parameters: ServoBusParameters, joints: JointParameters, limits
         latency = latency_finding('servo port latency timer', parameters.port,
                                   limits.link.latency_timer)
         return [port, latency, *_of_bus(link, parameters, joints, limits.servos)]
-    except PortLost as error:
-        return [port, Finding(BUS, FAIL, f'{parameters.port}: {error}',
+    except SerialPortError as error:
+        return [port, Finding(BUS, FAIL, str(error),
                               'check cable and adapter: docs/how-to/hardware.md')]
     finally:
         link.close()
 
 
 def _of_bus(link, parameters, joints, limits):
-    from beetle_omni_ros.drivers.servo_setup import examine
-    from beetle_omni_ros.drivers.servo_state import make_servos
+    from beetle_omni_ros.drivers.servo_bus import examine, make_servos
     servos = make_servos(parameters)
     with link.patient():
-        states = [examine(link, servo) for servo in servos]
-        torques = [_torque(link, servo) if state.model is not None else None
-                   for servo, state in zip(servos, states, strict=True)]
-    present = [servo for servo, state in zip(servos, states, strict=True)
-               if state.model is not None]
+        problems = [examine(link, servo) for servo in servos]
+        present = [servo for servo in servos if servo.model is not None]
+        for servo in present:
+            servo.torque = _torque(link, servo)
     findings = [_answers(link, present, limits)] if present else []
     misplaced = []
     if len(present) < len(servos):
-        misplaced = _misplaced(link, parameters)
+        link.close()
+        misplaced = _misplaced(parameters)
         if not present and not misplaced:
             return [Finding(BUS, FAIL, 'no servo answers at any baud rate',
                             "check the servos' supply (their LEDs blink once at power-up) "
                             'and the data cable')]
-    for k, (servo, state) in enumerate(zip(servos, states, strict=True)):
-        findings.append(_of_servo(state, parameters, misplaced))
-        if state.position is not None:
-            findings += _of_health(state, torques[k], limits)
-            findings += _of_turn(servo, state, parameters, joints, k)
+    for k, (servo, (problem, remedy)) in enumerate(zip(servos, problems, strict=True)):
+        if servo.model is None:
+            remedy = _remedy_of_missing(servo.identifier, parameters, misplaced)
+        findings.append(_of_servo(servo, link.baud_rate, problem, remedy))
+        if servo.firmware is not None:
+            findings += _of_health(servo, limits)
+            findings += _of_turn(servo, parameters, joints, k)
     return findings
 
 
@@ -86,30 +87,43 @@ def _torque(link, servo):
         return None
 
 
-def _of_servo(state, parameters, misplaced):
+def _of_servo(servo, baud_rate, problem, remedy):
     """Finding whether a servo answers, has the right model and reports no error."""
-    values = {'id': state.identifier, 'model': state.model, 'firmware': state.firmware,
-              'baud_rate': state.baud_rate, 'supply_V': state.voltage,
-              'temperature_C': state.temperature, 'position_rad': state.position}
-    facts = ''
-    if state.position is not None:
-        facts = (f'id {state.identifier}, model {state.model}, firmware {state.firmware}, '
-                 f'{state.voltage:.1f} V, {state.temperature:.0f} C, {state.position:+.2f} rad')
-    if state.ok:
-        return Finding(state.name, OK, facts, values=values)
-    found = f'{state.problem}; {facts}' if facts else f'id {state.identifier} {state.problem}'
-    remedy = state.remedy
-    if state.model is None:
-        remedy = _remedy_of_missing(state.identifier, parameters, misplaced)
-    return Finding(state.name, FAIL, found, remedy, values)
+    read = servo.firmware is not None
+    values = {'id': servo.identifier, 'model': servo.model, 'firmware': servo.firmware,
+              'baud_rate': baud_rate if read else None,
+              'supply_V': servo.voltage if read else None,
+              'temperature_C': servo.temperature if read else None,
+              'position_rad': servo.position if read else None}
+    facts = f'id {servo.identifier}, model {servo.model}, firmware {servo.firmware}, ' \
+        f'{servo.voltage:.1f} V, {servo.temperature:.0f} C, {servo.position:+.2f} rad'
+    if not problem:
+        return Finding(servo.name, OK, facts, values=values)
+    found = f'{problem}; {facts}' if read else f'id {servo.identifier} {problem}'
+    return Finding(servo.name, FAIL, found, remedy, values)
 
 
-def _misplaced(link, parameters):
+def _misplaced(parameters):
     """Find (baud rate, ID, model) of servos with an unexpected ID or baud rate."""
-    from beetle_omni_ros.drivers.servo_setup import scan
-    link.close()
-    expected = {(parameters.baud_rate, int(name)) for name in parameters.ids}
-    return [found for found in scan(parameters, OTHER_IDS) if found[:2] not in expected]
+    from beetle_omni_ros.drivers.serial_port import SerialPortError
+    from beetle_omni_ros.drivers.servo_link import ServoBusError, ServoLink
+    found, ids = [], {int(name) for name in parameters.ids}
+    for baud_rate in registers.BAUD_CODES:
+        link = ServoLink(parameters.port, baud_rate, max(parameters.timing.reply, 0.005))
+        try:
+            link.open()
+            for identifier in sorted(ids.union(OTHER_IDS)):
+                if baud_rate == parameters.baud_rate and identifier in ids:
+                    continue
+                try:
+                    found.append((baud_rate, identifier, link.ping(identifier)))
+                except ServoBusError:
+                    continue
+        except SerialPortError:
+            continue    # some adapters lack some baud rates
+        finally:
+            link.close()
+    return found
 
 
 def _remedy_of_missing(identifier, parameters, misplaced):
@@ -126,48 +140,48 @@ def _remedy_of_missing(identifier, parameters, misplaced):
     return 'check its connector, and those before it in the chain'
 
 
-def _of_health(state, torque, limits: ServoLimits):
+def _of_health(servo, limits: ServoLimits):
     """Findings about firmware, supply, temperature and torque; empty without a problem."""
-    name, findings = state.name, []
-    if state.firmware < registers.FIRST_FAST_FIRMWARE:
+    name, findings = servo.name, []
+    if servo.firmware < registers.FIRST_FAST_FIRMWARE:
         findings.append(Finding(
-            f'{name} firmware', WARN, f'{state.firmware}, before '
+            f'{name} firmware', WARN, f'{servo.firmware}, before '
             f'{registers.FIRST_FAST_FIRMWARE}: no fast sync read, feedback of all servos takes '
-            'longer', 'update it with DYNAMIXEL Wizard', {'firmware': state.firmware}))
-    supply = {'supply_V': state.voltage}
-    if not limits.supply_fail_low <= state.voltage <= limits.supply_high:
+            'longer', 'update it with DYNAMIXEL Wizard', {'firmware': servo.firmware}))
+    supply = {'supply_V': servo.voltage}
+    if not limits.supply_fail_low <= servo.voltage <= limits.supply_high:
         findings.append(Finding(
-            f'{name} supply', FAIL, f'{state.voltage:.1f} V, allowed are '
+            f'{name} supply', FAIL, f'{servo.voltage:.1f} V, allowed are '
             f'{limits.supply_fail_low:g} to {limits.supply_high:g} V',
             'set the regulator to 11.1 to 12 V', supply))
-    elif state.voltage < limits.supply_low:
+    elif servo.voltage < limits.supply_low:
         findings.append(Finding(
-            f'{name} supply', WARN, f'{state.voltage:.1f} V: slower and weaker than identified',
+            f'{name} supply', WARN, f'{servo.voltage:.1f} V: slower and weaker than identified',
             'set the regulator to 11.1 to 12 V; check the drop over thin cables', supply))
-    if state.temperature > limits.temperature_high:
+    if servo.temperature > limits.temperature_high:
         findings.append(Finding(
-            f'{name} temperature', WARN, f'{state.temperature:.0f} C', 'let it cool; check what '
-            'blocks the joint', {'temperature_C': state.temperature}))
-    if torque:
+            f'{name} temperature', WARN, f'{servo.temperature:.0f} C', 'let it cool; check what '
+            'blocks the joint', {'temperature_C': servo.temperature}))
+    if servo.torque:
         findings.append(Finding(
             f'{name} torque', WARN, 'its torque is on, although no driver has the port open',
             'a program left it on: switch it off with the joint bridge, or cut its supply'))
     return findings
 
 
-def _of_turn(servo, state, parameters, joints, k):
+def _of_turn(servo, parameters, joints, k):
     """Finding if the turn of the joint is ambiguous, by the rule of the driver."""
-    servo.position = state.position
+    read = servo.position
     confirmed = [parameters.confirmed_tilts[k]] if parameters.confirm_tilts else None
     doubts = settle([servo], joints.position_limit, confirmed)
     if doubts:
         limit = unambiguous_limit(joints.position_limit)
-        return [Finding(f'{state.name} turn', FAIL, f'ambiguous: {doubts}', 'turn it by hand to '
+        return [Finding(f'{servo.name} turn', FAIL, f'ambiguous: {doubts}', 'turn it by hand to '
                         f'within +-{limit:.2f} rad, cables untwisted; or set confirmed_tilts and '
                         'confirm_tilts: docs/how-to/hardware.md',
-                        {'position_rad': state.position})]
+                        {'position_rad': read})]
     if confirmed:
-        return [Finding(f'{state.name} turn', WARN, f'taken as {servo.position:+.2f} rad because '
+        return [Finding(f'{servo.name} turn', WARN, f'taken as {servo.position:+.2f} rad because '
                         'confirm_tilts is set', 'reset confirm_tilts once it is parked',
                         {'position_rad': servo.position})]
     return []

@@ -15,9 +15,16 @@ from typer.main import get_command
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.cli import flights, live, models
-from beetle_omni_ros.cli.options import fail, INTERRUPTED, refuse_empty, UNUSABLE, usage_text
+from beetle_omni_ros.cli.options import (
+    fail,
+    FAILED,
+    INTERRUPTED,
+    refuse_empty,
+    UNUSABLE,
+    usage_text,
+)
 from beetle_omni_ros.robot.resources import PACKAGE
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.schema import ParameterError, RunError
 
 # Modules of ROS (also of the extra 'ros') and of the other extras of the package.
 ROS_MODULES, ROS_ENDINGS = ('rclpy', 'ament_index_python'), ('_msgs', '_srvs', '_interfaces')
@@ -73,6 +80,8 @@ def main(args: list[str] | None = None) -> int:
         return fail(f"the module '{top}' is not installed; {cure}", UNUSABLE)
     except ParameterError as error:
         return fail(error, UNUSABLE)
+    except RunError as error:
+        return fail(error, FAILED)
     except (KeyboardInterrupt, typer.Abort):
         return fail('interrupted', INTERRUPTED)
     except Exception as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from datetime import datetime
+import os
 from pathlib import Path
 from typing import Annotated, Optional
 
@@ -17,7 +18,6 @@ from beetle_omni_ros.cli.options import (
     ConditionsOption,
     ControllerOption,
     DiscoveryOption,
-    fail,
     FAILED,
     FaultsOption,
     JobsOption,
@@ -89,19 +89,16 @@ def fly(controller: ControllerOption = DEFAULT,
                  json_path=json_path, files=(nmpc_file, policy, faults))
     if allow_targets and not view:
         raise ParameterError('--allow-targets: expected --view with it')
-    from beetle_omni_ros.nodes.fly import FlightError, run_fly
+    from beetle_omni_ros.nodes.fly import run_fly
     if not given:
         typer.echo(f'bag: {bag}')
-    try:
-        code = run_fly(controller=controller, task=task, bag=bag, compression=compression,
-                       seed=seed, conditions=conditions, actuators=actuators, clock=clock,
-                       robot=robot, plant=plant, nmpc=nmpc_file, policy=policy,
-                       allow_other_robot=allow_other_robot, standby=standby,
-                       composed=composed, faults=faults, json_path=json_path,
-                       domain_id=domain_id, discovery=discovery,
-                       view=view, allow_targets=allow_targets)
-    except FlightError as error:
-        raise typer.Exit(fail(error, FAILED)) from None
+    code = run_fly(controller=controller, task=task, bag=bag, compression=compression,
+                   seed=seed, conditions=conditions, actuators=actuators, clock=clock,
+                   robot=robot, plant=plant, nmpc=nmpc_file, policy=policy,
+                   allow_other_robot=allow_other_robot, standby=standby,
+                   composed=composed, faults=faults, json_path=json_path,
+                   domain_id=domain_id, discovery=discovery,
+                   view=view, allow_targets=allow_targets)
     raise typer.Exit(code if isinstance(code, int) else 0)
 
 
@@ -151,14 +148,10 @@ def evaluate(controllers: Annotated[str, typer.Option(
     check_flight(task=task, seed=seed, conditions=conditions, bag=bag, compression=compression,
                  json_path=json_path, files=(nmpc_file, policy, faults))
     from beetle_omni_ros.evaluation.command import run_evaluate
-    from beetle_omni_ros.evaluation.loop import FlightError
     from beetle_omni_ros.runs.metrics import failed
-    try:
-        results = run_evaluate(controllers=chosen, task=task, conditions=conditions, robot=robot,
-                               plant=plant, seed=seed, bag=bag, compression=compression,
-                               json_path=json_path, faults=faults, options=options)
-    except FlightError as error:
-        raise typer.Exit(fail(error, FAILED)) from None
+    results = run_evaluate(controllers=chosen, task=task, conditions=conditions, robot=robot,
+                           plant=plant, seed=seed, bag=bag, compression=compression,
+                           json_path=json_path, faults=faults, options=options)
     if any(map(failed, results.values())):
         raise typer.Exit(FAILED)
 
@@ -176,6 +169,7 @@ def compare(controllers: Annotated[Optional[str], typer.Option(
                 '--seeds', metavar='N,...',
                 help='Default: 0,1; only 0 for tasks of more than 50 s.')] = None,
             policy: PolicyOption = None,
+            plant: PlantOption = None,
             jobs: JobsOption = None,
             backend: Annotated[str, typer.Option(
                 '--backend', metavar='processes|ray', help='Run the flights on this computer, or '
@@ -206,12 +200,8 @@ def compare(controllers: Annotated[Optional[str], typer.Option(
     check_files(policy)
     check_writable(json_path)
     from beetle_omni_ros.comparison.command import run_compare
-    from beetle_omni_ros.comparison.sweep import SweepError
-    try:
-        run_compare(**arguments, output=output, jobs=jobs, backend=backend, address=address,
-                    cache=cache, fresh=fresh, policy=policy, json_path=json_path)
-    except SweepError as error:
-        raise typer.Exit(fail(error, FAILED)) from None
+    run_compare(**arguments, output=output, jobs=jobs, backend=backend, address=address,
+                cache=cache, fresh=fresh, policy=policy, plant=plant, json_path=json_path)
 
 
 def faults(faults: Annotated[Optional[Path], typer.Option(
@@ -230,6 +220,7 @@ def faults(faults: Annotated[Optional[Path], typer.Option(
                help='Seed of the first flight; it grows by one with each further flight.')] = 0,
            conditions: ConditionsOption = 'nominal',
            controller: ControllerOption = DEFAULT,
+           plant: PlantOption = None,
            landings: Annotated[int, typer.Option(
                '--landings', metavar='N', min=0, help='Fly N landings from random attitudes '
                                                       'instead of the list.')] = 0,
@@ -240,10 +231,6 @@ def faults(faults: Annotated[Optional[Path], typer.Option(
                '--healthy', metavar='HOURS', min=0.0, max=1000.0,
                help='Fly for this time without a fault under each of nominal, published and '
                     'effects, and count false alarms, instead of the list.')] = 0.0,
-           ros: Annotated[bool, typer.Option(
-               '--ros', help='Inject the faults that need the ROS graph, in real time and in '
-                             'hover: killed or stopped processes, and other programs that publish '
-                             'on its topics.')] = False,
            jobs: JobsOption = None,
            bags: Annotated[bool, typer.Option(
                '--bags', help='Record each flight in --output, and read its bag.')] = False,
@@ -266,21 +253,11 @@ def faults(faults: Annotated[Optional[Path], typer.Option(
     check_files(faults)
     if without_mocap and not landings:
         raise ParameterError('--without-mocap: expected --landings N with it')
-    chosen, through_ros = names('--only', only), None
-    if ros:
-        if landings or healthy:
-            raise ParameterError('--ros: expected without --landings and --healthy')
-        from beetle_omni_ros.nodes import process_faults
-        wanted = process_faults.chosen(chosen)
-
-        def through_ros(listed):
-            return (process_faults.fly_through_ros(name, listed) for name in wanted)
-
     from beetle_omni_ros.faults.command import run_faults
-    run_faults(faults=faults, only=chosen, starts=names('--from', starts),
+    run_faults(faults=faults, only=names('--only', only), starts=names('--from', starts),
                seeds=seeds, seed=seed, conditions=conditions, controller=controller, jobs=jobs,
                output=output, json_path=json_path, docs=docs, bags=bags, landings=landings,
-               without_mocap=without_mocap, healthy=healthy, through_ros=through_ros)
+               without_mocap=without_mocap, healthy=healthy, plant=plant)
 
 
 def report(runs: Annotated[list[Path], typer.Argument(
@@ -303,40 +280,26 @@ def report(runs: Annotated[list[Path], typer.Argument(
 def film(runs: Annotated[list[Path], typer.Argument(
              metavar='RUN...', help='Recorded bags, side by side: rosbag2 folders, or one of '
                                     'their files.')],
-         output: Annotated[list[Path], typer.Option(
-             '--output', '-o', metavar='FILE', help='The film, .gif or .mp4; may be repeated.')],
+         output: Annotated[Path, typer.Option('--output', '-o', metavar='FILE',
+                                              help='The film, a .gif.')],
          model: Annotated[Optional[list[Path]], typer.Option(
              '--model', metavar='FILE',
              help='Robot file whose prediction is drawn over one RUN; it starts again from the '
-                  'recorded state each second; one panel for each --model.')] = None,
-         robot: Annotated[Optional[Path], typer.Option(
-             '--robot', metavar='FILE', help='Robot file with the dimensions for drawing. '
-                                             'Default: the shipped params/robot.yaml.')] = None,
-         start: Annotated[float, typer.Option(
-             '--start', metavar='SECONDS', help='Start of the film, after the first '
-                                                'target.')] = 0.0,
-         duration: Annotated[Optional[float], typer.Option(
-             '--duration', metavar='SECONDS', help='Duration of the film. Default: to the end of '
-                                                   'the flight.')] = None,
-         speed: Annotated[float, typer.Option(
-             '--speed', metavar='FACTOR', min=0.05, max=50.0, help='Speed of the film; 1 is real '
-                                                                   'time.')] = 1.0,
-         size: Annotated[int, typer.Option(
-             '--size', metavar='PIXELS', min=160, max=1600, help='Width of a panel, even.')]
-         = 440):
+                  'recorded state each second; one panel for each --model.')] = None):
     """
     Render recorded flights as a film: robot, target, path, errors and thrusts.
 
     Needs OpenGL for off-screen rendering; without it, a message names the packages to install.
     Example: beetle_omni film my_run/rl my_run/nmpc --output flight.gif
     """
-    for path in output:
-        check_writable(path, 'film')
-    from beetle_omni_ros.film.graphics import choose_backend
-    choose_backend()
-    from beetle_omni_ros.film.command import run_film
-    run_film(runs, output, models=model or [], robot=robot, start=start, duration=duration,
-             speed=speed, size=size)
+    check_writable(output, 'film')
+    os.environ.setdefault('MUJOCO_GL', 'egl')       # MuJoCo reads it when it is imported
+    try:
+        from beetle_omni_ros.film.command import run_film
+    except (AttributeError, ImportError, RuntimeError) as error:
+        raise ParameterError(f'no off-screen OpenGL ({error}); install libegl1, libgl1-mesa-dri '
+                             'and libopengl0 (apt)') from None
+    run_film(runs, output, models=model or [])
 
 
 def controllers(json_path: JsonOption = None):

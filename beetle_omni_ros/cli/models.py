@@ -7,7 +7,7 @@ from typing import Annotated, Optional
 
 import typer
 
-from beetle_omni_ros.cli.options import fail, FAILED, JsonOption, PublishedOption
+from beetle_omni_ros.cli.options import JsonOption, PublishedOption
 
 PageOption = Annotated[Optional[Path], typer.Option(
     '--report', metavar='FILE', help='Write a self-contained HTML page with plots.')]
@@ -121,14 +121,18 @@ def robot(logs: Annotated[list[Path], typer.Argument(
                                      'force-torque stand, recognised by their header.')],
           params: Annotated[Path, typer.Option(
               '--params', metavar='FILE', help='The robot file to write.')],
-          rate: RateOption = None, robot: PublishedOption = None, json_path: JsonOption = None):
+          rate: RateOption = None, robot: PublishedOption = None,
+          picture: Annotated[Optional[Path], typer.Option(
+              '--picture', metavar='FILE', help='Draw the logs with both robots (.png or .svg).')]
+          = None, json_path: JsonOption = None):
     """
     Write a robot file with intervals and origins from all logs of servos and rotors.
 
     Example: beetle_omni identify robot slow.csv fast.csv bench.csv --params my_robot.yaml
     """
     from beetle_omni_ros.identify.command import run_identify_robot
-    run_identify_robot(logs, params, rate=rate, robot=robot, json_path=json_path)
+    run_identify_robot(logs, params, rate=rate, robot=robot, picture=picture,
+                       json_path=json_path)
 
 
 def train(output: Annotated[Path, typer.Option(
@@ -163,11 +167,8 @@ def train(output: Annotated[Path, typer.Option(
 
     Several GPUs: torchrun --nproc-per-node N -m beetle_omni_ros.cli train --output DIR
     """
-    from beetle_omni_ros.train.command import run_train, TrainingError
+    from beetle_omni_ros.train.command import run_train
     from beetle_omni_ros.train.run_folder import parse_changes
-    try:
-        run_train(output=output, config=config, robot=robot, device=device, resume=resume,
-                  changes=parse_changes(changes or [], seed=seed, memory=memory),
-                  smoke=smoke, stop_after=stop_after, json_path=json_path)
-    except TrainingError as error:
-        raise typer.Exit(fail(error, FAILED)) from None
+    run_train(output=output, config=config, robot=robot, device=device, resume=resume,
+              changes=parse_changes(changes or [], seed=seed, memory=memory),
+              smoke=smoke, stop_after=stop_after, json_path=json_path)

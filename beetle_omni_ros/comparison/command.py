@@ -45,7 +45,8 @@ def run_compare(*, output: Path, controllers: list[str] | None = None,
                 seeds: list[int] | None = None, jobs: int | None = None,
                 backend: str = 'processes', address: str | None = None,
                 cache: Path | None = None, fresh: bool = False, policy: Path | None = None,
-                json_path: Path | None = None, console: Console | None = None) -> dict:
+                plant: Path | None = None, json_path: Path | None = None,
+                console: Console | None = None) -> dict:
     """
     Fly the missing flights, then write page, pictures and numbers.
 
@@ -56,18 +57,21 @@ def run_compare(*, output: Path, controllers: list[str] | None = None,
 
     Raises:
         ParameterError: unusable input.
-        SweepError: a worker was lost.
+        RunError: a worker was lost.
 
     """
     console = console or Terminal()
     names = controllers or registry.compared()
     arguments = (names, tasks or TASKS, conditions or CONDITIONS, seeds)
     check_backend(backend)
+    if plant:
+        RobotParameters.load(plant)
     plan(*arguments)  # refuses unusable input before any work
     available, skipped = _available(names, policy, refuse=controllers is not None)
     for name, reason in skipped.items():
         print(f'beetle_omni: {name} is left out: {reason}', file=sys.stderr)
-    flights = plan([entry.reference for entry in available], *arguments[1:], policy=policy)
+    flights = plan([entry.reference for entry in available], *arguments[1:], policy=policy,
+                   plant=plant)
     output = Path(output)
     try:
         output.mkdir(parents=True, exist_ok=True)
@@ -81,7 +85,8 @@ def run_compare(*, output: Path, controllers: list[str] | None = None,
         print(f'beetle_omni: finished flights are kept in {store.folder}; the same command '
               'continues from there', file=sys.stderr)
         raise
-    results = _results(flown, arguments, [entry.name for entry in available], skipped, policy)
+    results = _results(flown, arguments, [entry.name for entry in available], skipped, policy,
+                       plant)
     results['meta']['guidance'] = {entry.name: text for entry, text in available.items()}
     _write(results, flown, output, console)
     write_json(json_path, results)
@@ -148,7 +153,7 @@ def _line(flight, result, kept):
     return f"{flight.name}: {', '.join(parts)}"
 
 
-def _results(flown, arguments, names, skipped, policy):
+def _results(flown, arguments, names, skipped, policy, plant=None):
     """Content of the JSON file, from plain values, so that it is equal after reading."""
     _, tasks, conditions, seeds = arguments
     order = {name: k for k, name in enumerate((*tasks, *conditions, *names))}
@@ -161,13 +166,15 @@ def _results(flown, arguments, names, skipped, policy):
     command = (f"beetle_omni compare --controllers {','.join(references)} "
                f"--tasks {','.join(tasks)} --conditions {','.join(conditions)}"
                + (f" --seeds {','.join(map(str, seeds))}" if seeds else '')
-               + (f' --policy {policy}' if policy else ''))
+               + (f' --policy {policy}' if policy else '')
+               + (f' --plant {plant}' if plant else ''))
     return {
         'meta': {'version': __version__, 'commit': commit(), 'command': command,
                  'controllers': names, 'specs': specs, 'skipped': skipped, 'tasks': list(tasks),
                  'conditions': list(conditions),
                  'seeds': sorted({flight.seed for flight in flights}),
                  'policy_file': str(policy) if policy else None,
+                 'plant': str(plant) if plant else None,
                  'policies': {name: f'{file.name} ({file_digest(file)})'
                               for name, file in files.items() if file},
                  'cpu_s': sum(result.get('cpu_s', 0.0) for result in flown.values()),

@@ -12,6 +12,7 @@ import subprocess
 
 from beetle_omni_ros.comparison.plan import Flight
 from beetle_omni_ros.control import registry
+from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import PACKAGE, share_path
 
 LIBRARIES = ('casadi', 'filterpy', 'mujoco', 'numpy', 'onnxruntime', 'scipy')
@@ -143,6 +144,8 @@ def flight_key(flight: Flight) -> str:
     parts.append(file_digest(flight.task) if is_file else flight.task)
     if policy := policy_file(flight.reference, flight.policy):
         parts.append(file_digest(policy))
+    if flight.plant:
+        parts.append(RobotParameters.load(flight.plant).hash())
     return hashlib.sha256('\n'.join(parts).encode()).hexdigest()[:LENGTH]
 
 

@@ -15,9 +15,8 @@ from beetle_omni_ros.comparison.fingerprint import code_fingerprint
 from beetle_omni_ros.comparison.plan import Flight
 from beetle_omni_ros.control.registry import ControllerOptions
 from beetle_omni_ros.evaluation.command import fly
-from beetle_omni_ros.evaluation.loop import FlightError
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.schema import ParameterError, RunError
 from beetle_omni_ros.runs.body import errors, motion
 from beetle_omni_ros.runs.log import FlightLog
 from beetle_omni_ros.runs.metrics import metrics
@@ -53,10 +52,11 @@ def fly_flight(flight: Flight, task: Task, code: str | None = None) -> dict:
         return result
     try:
         robot = RobotParameters.load()
+        plant = RobotParameters.load(flight.plant) if flight.plant else robot
         with warnings.catch_warnings():
             # An unstable flight may overflow; its metrics show the failure.
             warnings.simplefilter('ignore', RuntimeWarning)
-            log = fly(flight.reference, task, robot=robot, plant=robot,
+            log = fly(flight.reference, task, robot=robot, plant=plant,
                       conditions=flight.conditions, seed=flight.seed,
                       options={flight.reference: ControllerOptions(
                           policy=Path(flight.policy) if flight.policy else None)},
@@ -65,7 +65,7 @@ def fly_flight(flight: Flight, task: Task, code: str | None = None) -> dict:
             result['metrics'] = judged = metrics(log, task)
             judged['steps'] = log.compute.get(flight.controller, {}).get('count', 0)
             result['trace'] = trace(log, task)
-    except (FlightError, ParameterError) as error:
+    except (RunError, ParameterError) as error:
         result['failure'] = _line(error)
     except Exception as error:  # the other flights continue after any failure of a controller
         result['failure'] = f'{type(error).__name__}: {_line(error)}'

@@ -151,6 +151,7 @@ def facts(results: dict) -> list[str]:
     lines = [code, f"{len(results['flights'])} flights, {failed} failed; seeds "
                    f"{', '.join(map(str, meta['seeds']))}",
              f"{meta['cpu_s'] / 60:.1f} core minutes on {meta['machine']['processor']}"]
+    lines += [f"simulated plant: {meta['plant']}"] * bool(meta.get('plant'))
     lines += [f'{look(name).label}: policy {digest}' for name, digest in meta['policies'].items()]
     return lines
 

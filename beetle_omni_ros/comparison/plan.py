@@ -36,6 +36,7 @@ class Flight:
         seed: seed of the task's poses and of the simulation.
         policy: file in place of its shipped policy, '' for none.
         spec: reference to its class, '' for a registered controller.
+        plant: robot file of the simulated plant, '' for the shipped one.
 
     """
 
@@ -45,11 +46,13 @@ class Flight:
     seed: int
     policy: str = ''
     spec: str = ''
+    plant: str = ''
 
     @property
     def name(self) -> str:
         """Name in messages."""
-        return f'{self.controller}, {self.task}, {self.conditions}, seed {self.seed}'
+        return f'{self.controller}, {self.task}, {self.conditions}, seed {self.seed}' \
+            + f', {Path(self.plant).stem}' * bool(self.plant)
 
     @property
     def slug(self) -> str:
@@ -73,7 +76,7 @@ class Flight:
 
 def plan(controllers: Sequence[str], tasks: Sequence[str] = TASKS,
          conditions: Sequence[str] = CONDITIONS, seeds: Sequence[int] | None = None,
-         policy: Path | None = None) -> list[Flight]:
+         policy: Path | None = None, plant: Path | None = None) -> list[Flight]:
     """
     List all flights, longest first, so that none of the long ones remains at the end.
 
@@ -83,6 +86,7 @@ def plan(controllers: Sequence[str], tasks: Sequence[str] = TASKS,
         conditions: 'nominal', 'published'.
         seeds: numbers from 0; None: 0 and 1, but only 0 for tasks of more than 50 s.
         policy: file that replaces the shipped policy, for the controller of `--policy`.
+        plant: robot file of the simulated plant.
 
     Raises:
         ParameterError: no entry or equal entries; unknown conditions or task.
@@ -103,7 +107,8 @@ def plan(controllers: Sequence[str], tasks: Sequence[str] = TASKS,
         chosen = dict.fromkeys(tasks, seeds)
     other = {registry.owner('--policy'): str(policy)} if policy else {}
     entries = registry.find_all(controllers)
-    flights = [Flight(task, condition, entry.name, seed, other.get(entry.name, ''), entry.spec)
+    flights = [Flight(task, condition, entry.name, seed, other.get(entry.name, ''), entry.spec,
+                      str(plant or ''))
                for task in tasks for condition, entry, seed
                in product(conditions, entries, chosen[task])]
     return sorted(flights, key=lambda flight: -flight.cost)

@@ -20,7 +20,7 @@ import numpy as np
 from beetle_omni_ros.comparison.fingerprint import code_fingerprint, flight_key
 from beetle_omni_ros.comparison.flight import fly_flight
 from beetle_omni_ros.comparison.plan import Flight
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.schema import ParameterError, RunError
 
 BACKENDS = ('processes', 'ray')
 OBJECT_STORE = 200 * 2**20  # [byte] shared memory of a local Ray; traces are far smaller
@@ -76,10 +76,6 @@ class Store:
             raise ParameterError(f'{path}: cannot keep the flight ({error.strerror})') from None
 
 
-class SweepError(RuntimeError):
-    """Workers were lost; the text gives the number of stored flights."""
-
-
 def check_backend(backend: str) -> None:
     """Raise a ParameterError for an unknown backend."""
     if backend not in BACKENDS:
@@ -107,7 +103,7 @@ def sweep(flights: list[Flight], *, store: Store, backend: str = 'processes',
 
     Raises:
         ParameterError: unknown backend, or Ray is absent or not reachable.
-        SweepError: a worker was killed.
+        RunError: a worker was killed.
 
     """
     check_backend(backend)
@@ -141,7 +137,7 @@ def _fly_all(flights: list[Flight]) -> Iterator[tuple[Flight, dict]]:
         if type(error).__name__ not in ('TerminatedWorkerError', 'BrokenProcessPool',
                                         'RayActorError', 'ActorDiedError', 'OutOfMemoryError'):
             raise
-        raise SweepError(
+        raise RunError(
             f'a worker was lost, possibly for lack of memory; {finished} of {len(flights)} '
             'flights are kept and the same command continues; --jobs 1 needs the least '
             'memory') from None

@@ -6,6 +6,10 @@ external torque in body and an offset of each servo's resting angle. A wrong mas
 coefficient, a shifted centre of mass, wind and servo sag under load are absorbed by one of them. A
 controller that predicts with them has no steady error. The module also predicts quantities that no
 sensor reports: the rotors' thrust, and the present tilts, because encoder readings are delayed.
+
+Friction holds a servo until its target is a band (friction over stiffness) away. In a loop around
+a floating body this play causes a limit cycle. For a robot file with ``joint_friction`` the
+estimator therefore models the play of each servo, and the targets overcome it.
 """
 
 from collections import deque
@@ -24,6 +28,7 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 LONGEST_STEP = 0.1  # [s] a longer gap between states restarts the actuator model
 SHORT = 0.002           # [s] a command change nearer to an end of a span is treated as at this end
 UNNOTICED = 0.3     # [s] before a fault is reported: the estimates contain the fault
+RESOLUTION = 0.0015  # [rad] change of a target that reverses a servo: an encoder count
 HISTORY = 64        # number of stored states and commands, more than any latency needs
 
 
@@ -58,6 +63,8 @@ class DisturbanceEstimator:
         self._force_gain = p.force_bandwidth * robot.mass
         self._torque_gain = p.torque_bandwidth * robot.inertia
         self._tilt_bandwidth, self._tilt_correction = p.tilt_bandwidth, p.tilt_correction
+        servos = [model.tilt_servo(robot, joint, 0.0)[0] for joint in range(4)]
+        self._band = np.array([(servo.coulomb or 0.0) / servo.kp for servo in servos])
         self._health = ALL_HEALTHY
         self._movable = np.ones(4)
         self.reset()
@@ -66,6 +73,7 @@ class DisturbanceEstimator:
         """Reset all estimates."""
         self.disturbance = np.zeros(model.DISTURBANCE_SIZE)
         self._state: np.ndarray | None = None
+        self._direction = np.zeros(4)
         self._stamp = -np.inf
         self._commands: deque[Command] = deque(maxlen=HISTORY)
         self._tilts: deque[tuple[float, np.ndarray]] = deque(maxlen=HISTORY)
@@ -112,7 +120,7 @@ class DisturbanceEstimator:
         state = redated(state, self._robot)
         if state.command is not None and (
                 not self._commands or state.command.stamp > self._commands[-1].stamp):
-            self._commands.append(state.command)
+            self._commands.append(self._moving(state.command))
         step = state.stamp - self._stamp
         if self._state is None or not 0 < step <= LONGEST_STEP:
             present = self._restart(state)
@@ -125,6 +133,22 @@ class DisturbanceEstimator:
         self._tilts.append((state.stamp, present[model.TILT].copy()))
         self._learnt.append((state.stamp, self.disturbance))
         return present
+
+    def _moving(self, command):
+        """Command in whose tilts each servo would rest without friction."""
+        self._sent = command.tilt
+        if self._commands:
+            command = replace(command, tilt=clipped(
+                self._commands[-1].tilt, self._sent - self._band, self._sent + self._band))
+        return command
+
+    def sent(self, tilt: np.ndarray) -> np.ndarray:
+        """Targets (4,) [rad] that overcome the friction, for targets without friction."""
+        if self._commands:
+            motion = tilt - self._commands[-1].tilt
+            self._direction = np.where(np.abs(motion) > RESOLUTION, np.sign(motion),
+                                       self._direction)
+        return tilt + self._band * self._direction
 
     def _restart(self, state):
         thrust = np.zeros(4) if state.command is None else state.command.thrust
@@ -178,7 +202,14 @@ class DisturbanceEstimator:
         limit = self._limit[model.TILT_OFFSET]
         error = self._movable * clipped(state.tilt - modelled, -limit, limit)
         present[model.TILT] += self._tilt_correction * error
-        offset = self.disturbance[model.TILT_OFFSET] + self._tilt_bandwidth * step * error
+        change = self._tilt_bandwidth * step * error
+        if self._commands:
+            # Friction explains a reading within the band, the offset only what is beyond.
+            newest = self._commands[-1]
+            rest = clipped(newest.tilt + change, self._sent - self._band, self._sent + self._band)
+            change = change - (rest - newest.tilt)
+            self._commands[-1] = replace(newest, tilt=rest)
+        offset = self.disturbance[model.TILT_OFFSET] + change
         self.disturbance[model.TILT_OFFSET] = clipped(offset, -limit, limit)
 
     def _modelled_tilt(self, stamp):

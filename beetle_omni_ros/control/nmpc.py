@@ -1,5 +1,6 @@
 """Nonlinear model predictive control by real-time iteration."""
 
+from dataclasses import replace
 import logging
 
 import numpy as np
@@ -58,7 +59,9 @@ class NmpcController:
         options = {'ocp': problem, 'intervals': intervals, 'soft': soft,
                    'tolerance': p.solver.tolerance, 'max_iterations': p.solver.max_iterations,
                    'reaches': p.limits.tilt_rate_intervals - 1}
-        advance = model.integrator(robot)
+        # The estimator has its own model of the servos' friction.
+        advance = model.integrator(replace(robot, effects={
+            name: values for name, values in robot.effects.items() if name != 'joint_friction'}))
         self._rti = self._make_solver(options, advance, p.solver.compile)
         library = self._rti.library if isinstance(self._rti, CompiledRti) else None
         self.compiled = library is not None
@@ -161,7 +164,9 @@ class NmpcController:
         return np.minimum(targets, lowest if self._above else NO_HEIGHT)
 
     def _command(self, stamp):
-        command = clipped(self._rti.inputs[0], self._bounds[:8], self._bounds[8:16])
+        planned = self._rti.inputs[0]
+        command = clipped(np.r_[self._estimator.sent(planned[:4]), planned[4:]],
+                          self._bounds[:8], self._bounds[8:16])
         rotors, health = self._robot.rotors, self._health
         tilt = command[:4]
         thrust = clipped(command[4:], rotors.thrust_min, rotors.thrust_max)

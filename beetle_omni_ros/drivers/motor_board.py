@@ -4,63 +4,57 @@ from __future__ import annotations
 
 import atexit
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import math
+import select
 import threading
 import time
 
 import numpy as np
+from pymavlink.dialects.v20 import common
 
-from beetle_omni_ros.drivers.mavlink_dialect import common
-from beetle_omni_ros.drivers.motor_board_link import BoardLink
-from beetle_omni_ros.drivers.motor_board_messages import (
-    BoardStatus,
-    BoardUpdate,
-    CommandResult,
-    conditions_of,
-    CONTRACT_VERSION,
-    heartbeat,
-    LinkStatistics,
-    NO_HOST_HEARTBEAT,
-    RESULTS,
-)
-from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
-from beetle_omni_ros.drivers.motor_board_watch import BoardWatch, restarted
+from beetle_omni_ros.drivers import motor_board_state as messages
+from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters
+from beetle_omni_ros.drivers.motor_board_state import BoardState, MavlinkReceiver, RotorStates
+from beetle_omni_ros.drivers.serial_port import SerialPort, SerialPortError
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.readings import BatteryReading
 from beetle_omni_ros.robot.thrust_map import ThrustMap
 
+TICK = 0.01             # [s] longest sleep of the thread, a tenth of its shortest period
 CORRECTION = 50_000     # [us] a larger backward step of the board's clock is a restart
 CLOSING_COMMANDS = 3    # disarm commands sent at once on closing
-NOTHING = np.zeros(4)
-NOT_SATURATED = np.zeros(4, dtype=bool)
+RESULTS = {1: 'refused', 2: 'denied', 3: 'unsupported', 4: 'failed'}
+
+DISARMED = 'disarmed'
+RESTING = (DISARMED, 'emergency_stop')      # states of the supervisor without thrust
+RESTS, ARMS, FLIES, LOST = 'rests', 'arms', 'flies', 'lost'
+# A board that is not ready is tolerated for this long [s], counted in steps of at most STEP [s]:
+# after a pause of this process the waiting messages of the board are read first.
+PATIENCE, STEP = 0.05, 0.01
 
 
 class ArmCommand:
     """
     One arm or disarm command, repeated until the board acknowledges it.
 
-    Attributes:
-        arm: True to arm, False to disarm.
-        result: result of the command, None while it is pending.
-
+    ``send(message)`` sends it, first in the first :meth:`tick`. ``accepted`` is whether the board
+    accepted it, None while it is pending, and ``reason`` the reason of a refusal.
     """
 
-    def __init__(self, arm: bool, parameters: MotorBoardParameters, send: Callable, now: float):
-        """Send it for the first time at ``now`` [s] by ``send(message)``."""
-        self.arm = arm
-        self.result: CommandResult | None = None
+    def __init__(self, arm: bool, parameters: MotorBoardParameters, send: Callable):
+        self.arm, self.reason = arm, ''
+        self.accepted: bool | None = None
         self._parameters, self._send = parameters, send
-        self._begin = self._next = now
-        self._attempts = 0
+        self._next, self._attempts = -math.inf, 0
         self._done = threading.Event()
-        self.tick(now)
 
     def tick(self, now: float) -> None:
-        """Send it again, or fail, if the acknowledgement is overdue."""
-        if self.result or now < self._next:
+        """Send it, or fail, if no acknowledgement arrived in time."""
+        if self.accepted is not None or now < self._next:
             return
         if self._attempts >= self._parameters.acknowledge_attempts:
-            self.end(now, False, f'no acknowledgement to {self._attempts} attempts')
+            self.end(False, f'no acknowledgement to {self._attempts} attempts')
             return
         self._next = now + self._parameters.acknowledge_timeout
         self._send(common.MAVLink_command_long_message(
@@ -69,47 +63,40 @@ class ArmCommand:
             float(self.arm), 0, 0, 0, 0, 0, 0))
         self._attempts += 1
 
-    def acknowledge(self, message, now: float) -> bool:
+    def acknowledge(self, message) -> bool:
         """Handle a COMMAND_ACK; return whether it accepts this command."""
         if message.command != common.MAV_CMD_COMPONENT_ARM_DISARM \
                 or bool(message.result_param2 & 1) != self.arm:
             return False
         if message.result == common.MAV_RESULT_ACCEPTED:
-            self.end(now, True)
+            self.end(True)
             return True
         text = RESULTS.get(message.result, f'result {message.result}')
-        reason = ', '.join(conditions_of(message.result_param2 >> 8 & 0xFF))
-        self.end(now, False, f'{text} by the board: {reason or "no reason given"}')
+        reason = ', '.join(messages.conditions_of(message.result_param2 >> 8 & 0xFF))
+        self.end(False, f'{text} by the board: {reason or "no reason given"}')
         return False
 
-    def end(self, now: float, accepted: bool, reason: str = '') -> None:
+    def end(self, accepted: bool, reason: str = '') -> None:
         """Set the result, if it is pending."""
-        if self.result is None:
-            self.result = CommandResult(accepted, reason, self._attempts, now - self._begin)
+        if self.accepted is None:
+            self.accepted, self.reason = accepted, reason
             self._done.set()
 
-    def wait(self, timeout: float) -> bool:
-        """Wait for the result at most ``timeout`` [s]; return whether there is one."""
-        return self._done.wait(timeout)
+    def wait(self) -> ArmCommand:
+        """Return itself with the result, after half a second at most."""
+        p = self._parameters
+        if not self._done.wait(p.acknowledge_timeout * (p.acknowledge_attempts + 2)):
+            self.end(False, 'the thread of the link does not run')
+        return self
 
 
 @dataclass(frozen=True, slots=True)
 class Sent:
-    """
-    Result of sending one thrust target.
+    """Result of sending one thrust target: the reason why it was not sent, or arrays (4,)."""
 
-    Attributes:
-        sent: whether the target was sent.
-        reason: reason why it was not sent, or ''.
-        saturated: (4,) whether the battery limits the thrust; the largest one was sent then.
-        command: (4,) normalised commands, 0 to 1.
-
-    """
-
-    sent: bool
-    reason: str
-    saturated: np.ndarray
-    command: np.ndarray
+    reason: str = ''
+    saturated: np.ndarray | None = None     # whether the battery limits the thrust to the one sent
+    command: np.ndarray | None = None       # normalised, 0 to 1
 
 
 class MotorBoard:
@@ -119,223 +106,345 @@ class MotorBoard:
     A thread reads, sends heartbeats and reconnects. :meth:`send` and :meth:`poll` do not wait.
     The board stops the rotors 100 ms after the last target, also if this process fails.
 
-    Args:
-        parameters: parameters of the link; default: params/motor_board.yaml.
-        robot: robot with the rotor map and the battery; default: params/robot.yaml.
-        clock: clock of all stamps, those given to :meth:`send` and those returned [s].
-
+    ``clock`` is that of all stamps, those given to :meth:`send` and those returned [s].
     """
 
-    def __init__(self, parameters: MotorBoardParameters | None = None,
-                 robot: RobotParameters | None = None, clock: Callable[[], float] = time.time):
-        self.parameters = parameters or MotorBoardParameters.load()
-        robot = robot or RobotParameters.load()
+    def __init__(self, parameters: MotorBoardParameters, robot: RobotParameters,
+                 clock: Callable[[], float] = time.time):
+        self.parameters = parameters
         self.thrust_map = ThrustMap(robot.rotors)
         self._clock = clock
-        self._lock = threading.Lock()
-        self._watch = BoardWatch(self.parameters, robot, clock)
-        self._link = BoardLink(self.parameters, self._on_message, self._on_tick,
-                               self._on_connection, restarted)
+        self._lock = threading.Lock()           # of state and command
+        self._write_lock = threading.Lock()     # of port and packer
+        self.state = BoardState(parameters, robot.battery.cells, clock)
+        self._receiver = MavlinkReceiver(parameters.board_system, parameters.board_component)
+        self._packer = common.MAVLink(None, parameters.host_system, parameters.host_component)
+        self._port: SerialPort | None = None
+        self._thread: threading.Thread | None = None
+        self._stopping = False
+        self._sent = self._dropped = self._connections = 0
         self._command: ArmCommand | None = None
-        self._next_heartbeat = self._next_timesync = 0.0
+        self._next_heartbeat = self._next_timesync = self._next_open = 0.0
         self._last_stamp = (math.nan, 0)
 
     def open(self) -> None:
-        """
-        Open the port and start the thread; :meth:`wait_ready` waits for the board.
-
-        Raises:
-            SerialPortError: the port cannot be opened.
-
-        """
-        if self._link.opened:
-            return
-        self._link.open()
+        """Open the port, or raise SerialPortError, and start the thread."""
+        self._connect()
+        self._stopping = False
+        self._thread = threading.Thread(target=self._run, name='motor_board', daemon=True)
+        self._thread.start()
         atexit.register(self.close)
 
     def close(self) -> None:
         """Disarm, wait shortly for the acknowledgement, close the port."""
         atexit.unregister(self.close)
-        if not self._link.opened:
+        if self._thread is None:
             return
         for _ in range(CLOSING_COMMANDS):
-            command = self._start(False)
-        command.wait(self.parameters.acknowledge_timeout * self.parameters.acknowledge_attempts)
-        self._link.close()
-
-    def __enter__(self) -> MotorBoard:
-        self.open()
-        return self
-
-    def __exit__(self, *_) -> None:
-        self.close()
-
-    @property
-    def status(self) -> BoardStatus | None:
-        """Last heartbeat of the board, or None."""
-        return self._watch.status
+            command = self.start(False)
+        command.wait()
+        self._stopping = True
+        self._thread.join(2.0)
+        self._thread = None
+        self._disconnect()
 
     @property
     def connected(self) -> bool:
         """Whether the port is open, so that targets can be sent."""
-        return self._link.connected
+        return self._port is not None
 
     @property
     def ready(self) -> str:
         """Reason why this side cannot arm the board; '' if it can."""
-        status, now = self._watch.status, time.monotonic()
-        if not self._link.connected:
+        state, status = self.state, self.state.status
+        if self._port is None:
             return f'{self.parameters.port}: port is away'
-        if self._watch.silent(now):
+        if state.silent(time.monotonic()):
             return 'no message from the board'
         if status is None:
             return 'no heartbeat of the board'
-        if status.contract != CONTRACT_VERSION:
+        if status.contract != messages.CONTRACT_VERSION:
             return (f'firmware follows contract {status.contract}, '
-                    f'this driver {CONTRACT_VERSION}')
-        if NO_HOST_HEARTBEAT in status.conditions:
+                    f'this driver {messages.CONTRACT_VERSION}')
+        if messages.NO_HOST_HEARTBEAT in status.conditions:
             return 'the board receives no heartbeat of this computer'
-        if self._watch.voltage is None:
+        if state.voltage is None:
             return 'battery voltage unknown'
-        if not self._watch.clock.known:
-            return "offset of the board's clock unknown"
-        return ''
+        return '' if state.clock.known else "offset of the board's clock unknown"
 
-    def wait_ready(self, timeout: float) -> str:
-        """Wait at most ``timeout`` [s] until :attr:`ready` is ''; return it."""
-        end = time.monotonic() + timeout
-        while (missing := self.ready) and time.monotonic() < end:
-            time.sleep(0.01)
-        return missing
-
-    def start_arm(self) -> ArmCommand:
-        """Start to arm without waiting; the returned command gets the result."""
-        missing = self.ready
-        if missing:
-            command = ArmCommand(True, self.parameters, lambda _: None, time.monotonic())
-            command.end(time.monotonic(), False, missing)
-            command.result = replace(command.result, attempts=0)
+    def start(self, arm: bool) -> ArmCommand:
+        """Start to arm or disarm without waiting; the returned command gets the result."""
+        missing = self.ready if arm else ''
+        with self._lock:
+            command = ArmCommand(arm, self.parameters, self._write)
+            if missing:
+                command.end(False, missing)
+                return command
+            if self._command:
+                self._command.end(False, 'replaced by another command')
+            self._command = command
+            command.tick(time.monotonic())
             return command
-        return self._start(True)
-
-    def start_disarm(self) -> ArmCommand:
-        """Start to disarm without waiting; the returned command gets the result."""
-        return self._start(False)
-
-    def arm(self) -> CommandResult:
-        """Arm and wait for the answer, half a second at most; needs :attr:`ready` to be ''."""
-        return self._finished(self.start_arm())
-
-    def disarm(self) -> CommandResult:
-        """Disarm and wait for the answer, half a second at most."""
-        return self._finished(self.start_disarm())
-
-    @property
-    def armed(self) -> bool:
-        """Whether the board is armed by its last heartbeat, and not silent."""
-        status = self._watch.status
-        return bool(status and status.armed and not self._watch.silent(time.monotonic()))
 
     def send(self, thrust: np.ndarray, stamp: float) -> Sent:
         """
-        Send thrust targets without waiting. Only one thread may call this.
+        Send thrust targets (4,) [N] without waiting. Only one thread may call this.
 
-        Args:
-            thrust: (4,) thrust targets [N]; zero and negative values stop the rotor.
-            stamp: time of the state estimate that they answer [s].
-
+        Zero and negative values stop the rotor. ``stamp`` is the time of the state estimate that
+        they answer [s].
         """
-        try:
-            thrust = np.asarray(thrust, dtype=float)
-        except (TypeError, ValueError):
-            return _not_sent('not numbers')
-        if thrust.shape != (4,):
-            return _not_sent(f'expected 4 thrusts, found shape {thrust.shape}')
+        thrust = np.asarray(thrust, dtype=float)
         age = self._clock() - stamp
-        if not (np.isfinite(thrust).all() and math.isfinite(age)):
-            return _not_sent('not finite')
+        if thrust.shape != (4,) or not (np.isfinite(thrust).all() and math.isfinite(age)):
+            return Sent('not four finite numbers')
         if abs(age) > self.parameters.stamp_age_limit:
-            return _not_sent('stale stamp' if age > 0 else 'stamp in the future')
-        if not self._watch.clock.known:
-            return _not_sent("offset of the board's clock unknown")
+            return Sent('stale stamp' if age > 0 else 'stamp in the future')
+        if not self.state.clock.known:
+            return Sent("offset of the board's clock unknown")
         # Without a measurement use the highest voltage, which gives the smallest duty.
-        voltage = self._watch.voltage or self.thrust_map.voltages[-1]
+        voltage = self.state.voltage or self.thrust_map.voltages[-1]
         command = self.thrust_map.command(thrust, voltage)
-        message = common.MAVLink_set_actuator_control_target_message(
-            self._board_stamp(stamp, max(age, 0.0)), 0, self.parameters.board_system,
-            self.parameters.board_component, [*command.tolist(), 0.0, 0.0, 0.0, 0.0])
-        sent = self._link.send(message)
-        reason = '' if sent else 'buffer full' if self._link.connected else 'port is away'
-        return Sent(sent, reason, self.thrust_map.saturated(thrust, voltage), command)
-
-    def poll(self) -> BoardUpdate:
-        """Return measurements and events since the last call, and the present state."""
-        with self._lock:
-            news = self._watch.take()
-        link = self._link
-        counts = LinkStatistics(replace(link.receiver.counts), self._watch.reception, link.sent,
-                                link.dropped, link.connections)
-        clock = self._watch.clock
-        return BoardUpdate(**news, status=self._watch.status, link=counts,
-                           clock_offset=clock.offset(),
-                           clock_uncertainty=clock.uncertainty(time.monotonic()))
+        if not self._write(common.MAVLink_set_actuator_control_target_message(
+                self._board_stamp(stamp, max(age, 0.0)), 0, self.parameters.board_system,
+                self.parameters.board_component, [*command.tolist(), 0.0, 0.0, 0.0, 0.0])):
+            return Sent('port is away' if self._port is None else 'buffer full')
+        return Sent('', self.thrust_map.saturated(thrust, voltage), command)
 
     def _board_stamp(self, stamp, age):
-        """
-        Board's clock [us] at a stamp; equal stamps give equal values, rising stamps rising ones.
-
-        It is computed from the age, so that a step of the host's clock affects one target only.
-        """
+        """Board's clock [us] at a stamp, equal for equal stamps and rising for rising ones."""
         last_stamp, last = self._last_stamp
         if stamp == last_stamp:
             return last
-        micros = max(0, round(1e6 * (time.monotonic() - age + self._watch.clock.offset())))
+        # From the age, so that a step of the host's clock affects one target only.
+        micros = max(0, round(1e6 * (time.monotonic() - age + self.state.clock.offset())))
         if stamp > last_stamp and last - CORRECTION < micros <= last:
             micros = last + 1   # the offset was corrected by more than the time between stamps
         self._last_stamp = stamp, micros
         return micros
 
-    def _start(self, arm):
-        now = time.monotonic()
+    def poll(self) -> tuple[BatteryReading | None, RotorStates | None, tuple]:
+        """Return battery, rotors and (level, text) of each event since the last call."""
         with self._lock:
-            if self._command:
-                self._command.end(now, False, 'replaced by another command')
-            self._command = ArmCommand(arm, self.parameters, self._link.send, now)
-            return self._command
+            return self.state.take()
 
-    def _finished(self, command):
-        timeout = self.parameters.acknowledge_timeout * (self.parameters.acknowledge_attempts + 2)
-        if not command.wait(timeout):
-            command.end(time.monotonic(), False, 'the thread of the link does not run')
-        return command.result
+    def link(self) -> dict[str, float]:
+        """Counts of both directions of the link and synchronisation of the clocks, by name."""
+        clock = self.state.clock
+        return {**self._receiver.counts, 'sent': self._sent, 'buffer_full': self._dropped,
+                'connections': self._connections,
+                **{f'board {name}': count for name, count in self.state.reception.items()},
+                'clock_offset_s': clock.offset(),
+                'clock_uncertainty_ms': 1e3 * clock.uncertainty(time.monotonic())}
 
-    def _on_message(self, message, now):
-        with self._lock:
-            if message.get_msgId() == common.MAVLINK_MSG_ID_COMMAND_ACK:
-                if self._command and self._command.acknowledge(message, now):
-                    self._watch.acknowledged(self._command.arm)
+    def _write(self, message):
+        """Pack and write a message without waiting; return whether it was written."""
+        with self._write_lock:
+            if self._port is None:
+                return False
+            frame = message.pack(self._packer)
+            try:
+                taken = self._port.write(frame)
+            except SerialPortError:
+                return False            # the thread detects the error itself and reconnects
+            if taken:
+                # A dropped frame must not leave a gap, which the board would count as lost.
+                self._packer.seq = (self._packer.seq + 1) % 256
+                self._sent += 1
             else:
-                self._watch.message(message, now)
-                if restarted(message):
-                    self._next_heartbeat = self._next_timesync = now
+                self._dropped += 1
+            return taken
 
-    def _on_connection(self, connected, text):
-        with self._lock:
-            self._watch.connection(connected, text)
+    def _connect(self):
+        port = SerialPort(self.parameters.port, self.parameters.baud)
+        self._receiver.restart()
+        with self._write_lock:
+            self._port = port
+        self._connections += 1
 
-    def _on_tick(self, now):
+    def _disconnect(self):
+        with self._write_lock:
+            if self._port is not None:
+                self._port.close()
+            self._port = None
+
+    def _run(self):
+        while not self._stopping:
+            try:
+                if self._port is None:
+                    self._reconnect()
+                else:
+                    self._serve(self._port)
+            except SerialPortError as error:
+                self._disconnect()
+                with self._lock:
+                    self.state.connection(str(error))
+            self._tick(time.monotonic())
+
+    def _reconnect(self):
+        """Try to open the port if it is time."""
+        time.sleep(TICK)
+        now = time.monotonic()
+        if now < self._next_open:
+            return
+        self._next_open = now + self.parameters.reconnect_period
+        try:
+            self._connect()
+            with self._lock:
+                self.state.connection('')
+        except SerialPortError:
+            pass
+
+    def _serve(self, port):
+        """Wait at most one tick for bytes and handle them."""
+        readable, writable, _ = select.select([port.fd], [port.fd] if port.rest else [], [], TICK)
+        if writable:
+            with self._write_lock:
+                port.flush()
+        if readable:
+            data, now = port.read(), time.monotonic()
+            for message in self._receiver.feed(data):
+                with self._lock:
+                    self._handle(message, now)
+
+    def _handle(self, message, now):
+        if message.get_msgId() == common.MAVLINK_MSG_ID_COMMAND_ACK:
+            if self._command and self._command.acknowledge(message):
+                self.state.acknowledged(self._command.arm)
+            return
+        self.state.message(message, now)
+        if messages.restarted(message):
+            self._next_heartbeat = self._next_timesync = now
+
+    def _tick(self, now):
         with self._lock:
-            self._watch.tick(now, self._link.connected)
+            self.state.tick(now, self.connected)
             if self._command:
                 self._command.tick(now)
         if now >= self._next_heartbeat:
             self._next_heartbeat = now + 1 / self.parameters.heartbeat_rate
-            self._link.send(heartbeat())
+            self._write(common.MAVLink_heartbeat_message(
+                common.MAV_TYPE_ONBOARD_CONTROLLER, common.MAV_AUTOPILOT_INVALID, 0, 0,
+                common.MAV_STATE_ACTIVE, 3))
         if now >= self._next_timesync:
-            factor = 1 if self._watch.clock.known else 4
+            factor = 1 if self.state.clock.known else 4
             self._next_timesync = now + 1 / (factor * self.parameters.timesync_rate)
-            self._link.send(self._watch.timesync_request())
+            self._write(self.state.timesync_request())
 
 
-def _not_sent(reason):
-    return Sent(False, reason, NOT_SATURATED, NOTHING)
+class Arming:
+    """
+    Keeps the board armed while the supervisor flies.
+
+    It arms once, when the supervisor leaves 'disarmed'. A board that is lost later is disarmed,
+    and not armed before the supervisor has been 'disarmed' again. A board that is only silent,
+    while targets can be sent, remains armed, because its rotors carry the robot to the ground.
+
+    ``phase`` is 'rests', 'arms', 'flies' or 'lost'; targets are sent only in 'flies'.
+    """
+
+    def __init__(self, board: MotorBoard):
+        self.phase = RESTS
+        self._board = board
+        self._command: ArmCommand | None = None
+        self._supervisor = self._lost = self._silent = self._inhibited = ''
+        self._missing_for = 0.0
+        self._disarm = False        # whether a confirmation of disarming is pending
+
+    def inhibit(self, reason: str) -> None:
+        """Keep the board disarmed for a reason, also in flight; '' ends this."""
+        self._inhibited = reason
+        if reason and self.phase in (ARMS, FLIES):
+            self._set_lost(reason)
+
+    def follow(self, state: str) -> None:
+        """Act on the state of the supervisor, 'STATE' or 'STATE: FAULT'."""
+        state = state.partition(':')[0]
+        before, self._supervisor = self._supervisor, state
+        if state in RESTING:
+            if self.phase != LOST or state == DISARMED:
+                self.phase = RESTS
+            if before != state:
+                self._start_disarm()
+        elif before == DISARMED and not self._inhibited:
+            self.phase, self._disarm, self._missing_for = ARMS, False, 0.0
+            self._command = self._board.start(True)
+            self._check_answer(0.0)
+        elif before in RESTING or not before:
+            self._set_lost(self._inhibited or 'the supervisor was not disarmed before')
+
+    def update(self, elapsed: float) -> None:
+        """Check the board, ``elapsed`` [s] after the last call."""
+        status, elapsed = self._board.state.status, min(elapsed, STEP)
+        if self.phase == ARMS:
+            self._check_answer(elapsed)
+        elif self.phase == FLIES:
+            missing = self._board.ready
+            self._missing_for = self._missing_for + elapsed if missing else 0.0
+            if status is None or not status.armed:
+                self._set_lost(_disarm_cause(status))
+            elif self._missing_for < PATIENCE:
+                self._silent = self._silent and missing
+            elif self._board.connected:
+                self._silent = missing
+            else:
+                self._set_lost(missing)
+        elif self._command is None or self._command.accepted is not None:
+            if self._command and self._command.accepted:
+                self._disarm = False
+            if self._disarm or (status and status.armed):
+                self._start_disarm()
+
+    def end(self) -> None:
+        """Enter 'lost' because the bridge stops."""
+        self.phase, self._lost = LOST, 'the bridge has stopped'
+
+    @property
+    def text(self) -> str:
+        """State for the supervisor: 'ready', or 'waiting', 'silent' or 'lost' with ': REASON'."""
+        if self.phase == LOST:
+            return f'lost: {self._lost}'
+        if self.phase == FLIES and self._silent:
+            return f'silent: {self._silent}'
+        missing = self._missing if self.phase == RESTS else ''
+        return f'waiting: {missing}' if missing else 'ready'
+
+    @property
+    def _missing(self):
+        """Reason on either side that prevents arming now; '' if there is none."""
+        missing = self._inhibited or self._board.ready
+        if not missing and self._disarm:
+            missing = 'disarming is not confirmed yet'
+        if not missing:
+            missing = ', '.join(text for text in self._board.state.status.conditions
+                                if text in messages.BLOCKS_ARMING)
+        return missing or ('' if self._supervisor else 'no message from the supervisor')
+
+    def _check_answer(self, elapsed):
+        command, status = self._command, self._board.state.status
+        if command.accepted is None:
+            return
+        if not command.accepted:
+            self._set_lost(f'not armed: {command.reason}')
+        elif status.armed:
+            self.phase, self._missing_for, self._silent = FLIES, 0.0, ''
+        else:
+            self._missing_for += elapsed       # the link's thread has not set the status yet
+            if self._missing_for >= PATIENCE:
+                self._set_lost(_disarm_cause(status))
+
+    def _set_lost(self, reason):
+        self.phase, self._lost = LOST, reason
+        self._start_disarm()
+
+    def _start_disarm(self):
+        self._disarm = True
+        self._command = self._board.start(False)
+
+
+def _disarm_cause(status):
+    """Reason why an armed board is not armed any more."""
+    if status is None or status.stop_reason == 'none':
+        return 'restarted'
+    if status.state == 'boot' or status.stop_reason == messages.WATCHDOG_RESET:
+        return f'restarted ({messages.WATCHDOG_RESET})'
+    return f'{status.state} ({status.stop_reason})'

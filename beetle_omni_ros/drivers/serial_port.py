@@ -14,136 +14,92 @@ import serial
 
 
 class SerialPortError(OSError):
-    """The port cannot be used; the message has its name and a remedy."""
+    """The port cannot be opened, or is lost; one line with its name and a remedy."""
 
 
 CAUSES = {errno.ENOENT: 'no such port; check plug, power, name and udev rule',
           errno.EACCES: 'no permission; add the user to the group dialout and log in again, or '
                         'install the udev rule',
-          errno.EAGAIN: 'in use by another process; stop it',
-          errno.EBUSY: 'in use by another process; stop it',
-          errno.EIO: 'unplugged', errno.ENXIO: 'unplugged', errno.ENODEV: 'unplugged'}
-OPEN_ERRORS = OSError, ValueError, termios.error
-
-
-def open_serial(name: str, baud: int) -> serial.Serial:
-    """Open a port for this process only, without timeout; raises one of OPEN_ERRORS."""
-    port = serial.Serial(name, baud, timeout=0, exclusive=True)
-    try:
-        port.set_low_latency_mode(True)
-    except (OSError, ValueError, AttributeError, NotImplementedError):
-        pass        # pseudo-terminals and USB CDC do not need this setting
-    return port
-
-
-def cause(error: Exception) -> str:
-    """Cause and remedy of a port's error."""
-    number = getattr(error, 'errno', None)
-    if number is None and error.args and isinstance(error.args[0], int):
-        number = error.args[0]
-    return CAUSES.get(number) or (str(error).splitlines() or ['unplugged'])[0]
+          **dict.fromkeys((errno.EAGAIN, errno.EBUSY), 'in use by another process; stop it'),
+          **dict.fromkeys((errno.EIO, errno.ENXIO, errno.ENODEV), 'unplugged')}
 
 
 class SerialPort:
     """
-    One open port, locked against other processes.
+    One open port, locked against other processes. Each call raises SerialPortError if it is lost.
 
-    Attributes:
-        name: path of the port.
-        dropped: number of frames dropped because the output buffer was full.
-
+    ``fd`` is its descriptor, ``rest`` the part of a frame that is not written yet.
     """
 
     def __init__(self, name: str, baud: int):
-        """
-        Open ``name`` at ``baud`` [bit/s] and empty its buffers.
-
-        Raises:
-            SerialPortError: it is absent, in use, not permitted, or no serial port.
-
-        """
-        self.name = name
-        self.dropped = 0
+        """Open ``name`` at ``baud`` [bit/s] and empty its buffers."""
+        self.name, self.rest = name, b''
         try:
-            self._serial = open_serial(name, baud)
-        except OPEN_ERRORS as error:
-            raise SerialPortError(f'{name}: cannot be opened ({cause(error)})') from None
-        os.set_blocking(self._serial.fileno(), False)
-        self._rest = b''
-
-    def fileno(self) -> int:
-        """Descriptor, for select."""
-        return self._serial.fileno()
-
-    def read(self) -> bytes:
-        """
-        Return the received bytes, also if there are none.
-
-        Raises:
-            SerialPortError: the device is gone.
-
-        """
+            self._serial = serial.Serial(name, baud, timeout=0, exclusive=True)
+        except (OSError, ValueError, termios.error) as error:
+            raise SerialPortError(f'{name}: cannot be opened ({_cause(error)})') from None
         try:
-            data = os.read(self.fileno(), 4096)
+            self._serial.set_low_latency_mode(True)
+        except (OSError, ValueError, AttributeError, NotImplementedError):
+            pass        # pseudo-terminals and USB CDC do not need this setting
+        self.fd = self._serial.fileno()
+        os.set_blocking(self.fd, False)
+
+    def read(self, size: int = 4096) -> bytes:
+        """Return the received bytes, at most ``size``, also if there are none."""
+        try:
+            data = os.read(self.fd, size)
         except BlockingIOError:
             return b''
         except OSError as error:
-            raise self._gone(error) from None
-        if not data and select.select([self.fileno()], [], [], 0)[0]:
+            raise SerialPortError(f'{self.name}: {_cause(error)}') from None
+        if not data and select.select([self.fd], [], [], 0)[0]:
             # A tty whose other end is closed is readable and empty.
-            raise SerialPortError(f'{self.name}: device is gone (end of file)')
+            raise SerialPortError(f'{self.name}: unplugged')
         return data
+
+    def clear(self) -> None:
+        """Drop received bytes."""
+        try:
+            termios.tcflush(self.fd, termios.TCIFLUSH)
+        except (OSError, termios.error) as error:
+            raise SerialPortError(f'{self.name}: {_cause(error)}') from None
 
     def write(self, frame: bytes) -> bool:
         """
-        Write a frame, or drop it if the output buffer is full.
+        Write a frame, or drop it if the output buffer is full; return whether it was written.
 
         A frame that fits only in part is completed before the next frame.
-
-        Raises:
-            SerialPortError: the device is gone.
-
         """
-        if self._rest and not self.flush():
-            self.dropped += 1
-            return False
-        written = self._write(frame)
-        if not written:
-            self.dropped += 1
-            return False
-        self._rest = frame[written:]
-        return True
+        written = self._write(frame) if self.flush() else 0
+        if written:
+            self.rest = frame[written:]
+        return written > 0
 
     def flush(self) -> bool:
         """Continue a partly written frame; return whether it is complete."""
-        if self._rest:
-            self._rest = self._rest[self._write(self._rest):]
-        return not self._rest
-
-    @property
-    def waiting(self) -> bool:
-        """Whether part of a frame is not written yet."""
-        return bool(self._rest)
+        if self.rest:
+            self.rest = self.rest[self._write(self.rest):]
+        return not self.rest
 
     def _write(self, data):
         try:
-            return os.write(self.fileno(), data)
+            return os.write(self.fd, data)
         except BlockingIOError:
             return 0
         except OSError as error:
-            raise self._gone(error) from None
-
-    def _gone(self, error):
-        text = getattr(error, 'strerror', None) or str(error).splitlines()[0]
-        return SerialPortError(f'{self.name}: device is gone ({text})')
+            raise SerialPortError(f'{self.name}: {_cause(error)}') from None
 
     def close(self) -> None:
         """Close the port and drop unsent bytes, for which closing would wait."""
-        try:
-            self._serial.reset_output_buffer()
-        except (OSError, termios.error):
-            pass        # of a device that is gone
-        try:
-            self._serial.close()
-        except OSError:
-            pass
+        for step in (self._serial.reset_output_buffer, self._serial.close):
+            try:
+                step()
+            except (OSError, termios.error):
+                pass        # of a device that is gone
+
+
+def _cause(error):
+    """Cause and remedy of an error of the port; pyserial has the number in ``args`` at times."""
+    number = getattr(error, 'errno', None) or (error.args or [None])[0]
+    return CAUSES.get(number) or (str(error).splitlines() or ['unplugged'])[0]

@@ -1,81 +1,198 @@
-"""Driver of the servo bus for the joint bridge: tilt goals, feedback, health."""
+"""Driver of the servo bus for the joint bridge: settings, torque, goals, feedback, recovery."""
 
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import astuple, dataclass
+import struct
 import time
 
 import numpy as np
 
 from beetle_omni_ros.drivers import servo_registers as registers
+from beetle_omni_ros.drivers.device_parameters import ServoBusParameters
+from beetle_omni_ros.drivers.serial_port import SerialPortError
 from beetle_omni_ros.drivers.servo_guard import Guard
-from beetle_omni_ros.drivers.servo_link import LinkStatistics, ServoBusError, ServoLink
-from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
-from beetle_omni_ros.drivers.servo_port import PortLost
-from beetle_omni_ros.drivers.servo_setup import (
-    configure,
-    enable_torque,
-    examine,
-    locate,
-    ServoFinding,
-)
-from beetle_omni_ros.drivers.servo_state import (
-    FEEDBACK,
-    FEEDBACK_SIZE,
-    make_servos,
-    readings,
-    ServoHealth,
-    ServoReadings,
-)
-from beetle_omni_ros.drivers.servo_turns import settle, unambiguous_limit
-from beetle_omni_ros.drivers.servo_upkeep import ServoUpkeep
-from beetle_omni_ros.robot.parameters import JointParameters
+from beetle_omni_ros.drivers.servo_link import NoAnswer, ServoBusError, ServoLink
+from beetle_omni_ros.drivers.servo_registers import nearest_turns, TURN
+from beetle_omni_ros.robot.parameters import JOINT_NAMES, JointParameters
+
+# Current, velocity and position have consecutive addresses.
+FEEDBACK, FEEDBACK_LAYOUT = registers.PRESENT_CURRENT.address, struct.Struct('<hii')
+# First register and number of bytes, read in turn from all servos at once. A range has no gap,
+# because a servo may refuse undefined addresses. All lengths differ, because an answer does not
+# contain its address, and a late answer must not be mistaken for another register.
+HEALTH = ((registers.TORQUE_ENABLE, 2), (registers.STATUS_LEVEL, 3), (registers.WATCHDOG, 1),
+          (registers.INPUT_VOLTAGE, 4))
+# A value that only a configured servo has: a restart sets the register to its default, 1200. The
+# register has an effect only in velocity mode.
+MARK = (registers.VELOCITY_I, 1201)
+# Registers of the parameters of ServoGains, in their order.
+GAINS = (registers.POSITION_P, registers.POSITION_I, registers.POSITION_D,
+         registers.FEEDFORWARD_1, registers.FEEDFORWARD_2)
+ATTEMPTS = 3            # of reads outside the loop
+TRACKED = 0.2           # [s] half a turn takes longer at the servo's largest speed, 12 rad/s
+WATCHDOG_MARGIN = 0.8   # a pause above this share of the watchdog's time may have expired it
+REPEAT_AFTER = 1.0      # [s] until an equal line is logged again
+FIRST_PING = 0.2        # [s] after a reboot; a servo does not answer earlier
+PING_PERIOD = 0.02      # [s]
+
+
+@dataclass(frozen=True, slots=True)
+class ServoReadings:
+    """Feedback of the four servos (4,); the last one, or NaN, where it is not ``valid``."""
+
+    stamp: float            # time of the request on the bus's clock [s]
+    position: np.ndarray    # tilt [rad], unwrapped
+    velocity: np.ndarray    # [rad/s]
+    effort: np.ndarray      # torque estimated from the current [N m]
+    valid: np.ndarray       # whether a servo was read in this call
+
+
+@dataclass(slots=True, eq=False)
+class Servo:
+    """State of one servo as last known, NaN or None if unknown."""
+
+    name: str
+    identifier: int
+    sign: int
+    zero: int
+    where: str                          # joint, port and ID, for messages
+    model: int | None = None
+    firmware: int | None = None
+    position: float = float('nan')      # [rad], with the sign of the tilt, as the next two
+    velocity: float = 0.0               # [rad/s]
+    current: float = 0.0                # [A]
+    updated: float = float('-inf')      # monotonic time of the last feedback [s]
+    turns: int = 0                      # to add to its reading
+    turns_known: bool = False
+    misses: int = 0                     # consecutive missing answers
+    silent: bool = False                # after several of them: it is only pinged
+    next_probe: float = 0.0             # monotonic time of the next ping [s]
+    probe_wait: float = 0.0             # until the ping after it [s]
+    wanted: bool = False                # whether it should have torque
+    torque: bool | None = None          # whether it has
+    error: int = 0                      # Hardware Error Status
+    watchdog_expired: bool = False
+    voltage: float = float('nan')       # [V]
+    temperature: float = float('nan')   # [deg C]
+    recovery: Iterator[None] | None = None      # while it is recovered
+    boot_ends: float = 0.0              # until then it may be silent because of a restart [s]
+    recoveries: int = 0
+    kept_off: bool = False              # it has shut down and stays off until it is rebooted
+
+    def angle(self, counts: int) -> float:
+        """Tilt of a reading without added turns [rad]."""
+        return self.sign * (counts - self.zero) * registers.POSITION_UNIT
+
+    def counts(self, tilt: float) -> int:
+        """Goal for a tilt [rad], in the servo's present frame."""
+        return round(self.zero + self.sign * (tilt - TURN * self.turns) / registers.POSITION_UNIT)
+
+    def update(self, data: bytes, now: float) -> bool:
+        """Update it from feedback at monotonic ``now`` [s]; return whether it has restarted."""
+        current, velocity, counts = FEEDBACK_LAYOUT.unpack(data)
+        self.current = self.sign * current * registers.CURRENT_UNIT
+        self.velocity = self.sign * velocity * registers.VELOCITY_UNIT
+        angle, before = self.angle(counts), self.turns
+        if self.wanted or now - self.updated < TRACKED:
+            # A servo cannot move by half a turn between two readings. After a pause without
+            # torque, in which it can be turned by hand, the servo's own count is used.
+            self.turns = nearest_turns(angle, self.position)
+        self.position = angle + TURN * self.turns
+        self.updated, self.misses = now, 0
+        return self.turns != before
+
+    @property
+    def restarting(self) -> bool:
+        """Whether it is silent because of a restart."""
+        return self.silent and time.monotonic() < self.boot_ends
+
+    @property
+    def errors(self) -> tuple[str, ...]:
+        """Hardware errors in words."""
+        return tuple(text for bit, text in registers.HARDWARE_ERRORS.items() if self.error & bit)
+
+    @property
+    def message(self) -> str:
+        """Problem and remedy; '' without a problem."""
+        errors = ', '.join(self.errors)
+        if self.silent and not self.restarting:
+            return f'{self.where}: silent; check its cable and power'
+        if errors and not self.torque:
+            return f'{self.where}: shut down ({errors}); remove the cause, reboot it'
+        if errors:
+            return f'{self.where}: {errors}'
+        if self.watchdog_expired:
+            return f'{self.where}: stopped by its watchdog'
+        return f'{self.where}: torque is off' if self.wanted and self.torque is False else ''
+
+
+def make_servos(parameters: ServoBusParameters) -> list[Servo]:
+    """Initial state of the servo of each joint."""
+    return [Servo(name, int(identifier), int(sign), int(zero),
+                  f'{name} ({parameters.port}, id {int(identifier)})')
+            for name, identifier, sign, zero in zip(
+                JOINT_NAMES, parameters.ids, parameters.signs, parameters.zeros, strict=True)]
+
+
+def examine(link: ServoLink, servo: Servo) -> tuple[str, str]:
+    """Read its state into ``servo`` and change nothing; return (problem or '', remedy)."""
+    servo.model = servo.firmware = None
+    try:
+        servo.model = link.ping(servo.identifier, ATTEMPTS)
+        voltage, temperature, servo.error, position, shadow, firmware = (
+            link.read(servo.identifier, register, ATTEMPTS) for register in (
+                registers.INPUT_VOLTAGE, registers.TEMPERATURE, registers.HARDWARE_ERROR,
+                registers.PRESENT_POSITION, registers.SHADOW_ID, registers.FIRMWARE))
+    except ServoBusError as error:
+        if servo.model is not None:
+            return str(error), 'check its cable, and whether two servos have this id'
+        return ('does not answer', 'check power, cable, id and baud rate') \
+            if isinstance(error, NoAnswer) else (str(error), 'reboot it')
+    servo.firmware, servo.temperature = firmware, float(temperature)
+    servo.voltage = voltage * registers.VOLTAGE_UNIT
+    servo.position = servo.angle(position) + TURN * servo.turns
+    if servo.model != registers.MODEL:
+        return (f'model {servo.model}, expected {registers.MODEL} (XC330-T181-T)',
+                'another servo has this id, or ids is wrong')
+    if servo.error:
+        return ', '.join(servo.errors), 'remove the cause, then reboot the servo'
+    if shadow <= 252:
+        return f'also has the secondary id {shadow}', 'set Secondary(Shadow) ID(12) to 255'
+    return '', ''
 
 
 class ServoBus:
     """
     Four tilt servos. Only one thread may use it, between :meth:`open` and :meth:`close`.
 
-    A loop of 200 Hz calls :meth:`write_goals`, :meth:`read` and :meth:`poll_health` in each tick.
-    If the cable is unplugged or servos are silent, they raise nothing and report it in their
+    A loop of 200 Hz calls :meth:`write_goals`, :meth:`read` and :meth:`upkeep` in each tick. If
+    the cable is unplugged or servos are silent, they raise nothing and report it in their
     results. Together they then take at most one reply time. They recover without further calls.
 
-    Args:
-        joints: joint parameters, for the travel of the tilts.
-        clock: clock of the stamps of readings [s].
-
-    Attributes:
-        parameters: may be replaced while torque is off.
-        enabled: whether the servos should have torque.
-        clipped: number of goals limited to the travel.
-        rejected: number of goals that are not four finite numbers.
-
+    ``clock`` gives the stamps of readings [s]. ``parameters`` may be replaced while torque is off.
+    ``enabled`` is whether the servos should have torque, ``clipped`` the number of goals limited
+    to the travel.
     """
 
     def __init__(self, parameters: ServoBusParameters, joints: JointParameters,
                  clock: Callable[[], float] = time.time):
-        self.parameters = parameters
-        self.travel = joints.position_limit
-        self.enabled = False
-        self.clipped = self.rejected = 0
-        self._clock = clock
-        self._link = ServoLink(parameters.port, parameters.baud_rate, parameters.timing.reply)
-        self._servos = make_servos(parameters)
-        self._upkeep = ServoUpkeep(self._link, parameters, self._servos)
+        self.parameters, self.travel = parameters, joints.position_limit
+        self.servos = make_servos(parameters)
+        self.enabled, self.clipped, self._clock = False, 0, clock
+        self.link = ServoLink(parameters.port, parameters.baud_rate, parameters.timing.reply)
         self._guard: Guard | None = None
-
-    # --- lifecycle ----------------------------------------------------------------------------
+        self._torque_off = registers.TORQUE_ENABLE, {one.identifier: 0 for one in self.servos}
+        self._recovering: deque[Servo] = deque()    # with a recovery, the next one first
+        self._next_health = self._next_open = 0.0
+        self._group = 0
+        self._events: deque[str] = deque(maxlen=200)    # lines for the log
+        self._logged: dict[str, float] = {}
 
     def open(self):
-        """
-        Open the port.
-
-        Raises:
-            ServoBusError: it cannot be opened.
-
-        """
-        try:
-            self._link.open()
-        except PortLost as error:
-            raise ServoBusError(f'{self._link.where()}: {error}') from None
+        """Open the port; raises SerialPortError, as the next two methods if it is lost."""
+        self.link.open()
 
     def close(self):
         """Switch the torque off and close the port; may be called at any time, repeatedly."""
@@ -83,83 +200,88 @@ class ServoBus:
         if self._guard is not None:
             self._guard.trigger()
             self._guard = None
-        self._link.close()
-
-    def check(self) -> list[ServoFinding]:
-        """Examine each servo without changing anything."""
-        try:
-            with self._link.patient():
-                return [examine(self._link, servo) for servo in self._servos]
-        except PortLost as error:
-            self._upkeep.port_lost()
-            return [ServoFinding(servo.name, servo.identifier, problem=f'{self._link.where()}: '
-                                 f'{error}', remedy='plug the adapter in') for servo in
-                    self._servos]
+        self.link.close()
 
     def configure(self):
         """
-        Switch the torque off, write all settings and read the angles.
+        Switch the torque off, write all settings, EEPROM only where it differs, read the angles.
 
-        Raises:
-            ServoBusError: servos are missing or wrong; the message names all of them.
-
+        ServoBusError names all servos that are missing or wrong, or refuse a setting.
         """
-        self._call(self.disable)
-        self._link.fast = False
-        self._link.fast = self._call(configure, self._link, self.parameters, self._servos)
-        for servo in self._servos:
-            servo.silent, servo.kept_off, servo.misses, servo.recoveries = False, False, 0, 0
-            servo.torque, servo.error, servo.watchdog_expired = False, 0, False
-        self._call(locate, self._link, self.parameters, self._servos)
+        with self._outside_the_loop():
+            self.disable()
+            self.link.fast = False
+            problems = []
+            for servo in self.servos:
+                problem, remedy = examine(self.link, servo)
+                if problem:
+                    problems.append(f'{servo.name} (id {servo.identifier}): {problem}; {remedy}')
+                    continue
+                try:
+                    servo.turns_known &= self._is_marked(servo)
+                    self._apply_settings(servo)
+                except ServoBusError as error:
+                    problems.append(f'{servo.name}: {error}')
+            if problems:
+                raise ServoBusError(f'{self.link.path}: ' + ' | '.join(problems))
+            self.link.fast = all(servo.firmware >= registers.FIRST_FAST_FIRMWARE
+                                  for servo in self.servos)
+            for servo in self.servos:
+                servo.silent, servo.kept_off, servo.misses, servo.recoveries = False, False, 0, 0
+                servo.torque, servo.error, servo.watchdog_expired = False, 0, False
+            self._locate()
 
     def enable(self):
         """
         Switch the torque on with the present angles as goals.
 
-        Raises:
-            ServoBusError: an angle is ambiguous, or a servo is silent or shut down. No servo has
-                torque then.
-
+        ServoBusError: an angle is ambiguous, or a servo failed; then none has torque.
         """
-        self._call(locate, self._link, self.parameters, self._servos)
+        with self._outside_the_loop():
+            self._locate()
         confirmed = self.parameters.confirmed_tilts if self.parameters.confirm_tilts else None
-        doubts = settle(self._servos, self.travel, confirmed)
+        doubts = registers.settle(self.servos, self.travel, confirmed)
         if doubts:
+            limit = registers.unambiguous_limit(self.travel)
             raise ServoBusError(
-                f'{self._link.where()}: no torque, the turn is lost: {doubts}; turn it by hand '
-                f'to within +-{unambiguous_limit(self.travel):.2f} rad, or measure it and set '
-                'confirmed_tilts and confirm_tilts')
+                f'{self.link.path}: no torque, the turn is lost: {doubts}; turn it by hand to '
+                f'within +-{limit:.2f} rad, or measure it and set confirmed_tilts and '
+                'confirm_tilts')
+        if self.parameters.guard and self._guard is None:
+            self._guard = Guard(self.link.path, self.link.baud_rate,
+                                self.link.packet_of_sync_write(*self._torque_off))
+        self._want_torque(True)
         try:
-            if self.parameters.guard and self._guard is None:
-                packet = self._link.packet_of_sync_write(
-                    registers.TORQUE_ENABLE, {servo.identifier: 0 for servo in self._servos})
-                self._guard = Guard(self.parameters.port, self.parameters.baud_rate, packet)
-            for servo in self._servos:
-                self._call(enable_torque, self._link, self.parameters, servo)
-                self._upkeep.packet_sent()
-        except ServoBusError:
-            self.enabled = True
+            with self._outside_the_loop():
+                for servo in self.servos:
+                    for register, value in ((registers.WATCHDOG, 0), *self._power_on(
+                            servo.counts(servo.position))):
+                        self.link.write(servo.identifier, register, value)
+                    servo.torque, servo.watchdog_expired = True, False
+        except (ServoBusError, SerialPortError):
             self.disable()
             raise
-        self.enabled = True
 
     def disable(self) -> bool:
-        """
-        Switch the torque of all servos off.
-
-        Returns:
-            whether every servo has confirmed it.
-
-        """
-        was_enabled, self.enabled = self.enabled, False
-        self._upkeep.drop_recoveries()
-        if not self._link.is_open:
+        """Switch the torque of all servos off; return whether every servo has confirmed it."""
+        was_enabled = self.enabled
+        self._want_torque(False)
+        self._drop_recoveries()
+        if not self.link.is_open:
             return not was_enabled
+        confirmed = True
         try:
-            with self._link.patient():
-                confirmed = self._torque_off()
-        except PortLost as error:
-            self._upkeep.port_lost(error)
+            with self.link.patient():
+                self.link.sync_write(*self._torque_off)
+                for servo in self.servos:
+                    try:
+                        self.link.write(servo.identifier, registers.TORQUE_ENABLE, 0)
+                        servo.torque = False
+                    except ServoBusError as error:
+                        confirmed = False
+                        self.log(f'torque off is not confirmed: {error}')
+        except SerialPortError as error:
+            self._port_lost(error)
             return False
         if self._guard is not None and confirmed:
             self._guard.dismiss()
@@ -167,133 +289,363 @@ class ServoBus:
         return confirmed
 
     def reboot(self, identifier: int):
-        """
-        Start the restart of a servo; calls of :meth:`poll_health` finish it in about 0.5 s.
-
-        Raises:
-            ServoBusError: no servo has this ID.
-
-        """
-        for servo in self._servos:
-            if servo.identifier == identifier:
-                self._upkeep.recover(servo, forced=True)
-                return
-        raise ServoBusError(f'{self._link.where(identifier)}: no such servo; ids are '
-                            f'{[servo.identifier for servo in self._servos]}')
-
-    # --- the loop -----------------------------------------------------------------------------
+        """Start the restart of a servo; calls of :meth:`upkeep` finish it in about 0.5 s."""
+        (servo,) = (servo for servo in self.servos if servo.identifier == identifier)
+        self._recover(servo, forced=True)
 
     def write_goals(self, tilt: np.ndarray) -> bool:
         """
-        Send tilt targets to all servos with one packet.
+        Send tilt targets (4,) [rad], limited to the travel, to all servos with one packet.
 
-        Args:
-            tilt: (4,) tilt targets [rad], limited to the travel.
-
-        Returns:
-            whether the packet was sent; False without torque, port or finite numbers.
-
+        Return whether it was sent; False without torque, port or four finite numbers.
         """
         tilt = np.asarray(tilt, dtype=float)
-        if tilt.shape != (len(self._servos),) or not np.all(np.isfinite(tilt)):
-            self.rejected += 1
-            return False
-        if not self.enabled or not self._link.is_open:
+        if tilt.shape != (4,) or not np.all(np.isfinite(tilt)) or not self.enabled \
+                or not self.link.is_open:
             return False
         legal = np.clip(tilt, -self.travel, self.travel)
         self.clipped += int(np.any(legal != tilt))
         try:
-            self._upkeep.feed_watchdog()
-            sent = self._link.sync_write(registers.GOAL_POSITION, {
+            self._feed_watchdog()
+            return self.link.sync_write(registers.GOAL_POSITION, {
                 servo.identifier: servo.counts(angle)
-                for servo, angle in zip(self._servos, legal, strict=True)})
-        except PortLost as error:
-            self._upkeep.port_lost(error)
+                for servo, angle in zip(self.servos, legal, strict=True)})
+        except SerialPortError as error:
+            self._port_lost(error)
             return False
-        self._upkeep.packet_sent()
-        return sent
 
     def read(self) -> ServoReadings:
         """Read current, velocity and position of all servos except silent ones."""
-        stamp = self._clock()
-        asked = sorted((servo for servo in self._servos if not servo.silent),
-                       key=lambda servo: servo.misses)
-        answers = {}
-        if self._link.is_open and asked:
-            try:
-                answers = self._link.sync_read(FEEDBACK, FEEDBACK_SIZE,
-                                               [servo.identifier for servo in asked])
-                self._upkeep.packet_sent()
-            except PortLost as error:
-                self._upkeep.port_lost(error)
-        if self._link.is_open:
-            answered = self._upkeep.handle_feedback(asked, answers, self.enabled)
+        stamp, answered = self._clock(), set()
+        if not self.link.is_open:
+            self._reconnect()
         else:
-            answered = set()
-            self._upkeep.reconnect(self.enabled)
-        return readings(self._servos, stamp, answered, self.parameters.torque_per_current)
+            asked = sorted((servo for servo in self.servos if not servo.silent),
+                           key=lambda servo: servo.misses)
+            try:
+                answered = self._read_feedback(asked)
+            except SerialPortError as error:
+                self._port_lost(error)
+        return ServoReadings(
+            stamp, np.array([servo.position for servo in self.servos]),
+            np.array([servo.velocity for servo in self.servos]),
+            self.parameters.torque_per_current * np.array([one.current for one in self.servos]),
+            np.array([servo in answered for servo in self.servos]))
 
     def upkeep(self):
         """
-        Do at most one transaction besides goals and feedback.
+        Do at most one transaction besides goals and feedback; none after a timeout in this tick.
 
         It is a step of a servo's recovery, a ping of a silent servo, or a read of torque, hardware
         error, watchdog, voltage and temperature of all servos.
         """
+        if not self.link.is_open:
+            return
+        now = time.monotonic()
         try:
-            self._upkeep.step(self.enabled)
-        except PortLost as error:
-            self._upkeep.port_lost(error)
-
-    def health(self) -> list[ServoHealth]:
-        """Last known health of each servo, without a transaction."""
-        return self._upkeep.report(self.enabled)
-
-    def poll_health(self) -> list[ServoHealth]:
-        """Do :meth:`upkeep` and return :meth:`health`."""
-        self.upkeep()
-        return self.health()
+            if self.link.late:
+                self.link.late = False
+            elif self._recovering:
+                self._recover_step()
+            elif any(servo.silent and now >= servo.next_probe for servo in self.servos):
+                self._probe(now)
+            elif now >= self._next_health:
+                self._next_health = now + self.parameters.timing.health / len(HEALTH)
+                self._read_health()
+        except SerialPortError as error:
+            self._port_lost(error)
 
     @property
     def obeying(self) -> np.ndarray:
         """(4,) bool: whether a servo is connected, answers and has torque, as last known."""
-        return np.array([self._link.is_open and not servo.silent and servo.torque is True
-                         for servo in self._servos])
+        return np.array([self.link.is_open and not servo.silent and servo.torque is True
+                         for servo in self.servos])
 
     def take_events(self) -> list[str]:
-        """Return the lines for the log since the last call."""
-        return self._upkeep.take_events()
+        """Return the lines for the log since the last call, which may come from any thread."""
+        return [self._events.popleft() for _ in range(len(self._events))]
 
-    @property
-    def connected(self) -> bool:
-        """Whether the port is open."""
-        return self._link.is_open
+    def log(self, line):
+        """Add a line to the log, unless an equal one was added within a second."""
+        now = time.monotonic()
+        if now - self._logged.get(line, -REPEAT_AFTER) >= REPEAT_AFTER:
+            self._logged[line] = now
+            self._events.append(line)
 
-    @property
-    def statistics(self) -> LinkStatistics:
-        """Counts of the link."""
-        return self._link.statistics
-
-    # --- inside -------------------------------------------------------------------------------
-
-    def _torque_off(self):
-        """Switch the torque off by one packet, then for each servo with confirmation."""
-        self._link.sync_write(registers.TORQUE_ENABLE,
-                              {servo.identifier: 0 for servo in self._servos})
-        confirmed = True
-        for servo in self._servos:
-            try:
-                self._link.write(servo.identifier, registers.TORQUE_ENABLE, 0)
-                servo.torque = False
-            except ServoBusError as error:
-                confirmed = False
-                self._upkeep.log(f'torque off is not confirmed: {error}')
-        return confirmed
-
-    def _call(self, function, *arguments):
+    @contextmanager
+    def _outside_the_loop(self):
+        """Context that waits longer for answers."""
         try:
-            with self._link.patient():
-                return function(*arguments)
-        except PortLost as error:
-            self._upkeep.port_lost(error)
-            raise ServoBusError(f'{self._link.where()}: {error}') from None
+            with self.link.patient():
+                yield
+        except SerialPortError as error:
+            self._port_lost(error)
+            raise
+
+    def _port_lost(self, error):
+        """Close the failed port; :meth:`_reconnect` opens it again."""
+        if self.link.is_open:
+            self.log(f'{error}; trying again every {self.parameters.timing.reconnect:g} s')
+        self.link.close()
+        self._drop_recoveries()
+        self._next_open = time.monotonic() + self.parameters.timing.reconnect
+
+    def _reconnect(self):
+        """Open the port again if it is time, and restore the torque state of the servos."""
+        if time.monotonic() < self._next_open:
+            return
+        self._next_open = time.monotonic() + self.parameters.timing.reconnect
+        try:
+            self.link.open()
+            self.log(f'{self.link.path}: connected again')
+            if self.enabled:
+                # Their watchdogs have stopped them, and they may have restarted.
+                self._feed_watchdog()
+                for servo in self.servos:
+                    self._recover(servo)
+            else:
+                self.link.sync_write(*self._torque_off)
+        except SerialPortError:
+            self.link.close()
+
+    def _want_torque(self, wanted):
+        self.enabled = wanted
+        for servo in self.servos:
+            servo.wanted = wanted
+
+    @property
+    def _watchdog_counts(self):
+        return round(self.parameters.timing.watchdog / registers.WATCHDOG_UNIT)     # 1 to 127
+
+    def _apply_settings(self, servo):
+        given, identifier = self.parameters, servo.identifier
+        permanent = [       # in EEPROM; the mode is first, because it resets the gains
+            (registers.OPERATING_MODE, registers.MODE_CODES[given.mode]),
+            (registers.DRIVE_MODE, 0), (registers.HOMING_OFFSET, 0), (registers.RETURN_DELAY, 0),
+            (registers.CURRENT_LIMIT, round(given.current_limit / registers.CURRENT_UNIT))]
+        if servo.firmware >= registers.FIRST_FAST_FIRMWARE:
+            permanent.append((registers.STARTUP, 0))    # nothing is restored after power-up
+        link, volatile = self.link, self._volatile_settings()
+        link.write(identifier, registers.WATCHDOG, 0)
+        link.write(identifier, registers.TORQUE_ENABLE, 0)
+        for register, value in permanent:
+            if link.read(identifier, register, ATTEMPTS) != value:
+                link.write(identifier, register, value)
+        for register, value in volatile:
+            link.write(identifier, register, value)
+        for register, value in permanent + volatile:
+            found = link.read(identifier, register, ATTEMPTS)
+            if found != value:
+                raise ServoBusError(f'{link.path}, id {identifier}: {register} is {found} after '
+                                    f'{value} was written')
+
+    def _volatile_settings(self):
+        """RAM settings, lost by a restart, except torque and watchdog."""
+        settings = [MARK, (registers.STATUS_LEVEL, 2),
+                    *zip(GAINS, astuple(self.parameters.gains), strict=True),
+                    (registers.PROFILE_ACCELERATION, 0), (registers.PROFILE_VELOCITY, 0)]
+        if self.parameters.mode == 'current_based_position':
+            settings.append((registers.GOAL_CURRENT, round(
+                self.parameters.current_limit / registers.CURRENT_UNIT)))
+        return settings
+
+    def _is_marked(self, servo):
+        return self.link.read(servo.identifier, MARK[0], ATTEMPTS) == MARK[1]
+
+    def _locate(self):
+        """Read all angles; restarted servos get their RAM settings and have unknown turns."""
+        for servo in self.servos:
+            if not self._is_marked(servo):
+                servo.turns_known = False
+                for register, value in self._volatile_settings():
+                    self.link.write(servo.identifier, register, value)
+            counts = self.link.read(servo.identifier, registers.PRESENT_POSITION, ATTEMPTS)
+            servo.turns *= servo.turns_known
+            servo.position = servo.angle(counts) + TURN * servo.turns
+
+    def _feed_watchdog(self):
+        """Clear the watchdogs after a pause, because expired ones refuse goals without answer."""
+        pause = time.monotonic() - self.link.last_sent
+        if pause > WATCHDOG_MARGIN * self.parameters.timing.watchdog:
+            self._restart_watchdog(self.servos)
+
+    def _restart_watchdog(self, servos):
+        for counts in (0, self._watchdog_counts):
+            self.link.sync_write(registers.WATCHDOG,
+                                  {servo.identifier: counts for servo in servos})
+
+    # --- feedback and health ------------------------------------------------------------------
+
+    def _sync_read(self, asked, address, length):
+        """Pairs of the asked servos and their data, None without a valid answer."""
+        answers = self.link.sync_read(address, length, [servo.identifier for servo in asked]) \
+            if asked else {}
+        found = []
+        for servo in asked:
+            error, data = answers.get(servo.identifier, (0, None))
+            if data is not None and not error & registers.ALERT:
+                servo.error = 0
+            elif data is not None and not servo.error and servo.recovery is None:
+                servo.kept_off = False
+                self._recover(servo)    # its recovery reads the hardware error
+            found.append((servo, None if error & ~registers.ALERT else data))
+        return found
+
+    def _read_feedback(self, asked):
+        """Read and update servos; return those that answered. The first without answer missed."""
+        answered, now = set(), time.monotonic()
+        for servo, data in self._sync_read(asked, FEEDBACK, FEEDBACK_LAYOUT.size):
+            if data is None:
+                continue
+            answered.add(servo)
+            if servo.update(data, now):
+                servo.turns_known &= self.enabled
+                if servo.recovery is None:
+                    self.log(f'{servo.where}: lost its turn count, taken as '
+                              f'{servo.position:+.2f} rad')
+                    self._recover(servo)
+        for missing in [servo for servo in asked if servo not in answered][:1]:
+            self._count_miss(missing)
+        return answered
+
+    def _count_miss(self, servo):
+        """Count a missing answer; after several in a row the servo is silent and only pinged."""
+        servo.misses += 1
+        timing = self.parameters.timing
+        if servo.misses >= timing.silent_after and not servo.silent:
+            servo.silent, servo.torque = True, None
+            servo.probe_wait = timing.probe_first
+            servo.next_probe = time.monotonic() + servo.probe_wait
+            self.log(f'{servo.where}: silent; check its cable and power')
+
+    def _probe(self, now):
+        servo = min((servo for servo in self.servos if servo.silent),
+                    key=lambda servo: servo.next_probe)
+        try:
+            self.link.ping(servo.identifier)
+        except NoAnswer:
+            self.link.late = False
+            if servo.restarting:
+                servo.next_probe = now + PING_PERIOD
+            else:
+                servo.probe_wait = min(2 * servo.probe_wait, self.parameters.timing.probe_longest)
+                servo.next_probe = now + servo.probe_wait
+            return
+        except ServoBusError:
+            pass
+        if not servo.restarting:
+            self.log(f'{servo.where}: answers again')
+            for other in self.servos:
+                other.next_probe = now  # the cause may have been the bus
+        servo.silent, servo.misses, servo.boot_ends = False, 0, 0.0
+        self._recover(servo)
+
+    def _read_health(self):
+        register, length = HEALTH[self._group]
+        self._group = (self._group + 1) % len(HEALTH)
+        asked = [servo for servo in self.servos if not servo.silent]
+        for servo, data in self._sync_read(asked, register.address, length):
+            if data is None:
+                continue
+            if register is registers.TORQUE_ENABLE:
+                servo.torque = bool(data[0])
+                if self.enabled and not servo.torque and not servo.kept_off:
+                    self._recover(servo)
+                elif servo.torque and not self.enabled:
+                    # It did not answer when the torque was switched off.
+                    self.link.sync_write(register, {servo.identifier: 0})
+                    self.log(f'{servo.where}: still had torque, switched off')
+            elif register is registers.STATUS_LEVEL:
+                servo.error = data[2]  # Hardware Error Status is the third
+            elif register is registers.WATCHDOG:
+                servo.watchdog_expired = data[0] == registers.WATCHDOG_EXPIRED
+                if servo.watchdog_expired and self.enabled:
+                    self.log(f'{servo.where}: was stopped by its watchdog, continues')
+                    self._restart_watchdog([servo])
+            else:
+                servo.voltage = int.from_bytes(data[:2], 'little') * registers.VOLTAGE_UNIT
+                servo.temperature = float(data[2])
+
+    # --- recovery -----------------------------------------------------------------------------
+
+    def _recover(self, servo, forced=False):
+        """Start the recovery of a servo; with ``forced``, restart it in any case."""
+        if servo.recovery is None:
+            self._recovering.append(servo)
+        elif not forced:
+            return
+        servo.torque = None     # unknown until it is read
+        servo.recovery = self._recovery(servo, forced)
+
+    def _drop_recoveries(self):
+        self._recovering.clear()
+        for servo in self.servos:
+            servo.recovery = None
+
+    def _recover_step(self):
+        servo = self._recovering.popleft()
+        try:
+            next(servo.recovery)
+            self._recovering.append(servo)  # behind the others
+            return
+        except StopIteration:
+            pass
+        except ServoBusError as error:
+            self.log(f'{servo.name}: {error}')
+            if isinstance(error, NoAnswer):
+                self._count_miss(servo)
+        servo.recovery = None
+
+    def _recovery(self, servo, forced):
+        """
+        Read the state of a servo and recover it; yields after each transaction.
+
+        A restarted servo has lost gains, watchdog, torque and turn count. At the end it has
+        torque if the bus is enabled. With ``forced``, and after a shutdown, it is restarted; the
+        ping that it answers starts another recovery.
+        """
+        link, identifier, given = self.link, servo.identifier, self.parameters
+        servo.error = link.read(identifier, registers.HARDWARE_ERROR)
+        yield
+        servo.torque = bool(link.read(identifier, registers.TORQUE_ENABLE))
+        yield
+        if servo.torque and not forced:
+            return
+        if forced or servo.error:
+            if not forced and not (self.enabled and given.reboot_after_overload
+                                   and not servo.error & registers.OVERHEATING
+                                   and servo.recoveries < given.recoveries):
+                self.log(f'{servo.where}: shut down ({", ".join(servo.errors)}); it stays off '
+                         'until it is rebooted')
+                servo.kept_off = True
+                return
+            servo.recoveries += 1
+            self.log(f'{servo.where}: restarting it')
+            link.reboot(identifier)
+            now = time.monotonic()
+            servo.silent = True     # so that reads of the others do not wait for it
+            servo.probe_wait, servo.next_probe = given.timing.probe_first, now + FIRST_PING
+            servo.boot_ends = now + given.timing.reboot
+            return
+        for register, value in self._volatile_settings():
+            link.write(identifier, register, value, attempts=1)
+            yield
+        counts = link.read(identifier, registers.PRESENT_POSITION)
+        servo.turns = nearest_turns(servo.angle(counts), servo.position)
+        yield
+        servo.kept_off = False
+        if not self.enabled:
+            servo.turns_known = False
+            self.log(f'{servo.where}: is back, without torque')
+            return
+        # The goals of the running loop also use the new turn count.
+        for register, value in self._power_on(counts):
+            yield
+            link.write(identifier, register, value, attempts=1)
+        servo.torque, servo.watchdog_expired = True, False
+        self.log(f'{servo.where}: had restarted, is back at {servo.position:+.2f} rad')
+
+    def _power_on(self, counts):
+        """Settings that switch the torque on with a goal, which holds the servo."""
+        return ((registers.GOAL_POSITION, counts), (registers.WATCHDOG, self._watchdog_counts),
+                (registers.TORQUE_ENABLE, 1))

@@ -1,10 +1,9 @@
 """
-Switches the servos' torque off if the process of their driver was killed.
+Switches the servos' torque off if their driver was killed; their own watchdog only stops them.
 
 :class:`Guard` starts this module as a separate process, which sleeps and has no port open. Its
 standard input is a pipe from the driver. A byte ends it without action. The end of the pipe
-without a byte means that the driver died with torque on. The servos' own watchdog would only stop
-them.
+without a byte means that the driver died with torque on.
 """
 
 import os
@@ -23,33 +22,26 @@ class Guard:
     """The guard process of one bus; ``packet`` switches the torque of all servos off."""
 
     def __init__(self, port: str, baud_rate: int, packet: bytes):
-        self._process = subprocess.Popen(
+        self.process = subprocess.Popen(
             [sys.executable, __file__, port, str(baud_rate), packet.hex()],
             stdin=subprocess.PIPE, start_new_session=True)
 
     def trigger(self):
         """Let it switch the torque off now, because the driver has no confirmation."""
-        if self._process is not None:
-            self._process.stdin.close()
-            self._process = None
+        self.process.stdin.close()
 
     def dismiss(self):
         """End it without action, because the torque of all servos is off."""
-        if self._process is None:
-            return
         try:
-            self._process.stdin.write(b'.')
-            self._process.stdin.close()
-            self._process.wait(2.0)
-        except (OSError, subprocess.TimeoutExpired):
-            self._process.kill()
-            self._process.wait()
-        self._process = None
+            self.process.communicate(b'.', 2.0)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
 
 
-def send_torque_off(port: str, baud_rate: int, packet: bytes):
-    """Send ``packet`` as soon as the port can be opened."""
-    end = time.monotonic() + OPEN_TIMEOUT
+def main():
+    """Wait for the end of the pipe, then send the packet as soon as the port can be opened."""
+    port, baud_rate, packet = sys.argv[1], int(sys.argv[2]), bytes.fromhex(sys.argv[3])
+    end = 0.0 if os.read(0, 1) else time.monotonic() + OPEN_TIMEOUT
     while time.monotonic() < end:
         try:
             with serial.Serial(port, baud_rate, timeout=0, write_timeout=0.1) as line:
@@ -61,13 +53,6 @@ def send_torque_off(port: str, baud_rate: int, packet: bytes):
             return
         except OSError:
             time.sleep(PAUSE)
-
-
-def main():
-    """Wait for the end of the pipe."""
-    port, baud_rate, packet = sys.argv[1:4]
-    if not os.read(0, 1):
-        send_torque_off(port, int(baud_rate), bytes.fromhex(packet))
 
 
 if __name__ == '__main__':

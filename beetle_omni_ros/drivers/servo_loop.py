@@ -1,16 +1,13 @@
 """The 200 Hz loop of the servo bus in a thread; new goals are written at once."""
 
-from collections import deque
 from collections.abc import Callable
 from contextlib import contextmanager
-from dataclasses import dataclass
 from threading import Lock, Thread
 import time
 
 import numpy as np
 
-from beetle_omni_ros.drivers.servo_bus import ServoBus
-from beetle_omni_ros.drivers.servo_state import ServoHealth, ServoReadings
+from beetle_omni_ros.drivers.servo_bus import ServoBus, ServoReadings
 
 READ_AFTER = 0.001  # [s] start of a cycle after the arrival of goals, which find the bus free
 SLEW = 0.01         # largest relative change of a period by the phase control
@@ -18,59 +15,31 @@ GAIN = 0.1          # of the phase control in each cycle, small against single l
 GOALS_KEPT = 0.1    # [s] older goals do not control the phase
 PERIOD = 0.005      # [s]
 STOP_TIMEOUT = 5.0  # [s] until the thread has ended; a cycle takes at most 0.02 s
-EVENTS_KEPT = 200   # lines for the log
 
 
 class ServoPace:
     """
-    Times of the cycles on a monotonic clock.
+    Times of the cycles on a monotonic clock [s].
 
     A late cycle does not delay the next one, and a period without a cycle is missed. Goals arrive
     once in one or several periods. The phase of the cycles is controlled so that goals do not
     arrive during a transaction.
 
-    Attributes:
-        missed: number of periods without a cycle.
-
+    ``missed`` counts periods without a cycle, ``due`` is the time of the next one, ``goals`` that
+    of the last arrival.
     """
 
-    def __init__(self, period: float):
-        self.missed = 0
-        self._period = period
-        self._due = 0.0
-        self._goals = float('-inf')
-
-    def start(self, now: float):
-        """Set the next cycle to ``now`` [s]."""
-        self._due = now
-
-    def wait(self, now: float) -> float:
-        """Time until the next cycle [s]."""
-        return max(0.0, self._due - now)
-
-    def goals_arrived(self, now: float):
-        """Record goals that arrived at ``now`` [s]."""
-        self._goals = now
+    def __init__(self, now: float):
+        self.missed, self.due, self.goals = 0, now, float('-inf')
 
     def begin(self, now: float):
-        """Start a cycle at ``now`` [s] and set the time of the next one."""
-        passed = int(max(0.0, now - self._due) / self._period)
+        """Start a cycle at ``now`` and set the time of the next one."""
+        passed = int(max(0.0, now - self.due) / PERIOD)
         self.missed += passed
-        self._due += (passed + 1) * self._period
-        if now - self._goals < GOALS_KEPT:
-            period = self._period
-            late = (self._due - self._goals - READ_AFTER + period / 2) % period - period / 2
-            limit = SLEW * period
-            self._due -= min(max(GAIN * late, -limit), limit)
-
-
-@dataclass(frozen=True, slots=True)
-class Goal:
-    """Tilt targets (4,) [rad], publication time [s], expiry on the monotonic clock [s]."""
-
-    tilt: np.ndarray
-    published: float
-    expires: float
+        self.due += (passed + 1) * PERIOD
+        if now - self.goals < GOALS_KEPT:
+            late = (self.due - self.goals - READ_AFTER + PERIOD / 2) % PERIOD - PERIOD / 2
+            self.due -= min(max(GAIN * late, -SLEW * PERIOD), SLEW * PERIOD)
 
 
 class ServoLoop:
@@ -84,14 +53,12 @@ class ServoLoop:
         bus: configured bus; while the loop runs, other threads use it in :meth:`exclusive` only.
         on_readings: called in the thread with the readings and (4,) bool: whether a reading is
             valid and, with torque on, the servo obeys.
-        on_written: called with ``Goal.published`` after the goals were written.
+        on_written: called with their time of publication after the goals were written.
         clock: monotonic time [s].
 
     Attributes:
-        cycles: number of cycles.
-        written: number of packets with goals, repetitions included.
-        stale: number of goals that had expired when the bus was free.
-        incomplete: number of cycles without a valid reading of each servo.
+        cycles, incomplete: number of cycles, and of those without a valid reading of each servo.
+        written, stale: number of packets with goals, and of goals that had expired before.
         failure: error that ended the thread, or ''; torque is off then.
 
     """
@@ -102,20 +69,16 @@ class ServoLoop:
         self.cycles = self.written = self.stale = self.incomplete = 0
         self.failure = ''
         self._bus, self._on_readings, self._on_written = bus, on_readings, on_written
-        self._clock = clock
-        self._pace = ServoPace(PERIOD)
+        self._clock, self.pace = clock, ServoPace(clock())
         self._lock = Lock()
-        self._goal: Goal | None = None
+        self._goal: tuple[np.ndarray, float, float] | None = None
         self._fresh = self._wrote = self._stopping = False
-        self._last_obeying = [clock()] * 4
-        self._events: deque[str] = deque(maxlen=EVENTS_KEPT)
+        self._last_obeying = np.full(4, clock())
         self._thread = Thread(target=self._run, name='servo bus', daemon=True)
-
-    # --- from other threads -------------------------------------------------------------------
 
     def start(self):
         """Start the thread."""
-        self._pace.start(self._clock())
+        self.pace.due = self._clock()
         self._thread.start()
 
     def stop(self):
@@ -124,10 +87,14 @@ class ServoLoop:
         if self._thread.is_alive():
             self._thread.join(STOP_TIMEOUT)
 
-    def offer(self, goal: Goal):
-        """Write goals now, or after the present transaction; newer goals replace older ones."""
-        self._pace.goals_arrived(self._clock())
-        self._goal = goal
+    def offer(self, tilt: np.ndarray, published: float, expires: float):
+        """
+        Write tilt targets (4,) [rad] now, or after the present transaction instead of older ones.
+
+        They were ``published`` [s] and are valid until ``expires`` on the monotonic clock [s].
+        """
+        self.pace.goals = self._clock()
+        self._goal = tilt, published, expires
         self._fresh = True
         self._write_pending()
 
@@ -138,79 +105,51 @@ class ServoLoop:
             try:
                 yield self._bus
             finally:
-                now = self._clock()
-                self._last_obeying = [now] * len(self._last_obeying)
-                self._pace.start(now)
+                self.pace.due = now = self._clock()
+                self._last_obeying = np.full(4, now)
         self._write_pending()
-
-    @property
-    def missed(self) -> int:
-        """Number of periods without a cycle."""
-        return self._pace.missed
-
-    def health(self) -> list[ServoHealth]:
-        """Last known health of each servo."""
-        with self._lock:
-            return self._bus.health()
 
     def lost(self, patience: float) -> str:
         """Servos that have not obeyed for ``patience`` [s], with reasons; '' if there is none."""
-        if self.failure:
+        gone = self._clock() - self._last_obeying > patience
+        if self.failure or not gone.any():
             return self.failure
-        limit = self._clock() - patience
-        gone = [k for k, seen in enumerate(self._last_obeying) if seen < limit]
-        if not gone:
-            return ''
-        if not self._bus.connected:
-            return f'{self._bus.parameters.port}: no connection'
-        health = self.health()
-        return '; '.join(health[k].message or f'{health[k].name}: being brought back'
-                         for k in gone)
-
-    def take_events(self) -> list[str]:
-        """Return the lines for the log since the last call."""
-        events = []
-        while self._events:
-            events.append(self._events.popleft())
-        return events
-
-    # --- the thread ---------------------------------------------------------------------------
+        if not self._bus.link.is_open:
+            return f'{self._bus.link.path}: no connection'
+        return '; '.join(servo.message or f'{servo.name}: being brought back'
+                         for servo, is_gone in zip(self._bus.servos, gone) if is_gone)
 
     def _run(self):
         try:
             while not self._stopping:
-                time.sleep(self._pace.wait(self._clock()))
+                time.sleep(max(0.0, self.pace.due - self._clock()))
                 with self._lock:
                     if not self._stopping:
                         self._cycle()
                 self._write_pending()
         except Exception as error:  # also after a programming error torque must go off
             self.failure = f'the bus thread ended: {type(error).__name__}: {error}'
-            self._events.append(self.failure)
+            self._bus.log(self.failure)
             with self._lock:
                 self._bus.close()
 
     def _cycle(self):
         """Goals, feedback and upkeep, with the lock held."""
-        self._pace.begin(self._clock())
+        self.pace.begin(self._clock())
         self.cycles += 1
-        self._write()
+        if self._fresh:
+            self._write_fresh()
+        elif self._goal is not None and not self._wrote and self._clock() <= self._goal[2]:
+            self.written += self._bus.write_goals(self._goal[0])  # a whole period brought none
+        self._wrote = False
         readings = self._bus.read()
-        good = readings.valid
-        self.incomplete += not good.all()
+        self.incomplete += not readings.valid.all()
         obeying = self._bus.obeying
-        if self._bus.enabled:
-            good = good & obeying
-        self._on_readings(readings, good)
+        self._on_readings(readings, readings.valid & obeying if self._bus.enabled
+                          else readings.valid)
         self._write_fresh()
         self._bus.upkeep()
-        self._events.extend(self._bus.take_events())
-        now = self._clock()
-        if obeying.all():
-            self._last_obeying = [now] * len(self._last_obeying)
-        else:
-            self._last_obeying = [now if obeys else seen
-                                  for obeys, seen in zip(obeying, self._last_obeying, strict=True)]
+        self._last_obeying = np.where(obeying, self._clock(), self._last_obeying)
 
     def _write_pending(self):
         """Write new goals if the bus is free; otherwise the holder of the lock does it later."""
@@ -220,22 +159,14 @@ class ServoLoop:
             finally:
                 self._lock.release()
 
-    def _write(self):
-        """Write new goals, or repeat the last ones if a whole period brought none."""
-        if self._fresh:
-            self._write_fresh()
-        elif self._goal is not None and not self._wrote and self._clock() <= self._goal.expires:
-            self.written += self._bus.write_goals(self._goal.tilt)
-        self._wrote = False
-
     def _write_fresh(self):
         if not self._fresh:
             return
         self._fresh = False
-        goal = self._goal
-        if self._clock() > goal.expires:
+        tilt, published, expires = self._goal
+        if self._clock() > expires:
             self.stale += 1
-        elif self._bus.write_goals(goal.tilt):
-            self._on_written(goal.published)
+        elif self._bus.write_goals(tilt):
+            self._on_written(published)
             self.written += 1
             self._wrote = True

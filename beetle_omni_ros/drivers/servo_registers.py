@@ -1,16 +1,16 @@
 """
-Control table of the XC330-T181-T: registers, units and codes.
+Control table of the XC330-T181-T, as far as the driver uses it, and the turns of its angle.
 
 Source: emanual.robotis.com/docs/en/dxl/x/xc330-t181 (addresses, sizes, units), .../dxl/protocol2
 (errors). Indirect addresses (168 on) are left out, because they depend on the firmware version.
 """
 
-from dataclasses import dataclass
-from math import pi
+from collections.abc import Sequence
+from math import ceil, floor, pi
+from typing import NamedTuple
 
 
-@dataclass(frozen=True, slots=True)
-class Register:
+class Register(NamedTuple):
     """A register: first address, size [B], whether it is in two's complement."""
 
     name: str
@@ -18,10 +18,9 @@ class Register:
     size: int
     signed: bool = False
 
-    @property
-    def permanent(self) -> bool:
-        """Whether it is in EEPROM, kept without power and writable only with torque off."""
-        return self.address < 64
+    def __str__(self) -> str:
+        """Name and address, for messages."""
+        return f'{self.name}({self.address})'
 
     def encoded(self, value: int) -> list[int]:
         """Bytes of a value, in the form of the SDK."""
@@ -32,69 +31,43 @@ class Register:
         return int.from_bytes(bytes(data), 'little', signed=self.signed)
 
 
-MODEL_NUMBER = Register('Model Number', 0, 2)
-MODEL_INFORMATION = Register('Model Information', 2, 4)
+# EEPROM: kept without power and writable only with torque off.
 FIRMWARE = Register('Firmware Version', 6, 1)
-ID = Register('ID', 7, 1)
-BAUD_RATE = Register('Baud Rate', 8, 1)
 RETURN_DELAY = Register('Return Delay Time', 9, 1)
 DRIVE_MODE = Register('Drive Mode', 10, 1)
 OPERATING_MODE = Register('Operating Mode', 11, 1)
 SHADOW_ID = Register('Secondary(Shadow) ID', 12, 1)
-PROTOCOL = Register('Protocol Type', 13, 1)
 HOMING_OFFSET = Register('Homing Offset', 20, 4, True)
-MOVING_THRESHOLD = Register('Moving Threshold', 24, 4)
-TEMPERATURE_LIMIT = Register('Temperature Limit', 31, 1)
-MAX_VOLTAGE = Register('Max Voltage Limit', 32, 2)
-MIN_VOLTAGE = Register('Min Voltage Limit', 34, 2)
-PWM_LIMIT = Register('PWM Limit', 36, 2)
 CURRENT_LIMIT = Register('Current Limit', 38, 2)
-VELOCITY_LIMIT = Register('Velocity Limit', 44, 4)
-MAX_POSITION = Register('Max Position Limit', 48, 4)
-MIN_POSITION = Register('Min Position Limit', 52, 4)
 STARTUP = Register('Startup Configuration', 60, 1)
-PWM_SLOPE = Register('PWM Slope', 62, 1)
-SHUTDOWN = Register('Shutdown', 63, 1)
+# RAM
 TORQUE_ENABLE = Register('Torque Enable', 64, 1)
-LED = Register('LED', 65, 1)
 STATUS_LEVEL = Register('Status Return Level', 68, 1)
-REGISTERED = Register('Registered Instruction', 69, 1)
 HARDWARE_ERROR = Register('Hardware Error Status', 70, 1)
 VELOCITY_I = Register('Velocity I Gain', 76, 2)
-VELOCITY_P = Register('Velocity P Gain', 78, 2)
 POSITION_D = Register('Position D Gain', 80, 2)
 POSITION_I = Register('Position I Gain', 82, 2)
 POSITION_P = Register('Position P Gain', 84, 2)
 FEEDFORWARD_2 = Register('Feedforward 2nd Gain', 88, 2)
 FEEDFORWARD_1 = Register('Feedforward 1st Gain', 90, 2)
 WATCHDOG = Register('Bus Watchdog', 98, 1)
-GOAL_PWM = Register('Goal PWM', 100, 2, True)
 GOAL_CURRENT = Register('Goal Current', 102, 2, True)
-GOAL_VELOCITY = Register('Goal Velocity', 104, 4, True)
 PROFILE_ACCELERATION = Register('Profile Acceleration', 108, 4)
 PROFILE_VELOCITY = Register('Profile Velocity', 112, 4)
 GOAL_POSITION = Register('Goal Position', 116, 4, True)
-TICK = Register('Realtime Tick', 120, 2)
-MOVING = Register('Moving', 122, 1)
-MOVING_STATUS = Register('Moving Status', 123, 1)
-PRESENT_PWM = Register('Present PWM', 124, 2, True)
 PRESENT_CURRENT = Register('Present Current', 126, 2, True)
-PRESENT_VELOCITY = Register('Present Velocity', 128, 4, True)
 PRESENT_POSITION = Register('Present Position', 132, 4, True)
-VELOCITY_TRAJECTORY = Register('Velocity Trajectory', 136, 4, True)
-POSITION_TRAJECTORY = Register('Position Trajectory', 140, 4, True)
 INPUT_VOLTAGE = Register('Present Input Voltage', 144, 2)
 TEMPERATURE = Register('Present Temperature', 146, 1)
-BACKUP_READY = Register('Backup Ready', 147, 1)
 
 ALL = tuple(value for value in list(globals().values()) if isinstance(value, Register))
 
 MODEL = 1210                # XC330-T181-T
 FIRST_FAST_FIRMWARE = 46    # fast sync read and startup configuration exist from here on
 
-COUNTS_PER_TURN = 4096
-POSITION_UNIT = 2 * pi / COUNTS_PER_TURN  # [rad]
-VELOCITY_UNIT = 0.229 * 2 * pi / 60       # [rad/s] 0.229 rev/min
+TURN = 2 * pi
+POSITION_UNIT = TURN / 4096         # [rad]
+VELOCITY_UNIT = 0.229 * TURN / 60   # [rad/s] 0.229 rev/min
 CURRENT_UNIT = 0.001        # [A] "about 1 mA" in the manual, at the supply input
 VOLTAGE_UNIT = 0.1          # [V]
 WATCHDOG_UNIT = 0.02        # [s]
@@ -105,11 +78,10 @@ BAUD_CODES = {9600: 0, 57600: 1, 115200: 2, 1_000_000: 3, 2_000_000: 4, 3_000_00
 MODE_CODES = {'extended_position': 4, 'current_based_position': 5}
 
 # Bits of Hardware Error Status (70) and Shutdown (63).
-OVERLOAD = 0x20
 OVERHEATING = 0x04
 HARDWARE_ERRORS = {
     0x01: 'input voltage outside its limits', OVERHEATING: 'overheated', 0x08: 'encoder fault',
-    0x10: 'electrical shock or too little power', OVERLOAD: 'overload'}
+    0x10: 'electrical shock or too little power', 0x20: 'overload'}
 
 # Error number of a status packet; bit 7 is the alert that HARDWARE_ERROR explains.
 ALERT = 0x80
@@ -119,6 +91,46 @@ PACKET_ERRORS = {
     7: 'no access (unknown or read-only register, or EEPROM while torque is on)'}
 
 
-def hardware_errors(status: int) -> tuple[str, ...]:
-    """Decode Hardware Error Status (70)."""
-    return tuple(text for bit, text in HARDWARE_ERRORS.items() if status & bit)
+# A servo counts turns only while it has power. After power-up or reboot its position is within
+# one turn. An angle beyond +-(2 pi - travel) then has a second solution, one turn away, within
+# the travel. With a travel of +-3.96 rad, readings beyond +-2.32 rad (0.74 pi) are ambiguous.
+
+def candidates(angle: float, travel: float) -> list[float]:
+    """Angles within +-``travel`` [rad] that differ from ``angle`` by whole turns, ascending."""
+    first, last = ceil((-travel - angle) / TURN), floor((travel - angle) / TURN)
+    return [angle + TURN * turn for turn in range(first, last + 1)]
+
+
+def nearest_turns(angle: float, reference: float) -> int:
+    """Number of whole turns that brings ``angle`` [rad] nearest to ``reference``."""
+    return round((reference - angle) / TURN)
+
+
+def unambiguous_limit(travel: float) -> float:
+    """Angle up to which a reading within one turn is unambiguous [rad]."""
+    return TURN - travel if travel > pi else travel
+
+
+def settle(servos: Sequence, travel: float, confirmed: Sequence[float] | None) -> str:
+    """
+    Determine the unknown turn counts of servos; return '' or a message about ambiguous ones.
+
+    Their ``position`` [rad], ``turns`` and ``turns_known`` are updated. ``travel`` is that of the
+    joints to each side [rad], ``confirmed`` angles measured by the operator to half a turn [rad].
+    """
+    doubts = []
+    for k, servo in enumerate(servos):
+        if servo.turns_known:
+            continue
+        options = candidates(servo.position, travel)
+        if len(options) == 1:
+            chosen = options[0]
+        elif options and confirmed is not None:
+            chosen = min(options, key=lambda angle: abs(angle - confirmed[k]))
+        else:
+            places = ' or '.join(f'{angle:+.2f}' for angle in options or [servo.position])
+            doubts.append(f'{servo.name} (id {servo.identifier}) stands at {places} rad')
+            continue
+        servo.turns += nearest_turns(servo.position, chosen)
+        servo.position, servo.turns_known = chosen, True
+    return '; '.join(doubts)

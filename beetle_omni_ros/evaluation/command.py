@@ -42,7 +42,7 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
         the flight, also after a crash (``meta['crashed']``).
 
     Raises:
-        TaskError: a pose of the task is beyond the controller's reach.
+        ParameterError: a pose of the task is beyond the controller's reach.
 
     """
     # With a lost actuator the pilot lands the robot, whatever the active controller is.
@@ -100,7 +100,7 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
         the results as in INTERFACES: ``meta`` and a key for each controller.
 
     Raises:
-        ParameterError, TaskError, BagError: unusable input, one line.
+        ParameterError, BagError: unusable input, one line.
 
     """
     console = console or table.Terminal()

@@ -26,6 +26,7 @@ from beetle_omni_ros.messages.values import Odom, Wrench
 from beetle_omni_ros.robot.actuator_health import ALL_HEALTHY
 from beetle_omni_ros.robot.effects import SensorErrors
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import RunError
 from beetle_omni_ros.runs.target_checks import TargetChecks
 from beetle_omni_ros.runs.tasks import Task, TaskPlayer
 from beetle_omni_ros.safety.parameters import SupervisorParameters
@@ -41,10 +42,6 @@ COMPUTE_REPORT = 1.0     # [s] between two records of compute times, as of the n
 SWAP_CHARGE = 0.3         # [-] charge below which the pack is replaced at the next target
 CLOCK_SET_BACK = 0.1     # [s] least age of a command that shows that the clock was set back
 SETTLE_TIME = 0.5        # [s] on the ground before arming, for the start of the estimator
-
-
-class FlightError(RuntimeError):
-    """The flight could not start; the text gives the reason."""
 
 
 class FlightLoop:
@@ -145,7 +142,7 @@ class FlightLoop:
             whether the robot was airborne to the end.
 
         Raises:
-            ControllerError, FlightError: no take-off.
+            ControllerError, RunError: no take-off.
 
         """
         with collector_off():
@@ -205,7 +202,7 @@ class FlightLoop:
 
         Raises:
             ControllerError: the active controller raised an exception.
-            FlightError: no take-off.
+            RunError: no take-off.
 
         """
         while self.simulator.time < SETTLE_TIME or (
@@ -213,14 +210,14 @@ class FlightLoop:
             self._step_before_flight()
         answer = self.supervisor.arm(self.simulator.time)
         if not answer:
-            raise FlightError(answer.text)
+            raise RunError(answer.text)
         while self.supervisor.state != 'flying':
             self._step_before_flight()
             if self.simulator.time > TAKEOFF_TIMEOUT or self.supervisor.state == 'disarmed':
                 events = list(dict.fromkeys(     # the newest first, each once
                     event.text for event in reversed(self.supervisor.events)))
-                raise FlightError(f'no take-off within {TAKEOFF_TIMEOUT:g} s, supervisor in '
-                                  f"'{self.supervisor.state}' ({'; '.join(events[2::-1])})")
+                raise RunError(f'no take-off within {TAKEOFF_TIMEOUT:g} s, supervisor in '
+                               f"'{self.supervisor.state}' ({'; '.join(events[2::-1])})")
 
     def _step_before_flight(self):
         self.step()

@@ -1,6 +1,6 @@
 """`beetle_omni faults`: flies listed faults, landings or healthy flights; writes one page."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict
 from datetime import datetime, timezone
@@ -26,7 +26,6 @@ from beetle_omni_ros.faults.landings import (
     LandingTrial,
 )
 from beetle_omni_ros.faults.trial import fly_trial, Trial
-from beetle_omni_ros.faults.watch import as_expected
 from beetle_omni_ros.pages.table import print_grids
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
@@ -42,16 +41,16 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
                jobs: int | None = None, output: Path | None = None,
                json_path: Path | None = None, docs: Path | None = None, bags: bool = False,
                landings: int = 0, without_mocap: bool = False, healthy: float = 0.0,
-               through_ros: Callable[[FaultList], Iterator[dict]] | None = None,
+               plant: Path | None = None,
                console: Console | None = None) -> dict:
     """
     Fly the list of faults, or landings or healthy flights if requested.
 
     Arguments are the options of `beetle_omni faults`. ``starts`` are of ALL_STARTS, ``healthy`` is
-    in hours, and ``through_ros`` flies the faults of the ROS graph in place of the list.
+    in hours.
 
     Returns:
-        ``meta``; ``flights`` and ``summary``, or ``landings``, ``healthy`` or ``ros``.
+        ``meta``; ``flights`` and ``summary``, or ``landings`` or ``healthy``.
 
     Raises:
         ParameterError: unusable input, one line.
@@ -59,40 +58,34 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
     """
     console = console or Console()
     listed = FaultList.load(faults)
-    cases = listed.chosen(None if through_ros else only)
+    cases = listed.chosen(only)
     entry = registry.find(controller)
     controller = entry.reference
     _check(starts, output, json_path, docs, bags)
+    true = RobotParameters.load(plant)
     guidance = guidance_of(entry.make(RobotParameters.load()))  # refuses an unusable controller
     meta = {'command': _described(faults, only, starts, seeds, seed, conditions, controller,
-                                  landings, without_mocap, healthy, bool(through_ros)),
+                                  landings, without_mocap, healthy, plant),
             'version': __version__, 'commit': commit(),
             'date': datetime.now(timezone.utc).strftime('%Y-%m-%d'), 'guidance': guidance,
-            'limits': asdict(listed.limits)}
-    fly = _Flyer(console, jobs, output, file_digest(faults) if faults else '')
+            'plant': str(plant) if plant else None, 'limits': asdict(listed.limits)}
+    own = str(plant) if plant else None
+    fly = _Flyer(console, jobs, output, file_digest(faults) if faults else '', true.hash())
     results: dict = {'meta': meta}
     if landings:
         flown = fly('landings', fly_landing, [
-            LandingTrial(k, conditions, controller, without_mocap)
+            LandingTrial(k, conditions, controller, without_mocap, own)
             for k in range(seed, seed + landings)], listed)
         results['landings'] = {'flights': flown, 'summary': campaign.landing_summary(flown)}
     if healthy:
         number = ceil(3600 * healthy / listed.healthy.flight_time)
         flown = fly('healthy flights', fly_healthy, [
-            HealthyTrial(k, name, controller) for name in CONDITIONS
+            HealthyTrial(k, name, controller, own) for name in CONDITIONS
             for k in range(seed, seed + number)], listed)
         results['healthy'] = {'flights': flown, 'summary': campaign.healthy_summary(flown)}
-    if through_ros:
-        results['ros'] = []
-        for flown in through_ros(listed):
-            flown['good'] = not flown['bag_lost'] and as_expected(flown['expected'],
-                                                                  flown['outcome'])
-            results['ros'].append(flown)
-            console.print(f"{flown['case']}: {flown['outcome']} {flown['error']}",
-                          markup=False, highlight=False)
-    if not landings and not healthy and not through_ros:
+    if not landings and not healthy:
         flown = fly('faults', fly_trial, [
-            Trial(case.name, start, k, conditions, controller) for case in cases
+            Trial(case.name, start, k, conditions, controller, own) for case in cases
             for start in starts or STARTS for k in range(seed, seed + seeds)], listed,
             output / 'bags' if bags else None)
         flown.sort(key=lambda one: (list(listed.cases).index(one['case']), one['start'],
@@ -131,8 +124,8 @@ def _text(path):
 
 
 def _described(faults, only, starts, seeds, seed, conditions, controller, landings,
-               without_mocap, healthy, through_ros):
-    parts = ['beetle_omni faults'] + ['--ros'] * through_ros
+                without_mocap, healthy, plant):
+    parts = ['beetle_omni faults']
     parts += [f'--faults {faults}'] if faults else []
     parts += [f"--only {','.join(only)}"] if only else []
     parts += [f"--from {','.join(starts)}"] if starts else []
@@ -141,6 +134,7 @@ def _described(faults, only, starts, seeds, seed, conditions, controller, landin
     parts += [f'--healthy {healthy:g}'] if healthy else [f'--conditions {conditions}']
     parts += [] if landings or healthy else [f'--seeds {seeds}']
     parts += [f'--seed {seed}'] if seed else []
+    parts += [f'--plant {plant}'] if plant else []
     return ' '.join([*parts, f'--controller {controller}'])
 
 
@@ -152,9 +146,10 @@ class _Flyer:
     interrupted campaign continues, and further seeds extend it.
     """
 
-    def __init__(self, console, jobs, output, listed):
-        """``listed``: digest of an own list of faults, '' for the shipped one."""
+    def __init__(self, console, jobs, output, listed, plant):
+        """``listed``: digest of an own list, '' for the shipped one; ``plant``: robot's hash."""
         self._console, self._jobs, self._listed = console, jobs, listed
+        self._plant = plant
         self._file = output / 'flights.jsonl' if output else None
 
     def __call__(self, title: str, function: Callable, trials: list, *arguments) -> list[dict]:
@@ -165,7 +160,7 @@ class _Flyer:
             stored, kind, results = None, dict[str, str](), list[dict]()
             if self._file:
                 kind = {'code': code_fingerprint(flown_by=(Path(getfile(function)),)),
-                        'list': self._listed,
+                        'list': self._listed, 'plant': self._plant,
                         'flown': title + ' with bags' * any(
                             isinstance(argument, Path) for argument in arguments)}
                 lines, results = self._stored(kind, trials)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -34,8 +35,8 @@ class Flight:
     """
 
     def __init__(self, *, controller: str, conditions: str, seed: int,
-                 true_robot: RobotParameters | None = None, strike: tuple[Fault, ...] = (),
-                 recorder=None):
+                 plant: str | None = None, effects: dict | None = None,
+                 strike: tuple[Fault, ...] = (), recorder=None):
         """
         Build robot and flight stack.
 
@@ -43,7 +44,8 @@ class Flight:
             controller: the active controller.
             conditions: 'nominal' or 'published'.
             seed: seed of the plan and the simulation.
-            true_robot: simulated robot; by default that of the flight stack.
+            plant: robot file of the simulated robot; None: that of the flight stack.
+            effects: further effects of the simulated robot.
             strike: faults, started by ``loop.start_faults``.
             recorder: recorder of the loop; by default nothing is recorded.
 
@@ -51,8 +53,11 @@ class Flight:
         nominal, envelope = RobotParameters.load(), SupervisorParameters.load().envelope
         aboard = {entry.name: entry.make(nominal) for entry in map(
             registry.find, dict.fromkeys([controller, registry.pilot()]))}
+        true = RobotParameters.load(plant) if plant else nominal
+        if effects:
+            true = replace(true, effects=true.effects | effects)
         self.loop = FlightLoop.shipped(
-            nominal, true_robot or nominal, aboard, Tee() if recorder is None else recorder,
+            nominal, true, aboard, Tee() if recorder is None else recorder,
             conditions=conditions, seed=seed, faults=strike)
         self.simulator, self.supervisor = self.loop.simulator, self.loop.supervisor
         self.random = np.random.default_rng(seed)

@@ -1,6 +1,6 @@
 """Landings from random attitudes, and healthy flights with their alarms."""
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -9,7 +9,6 @@ from beetle_omni_ros.evaluation.compute import collector_off
 from beetle_omni_ros.faults.flight import Flight
 from beetle_omni_ros.faults.trial import observed
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.events import INFO
 from beetle_omni_ros.sim.faults import Fault
 from beetle_omni_ros.sim.faults.listed import FaultList
@@ -28,6 +27,7 @@ class LandingTrial:
         conditions: 'nominal' or 'published'.
         controller: the active controller.
         without_mocap: whether motion capture is lost at the start of the landing.
+        plant: robot file of the simulated robot; None: the shipped one.
 
     """
 
@@ -35,6 +35,7 @@ class LandingTrial:
     conditions: str = 'nominal'
     controller: str = registry.DEFAULT
     without_mocap: bool = False
+    plant: str | None = None
 
 
 def fly_landing(trial: LandingTrial, listed: FaultList) -> dict:
@@ -71,7 +72,7 @@ def attitude(seed: int) -> np.ndarray:
 def _fly(trial, listed, plan, rpy):
     strike = (Fault('mocap_lost'),) if trial.without_mocap else ()
     flight = Flight(controller=trial.controller, conditions=trial.conditions, seed=trial.seed,
-                    strike=strike)
+                    plant=trial.plant, strike=strike)
     flight.loop.take_off()
     flight.aim((0.0, 0.0, plan.height), rotations.from_rpy(*rpy))
     flight.fly(plan.turn_time)
@@ -92,12 +93,14 @@ class HealthyTrial:
         seed: seed of poses and simulation.
         conditions: one of CONDITIONS; 'effects' is nominal with the list's effects in the plant.
         controller: the active controller.
+        plant: robot file of the simulated robot; None: the shipped one.
 
     """
 
     seed: int
     conditions: str = 'nominal'
     controller: str = registry.DEFAULT
+    plant: str | None = None
 
 
 def fly_healthy(trial: HealthyTrial, listed: FaultList) -> dict:
@@ -120,8 +123,8 @@ def fly_healthy(trial: HealthyTrial, listed: FaultList) -> dict:
 
 def _fly_on(trial, listed, result):
     effects = trial.conditions == 'effects'
-    robot = replace(RobotParameters.load(), effects=listed.healthy.effects) if effects else None
-    flight = Flight(controller=trial.controller, seed=trial.seed, true_robot=robot,
+    flight = Flight(controller=trial.controller, seed=trial.seed, plant=trial.plant,
+                    effects=listed.healthy.effects if effects else None,
                     conditions='nominal' if effects else trial.conditions)
     plan = listed.healthy
     flight.loop.take_off()

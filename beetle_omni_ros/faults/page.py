@@ -58,7 +58,7 @@ def fault_rows(results: dict) -> list[list[str]]:
 
 
 def other_tables(results: dict) -> list[tuple[str, tuple[str, ...], list[list[str]]]]:
-    """Title, header and rows of landings, healthy flights and ROS, if flown."""
+    """Title, header and rows of landings, healthy flights, if flown."""
     tables = []
     if results.get('landings'):
         tables.append(('Landings from random attitudes', (
@@ -74,14 +74,6 @@ def other_tables(results: dict) -> list[tuple[str, tuple[str, ...], list[list[st
             [[row['conditions'], str(row['flights']), f"{row['hours']:.2f}",
               _counted(row['alarms']) or 'none', str(row['not_landed']), str(len(row['errors']))]
              for row in results['healthy']['summary']]))
-    if results.get('ros'):
-        tables.append(('Through ROS', (
-            'fault', 'what happens', 'expected', 'outcome', 'as expected', 'named',
-            'impact [m/s]', 'motors off after the crash [s]', 'bag'),
-            [[row['case'], row['what'], row['expected'],
-              f"{row['outcome']} {row['error']}".strip(), 'yes' if row['good'] else 'no',
-              row['named'], _number(row['impact_m_s']), _number(row['stopped_s']),
-              'lost' if row['bag_lost'] else 'kept'] for row in results['ros']]))
     return tables
 
 

@@ -30,6 +30,7 @@ class Trial:
         seed: seed of poses, time of the fault and simulation.
         conditions: 'nominal' or 'published'.
         controller: the active controller.
+        plant: robot file of the simulated robot; None: the shipped one.
 
     """
 
@@ -38,11 +39,13 @@ class Trial:
     seed: int = 0
     conditions: str = 'nominal'
     controller: str = registry.DEFAULT
+    plant: str | None = None
 
     def __str__(self) -> str:
         """Name of its bag."""
         controller = registry.find(self.controller).name
-        return f'{self.case}_{self.start}_{self.conditions}_{controller}_{self.seed}'
+        plant = f'_{Path(self.plant).stem}' if self.plant else ''
+        return f'{self.case}_{self.start}_{self.conditions}_{controller}_{self.seed}{plant}'
 
 
 def fly_trial(trial: Trial, listed: FaultList, bags: Path | None = None) -> dict:
@@ -82,7 +85,8 @@ def fly_trial(trial: Trial, listed: FaultList, bags: Path | None = None) -> dict
 def _fly(trial, listed, recorder):
     plan = listed.flight
     flight = Flight(controller=trial.controller, conditions=trial.conditions, seed=trial.seed,
-                    strike=listed.cases[trial.case].strike, recorder=recorder)
+                    plant=trial.plant, strike=listed.cases[trial.case].strike,
+                    recorder=recorder)
     loop, supervisor = flight.loop, flight.supervisor
     loop.take_off()
     fly_to_start(flight, trial.start, plan)

@@ -6,6 +6,7 @@ import shlex
 
 from rich.console import Console
 
+from beetle_omni_ros.identify import picture as of_logs
 from beetle_omni_ros.identify.measured import (
     read_logs,
     rotor_values,
@@ -99,7 +100,7 @@ def run_identify_rotor(paths: Sequence[Path], *, columns: Sequence[str] = (),
 
 def run_identify_robot(paths: Sequence[Path], params: Path, *, rate: float | None = None,
                        robot: Path | None = None, json_path: Path | None = None,
-                       console: Console | None = None) -> dict:
+                       picture: Path | None = None, console: Console | None = None) -> dict:
     """
     Write a robot file from logs of servos and rotors.
 
@@ -114,23 +115,31 @@ def run_identify_robot(paths: Sequence[Path], params: Path, *, rate: float | Non
 
     """
     console = console or Terminal()
-    check_outputs(params, robot, json_path, None, 'report')
+    check_outputs(params, robot, json_path, picture, 'picture')
     robot_parameters = RobotParameters.load(robot)
     joints, rotors, notes = read_logs(paths, rate)
     results: dict = {'servos': None, 'rotor': None, 'warnings': notes}
-    servo = rotor = None
+    servo = rotor = model = None
     if joints:
         with console.status('identifying the servos'):
-            found = identify(joints, robot_parameters)
+            found = identify(joints, robot_parameters, one_delay=True)
             servo = servo_values(found, robot_parameters)
         results['servos'] = joint_results(found, [], robot_parameters)
         print_grids(of_joints.grids(results['servos'], brief=True), console)
     if rotors:
-        results['rotor'] = of_rotor.rotor_results(of_rotor.identify_rotor(rotors))
+        model = of_rotor.identify_rotor(rotors)
+        results['rotor'] = of_rotor.rotor_results(model)
         rotor = rotor_values(results['rotor'])
         print_grids(of_rotor.grids(results['rotor']), console)
     results['robot'] = write_measured(params, robot_parameters, robot, _line(
         'robot', paths, robot, params, rate), paths, servo, rotor)
+    both = {robot.stem if robot else 'published': robot_parameters,
+            'measured': RobotParameters.load(params)}
+    if joints:
+        print_grids([of_logs.errors(joints, both)], console)
+    if picture:
+        lags = (results['rotor'] or {}).get('lag') or {'logs': []}
+        of_logs.draw(picture, joints, model, lags['logs'], both)
     _print(console, [], [f'warning: {note}' for note in notes])
     write_json(json_path, results)
     return results

@@ -27,6 +27,7 @@ from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import load_yaml
 from beetle_omni_ros.runs.csv_table import LogError
 
+MILLI = 1e3
 DRAWS = 4000            # of the parameters, whose quantiles are the intervals
 TAILS = 2.5, 97.5       # [%] outside a 95 % interval
 GAINS = 'natural_frequency', 'damping_ratio'
@@ -109,8 +110,8 @@ def servo_values(found: Found, robot: RobotParameters) -> tuple[dict, dict, dict
               for k in (None, *range(len(servos.logs)))]
     effects: dict = {}
     intervals, origin = {}, {}
-    how = {'logs': [log.name for log in servos.logs], 'how': 'the same gains in all logs; '
-           'interval: also of each log, with gains that differ between logs'}
+    how = {'logs': [log.name for log in servos.logs], 'how': 'mean of the logs, '
+           'with the same gains; interval: also of each log, with gains that differ between logs'}
     for entry, parameters in best.items():
         effects[entry] = {}
         for name, drawn in parameters.items():
@@ -125,6 +126,10 @@ def servo_values(found: Found, robot: RobotParameters) -> tuple[dict, dict, dict
             effects[entry][name] = _plain(value)
             intervals[key] = [_plain(low), _plain(high)]
             origin[key] = how
+    if 'joint_offset' in found.chosen.entries:
+        zeros = MILLI * found.values()[:, INDEX['offset']]
+        origin['not written: joint_offset'] = how | {
+            'how': f'zeros of {zeros.min():.1f} to {zeros.max():.1f} mrad; each homing sets them'}
     delay = found.values()[:, INDEX['delay']].mean()
     origin['effects.joint_command_latency.delay'] = how | {
         'how': f'{delay:.4f} s in the mean of the logs, minus {own_delay():.3f} s that the '
@@ -235,8 +240,8 @@ def write_measured(path: Path, robot: RobotParameters, base: Path | None, comman
     """
     (effects, *of_servo), (rotors, *of_rotor) = servo or ({},) * 3, rotor or ({},) * 3
     if not effects and not rotors:
-        raise LogError(f'{", ".join(log.name for log in logs)}: no robot file written, because '
-                       'the logs show no value of it')
+        raise LogError(f'{path}: no robot file written, because the logs show no value of it '
+                       '(verdict bad_data of a rotor log?)')
     intervals, origin = ({**a, **b} for a, b in zip(of_rotor, of_servo, strict=True))
     merged = robot.effects | effects
     stated = {*intervals, *(f'rotors.{name}' for name in rotors), *settings(effects)}

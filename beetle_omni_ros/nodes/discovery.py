@@ -12,7 +12,6 @@ from itertools import count
 import os
 import socket
 
-from beetle_omni_ros.nodes.private import HeldError, Lock, remove_stale_locks
 from beetle_omni_ros.robot.schema import ParameterError
 
 VARIABLE, ARGUMENT = 'BEETLE_OMNI_DISCOVERY', '--discovery'
@@ -77,6 +76,23 @@ def apply_argument(arguments: Sequence[str]) -> list[str]:
     return rest
 
 
+def claim(name: str) -> socket.socket | None:
+    """
+    Take a name on this computer, until the socket is closed or the process ends.
+
+    Returns:
+        A socket of Linux' abstract namespace, which leaves no file; None: the name is taken.
+
+    """
+    holder = socket.socket(socket.AF_UNIX)
+    try:
+        holder.bind(f'\0beetle_omni/{name}')
+    except OSError:
+        holder.close()
+        return None
+    return holder
+
+
 @contextmanager
 def reserved_domain():
     """
@@ -89,24 +105,17 @@ def reserved_domain():
         Number of the domain.
 
     Raises:
-        OSError: no domain is free, or there is no safe folder for the locks.
+        OSError: no domain is free.
 
     """
     first = next(_starts) % len(DOMAINS)
     for number in [*DOMAINS[first:], *DOMAINS[:first]]:
-        try:
-            lock = Lock(f'domain{number}.lock')
-        except HeldError:
-            continue
-        try:
-            if _ports_are_free(number):
-                try:
+        holder = claim(f'domain/{number}')
+        if holder is not None:
+            with holder:
+                if _ports_are_free(number):
                     yield number
-                finally:
-                    remove_stale_locks(f'{number}.*.lock')      # files of nodes that were killed
-                return
-        finally:
-            lock.close()
+                    return
     raise OSError('no free ROS domain between 1 and 101')
 
 

@@ -10,6 +10,7 @@ from beetle_omni_ros.nodes.graph import Graph
 from beetle_omni_ros.nodes.health import ERROR
 from beetle_omni_ros.nodes.operator import Operator
 from beetle_omni_ros.nodes.plan import BRIDGES
+from beetle_omni_ros.robot.schema import RunError
 from beetle_omni_ros.runs.tasks import Task
 
 READY_TIMEOUT = 300.0   # s; the first start compiles the controller
@@ -33,11 +34,7 @@ MEASURED = {
     'joint_bridge_node': ('bus', 'servos'), 'rotor_bridge_node': ('board', 'motor_board')}
 
 
-class FlightError(RuntimeError):
-    """The flight failed; the text is one line for the operator."""
-
-
-class TooSlowError(FlightError):
+class TooSlowError(RunError):
     """The computer is too slow to fly this flight in real time."""
 
 
@@ -116,7 +113,7 @@ class Flight:
 
         Raises:
             TooSlowError: the simulator does not keep real time and ``may_be_slow`` is not set.
-            FlightError: any other failure.
+            RunError: any other failure.
 
         """
         operator = self._operator
@@ -131,12 +128,12 @@ class Flight:
         try:
             self._take_off()
             self._fly_task()
-        except FlightError as error:
+        except RunError as error:
             late, flown = self._lost_time() - lost, operator.time() - begin
             paused = any(PAUSED in state for state in operator.states)
             if late < SLOW_TIME and not paused:
                 raise
-            kind = FlightError if self._may_be_slow else TooSlowError
+            kind = RunError if self._may_be_slow else TooSlowError
             raise kind(f'{error}; the simulator fell {late:.1f} s behind in {flown:.0f} s'
                        + (', and supervisor_node was not scheduled' if paused else '')) from None
         self._take_latencies()
@@ -170,18 +167,18 @@ class Flight:
             if graph.simulated:
                 self.measured['real_time_factor'] = flown / passed
             if operator.state in ('disarmed', 'emergency_stop'):
-                raise FlightError(f"the flight ended early, supervisor in '{operator.state}'")
+                raise RunError(f"the flight ended early, supervisor in '{operator.state}'")
             if next(left, None) is None:
-                raise FlightError(f"the task does not continue at '{operator.progress}'")
+                raise RunError(f"the task does not continue at '{operator.progress}'")
 
     def _inject_faults(self):
         """Set the faults as the task begins, so that their times count from there."""
         operator = self._operator
         if not operator.wait(lambda: operator.progress.startswith('flying'), TAKEOFF_TIMEOUT):
-            raise FlightError(f"the task does not begin: '{operator.progress}'")
+            raise RunError(f"the task does not begin: '{operator.progress}'")
         accepted, answer = operator.set('sim_node', 'faults', self._faults)
         if not accepted:
-            raise FlightError(f'sim_node refuses the faults: {answer}')
+            raise RunError(f'sim_node refuses the faults: {answer}')
 
     def _take_latencies(self):
         operator = self._operator
@@ -203,7 +200,7 @@ class Flight:
             self._spin(SETTLE_TIME)
             while not (answer := operator.call('arm'))[0]:
                 if next(left, None) is None:
-                    raise FlightError(f'supervisor_node refuses to arm: {answer[1]}')
+                    raise RunError(f'supervisor_node refuses to arm: {answer[1]}')
                 self._spin()
             operator.states.clear()
             # The state may name a fault: disarmed:joint1_jammed.
@@ -212,7 +209,7 @@ class Flight:
                         TAKEOFF_TIMEOUT)
             if operator.state.startswith('flying'):
                 return
-        raise FlightError(f'no take-off in {TAKEOFF_ATTEMPTS} attempts; see the warnings below')
+        raise RunError(f'no take-off in {TAKEOFF_ATTEMPTS} attempts; see the warnings below')
 
     def land(self) -> None:
         """Land if the robot flies, and wait for the motors to stop."""
@@ -235,8 +232,8 @@ class Flight:
             self._spin()
             if next(left, None) is None:
                 waits = self._operator.waits_for(self._bridges)
-                raise FlightError(f'{text}: nothing after {timeout:g} s, supervisor in '
-                                  f"'{self._operator.state}'" + (waits and f'; {waits}'))
+                raise RunError(f'{text}: nothing after {timeout:g} s, supervisor in '
+                               f"'{self._operator.state}'" + (waits and f'; {waits}'))
 
     def _spin(self, seconds=CHECK_PERIOD):
         """Process messages; an ended process and a failing controller end the flight."""
@@ -245,12 +242,12 @@ class Flight:
                 if name not in self._reported}
         self._reported |= set(dead)
         if dead:
-            raise FlightError('; '.join(f'{name} died ({how})' for name, how in dead.items()))
+            raise RunError('; '.join(f'{name} died ({how})' for name, how in dead.items()))
         operator = self._operator
         status = operator.diagnostics.get(f'{operator.controller}_node: controller')
         if status is not None and status.level >= ERROR \
                 and not operator.state.startswith('flying'):
-            raise FlightError(status.message)
+            raise RunError(status.message)
 
     def _show(self, text, at='', completed=0.0):
         self._progress.update(self._bar, description=text, at=at,

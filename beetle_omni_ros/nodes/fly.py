@@ -18,13 +18,13 @@ from beetle_omni_ros import __version__
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.nodes import runner, speed
 from beetle_omni_ros.nodes.discovery import confine, reserved_domain
-from beetle_omni_ros.nodes.flight import Flight, FlightError, TooSlowError
+from beetle_omni_ros.nodes.flight import Flight, TooSlowError
 from beetle_omni_ros.nodes.graph import child_environment, Graph
 from beetle_omni_ros.nodes.operator import Operator
 from beetle_omni_ros.nodes.plan import ACTUATORS, GraphOptions, plan
 from beetle_omni_ros.nodes.runner import signals_ignored, sigterm_as_interrupt
 from beetle_omni_ros.robot.parameters import find_robot, RobotParameters
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.schema import ParameterError, RunError
 from beetle_omni_ros.runs import table
 from beetle_omni_ros.runs.bag import add_meta, BagError, check_new, read_bag
 from beetle_omni_ros.runs.json_file import check_writable, write_json
@@ -138,8 +138,7 @@ def _actuators_for(faults, actuators):
     for fault in faults:
         if fault.is_process:
             raise ParameterError(f"--faults: '{fault.kind}' affects a process; expected a fault "
-                                 'of the robot or its sensors; beetle_omni faults --ros kills '
-                                 'processes')
+                                 'of the robot or its sensors')
         if fault.changes(*listed.DEVICES):
             if actuators == 'emulated':
                 raise ParameterError(f"--faults: '{fault.kind}' affects a device; expected "
@@ -233,7 +232,7 @@ def _fly(graph: Graph, controller: str, task: Task, meta: dict, console: Console
                 flight.fly()
             except TooSlowError:
                 raise
-            except FlightError as error:
+            except RunError as error:
                 print(f'beetle_omni fly: error: {error}', file=sys.stderr)
                 status, failure = runner.FAILED, str(error)
             flight.land()

@@ -6,10 +6,11 @@ import time
 
 from std_srvs.srv import Trigger
 
+from beetle_omni_ros.drivers.device_parameters import ServoBusParameters
+from beetle_omni_ros.drivers.serial_port import SerialPortError
 from beetle_omni_ros.drivers.servo_bus import ServoBus
 from beetle_omni_ros.drivers.servo_link import ServoBusError
-from beetle_omni_ros.drivers.servo_loop import Goal, ServoLoop
-from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
+from beetle_omni_ros.drivers.servo_loop import ServoLoop
 from beetle_omni_ros.nodes import health
 from beetle_omni_ros.nodes.command_source import CommandSource
 from beetle_omni_ros.nodes.lifecycle_node import ACTIVE, AUTOSTART, INACTIVE, LifecycleFlightNode
@@ -38,7 +39,7 @@ class JointBridgeNode(LifecycleFlightNode):
     """Lifecycle node: configure checks the servos, activate switches their torque on."""
 
     real_time = True
-    refusals = (ServoBusError,)
+    refusals = (ServoBusError, SerialPortError)
 
     def __init__(self):
         super().__init__('joint_bridge_node', JointBridgeNodeParameters, 'params/servo_bus.yaml',
@@ -58,7 +59,7 @@ class JointBridgeNode(LifecycleFlightNode):
         self.health.report('bus', self._bus_status)
         self.health.report('latency', self._latency_status)
         for k, name in enumerate(JOINT_NAMES):
-            self.health.report(name, lambda k=k: servo_status(self._loop, k))
+            self.health.report(name, lambda k=k: servo_status(self._bus, k))
             self.create_service(Trigger, f'~/reboot_{name}',
                                 lambda request, response, k=k: self._on_reboot([k], response))
         self.create_service(Trigger, '~/reboot', lambda request, response: self._on_reboot(
@@ -109,11 +110,9 @@ class JointBridgeNode(LifecycleFlightNode):
             self._lost_reason = 'no torque, the node was shut down'
         if loop is not None:
             loop.stop()
-            self._log(loop)
         bus.close()
         if loop is not None:    # without a loop, the refusal was logged
-            for line in bus.take_events():
-                self.get_logger().warning(line)
+            self._log(bus)
 
     def close(self):
         """Switch the torque off and publish the state."""
@@ -131,9 +130,8 @@ class JointBridgeNode(LifecycleFlightNode):
             response.success, response.message = False, 'not configured'
             return response
         if which is None:
-            reports = self._loop.health()
-            which = [k for k, one in enumerate(reports) if one.errors and not one.torque] \
-                or list(range(len(reports)))
+            which = [k for k, servo in enumerate(self._bus.servos)
+                     if servo.errors and not servo.torque] or range(4)
         with self._loop.exclusive() as bus:
             for k in which:
                 bus.reboot(int(self.parameters.ids[k]))
@@ -148,7 +146,7 @@ class JointBridgeNode(LifecycleFlightNode):
             if math.isnan(published):
                 self._since, published = 'arrival', time.time()
             left = COMMAND_AGE - max(0.0, self.now() - command.stamp)
-            self._loop.offer(Goal(command.tilt, published, time.monotonic() + left))
+            self._loop.offer(command.tilt, published, time.monotonic() + left)
 
     def _on_written(self, published):
         self._latency.add(time.time() - published)
@@ -167,7 +165,7 @@ class JointBridgeNode(LifecycleFlightNode):
     def changed(self):
         """Log the thread's events; publish the state if it changed."""
         if self._loop is not None:
-            self._log(self._loop)
+            self._log(self._bus)
         text = self._state_text()
         if text != self._published:
             if text.startswith('lost') and not self._lost_reason:
@@ -177,8 +175,8 @@ class JointBridgeNode(LifecycleFlightNode):
             self._published = text
             self._state.publish(text)
 
-    def _log(self, loop):
-        for line in loop.take_events():
+    def _log(self, bus):
+        for line in bus.take_events():
             self.get_logger().warning(line)
 
     def _state_text(self):
@@ -200,20 +198,17 @@ class JointBridgeNode(LifecycleFlightNode):
         before, cycles, missed, then = self._counted
         if loop is not before:
             cycles = missed = 0
-        link = bus.statistics
         values = {
-            'stage': self.stage, 'cycles': loop.cycles, 'missed_cycles': loop.missed,
+            'stage': self.stage, 'cycles': loop.cycles, 'missed_cycles': loop.pace.missed,
             'rate_hz': (loop.cycles - cycles) / max(now - then, 1e-3),
-            'connected': bus.connected, 'goals_written': loop.written,
+            'connected': bus.link.is_open, 'goals_written': loop.written,
             'goals_stale': loop.stale, 'goals_clipped': bus.clipped,
-            'incomplete': loop.incomplete, 'transactions': link.transactions,
-            'unanswered': link.unanswered, 'corrupt': link.corrupt, 'refused': link.refused,
-            'connections': link.connections}
-        missed = loop.missed - missed
-        self._counted = (loop, loop.cycles, loop.missed, now)
+            'incomplete': loop.incomplete, **bus.link.counts}
+        missed = loop.pace.missed - missed
+        self._counted = (loop, loop.cycles, loop.pace.missed, now)
         if text.startswith('lost'):
             return health.ERROR, text, values
-        if not bus.connected:
+        if not bus.link.is_open:
             return health.WARN, 'no connection', values
         return (health.WARN, f'{missed} cycles missed', values) if missed else \
             (health.OK, text, values)
@@ -224,17 +219,18 @@ class JointBridgeNode(LifecycleFlightNode):
             **times.milliseconds(), 'count': times.count}
 
 
-def servo_status(loop, index):
+def servo_status(bus, index):
     """Return level, text and values of one servo."""
-    if loop is None:
+    if bus is None:
         return health.OK, 'not configured', {}
-    one = loop.health()[index]
-    values = {'id': one.identifier, 'responding': one.responding,
+    one = bus.servos[index]
+    recovering = one.recovery is not None or one.restarting
+    values = {'id': one.identifier, 'responding': not one.silent,
               'torque': 'unknown' if one.torque is None else one.torque,
               'voltage_v': one.voltage, 'temperature_c': one.temperature,
               'errors': ', '.join(one.errors) or 'none',
-              'watchdog_expired': one.watchdog_expired, 'recovering': one.recovering}
+              'watchdog_expired': one.watchdog_expired, 'recovering': recovering}
     if one.message:
-        bad = not one.responding or (one.errors and not one.torque)
+        bad = one.silent or (one.errors and not one.torque)
         return (health.ERROR if bad else health.WARN), one.message, values
-    return health.OK, 'being brought back' if one.recovering else 'ok', values
+    return health.OK, 'being brought back' if recovering else 'ok', values

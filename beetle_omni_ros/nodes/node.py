@@ -9,8 +9,8 @@ from rclpy.node import Node
 from beetle_omni_ros.messages.topics import Qos, topic_of
 from beetle_omni_ros.messages.values import MessageError
 from beetle_omni_ros.nodes import parameters, wire
+from beetle_omni_ros.nodes.discovery import claim
 from beetle_omni_ros.nodes.health import Health
-from beetle_omni_ros.nodes.private import HeldError, Lock
 from beetle_omni_ros.safety.events import ERROR, WARNING
 
 FUTURE = 0.05       # s ahead of the clock above which a stamp is refused
@@ -21,33 +21,12 @@ class StartError(RuntimeError):
     """A node cannot start or continue; the text is one line for the operator."""
 
 
-def lock_name(node: Node):
-    """
-    Take the lock of the node's name, until it is closed or the process ends.
-
-    The commands of two supervisors or the estimates of two estimators would alternate on one
-    topic. The lock file detects a second node on the same computer at once;
-    :func:`check_unique_name` detects one on another computer.
-
-    Raises:
-        StartError: another process of this computer holds the lock.
-
-    """
-    domain = node.context.get_domain_id()
-    name = node.get_fully_qualified_name()
-    try:
-        return Lock(f"{domain}{name.replace('/', '.')}.lock")
-    except HeldError as error:
-        raise StartError(f'{name} runs already (process {str(error) or "unknown"}, ROS domain '
-                         f'{domain}); stop it first') from None
-    except OSError as error:    # the graph check still stands
-        node.get_logger().warning(f'a second {name} on this computer cannot be detected: {error}')
-        return None
-
-
 def check_unique_name(node: Node) -> None:
     """
     Check that the ROS graph has no other node of the same name.
+
+    The commands of two supervisors or the estimates of two estimators would alternate on one
+    topic.
 
     Raises:
         StartError: there is one.
@@ -87,7 +66,11 @@ class FlightNode(Node):
 
         """
         super().__init__(name)
-        self._name_lock = lock_name(self)
+        domain, name = self.context.get_domain_id(), self.get_fully_qualified_name()
+        # At once for this computer; discovery of other ones takes seconds.
+        self._claim = claim(f'{domain}{name}')
+        if self._claim is None:
+            raise StartError(f'{name} runs already (ROS domain {domain}); stop it first')
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
         # Simulated time may stop, so timers of the flight must use it too.
         self.simulated = bool(self.get_parameter(parameters.CLOCK).value)
@@ -204,9 +187,8 @@ class FlightNode(Node):
         """Close, leave the graph, release the name."""
         self.close()
         super().destroy_node()
-        if self._name_lock:
-            self._name_lock.close()
-            self._name_lock = None
+        if self._claim:
+            self._claim.close()
 
 
 def _check_age(age, limit):

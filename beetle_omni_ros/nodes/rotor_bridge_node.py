@@ -4,9 +4,8 @@ from dataclasses import dataclass, replace
 import math
 import time
 
-from beetle_omni_ros.drivers.motor_board import MotorBoard
-from beetle_omni_ros.drivers.motor_board_arming import Arming, FLIES
-from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
+from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters
+from beetle_omni_ros.drivers.motor_board import Arming, FLIES, MotorBoard
 from beetle_omni_ros.drivers.serial_port import SerialPortError
 from beetle_omni_ros.nodes.command_source import CommandSource
 from beetle_omni_ros.nodes.lifecycle_node import AUTOSTART, LifecycleFlightNode
@@ -63,7 +62,8 @@ class RotorBridgeNode(LifecycleFlightNode):
         self._states = self.publisher('rotor_bridge/state')
         self._batteries = self.publisher('battery_state')
         self._rotors = self.publisher('rotor_states')
-        self._report = RotorBridgeReport(self.health, self._arming, self._stream)
+        self._report = RotorBridgeReport(self.health, self._board, self._arming,
+                                         self._stream)
         self.listen('command', self._on_command, read=CommandSource(self).read,
                     max_age=given.stamp_age_limit, stale_after=None, published=True)
         self.follow('supervisor/state', self._on_supervisor)
@@ -159,17 +159,16 @@ class RotorBridgeNode(LifecycleFlightNode):
         sent = self._board.send(command.thrust, command.stamp)
         self._sent = time.monotonic()
         self._stream.add(sent, self._sent)
-        return sent.sent
+        return not sent.reason
 
     def _poll(self):
-        update = self._board.poll()
-        self._report.update(update)
-        if update.battery is not None:
-            self._batteries.publish(replace(update.battery, cells=self._cells))
-        if update.rotors is not None:
-            self._rotors.publish(RotorReading(
-                update.rotors.stamp, RPM * update.rotors.rpm))
-        for event in update.events:
+        battery, rotors, events = self._board.poll()
+        self._report.update(battery, rotors)
+        if battery is not None:
+            self._batteries.publish(replace(battery, cells=self._cells))
+        if rotors is not None:
+            self._rotors.publish(RotorReading(rotors.stamp, RPM * rotors.rpm))
+        for event in events:
             self.log_line(*event)
 
     def _publish_state(self):

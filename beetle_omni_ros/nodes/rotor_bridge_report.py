@@ -6,9 +6,7 @@ import math
 
 import numpy as np
 
-from beetle_omni_ros.drivers.motor_board import Sent
-from beetle_omni_ros.drivers.motor_board_arming import Arming, FLIES, LOST
-from beetle_omni_ros.drivers.motor_board_messages import BoardUpdate
+from beetle_omni_ros.drivers.motor_board import Arming, FLIES, LOST, MotorBoard, Sent
 from beetle_omni_ros.nodes import health
 
 
@@ -45,7 +43,7 @@ class TargetStream:
 
     def add(self, sent: Sent, now: float) -> None:
         """Count the result of one target at monotonic time ``now`` [s]."""
-        if not sent.sent:
+        if sent.reason:
             self.unsent[sent.reason] += 1
             return
         if self._last is not None:
@@ -67,9 +65,9 @@ class TargetStream:
 class RotorBridgeReport:
     """Sources of the diagnostic statuses of the bridge."""
 
-    def __init__(self, reports: health.Health, arming: Arming, stream: TargetStream):
-        self._arming, self._stream = arming, stream
-        self._update: BoardUpdate | None = None
+    def __init__(self, reports: health.Health, board: MotorBoard, arming: Arming,
+                 stream: TargetStream):
+        self._board, self._arming, self._stream = board, arming, stream
         self._battery = self._rotors = None
         self._saturated, self._missed = stream.saturated.copy(), 0
         reports.report('board', self._board_status)
@@ -77,11 +75,10 @@ class RotorBridgeReport:
         for k in range(4):
             reports.report(f'rotor{k + 1}', partial(self._rotor_status, k))
 
-    def update(self, update: BoardUpdate) -> None:
-        """Store the newest data of the board."""
-        self._update = update
-        self._battery = update.battery or self._battery
-        self._rotors = update.rotors or self._rotors
+    def update(self, battery, rotors) -> None:
+        """Store the newest measurements of the board; None for no new one."""
+        self._battery = battery or self._battery
+        self._rotors = rotors or self._rotors
 
     def _board_status(self):
         arming, stream, text = self._arming, self._stream, self._arming.text
@@ -92,18 +89,14 @@ class RotorBridgeReport:
             health.OK if text == 'ready' and not missed else health.WARN
         if missed and text == 'ready':
             text = f'{missed} cycles missed'
-        update = self._update
-        if update is None:
-            return level, text, values
-        if update.status is not None:
-            status = update.status
+        if status := self._board.state.status:
             values.update({'armed': int(status.armed), 'state': status.state,
                            'last disarmed': status.stop_reason,
                            'conditions': ', '.join(status.conditions),
                            'contract': status.contract})
         if self._battery is not None:
             values.update({'voltage_V': self._battery.voltage, 'current_A': self._battery.current})
-        return level, text, {**values, **_link(update)}
+        return level, text, {**values, **self._board.link()}
 
     def _latency_status(self):
         times, ages = self._stream.latency, self._stream.age
@@ -131,18 +124,3 @@ class RotorBridgeReport:
         if saturates:
             return health.WARN, 'target above the thrust that the battery permits', values
         return health.OK, 'ok', values
-
-
-def _link(update):
-    """Counters of both directions of the link, and clock synchronisation."""
-    link, received = update.link, update.link.received
-    values = {'received': received.messages, 'lost': received.lost, 'bad_crc': received.bad_crc,
-              'skipped_bytes': received.skipped_bytes, 'sent': link.sent,
-              'buffer_full': link.dropped, 'connections': link.connections}
-    if link.board is not None:
-        values.update({'board lost': link.board.lost, 'board bad_crc': link.board.bad_crc,
-                       'board refused': link.board.refused,
-                       'board timeouts': link.board.timeouts})
-    values.update({'clock_offset_s': update.clock_offset,
-                   'clock_uncertainty_ms': 1e3 * update.clock_uncertainty})
-    return values

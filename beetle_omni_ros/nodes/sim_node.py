@@ -7,7 +7,7 @@ import time
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 
-from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
+from beetle_omni_ros.drivers.device_parameters import ServoBusParameters
 from beetle_omni_ros.messages.conversions import set_time
 from beetle_omni_ros.messages.topics import SENSOR
 from beetle_omni_ros.messages.values import Odom

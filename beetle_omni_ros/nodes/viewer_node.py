@@ -1,21 +1,24 @@
-"""ROS node for RViz and Foxglove: robot description, frames and markers."""
+"""ROS node for RViz and Foxglove: the frame of the body and markers."""
 
 from dataclasses import dataclass
 
 from geometry_msgs.msg import Point, TransformStamped
 import numpy as np
-from std_msgs.msg import ColorRGBA, String
+from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
 from beetle_omni_ros.messages.conversions import BODY, set_time, set_xyz, set_xyzw, WORLD
-from beetle_omni_ros.messages.topics import EVENT, LATCHED, SENSOR
+from beetle_omni_ros.messages.topics import EVENT, SENSOR
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.node import FlightNode
-from beetle_omni_ros.nodes.transform_message import transform_message
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters
+from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import parameter
-from beetle_omni_ros.robot.urdf import description, joints
+
+try:
+    from tf2_msgs.msg import TFMessage
+except ImportError:     # a ROS from PyPI, for which there is no viewer of frames either
+    TFMessage = None
 
 BODY_COLOUR, THRUST_COLOUR, TARGET_COLOUR = (0.3, 0.3, 0.35), (0.9, 0.5, 0.1), (0.2, 0.7, 0.3)
 
@@ -25,11 +28,7 @@ class ViewerNodeParameters:
     """Parameters of viewer_node."""
 
     robot_file: str = parameter('', doc='robot file; empty: the shipped one', read_only=True)
-    urdf_file: str = parameter('', doc='robot description; empty: the shipped one',
-                               read_only=True)
-    links: bool = parameter(True, doc='publish description and frames of the links; false if '
-                                      'robot_state_publisher runs', read_only=True)
-    frame_rate: float = parameter(50.0, doc='rate of the frames', unit='Hz', low=0.5, high=200,
+    frame_rate: float = parameter(50.0, doc='rate of the frame', unit='Hz', low=0.5, high=200,
                                   read_only=True)
     rate: float = parameter(20.0, doc='rate of the markers', unit='Hz', low=0.5, high=100,
                             read_only=True)
@@ -38,23 +37,18 @@ class ViewerNodeParameters:
 
 
 class ViewerNode(FlightNode):
-    """Publishes robot_description (latched), tf and markers."""
+    """Publishes the transform from world to base_link, and markers."""
 
     def __init__(self):
         super().__init__('viewer_node', ViewerNodeParameters, on_change=self._changed)
         given = self.parameters
         self._robot = RobotParameters.load(given.robot_file or None)
-        self._transform_message = transform_message()
-        self._transforms = self._moving = None
-        if given.links:
-            self._describe(description(given.urdf_file))
-        if self._transform_message:
-            self._transforms = self.create_publisher(self._transform_message, '/tf',
-                                                     wire.profile(EVENT))
+        if TFMessage is not None:
+            self._transforms = self.create_publisher(TFMessage, '/tf', wire.profile(EVENT))
             self.create_timer(1 / given.frame_rate, self._move, clock=self.steady_clock)
         self._markers = self.create_publisher(MarkerArray, 'markers', wire.profile(EVENT))
         self._odom = self._joints = self._command = self._target = None
-        self._moved = None      # stamp of the estimate that the frames show
+        self._moved = None      # stamp of the estimate that the frame shows
         self.listen('odom', self._keep('_odom'), qos=SENSOR)
         self.listen('joint_states', self._keep('_joints'))
         self.listen('command', self._keep('_command'), qos=SENSOR, stale_after=None)
@@ -67,35 +61,19 @@ class ViewerNode(FlightNode):
     def _keep(self, name):
         return lambda value: setattr(self, name, value)
 
-    def _describe(self, text):
-        """Publish the description and the fixed frames, once."""
-        tree = joints(text)
-        self._moving = [joint for joint in tree if joint.axis is not None]
-        self._description = self.create_publisher(String, 'robot_description',
-                                                   wire.profile(LATCHED))
-        self._description.publish(String(data=text))
-        if self._transform_message:
-            self._fixed = self.create_publisher(self._transform_message, '/tf_static',
-                                                wire.profile(LATCHED))
-            self._fixed.publish(self._transform_message(transforms=[
-                _transform(self.now(), joint.parent, joint.child, joint.position,
-                           joint.quaternion) for joint in tree if joint.axis is None]))
-
     def _move(self):
-        """Publish the moving frames, if there is a subscription."""
-        odom, angles = self._odom, self._joints
+        """Publish the frame of the body, if there is a subscription."""
+        odom = self._odom
         if odom is None or odom.stamp == self._moved or \
                 not self._transforms.get_subscription_count():
             return
         self._moved = odom.stamp
-        frames = [_transform(odom.stamp, WORLD, BODY, odom.position,
-                             odom.quaternion)]
-        if angles is not None and self._moving:
-            angle = dict(zip(JOINT_NAMES, angles.position))
-            frames += [_transform(angles.stamp, joint.parent, joint.child, joint.position,
-                                  joint.turned(angle[joint.name]))
-                       for joint in self._moving if joint.name in angle]
-        self._transforms.publish(self._transform_message(transforms=frames))
+        frame = TransformStamped(child_frame_id=BODY)
+        set_time(frame.header.stamp, odom.stamp)
+        frame.header.frame_id = WORLD
+        set_xyz(frame.transform.translation, odom.position)
+        set_xyzw(frame.transform.rotation, odom.quaternion)
+        self._transforms.publish(TFMessage(transforms=[frame]))
 
     def _draw(self):
         if self._odom is None or not self._markers.get_subscription_count():
@@ -131,12 +109,3 @@ class ViewerNode(FlightNode):
         marker.points = [Point(x=float(p[0]), y=float(p[1]), z=float(p[2]))
                          for p in np.asarray(points)]
         return marker
-
-
-def _transform(stamp, parent, child, position, quaternion):
-    frame = TransformStamped(child_frame_id=child)
-    set_time(frame.header.stamp, stamp)
-    frame.header.frame_id = parent
-    set_xyz(frame.transform.translation, position)
-    set_xyzw(frame.transform.rotation, quaternion)
-    return frame

@@ -54,8 +54,6 @@ class HoldingParameters(ParameterFile, file='degraded.yaml'):
     escape_time: float = parameter(
         1.5, doc='time for which the attitude of an escape is held before a landing turns the '
         'body further', unit='s', low=0.01, high=20)
-    holding_margin: float = parameter(1.0, doc='margin at which a target attitude is not replaced',
-                                      unit='m/s^2, rad/s^2', low=0, high=20)
 
 
 class Holding:

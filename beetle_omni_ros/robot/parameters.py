@@ -261,12 +261,19 @@ class RobotParameters:
         return value, value
 
     def drawn(self, rng: np.random.Generator) -> RobotParameters:
-        """A robot with each measured value drawn uniformly from its interval."""
+        """
+        A robot with measured values drawn from their intervals, positive ones by ratio.
+
+        The values of one joint have one place in their intervals: logs determine their ratios, the
+        lag Kd / Kp and the angle at which friction holds, better than the values.
+        """
+        place = rng.random(4)
         sections: dict[str, dict] = {}
         effects = deepcopy(self.effects)
         own: dict[str, Any] = {}
         for key, (low, high) in self.intervals.items():
-            value = rng.uniform(low, high)
+            share = place if np.shape(low) == (4,) else rng.random(np.shape(low))
+            value = (low * (high / low)**share if np.all(low > 0) else low + (high - low) * share)
             value = value.tolist() if np.ndim(value) else float(value)
             section, *rest = key.split('.')
             if section == 'effects':
@@ -295,7 +302,10 @@ class RobotParameters:
         """
         path = find_robot(path) if path else share_path('params/robot.yaml')
         if not path.is_file():
-            raise ParameterError(f'{path}: no such file')
+            shipped = sorted(each.stem.removeprefix('robot_')
+                             for each in share_path('params').glob('robot_*.yaml'))
+            raise ParameterError(f'{path}: no such file; expected a robot file, or one of the '
+                                 f"shipped {', '.join(shipped)}")
         robot = schema.bind(cls, _merged(path, ()), str(path))
         with _named(path):
             check_parts(robot)

@@ -23,6 +23,10 @@ NAMES = tuple[str, ...]     # type of a parameter that is a list of names
 FILE_NAME, KEY, WHOLE = 500, 80, 1000    # characters of them in a message
 
 
+class RunError(RuntimeError):
+    """A flight, a comparison or a training failed; the text is one line."""
+
+
 class ParameterError(ValueError):
     """A parameter file or value cannot be used; the text names file, key and expected value."""
 

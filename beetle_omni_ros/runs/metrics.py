@@ -28,7 +28,6 @@ from beetle_omni_ros.runs.tasks import (
     make_task,
     POSE_DURATION,
     Task,
-    TaskError,
 )
 
 U_WINDOW = (7.0, 7.5)  # [s] after the target
@@ -95,7 +94,7 @@ def task_of(log: FlightLog) -> Task | None:
         return None
     try:
         return make_task(name, int(log.meta.get('seed') or 0))
-    except (TaskError, ValueError):
+    except ValueError:
         return None
 
 

@@ -17,10 +17,6 @@ START = (0.0, 0.0, 1.0)     # [m] position after the take-off
 COLUMNS = ('x_m', 'y_m', 'z_m', 'roll_deg', 'pitch_deg', 'yaw_deg')
 
 
-class TaskError(ParameterError):
-    """A task is unusable; the text names file, row, column and expectation."""
-
-
 def read_poses(path: str | Path, reach: float = np.inf) -> np.ndarray:
     """
     Read a pose file with the header ``x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg``.
@@ -35,13 +31,13 @@ def read_poses(path: str | Path, reach: float = np.inf) -> np.ndarray:
         (N, 6) x, y, z [m], roll, pitch, yaw [deg].
 
     Raises:
-        TaskError: unusable file; names file, row (as in an editor), column and expectation.
+        ParameterError: unusable file; names file, row (as in an editor), column and expectation.
 
     """
     table = read_table(path, _columns, ','.join(COLUMNS), rows=' and poses', comment=None,
-                       error=TaskError, check=_unusable)
+                       error=ParameterError, check=_unusable)
     if not len(table):
-        raise TaskError(f'{path}: no pose below the header; expected at least one row')
+        raise ParameterError(f'{path}: no pose below the header; expected at least one row')
     poses = np.stack(list(table.columns.values()), axis=1)
     check_steps(poses, reach, lambda k: f'{path}: row {table.rows[k]}')
     return poses
@@ -52,27 +48,27 @@ def check_steps(poses: np.ndarray, reach: float, where: Callable[[int], str]) ->
     Check that the steps between poses (N, 6) are at most ``reach`` [m].
 
     Raises:
-        TaskError: a longer step to pose k; the text begins with ``where(k)``.
+        ParameterError: a longer step to pose k; the text begins with ``where(k)``.
 
     """
     steps = np.linalg.norm(np.diff(poses[:, :3], axis=0, prepend=[START]), axis=1)
     if np.any(steps > reach):
         k = int(np.argmax(steps > reach))
-        raise TaskError(f'{where(k)}: {steps[k]:.4g} m from '
-                        f"{'the pose before' if k else 'the take-off'}, expected at most "
-                        f'{reach:g} m: the reach of the controller')
+        raise ParameterError(f'{where(k)}: {steps[k]:.4g} m from '
+                             f"{'the pose before' if k else 'the take-off'}, expected at most "
+                             f'{reach:g} m: the reach of the controller')
 
 
 def _columns(header):
     unknown = [cell for cell in header if cell not in COLUMNS]
     if unknown:
-        raise TaskError(f'unknown column {quoted(unknown[0])}')
+        raise ParameterError(f'unknown column {quoted(unknown[0])}')
     missing = [name for name in COLUMNS if name not in header]
     if missing:
-        raise TaskError(f"column '{missing[0]}' is missing")
+        raise ParameterError(f"column '{missing[0]}' is missing")
     if len(header) != len(COLUMNS):
         twice = next(name for name in header if header.count(name) > 1)
-        raise TaskError(f"column '{twice}' occurs twice")
+        raise ParameterError(f"column '{twice}' occurs twice")
     return list(COLUMNS)
 
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from beetle_omni_ros.control.base import PoseTarget, Target, TrajectoryTarget
 from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs import lemniscate, pose_file
-from beetle_omni_ros.runs.pose_file import TaskError
 
 POSE_DURATION = 8.0  # [s] of one pose
 HOVER_DURATION = 60.0  # [s]
@@ -196,7 +196,7 @@ def make_task(name: str | Path, seed: int = 0, reach: float = np.inf) -> Task:
         reach: largest step between two poses of a file for the controller [m].
 
     Raises:
-        TaskError: unknown name, or an unusable file.
+        ParameterError: unknown name, or an unusable file.
 
     """
     name = str(name)
@@ -211,8 +211,8 @@ def make_task(name: str | Path, seed: int = 0, reach: float = np.inf) -> Task:
                 'payload': _payload_task}[name](name)
     if name.lower().endswith('.csv') or name and Path(name).exists():
         return _pose_task(name, pose_file.read_poses(name, reach))
-    raise TaskError(f"task '{name}': expected a CSV file of poses, random1 to random999999 or one "
-                    f"of {', '.join(NAMES)}")
+    raise ParameterError(f"task '{name}': expected a CSV file of poses, random1 to random999999 "
+                         f"or one of {', '.join(NAMES)}")
 
 
 def random_poses(count: int, seed: int) -> np.ndarray:
@@ -292,16 +292,16 @@ def trajectory_task(name: str, times: np.ndarray, positions: np.ndarray,
         quaternions: (N, 4) body to world (x, y, z, w).
 
     Raises:
-        TaskError: inconsistent shapes, or too few samples.
+        ParameterError: inconsistent shapes, or too few samples.
 
     """
     times, positions, quaternions = (np.asarray(array, dtype=float)
                                      for array in (times, positions, quaternions))
     count = len(times)
     if count < 3 or positions.shape != (count, 3) or quaternions.shape != (count, 4):
-        raise TaskError(f"task '{name}': expected times (N,), positions (N, 3) and quaternions "
-                        f'(N, 4) of at least 3 samples, found {times.shape}, {positions.shape} '
-                        f'and {quaternions.shape}')
+        raise ParameterError(f"task '{name}': expected times (N,), positions (N, 3) and "
+                             'quaternions (N, 4) of at least 3 samples, found '
+                             f'{times.shape}, {positions.shape} and {quaternions.shape}')
     quaternions = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
     steps = [rotations.log(rotations.multiply(rotations.conjugate(a), b))
              for a, b in zip(quaternions, quaternions[1:])]
@@ -323,9 +323,10 @@ def poses_task(name: str, poses: np.ndarray) -> Task:
     """Make a task of (N, 6) poses: x, y, z [m], roll, pitch, yaw [deg], 8 s each."""
     poses = np.atleast_2d(np.asarray(poses, dtype=float))
     if poses.ndim != 2 or poses.shape[1] != 6 or not np.isfinite(poses).all():
-        raise TaskError(f"task '{name}': expected finite poses (N, 6), found shape {poses.shape}")
+        raise ParameterError(f"task '{name}': expected finite poses (N, 6), found shape "
+                             f'{poses.shape}')
     return _pose_task(name, poses)
 
 
 __all__ = ['control_lost', 'make_task', 'Moment', 'NAMES', 'pose_target', 'poses_task',
-           'random_poses', 'Segment', 'Task', 'TaskError', 'TaskPlayer', 'trajectory_task']
+           'random_poses', 'Segment', 'Task', 'TaskPlayer', 'trajectory_task']

@@ -1,7 +1,7 @@
 """
 Pictures of robots without a display; the simulation does not use this module.
 
-It needs an off-screen OpenGL, see :func:`beetle_omni_ros.film.graphics.choose_backend`.
+It needs an off-screen OpenGL, which the variable MUJOCO_GL selects.
 """
 
 from __future__ import annotations
@@ -12,18 +12,35 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.sim.figure import Figure, HUB_HEIGHT, Look
-from beetle_omni_ros.sim.parameters import PlantParameters, SimulatorParameters
+from beetle_omni_ros.robot.parameters import ROTOR_NAMES
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.urdf import Joint, Link, Model, Visual
 
 SAMPLES = 4                     # samples per pixel, for smooth edges
 JOINTS = 15                     # generalised positions of one robot
-SPIN = 47.0                     # [rad/s] drawn; true propellers would flicker
+SPIN = 47.0, -47.0, 47.0, -47.0 # [rad/s] drawn; true propellers would flicker
 THRUST = (0.02, 0.66, 0.42)
 THRUST_SCALE = 0.030            # [m/N] length of an arrow
 SHAFT, TRAIL_WIDTH = 0.011, 0.009
 MOST_GEOMS = 4000
+# MuJoCo's sizes are half edges and half lengths.
+HALF = {'box': (0.5, 0.5, 0.5), 'cylinder': (1.0, 0.5), 'sphere': (1.0,)}
 HAZE, FLOOR = (0.93, 0.95, 0.97), (0.73, 0.77, 0.82)
+
+
+@dataclass(frozen=True)
+class Look:
+    """
+    Appearance of a robot.
+
+    Attributes:
+        opacity: 1 for a solid robot, less for a ghost.
+        tint: (3,) colour of the whole robot, or None for the colours of its parts.
+
+    """
+
+    opacity: float = 1.0
+    tint: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -67,39 +84,34 @@ class Trail:
 
 class Stage:
     """
-    Draws pictures of robots over a floor.
+    Draws pictures of the robot of the shipped URDF over a floor.
 
     Args:
         looks: appearance of each robot, in the order of the poses.
         width, height: size of a picture [pixels].
         field_of_view: vertical field of view [deg].
-        plant: sizes of feet and propellers; default: params/simulator.yaml.
 
     Raises:
-        RuntimeError: no off-screen OpenGL.
+        ParameterError: no off-screen OpenGL.
 
     """
 
-    def __init__(self, robot: RobotParameters, looks: Sequence[Look], width: int, height: int,
-                 field_of_view: float = 30.0, plant: PlantParameters | None = None):
-        figure = Figure(robot, plant or SimulatorParameters.load().plant)
-        scene = _scene(''.join(map(figure.body, looks)), field_of_view, width, height)
-        self._spin = robot.rotors.spin
-        self._model = mujoco.MjModel.from_xml_string(scene)
+    def __init__(self, looks: Sequence[Look], width: int, height: int,
+                 field_of_view: float = 30.0):
+        self._model = mujoco.MjModel.from_xml_string(scene(looks, field_of_view, width, height))
         self._data = mujoco.MjData(self._model)
-        self._arms = np.array([self._model.body(2 + 9 * k + 2 * arm).id
-                               for k in range(len(looks)) for arm in range(4)]).reshape(-1, 4)
-        ghosts = {2 + 9 * k - 1 + part for k, look in enumerate(looks) if look.opacity < 1
-                  for part in range(9)}
+        self._rotors = [[self._model.body(f'{name}_{k}').id for name in ROTOR_NAMES]
+                        for k in range(len(looks))]
+        ghosts = {self._model.body(f'base_link_{k}').id for k, look in enumerate(looks)
+                  if look.opacity < 1}
         self._ghostly = {geom for geom, body in enumerate(self._model.geom_bodyid)
-                         if int(body) in ghosts}
-        self._rotor = np.array([robot.parts.module.rotor_offset, 0, HUB_HEIGHT])
+                         if self._model.body_rootid[body] in ghosts}
         try:
             self._renderer = mujoco.Renderer(self._model, height, width, MOST_GEOMS)
         except Exception as error:
             # The OpenGL back ends raise exceptions of different types.
-            raise RuntimeError(f'no off-screen OpenGL ({type(error).__name__}: {error})') \
-                from error
+            raise ParameterError(f'no off-screen OpenGL ({type(error).__name__}: {error}); '
+                                 'install libegl1, libgl1-mesa-dri and libopengl0 (apt)') from None
 
     def __enter__(self) -> Stage:
         return self
@@ -127,23 +139,22 @@ class Stage:
                 geom.category = mujoco.mjtCatBit.mjCAT_DECOR    # which casts no shadow
         for trail in trails:
             self._path(trail)
-        for arms, pose in zip(self._arms, poses, strict=True):
+        for rotors, pose in zip(self._rotors, poses, strict=True):
             if pose is not None and pose.thrust is not None:
-                for arm, thrust in zip(arms, pose.thrust, strict=True):
-                    self._arrow(arm, thrust)
+                for rotor, thrust in zip(rotors, pose.thrust, strict=True):
+                    self._arrow(rotor, thrust)
         return self._renderer.render()
 
     def _joints(self, pose):
         if pose is None:
             return np.concatenate([[0, 0, -9, 1], np.zeros(JOINTS - 4)])
         x, y, z, w = pose.quaternion
-        turns = np.asarray(self._spin) * SPIN * pose.time
+        turns = np.array(SPIN) * pose.time
         return np.concatenate([pose.position, [w, x, y, z],
                                np.stack([pose.tilt, turns], axis=1).ravel()])
 
-    def _arrow(self, arm, thrust):
-        turn = self._data.xmat[arm].reshape(3, 3)
-        hub = self._data.xpos[arm] + turn @ self._rotor
+    def _arrow(self, rotor, thrust):
+        turn, hub = self._data.xmat[rotor].reshape(3, 3), self._data.xpos[rotor]
         self._connect(mujoco.mjtGeom.mjGEOM_ARROW, SHAFT, hub + 0.02 * turn[:, 2],
                       hub + (0.03 + THRUST_SCALE * thrust) * turn[:, 2], (*THRUST, 0.9))
 
@@ -166,12 +177,23 @@ class Stage:
         scene.ngeom += 1
 
 
-def _scene(bodies, field_of_view, width, height):
+def scene(looks: Sequence[Look], field_of_view: float, width: int, height: int) -> str:
+    """
+    MJCF of floor and robots.
+
+    Generalised positions of each robot: pose of base_link (7), then for each arm the tilt and the
+    angle of the propeller (8).
+    """
+    model = Model.load()
+    meshes = ''.join(f'<mesh name="{path.stem}" file="{path}" inertia="shell"/>\n' for path in {
+        visual.file for link in model.links.values() for visual in link.visuals if visual.file})
+    bodies = ''.join(_body(model, link, k, look) for k, look in enumerate(looks)
+                     for link in model.links.values() if link.joint is None)
     haze, floor = (' '.join(map(str, colour)) for colour in (HAZE, FLOOR))
     return f"""
 <mujoco>
   <statistic center="0 0 0.5" extent="4"/>
-  <compiler angle="radian"/>
+  <compiler angle="radian" inertiafromgeom="false"/>
   <visual>
     <global offwidth="{width}" offheight="{height}" fovy="{field_of_view}"/>
     <quality offsamples="{SAMPLES}" shadowsize="2048" numslices="20" numstacks="10"/>
@@ -187,7 +209,7 @@ def _scene(bodies, field_of_view, width, height):
     <material name="floor" texture="tiles" texrepeat="2 2" texuniform="true"
               specular="0.1" shininess="0.1"/>
     <material name="gloss" specular="0.6" shininess="0.6"/>
-    <material name="glow" specular="0.1" shininess="0.1" emission="0.35"/>
+    {meshes}
   </asset>
   <default><geom contype="0" conaffinity="0"/></default>
   <worldbody>
@@ -199,3 +221,37 @@ def _scene(bodies, field_of_view, width, height):
     {bodies}
   </worldbody>
 </mujoco>"""
+
+
+def _body(model: Model, link: Link, k: int, look: Look) -> str:
+    """MJCF of a link of robot ``k`` with all links that it carries."""
+    joint = link.joint
+    if joint is None:
+        place, hinge = '', '<freejoint/>'
+    else:
+        place = _place(joint)
+        axis = (0, 0, 1) if link.name in ROTOR_NAMES else joint.axis
+        hinge = '' if axis is None else f'<joint axis="{_numbers(axis)}"/>'
+    shapes = ''.join(_geom(visual, look) for visual in link.visuals)
+    carried = ''.join(_body(model, other, k, look) for other in model.links.values()
+                      if other.joint is not None and other.joint.parent == link.name)
+    # MuJoCo requires mass of a moving body.
+    return (f'<body name="{link.name}_{k}" {place}>{hinge}<inertial pos="0 0 0" mass="0.01" '
+            f'diaginertia="1e-5 1e-5 1e-5"/>{shapes}{carried}</body>\n')
+
+
+def _place(placed: Joint | Visual) -> str:
+    return (f'pos="{_numbers(placed.position)}" '
+            f'quat="{_numbers(placed.quaternion[[3, 0, 1, 2]])}"')
+
+
+def _geom(visual: Visual, look: Look) -> str:
+    shape = f'mesh="{visual.file.stem}"' if visual.file else \
+        f'size="{_numbers(visual.size * np.array(HALF[visual.shape]))}"'
+    *colour, opacity = visual.colour
+    return (f'<geom type="{visual.shape}" {shape} {_place(visual)} material="gloss" '
+            f'rgba="{_numbers((*(look.tint or colour), opacity * look.opacity))}"/>')
+
+
+def _numbers(values):
+    return ' '.join(f'{x:.6g}' for x in np.ravel(values))

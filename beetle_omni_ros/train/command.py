@@ -9,10 +9,10 @@ from rich.console import Console
 import torch
 
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.schema import ParameterError, RunError
 from beetle_omni_ros.runs.json_file import check_writable, write_json
 from beetle_omni_ros.train.assess import assess
-from beetle_omni_ros.train.export import export_policy, ExportError
+from beetle_omni_ros.train.export import export_policy
 from beetle_omni_ros.train.run_folder import (
     last_checkpoint,
     make_folder,
@@ -35,10 +35,6 @@ COLUMNS = (('iteration', 'iteration', '{:.0f}'), ('seconds', 'time s', '{:.0f}')
            ('learning_rate', 'rate', '{:.0e}'))
 
 OF_TARGETS = ('success_rate', 'position_error_m', 'attitude_error_deg')  # averages over targets
-
-
-class TrainingError(RuntimeError):
-    """The training cannot continue, or its policy cannot be written; one line."""
 
 
 def choose_device(name: str) -> str:
@@ -84,7 +80,7 @@ def run_train(*, output: Path | None, config: Path | None = None, robot: Path | 
 
     Raises:
         ParameterError: unusable input, one line.
-        TrainingError: the loss is not finite, or the exported file is wrong; one line.
+        RunError: the loss is not finite, or the exported file is wrong; one line.
         KeyboardInterrupt: raised again after a checkpoint.
 
     """
@@ -131,8 +127,8 @@ def run_train(*, output: Path | None, config: Path | None = None, robot: Path | 
             console.print(f'interrupted; continue with: beetle_omni train --resume {path.parent}',
                           soft_wrap=True)
         raise
-    except (FloatingPointError, ExportError) as error:
-        raise TrainingError(str(error)) from None
+    except FloatingPointError as error:
+        raise RunError(str(error)) from None
 
 
 def _finish(runner, robot, output, device, smoke, json_path, console):

@@ -16,16 +16,13 @@ from beetle_omni_ros import __version__
 from beetle_omni_ros.control import onnx_runtime, policy_checksum
 from beetle_omni_ros.control.policy_file import INPUT, OUTPUT, PolicyContract
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import RunError
 from beetle_omni_ros.train.network import ActorModel, ExportedPolicy
 from beetle_omni_ros.train.parameters import TrainParameters
 
 OPSET = 18
 AGREEMENT = 1e-5     # largest difference of torch and onnxruntime, relative to the largest action
 PROBES = 256         # compared observations
-
-
-class ExportError(RuntimeError):
-    """The written file and the network compute different actions."""
 
 
 def export_policy(actor: ActorModel, path: Path, robot: RobotParameters,
@@ -46,7 +43,7 @@ def export_policy(actor: ActorModel, path: Path, robot: RobotParameters,
         largest difference of torch and onnxruntime, relative to the largest action.
 
     Raises:
-        ExportError: the difference exceeds ``AGREEMENT``.
+        RunError: the difference exceeds ``AGREEMENT``.
 
     """
     import onnx
@@ -76,8 +73,8 @@ def export_policy(actor: ActorModel, path: Path, robot: RobotParameters,
     difference = compare(actor.mean, part, size)
     if not difference <= AGREEMENT:
         part.unlink()
-        raise ExportError(f'{path}: torch and onnxruntime differ by {difference:.2g}, more than '
-                          f'{AGREEMENT:g}')
+        raise RunError(f'{path}: torch and onnxruntime differ by {difference:.2g}, more than '
+                       f'{AGREEMENT:g}')
     part.replace(path)
     return difference
 

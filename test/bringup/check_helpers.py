@@ -8,8 +8,7 @@ from servo_bench import PATIENT
 from beetle_omni_ros.bringup.board import check_board
 from beetle_omni_ros.bringup.limits import CheckLimits
 from beetle_omni_ros.bringup.servos import check_servos
-from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
-from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
+from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters, ServoBusParameters
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 LIMITS, ROBOT = CheckLimits.load(), RobotParameters.load()

@@ -9,7 +9,7 @@ pytest.importorskip('dynamixel_sdk')
 
 from check_helpers import board, levels, QUICK, repeated
 
-from beetle_omni_ros.drivers import motor_board_messages
+from beetle_omni_ros.drivers import motor_board_state
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 
 pytestmark = pytest.mark.real_time
@@ -48,39 +48,36 @@ def test_an_old_start_of_another_program_is_not_counted_as_loss(emulated):
     board_with(emulated, {})
 
 
-@pytest.mark.parametrize(('volts', 'level', 'blocks'), [
-    (20.0, 'fail', True), (21.6, 'warn', False), (26.0, 'fail', False)])
-def test_the_battery_is_judged_by_its_cells(emulated, volts, level, blocks):
-    emulated.set_battery(volts, 0.0)
-    bad = {'battery': level} | ({'board ready to arm': 'fail'} if blocks else {})
-    found = board_with(emulated, bad)
-    assert f'{volts / 6:.2f} V a cell of 6' in found['battery'].found
-    assert ('battery low' in found['board ready to arm'].found) == blocks
+def volts(volts):
+    """Return a function that sets the voltage of the pack."""
+    return lambda emulated: emulated.set_battery(volts, 0.0)
 
 
-def test_a_failed_esc_is_named(emulated):
-    emulated.faults.failed_escs = (2,)
-    found = board_with(emulated, {'ESC of rotor 2': 'fail', 'board ready to arm': 'fail'})
-    assert found['ESC of rotor 2'].found == 'offline'
+def put(**faults):
+    """Return a function that sets faults of the board."""
+    return lambda emulated: [setattr(emulated.faults, *item) for item in faults.items()]
 
 
-def test_losses_are_reported_for_each_direction(emulated):
-    emulated.faults.corrupt_in = 0.5
-    emulated.faults.drop_out = 0.05
-    board_with(emulated, {'link to the board': 'fail', 'link from the board': 'warn'},
-               seconds=2.0)
+@pytest.mark.parametrize(('break_it', 'changes', 'bad', 'words'), [
+    (volts(20.0), {}, {'battery': 'fail', 'board ready to arm': 'fail'}, '3.33 V a cell of 6'),
+    (volts(21.6), {}, {'battery': 'warn'}, '3.60 V a cell of 6'),
+    (volts(26.0), {}, {'battery': 'fail'}, '4.33 V a cell of 6'),
+    (put(failed_escs=(2,)), {}, {'ESC of rotor 2': 'fail', 'board ready to arm': 'fail'},
+     'offline'),
+    (put(corrupt_in=0.5, drop_out=0.05), {'seconds': 2.0},
+     {'link to the board': 'fail', 'link from the board': 'warn'}, ''),
+    (put(), {'host_component': 190}, {'board receives host': 'fail', 'board clock': 'fail'},
+     'host_component')])
+def test_each_fault_is_found_and_named(emulated, break_it, changes, bad, words):
+    break_it(emulated)
+    found = board_with(emulated, bad, **changes)[next(iter(bad))]
+    assert words in found.found + found.remedy
 
 
 def test_firmware_with_another_protocol_version_is_refused(emulated, monkeypatch):
-    monkeypatch.setattr(motor_board_messages, 'CONTRACT_VERSION', 2)
+    monkeypatch.setattr(motor_board_state, 'CONTRACT_VERSION', 2)
     found = board_with(emulated, {'board firmware': 'fail'})
     assert 'contract 1, this driver uses 2' in found['board firmware'].found
-
-
-def test_a_difference_in_settings_of_the_computer_is_reported(emulated):
-    found = board_with(emulated, {'board receives host': 'fail', 'board clock': 'fail'},
-                       host_component=190)
-    assert 'host_component' in found['board receives host'].remedy
 
 
 def test_a_silent_or_foreign_board_ends_the_checks(emulated):
@@ -96,7 +93,7 @@ def test_a_silent_or_foreign_board_ends_the_checks(emulated):
 
 
 def test_without_pymavlink_the_extra_is_named(emulated, monkeypatch):
-    for name in ('motor_board', 'mavlink_dialect'):
+    for name in ('motor_board', 'motor_board_state'):
         monkeypatch.delitem(sys.modules, f'beetle_omni_ros.drivers.{name}')
     monkeypatch.setitem(sys.modules, 'pymavlink', None)
     monkeypatch.setitem(sys.modules, 'pymavlink.dialects.v20', None)

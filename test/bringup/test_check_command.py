@@ -13,7 +13,6 @@ from check_helpers import QUICK, repeated
 from servo_bench import JOINTS
 
 from beetle_omni_ros import cli
-from beetle_omni_ros.bringup import servos
 from beetle_omni_ros.bringup.command import run_check
 from beetle_omni_ros.bringup.graph import ObservedGraph, Status
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
@@ -62,19 +61,6 @@ def test_a_good_robot_ends_with_status_0(robot, tmp_path, capsys):
 
 
 @pytest.mark.real_time
-def test_a_fault_ends_with_status_1(robot, tmp_path, capsys, monkeypatch):
-    bus, _, arguments = robot
-    monkeypatch.setattr(servos, 'OTHER_IDS', ())
-    bus.servos[1]['Baud Rate'] = 1
-    status, result = checked([*arguments, '--skip', 'ros', '--skip', 'board'],
-                             tmp_path / 'result.json')
-    assert status == 1 and not result['ok']
-    (bad,) = [row for row in result['findings'] if row['level'] == 'fail']
-    assert bad['item'] == 'gimbal2' and '57600' in bad['remedy']
-    assert '1 failed' in capsys.readouterr().out
-
-
-@pytest.mark.real_time
 def test_without_ros_the_other_parts_are_checked(robot, tmp_path, monkeypatch):
     _, _, arguments = robot
     for name in [name for name in sys.modules if name.startswith('beetle_omni_ros.nodes')]:
@@ -111,14 +97,3 @@ def test_a_port_in_use_by_the_bridge_is_not_opened(robot, tmp_path):
     assert str(bridge.pid) in rows['servo port']['found']
     assert rows['joint_bridge gimbal2']['level'] == 'fail'
     assert rows['joint_bridge gimbal2']['part'] == 'servos'
-
-
-@pytest.mark.parametrize(('arguments', 'by_item'), [
-    (['--skip', 'rotors'], 'servos, board, ros'), (['--servo-bus', 'none.yaml'], 'none.yaml'),
-    (['--motor-board', 'none.yaml'], 'none.yaml'), (['--robot', 'none.yaml'], 'none.yaml'),
-    (['--seconds', '0'], '--seconds'), (['--json', 'no/folder.json'], 'folder.json'),
-    (['--nonsense'], '--nonsense')])
-def test_unusable_input_ends_with_status_2_and_one_line(capsys, arguments, by_item):
-    assert cli.main(['check', *arguments]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert by_item in line

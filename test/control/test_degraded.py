@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from beetle_omni_ros.control.base import Command, PoseTarget, State, TrajectoryTarget
+from beetle_omni_ros.control.base import Command, PoseTarget, State
 from beetle_omni_ros.control.call import FunctionCall
-from beetle_omni_ros.control.feasible import feasible_target
 from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.control.nmpc import NmpcController
 from beetle_omni_ros.robot import dynamics as model
@@ -119,27 +118,3 @@ def test_the_plan_respects_the_bounds(nmpc):
     body.fly(nmpc, PoseTarget(PLACE, held(LOST)), 0.1)
     assert np.abs(nmpc.predicted_states[:, 18]).max() < 0.01
     assert nmpc.diagnostics()['unsolved'] == 0
-
-
-def test_a_feasible_pose_is_held_at_the_same_position():
-    for health in (LOST, STUCK):
-        target = PoseTarget(PLACE, rotations.from_rpy(1.4, 0.3, 0.7), 3.0)
-        got = feasible_target(target, health, ROBOT)
-        np.testing.assert_array_equal(got.position, PLACE)
-        assert got.stamp == 3.0
-        assert Holding(ROBOT, health).margin(got.quaternion) >= 1.0 - 1e-9
-    assert feasible_target(target, ALL_HEALTHY, ROBOT) is target
-
-
-def test_an_infeasible_trajectory_is_flown_in_one_attitude():
-    times = np.linspace(0.0, 2.0, 5)
-    quaternions = np.array([rotations.from_rpy(0.8 * t, 0.0, 0.0) for t in times])
-    target = TrajectoryTarget(times, np.outer(times, [1.0, 0, 0]), quaternions,
-                              np.tile([1.0, 0, 0], (5, 1)), np.tile([0.8, 0, 0], (5, 1)))
-    got = feasible_target(target, LOST, ROBOT)
-    np.testing.assert_array_equal(got.positions, target.positions)
-    assert not got.angular_velocities.any()
-    assert Holding(ROBOT, LOST).margin(got.quaternions[0]) >= 2.0
-    still = TrajectoryTarget(times, target.positions, np.tile(got.quaternions[0], (5, 1)),
-                             target.velocities, np.zeros((5, 3)))
-    assert feasible_target(still, LOST, ROBOT) is still

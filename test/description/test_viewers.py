@@ -5,7 +5,6 @@ import re
 import xml.etree.ElementTree as ElementTree
 
 import numpy as np
-import pytest
 from rosbags.interfaces import Nodetype
 from synthetic_flights import fly
 import yaml
@@ -113,131 +112,14 @@ def test_rviz_shows_topics_of_the_graph_with_a_quality_of_service_that_matches()
     assert seen == set(expected)
 
 
-@pytest.mark.parametrize('node', [name for name in plan.NODES if name != plan.GENERIC])
-def test_the_aggregator_has_a_group_for_each_node(node):
+def test_the_aggregator_has_one_group_for_each_node():
     content = yaml.safe_load((VIEWERS / 'diagnostic_aggregator.yaml').read_text())
     groups = [group for group in content['analyzers']['ros__parameters'].values()
               if isinstance(group, dict)]
-    found = [group for group in groups
-             if any(node.startswith(prefix) for prefix in group['startswith'])]
-    assert len(found) == 1, node
-
-
-# Declarations in the sources of the programs: display class -> properties, and so on.
-DISPLAY = {'Class', 'Name', 'Enabled', 'Value'}
-RVIZ = {
-    'rviz_default_plugins/Grid': {
-        'Alpha', 'Cell Size', 'Color', 'Line Style', 'Normal Cell Count', 'Offset', 'Plane',
-        'Plane Cell Count', 'Reference Frame'},
-    'rviz_default_plugins/RobotModel': {
-        'Alpha', 'Collision Enabled', 'Description File', 'Description Source',
-        'Description Topic', 'Links', 'Mass Properties', 'TF Prefix', 'Update Interval',
-        'Visual Enabled'},
-    'rviz_default_plugins/MarkerArray': {'Namespaces', 'Topic'},
-    'rviz_default_plugins/Pose': {
-        'Alpha', 'Axes Length', 'Axes Radius', 'Color', 'Head Length', 'Head Radius',
-        'Shaft Length', 'Shaft Radius', 'Shape', 'Topic'},
-    'rviz_default_plugins/Odometry': {
-        'Angle Tolerance', 'Covariance', 'Keep', 'Position Tolerance', 'Shape', 'Topic'},
-    'rviz_default_plugins/TF': {
-        'Filter (blacklist)', 'Filter (whitelist)', 'Frame Timeout', 'Frames', 'Marker Scale',
-        'Show Arrows', 'Show Axes', 'Show Names', 'Tree', 'Update Interval'}}
-RVIZ_TOPIC = {'Value', 'Depth', 'Durability Policy', 'Filter size', 'History Policy',
-              'Reliability Policy'}
-RVIZ_TOOLS = {f'rviz_default_plugins/{name}' for name in (
-    'FocusCamera', 'Interact', 'Measure', 'MoveCamera', 'PublishPoint', 'Select',
-    'SetGoal', 'SetInitialPose')}
-RVIZ_ORBIT = {'Class', 'Name', 'Target Frame', 'Distance', 'Enable Stereo Rendering',
-              'Focal Point', 'Focal Shape Fixed Size', 'Focal Shape Size', 'Near Clip Distance',
-              'Invert Z Axis', 'Pitch', 'Yaw', 'Value'}
-# Foxglove Studio 1.48 (@foxglove/studio-base) and its successor Lichtblick 1.10.
-# Only showLine and lineSize are newer than 1.48, which ignores them.
-TITLE = {'foxglovePanelTitle'}
-FOXGLOVE = {
-    '3D': {'cameraState', 'followMode', 'followTf', 'layers', 'publish', 'scene', 'topics',
-           'transforms'},
-    'DiagnosticSummary': {'hardwareIdFilter', 'minLevel', 'pinnedIds', 'sortByLevel',
-                          'topicToRender'},
-    'Plot': {'isSynced', 'legendDisplay', 'maxXValue', 'maxYValue', 'minXValue', 'minYValue',
-             'paths', 'showLegend', 'showPlotValuesInLegend', 'showXAxisLabels',
-             'showYAxisLabels', 'sidebarDimension', 'xAxisVal'},
-    'StateTransitions': {'isSynced', 'paths'},
-    'Tab': {'activeTabIdx', 'tabs'}}
-FOXGLOVE_PATH = {
-    'Plot': {'color', 'enabled', 'label', 'lineSize', 'showLine', 'timestampMethod', 'value'},
-    'StateTransitions': {'color', 'enabled', 'label', 'timestampMethod', 'value'}}
-FOXGLOVE_CAMERA = {'distance', 'far', 'fovy', 'near', 'perspective', 'phi', 'target',
-                   'targetOffset', 'targetOrientation', 'thetaOffset'}
-FOXGLOVE_TOPIC = {
-    'geometry_msgs/msg/PoseStamped': {'arrowScale', 'axisScale', 'color', 'covarianceColor',
-                                      'frameLocked', 'showCovariance', 'type', 'visible'},
-    'std_msgs/msg/String': {'frameLocked', 'visible'},
-    'visualization_msgs/msg/MarkerArray': {'color', 'namespaces', 'selectedIdVariable',
-                                           'showOutlines', 'visible'}}
-FOXGLOVE_FRAMES = {'axisScale', 'editable', 'enablePreloading', 'labelSize', 'lineColor',
-                   'lineWidth', 'showLabel'}
-FOXGLOVE_GRID = {'color', 'divisions', 'frameId', 'frameLocked', 'instanceId', 'label', 'layerId',
-                 'lineWidth', 'order', 'position', 'rotation', 'size', 'visible'}
-FOLLOW = {'follow-pose', 'follow-position', 'follow-none'}
-
-
-def test_rviz_supports_every_class_and_property():
-    content = yaml.safe_load((VIEWERS / 'beetle_omni.rviz').read_text())
-    assert {panel['Class'] for panel in content['Panels']} <= {
-        f'rviz_common/{name}' for name in ('Displays', 'Selection', 'Time', 'Tool Properties',
-                                           'Views')}
-    manager = content['Visualization Manager']
-    assert manager['Global Options'].keys() <= {'Background Color', 'Fixed Frame', 'Frame Rate'}
-    for display in manager['Displays']:
-        assert display.keys() <= RVIZ[display['Class']] | DISPLAY, display['Name']
-        for given in (display.get('Topic'), display.get('Description Topic')):
-            assert given is None or given.keys() <= RVIZ_TOPIC
-    assert {tool['Class'] for tool in manager['Tools']} <= RVIZ_TOOLS
-    view = manager['Views']['Current']
-    assert view['Class'] == 'rviz_default_plugins/Orbit' and view.keys() <= RVIZ_ORBIT
-
-
-def test_foxglove_supports_every_panel_and_follow_mode():
-    layout = json.loads((VIEWERS / 'foxglove.json').read_text())
-    assert layout.keys() == {'configById', 'globalVariables', 'userNodes', 'playbackConfig',
-                             'layout'}
-    scene = layout['configById']['3D!robot']
-    assert scene['followMode'] in FOLLOW
-    assert scene['cameraState'].keys() <= FOXGLOVE_CAMERA
-    assert scene['scene'].keys() <= {'backgroundColor', 'transforms'}
-    assert scene['scene']['transforms'].keys() <= FOXGLOVE_FRAMES
-    for topic, settings in scene['topics'].items():
-        assert settings.keys() <= FOXGLOVE_TOPIC[TYPES[topic.lstrip('/')]], topic
-    # A URDF layer of 1.48 reads URLs only; every version shows the topic /robot_description.
-    for name, layer in scene['layers'].items():
-        assert layer['layerId'] == 'foxglove.Grid' and layer['instanceId'] == name
-        assert layer.keys() <= FOXGLOVE_GRID
-    for name, panel in layout['configById'].items():
-        kind = name.partition('!')[0]
-        assert panel.keys() <= FOXGLOVE[kind] | TITLE, name
-        for path in panel.get('paths', ()):
-            assert path.keys() <= FOXGLOVE_PATH[kind], path['value']
-            assert path['timestampMethod'] in ('headerStamp', 'receiveTime')
-            stamped = 'header' in dict(TYPESTORE.fielddefs[TYPES[split(path['value'])[0]]][1])
-            assert stamped or path['timestampMethod'] == 'receiveTime', path['value']
-
-
-def test_plotjuggler_finds_the_elements_of_its_layouts():
-    root = ElementTree.parse(VIEWERS / 'plotjuggler.xml').getroot()
-    window, = root.findall('tabbed_widget')
-    assert window.get('parent') == 'main_window'
-    for tab in window.findall('Tab'):
-        assert int(tab.get('containers')) == len(tab.findall('Container'))
-    for splitter in root.iter('DockSplitter'):
-        sizes = splitter.get('sizes').split(';')
-        areas = splitter.findall('DockArea')
-        assert int(splitter.get('count')) == len(sizes) == len(areas)
-        assert splitter.get('orientation') in '-|'
-        assert sum(map(float, sizes)) == pytest.approx(1.0, abs=1e-3)
-    for plot in root.iter('plot'):
-        assert plot.get('mode') == 'TimeSeries' and plot.findall('curve')
-        assert all(re.fullmatch('#[0-9a-f]{6}', curve.get('color'))
-                   for curve in plot.findall('curve'))
+    for node in plan.NODES:
+        found = [group for group in groups
+                 if any(node.startswith(prefix) for prefix in group['startswith'])]
+        assert len(found) == 1 or node == plan.GENERIC, node
 
 
 def test_a_bag_contains_the_frames_and_topics_of_all_layouts(tmp_path):

@@ -1,26 +1,36 @@
 """An emulated motor board, its driver, and a loop that sends targets."""
 
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 import threading
 import time
 
 import numpy as np
 
+from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters
 from beetle_omni_ros.drivers.motor_board import MotorBoard
-from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
+from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.sim.emulated.board_parameters import EmulatedBoardParameters
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 
 QUICK = replace(EmulatedBoardParameters.load(), boot_time=0.05, heartbeat_timeout=0.5,
                 idle_timeout=1.0, throttle_low_time=0.3, reception_rate=10.0)
+ROBOT = RobotParameters.load()
 HOVER = np.array([7.0, 7.5, 8.0, 8.5])
 
 
 def driver(port, **changes):
     """Driver with a short reconnect period."""
     return MotorBoard(replace(MotorBoardParameters.load(), port=port, reconnect_period=0.05,
-                              **changes))
+                              **changes), ROBOT)
+
+
+@contextmanager
+def opened(port, **changes):
+    """Driver with its port open."""
+    with closing(driver(port, **changes)) as board:
+        board.open()
+        yield board
 
 
 def until(condition, timeout=3.0):
@@ -50,7 +60,7 @@ class Pilot:
 
     def has_event(self, text):
         """Whether an event with this text arrived."""
-        self.events += self.board.poll().events
+        self.events += self.board.poll()[2]
         return any(text in event for _, event in self.events)
 
     def __enter__(self):
@@ -68,8 +78,8 @@ class Pilot:
 def connected(**changes):
     """Emulated board and driver, ready to arm."""
     with EmulatedMotorBoard(parameters=QUICK) as emulated, \
-            driver(emulated.port, **changes) as board:
-        assert board.wait_ready(3.0) == ''
+            opened(emulated.port, **changes) as board:
+        assert until(lambda: not board.ready), board.ready
         yield emulated, board
 
 
@@ -77,8 +87,8 @@ def connected(**changes):
 def flying(**changes):
     """Emulated board, driver and pilot, rotors following."""
     with connected(**changes) as (emulated, board):
-        result = board.arm()
-        assert result.accepted, result
+        result = board.start(True).wait()
+        assert result.accepted, result.reason
         with Pilot(board) as pilot:
             assert until(lambda: emulated.commands.all() and pilot.results)
             yield emulated, board, pilot

@@ -1,11 +1,13 @@
 """
-MAVLink 2 packets written by hand, and a parser small enough to check by eye.
+The MAVLink 2 packets of docs/reference/firmware.md, and a parser small enough to check by eye.
 
 Sources: mavlink.io "Packet Serialization" (header, truncation of zeros, CRC-16/MCRF4XX over
 header and payload and then the message's CRC_EXTRA) and the common message set. The checksums
 at the ends of the packets were computed with :func:`crc` below, bit by bit.
 """
 
+from pathlib import Path
+import re
 import struct
 
 # Message id -> name and fields (type, name, array length) in the order of the definition.
@@ -39,53 +41,11 @@ CODES = {'uint8_t': 'B', 'int8_t': 'b', 'int16_t': 'h', 'uint16_t': 'H', 'int32_
 EXTENSIONS = {77: 'BiBB'}
 
 
-def packet(text):
-    """Bytes of hexadecimal digits."""
-    return bytes.fromhex(text)
-
-
-# From the computer (system 1, component 191 = bf).
-HOST_HEARTBEAT = packet('fd 09 00 00 00 01 bf 00 00 00'      # 9 bytes, number 0, HEARTBEAT
-                        '00 00 00 00 12 08 00 04 03'         # custom mode, type 18, autopilot 8
-                        'ae c6')
-ARM = packet('fd 20 00 00 01 01 bf 4c 00 00'                 # 32 bytes: confirmation 0 left out
-             '00 00 80 3f' + '00' * 24 +                     # param1 = 1.0
-             '90 01 01 01'                                   # command 400 to 1, 1
-             '6a 1b')
-DISARM = packet('fd 20 00 00 02 01 bf 4c 00 00' + '00' * 28 + '90 01 01 01' '4f 9c')
-TARGET = packet('fd 2b 00 00 03 01 bf 8b 00 00'
-                '87 d6 12 00 00 00 00 00'                    # 1234567 us
-                '00 00 00 3f 00 00 80 3e 00 00 80 3f' + '00' * 20 +     # 0.5 0.25 1 0 ...
-                '00 01 01'                                   # group 0, to 1, 1
-                'a6 98')
-TIME_REQUEST = packet('fd 10 00 00 04 01 bf 6f 00 00' + '00' * 8 + '08 07 06 05 04 03 02 01'
-                      '98 28')
-# From the board (system 1, component 1).
-TIME_ANSWER = packet('fd 10 00 00 05 01 01 6f 00 00'
-                     '00 ca 9a 3b 00 00 00 00'               # 1 s
-                     '08 07 06 05 04 03 02 01' '96 c8')
-ACCEPTED = packet('fd 0a 00 00 06 01 01 4d 00 00' '90 01 00 00 01 00 00 00 01 bf' '6a 29')
-REFUSED = packet('fd 0a 00 00 07 01 01 4d 00 00'
-                 '90 01 01 00 01 0c 00 00 01 bf'             # throttle 04, battery 08
-                 '6c 45')
-BOARD_HEARTBEAT = packet('fd 09 00 00 08 01 01 00 00 00'
-                         '03 00 00 01 02 00 81 04 03'        # running, contract 1
-                         '2b 40')
-BATTERY = packet('fd 24 00 00 09 01 01 93 00 00' 'ff ff ff ff ff ff ff ff ff 7f'
-                 'c0 5d' + 'ff ff' * 9 +                     # 24000 mV
-                 'd2 04 00 00 01 ff' '0f 7b')                # 12.34 A
-ESC_STATUS = packet('fd 38 00 00 0a 01 01 23 01 00'          # 56 of 57 bytes: index 0 left out
-                    '40 42 0f 00 00 00 00 00'                # 1 s
-                    '70 17 00 00 71 17 00 00 72 17 00 00 00 00 00 00'
-                    '00 00 c0 41 00 00 c0 41 00 00 c0 41 00 00 00 00'   # 24 V, 24, 24, 0
-                    '00 00 40 40 00 00 40 40 00 00 40 40 00 00 40 40'   # 3 A
-                    '5b ff')
-ESC_INFO = packet('fd 2e 00 00 0b 01 01 22 01 00' '40 42 0f 00 00 00 00 00' + '00' * 12 +
-                  '02 00 00 00 07 00 00 00 00 00 00 00 40 00'           # 2 errors, 7 packets
-                  'ac 0d ac 0d ac 0d ff 7f 00 04 00 07'      # 35 C, rotor 4 unknown and offline
-                  'd1 83')
-RECEPTION = packet('fd 1f 00 00 0c 01 01 01 00 00' + '00' * 14 +
-                   'c0 5d d2 04 00 00 05 00 03 00 02 00 07 00 01 00 ff' '78 fa')
+DOCUMENT = (Path(__file__).resolve().parents[2] / 'docs' / 'reference' / 'firmware.md').read_text()
+(HOST_HEARTBEAT, ARM, DISARM, TARGET, TIME_REQUEST,     # from the computer (1, 191)
+ TIME_ANSWER, ACCEPTED, REFUSED, BOARD_HEARTBEAT, BATTERY, ESC_STATUS, ESC_INFO,    # board (1, 1)
+ RECEPTION) = (bytes.fromhex(packet) for packet in re.findall(
+    r'`(fd(?: [0-9a-f]{2})+)`', DOCUMENT))
 BY_HOST = (HOST_HEARTBEAT, ARM, DISARM, TARGET, TIME_REQUEST)
 BY_BOARD = (TIME_ANSWER, ACCEPTED, REFUSED, BOARD_HEARTBEAT, BATTERY, ESC_STATUS, ESC_INFO,
             RECEPTION)

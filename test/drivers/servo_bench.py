@@ -6,8 +6,8 @@ import time
 
 import numpy as np
 
+from beetle_omni_ros.drivers.device_parameters import ServoBusParameters
 from beetle_omni_ros.drivers.servo_bus import ServoBus
-from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
 
@@ -43,20 +43,22 @@ def running(**options):
 
 
 def tick(bus, goal):
-    """Run one cycle of the bridge; return readings and reports."""
+    """Run one cycle of the bridge; return readings and servos."""
     bus.write_goals(goal)
-    return bus.read(), bus.poll_health()
+    readings = bus.read()
+    bus.upkeep()
+    return readings, bus.servos
 
 
 def until(condition, bus, goal, limit=5.0):
-    """Run the loop until ``condition(readings, reports)``; return the last of both."""
+    """Run the loop until ``condition(readings, servos)``; return the last of both."""
     end = time.monotonic() + limit
     while time.monotonic() < end:
-        readings, reports = tick(bus, goal)
-        if condition(readings, reports):
-            return readings, reports
+        readings, servos = tick(bus, goal)
+        if condition(readings, servos):
+            return readings, servos
         time.sleep(0.002)
-    raise AssertionError(f'not within {limit} s: {readings} {reports} {bus.take_events()}')
+    raise AssertionError(f'not within {limit} s: {readings} {servos} {bus.take_events()}')
 
 
 def arrived(goal):

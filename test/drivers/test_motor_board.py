@@ -4,7 +4,6 @@ import math
 import os
 from pathlib import Path
 import pty
-import signal
 import subprocess
 import sys
 import threading
@@ -17,44 +16,23 @@ import reference_packets as reference
 pytest.importorskip('pymavlink')
 pytest.importorskip('serial')
 
-from board_bench import connected, driver, flying, HOVER, QUICK, until
+from board_bench import connected, driver, HOVER, opened, QUICK, until
 
-from beetle_omni_ros.drivers.mavlink_dialect import common
-from beetle_omni_ros.drivers.serial_port import SerialPort, SerialPortError
-from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 
 pytestmark = pytest.mark.real_time
 
 
-def test_commanded_thrusts_are_produced_at_the_measured_voltage():
+def test_bad_thrusts_are_not_sent():
     with connected() as (emulated, board):
-        emulated.set_battery(22.9, 20.0)
-        time.sleep(0.6)         # twelve time constants of the voltage filter
-        assert board.arm().accepted
-        assert board.send(HOVER, time.time()).sent
-        assert until(lambda: emulated.commands.all())
-        np.testing.assert_allclose(emulated.thrust_targets, HOVER, rtol=1e-3)
-
-
-def test_saturation_is_reported_and_the_maximum_is_sent():
-    with flying() as (emulated, board, pilot):
-        emulated.set_battery(21.4, 40.0)
-        pilot.thrust = np.array([5.0, 19.5, 5.0, 30.0])
-        assert until(lambda: pilot.results[-1].saturated.tolist() == [False, True, False, True])
-        assert until(lambda: abs(emulated.thrust_targets[3] - 18.7075) < 1e-3)
-
-
-@pytest.mark.parametrize(('thrust', 'age', 'reason'), [
-    ([1, 2, 3], 0, 'expected 4 thrusts'), ('rubbish', 0, 'not numbers'),
-    ([1, 2, 3, math.nan], 0, 'not finite'), ([1, 2, 3, math.inf], 0, 'not finite'),
-    ([1, 2, 3, 4], math.nan, 'not finite'), ([1, 2, 3, 4], 0.2, 'stale stamp'),
-    ([1, 2, 3, 4], -0.2, 'stamp in the future')])
-def test_bad_thrusts_are_not_sent(thrust, age, reason):
-    with connected() as (emulated, board):
-        board.arm()
-        result = board.send(thrust, time.time() - age)
-        assert not result.sent and reason in result.reason
+        board.start(True).wait()
+        for thrust, age, reason in (
+                ([1, 2, 3], 0, 'not four finite numbers'),
+                ([1, 2, 3, math.nan], 0, 'not four finite numbers'),
+                ([1, 2, 3, math.inf], 0, 'not four finite numbers'),
+                ([1, 2, 3, 4], math.nan, 'not four finite numbers'),
+                ([1, 2, 3, 4], 0.2, 'stale stamp'), ([1, 2, 3, 4], -0.2, 'stamp in the future')):
+            assert board.send(thrust, time.time() - age).reason == reason
         time.sleep(0.05)
         assert not emulated.commands.any()
 
@@ -62,38 +40,22 @@ def test_bad_thrusts_are_not_sent(thrust, age, reason):
 def test_refused_arming_is_reported_with_the_reason():
     with connected() as (emulated, board):
         emulated.set_battery(20.0, 0.0)
-        assert until(lambda: 'battery low' in board.poll().status.conditions)
-        assert board.arm().reason == 'refused by the board: battery low'
+        assert until(lambda: 'battery low' in board.state.status.conditions)
+        assert board.start(True).wait().reason == 'refused by the board: battery low'
         emulated.set_battery(25.0, 0.0)
         for _ in range(20):
             board.send(HOVER, time.time())
             time.sleep(0.005)
-        result = board.arm()
+        result = board.start(True).wait()
         assert not result.accepted and result.reason.endswith('throttle not low')
         time.sleep(QUICK.throttle_low_time)
-        assert board.arm().accepted and emulated.armed
+        assert board.start(True).wait().accepted and emulated.armed
+        emulated._firmware._heartbeat = lambda state, now: (0, (1 | 9 << 24, 2, 0, 1, 3, 3))
+        assert until(lambda: board.state.status.contract == 9)
+        assert board.start(True).wait().reason == 'firmware follows contract 9, this driver 1'
 
 
-def test_disarming_is_acknowledged_and_stops_the_rotors():
-    with flying() as (emulated, board, _):
-        result = board.disarm()
-        assert result.accepted and result.attempts >= 1
-        assert not emulated.armed and not emulated.commands.any()
-        assert until(lambda: not board.armed)
-
-
-def test_an_acknowledgement_of_another_command_is_ignored():
-    """The late acknowledgement of an arm command must not confirm a disarm command."""
-    with connected() as (_, board):
-        command = board.start_disarm()
-        late = common.MAVLink(None).decode(bytearray(reference.ACCEPTED))
-        other = type(command)(False, board.parameters, lambda _: None, 0.0)
-        other.acknowledge(late, 0.1)
-        assert other.result is None
-        assert command.wait(1.0) and command.result.accepted
-
-
-def test_battery_and_rotor_states_have_si_units_and_stamps_of_the_computer():
+def test_battery_rotors_and_clock_have_si_units_and_stamps_of_the_computer():
     with connected() as (emulated, board):
         emulated.set_battery(23.456, 12.34)
         emulated.set_rotors(np.array([1.0, 4.0, 9.0, 0.0]), np.array([30.0, 40.0, 50.0, 60.0]))
@@ -101,33 +63,19 @@ def test_battery_and_rotor_states_have_si_units_and_stamps_of_the_computer():
         before = time.time()
         board.poll()
         time.sleep(0.1)
-        update = board.poll()
-        assert (update.battery.voltage, update.battery.current) == (23.456, -12.34)
-        rotors = update.rotors
+        battery, rotors, _ = board.poll()
+        assert (battery.voltage, battery.current) == (23.456, -12.34)
         assert rotors.rpm.tolist() == [2700, 5400, 8100, 0]
         assert rotors.temperature.tolist() == [30, 40, 50, 60]
         assert rotors.current.sum() == pytest.approx(12.34, rel=1e-5)
         assert before - 0.02 < rotors.stamp <= time.time()
-
-
-def test_a_poll_returns_new_messages_only():
-    with connected() as (emulated, board):
+        link, now = board.link(), time.monotonic()
+        truth, bound = emulated._firmware.clock(now) - now, link['clock_uncertainty_ms'] / 1e3
+        assert abs(link['clock_offset_s'] - truth) <= bound < 0.02
         emulated.faults.mute = True
         time.sleep(0.05)
         board.poll()
-        update = board.poll()
-        assert update.battery is None and update.rotors is None
-        assert update.status is not None
-
-
-def test_the_clock_offset_of_the_board_is_within_its_bound():
-    with connected() as (emulated, board):
-        time.sleep(0.5)
-        update = board.poll()
-        now = time.monotonic()
-        truth = emulated._firmware.clock(now) - now
-        assert abs(update.clock_offset - truth) <= update.clock_uncertainty
-        assert update.clock_uncertainty < 0.02
+        assert board.poll()[:2] == (None, None)
 
 
 def test_an_independent_parser_accepts_all_output_of_the_driver():
@@ -136,8 +84,8 @@ def test_an_independent_parser_accepts_all_output_of_the_driver():
     received = bytearray()
     board = driver(os.ttyname(other))
     board.open()
-    threading.Thread(target=board.disarm, daemon=True).start()
-    board._watch.clock.add(time.monotonic(), 1.0, time.monotonic())
+    threading.Thread(target=lambda: board.start(False).wait(), daemon=True).start()
+    board.state.clock.add(time.monotonic(), 1.0, time.monotonic())
     for _ in range(100):
         board.send(HOVER, time.time())
         time.sleep(0.005)
@@ -157,132 +105,80 @@ def test_an_independent_parser_accepts_all_output_of_the_driver():
         == [k % 256 for k in range(len(messages))]
     stamps = [values[0] for number, _, _, values in messages if number == 139]
     assert len(stamps) == 100 and np.all(np.diff(stamps) > 0)
-    assert messages[-1][0] in (0, 76, 111)
+    contents = [(number, values) for number, _, _, values in messages]
+    for frame in (reference.HOST_HEARTBEAT, reference.DISARM):
+        number, _, _, values = reference.parse(frame)
+        assert (number, values) in contents
     os.close(device)
     os.close(other)
-
-
-def test_pymavlink_accepts_all_output_of_the_emulated_board():
-    """Its strict parser raises at the first wrong byte."""
-    with EmulatedMotorBoard(parameters=QUICK) as emulated:
-        port = SerialPort(emulated.port, 921600)
-        parser, names, sequence = common.MAVLink(None), set(), None
-        packer = common.MAVLink(None, 1, 191)
-        end = time.monotonic() + 1.2
-        while time.monotonic() < end:
-            port.write(common.MAVLink_timesync_message(0, 5).pack(packer))
-            port.write(reference.ARM)
-            time.sleep(0.02)
-            for message in parser.parse_buffer(port.read()) or []:
-                names.add(message.get_type())
-                assert sequence is None or message.get_seq() == (sequence + 1) % 256
-                sequence = message.get_seq()
-        port.close()
-    assert names == {'HEARTBEAT', 'SYS_STATUS', 'COMMAND_ACK', 'TIMESYNC', 'BATTERY_STATUS',
-                     'ESC_INFO', 'ESC_STATUS'}
-    assert parser.total_receive_errors == 0
 
 
 def test_without_a_board_every_call_times_out_soon_with_a_message():
     device, other = pty.openpty()
-    with driver(os.ttyname(other), acknowledge_timeout=0.02) as board:
-        assert board.wait_ready(0.1) == 'no message from the board'
-        assert board.arm().reason == 'no message from the board'
-        assert board.disarm().reason == 'no acknowledgement to 5 attempts'
-        assert not board.send(HOVER, time.time()).sent
-        assert not board.armed
+    with opened(os.ttyname(other), acknowledge_timeout=0.02) as board:
+        assert board.start(True).wait().reason == 'no message from the board'
+        assert board.start(False).wait().reason == 'no acknowledgement to 5 attempts'
+        assert board.send(HOVER, time.time()).reason == "offset of the board's clock unknown"
     os.close(device)
     os.close(other)
 
 
-def test_another_firmware_is_refused():
+def test_a_step_of_the_computers_clock_does_not_stop_the_rotors():
+    """Stamps and clock step together; the age of a stamp gives the board's clock."""
+    shift = [0.0]
     with connected() as (emulated, board):
-        emulated._firmware._heartbeat = lambda state, now: (0, (1 | 9 << 24, 2, 0, 1, 3, 3))
-        assert until(lambda: board.poll().status.contract == 9)
-        assert board.arm().reason == 'firmware follows contract 9, this driver 1'
+        board._clock = lambda: time.time() + shift[0]
+        assert board.start(True).wait().accepted
+        for k in range(60):
+            shift[0] = 3600.0 * (k > 20) - 7200.0 * (k > 40)
+            assert not board.send(HOVER, time.time() + shift[0]).reason
+            time.sleep(0.005)
+            assert k < 10 or emulated.commands.all()
+        assert sum(emulated.refused.values()) <= 2
 
 
-def test_a_port_that_cannot_be_opened_is_refused_in_one_line(tmp_path):
-    with pytest.raises(SerialPortError, match='board: cannot be opened .no such port'):
-        driver(str(tmp_path / 'board')).open()
-
-
-def test_closing_disarms():
-    with EmulatedMotorBoard(parameters=QUICK) as emulated:
-        board = driver(emulated.port)
-        board.open()
-        assert board.wait_ready(3) == '' and board.arm().accepted
-        board.send(HOVER, time.time())
-        board.close()
-        assert not emulated.armed
-        board.close()
-        assert emulated._firmware._stop_reason == 1
+def test_stamps_stay_monotonic_when_the_offset_is_corrected():
+    with connected() as (emulated, board):
+        stamps = []
+        emulated.on_target = lambda now, values: stamps.append(values[0])
+        assert board.start(True).wait().accepted
+        clock, begin = board.state.clock, time.time()
+        for k, correction in enumerate((0.0, -0.003, 0.002, -0.003)):
+            low, high, at = clock._bounds
+            clock._bounds = low + correction, high + correction, at
+            board.send(HOVER, begin + 0.001 * k)
+            board.send(HOVER, begin + 0.001 * k)
+            time.sleep(0.003)
+        time.sleep(0.03)
+        assert len(stamps) == 8
+        assert stamps[::2] == stamps[1::2]
+        assert stamps == sorted(stamps) and len(set(stamps)) == 4
+        assert emulated.refused == {}
 
 
 CHILD = """
 import sys, time
 sys.path.insert(0, sys.argv[2])
-from board_bench import driver, HOVER
+from board_bench import driver, HOVER, until
 board = driver(sys.argv[1])
 board.open()
-assert board.wait_ready(5) == '' and board.arm().accepted
-print('flying', flush=True)
-end = time.monotonic() + float(sys.argv[3])
-while time.monotonic() < end:
+assert until(lambda: not board.ready) and board.start(True).wait().accepted
+for _ in range(40):
     board.send(HOVER, time.time())
     time.sleep(0.005)
-if sys.argv[4] == 'fail':
+if sys.argv[3]:
     raise RuntimeError('a bug in the bridge')
 """
-
-
-def process(emulated, seconds=60, end=''):
-    """A process that flies for some seconds and ends without closing."""
-    folder = Path(__file__).parent
-    child = subprocess.Popen(
-        [sys.executable, '-c', CHILD, emulated.port, str(folder), str(seconds), end],
-        stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
-        env={**os.environ, 'PYTHONPATH': os.pathsep.join([str(folder.parents[1]), *sys.path])})
-    assert child.stdout.readline() == 'flying\n'
-    return child
 
 
 @pytest.mark.parametrize('end', ['', 'fail'])
 def test_a_process_disarms_at_exit_and_after_an_exception(end):
     with EmulatedMotorBoard(parameters=QUICK) as emulated:
-        child = process(emulated, 0.2, end)
-        child.wait(20)
-        assert not emulated.armed
-        assert emulated._firmware._stop_reason == 1         # requested by the host
-
-
-@pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGTERM, signal.SIGSTOP])
-def test_no_rotor_turns_100_ms_after_the_end_of_the_process(number):
-    with EmulatedMotorBoard(parameters=QUICK) as emulated:
-        arrivals = []
+        arrivals, folder = [], Path(__file__).parent
         emulated.on_target = lambda now, values: arrivals.append(now)
-        child = process(emulated)
-        assert until(lambda: emulated.commands.all())
-        try:
-            os.kill(child.pid, number)
-            killed = time.monotonic()
-            assert until(lambda: not emulated.commands.any())
-            stopped = time.monotonic()
-            assert arrivals[-1] - killed < 0.05
-            # The board's rule is exact; the rest is this test's own polling.
-            assert stopped - arrivals[-1] < QUICK.target_timeout + 0.05
-            assert until(lambda: not emulated.armed, 2.0)
-            if number == signal.SIGSTOP:
-                os.kill(child.pid, signal.SIGCONT)
-                time.sleep(0.3)
-                assert not emulated.commands.any() and not emulated.armed
-        finally:
-            child.kill()
-            child.wait(10)
-        assert emulated._firmware._stop_reason in (2, 3)
-
-
-def test_thrust_map_of_another_robot_is_used():
-    robot = RobotParameters.load()
-    with connected() as (_, board):
-        assert board.thrust_map.thrust_limits[-1] == robot.rotors.map[0].thrust_max
+        subprocess.run(
+            [sys.executable, '-c', CHILD, emulated.port, str(folder), end], timeout=20,
+            stderr=subprocess.DEVNULL, env={**os.environ, 'PYTHONPATH': os.pathsep.join(
+                [str(folder.parents[1]), *sys.path])})
+        assert arrivals and not emulated.armed
+        assert emulated._firmware._stop_reason == 1         # requested by the host

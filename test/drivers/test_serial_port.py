@@ -2,7 +2,6 @@
 
 import os
 import pty
-import time
 import tty
 
 import pytest
@@ -27,19 +26,6 @@ def ends():
             pass
 
 
-def test_bytes_arrive_unchanged_in_both_directions(ends):
-    device, name = ends
-    data = bytes(range(256))
-    port = SerialPort(name, 921600)
-    assert port.write(data)
-    assert os.read(device, 1000) == data
-    os.write(device, data)
-    time.sleep(0.05)
-    assert port.read() == data
-    assert port.read() == b''
-    port.close()
-
-
 def test_a_full_buffer_drops_whole_frames_without_waiting(ends):
     """Without a reader at the other end, pyserial's write would not return."""
     device, name = ends
@@ -47,7 +33,6 @@ def test_a_full_buffer_drops_whole_frames_without_waiting(ends):
     frames = [bytes([k % 256]) * 55 for k in range(2000)]
     taken = [k for k, frame in enumerate(frames) if port.write(frame)]
     assert 10 < len(taken) < 2000
-    assert port.dropped == 2000 - len(taken)
     received = b''
     while True:
         port.flush()
@@ -55,7 +40,7 @@ def test_a_full_buffer_drops_whole_frames_without_waiting(ends):
             os.set_blocking(device, False)
             received += os.read(device, 65536)
         except BlockingIOError:
-            if not port.waiting:
+            if not port.rest:
                 break
     assert received == b''.join(frames[k] for k in taken)
     port.close()
@@ -66,20 +51,17 @@ def test_an_unplugged_device_is_an_error_of_one_line(ends):
     port = SerialPort(name, 921600)
     os.close(device)
     for use in (port.read, lambda: port.write(b'x')):
-        with pytest.raises(SerialPortError, match='device is gone') as caught:
+        with pytest.raises(SerialPortError, match='unplugged') as caught:
             use()
         assert '\n' not in str(caught.value) and name in str(caught.value)
     port.close()
 
 
-def test_a_port_in_use_is_refused(ends):
+def test_a_port_that_cannot_be_opened_is_refused_with_the_remedy(ends, tmp_path):
     port = SerialPort(ends[1], 921600)
     with pytest.raises(SerialPortError, match='in use by another process'):
         SerialPort(ends[1], 921600)
     port.close()
-
-
-def test_a_port_that_cannot_be_opened_is_refused_with_the_remedy(tmp_path):
     with pytest.raises(SerialPortError, match='nowhere: cannot be opened .no such port'):
         SerialPort(str(tmp_path / 'nowhere'), 921600)
     (tmp_path / 'file').write_text('x')

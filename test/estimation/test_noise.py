@@ -16,16 +16,12 @@ def scale_after(poses):
     return np.array(monitor.scale)
 
 
-@pytest.mark.parametrize('agility', [0.0, 1.0])
-def test_noise_equal_to_its_parameter_is_not_rescaled(agility):
-    assert np.array_equal(scale_after(fly(1, 5.0, agility=agility).poses), [1.0, 1.0])
+@pytest.mark.parametrize('sensors', [Sensors(), Sensors.perfect()])
+def test_noise_up_to_its_parameter_is_not_rescaled(sensors):
+    assert np.array_equal(scale_after(fly(1, 5.0, sensors).poses), [1.0, 1.0])
 
 
-def test_noise_below_its_parameter_is_not_rescaled():
-    assert np.array_equal(scale_after(fly(1, 5.0, Sensors.perfect()).poses), [1.0, 1.0])
-
-
-@pytest.mark.parametrize('position, orientation', [(5.0, 1.0), (1.0, 4.0), (6.0, 3.0)])
+@pytest.mark.parametrize('position, orientation', [(5.0, 1.0), (1.0, 4.0)])
 def test_excess_noise_is_estimated_for_each_measurement_kind(position, orientation):
     claim = MocapParameters()
     sensors = Sensors(position_noise=position * claim.position_noise,

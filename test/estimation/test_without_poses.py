@@ -81,19 +81,6 @@ def test_poses_that_return_are_used_soon():
     assert ekf.rejected['outlier'] < 10 < without.rejected['outlier']
 
 
-def test_poses_in_two_attitudes_separate_the_errors_of_markers_and_accelerometer():
-    errors = {'markers': (0.01, -0.008, 0.0), 'bias': (-0.04, 0.05, 0.0)}
-    one, two = speed(0.006, **errors), speed(0.006, inverted_first=10.0, **errors)
-    assert one > 0.3 and two < 0.15 * one
-
-
-def test_the_estimate_does_not_depend_on_the_markers_while_poses_arrive():
-    with_markers, without = (rolled_over(std, markers=(0.01, 0.0, 0.0), end=HOVER).estimate
-                             for std in (0.006, 0.0))
-    for name in ('position', 'velocity', 'quaternion', 'accelerometer_bias'):
-        assert np.array_equal(getattr(with_markers, name), getattr(without, name))
-
-
 def test_rare_poses_do_not_turn_the_attitude_again_and_again():
     """Poses of 4 Hz: each ends an interval of dead reckoning."""
     tilted = 0.01

@@ -229,6 +229,8 @@ def test_an_interrupted_campaign_continues_and_more_seeds_extend_it(tmp_path, mo
     assert len(run(1, only=['gust'])) == 1 and flown[-1] == []      # the others are kept
     run(1, bags=True)
     assert len(flown[-1]) == 2
+    run(1, plant='measured')
+    assert len(flown[-1]) == 2
     code = 'another'
     run(1)
     assert len(flown[-1]) == 2

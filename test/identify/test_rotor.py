@@ -7,8 +7,9 @@ import pytest
 from rotor_logs import bench, HEADER, RATIO, SERIES, series, stand, SURFACE, write
 
 from beetle_omni_ros.identify.inference.robust import interval
+from beetle_omni_ros.identify.measured import rotor_values, write_measured
 from beetle_omni_ros.identify.rotor.log import chosen, read_rotor_log
-from beetle_omni_ros.identify.rotor.results import identify_rotor, rotor_results, write_rotor_file
+from beetle_omni_ros.identify.rotor.results import identify_rotor, rotor_results
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.robot.thrust_map import ThrustMap
@@ -26,6 +27,11 @@ def identified(tmp_path, rows, header=HEADER, **options):
 
 def thrust_of(model, duty, voltage):
     return model.surfaces['thrust'].at(duty, voltage)[..., 0]
+
+
+def written(folder, results):
+    write_measured(folder / 'robot.yaml', RobotParameters.load(), None, '', [], None,
+                   rotor_values(results))
 
 
 def only_lag(model):
@@ -122,7 +128,7 @@ def test_a_gain_that_jumps_is_bad_data_with_the_lag_that_remains(tmp_path, seed)
     assert 'do not belong together' in results['reason']
     assert results['lag']['value'] == pytest.approx(0.055, rel=0.3)
     with pytest.raises(LogError, match='bad_data'):
-        write_rotor_file(tmp_path / 'robot.yaml', results, None)
+        written(tmp_path, results)
     steady = rotor_results(identified(tmp_path, series(rng, noise=1.0), SERIES))
     assert steady['verdict'] == 'identified'
 
@@ -148,12 +154,13 @@ def test_the_written_robot_file_gives_the_surface(tmp_path):
     model = identified(tmp_path, stand(np.random.default_rng(0)), STAND)
     path = tmp_path / 'robot.yaml'
     results = rotor_results(model)
-    write_rotor_file(path, results, None)
+    written(tmp_path, results)
     robot, shipped = RobotParameters.load(path), RobotParameters.load()
     assert robot.joints == shipped.joints
     assert robot.rotors.torque_to_thrust_ratio == pytest.approx(
         results['torque_to_thrust_ratio']['value'], rel=1e-4)
-    assert '95 %' in path.read_text()
+    low, high = robot.interval('rotors.torque_to_thrust_ratio')
+    assert low < RATIO < high
     found = ThrustMap(robot.rotors)
     assert not found.repaired
     for voltage in np.linspace(model.rows['voltage'].min(), model.rows['voltage'].max(), 7):

@@ -1,51 +1,25 @@
-"""The time of publication reaches the callback, under either executor."""
+"""The time of publication reaches the callback."""
 
-import math
 import time
 
 import pytest
-import rclpy
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import String
 
 from beetle_omni_ros.messages.topics import COMMAND
-from beetle_omni_ros.nodes import runner, wire
+from beetle_omni_ros.nodes import wire
 
-PATIENCE = 20           # s
+pytestmark = pytest.mark.real_time
 
 
-@pytest.mark.parametrize('make', [runner.make_executor, SingleThreadedExecutor])
-def test_a_callback_gets_the_time_at_which_its_message_was_published(make, ros_domain):
-    context = rclpy.Context()
-    rclpy.init(args=[], context=context, domain_id=ros_domain,
-               signal_handler_options=SignalHandlerOptions.NO)
-    node = rclpy.create_node('listener', context=context)
-    executor = make(context=context)
-    executor.add_node(node)
+def test_a_callback_gets_the_time_at_which_its_message_was_published(bench):
     received = []
-    node.create_subscription(String, 'word', wire.with_publication(
+    bench.user.create_subscription(String, 'word', wire.with_publication(
         lambda message, published: received.append((message.data, published))),
         wire.profile(COMMAND))
-    publisher = node.create_publisher(String, 'word', wire.profile(COMMAND))
-    try:
-        deadline = time.monotonic() + PATIENCE
-        while not received and time.monotonic() < deadline:
-            before = time.time()
-            publisher.publish(String(data='now'))
-            after = time.time()
-            executor.spin_once(timeout_sec=0.2)
-        assert received[0][0] == 'now'
-        assert before - 1e-3 <= received[0][1] <= after + 1e-3
-    finally:
-        node.destroy_node()
-        context.try_shutdown()
-
-
-def test_a_middleware_without_publication_times_gives_nan():
-    received = []
-    take = wire.with_publication(lambda message, published: received.append(published))
-    take('message', {'source_timestamp': 0})
-    take(('message', {}))
-    take('message', {'source_timestamp': 2_500_000_000})
-    assert math.isnan(received[0]) and math.isnan(received[1]) and received[2] == 2.5
+    publisher = bench.publisher(String, 'word', wire.profile(COMMAND))
+    before = time.time()
+    publisher.publish(String(data='now'))
+    after = time.time()
+    assert bench.wait(lambda: received)
+    assert received[0][0] == 'now'
+    assert before - 1e-3 <= received[0][1] <= after + 1e-3

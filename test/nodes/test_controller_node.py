@@ -1,7 +1,6 @@
-"""Nodes of registered controllers: by name, by class, in a whole graph."""
+"""Nodes of registered controllers: by name, by class, when they step, what they log."""
 
-import math
-import os
+from itertools import count
 from pathlib import Path
 import subprocess
 import sys
@@ -9,13 +8,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import rclpy
-from witness import HEADER, READY
+from rclpy.parameter import Parameter
+from witness import HEADER, READY, Sent
 
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.control.base import PoseTarget
-from beetle_omni_ros.messages.topics import split_topic, topic_of, topics_with
-from beetle_omni_ros.messages.values import MessageError, Odom
+from beetle_omni_ros.control.base import Command, PoseTarget
+from beetle_omni_ros.control.registry import ControllerEntry
+from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes import health, plan
 from beetle_omni_ros.nodes.controller_node import ControllerNode
 from beetle_omni_ros.nodes.supervisor_node import SupervisorNode
@@ -26,131 +25,166 @@ from beetle_omni_ros.runs.bag import read_bag
 
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 OWN = f"{Path(__file__).resolve().parents[2] / 'examples' / 'own_controller.py'}:PoseController"
-
-
-@pytest.fixture
-def make(ros_domain):
-    """Make one node in this process, with parameters."""
-    nodes = []
-
-    def build(node_class, *overrides):
-        arguments = [a for override in overrides for a in ('-p', override)]
-        rclpy.init(args=['--ros-args', *arguments], domain_id=ros_domain)
-        nodes.append(node_class())
-        return nodes[0]
-
-    yield build
-    for node in nodes:
-        node.destroy_node()
-    rclpy.try_shutdown()
-
-
-def topics(node):
-    """Topics that a node publishes."""
-    return [publisher.topic_name for publisher in node.publishers]
-
-
-def test_a_parameter_selects_the_controller_of_a_node(make):
-    node = make(ControllerNode, f'controller:={OWN}')
-    assert node.get_name() == 'pose_controller_node'
-    assert '/pose_controller/command' in topics(node)
-    assert node.get_parameter('controller').value == OWN
-    assert node._controller_status()[2] == {'guidance': 'none'}
-
-
-def test_a_shipped_controller_has_its_parameters_and_policy(make):
-    node = make(ControllerNode, 'controller:=rl_memory', 'unwinding.attempts:=0')
-    assert node.get_name() == 'rl_memory_node'
-    assert node.get_parameter('policy').value == registry.find('rl_memory').policy_file
-    assert node.get_parameter('unwinding.attempts').value == 0
-    assert node._controller_status()[2]['guidance'] == 'routing, turning, trimming'
-
-
-def test_any_controller_sees_true_tilts_and_no_target_beyond_its_reach(make, monkeypatch):
-    node, seen = make(ControllerNode, f'controller:={OWN}'), []
-    controller = node._host.controller
-    step = controller.step
-    monkeypatch.setattr(controller, 'step', lambda state, target: seen.append(state) or step(
-        state, target))
-    health = ActuatorHealth(zeros=(0.1, 0.0, 0.0, -0.2))
-    node._on_actuators(SimpleNamespace(health=health))
-    node._on_joints(JointReading(1.0, np.zeros(4), np.zeros(4)))
-    node._on_odom(Odom(1.0, np.array([0.0, 0.0, 1.0]), np.zeros(3), LEVEL,
-                               np.zeros(3)))
-    assert seen[0].tilt == pytest.approx(health.true(np.zeros(4))) and seen[0].tilt.any()
-    far = PoseTarget(np.array([9.0, 0.0, 1.0]), LEVEL, 1.0)
-    node._on_mode('flying:pose_controller')
-    node._check_target(far, math.nan)       # its reach is not limited
-    controller.reach = 3.0
-    with pytest.raises(MessageError, match='expected at most 3 m'):
-        node._check_target(far, math.nan)
-
-
 FAILING = """from beetle_omni_ros.control.hover import HoverController
 
 
 class Failing(HoverController):
-    fails_from = {fails_from}
-
     def step(self, state, target):
-        if state.stamp > self.fails_from:
+        if {fails}:
             state.positon
         return super().step(state, target)
 """
 
 
+class Follower:
+    """A controller that records its inputs."""
+
+    name, period = 'follower', 0.01
+
+    def __init__(self):
+        self.received, self.resets = [], 0
+
+    def reset(self):
+        self.resets += 1
+
+    def step(self, state, target):
+        self.received.append((state, target))
+        return Command(state.stamp, np.zeros(4), np.full(4, 7.5))
+
+
+class FollowerNode(ControllerNode):
+    """The controller node with a controller without solver."""
+
+    def __init__(self):
+        super().__init__(ControllerEntry(name='nmpc', controller=Follower))
+        self._publisher = Sent('nmpc/command')
+        self.follower = self._host.controller
+
+
+def fly(node, stamps, height=1.0):
+    for stamp in np.atleast_1d(stamps):
+        node._on_odom(Odom(stamp, np.array([0, 0, height]), np.zeros(3), LEVEL, np.zeros(3)))
+
+
+@pytest.fixture
+def follower(make):
+    """A node that has joint angles."""
+    node = make(FollowerNode)
+    fly(node, 99.9 + 0.005 * np.arange(20))
+    assert not node._publisher          # no joint angles yet
+    node._on_joints(JointReading(100.0, np.zeros(4), np.zeros(4)))
+    return node
+
+
+def test_the_controller_steps_once_a_period_and_stamps_with_the_state(follower):
+    health = ActuatorHealth(zeros=(0.1, 0.0, 0.0, -0.2))
+    follower._on_actuators(SimpleNamespace(health=health))
+    stamps = 101 + 0.005 * np.arange(200)
+    fly(follower, stamps)
+    assert np.allclose(follower._publisher.stamps(), stamps[::2])
+    assert follower.follower.received[-1][0].tilt == pytest.approx(health.true(np.zeros(4)))
+    fly(follower, [95.0, 95.005, 95.01])    # the clock was set back, and the new time is used
+    assert len(follower._publisher) == 102
+
+
+@pytest.mark.parametrize('rate', [100, 200])
+def test_a_controller_on_standby_steps_between_the_steps_of_the_one_that_flies(follower, rate):
+    def steps_from(begin):
+        before = len(follower._publisher)
+        for stamp in begin + np.arange(rate) / rate:
+            due = round((stamp - begin) * rate) % (rate // 100) == 0
+            if due and follower._host.mode == 'flying:rl':
+                follower._on_command(Command(stamp, np.zeros(4), np.full(4, 7.5)))
+            fly(follower, stamp)
+        return follower._publisher.stamps()[before:]
+
+    assert np.allclose(steps_from(100.0) - 100.0, 0.01 * np.arange(100), atol=1e-6)
+    follower._on_mode('flying:rl')
+    standby = steps_from(101.0)[5:]
+    if rate > 100:
+        assert np.all(np.abs((standby - 101.0) / 0.01 % 1.0 - 0.5) < 0.26)
+        assert np.allclose(np.diff(standby), 0.01, atol=1e-6)
+    else:       # no estimate in between: half the rate, within the timeout
+        assert np.allclose(np.diff(standby), 0.02, atol=1e-6)
+    follower._on_mode('flying:nmpc')
+    assert np.allclose(np.diff(steps_from(102.0)), 0.01, atol=1e-6)
+
+
+def test_the_newest_target_is_used_an_unset_stamp_means_now_and_a_landing_resets(follower):
+    stamps = count(100)
+
+    def target():
+        fly(follower, next(stamps))
+        return follower.follower.received[-1][1]
+
+    for stamp, x in ((50.0, 1.0), (60.0, 2.0), (50.0, 3.0)):
+        follower._on_target(PoseTarget(np.array([x, 0, 0]), LEVEL, stamp))
+    assert target().position[0] == 2.0
+    follower._on_target(PoseTarget(np.array([4.0, 0, 0]), LEVEL, 0.0))
+    assert target().position[0] == 4.0
+    assert target().stamp == pytest.approx(follower.now(), abs=5)
+    for mode in ('flying:nmpc', 'disarmed'):
+        follower._on_mode(mode)
+    assert follower.follower.resets == 1
+
+
+@pytest.mark.parametrize(('given', 'name', 'values'), [
+    ((f'controller:={OWN}',), 'pose_controller', {'controller': OWN}),
+    (('controller:=rl_memory', 'unwinding.attempts:=0'), 'rl_memory',
+     {'policy': registry.find('rl_memory').policy_file, 'unwinding.attempts': 0})])
+def test_a_parameter_selects_the_controller_of_a_node_with_its_parameters(make, given, name,
+                                                                          values):
+    node = make(ControllerNode, *given)
+    assert node.get_name() == f'{name}_node'
+    assert f'/{name}/command' in [publisher.topic_name for publisher in node.publishers]
+    assert {key: node.get_parameter(key).value for key in values} == values
+
+
 def test_an_exception_of_step_is_logged_and_reported_and_publishes_no_command(
         make, tmp_path, capfd):
-    own, published = tmp_path / 'bad.py', []
-    own.write_text(FAILING.format(fails_from=1.5))
+    own = tmp_path / 'bad.py'
+    own.write_text(FAILING.format(fails='state.stamp > 1.5'))
     node = make(ControllerNode, f'controller:={own}:Failing')
-    node._publisher = SimpleNamespace(publish=published.append)
+    node._publisher = Sent('nmpc/command')
     node._on_joints(JointReading(1.0, np.zeros(4), np.zeros(4)))
-
-    def step(stamp):
-        node._on_odom(Odom(stamp, np.array([0.0, 0.0, 1.0]), np.zeros(3), LEVEL, np.zeros(3)))
-
-    step(1.0)
-    step(2.0)
-    step(2.1)
-    assert [command.stamp for command in published] == [1.0]
+    fly(node, [1.0, 2.0, 2.1])
     error = "controller 'failing': step raised AttributeError: 'State' object has no attribute " \
-            "'positon' (bad.py:9)"
+            "'positon' (bad.py:7)"
     level, text, values = node._controller_status()
     assert (level, text, values['errors']) == (health.ERROR, error, 2)
     assert node._controller_status()[0] == health.OK      # none since the last report
-    node._host.controller.step = lambda state, target: ()
-    step(2.2)
-    assert 'step returned tuple' in node._controller_status()[1] and len(published) == 1
+    assert node._publisher.stamps().tolist() == [1.0]
     lines = [line for line in capfd.readouterr().err.splitlines() if 'ERROR' in line]
     assert len(lines) == 1 and lines[0].endswith(error)     # at most one a second
 
 
-@pytest.mark.simulated_time
 def test_fly_names_the_exception_of_a_controller_and_the_supervisor_lands(tmp_path):
     own, task = tmp_path / 'bad.py', tmp_path / 'poses.csv'
-    own.write_text(FAILING.format(fails_from='float("inf")').replace(
-        'state.stamp > self', 'state.position[2] > 1.3 or state.stamp > self'))
+    own.write_text(FAILING.format(fails='state.position[2] > 1.3'))
     task.write_text(HEADER + '0,0,1.6,0,0,0\n')      # higher than the climb
     done = subprocess.run(
         [sys.executable, '-m', 'beetle_omni_ros.start', 'beetle_omni', 'fly', '--controller',
          f'{own}:Failing', '--task', str(task), '--bag', str(tmp_path / 'bag'), '--alone',
-         '--clock', 'simulated'], capture_output=True, text=True, timeout=READY, check=False,
-        env=dict(os.environ))
+         '--clock', 'simulated'], capture_output=True, text=True, timeout=READY, check=False)
     line = done.stderr.splitlines()[0]
     assert done.returncode == 1 and 'Traceback' not in done.stderr
     assert line.startswith("beetle_omni fly: error: controller 'failing': step raised Attribute")
-    assert line.endswith('(bad.py:9)') and line not in done.stdout
+    assert line.endswith('(bad.py:7)') and line not in done.stdout
     states = [state.partition(':')[0] for state in read_bag(tmp_path / 'bag').states]
     assert 'fallback' in states and states[-2:] == ['landing', 'disarmed']
 
 
-def test_the_supervisor_accepts_the_listed_controllers(make):
+def test_the_supervisor_selects_among_the_listed_controllers(make):
     node = make(SupervisorNode, f"controllers:=['nmpc','{OWN}']", 'controller:=pose_controller')
+
+    def put(name, value):
+        return node.set_parameters([Parameter(name, value=value)])[0]
+
     assert node._supervisor.active == 'pose_controller'
-    assert node.get_parameter('controllers').value == ['nmpc', OWN]
-    refused, = node.set_parameters([rclpy.parameter.Parameter('controller', value='rl')])
+    assert put('controller', 'nmpc').successful and node._supervisor.active == 'nmpc'
+    refused = put('controller', 'rl')
     assert not refused.successful and 'nmpc, pose_controller' in refused.reason
+    assert node._supervisor.active == 'nmpc' and not put('takeoff.height', 2.0).successful
 
 
 def test_an_active_controller_outside_the_supervisors_list_is_refused(make):
@@ -158,41 +192,14 @@ def test_an_active_controller_outside_the_supervisors_list_is_refused(make):
         make(SupervisorNode, 'controller:=x')
 
 
-@pytest.mark.parametrize('override, message', [
-    ((), "'controller': missing"), (('-p', 'controller:=nmpx'), "'nmpx': expected one of nmpc"),
-    (('-p', 'controller:=absent.module:My'), "no module 'absent'"),
-    (('-p', f'controller:={OWN}Not'), 'its classes: PoseController')])
-def test_an_unusable_controller_ends_the_node_with_one_line(ros_domain, override, message):
-    done = subprocess.run(
-        [sys.executable, '-m', 'beetle_omni_ros.start', 'controller_node', '--ros-args',
-         *override],
-        capture_output=True, text=True, timeout=60, check=False, env=dict(os.environ))
-    assert done.returncode == 2, done.stderr
-    line, = done.stderr.strip().splitlines()
-    assert line.startswith('controller_node: error: ') and message in line
-
-
 def test_the_plan_of_a_graph_with_another_controller():
     nodes = plan.plan(plan.GraphOptions(controller=OWN, actuators='direct', bag='/b',
                                         task='hover')).nodes
-    assert list(nodes) == ['recorder_node', 'sim_node', 'ekf_node', 'pose_controller_node',
-                           'nmpc_node', 'rl_node', 'supervisor_node', 'reference_node']
+    known = ['pose_controller', *registry.standing_by()]
     assert nodes['pose_controller_node'] == {'controller': OWN}
     assert nodes['supervisor_node']['controller'] == 'pose_controller'
-    known = ['pose_controller', *registry.standing_by()]
-    assert nodes['supervisor_node']['controllers'] == known
-    assert nodes['recorder_node']['controllers'] == known
-    assert plan.executable('pose_controller_node') == 'controller_node'
+    for name in ('supervisor_node', 'recorder_node'):
+        assert nodes[name]['controllers'] == known
     assert plan.arguments(nodes, ['ekf_node', 'pose_controller_node']) == ['ekf_node', OWN]
     alone = plan.plan(plan.GraphOptions(controller=OWN, actuators='direct', standby=False)).nodes
     assert list(alone) == ['sim_node', 'ekf_node', 'pose_controller_node', 'supervisor_node']
-
-
-def test_topics_of_any_controller_are_distinguished_from_those_of_a_robot():
-    assert split_topic('/nmpc/command') == ('', 'nmpc/command')
-    assert split_topic('/robot1/rl/command') == ('/robot1', 'rl/command')
-    assert split_topic('/robot1/command') == ('/robot1', 'command')
-    assert split_topic('/own/command', ('',)) == ('', 'own/command')
-    assert split_topic('/robot1/own/command', ('/robot1',)) == ('/robot1', 'own/command')
-    assert split_topic('/robot1/command', ('/robot1',)) == ('/robot1', 'command')
-    assert topic_of('own/command') == topic_of('nmpc/command') == topics_with(['x'])['x/command']

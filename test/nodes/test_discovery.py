@@ -40,77 +40,56 @@ def test_an_unknown_range_is_refused():
         discovery.confine({'BEETLE_OMNI_DISCOVERY': 'world'})
 
 
-@pytest.mark.parametrize('start', [
-    'runner.main(ProbeNode, ["probe"])', 'sys.exit(runner.run([ProbeNode], ["x"], "composed"))'])
-def test_every_separate_or_composed_node_is_limited_to_this_computer(ros_domain, unset, start):
+@pytest.mark.parametrize(('start', 'variable', 'holds'), [
+    ('runner.main(ProbeNode, ["probe"])', '', 'LOCALHOST'),
+    ('sys.exit(runner.run([ProbeNode], ["x"], "composed"))', '', 'LOCALHOST'),
+    ('sys.exit(runner.run([ProbeNode], ["x"], "composed"))', 'subnet', 'SUBNET'),
+    ('runner.main(ProbeNode, ["probe", "--discovery", "SUBNET"])', '', 'SUBNET'),
+    ('runner.main(ProbeNode, ["probe", "--discovery=off", "--ros-args"])', '', 'OFF'),
+    ('runner.main(ProbeNode, ["probe", "--discovery"])', '',
+     "--discovery: expected one of LOCALHOST, SUBNET, OFF, SYSTEM_DEFAULT, found 'NOTHING'")])
+def test_a_separate_or_composed_node_is_limited_to_this_computer_unless_requested(
+        ros_domain, unset, start, variable, holds):
     done = subprocess.run([sys.executable, '-c', PROBE + start], capture_output=True, text=True,
-                          check=False, timeout=60)
-    assert done.stderr.strip() == 'probe_node: error: LOCALHOST'
-    done = subprocess.run([sys.executable, '-c', PROBE + start], capture_output=True, text=True,
-                          check=False, timeout=60,
-                          env={**os.environ, 'BEETLE_OMNI_DISCOVERY': 'subnet'})
-    assert done.stderr.strip() == 'probe_node: error: SUBNET'
-
-
-def test_an_argument_of_a_node_sets_the_range(ros_domain, unset):
-    def start(*arguments):
-        code = f'{PROBE}runner.main(ProbeNode, ["probe", *{list(arguments)!r}])'
-        return subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
-                              check=False, timeout=60).stderr.strip()
-
-    assert start('--discovery', 'SUBNET') == 'probe_node: error: SUBNET'
-    assert start('--discovery=off', '--ros-args', '-p', 'a:=1') == 'probe_node: error: OFF'
-    for bad in (('--discovery', 'world'), ('--discovery',)):
-        assert start(*bad).startswith('probe_node: error: --discovery: expected one of LOCALHOST')
-
-
-def test_the_range_argument_of_a_composition_is_not_a_node(ros_domain, unset):
-    done = subprocess.run(
-        [sys.executable, '-m', 'beetle_omni_ros.start', 'composed', '--discovery', 'subnet',
-         'no_node'], capture_output=True, text=True, check=False, timeout=60)
-    assert done.returncode == 2 and "unknown node 'no_node'" in done.stderr
-
-
-@pytest.mark.parametrize('command', ['fly', 'check'])
-def test_commands_that_join_the_graph_have_the_discovery_argument(command):
-    done = subprocess.run([sys.executable, '-m', 'beetle_omni_ros.cli', command, '--help'],
-                          capture_output=True, text=True, check=False, timeout=60)
-    assert '--discovery' in done.stdout
-
-
-def test_an_argument_of_fly_holds_for_the_processes_that_it_starts(tmp_path, unset, monkeypatch):
-    monkeypatch.setenv(discovery.RANGE, 'LOCALHOST')        # put back afterwards
-    monkeypatch.setenv(discovery.VARIABLE, '')
-    given = {}
-    monkeypatch.setattr(subprocess, 'Popen', lambda *_, env, **__: given.update(env))
-    discovery.confine(requested='subnet')
-    Graph({'ekf_node': {}}, tmp_path, 7).start_process('composed')
-    assert given['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'SUBNET'
-
-
-def test_a_graph_is_limited_to_this_computer(tmp_path, unset, monkeypatch):
-    given = {}
-    monkeypatch.setattr(subprocess, 'Popen', lambda *_, env, **__: given.update(env))
-    Graph({'ekf_node': {}}, tmp_path, 7).start_process('composed')
-    assert given['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'LOCALHOST'
+                          timeout=60, env={**os.environ, discovery.VARIABLE: variable})
+    assert done.stderr.strip() == f'probe_node: error: {holds}'
 
 
 @pytest.mark.parametrize('composed', [True, False])
-def test_an_argument_of_fly_reaches_every_node_of_the_plan(tmp_path, unset, monkeypatch, composed):
-    monkeypatch.setenv(discovery.RANGE, 'LOCALHOST')        # put back afterwards
+@pytest.mark.parametrize(('requested', 'holds'), [('', 'LOCALHOST'), ('subnet', 'SUBNET')])
+def test_an_argument_of_fly_reaches_every_node_of_the_plan(tmp_path, unset, monkeypatch, composed,
+                                                           requested, holds):
+    monkeypatch.setenv(discovery.RANGE, '')        # put back afterwards
     monkeypatch.setenv(discovery.VARIABLE, '')
-    started = {}
+    ranges = []
 
     def start(arguments, env, **_):
-        started[arguments[2]] = env[discovery.RANGE], arguments
+        ranges.append(env[discovery.RANGE])
         return SimpleNamespace(poll=lambda: 0, returncode=0)
 
     monkeypatch.setattr(subprocess, 'Popen', start)
     monkeypatch.setattr(os.path, 'exists', lambda _: True)
-    discovery.confine(requested='subnet')
+    discovery.confine(requested=requested)
     nodes = plan.plan(plan.GraphOptions(controller='hover', ports=str(tmp_path), task='hover',
                                         bag=str(tmp_path / 'bag'))).nodes
-    graph = Graph(nodes, tmp_path, 7, composed)
-    graph.start()
-    assert len(graph.processes) == (2 if composed else len(nodes))
-    assert {value for value, _ in started.values()} == {'SUBNET'}
+    Graph(nodes, tmp_path, 7, composed).start()
+    assert ranges == [holds] * (2 if composed else len(nodes))
+
+
+def test_a_name_is_free_again_when_its_process_ends():
+    name = f'test/{os.getpid()}'
+    with discovery.claim(name):
+        assert discovery.claim(name) is None
+    code = f'from beetle_omni_ros.nodes import discovery; print(discovery.claim({name!r}))'
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
+                          check=True, timeout=60)
+    assert 'socket' in done.stdout
+    with discovery.claim(name):
+        pass
+
+
+def test_two_reserved_domains_differ(monkeypatch):
+    with discovery.reserved_domain() as first:
+        monkeypatch.setattr(discovery, '_starts', iter([discovery.DOMAINS.index(first)]))
+        with discovery.reserved_domain() as second:
+            assert second != first

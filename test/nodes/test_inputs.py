@@ -9,35 +9,35 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 import numpy as np
 import pytest
-import rclpy
 
 pytest.importorskip('pymavlink')
 pytest.importorskip('serial')
 
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import JointState
+from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.control.registry import ControllerEntry
 from beetle_omni_ros.messages import conversions
-from beetle_omni_ros.messages.topics import COMMAND, EVENT, LATCHED
+from beetle_omni_ros.messages.topics import COMMAND, EVENT, LATCHED, SENSOR
 from beetle_omni_ros.messages.values import MessageError
 from beetle_omni_ros.nodes import command_source, wire
 from beetle_omni_ros.nodes.controller_node import ControllerNode
 from beetle_omni_ros.nodes.ekf_node import EkfNode
 from beetle_omni_ros.nodes.joint_bridge_node import JointBridgeNode
 from beetle_omni_ros.nodes.recorder_node import RecorderNode
-from beetle_omni_ros.nodes.reference_node import ReferenceNode
 from beetle_omni_ros.nodes.rotor_bridge_node import RotorBridgeNode
 from beetle_omni_ros.nodes.sim_node import SimNode
 from beetle_omni_ros.nodes.supervisor_node import SupervisorNode
-from beetle_omni_ros.nodes.viewer_node import ViewerNode
-from beetle_omni_ros.runs.bag import read_messages
+from beetle_omni_ros.robot.readings import ImuReading
+from beetle_omni_ros.runs.bag import read_bag, read_messages
 
+pytestmark = pytest.mark.real_time
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 SOON = 10       # s; a busy test machine must not cause a fault
 
@@ -49,56 +49,6 @@ class StillNode(ControllerNode):
         super().__init__(ControllerEntry(name='nmpc', controller=lambda: SimpleNamespace(
             period=0.01, step=lambda state, target: None, reset=lambda: None,
             set_health=lambda health: None)))
-
-
-class Bench:
-    """A node in this process, and another that publishes to it."""
-
-    def __init__(self, domain, *overrides):
-        arguments = [a for override in overrides for a in ('-p', override)]
-        rclpy.init(args=['--ros-args', *arguments], domain_id=domain)
-        self.user = rclpy.create_node('user')
-        self.executor = SingleThreadedExecutor()
-        self.executor.add_node(self.user)
-        self.nodes = [self.user]
-
-    def add(self, node):
-        """Spin this node too; log lines of its refusals are kept in ``node.refusals``."""
-        node.refusals = []
-        before = node.health.rejected
-        node.health.rejected = lambda topic, reason, kind='': (
-            node.refusals.append(f'{topic}: {reason}'), before(topic, reason, kind))
-        self.executor.add_node(node)
-        self.nodes.append(node)
-        return node
-
-    def publisher(self, kind, topic, profile=wire.profile(EVENT), readers=1):
-        """Make a publisher and wait for its subscription."""
-        made = self.user.create_publisher(kind, topic, profile)
-        assert self.wait(lambda: made.get_subscription_count() >= readers)
-        return made
-
-    def wait(self, condition, timeout=SOON):
-        """Spin until a condition holds."""
-        end = time.monotonic() + timeout
-        while not condition() and time.monotonic() < end:
-            self.executor.spin_once(timeout_sec=0.02)
-        return condition()
-
-    def close(self):
-        """Destroy the nodes."""
-        for node in self.nodes:
-            self.executor.remove_node(node)
-            node.destroy_node()
-        rclpy.try_shutdown()
-
-
-@pytest.fixture
-def bench(ros_domain):
-    """A bench without a node."""
-    made = Bench(ros_domain)
-    yield made
-    made.close()
 
 
 def pose(height=1.0, stamp=0.0, frame='world', x=0.0):
@@ -113,10 +63,12 @@ def test_a_bad_target_pose_is_refused_with_its_reason_and_the_old_one_stays(benc
     poses.publish(pose())
     assert bench.wait(lambda: node._host.target is not None)
     first, now = node._host.target, time.time()
+    node._host.controller.reach = 6.5
+    node._host.on_estimate(PoseTarget(np.array([0.0, 0.0, 1.0]), LEVEL))
+    node._on_mode('flying:nmpc')
     for message, expected in (
-            (pose(-5.0), 'z = -5 m, expected at least'),
-            (pose(0.05), 'z = 0.05 m, expected at least'), (pose(1e300), 'the fence'),
-            (pose(x=25.0), '|x| = 25 m, expected at most'), (pose(frame='map'), "frame_id 'map'"),
+            (pose(-5.0), 'z = -5 m, expected at least'), (pose(frame='map'), "frame_id 'map'"),
+            (pose(x=12.0), '12 m from the robot, expected at most 6.5 m'),
             (pose(stamp=1.5), 's old, expected at most 10 s'),
             (pose(stamp=now + 100), 's ahead, expected at most')):
         received = len(node.refusals)
@@ -124,17 +76,12 @@ def test_a_bad_target_pose_is_refused_with_its_reason_and_the_old_one_stays(benc
         assert bench.wait(lambda received=received: len(node.refusals) > received), expected
         assert node.refusals[-1].startswith('target_pose: ') and expected in node.refusals[-1]
         assert node._host.target is first
-    kinds = node.health._inputs['target_pose'].rejected
-    assert kinds['cannot be flown'] == 6 and kinds.total() == 7
-
-
-def test_a_target_from_a_clock_ahead_does_not_block_later_ones(bench):
-    node = bench.add(StillNode())
-    poses = bench.publisher(PoseStamped, 'target_pose')
-    poses.publish(pose(1.0, time.time() + 0.8))
-    assert bench.wait(lambda: node._host.target is not None)
+    poses.publish(pose(1.4, now + 0.8))     # of a clock ahead, which does not block later ones
+    assert bench.wait(lambda: node._host.target.position[2] == 1.4)
     poses.publish(pose(1.5, time.time()))
     assert bench.wait(lambda: node._host.target.position[2] == 1.5)
+    kinds = node.health._inputs['target_pose'].rejected
+    assert kinds['cannot be flown'] == 4 and kinds.total() == 5
 
 
 def test_a_stamp_of_1970_is_refused_in_simulated_time_too(bench, monkeypatch):
@@ -153,33 +100,6 @@ def test_a_stamp_of_1970_is_refused_in_simulated_time_too(bench, monkeypatch):
                 node._check_target(target, now)
 
 
-def test_a_latched_target_stays_good_for_a_node_that_starts_later(bench, monkeypatch):
-    node = bench.add(StillNode())
-    late = time.time() + 60
-    monkeypatch.setattr(node, 'now', lambda: late)
-    latched = bench.user.create_publisher(PoseStamped, 'target_pose', wire.profile(LATCHED))
-    latched.publish(pose(1.2, time.time()))
-    assert bench.wait(lambda: node._host.target is not None)
-
-
-def test_a_target_beyond_the_reach_of_the_active_controller_is_refused_and_not_taken_over(bench):
-    node = bench.add(StillNode())
-    node._host.controller.reach = 6.5
-    node._host.on_estimate(PoseTarget(np.array([0.0, 0.0, 1.0]), LEVEL))
-    poses = bench.publisher(PoseStamped, 'target_pose')
-    poses.publish(pose(x=12.0))
-    assert bench.wait(lambda: node._host.target is not None)     # others may reach it
-    node._on_mode('flying:nmpc')
-    assert node._host.target is None and 'the present pose is held' in node.refusals[-1]
-    poses.publish(pose(x=3.0))
-    assert bench.wait(lambda: node._host.target is not None)
-    near, received = node._host.target, len(node.refusals)
-    poses.publish(pose(x=12.0))
-    assert bench.wait(lambda: len(node.refusals) > received)
-    assert node._host.target is near
-    assert '12 m from the robot, expected at most 6.5 m' in node.refusals[-1]
-
-
 def trajectory(heights, stamp):
     count = len(heights)
     positions = np.column_stack([np.zeros((count, 2)), heights])
@@ -194,37 +114,30 @@ def test_every_point_of_a_target_trajectory_is_checked(bench):
     paths.publish(trajectory([1.0, 1.1, -5.0], time.time()))
     assert bench.wait(lambda: node.refusals)
     assert node.refusals[0].startswith('target_trajectory: point 3: z = -5 m, expected')
-    fast = trajectory([1.0, 1.1], time.time())
-    fast.points[1].velocities[0].linear.x = 1e300
-    paths.publish(fast)
-    assert bench.wait(lambda: len(node.refusals) > 1)
-    assert 'point 2: velocity 1e+300 m/s, expected within +-10 m/s' in node.refusals[1]
     assert node._host.target is None
     paths.publish(trajectory([1.0, 1.1, 1.2], time.time()))
     assert bench.wait(lambda: node._host.target is not None)
 
 
-def test_refusals_of_many_kinds_take_no_memory(bench):
-    node = bench.add(StillNode())
-    for k in range(500):
-        node.health.rejected('target_pose', f'reason {k}')
-    assert len(node.health._inputs['target_pose'].rejected) < 30
+def test_bad_and_stale_samples_are_refused_and_counted_by_reason(bench):
+    node = bench.add(EkfNode())
+    samples = bench.publisher(Imu, 'imu/data_raw', wire.profile(SENSOR))
+    rejected = node.health._inputs['imu/data_raw'].rejected
+    for specific_force, age in (([np.nan, 0, 9.8], 0.0), ([0, 0, 9.8], 30.0)):
+        before = rejected.total()
+        samples.publish(wire.message('imu/data_raw', ImuReading(
+            time.time() - age, specific_force, [0, 0, 0])))
+        assert bench.wait(lambda before=before: rejected.total() > before)
+    assert rejected == {'linear_acceleration is not finite': 1, 'stale stamp': 1}
 
 
 @pytest.mark.parametrize(('kind', 'overrides'), [
     (SimNode, ()), (JointBridgeNode, ('port:=/tmp/none/a',)),
     (RotorBridgeNode, ('port:=/tmp/none/b',)), (StillNode, ())])
-def test_only_the_supervisors_commands_are_executed_and_others_are_named(ros_domain, kind,
+def test_only_the_supervisors_commands_are_executed_and_others_are_named(make_bench, kind,
                                                                          overrides):
-    bench = Bench(ros_domain, *overrides)
-    try:
-        _fly_with_an_intruder(bench, bench.add(kind()))
-    finally:
-        bench.close()
-
-
-def _fly_with_an_intruder(bench, node):
-    texts = []
+    bench, texts = make_bench(*overrides), []
+    node = bench.add(kind())
     bench.user.create_subscription(
         DiagnosticArray, 'diagnostics', lambda m: texts.extend(s.message for s in m.status), 10)
     commands = bench.publisher(JointState, 'command', wire.profile(COMMAND))
@@ -267,49 +180,54 @@ def test_the_supervisor_signs_its_commands_and_publishes_its_identity(bench):
     assert re.fullmatch('supervisor_node:[0-9a-f]{8}', received[0])
 
 
-@pytest.mark.parametrize('kind', [
-    EkfNode, SimNode, SupervisorNode, ReferenceNode, StillNode, RecorderNode, ViewerNode,
-    JointBridgeNode, RotorBridgeNode])
-def test_read_only_parameters_cannot_be_set_in_flight(ros_domain, tmp_path, kind):
-    own = {JointBridgeNode: ('port:=/tmp/none/a',), RotorBridgeNode: ('port:=/tmp/none/b',),
-           RecorderNode: (f'bag:={tmp_path}/bag',)}
-    bench = Bench(ros_domain, *own.get(kind, ()))
-    try:
-        node = bench.add(kind())
-        before = node.now()
-        for simulated in (True, False):
-            new = Parameter('use_sim_time', value=simulated)
-            for answer in (node.set_parameters([new])[0],
-                           node.set_parameters_atomically([new])):
-                assert not answer.successful and '\n' not in answer.reason
-                assert 'read-only parameter: use_sim_time' in answer.reason
-        assert node.now() > before and not node.get_parameter('use_sim_time').value
-        assert node.describe_parameter('use_sim_time').read_only
-        for name in node._parameters:
-            if node.describe_parameter(name).read_only:
-                answer = node.set_parameters([Parameter(name, value=node.get_parameter(
-                    name).value)])[0]
-                assert not answer.successful and 'read-only' in answer.reason, name
-    finally:
-        bench.close()
+@pytest.mark.parametrize('kind', [EkfNode, JointBridgeNode])
+def test_the_clock_cannot_be_changed_in_flight(make, kind):
+    node = make(kind, *(('port:=/tmp/none/a',) if kind is JointBridgeNode else ()))
+    new = Parameter('use_sim_time', value=True)
+    for answer in (node.set_parameters([new])[0], node.set_parameters_atomically([new])):
+        assert not answer.successful
+        assert 'read-only parameter: use_sim_time' in answer.reason
 
 
 def test_messages_from_before_the_first_simulated_time_are_recorded_with_that_time(
-        ros_domain, tmp_path):
-    bench = Bench(ros_domain, 'use_sim_time:=true', f'bag:={tmp_path}/bag')
-    try:
-        node = bench.add(RecorderNode())
-        bench.publisher(String, 'supervisor/state', wire.profile(LATCHED)).publish(
-            String(data='disarmed'))
-        assert bench.wait(lambda: node._held) and not node.now()
-        bench.publisher(Clock, '/clock', wire.profile(EVENT)).publish(
-            Clock(clock=Time(sec=1_700_000_000)))
-        assert bench.wait(node.now)
-        bench.publisher(String, 'reference/state', wire.profile(LATCHED)).publish(
-            String(data='waiting'))
-        assert bench.wait(lambda: not node._held)
-        node.close()
-        assert [(one.topic, one.received) for one in read_messages(tmp_path / 'bag')] == [
-            ('/supervisor/state', 1.7e9), ('/reference/state', 1.7e9)]
-    finally:
-        bench.close()
+        make_bench, tmp_path):
+    bench = make_bench('use_sim_time:=true', f'bag:={tmp_path}/bag')
+    node = bench.add(RecorderNode())
+    bench.publisher(String, 'supervisor/state', wire.profile(LATCHED)).publish(
+        String(data='disarmed'))
+    assert bench.wait(lambda: node._held) and not node.now()
+    bench.publisher(Clock, '/clock', wire.profile(EVENT)).publish(
+        Clock(clock=Time(sec=1_700_000_000)))
+    assert bench.wait(node.now)
+    bench.publisher(String, 'reference/state', wire.profile(LATCHED)).publish(
+        String(data='waiting'))
+    assert bench.wait(lambda: not node._held)
+    node.close()
+    assert [(one.topic, one.received) for one in read_messages(tmp_path / 'bag')] == [
+        ('/supervisor/state', 1.7e9), ('/reference/state', 1.7e9)]
+
+
+BEST_EFFORT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+@pytest.mark.parametrize('profile', [wire.profile(EVENT), wire.profile(LATCHED), BEST_EFFORT])
+def test_each_target_is_recorded_once_with_any_quality_of_service(make_bench, tmp_path, profile):
+    bench, incompatible, heights = make_bench(f'bag:={tmp_path}/bag'), [], [1.0, 1.1, 1.2]
+    publisher = bench.user.create_publisher(
+        PoseStamped, 'target_pose', profile, event_callbacks=PublisherEventCallbacks(
+            incompatible_qos=incompatible.append))
+    if profile.durability == wire.profile(LATCHED).durability:
+        heights.insert(0, 0.9)
+        publisher.publish(pose(0.9))    # before the subscription
+    recorder = bench.add(RecorderNode())
+    bench.wait(lambda: False, 1.2)      # the required subscriptions exist
+    for height in heights[-3:]:
+        before = recorder._bag.counts['/target_pose']
+        publisher.publish(pose(height))
+        assert bench.wait(lambda n=before: recorder._bag.counts['/target_pose'] == n + 1)
+    bench.wait(lambda: False, 0.3)
+    assert not incompatible or profile is BEST_EFFORT
+    recorder.close()
+    targets = read_bag(tmp_path / 'bag').targets
+    assert [target.position[2] for target in targets] == heights
+    assert targets[-1].stamp == pytest.approx(time.time(), abs=60)   # time of receipt

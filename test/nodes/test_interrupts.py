@@ -25,11 +25,6 @@ def test_a_signal_is_an_interrupt_even_if_a_library_converts_it(number):
     assert signal.getsignal(number) is before
 
 
-def test_an_error_without_a_signal_is_not_changed():
-    with pytest.raises(RuntimeError, match='mine'), sigterm_as_interrupt():
-        raise RuntimeError('mine')
-
-
 def test_a_second_signal_does_not_interrupt_the_clean_up():
     cleaned = []
     with pytest.raises(KeyboardInterrupt), sigterm_as_interrupt():
@@ -53,14 +48,14 @@ def test_a_signal_while_a_flight_that_is_over_is_cleaned_up_waits():
     assert cleaned
 
 
-@pytest.mark.simulated_time
-@pytest.mark.parametrize('moment', ['start', 'flight'])
-def test_sigterm_ends_a_flight_cleanly_and_the_bag_is_complete(tmp_path, moment):
+@pytest.mark.parametrize(('moment', 'options'), [
+    ('start', ('--separate', '--actuators', 'direct')), ('flight', ())])
+def test_sigterm_ends_a_flight_cleanly_and_the_bag_is_complete(tmp_path, moment, options):
     bag, temporary = tmp_path / 'bag', tmp_path / 'tmp'
     temporary.mkdir()
     process = subprocess.Popen(
         [sys.executable, '-m', 'beetle_omni_ros.cli', 'fly', '--bag', str(bag), '--task', 'hover',
-         '--clock', 'simulated', '--alone'],
+         '--clock', 'simulated', '--alone', *options],
         stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
         env={**os.environ, 'TMPDIR': str(temporary)})
     deadline = time.monotonic() + 120

@@ -1,24 +1,21 @@
 """Processes of the launch file by its arguments; launch itself is replaced."""
 
-from contextlib import contextmanager, suppress
 from importlib.util import module_from_spec, spec_from_file_location
 import os
 from pathlib import Path
 import re
 import signal
+import stat
 import subprocess
 import sys
-import time
 from types import ModuleType
 
-from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
 import pytest
 from test_deploy import install, UNIT
-from witness import READY, Witness
 
 from beetle_omni_ros.messages.topics import TOPICS
-from beetle_omni_ros.nodes import discovery, plan, private
+from beetle_omni_ros.nodes import discovery, plan
+from beetle_omni_ros.nodes.operator import Operator
 from beetle_omni_ros.nodes.plan import BRIDGES
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
@@ -59,16 +56,8 @@ def bringup(monkeypatch):
                             lambda self, context: given[self.args[0]], raising=False)
         return module.actions(None)
 
-    monkeypatch.setattr(module, 'has_state_publisher', lambda: False)
     module.start = start
     return module
-
-
-def test_the_arguments_of_the_interface_are_declared(bringup):
-    declared = bringup.generate_launch_description().args[0][:-1]
-    names = {d.args[0] for d in declared}
-    assert {'backend', 'controller', 'record', 'namespace', 'composed'} <= names
-    assert all(d.kwargs['description'] for d in declared)
 
 
 def test_composed_is_one_process_and_one_for_the_bridges(bringup):
@@ -85,128 +74,68 @@ def test_composed_is_one_process_and_one_for_the_bridges(bringup):
 
 
 def test_separate_nodes_and_no_simulator_for_another_backend(bringup):
-    nodes = bringup.start(composed='false', backend='none', task='waypoints',
-                          viewer='true', namespace='robot1')
+    _, *nodes = bringup.start(composed='false', backend='none', task='waypoints',
+                              viewer='true', namespace='robot1')
     assert [n.kwargs['executable'] for n in nodes] == [
         'ekf_node', 'nmpc_node', 'rl_node', 'supervisor_node', 'reference_node', 'viewer_node']
     assert all(n.kwargs['namespace'] == 'robot1' for n in nodes)
 
 
-def test_robot_state_publisher_where_it_is_installed_has_the_links(bringup, monkeypatch):
-    monkeypatch.setattr(bringup, 'has_state_publisher', lambda: True)
+def test_robot_state_publisher_has_the_links(bringup):
     state_publisher, *_ = bringup.start(viewer='true', namespace='robot1', composed='false')
     given = state_publisher.kwargs
     assert (given['package'], given['namespace']) == ('robot_state_publisher', 'robot1')
     text = given['parameters'][0]['robot_description']
     assert text.args[0].startswith('<?xml') and text.kwargs == {'value_type': str}
-    viewer, = (n for n in bringup.start(viewer='true', composed='false')
-               if n.kwargs.get('name') == 'viewer_node')
-    assert viewer.kwargs['parameters'][0] == {'links': False}
     assert all(n.kwargs['package'] != 'robot_state_publisher'
                for n in bringup.start(composed='false'))
 
 
-def test_simulator_and_bridges_meet_at_the_same_ports(bringup):
-    nodes = {n.kwargs['name']: n.kwargs['parameters'][0]
-             for n in bringup.start(composed='false')}
+def given_to(nodes):
+    """Name -> parameters of separate nodes."""
+    return {node.kwargs['name']: node.kwargs['parameters'][0] for node in nodes}
+
+
+def test_simulator_and_bridges_meet_at_the_same_ports_in_a_private_folder(bringup):
+    nodes = given_to(bringup.start(composed='false'))
     assert nodes['sim_node']['actuators'] == 'emulated'
     assert nodes['sim_node']['servo_port'] == nodes['joint_bridge_node']['port']
     assert nodes['sim_node']['board_port'] == nodes['rotor_bridge_node']['port']
     assert nodes['joint_bridge_node']['autostart'] == 'activate'
-    again = {n.kwargs['name']: n.kwargs['parameters'][0]
-             for n in bringup.start(composed='false')}
-    assert again['sim_node']['servo_port'] != nodes['sim_node']['servo_port']
-    direct = bringup.start(composed='false', actuators='direct')
-    assert not set(BRIDGES) & {n.kwargs['name'] for n in direct}
-    assert 'actuators' not in next(n for n in direct if n.kwargs['name'] == 'sim_node'
-                                   ).kwargs['parameters'][0]
+    direct = given_to(bringup.start(composed='false', actuators='direct'))
+    assert not set(BRIDGES) & set(direct) and 'actuators' not in direct['sim_node']
 
 
-class Pilot(Witness):
-    """Operator that activates bridges, as `ros2 lifecycle set` does, and counts nodes."""
-
-    def activate(self, bridge):
-        """Activate a bridge; return whether it accepts."""
-        client = self._node.create_client(ChangeState, f'{bridge}/change_state')
-        assert self.wait(client.service_is_ready, 10)
-        request = ChangeState.Request()
-        request.transition.id = Transition.TRANSITION_ACTIVATE
-        future = client.call_async(request)
-        return self.wait(future.done, 10) and future.result().success
-
-    def count(self, name):
-        """Number of nodes of this name."""
-        return self._node.get_node_names().count(name)
-
-
-@contextmanager
-def running(commands, folder):
-    """Processes by name, with their output in the folder; ended by SIGINT."""
-    processes = {}
-    try:
-        for name, (command, needs) in commands.items():
-            deadline = time.monotonic() + 30
-            while not all(map(os.path.exists, needs)) and time.monotonic() < deadline:
-                time.sleep(0.05)
-            with open(folder / f'{name}.log', 'w') as log:
-                processes[name] = subprocess.Popen(command, stdout=log, stderr=log,
-                                                   stdin=subprocess.DEVNULL)
-        yield processes
-    finally:
-        for process in reversed(processes.values()):
-            process.send_signal(signal.SIGINT)
-            with suppress(subprocess.TimeoutExpired):
-                process.wait(10)
-            process.kill()
-
-
-@pytest.mark.alone
-def test_the_service_and_the_launch_file_fly_with_one_pair_of_bridges(bringup, tmp_path,
-                                                                      ros_domain):
+@pytest.mark.real_time
+def test_the_bridges_of_the_service_start_and_wait_for_their_ports(tmp_path, ros_domain):
     assert install(tmp_path).returncode == 0
     start = re.search(r"exec python3 (.*)'$", (tmp_path / UNIT).read_text(), re.M)[1]
-    ports = [str(tmp_path / name) for name in ('beetle_servos', 'motor_board')]
-    python = [sys.executable, '-m', 'beetle_omni_ros.start']
-    launched, = bringup.start(backend='none', standby='false')
-    commands = {
-        # In place of the devices and of the drivers of MoCap and IMU.
-        'robot': ([*python, 'sim_node', '--ros-args', '-p', 'actuators:=emulated', '-p',
-                   f'servo_port:={ports[0]}', '-p', f'board_port:={ports[1]}'], ()),
-        'service': ([sys.executable, *start.replace('/dev', str(tmp_path)).split()], ports),
-        'launch': (launched.kwargs['cmd'], ())}
-    with running(commands, tmp_path) as processes:
-        operator = Pilot(ros_domain)
-        try:
-            assert operator.wait(lambda: set(operator.bridges) == set(BRIDGES), 40)
-            assert operator.wait(lambda: operator.ready, READY)
-            assert [operator.count(name) for name in BRIDGES] == [1, 1]
-            assert all(operator.waits_for([name]) for name in BRIDGES)
-            assert all(map(operator.activate, BRIDGES))
-            assert operator.wait(lambda: not operator.waits_for(BRIDGES), 20), operator.bridges
-            operator.take_off(lambda: operator.state == 'flying:nmpc')
-            assert operator.stays_in_the_air(2.0)
-            assert operator.call('land')[0]
-            assert operator.wait(lambda: operator.state == 'disarmed', 30), operator.states
-        finally:
-            operator.close()
-    assert [process.returncode for process in processes.values()] == [0, 0, 0]
+    service = subprocess.Popen([sys.executable, *start.replace('/dev', str(tmp_path)).split()])
+    operator = Operator(ros_domain)
+    try:
+        assert operator.wait(lambda: set(operator.bridges) == set(BRIDGES), 40)
+        ports = tmp_path / 'beetle_servos', tmp_path / 'motor_board'
+        assert operator.wait(lambda: all(f'waiting: {port}' in operator.bridges[name]
+                                         for name, port in zip(BRIDGES, ports, strict=True)), 20)
+    finally:
+        operator.close()
+        service.send_signal(signal.SIGINT)
+        assert service.wait(20) == 0
 
 
 def test_the_plant_may_differ_from_the_robot_file(bringup):
-    nodes = bringup.start(composed='false', robot_file='a.yaml', plant_file='b.yaml',
-                          actuators='direct')
-    given = {n.kwargs['name']: n.kwargs['parameters'][0].get('robot_file') for n in nodes}
-    assert given == {'sim_node': 'b.yaml', 'ekf_node': 'a.yaml', 'nmpc_node': 'a.yaml',
+    nodes = given_to(bringup.start(composed='false', robot_file='a.yaml', plant_file='b.yaml',
+                                   actuators='direct'))
+    files = {name: parameters.get('robot_file') for name, parameters in nodes.items()}
+    assert files == {'sim_node': 'b.yaml', 'ekf_node': 'a.yaml', 'nmpc_node': 'a.yaml',
                      'rl_node': 'a.yaml', 'supervisor_node': 'a.yaml'}
 
 
 def test_each_controller_can_be_active_with_the_other_on_standby(bringup, capsys, monkeypatch):
     def controllers(**arguments):
-        nodes = bringup.start(composed='false', **arguments)
-        active = next(n.kwargs['parameters'][0]['controller'] for n in nodes
-                      if n.kwargs['name'] == 'supervisor_node')
-        return active, {n.kwargs['name']: n.kwargs['parameters'][0] for n in nodes
-                        if n.kwargs['name'] in ('nmpc_node', 'rl_node')}
+        nodes = given_to(bringup.start(composed='false', **arguments))
+        return nodes['supervisor_node']['controller'], {
+            name: nodes[name] for name in ('nmpc_node', 'rl_node') if name in nodes}
 
     assert controllers() == ('nmpc', {'nmpc_node': {}, 'rl_node': {}})
     assert controllers(controller='rl', standby='false') == ('rl', {'rl_node': {}})
@@ -250,8 +179,10 @@ def test_a_launch_is_visible_on_this_computer_only(bringup, monkeypatch):
 
 
 def test_the_ports_of_a_launch_are_in_a_private_folder(bringup):
-    nodes = {n.kwargs['name']: n.kwargs['parameters'][0] for n in bringup.start(composed='false')}
-    assert Path(nodes['sim_node']['servo_port']).parent.parent == private.folder()
+    folders = {Path(n.kwargs['parameters'][0]['servo_port']).parent for _ in range(2)
+               for n in bringup.start(composed='false') if n.kwargs['name'] == 'sim_node'}
+    assert len(folders) == 2
+    assert all(stat.S_IMODE(folder.stat().st_mode) == 0o700 for folder in folders)
 
 
 def test_the_browser_viewer_is_a_separate_process_without_targets(bringup):

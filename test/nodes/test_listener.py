@@ -21,6 +21,7 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import PoseReading
 from beetle_omni_ros.robot.schema import ParameterError
 
+pytestmark = pytest.mark.real_time
 UPRIGHT = np.array([0, 0, 0, 1.0])
 
 
@@ -109,14 +110,9 @@ def test_messages_of_real_publishers_are_recorded_and_checked(ros_domain):
     assert found['joint_bridge gimbal2'].values == {'voltage': '11.9'}
 
 
-def test_an_empty_graph_and_a_namespace(ros_domain):
-    graph = listen(0.2, 'robot1')
-    assert not graph.runs('joint_bridge') and not graph.streams['mocap/pose'].arrivals
+def test_another_namespace_is_empty_and_an_impossible_one_is_refused(ros_domain):
     with Drivers(ros_domain):
-        assert not listen(1.0, 'robot1').streams['imu/data_raw'].arrivals
-
-
-def test_an_impossible_namespace_is_refused_in_one_line(ros_domain):
-    with pytest.raises(ParameterError, match="namespace 'a b'") as caught:
+        graph = listen(1.0, 'robot1')
+    assert not graph.runs('joint_bridge') and not graph.streams['imu/data_raw'].arrivals
+    with pytest.raises(ParameterError, match="namespace 'a b'"):
         listen(0.1, 'a b')
-    assert '\n' not in str(caught.value)

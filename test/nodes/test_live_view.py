@@ -1,63 +1,34 @@
-"""The viewer's data of a graph, and its targets and selections."""
-
-import threading
-import time
+"""The viewer's data of a bench.user, and its targets and selections."""
 
 import numpy as np
 import pytest
 from rcl_interfaces.msg import SetParametersResult
-import rclpy
 
 from beetle_omni_ros.control.base import Command, PoseTarget
 from beetle_omni_ros.messages.values import Odom
-from beetle_omni_ros.nodes import runner, wire
+from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.live_view import LiveGraph
-from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.view.frames import COLUMNS, pose, Sampler
 
-TIMEOUT = 20.0      # [s]
+pytestmark = pytest.mark.real_time
 TURNED = np.array([0.0, 0.0, np.sin(0.3), np.cos(0.3)])
 
 
 @pytest.fixture
-def graph(ros_domain):
-    """A node in place of a graph, spun in a thread."""
-    rclpy.init(domain_id=ros_domain)
-    node = rclpy.create_node('supervisor_node')
-    executor = runner.make_executor()
-    executor.add_node(node)
-    stop = threading.Event()
-
-    def spin():
-        while not stop.is_set():
-            executor.spin_once(timeout_sec=0.05)
-    thread = threading.Thread(target=spin)
-    thread.start()
-    yield node
-    stop.set()
-    thread.join()
-    node.destroy_node()
-    rclpy.try_shutdown()
+def bench(make_bench):
+    """A node in place of a bench.user."""
+    return make_bench(user='supervisor_node')
 
 
 @pytest.fixture
-def listener(graph, ros_domain):
+def listener(bench, ros_domain):
     made = LiveGraph(domain=ros_domain, writable=True)
     yield made
     made.close()
 
 
-def wait(condition):
-    deadline = time.monotonic() + TIMEOUT
-    while time.monotonic() < deadline:
-        if condition():
-            return True
-        time.sleep(0.05)
-    return False
-
-
-def test_messages_become_a_row(graph, listener):
-    odom, truth, command, target = (wire.Publisher(graph, topic) for topic in (
+def test_messages_become_a_row(bench, listener):
+    odom, truth, command, target = (wire.Publisher(bench.user, topic) for topic in (
         'odom', 'ground_truth/odom', 'command', 'target_pose'))
     target.publish(PoseTarget(np.array([0, 0, 2.0]), TURNED, 6.0))
     sampler = Sampler()
@@ -71,7 +42,7 @@ def test_messages_become_a_row(graph, listener):
         row = sampler.row(8.0)
         return not np.isnan(row[COLUMNS['thrust']]).any() and \
             pose(row, 'estimate_') and pose(row, 'target_')
-    assert wait(complete)
+    assert bench.wait(complete)
     row = sampler.row(8.0)
     np.testing.assert_allclose(row[COLUMNS['position']], [0.5, 0, 1.0])
     np.testing.assert_allclose(row[COLUMNS['estimate_position']], [0.5, 0, 1.01])
@@ -80,47 +51,42 @@ def test_messages_become_a_row(graph, listener):
     assert sampler.clock == pytest.approx(7.0)
 
 
-def test_a_target_arrives_latched_and_unchanged(graph, listener):
+def test_a_target_arrives_latched_and_unchanged(bench, listener):
     target = PoseTarget(np.array([0.4, -0.2, 1.5]), TURNED, 12.25)
     listener.publish_target(target)
     received = []      # of a later subscriber
-    wire.subscribe(graph, 'target_pose', received.append)
-    assert wait(lambda: received)
+    wire.subscribe(bench.user, 'target_pose', received.append)
+    assert bench.wait(lambda: received)
     found = received[0]
     np.testing.assert_allclose(found.position, target.position)
     np.testing.assert_allclose(found.quaternion, target.quaternion)
     assert found.stamp == target.stamp
 
 
-def test_the_supervisor_accepts_or_refuses_a_controller(graph, listener):
+def test_the_supervisor_accepts_or_refuses_a_controller(bench, listener):
     answers = []
-    graph.declare_parameter('controller', 'nmpc')
-    graph.add_on_set_parameters_callback(lambda given: SetParametersResult(
+    bench.user.declare_parameter('controller', 'nmpc')
+    bench.user.add_on_set_parameters_callback(lambda given: SetParametersResult(
         successful=given[0].value == 'rl', reason='rl alone'))
-    wire.Publisher(graph, 'rl/command')
-    assert wait(lambda: listener.controllers() == ['rl'])
-    assert wait(lambda: listener._setting.service_is_ready())
+    wire.Publisher(bench.user, 'rl/command')
+    assert bench.wait(lambda: listener.controllers() == ['rl'])
+    assert bench.wait(lambda: listener._setting.service_is_ready())
     listener.select('rl', answers.append)
-    assert wait(lambda: answers == [''])
-    assert graph.get_parameter('controller').value == 'rl'
+    assert bench.wait(lambda: answers == [''])
+    assert bench.user.get_parameter('controller').value == 'rl'
     listener.select('hover', answers.append)
-    assert wait(lambda: answers == ['', 'rl alone'])
-    assert graph.get_parameter('controller').value == 'rl'
+    assert bench.wait(lambda: answers == ['', 'rl alone'])
+    assert bench.user.get_parameter('controller').value == 'rl'
 
 
-def test_a_read_only_graph_publishes_no_target(graph, ros_domain):
+def test_a_read_only_graph_publishes_no_target(bench, ros_domain):
     silent = LiveGraph(domain=ros_domain)
     try:
         silent.publish_target(PoseTarget(np.zeros(3), TURNED, 1.0))
         answers = []
         silent.select('rl', answers.append)
         assert answers == ['supervisor_node is not there']
-        assert wait(lambda: graph.count_subscribers('odom'))    # it is in the graph
-        assert not graph.count_publishers('target_pose')
+        assert bench.wait(lambda: bench.user.count_subscribers('odom'))    # it is in the graph
+        assert not bench.user.count_publishers('target_pose')
     finally:
         silent.close()
-
-
-def test_an_impossible_namespace_is_refused():
-    with pytest.raises(ParameterError, match="--namespace '7 up'"):
-        LiveGraph('7 up')

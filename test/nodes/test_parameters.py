@@ -1,5 +1,6 @@
 """Parameters: files, overrides, one-line refusals, changes in flight."""
 
+from contextlib import ExitStack
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,26 +34,25 @@ class Example:
 
 @pytest.fixture
 def make_node(ros_domain):
-    """Make nodes with command line arguments, and destroy them afterwards."""
-    made = []
-
-    def make(*arguments):
-        context = rclpy.Context()
-        rclpy.init(args=['--ros-args', *arguments], context=context, domain_id=ros_domain)
-        node = Node('example', context=context)
-        made.append((node, context))
-        return node
-
-    yield make
-    for node, context in made:
-        node.destroy_node()
-        context.try_shutdown()
+    """Make a node with command line arguments, and destroy it afterwards."""
+    with ExitStack() as stack:
+        def make(*arguments):
+            context = rclpy.Context()
+            rclpy.init(args=['--ros-args', *arguments], context=context, domain_id=ros_domain)
+            stack.callback(context.try_shutdown)
+            node = Node('example', context=context)
+            stack.callback(node.destroy_node)
+            return node
+        yield make
 
 
-def test_overrides_arrive_in_the_dataclass(make_node):
-    node = make_node('-p', 'gains.kp:=4', '-p', 'mode:=fast', '-p', 'gains.axes:=[1.,2.,3.,4.]')
+def test_file_and_overrides_arrive_in_the_dataclass(make_node, tmp_path):
+    file = tmp_path / 'example.yaml'
+    file.write_text('/**/example:\n  ros__parameters:\n    gains: {kp: 6.5}\n    count: 2\n')
+    node = make_node('--params-file', str(file), '-p', 'gains.kp:=4', '-p', 'mode:=fast',
+                     '-p', 'gains.axes:=[1.,2.,3.,4.]')
     given = parameters.declare(node, Example)
-    assert given.gains.kp == 4.0 and given.mode == 'fast' and given.count == 3
+    assert given.gains.kp == 4.0 and given.mode == 'fast' and given.count == 2
     assert given.gains.axes.tolist() == [[1, 2], [3, 4]]
     assert node.get_parameter('gains.kp').value == 4.0
     descriptor = node.describe_parameter('gains.kp')
@@ -60,20 +60,9 @@ def test_overrides_arrive_in_the_dataclass(make_node):
     assert descriptor.floating_point_range[0].to_value == 10
 
 
-def test_node_and_tools_read_a_file_alike(make_node, tmp_path):
-    file = tmp_path / 'example.yaml'
-    file.write_text('/**/example:\n  ros__parameters:\n    gains: {kp: 6.5}\n    count: 2\n')
-    given = parameters.declare(make_node('--params-file', str(file)), Example)
-    assert given.gains.kp == 6.5 and given.count == 2
-
-
 @pytest.mark.parametrize('override, named', [
-    ('gains.kq:=1.0', "'gains.kq': unknown key; known: kp, axes"),
     ('gain.kp:=1.0', "'gain': unknown key; did you mean 'gains'"),
     ('gains.kp:=11.0', "'gains.kp': 11 is outside 0 to 10 1/s"),
-    ('gains.kp:=fast', "'gains.kp': expected a number"),
-    ('gains.axes:=[1.0, 2.0]', "'gains.axes': expected shape (2, 2)"),
-    ('mode:=warp', "'mode': expected one of slow, fast"),
     ('count:=2.5', "'count': expected an integer"),
     ('gains:=3', "'gains': expected a mapping"),
 ])
@@ -98,9 +87,3 @@ def test_changes_in_flight_are_validated(make_node):
     assert not set_to('seed', 4).successful
     assert node.get_parameter('gains.kp').value == 5.0
     assert len(seen) == 2
-
-
-def test_without_a_handler_everything_is_read_only(make_node):
-    node = make_node()
-    parameters.declare(node, Example)
-    assert not node.set_parameters([Parameter('gains.kp', value=5.0)])[0].successful

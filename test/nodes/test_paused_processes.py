@@ -4,9 +4,8 @@ import signal
 import time
 
 import pytest
-from witness import READY, Witness
+from witness import running_graph
 
-from beetle_omni_ros.nodes.graph import Graph
 from beetle_omni_ros.nodes.plan import COMPOSED, GraphOptions, plan
 
 pytestmark = pytest.mark.real_time
@@ -18,12 +17,7 @@ def test_a_pause_of_the_computer_in_flight_is_not_reported_as_a_crash(ros_domain
                                                                       tmp_path):
     options = GraphOptions(controller='nmpc', task='hover', actuators='direct',
                            ports=str(tmp_path), bag=str(tmp_path / 'bag'), standby=False)
-    graph = Graph(plan(options).nodes, tmp_path, ros_domain)
-    witness = None
-    try:
-        graph.start()
-        witness = Witness(ros_domain)
-        assert witness.wait(lambda: witness.ready, READY), graph.dead()
+    with running_graph(plan(options).nodes, tmp_path, ros_domain) as (graph, witness):
         witness.can_judge(graph)
         witness.take_off(lambda: witness.state.startswith('flying'))
         witness.spin(2.0)
@@ -38,7 +32,3 @@ def test_a_pause_of_the_computer_in_flight_is_not_reported_as_a_crash(ros_domain
         assert not any('crash' in state for state in witness.states), (witness.states, robot)
         assert robot['broken'] == '0' and impact < SOFT
         assert witness.state.startswith('flying') or witness.state == 'disarmed'
-    finally:
-        graph.stop()
-        if witness:
-            witness.close()

@@ -1,20 +1,14 @@
-"""Markers and frames of the viewer agree with the topics."""
+"""Markers and frame of the viewer agree with the topics."""
 
-import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import rclpy
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
-from std_msgs.msg import String
 
 from beetle_omni_ros.control.base import Command, PoseTarget
 from beetle_omni_ros.messages import conversions
-from beetle_omni_ros.messages.topics import EVENT, LATCHED
 from beetle_omni_ros.messages.values import Odom
-from beetle_omni_ros.nodes import wire
-from beetle_omni_ros.nodes.transform_message import transform_message
+from beetle_omni_ros.nodes import viewer_node
 from beetle_omni_ros.nodes.viewer_node import ViewerNode
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.readings import JointReading
@@ -24,19 +18,18 @@ class Sent(list):
     """A publisher that stores its messages."""
 
     publish = list.append
+    subscribed = 1
 
     def get_subscription_count(self):
-        return 1
+        return self.subscribed
 
 
 @pytest.fixture
-def viewer(ros_domain):
-    rclpy.init(domain_id=ros_domain)
-    node = ViewerNode()
-    node._markers, node._transforms = Sent(), Sent()
-    yield node
-    node.destroy_node()
-    rclpy.try_shutdown()
+def viewer(make, monkeypatch):
+    node = make(ViewerNode)
+    monkeypatch.setattr(node, '_markers', Sent())
+    monkeypatch.setattr(node, '_transforms', Sent(), raising=False)
+    return node
 
 
 def test_thrust_arrows_point_along_the_tilted_rotors(viewer):
@@ -48,6 +41,11 @@ def test_thrust_arrows_point_along_the_tilted_rotors(viewer):
     viewer._joints = JointReading(5.0, tilt, np.zeros(4))
     viewer._command = Command(5.0, tilt, np.array([8.0, 4.0, 0.0, 20.0]))
     viewer._target = PoseTarget(position, rotation)
+    viewer._markers.subscribed = viewer._transforms.subscribed = 0
+    viewer._draw()
+    viewer._move()
+    assert not viewer._markers and not viewer._transforms
+    viewer._markers.subscribed = 1
     viewer._draw()
     markers = {marker.ns: marker for marker in viewer._markers[-1].markers}
     assert set(markers) == {'body', 'rotor1', 'rotor2', 'rotor3', 'rotor4', 'target'}
@@ -62,61 +60,15 @@ def test_thrust_arrows_point_along_the_tilted_rotors(viewer):
     assert markers['rotor1'].header.frame_id == 'world'
 
 
-def test_the_frames_of_all_links_form_one_tree_and_stand_where_the_rotors_are(ros_domain):
-    if transform_message() is None:
-        pytest.skip('no tf2_msgs here, and none can be made')
-    context = Context()
-    rclpy.init(context=context, domain_id=ros_domain)
-    listener = rclpy.create_node('listener', context=context)
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(listener)
-    received = {'/tf': [], '/tf_static': [], 'robot_description': []}
-    for topic, profile in (('/tf', wire.profile(EVENT)), ('/tf_static', wire.profile(LATCHED))):
-        listener.create_subscription(transform_message(), topic, received[topic].append, profile)
-    listener.create_subscription(String, 'robot_description', received['robot_description'].append,
-                                 wire.profile(LATCHED))
-    rclpy.init(domain_id=ros_domain)
-    node = ViewerNode()
-    try:
-        rotation = rotations.from_rpy(0.4, -0.2, 1.0)
-        position, tilt = np.array([1.0, 2.0, 3.0]), np.array([0.0, np.pi / 2, 0.0, -0.3])
-        node._odom = Odom(5.0, position, np.zeros(3), rotation, np.zeros(3))
-        node._joints = JointReading(4.9, tilt, np.zeros(4))
-        end = time.monotonic() + 20
-        while not all(received.values()) and time.monotonic() < end:
-            node._moved = None
-            node._move()
-            executor.spin_once(timeout_sec=0.1)
-        frames = {frame.child_frame_id: frame for topic in ('/tf', '/tf_static')
-                  for frame in received[topic][-1].transforms}
-        assert set(frames) == {'base_link', 'main_body', 'end_effector', 'imu', *(
-            f'{kind}{k}' for kind in ('module', 'rotor') for k in (1, 2, 3, 4))}
-        assert frames['base_link'].header.stamp.sec == 5
-        for k in range(4):
-            at, turn, name = np.zeros(3), np.array([0, 0, 0, 1.0]), f'rotor{k + 1}'
-            while name != 'world':
-                frame = frames[name]
-                here = conversions.xyzw(frame.transform.rotation)
-                at = rotations.matrix(here) @ at + conversions.xyz(frame.transform.translation)
-                turn, name = rotations.multiply(here, turn), frame.header.frame_id
-            axes = rotations.matrix(rotation)
-            assert at == pytest.approx(position + axes @ node._robot.rotors.positions[k])
-            tilted = rotations.matrix(rotations.exp(node._robot.tilt_axes[k] * tilt[k]))
-            assert rotations.matrix(turn)[:, 2] == pytest.approx(axes @ tilted[:, 2])
-        assert '<robot' in received['robot_description'][0].data
-    finally:
-        node.destroy_node()
-        listener.destroy_node()
-        executor.shutdown()
-        rclpy.try_shutdown()
-        rclpy.try_shutdown(context=context)
-
-
-def test_nothing_is_drawn_without_subscriptions(viewer):
-    viewer._odom = Odom(5.0, np.zeros(3), np.zeros(3), np.array([0, 0, 0, 1.0]),
-                                np.zeros(3))
-    for publisher in (viewer._markers, viewer._transforms):
-        publisher.get_subscription_count = lambda: 0
-    viewer._draw()
+def test_the_frame_of_the_body_is_sent_once_for_each_estimate(viewer, monkeypatch):
+    monkeypatch.setattr(viewer_node, 'TFMessage', SimpleNamespace)
+    rotation, position = rotations.from_rpy(0.4, -0.2, 1.0), np.array([1.0, 2.0, 3.0])
+    viewer._odom = Odom(5.0, position, np.zeros(3), rotation, np.zeros(3))
     viewer._move()
-    assert not viewer._markers and not viewer._transforms
+    viewer._move()
+    (message,) = viewer._transforms
+    (frame,) = message.transforms
+    assert (frame.header.frame_id, frame.child_frame_id) == ('world', 'base_link')
+    assert frame.header.stamp.sec == 5
+    assert conversions.xyz(frame.transform.translation) == pytest.approx(position)
+    assert conversions.xyzw(frame.transform.rotation) == pytest.approx(rotation)

@@ -1,12 +1,16 @@
 """Test bench of real flights: long timeouts, and an operator that observes the truth."""
 
+from contextlib import contextmanager
 import time
 
 import numpy as np
 import pytest
+import rclpy
 
-from beetle_omni_ros.messages.topics import SENSOR
-from beetle_omni_ros.nodes import wire
+from beetle_omni_ros.messages import conversions
+from beetle_omni_ros.messages.topics import EVENT, SENSOR
+from beetle_omni_ros.nodes import runner, wire
+from beetle_omni_ros.nodes.graph import Graph
 from beetle_omni_ros.nodes.operator import Operator
 
 HEADER = 'x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg\n'
@@ -18,6 +22,22 @@ READY = 240     # s; without a cache the controller is compiled first
 PATIENT = {'commands': {'timeout': 0.08, 'stale_after': 0.08},
            'state': {'timeout': 0.08, 'stale_after': 0.08, 'imu_timeout': 0.08,
                      'mocap_timeout': 1.0, 'joint_timeout': 1.0}}
+
+
+class Sent(list):
+    """A publisher of a topic that keeps its messages."""
+
+    def __init__(self, topic):
+        super().__init__()
+        self._topic = topic
+
+    def publish(self, value):
+        """Store a value."""
+        self.append(wire.message(self._topic, value))
+
+    def stamps(self):
+        """Return the stamps of all messages [s]."""
+        return np.array([conversions.seconds(message.header.stamp) for message in self])
 
 
 class Witness(Operator):
@@ -60,3 +80,62 @@ class Witness(Operator):
             if flies():
                 return
         raise AssertionError(f'no take-off: {self.states}')
+
+
+@contextmanager
+def running_graph(nodes, folder, domain, *, operator=Witness, ready=lambda one: one.ready,
+                  **options):
+    """Yield a graph of nodes (name -> parameters) and its operator once this is ready."""
+    graph, witness = Graph(nodes, folder, domain, **options), None
+    try:
+        graph.start()
+        witness = operator(domain)
+        assert witness.wait(lambda: ready(witness), READY), graph.dead()
+        yield graph, witness
+    finally:
+        stubborn = graph.stop()
+        if witness:
+            witness.close()
+    assert not stubborn
+
+
+class Bench:
+    """Nodes in this process, and one named ``user`` that publishes to them."""
+
+    def __init__(self, domain, *overrides, user='user'):
+        arguments = [a for override in overrides for a in ('-p', override)]
+        rclpy.init(args=['--ros-args', *arguments], domain_id=domain)
+        self.user = rclpy.create_node(user)
+        self.executor = runner.make_executor()
+        self.executor.add_node(self.user)
+        self.nodes = [self.user]
+
+    def add(self, node):
+        """Spin this node too; log lines of its refusals are kept in ``node.refusals``."""
+        node.refusals = []
+        before = node.health.rejected
+        node.health.rejected = lambda topic, reason, kind='': (
+            node.refusals.append(f'{topic}: {reason}'), before(topic, reason, kind))
+        self.executor.add_node(node)
+        self.nodes.append(node)
+        return node
+
+    def publisher(self, kind, topic, profile=wire.profile(EVENT)):
+        """Make a publisher and wait for its subscription."""
+        made = self.user.create_publisher(kind, topic, profile)
+        assert self.wait(lambda: made.get_subscription_count())
+        return made
+
+    def wait(self, condition, timeout=20.0):
+        """Spin until a condition holds."""
+        end = time.monotonic() + timeout
+        while not condition() and time.monotonic() < end:
+            self.executor.spin_once(timeout_sec=0.02)
+        return condition()
+
+    def close(self):
+        """Destroy the nodes."""
+        for node in self.nodes:
+            self.executor.remove_node(node)
+            node.destroy_node()
+        rclpy.try_shutdown()

@@ -31,21 +31,9 @@ def record(folder, *, task, body='truth', targets=0):
     return folder
 
 
-@pytest.mark.parametrize('targets', [0, 1])
-@pytest.mark.parametrize('task', ['waypoints', 'lemniscate', 'payload', 'force', 'hover', ''])
-def test_a_bag_without_targets_gives_a_page(tmp_path, task, targets):
-    bag = record(tmp_path / 'bag', task=task, targets=targets)
-    page = tmp_path / 'page.html'
-    results = run_report([bag], page, console=Console(file=io.StringIO()))
-    assert results['meta']['seed'] == 0
-    text = page.read_text()
-    assert str(bag) in text and '>Pose<' in text and ('>Errors<' in text) == bool(targets)
-
-
 @pytest.mark.parametrize('meta', [
-    [1], 'x', {'task': ['x']}, {'task': 'x' * 9000}, {'task': 'random10', 'seed': -1},
-    {'task': 'random10', 'seed': 'abc'}, {'task': 'hover', 'seed': 1e999}, {'robot': {'a': 1}},
-    {'robot': 'a\0b'}, {'controller': ['nmpc']}, {'conditions': {'a': 1}, 'seed': [1]}], ids=str)
+    [1], {'task': ['x']}, {'task': 'random10', 'seed': 'abc'}, {'task': 'hover', 'seed': 1e999},
+    {'robot': 'a\0b'}, {'controller': ['nmpc']}], ids=str)
 def test_metadata_of_any_kind_do_not_hide_the_flight(tmp_path, meta):
     bag = record(tmp_path / 'bag', task='hover', targets=1)
     file = bag / 'metadata.yaml'
@@ -59,27 +47,17 @@ def test_metadata_of_any_kind_do_not_hide_the_flight(tmp_path, meta):
     assert results_of(runs)['run'] and '>Pose<' in make_page(runs, results_of(runs))
 
 
-def test_metadata_nested_too_deeply_give_a_warning(tmp_path):
-    bag = record(tmp_path / 'bag', task='hover')
-    (bag / 'metadata.yaml').write_text('a: ' + '[' * 5000)
-    assert 'metadata.yaml is not readable' in read_bag(bag).warnings
-
-
-def test_numbers_too_close_for_a_histogram_do_not_prevent_the_page(tmp_path):
-    bag = record(tmp_path / 'bag', task='hover', targets=1)
-    log = read_bag(bag)
-    log.command_t = log.command_received = np.arange(10.0, 13.0)
-    log.command_tilt = np.zeros((3, 4))
-    log.command_thrust = np.array([1e5, np.nextafter(1e5, 0), 1e5])[:, None] * np.ones(4)
-    runs = make_runs([log], ['run'])
-    assert '>Pose<' in make_page(runs, results_of(runs))
-
-
 def test_flights_with_and_without_targets_share_one_page(tmp_path):
     bags = [record(tmp_path / 'none', task='hover', body='odom'),
-            record(tmp_path / 'one', task='hover', targets=2)]
-    run_report(bags, tmp_path / 'page.html', console=Console(file=io.StringIO()))
-    assert (tmp_path / 'page.html').stat().st_size > 10_000
+            *(record(tmp_path / f'_{task}', task=task, targets=1)
+              for task in ('waypoints', 'lemniscate', 'payload', 'force', ''))]
+    page = tmp_path / 'page.html'
+    results = run_report(bags, page, console=Console(file=io.StringIO()))
+    assert results['meta']['seed'] == 0
+    text = page.read_text()
+    assert '>Errors<' in text and all(str(bag) in text for bag in bags)
+    run_report(bags[:1], page, console=Console(file=io.StringIO()))
+    assert '>Pose<' in page.read_text() and '>Errors<' not in page.read_text()
 
 
 def test_the_outcome_and_the_injected_faults_are_on_the_page_and_in_the_table(tmp_path):

@@ -10,6 +10,7 @@ from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.actuator_health import ALL_HEALTHY
 from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.servo import NUMPY, Servo, Step
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.watch.faults import FaultWatch
 from beetle_omni_ros.safety.watch.joints import JointWatch
@@ -22,28 +23,50 @@ ALLOCATOR = Allocator(ROBOT)
 P = SupervisorParameters.load().detection
 TICK = 0.005
 LAG = ROBOT.rotors.time_constant
+LAGS = np.linspace(*ROBOT.interval('rotors.time_constant'), 4)
+MEASURED = RobotParameters.load('measured')
+
+
+def jumps(seed, duration, low, high, shortest, longest):
+    """Four commands for each tick that jump at random times."""
+    random, ticks = np.random.default_rng(seed), round(duration / TICK)
+    made = np.empty((ticks, 4))
+    for joint in range(4):
+        times = np.cumsum(random.uniform(shortest, longest, round(duration / shortest) + 1))
+        values = random.uniform(low, high, len(times) + 1)
+        made[:, joint] = values[np.searchsorted(times, TICK * np.arange(ticks))]
+    return made
 
 
 class Body:
     """A free body moved by its thrusts; the IMU has the noise of the simulator."""
 
-    def __init__(self, attitude, seed=0):
+    def __init__(self, attitude, seed=0, lag=LAG):
+        self.lag = lag
         self.hover = ALLOCATOR.hover(attitude, np.zeros(4))
         self.thrust, self.rate = self.hover.thrust.copy(), np.zeros(3)
         self.random, self.time = np.random.default_rng(seed), 0.0
         self.command = Command(0.0, self.hover.tilt, self.hover.thrust)
+        self.surprise = 0.0     # largest unexplained force [m/s^2]
 
-    def feed(self, watch, duration, works=np.ones(4), turn=np.zeros(4), push=np.zeros(3)):
-        """Feed the watch for a time; return the time of the first named fault [s], or None."""
+    def feed(self, watch, duration, works=np.ones(4), turn=np.zeros(4), push=np.zeros(3),
+             asked=None):
+        """
+        Feed the watch for a time; return the time of the first named fault [s], or None.
+
+        The thrusts ``asked`` of each tick are by default those of hover.
+        """
         for k in range(round(duration / TICK)):
             self.time += TICK
-            self.thrust += -np.expm1(-TICK / LAG) * (works * self.hover.thrust - self.thrust)
+            thrust = self.hover.thrust if asked is None else asked[k]
+            self.thrust += -np.expm1(-TICK / self.lag) * (works * thrust - self.thrust)
             force, torque = ALLOCATOR.wrench(self.hover.tilt + turn, self.thrust)
             self.rate = self.rate + TICK * (torque - np.cross(
                 self.rate, ROBOT.inertia * self.rate)) / ROBOT.inertia
             noise = self.random.normal(size=6) * [*[0.05] * 3, *[0.005] * 3]
             watch.on_imu(self.time, (force + push) / ALLOCATOR.mass + noise[:3],
-                         self.rate + noise[3:], self.hover.tilt, self.hover.thrust, ALL_HEALTHY)
+                         self.rate + noise[3:], self.hover.tilt, thrust, ALL_HEALTHY)
+            self.surprise = max(self.surprise, float(np.linalg.norm(watch.unexplained)))
             if watch.lost is not None or watch.slipped is not None:
                 return (k + 1) * TICK
         return None
@@ -74,6 +97,18 @@ def test_by_the_wrench_alone_a_lost_rotor_takes_longer():
     assert body.feed(watch, 2.0) is None
     assert P.rotor.time_alone < body.feed(watch, 0.6, np.array([1, 1, 0, 1])) < 0.45
     assert watch.lost == 2
+
+
+@pytest.mark.parametrize('lag', LAGS)
+def test_no_lag_of_the_robot_file_leaves_an_unexplained_force(lag):
+    body, watch = Body(ATTITUDES[0], lag=lag), wrench_watch()
+    assert body.feed(watch, 0.5) is None
+    watch.supported = np.ones(4, dtype=bool)
+    together = jumps(1, 4.0, 3.0, 15.0, 0.05, 0.4)[:, :1] * np.ones(4)
+    assert body.feed(watch, 4.0, asked=together) is None
+    assert body.surprise < 3 * P.rotor.force_noise
+    works = np.array([1, 0, 1, 1])
+    assert body.feed(watch, 0.5, works) < 0.2 and watch.lost == 1
 
 
 @pytest.mark.parametrize('angle', [-1.2, -0.6, 0.6, 1.2])
@@ -125,20 +160,26 @@ def test_contact_is_detected_by_impact_or_by_a_push_near_the_ground():
         assert watch.impact == 0.0
 
 
-def follow(watch, asked, follows, duration=2.0, delay=0.03, start=0.0, noise=0.05):
-    """Joints that follow ``asked(t)``; ``follows(t, tilt)`` adds a fault."""
-    random, tilt = np.random.default_rng(1), np.zeros(4)
-    lag = ROBOT.joints.kd / ROBOT.joints.kp
-    first = None
+def follow(watch, asked, follows, duration=2.0, delay=0.03, start=0.0, noise=0.05, robot=ROBOT):
+    """
+    Move the servos of a robot by ``asked(t)``; ``follows(t, tilt)`` adds a fault.
+
+    Returns:
+        time at which the watch names the first fault [s], or None.
+
+    """
+    random, tilt, rate = np.random.default_rng(1), np.zeros(4), np.zeros(4)
+    friction = robot.effects.get('joint_friction', {'coulomb': 0.0, 'stiction': 0.0})
+    servo = Step(NUMPY, Servo.of(robot.joints, **{
+        name: np.array(value) for name, value in friction.items()}), TICK)
     for k in range(round(duration / TICK)):
         t = start + k * TICK
         watch.on_command(t, asked(t))
-        step = (asked(t - delay) - tilt) * -np.expm1(-TICK / lag)
-        tilt = tilt + np.clip(step, -10 * TICK, 10 * TICK)
+        tilt, rate = servo(asked(t - delay), tilt, rate)
         watch.on_joints(t, follows(t, tilt) + noise * random.uniform(-1, 1, 4) * 0.1)
-        if first is None and (watch.jammed | watch.astray | (watch.jump != 0)).any():
-            first = t
-    return first
+        if (watch.jammed | watch.astray | (watch.jump != 0)).any():
+            return t
+    return None
 
 
 def swings(t):
@@ -149,6 +190,24 @@ def swings(t):
 def test_joints_that_follow_are_never_named():
     for delay in (0.01, 0.03, 0.05):
         assert follow(JointWatch(P.servo, ROBOT), swings, lambda t, q: q, 6.0, delay) is None
+
+
+@pytest.mark.parametrize('seed', range(4))
+@pytest.mark.parametrize('known', [ROBOT, MEASURED], ids=['shipped file', 'measured file'])
+def test_a_servo_within_the_intervals_is_never_named_and_a_frozen_one_is(known, seed):
+    asked = jumps(seed, 8.0, -2.0, 2.0, 0.03, 0.8)
+    drawn = MEASURED.drawn(np.random.default_rng(seed))
+    delay = P.servo.delay + drawn.command_delays[0]
+
+    def command(t):
+        return asked[max(0, round(t / TICK))]
+
+    assert follow(JointWatch(P.servo, known), command, lambda t, q: q, 8.0, delay,
+                  robot=drawn) is None
+    watch = JointWatch(P.servo, known)
+    first = follow(watch, command, lambda t, q: np.where(np.arange(4) == 1, 1.5, q), 8.0, delay,
+                   robot=drawn)
+    assert first < 1.5 and watch.jammed[1]
 
 
 def test_delays_of_the_robot_file_are_no_fault_of_its_joints():
@@ -172,18 +231,48 @@ def test_an_encoder_jump_is_detected_at_once():
     assert first == pytest.approx(1.0, abs=0.02)
 
 
-def test_a_rotor_that_turns_too_slowly_is_named_by_its_esc():
-    watch, k, named = SpeedWatch(P.rotor, ROBOT), 300.0, None
-    thrust = np.array([7.0, 8.0, 6.0, 9.0])
-    for n in range(200):
-        t, works = 0.02 * n, np.ones(4)
-        if t > 3.0:
-            works[1] = np.exp(-(t - 3.0) / LAG)
-        watch.on_command(t, thrust)
-        watch.on_speeds(t, k * np.sqrt(thrust * works))
-        if watch.lost is not None and named is None:
-            named = t - 3.0, watch.lost
-    assert named[1] == 1 and named[0] < 0.2
+def esc(lag, asked, works, noise=0.0, seed=0):
+    """
+    Speeds of rotors with a lag [s], of which after 4 s only the shares ``works`` are left.
+
+    Returns:
+        the watch, time from the fault until it is named [s] or None, and the time at which a rotor
+        is noticed as slow.
+
+    """
+    watch, thrust, noticed = SpeedWatch(P.rotor, ROBOT), asked[0].copy(), None
+    random = np.random.default_rng(seed)
+    for k, command in enumerate(asked):
+        t = TICK * k
+        share = works if t > 4.0 else np.ones(4)
+        thrust = thrust - np.expm1(-TICK / lag) * (share * asked[max(0, k - 2)] - thrust)
+        watch.on_command(t, command)
+        if k % 4 == 0:
+            watch.on_speeds(t, 300.0 * np.sqrt(thrust) * random.normal(1.0, noise, 4))
+            if noticed is None and watch.slow.any():
+                noticed = t - 4.0
+            if watch.lost is not None or watch.deaf is not None:
+                return watch, t - 4.0, noticed
+    return watch, None, noticed
+
+
+@pytest.mark.parametrize('lag', LAGS)
+@pytest.mark.parametrize('seed', range(3))
+def test_no_lag_of_the_robot_file_makes_a_rotor_suspect(lag, seed):
+    asked = jumps(seed, 8.0, 2.0, 14.0, 0.02, 0.5)
+    _, named, noticed = esc(lag, asked, np.ones(4), 0.01, seed)
+    assert named is None and noticed is None
+    watch, named, _ = esc(lag, asked, np.array([1, 0.4, 1, 1]), 0.01, seed)
+    assert watch.lost == 1 and 0 < named < 1.0
+
+
+@pytest.mark.parametrize('lag', LAGS)
+def test_a_rotor_that_turns_too_slowly_is_named_by_its_esc(lag):
+    hover = np.tile([7.0, 8.0, 6.0, 9.0], (1200, 1))
+    watch, named, _ = esc(lag, hover, np.array([1, 0, 1, 1]))
+    assert watch.lost == 1 and 0 < named < 0.2
+    watch, named, noticed = esc(lag, hover, np.array([1, 0.6, 1, 1]))
+    assert named is None and 0 < noticed < 0.4
 
 
 def test_an_esc_without_telemetry_is_not_a_lost_rotor():
@@ -269,7 +358,7 @@ def test_a_marker_flip_is_attributed_to_mocap_and_a_wrong_estimate_to_the_estima
 def test_a_fault_stays_named_and_the_health_follows():
     watch = FaultWatch(P, ROBOT, ALLOCATOR)
     body = Body(ATTITUDES[0])
-    adapter = type('Adapter', (), {'lost': None, 'slipped': None})()
+    adapter = type('Adapter', (), {'lost': None, 'slipped': None, 'unexplained': 0.0})()
     adapter.on_imu = lambda t, f, r, tilt, thrust, health: watch.on_imu(
         t, f, r, tilt, body.command, 1.0)
     body.feed(adapter, 1.0)

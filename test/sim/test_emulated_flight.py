@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip('dynamixel_sdk')
 pytest.importorskip('pymavlink')
 
-from board_bench import driver, QUICK
+from board_bench import driver, QUICK, until
 from servo_bench import PATIENT, SHIPPED
 from sim_robots import HIGH, ROBOT, WORLD
 
@@ -48,9 +48,9 @@ class Flight:
         self.bus.configure()
         self.bus.enable()
         self.board.open()
-        assert self.board.wait_ready(3.0) == ''
-        result = self.board.arm()
-        assert result.accepted, result
+        assert until(lambda: not self.board.ready), self.board.ready
+        result = self.board.start(True).wait()
+        assert result.accepted, result.reason
         return self
 
     def __exit__(self, *_):
@@ -66,10 +66,11 @@ class Flight:
         self.bus.write_goals(self.tilt)
         if self.thrust is not None:
             self.board.send(self.thrust, time.time())
-        self.readings, self.reports = self.bus.read(), self.bus.poll_health()
-        update = self.board.poll()
-        for name in ('battery', 'rotors', 'status'):
-            news = getattr(update, name)
+        self.readings, self.reports = self.bus.read(), self.bus.servos
+        self.bus.upkeep()
+        battery, rotors, _ = self.board.poll()
+        for name, news in (('battery', battery), ('rotors', rotors),
+                           ('status', self.board.state.status)):
             if news is not None:
                 self.latest[name] = news
         time.sleep(max(0.0, began + TICK - time.monotonic()))
@@ -143,7 +144,7 @@ def test_torque_off_frees_the_joints_and_torque_on_holds_them_where_they_are(fli
 
 def test_an_overloaded_servo_goes_limp_and_the_others_keep_their_angles(flight):
     flight.switch({'overload': np.array([2.0])})
-    flight.until(lambda: 'overload' in str(flight.reports[1]))
+    flight.until(lambda: 'overload' in flight.reports[1].message)
     flight.tilt = np.full(4, 0.8 * -np.sign(flight.truth.tilt[1]))
     flight.until(lambda: np.all(np.abs(flight.truth.tilt - flight.tilt)[[0, 2, 3]] < 0.15))
     assert abs(flight.truth.tilt[1] - flight.tilt[1]) > 0.4

@@ -211,22 +211,9 @@ def test_only_the_addressed_servo_answers_at_its_baud_rate(network):
     assert [name for name, _, _ in ask(network, BROADCAST, Instruction.PING)] == [1, 2, 3, 4]
 
 
-def test_registered_writes_wait_for_the_action_instruction(network):
-    goal = table.BY_NAME['Goal Position'].address.to_bytes(2, 'little') + b'\x00\x04\0\0'
-    assert ask(network, 1, Instruction.ACTION)[0][1] == Error.INSTRUCTION
-    assert ask(network, 1, Instruction.REG_WRITE, goal)[0][1] == Error.NONE
-    assert network.servos[0]['Goal Position'] == 0
-    assert network.servos[0]['Registered Instruction'] == 1
-    assert ask(network, BROADCAST, Instruction.ACTION) == []
-    assert network.servos[0]['Goal Position'] == 1024
-    assert network.servos[0]['Registered Instruction'] == 0
-
-
-def test_factory_reset_and_unknown_instructions_are_refused(network):
-    assert ask(network, 2, Instruction.FACTORY_RESET, b'\x01')[0][1] == Error.RESULT_FAIL
+def test_unknown_instructions_are_refused(network):
     assert ask(network, 2, 0x20)[0][1] == Error.INSTRUCTION
-    assert network.servos[1]['ID'] == 2
-    assert [refusal.identifier for refusal in network.refused] == [2, 2]
+    assert [refusal.identifier for refusal in network.refused] == [2]
 
 
 def test_a_bad_crc_is_answered_with_its_error_and_does_nothing(network):
@@ -245,15 +232,6 @@ def test_refused_sync_writes_are_not_answered_but_recorded(network):
     assert [(one.identifier, one.error, one.address) for one in network.refused] \
         == [(1, Error.ACCESS, 11)]
     assert network.servos[1]['Operating Mode'] == 4
-
-
-def test_bulk_instructions_reach_each_servo_with_its_own_address(network):
-    ask(network, BROADCAST, Instruction.BULK_WRITE,
-        b'\x01' + place('LED') + b'\1' + b'\x02' + place('Position P Gain') + b'\x64\0')
-    assert (network.servos[0]['LED'], network.servos[1]['Position P Gain']) == (1, 100)
-    answers = ask(network, BROADCAST, Instruction.BULK_READ,
-                  b'\x02' + place('Position P Gain') + b'\x01' + place('LED'))
-    assert answers == [(2, 0, b'\x64\0'), (1, 0, b'\1')]
 
 
 @pytest.mark.parametrize('instruction', [Instruction.SYNC_READ, Instruction.FAST_SYNC_READ])

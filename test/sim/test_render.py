@@ -4,22 +4,21 @@ import os
 import subprocess
 import sys
 
+import mujoco
 import numpy as np
 import pytest
-from sim_robots import ROBOT, WORLD
+from sim_robots import ROBOT
 
-from beetle_omni_ros.sim.figure import Figure
+from beetle_omni_ros.sim.render import Look, scene
 
 DRAW = """
 import numpy as np
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.sim.figure import Look
-from beetle_omni_ros.sim.render import Camera, Pose, Stage, Trail
+from beetle_omni_ros.sim.render import Camera, Look, Pose, Stage, Trail
 level, tilt = np.array([0, 0, 0, 1.0]), np.zeros(4)
 camera = Camera(lookat=(0, 0, 0.8), distance=2.0)
 pose = Pose(np.array([0, 0, 0.8]), level, tilt, np.full(4, 7.0))
 path = Trail(np.array([[-0.4, 0, 0.5], [0.4, 0, 0.5]]), (1, 0, 0))
-with Stage(RobotParameters.load(), [Look(), Look(0.3, (0, 0, 1))], 160, 90) as stage:
+with Stage([Look(), Look(0.3, (0, 0, 1))], 160, 90) as stage:
     empty = stage.draw([None, None], camera)
     drawn = stage.draw([pose, None], camera)
     ghost = stage.draw([None, pose], camera)
@@ -35,16 +34,11 @@ assert changed(ghost)[75:].sum() == 0 < changed(again).sum() < 400
 
 
 def test_the_drawn_rotors_have_the_positions_of_the_robot():
-    mujoco = pytest.importorskip('mujoco')
-    text = Figure(ROBOT, WORLD.plant).body()
-    model = mujoco.MjModel.from_xml_string(
-        '<mujoco><compiler angle="radian"/><asset><material name="gloss"/><material name="glow"/>'
-        f'</asset><worldbody>{text}</worldbody></mujoco>')
+    model = mujoco.MjModel.from_xml_string(scene([Look()], 30.0, 160, 90))
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    discs = data.geom_xpos[(model.geom_type == mujoco.mjtGeom.mjGEOM_CYLINDER)
-                           & (model.geom_size[:, 0] == WORLD.plant.propeller_radius)]
-    np.testing.assert_allclose(discs[:, :2], ROBOT.rotors.positions[:, :2], atol=1e-6)
+    rotors = [data.body(f'rotor{k}_0').xpos for k in (1, 2, 3, 4)]
+    np.testing.assert_allclose(rotors, ROBOT.rotors.positions, atol=1e-6)
 
 
 def test_simulating_loads_no_graphics():

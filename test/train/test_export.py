@@ -13,8 +13,9 @@ import beetle_omni_ros
 from beetle_omni_ros.control import policy_checksum
 from beetle_omni_ros.control.policy_file import PolicyContract
 from beetle_omni_ros.control.policy_network import PolicyNetwork
+from beetle_omni_ros.robot.schema import RunError
 from beetle_omni_ros.train import export
-from beetle_omni_ros.train.export import export_policy, ExportError
+from beetle_omni_ros.train.export import export_policy
 from beetle_omni_ros.train.network import ExportedPolicy
 from beetle_omni_ros.train.runner import Runner
 
@@ -72,7 +73,7 @@ def test_the_file_is_complete_and_accepted_on_board(tmp_path, memory):
     export_policy(network, path, ROBOT, parameters, {'seconds': 12.5}, metrics)
     entries = {entry.key: entry.value for entry in onnx.load(path).metadata_props}
     assert set(entries) == {*PolicyContract.default(ROBOT).to_metadata(), 'checksum'}
-    assert entries['checksum'] == policy_checksum.checksum(path.read_bytes())
+    assert policy_checksum.verify(path.read_bytes())
     contract = PolicyContract.from_metadata(entries)
     assert contract.check(ROBOT) == ''
     assert contract.memory == memory and contract.observation_size == (39 if memory else 33)
@@ -104,7 +105,7 @@ def test_a_wrong_export_is_removed(tmp_path, monkeypatch, difference):
     network, parameters = actor()
     monkeypatch.setattr(export, 'compare', lambda *_: difference)
     (tmp_path / 'policy.onnx').write_text('the one before')
-    with pytest.raises(ExportError, match=r'policy.onnx: torch and onnxruntime differ by'):
+    with pytest.raises(RunError, match=r'policy.onnx: torch and onnxruntime differ by'):
         export_policy(network, tmp_path / 'policy.onnx', ROBOT, parameters)
     assert [path.name for path in tmp_path.iterdir()] == ['policy.onnx']
     assert (tmp_path / 'policy.onnx').read_text() == 'the one before'

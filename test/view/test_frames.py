@@ -4,12 +4,10 @@ import numpy as np
 import pytest
 from synthetic_flights import fly, write_battery, write_odom, write_state, write_truth
 
-from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.runs.bag import BagError, BagWriter, read_bag
 from beetle_omni_ros.runs.tasks import make_task
 from beetle_omni_ros.view import plots
-from beetle_omni_ros.view.command import names
 from beetle_omni_ros.view.frames import COLUMNS, known, pose, Rows, Sampler, state_at, T, WIDTH
 from beetle_omni_ros.view.recording import parts, Recording, STEP
 
@@ -97,13 +95,6 @@ def test_faults_and_input_warnings_are_kept_with_their_time():
     assert sampler.input_warnings == [('nmpc_node: inputs', 'target_pose: 1 rejected, low')]
 
 
-def test_an_older_target_does_not_replace_a_newer_one():
-    sampler = Sampler()
-    sampler.write_target(PoseTarget(np.zeros(3), UP, 5.0))
-    sampler.write_target(PoseTarget(np.ones(3), UP, 4.0))
-    np.testing.assert_array_equal(sampler.row(6.0)[COLUMNS['target_position']], 0)
-
-
 def row(t, x=0.0, quaternion=UP, target=0.0):
     made = np.full(WIDTH, np.nan)
     made[T] = t
@@ -152,9 +143,3 @@ def test_a_plot_has_a_line_at_the_present_and_no_gaps():
     np.testing.assert_allclose(b[inside], 2 * times[inside], atol=1e-9)
     assert np.isfinite(b).all()
     assert plots.window(plots.PLOTS[-1], [first], 2.0) is None      # no battery
-
-
-def test_runs_have_distinct_names(tmp_path):
-    assert names([tmp_path / 'a' / 'rl', tmp_path / 'a' / 'nmpc']) == ['rl', 'nmpc']
-    assert names([tmp_path / 'a' / 'rl', tmp_path / 'b' / 'rl']) == ['a/rl', 'b/rl']
-    assert len(set(names([tmp_path / 'a', tmp_path / 'a']))) == 2

@@ -42,13 +42,13 @@ class Plan:
 
 
 def identify(logs: Sequence[JointLog], robot: RobotParameters,
-             fitted: float | None = None) -> Found:
+             fitted: float | None = None, one_delay: bool = False) -> Found:
     """
     Identify the servos from the first part of some logs.
 
     The model with the largest evidence predicts best; the robot file is the centre of the prior.
     """
-    return select(Servos(logs, file_sets(robot), fitted), ALWAYS, list(ENTRIES))
+    return select(Servos(logs, file_sets(robot), fitted, one_delay), ALWAYS, list(ENTRIES))
 
 
 def interval(found: Found, trial: Trial, unit: int, name: str) -> tuple[float, float]:

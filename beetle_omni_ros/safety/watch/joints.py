@@ -79,7 +79,7 @@ class JointWatch:
             return False
         before, self.stamp = getattr(self, '_tilt', tilt), stamp
         self._tilt = tilt
-        if dt > LONGEST or not self._follow(stamp, dt):
+        if self._models is None or dt > LONGEST or not self._follow(stamp, dt):
             self._models, self._for = np.array([tilt, tilt]), np.zeros(ROTORS)
             self._change, self.jump = np.zeros(ROTORS), NO_JUMP
             return True
@@ -92,7 +92,7 @@ class JointWatch:
             self._models = np.where(jumped, tilt, self._models)
         else:
             self.jump, self._change = NO_JUMP, change
-        self._judge(tilt, dt)
+        self._judge(tilt, self._models, dt)
         return True
 
     def advance(self, stamp: float) -> None:
@@ -113,10 +113,10 @@ class JointWatch:
                       for error in (target - model).tolist()]
         return True
 
-    def _judge(self, tilt, dt):
+    def _judge(self, tilt, models, dt):
         p, error = self._p, self._error
         each = [reading < min(pair) - error or reading > max(pair) + error
-                for reading, pair in zip(tilt.tolist(), self._models.T.tolist())]
+                for reading, pair in zip(tilt.tolist(), models.T.tolist())]
         if not self._suspects and not any(each):
             return
         off = np.array(each)

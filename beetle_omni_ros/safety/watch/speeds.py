@@ -23,16 +23,15 @@ class SpeedWatch:
     """
     Thrust is proportional to the squared speed; the factor of each rotor is learnt in flight.
 
-    The thrust is modelled with the shortest and with the longest lag that the robot file allows. A
-    rotor is too slow if it gives too little for both, and its factor is the ratio of mean thrust
-    and mean squared speed, which no lag changes.
+    The thrust is modelled with the shortest and with the longest lag that the robot file allows.
+    Of the thrusts between both, the modelled one is the nearest to the measured one. The factor is
+    the ratio of mean thrust and mean squared speed, which no lag changes.
 
     A rotor that does not follow commands is detected by the slope of the measured over the
-    modelled thrust with the longest lag, a regression over the last half second. The slope is at
-    least 1 for a healthy rotor (a shorter lag passes more of each frequency), less for a weak
-    rotor, and 0 for a rotor that holds its thrust. It is used if the modelled thrust has varied
-    enough. A rotor that gives clearly more thrust than commanded is detected at once, because
-    neither lag nor weakness causes this.
+    modelled thrust, a regression over the last half second. The slope is 1 for a healthy rotor,
+    less for a weak rotor, and 0 for a rotor that holds its thrust. It is used if the modelled
+    thrust has varied enough. A rotor that gives clearly more thrust than commanded is detected at
+    once, because neither lag nor weakness causes this.
 
     If the reports of the motor board pause, its commands were probably late, too. For SETTLED
     seconds the thrusts then differ from the model, and no rotor is suspected.
@@ -166,24 +165,25 @@ class Rotor:
             decay: factor of the moments in this time.
 
         """
-        p, x = self._p, self.modelled[1]
-        least, most = min(self.modelled), max(self.modelled)
+        p, y, slowest = self._p, nan, self.modelled[1]
+        if self._learnt_for >= LEARNT:
+            y = self._mean_thrust / self._mean_square * square
+        # Of the lags between, the one nearest to the measurement; with nan the longest.
+        x = min(max(y, min(self.modelled)), max(self.modelled)) if isfinite(y) else slowest
         judged = isfinite(square) and x > p.least_thrust
-        known = judged and self._learnt_for >= LEARNT
-        y = self._mean_thrust / self._mean_square * square if known else nan
-        # a comparison with nan is False
-        missing = 1 - y / least if least > p.least_thrust else nan
-        too_slow = missing > p.share
-        self.measured, self.slow = y, missing > p.noticed
+        known = judged and isfinite(y)
+        too_slow = known and y < (1 - p.share) * x
+        self.measured = y if known else nan
+        self.slow = known and y < (1 - p.noticed) * x
         self.slow_for = self.slow_for + dt if too_slow else 0.0
         if known:
-            self._regress(x, y, most, dt, decay)
+            self._regress(x, y, dt, decay)
         else:
             self._weight = self._x = self._y = self._xx = self._xy = 0.0
             self.deaf, self._deaf_for, self._more_for = False, 0.0, 0.0
         if judged and not too_slow and square > 0:
             gain = max(min(1.0, dt / max(self._learnt_for, dt)), min(1.0, dt / LEARNT))
-            self._mean_thrust += gain * (x - self._mean_thrust)
+            self._mean_thrust += gain * (slowest - self._mean_thrust)
             self._mean_square += gain * (square - self._mean_square)
             self._learnt_for += dt
 
@@ -192,7 +192,7 @@ class Rotor:
         """Whether the last reports do not follow the commands."""
         return self._deaf_for > 0
 
-    def _regress(self, x, y, most, dt, decay):
+    def _regress(self, x, y, dt, decay):
         """Whether the measured thrust ``y`` does not follow the modelled thrust ``x``."""
         p = self._p
         self._weight = self._weight * decay + dt
@@ -204,6 +204,6 @@ class Rotor:
         deaf = w > 0.5 * p.slope_window and variance > p.least_variation**2 \
             and covariance < p.least_slope * variance
         self._deaf_for = self._deaf_for + dt if deaf else 0.0
-        more = y > (1 + p.share) * most and y - most > p.excess
+        more = y > (1 + p.share) * x and y - x > p.excess
         self._more_for = self._more_for + dt if more else 0.0
         self.deaf = self._deaf_for >= p.deaf_time or self._more_for >= p.speed_time

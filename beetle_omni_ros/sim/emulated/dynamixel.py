@@ -25,18 +25,11 @@ class Instruction(IntEnum):
     PING = 0x01
     READ = 0x02
     WRITE = 0x03
-    REG_WRITE = 0x04
-    ACTION = 0x05
-    FACTORY_RESET = 0x06
     REBOOT = 0x08
-    CLEAR = 0x10
     STATUS = 0x55
     SYNC_READ = 0x82
     SYNC_WRITE = 0x83
     FAST_SYNC_READ = 0x8A
-    BULK_READ = 0x92
-    BULK_WRITE = 0x93
-    FAST_BULK_READ = 0x9A
 
 
 class Error(IntEnum):
@@ -97,7 +90,7 @@ def status(identifier: int, error: int, data: bytes = b'') -> bytes:
     return packet(identifier, Instruction.STATUS, bytes((error,)) + data)
 
 
-def fast_status(blocks: list[tuple[int, int, bytes]], length: int) -> list[bytes]:
+def fast_status(blocks: list[tuple[int, int, bytes]], length: int) -> bytes:
     """
     Build the common answer of several servos, without stuffing.
 
@@ -106,18 +99,14 @@ def fast_status(blocks: list[tuple[int, int, bytes]], length: int) -> list[bytes
         length: sum of the bytes of data plus four (error, ID, CRC) over all addressed servos.
 
     Returns:
-        parts of the servos; each ends with the CRC of all bytes before.
+        the parts of the servos in one; each ends with the CRC of all bytes before.
 
     """
     sent = HEADER + bytes((BROADCAST,)) + (length + 1).to_bytes(2, 'little') \
         + bytes((Instruction.STATUS,))
-    pieces = []
-    start = 0
     for identifier, error, data in blocks:
         sent = _sealed(sent + bytes((error, identifier)) + data)
-        pieces.append(sent[start:])
-        start = len(sent)
-    return pieces
+    return sent
 
 
 def _sealed(data: bytes) -> bytes:

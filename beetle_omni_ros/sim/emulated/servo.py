@@ -23,7 +23,6 @@ class EmulatedServo:
         self.temperature = self.voltage = None
         self._memory = bytearray(table.SIZE)
         self._turns = 0
-        self._registered = None
         self._last_packet = 0.0
         self._boots_at = -inf
         for register in table.REGISTERS:
@@ -106,35 +105,11 @@ class EmulatedServo:
                 self._apply(register.name, value)
         return error
 
-    def register(self, address: int, data: bytes) -> Error:
-        """Store a write until :meth:`action`."""
-        error, _ = self._parsed(address, data)
-        if error is Error.NONE:
-            self._registered = (address, data)
-            self['Registered Instruction'] = 1
-        return error
-
-    def action(self) -> Error:
-        """Execute the stored write."""
-        if self._registered is None:
-            return Error.INSTRUCTION
-        stored, self._registered = self._registered, None
-        self['Registered Instruction'] = 0
-        return self.write(*stored)
-
-    def clear_turns(self) -> Error:
-        """Clear the turn count; only at rest."""
-        if abs(self.velocity) > self['Moving Threshold'] * table.VELOCITY_UNIT:
-            return Error.RESULT_FAIL
-        self._to_one_turn()
-        return Error.NONE
-
     def reboot(self, now: float):
         """Restart with initial RAM, torque off, position within one turn; silent until booted."""
         for register in table.REGISTERS:
             if register.address >= table.EEPROM_END:
                 self[register.name] = register.initial
-        self._registered = None
         self._boots_at = now + self.reboot_time
         self._to_one_turn()
         if self['Startup Configuration'] & 1:

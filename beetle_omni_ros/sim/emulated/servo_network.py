@@ -15,8 +15,6 @@ from beetle_omni_ros.sim.emulated.dynamixel import (
 )
 from beetle_omni_ros.sim.emulated.servo import EmulatedServo
 
-CLEAR_KEY = b'\x01\x44\x58\x4c\x22'  # Clear "multi-turn information", with its safety bytes
-
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
@@ -79,9 +77,7 @@ class ServoNetwork:
             servo.feed_watchdog(now)
         group = {
             Instruction.SYNC_READ: self._sync_read, Instruction.SYNC_WRITE: self._sync_write,
-            Instruction.FAST_SYNC_READ: self._sync_read, Instruction.BULK_READ: self._bulk_read,
-            Instruction.FAST_BULK_READ: self._bulk_read,
-            Instruction.BULK_WRITE: self._bulk_write}.get(packet.instruction)
+            Instruction.FAST_SYNC_READ: self._sync_read}.get(packet.instruction)
         if group:
             return group(packet, listening, now) if packet.identifier == BROADCAST else []
         if packet.identifier == BROADCAST:
@@ -109,22 +105,14 @@ class ServoNetwork:
             error = Error.DATA_LENGTH
             if len(given) == 4:
                 error, data = servo.read(address, int.from_bytes(given[2:], 'little'), now)
-        elif code in (Instruction.WRITE, Instruction.REG_WRITE):
-            act = servo.write if code == Instruction.WRITE else servo.register
+        elif code == Instruction.WRITE:
             delay = servo['Return Delay Time']
-            error = Error.DATA_LENGTH if address is None else act(address, given[2:])
+            error = Error.DATA_LENGTH if address is None else servo.write(address, given[2:])
             return self._answer(servo, error, packet, address=address, delay=delay)
-        elif code == Instruction.ACTION:
-            error = servo.action()
         elif code == Instruction.REBOOT:
             reply = self._answer(servo, Error.NONE, packet)
             servo.reboot(now)
             return reply
-        elif code == Instruction.CLEAR and given == CLEAR_KEY:
-            error = servo.clear_turns()
-        elif code == Instruction.FACTORY_RESET:
-            # A real servo would lose ID and baud rate; no driver may request that.
-            error = Error.RESULT_FAIL
         else:
             error = Error.INSTRUCTION
         return self._answer(servo, error, packet, data, address)
@@ -145,28 +133,16 @@ class ServoNetwork:
     # --- several servos -----------------------------------------------------------------------
 
     def _sync_read(self, packet, listening, now):
+        """Answers in sequence; each servo waits for the previous one, so a silent one ends it."""
         given = packet.parameters
         address, length = (int.from_bytes(given[k:k + 2], 'little') for k in (0, 2))
-        asked = [(name, address, length) for name in given[4:]]
-        return self._chain(packet, asked, listening, now)
-
-    def _bulk_read(self, packet, listening, now):
-        given = packet.parameters
-        if len(given) % 5:
+        names = given[4:]
+        total = len(names) * (4 + length)
+        if not names or len(set(names)) != len(names) or total > LENGTH_LIMIT:
             return []
-        asked = [(given[k], int.from_bytes(given[k + 1:k + 3], 'little'),
-                  int.from_bytes(given[k + 3:k + 5], 'little')) for k in range(0, len(given), 5)]
-        return self._chain(packet, asked, listening, now)
-
-    def _chain(self, packet, asked, listening, now):
-        """Answers in sequence; each servo waits for the previous one, so a silent one ends it."""
-        names = [name for name, _, _ in asked]
-        total = sum(4 + length for _, _, length in asked)
-        if not asked or len(set(names)) != len(names) or total > LENGTH_LIMIT:
-            return []
-        fast = packet.instruction in (Instruction.FAST_SYNC_READ, Instruction.FAST_BULK_READ)
+        fast = packet.instruction == Instruction.FAST_SYNC_READ
         blocks, delays = [], []
-        for name, address, length in asked:
+        for name in names:
             servo = listening.get(name)
             if servo is None or servo['Status Return Level'] < 1 \
                     or (fast and servo['Firmware Version'] < table.FIRST_FAST_FIRMWARE):
@@ -182,9 +158,8 @@ class ServoNetwork:
                     for block, delay in zip(blocks, delays, strict=True)]
         if not blocks:
             return []
-        pieces = fast_status(blocks, total)
         # The parts form one packet without pauses; only the first one has a delay.
-        return [Reply(b''.join(pieces), delays[0])]
+        return [Reply(fast_status(blocks, total), delays[0])]
 
     def _sync_write(self, packet, listening, now):
         given = packet.parameters
@@ -193,22 +168,8 @@ class ServoNetwork:
         if not length or len(rest) % (length + 1):
             return []
         for k in range(0, len(rest), length + 1):
-            self._write_unanswered(packet, listening, rest[k], address, rest[k + 1:k + 1 + length])
+            servo = listening.get(rest[k])
+            if servo is not None:
+                error = servo.write(address, rest[k + 1:k + 1 + length])
+                self._record_refusal(servo, error, packet, address)
         return []
-
-    def _bulk_write(self, packet, listening, now):
-        given, place, writes = packet.parameters, 0, []
-        while place + 5 <= len(given):
-            address, length = (int.from_bytes(given[k:k + 2], 'little')
-                               for k in (place + 1, place + 3))
-            writes.append((given[place], address, given[place + 5:place + 5 + length]))
-            place += 5 + length
-        if place == len(given):
-            for name, address, data in writes:
-                self._write_unanswered(packet, listening, name, address, data)
-        return []
-
-    def _write_unanswered(self, packet, listening, name, address, data):
-        servo = listening.get(name)
-        if servo is not None:
-            self._record_refusal(servo, servo.write(address, data), packet, address)

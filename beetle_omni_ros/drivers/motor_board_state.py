@@ -1,0 +1,354 @@
+"""State of the motor board from the bytes that it sends (docs/reference/firmware.md)."""
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+import math
+import struct
+import time
+
+import numpy as np
+from pymavlink.dialects.v20 import common
+
+from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters
+from beetle_omni_ros.robot.readings import BatteryReading
+
+# The bytes of HEARTBEAT.custom_mode and COMMAND_ACK.result_param2.
+CONTRACT_VERSION = 1
+STATES = {0: 'boot', 1: 'disarmed', 2: 'armed', 3: 'running'}
+REQUESTED, WATCHDOG_RESET = 'requested by the host', 'watchdog reset'
+STOP_REASONS = {0: 'none', 1: REQUESTED, 2: 'heartbeat of the host lost',
+                3: 'no target for too long', 4: WATCHDOG_RESET}
+NO_HOST_HEARTBEAT, THROTTLE = 'no heartbeat of the host', 'throttle not low'
+CONDITIONS = {1: 'booting', 2: NO_HOST_HEARTBEAT, 4: THROTTLE,
+              8: 'battery low', 16: 'ESC failure', 32: 'targets timed out', 64: 'saturated'}
+BLOCKS_ARMING = tuple(text for bit, text in CONDITIONS.items() if bit <= 16)
+SEVERE = ('ESC failure', 'targets timed out')
+ESC_FAILURES = {1: 'over-current', 2: 'over-voltage', 4: 'overheated', 8: 'over-rpm',
+                16: 'inconsistent command', 32: 'stuck', 64: 'generic'}
+UNKNOWN_TEMPERATURE, UNKNOWN_CELL, UNKNOWN_CURRENT = 32767, 65535, -1
+EVENTS_KEPT = 200
+REQUESTS_KEPT = 50      # TIMESYNC requests; later answers are ignored
+
+
+def _declare(number, name, crc_extra, layout, fields, order):
+    """Declare a received message; fields in the order of the payload and of the definition."""
+    def __init__(self, *values):
+        common.MAVLink_message.__init__(self, number, name)
+        self.__dict__.update(zip(order, values, strict=True))
+
+    common.mavlink_map.setdefault(number, type(name, (common.MAVLink_message,), {
+        '__init__': __init__, 'id': number, 'msgname': name, 'crc_extra': crc_extra,
+        'fieldnames': order, 'unpacker': struct.Struct(layout), 'lengths': list(fields.values()),
+        'orders': [list(fields).index(field) for field in order]}))
+
+
+# The dialects of pymavlink 2.4.41 and 2.4.50 do not contain these two. The declaration of a
+# release that contains them has priority.
+_declare(290, 'ESC_INFO', 251, '<Q4IH4H4hBBBB', {
+    'time_usec': 1, 'error_count': 4, 'counter': 1, 'failure_flags': 4, 'temperature': 4,
+    'index': 1, 'count': 1, 'connection_type': 1, 'info': 1}, [
+    'index', 'time_usec', 'counter', 'count', 'connection_type', 'info', 'failure_flags',
+    'error_count', 'temperature'])
+_declare(291, 'ESC_STATUS', 10, '<Q4i4f4fB', {
+    'time_usec': 1, 'rpm': 4, 'voltage': 4, 'current': 4, 'index': 1}, [
+    'index', 'time_usec', 'rpm', 'voltage', 'current'])
+common.MAVLINK_IGNORE_CRC = 0   # the environment must not switch the checksum off
+
+
+class MavlinkReceiver:
+    """
+    Splits a byte stream into the messages of one sender with the IDs ``system``, ``component``.
+
+    ``counts`` are messages received and bytes; lost: gaps in the sender's sequence numbers;
+    bad_crc: frames with a valid header and a wrong checksum; skipped_bytes: outside valid frames;
+    foreign: valid frames of another sender.
+    """
+
+    def __init__(self, system: int, component: int):
+        self._sender = system, component
+        self.counts = dict.fromkeys(
+            ('received', 'bytes', 'lost', 'bad_crc', 'skipped_bytes', 'foreign'), 0)
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget an incomplete frame and the sequence number."""
+        self._parser = common.MAVLink(None)
+        self._parser.robust_parsing = True
+        self._sequence: int | None = None
+
+    def feed(self, data: bytes) -> list:
+        """Parse further bytes; return the messages that they complete."""
+        counts, found = self.counts, []
+        counts['bytes'] += len(data)
+        for message in self._parser.parse_buffer(data) or ():
+            if message.get_msgId() < 0:     # bad data, or an unknown message, which has no CRC
+                counts['skipped_bytes'] += len(message.data)
+                counts['bad_crc'] += 'CRC' in getattr(message, 'reason', '')
+            elif (message.get_srcSystem(), message.get_srcComponent()) != self._sender:
+                counts['foreign'] += 1
+            else:
+                counts['received'] += 1
+                sequence = message.get_seq()
+                if self._sequence is not None and not restarted(message):
+                    counts['lost'] += (sequence - self._sequence - 1) % 256
+                self._sequence = sequence
+                found.append(message)
+        return found
+
+
+def restarted(message) -> bool:
+    """Whether a message is the first heartbeat after a start of the board."""
+    return message.get_msgId() == common.MAVLINK_MSG_ID_HEARTBEAT \
+        and message.custom_mode & 0xFF == 0
+
+
+class ClockOffset:
+    """
+    Offset of a remote clock, remote minus local [s], with an error bound.
+
+    The remote clock is read between a request and its answer, so each exchange gives a lower and
+    an upper bound of the offset. Bounds of earlier exchanges are widened by the largest possible
+    drift [s/s], and all bounds are intersected. The estimate is the centre of this interval, and
+    its error is at most half the width, for any delays.
+    """
+
+    def __init__(self, drift: float):
+        self._drift = drift
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget all exchanges."""
+        # Other threads read this tuple, so it is only replaced as a whole.
+        self._bounds = -math.inf, math.inf, 0.0
+
+    @property
+    def known(self) -> bool:
+        """Whether an answer arrived since the restart."""
+        return math.isfinite(self._bounds[0])
+
+    def add(self, sent: float, remote: float, received: float) -> bool:
+        """Use one exchange; return whether it contradicts the earlier ones, then forgotten."""
+        within = self._drift * (received - sent)
+        low, high = remote - received - within, remote - sent + within
+        known_low, known_high, at = self._bounds
+        widening = self._drift * max(0.0, received - at)
+        new_low, new_high = max(low, known_low - widening), min(high, known_high + widening)
+        jumped = new_low > new_high
+        self._bounds = (low, high, received) if jumped else (new_low, new_high, received)
+        return jumped
+
+    def offset(self) -> float:
+        """Remote minus local clock [s]; NaN while unknown."""
+        low, high, _ = self._bounds
+        return 0.5 * (low + high) if math.isfinite(low) else math.nan
+
+    def uncertainty(self, now: float) -> float:
+        """Bound of the offset's error [s] at local time ``now``; inf while unknown."""
+        low, high, at = self._bounds
+        return 0.5 * (high - low) + self._drift * max(0.0, now - at)
+
+
+@dataclass(frozen=True, slots=True)
+class BoardStatus:
+    """A heartbeat: state, reason of the last disarming, present conditions, contract version."""
+
+    stamp: float
+    state: str
+    stop_reason: str
+    conditions: tuple[str, ...]
+    contract: int
+
+    @property
+    def armed(self) -> bool:
+        """Whether the rotors may turn."""
+        return self.state in ('armed', 'running')
+
+
+@dataclass(frozen=True, slots=True)
+class RotorStates:
+    """Telemetry of the four ESCs (4,)."""
+
+    stamp: float                # host time of the measurement [s]
+    rpm: np.ndarray             # [1/min]; this and the next two are NaN if the ESC is offline
+    voltage: np.ndarray         # [V]
+    current: np.ndarray         # [A]
+    temperature: np.ndarray     # [C] of the last ESC_INFO; NaN if unknown
+    failures: tuple[tuple[str, ...], ...]   # of each ESC
+    error_count: np.ndarray     # since the start of the board
+
+
+class BoardState:
+    """
+    Newest state and measurements of the board, stamped by ``clock`` [s], and events.
+
+    ``status`` is the last heartbeat, ``voltage`` the filtered pack voltage [V] for the thrust map,
+    ``reception`` the last counts of the board, and ``clock`` the offset of the board's clock
+    against the monotonic clock.
+    """
+
+    def __init__(self, parameters: MotorBoardParameters, cells: int, clock: Callable[[], float]):
+        self._parameters, self._host_clock, self._cells = parameters, clock, cells
+        self.clock = ClockOffset(parameters.clock_drift)
+        self.status: BoardStatus | None = None
+        self.battery: BatteryReading | None = None
+        self.rotors: RotorStates | None = None
+        self.voltage: float | None = None
+        self.reception: dict[str, int] = {}
+        self._info = None       # last ESC_INFO
+        self._events: deque[tuple[str, str]] = deque(maxlen=EVENTS_KEPT)
+        self._requests: deque[int] = deque(maxlen=REQUESTS_KEPT)
+        self._received_at = self._opened = self._battery_at = -math.inf
+        self._conditions: dict[str, bool] = {}      # of the last call, for events about changes
+        self._handlers = {
+            'HEARTBEAT': self._on_heartbeat, 'TIMESYNC': self._on_timesync,
+            'BATTERY_STATUS': self._on_battery, 'SYS_STATUS': self._on_reception,
+            'ESC_INFO': self._on_info, 'ESC_STATUS': self._on_rotors}
+
+    def timesync_request(self) -> common.MAVLink_message:
+        """TIMESYNC request for the board's clock, to be sent at once."""
+        self._requests.append(time.monotonic_ns())
+        return common.MAVLink_timesync_message(0, self._requests[-1])
+
+    def message(self, message, now: float) -> None:
+        """Handle a message of the board that arrived at ``now`` [s, monotonic]."""
+        self._received_at = now
+        if handler := self._handlers.get(message.get_type()):
+            handler(message, now)
+
+    def silent(self, now: float) -> bool:
+        """Whether no message arrived for too long."""
+        return now - self._received_at > self._parameters.silence
+
+    def tick(self, now: float, connected: bool) -> None:
+        """Update the events about silence and the clock's uncertainty."""
+        # After a reconnection the board has the same time for its first message.
+        silent = math.isfinite(self._received_at) and \
+            now - max(self._received_at, self._opened) > self._parameters.silence
+        if connected and self._changed('silent', silent):
+            self._event('error' if silent else 'info',
+                        f'no message for {self._parameters.silence:g} s' if silent
+                        else 'messages again')
+        uncertainty = self.clock.uncertainty(now)
+        uncertain = self.clock.known and uncertainty > self._parameters.clock_uncertainty_limit
+        if self._changed('uncertain', uncertain):
+            self._event('warning' if uncertain else 'info',
+                        f'offset of its clock known to {1e3 * uncertainty:.1f} ms')
+
+    def _changed(self, name, value):
+        """Whether a condition differs from the last call."""
+        before, self._conditions[name] = self._conditions.get(name, False), value
+        return value != before
+
+    def acknowledged(self, arm: bool) -> None:
+        """Update the status after an acknowledged command, before the next heartbeat."""
+        if self.status is not None and self.status.armed != arm:
+            # The next heartbeat contains the conditions that prevent arming again.
+            self.status = replace(self.status, stamp=self._host_clock(),
+                                  state='armed' if arm else 'disarmed',
+                                  conditions=self.status.conditions if arm else (THROTTLE,))
+            self._event('info', self.status.state)
+
+    def connection(self, error: str) -> None:
+        """Record that the port was opened again, or lost with an ``error``."""
+        self._opened = time.monotonic()
+        self._event('error' if error else 'info', error or 'port opened again')
+
+    def take(self) -> tuple:
+        """Return battery, rotors and (level, text) of the events since the last call."""
+        news = self.battery, self.rotors, tuple(self._events)
+        self.battery = self.rotors = None
+        self._events.clear()
+        return news
+
+    def _event(self, level, text):
+        self._events.append((level, f'motor board: {text}'))
+
+    def _on_heartbeat(self, message, now):
+        state, reason, conditions, contract = message.custom_mode.to_bytes(4, 'little')
+        old = self.status
+        self.status = new = BoardStatus(
+            self._host_clock(), STATES.get(state, f'state {state}'),
+            STOP_REASONS.get(reason, f'reason {reason}'), conditions_of(conditions), contract)
+        if new.state == 'boot':
+            self.clock.restart()
+            self._info = None
+            if old is not None and old.state != 'boot':
+                level = 'error' if old.armed else 'warning'
+                self._event(level, f'restarted ({new.stop_reason})')
+            return
+        if old is None:
+            self._event('info', f'found, {new.state}, contract {new.contract}')
+            return
+        if old.armed != new.armed:
+            asked = new.stop_reason == REQUESTED
+            self._event('info' if new.armed or asked else 'error',
+                        'armed' if new.armed else f'disarmed ({new.stop_reason})')
+        for condition in new.conditions if new.armed else ():
+            if condition not in old.conditions:
+                self._event('error' if condition in SEVERE else 'warning', condition)
+
+    def _on_timesync(self, message, now):
+        if not message.tc1 or message.ts1 not in self._requests:
+            return
+        self._requests.remove(message.ts1)
+        if self.clock.add(message.ts1 / 1e9, message.tc1 / 1e9, now) and self.status is not None:
+            self._event('warning', 'its clock jumped, perhaps by a restart')
+
+    def _on_battery(self, message, now):
+        cells = [cell for cell in message.voltages if cell != UNKNOWN_CELL]
+        voltage = sum(cells) / 1000 if cells else math.nan
+        plausible = self._parameters.cell_voltage_low <= voltage / self._cells \
+            <= self._parameters.cell_voltage_high
+        if self._changed('implausible', not plausible):
+            self._event('info' if plausible else 'warning',
+                        'battery voltage plausible again' if plausible else
+                        f'battery voltage {voltage:.1f} V not plausible, the last good one is '
+                        'used')
+        if not plausible:
+            return
+        current = message.current_battery
+        self.battery = BatteryReading(self._host_clock(), voltage, math.nan if
+                                      current == UNKNOWN_CURRENT else -current / 100)
+        if self.voltage is None:
+            self.voltage = voltage
+        else:
+            constant = self._parameters.voltage_time_constant
+            weight = -math.expm1(-(now - self._battery_at) / constant) if constant else 1.0
+            self.voltage += weight * (voltage - self.voltage)
+        self._battery_at = now
+
+    def _on_reception(self, message, now):
+        self.reception = {'lost': message.errors_count1, 'bad_crc': message.errors_count2,
+                          'refused': message.errors_count3, 'timeouts': message.errors_count4}
+
+    def _on_info(self, message, now):
+        self._info = message
+        for k in range(4):
+            online = bool(message.info >> k & 1)
+            if self._changed(f'offline {k}', not online):
+                self._event('info' if online else 'error',
+                            f"ESC of rotor {k + 1} {'online again' if online else 'offline'}")
+
+    def _on_rotors(self, message, now):
+        measured = now      # the time of arrival, while the board's clock is unknown
+        if self.clock.known:
+            measured = min(now, message.time_usec / 1e6 - self.clock.offset())
+        stamp = self._host_clock() - (time.monotonic() - measured)
+        online, temperature = np.ones(4, dtype=bool), np.full(4, np.nan)
+        failures, errors = ((),) * 4, np.zeros(4, dtype=int)
+        if info := self._info:
+            online = np.array([bool(info.info >> k & 1) for k in range(4)])
+            temperature = np.array([math.nan if value == UNKNOWN_TEMPERATURE else value / 100
+                                    for value in info.temperature])
+            failures = tuple(tuple(text for bit, text in ESC_FAILURES.items() if flags & bit)
+                             for flags in info.failure_flags)
+            errors = np.array(info.error_count)
+        rpm, voltage, current = (np.where(online, np.array(values, dtype=float), np.nan)
+                                 for values in (message.rpm, message.voltage, message.current))
+        self.rotors = RotorStates(stamp, rpm, voltage, current, temperature, failures, errors)
+
+
+def conditions_of(bits: int) -> tuple[str, ...]:
+    """Names of the set bits of a condition byte."""
+    return tuple(text for bit, text in CONDITIONS.items() if bits & bit)

@@ -1,0 +1,147 @@
+"""
+False alarms and reached poses on the measured robot, and on robots drawn from its intervals.
+
+    python benchmarks/measured_robot.py [--controllers nmpc,rl] [--hours 1] [--draws 20] [--seed 0]
+                                        [--robot FILE] [--plant measured] [--jobs 2] [--json FILE]
+
+Each controller flies `--hours` in each condition to random poses of 8 s, in flights of 15 poses.
+It also flies ten poses with each of `--draws` robots, whose measured values are drawn uniformly
+from the intervals of the robot file. No fault is injected, so each reported fault, fallback or
+landing is a false alarm. The bound is the largest rate with which so few alarms still occur in 5 %
+of such campaigns; without an alarm it is 3 / hours. The flight stack has the shipped robot file,
+or `--robot`.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict, dataclass
+import json
+from math import ceil
+from pathlib import Path
+import sys
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+from scipy.stats import chi2
+
+from beetle_omni_ros.control.entry import ControllerOptions
+from beetle_omni_ros.evaluation.command import fly
+from beetle_omni_ros.faults.campaign import fly_all
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.runs.metrics import metrics
+from beetle_omni_ros.runs.tasks import make_task
+
+POSES, POSE_TIME, OF_DRAWN = 15, 8.0, 10    # of a flight; [s]; poses of a drawn robot
+DRAWN = 'drawn'
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A flight of ``controller`` with ``seed``; ``kind`` is a condition, or a drawn robot."""
+
+    controller: str
+    kind: str
+    seed: int
+
+    @property
+    def poses(self) -> int:
+        """Number of poses."""
+        return OF_DRAWN if self.kind == DRAWN else POSES
+
+
+def fly_one(trial: Trial, robot: str | None, plant: str) -> dict:
+    """Fly one trial; returns its fields, hours, poses, reached, the errors and the alarms."""
+    known, true = RobotParameters.load(robot), RobotParameters.load(plant)
+    if trial.kind == DRAWN:
+        true = true.drawn(np.random.default_rng(trial.seed))
+    task = make_task(f'random{trial.poses}', trial.seed)
+    log = fly(trial.controller, task, robot=known, plant=true, seed=trial.seed,
+              conditions='nominal' if trial.kind == DRAWN else trial.kind,
+              options={trial.controller: ControllerOptions(allow_other_robot=True)})
+    result = metrics(log, task)
+    poses, ended = result['poses'], result.get('ended', '')
+    alarms = [*log.named_faults(), ended, result.get('controller_error', '')]
+    return {**asdict(trial), 'hours': POSE_TIME * sum(
+                pose['U_position_m'] is not None for pose in poses) / 3600,
+            'poses': len(poses), 'reached': sum(pose['reached'] for pose in poses),
+            'U_position_m': [pose['U_position_m'] for pose in poses],
+            'U_orientation_deg': [pose['U_orientation_deg'] for pose in poses],
+            'alarms': [alarm for alarm in alarms if alarm]}
+
+
+def summary(flights: list[dict]) -> list[dict]:
+    """Sums of the flights with the same controller and kind."""
+    rows = []
+    for controller, kind in dict.fromkeys((one['controller'], one['kind']) for one in flights):
+        flown = [one for one in flights if (one['controller'], one['kind']) == (controller, kind)]
+        hours, alarmed = sum(one['hours'] for one in flown), sum(
+            bool(one['alarms']) for one in flown)
+        errors = {key: [value for one in flown for value in one[key] if value is not None]
+                  for key in ('U_position_m', 'U_orientation_deg')}
+        rows.append({
+            'controller': controller, 'kind': kind, 'flights': len(flown), 'hours': hours,
+            'poses': sum(one['poses'] for one in flown),
+            'reached': sum(one['reached'] for one in flown), 'flights_with_alarm': alarmed,
+            'bound_per_hour': chi2.ppf(0.95, 2 * alarmed + 2) / 2 / hours if hours else None,
+            **{f'{name}_{key}': float(function(values)) if values else None
+               for key, values in errors.items()
+               for name, function in (('mean', np.mean), ('max', np.max))},
+            'alarms': [f"seed {one['seed']}: {', '.join(one['alarms'])}" for one in flown
+                       if one['alarms']]})
+    return rows
+
+
+def main() -> None:
+    """Fly and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
+    parser.add_argument('--controllers', default='nmpc,rl')
+    parser.add_argument('--hours', type=float, default=1.0)
+    parser.add_argument('--draws', type=int, default=20)
+    parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--robot')
+    parser.add_argument('--plant', default='measured')
+    parser.add_argument('--jobs', type=int, default=2)
+    parser.add_argument('--json', type=Path)
+    chosen = parser.parse_args()
+    number = ceil(3600 * chosen.hours / (POSES * POSE_TIME))
+    trials = [Trial(controller, kind, chosen.seed + k)
+              for controller in chosen.controllers.split(',')
+              for kind, count in (('nominal', number), ('published', number),
+                                  (DRAWN, chosen.draws)) for k in range(count)]
+    console = Console(width=None if sys.stdout.isatty() else 140)
+    flights = list(track(
+        fly_all(fly_one, trials, chosen.robot, chosen.plant, jobs=chosen.jobs),
+        'flights', total=len(trials), console=console))
+    flights.sort(key=lambda one: trials.index(Trial(*(
+        one[key] for key in ('controller', 'kind', 'seed')))))
+    rows = summary(flights)
+    table = Table('controller', 'robot', 'hours', 'reached', 'U mean (max)',
+                  'flights with an alarm', 'bound [1/h]')
+    for row in rows:
+        table.add_row(
+            row['controller'], row['kind'], f"{row['hours']:.2f}",
+            f"{row['reached']} of {row['poses']}",
+            '–' if row['mean_U_position_m'] is None else
+            f"{row['mean_U_position_m']:.4f} ({row['max_U_position_m']:.4f}) m, "
+            f"{row['mean_U_orientation_deg']:.2f} ({row['max_U_orientation_deg']:.2f}) deg",
+            f"{row['flights_with_alarm']} of {row['flights']}",
+            '–' if row['bound_per_hour'] is None else f"{row['bound_per_hour']:.1f}")
+    console.print(table)
+    for row in rows:
+        for alarm in row['alarms']:
+            console.print(f"{row['controller']}, {row['kind']}, {alarm}", markup=False)
+    if chosen.json:
+        chosen.json.write_text(json.dumps(
+            {'meta': {**vars(chosen), 'json': str(chosen.json)}, 'summary': rows,
+             'flights': flights}, indent=1))
+
+
+if __name__ == '__main__':
+    try:
+        main()
+    except ParameterError as error:
+        sys.exit(f'measured_robot.py: {error}')

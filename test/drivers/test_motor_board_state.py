@@ -1,0 +1,153 @@
+"""State of the board for any numbers in its messages, and the offset of its clock."""
+
+import math
+import time
+
+from hypothesis import given, settings, strategies
+import pytest
+import reference_packets as reference
+
+from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.sim.emulated import mavlink as emulated
+
+pytest.importorskip('pymavlink')
+
+from beetle_omni_ros.drivers.motor_board_state import (
+    BoardState,
+    ClockOffset,
+    conditions_of,
+    MavlinkReceiver,
+    restarted,
+)
+
+PARAMETERS, CELLS = MotorBoardParameters.load(), RobotParameters.load().battery.cells
+PAYLOADS = strategies.sampled_from(sorted(emulated.MESSAGES)).flatmap(
+    lambda number: strategies.tuples(strategies.just(number), strategies.binary(
+        min_size=emulated.MESSAGES[number][1].size, max_size=emulated.MESSAGES[number][1].size)))
+DELAYS = strategies.floats(1e-5, 0.2)
+
+
+@pytest.fixture
+def board():
+    """A state without messages."""
+    return BoardState(PARAMETERS, CELLS, time.time)
+
+
+def tell(board, number, values, now=None):
+    """Give a message of the board; return the events."""
+    (message,) = MavlinkReceiver(1, 1).feed(emulated.pack(number, values, 0, 1, 1))
+    board.message(message, time.monotonic() if now is None else now)
+    return board.take()[2]
+
+
+@settings(max_examples=400, deadline=None)
+@given(strategies.lists(PAYLOADS, max_size=8))
+def test_valid_frames_with_arbitrary_content_are_tolerated(payloads):
+    """The voltage for the thrust map remains plausible."""
+    board = BoardState(PARAMETERS, CELLS, time.time)
+    for number, payload in payloads:
+        (message,) = MavlinkReceiver(1, 1).feed(emulated.pack(
+            number, emulated.MESSAGES[number][1].unpack(payload), 0, 1, 1))
+        board.message(message, time.monotonic())
+        board.tick(time.monotonic(), True)
+        restarted(message)
+    assert board.voltage is None or 15.0 <= board.voltage <= 26.4
+    assert not board.clock.known        # without a request
+    assert all(len(text.splitlines()) == 1 for _, text in board.take()[2])
+
+
+def test_the_documented_packets_are_read_in_si_units(board):
+    for message in MavlinkReceiver(1, 1).feed(b''.join(reference.BY_BOARD)):
+        board.message(message, 5.0)
+    status = board.status
+    assert (status.state, status.armed, status.contract) == ('running', True, 1)
+    assert (status.stop_reason, status.conditions) == ('none', ())
+    assert conditions_of(0x0C) == ('throttle not low', 'battery low')
+    assert board.reception == {'lost': 3, 'bad_crc': 2, 'refused': 7, 'timeouts': 1}
+    assert (board.battery.voltage, board.battery.current) == (24.0, -12.34)
+    for message in MavlinkReceiver(1, 1).feed(reference.ESC_INFO + reference.ESC_STATUS):
+        board.message(message, 5.0)
+    _, rotors, events = board.take()
+    assert rotors.rpm[:3].tolist() == [6000, 6001, 6002]
+    assert rotors.temperature[0] == 35.0
+    assert rotors.failures == ((), (), (), ('generic',))
+    assert all(math.isnan(values[3]) for values in (rotors.rpm, rotors.voltage, rotors.current,
+                                                    rotors.temperature))
+    assert rotors.error_count.tolist() == [0, 0, 0, 2]
+    assert events.count(('error', 'motor board: ESC of rotor 4 offline')) == 1
+
+
+def test_only_answers_to_own_requests_count_and_only_once(board):
+    question, now = board.timesync_request(), time.monotonic()
+    tell(board, emulated.TIMESYNC, (5 * 10**9, question.ts1 + 1), now)
+    assert not board.clock.known
+    for remote in (5, 900):
+        tell(board, emulated.TIMESYNC, (remote * 10**9, question.ts1), now)
+    assert abs(board.clock.offset() + now - 5) < 0.1
+
+
+def test_the_voltage_filter_depends_on_time_and_not_on_message_count(board):
+    def measure(volts, now):
+        tell(board, emulated.BATTERY_STATUS, (-1, -1, 0, round(1000 * volts), *[65535] * 9,
+                                              0, 0, 0, 1, -1), now)
+
+    measure(25.0, 10.0)
+    assert board.voltage == 25.0
+    measure(24.0, 10.0 + PARAMETERS.voltage_time_constant)
+    assert board.voltage == pytest.approx(25 - (1 - math.exp(-1)), abs=1e-6)
+    measure(24.0, 20.0)
+    assert board.voltage == pytest.approx(24.0)
+
+
+def test_changes_are_reported_once_and_severe_ones_as_errors(board):
+    def heartbeat(state, reason=0, conditions=0):
+        mode = state | reason << 8 | conditions << 16 | 1 << 24
+        return tell(board, emulated.HEARTBEAT, (mode, 2, 0, 1, 4, 3))
+
+    assert heartbeat(1) == (('info', 'motor board: found, disarmed, contract 1'),)
+    assert heartbeat(3) == (('info', 'motor board: armed'),)
+    assert heartbeat(3) == ()
+    assert heartbeat(2, 0, 32) == (('error', 'motor board: targets timed out'),)
+    assert heartbeat(2, 0, 32 | 8) == (('warning', 'motor board: battery low'),)
+    assert heartbeat(1, 3) == (('error', 'motor board: disarmed (no target for too long)'),)
+    assert heartbeat(3) == (('info', 'motor board: armed'),)
+    assert heartbeat(1, 1) == (('info', 'motor board: disarmed (requested by the host)'),)
+    assert heartbeat(0, 4)[0] == ('warning', 'motor board: restarted (watchdog reset)')
+
+
+# --- the clock --------------------------------------------------------------------------------
+
+@given(strategies.floats(-1e4, 1e4), strategies.floats(-1e-4, 1e-4),
+       strategies.lists(strategies.tuples(DELAYS, DELAYS), min_size=1, max_size=50))
+def test_the_true_offset_is_within_the_bound(start, drift, delays):
+    """With unequal delays of 10 us to 0.2 s, and drift within its bound."""
+    clock, now = ClockOffset(1e-4), 100.0
+
+    def truth(time):
+        return start + drift * (time - 100.0)
+
+    for there, back in delays:
+        remote = now + there + truth(now + there)
+        assert not clock.add(now, remote, now + there + back)
+        now += there + back
+        assert abs(clock.offset() - truth(now)) <= clock.uncertainty(now) + 1e-9
+        now += 0.2
+        assert abs(clock.offset() - truth(now)) <= clock.uncertainty(now) + 1e-9
+
+
+def test_one_fast_answer_outweighs_many_slow_ones():
+    clock = ClockOffset(1e-5)
+    assert math.isnan(clock.offset()) and clock.uncertainty(5) == math.inf
+    clock.add(0.0, 50.0005, 0.001)
+    for k in range(1, 100):
+        clock.add(k, 50 + k + 0.08, k + 0.1)
+    assert clock.offset() == pytest.approx(50, abs=2e-3)
+    assert clock.uncertainty(100) < 2e-3
+
+
+def test_a_restarted_clock_is_detected_and_the_offset_replaced():
+    clock = ClockOffset(1e-4)
+    assert not clock.add(10.0, 500.001, 10.002)
+    assert clock.add(11.0, 0.001, 11.002)
+    assert clock.offset() == pytest.approx(-11, abs=1e-6)

@@ -1,0 +1,183 @@
+"""A robot file from all logs, and the shipped one that is made from the measured logs."""
+
+from pathlib import Path
+import shlex
+
+import numpy as np
+import pytest
+from rotor_logs import RATIO, SERIES, series, stand
+from rotor_logs import write as write_rows
+from servo_logs import log_of, sweep, write
+import yaml
+
+from beetle_omni_ros import cli
+from beetle_omni_ros.control.base import Command
+from beetle_omni_ros.faults.flight import Flight
+from beetle_omni_ros.identify.measured import own_delay
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.dynamics import (
+    DISTURBANCE_SIZE,
+    integrator,
+    QUATERNION,
+    STATE_SIZE,
+    THRUST,
+)
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.resources import share_path
+from beetle_omni_ros.robot.thrust_map import ThrustMap
+from beetle_omni_ros.sim.parameters import SimulatorParameters
+from beetle_omni_ros.sim.simulator import Simulator
+from beetle_omni_ros.train.model import nominal_body, substep, WRENCH_SIZE
+
+ROOT = Path(__file__).resolve().parents[2]
+PUBLISHED, MEASURED = RobotParameters.load(), RobotParameters.load('measured')
+TRUE = [{'frequency': wn, 'damping': 0.6, 'coulomb': band, 'delay': 0.024}
+        for wn, band in ((50.0, 0.013), (47.0, 0.030), (53.0, 0.012), (55.0, 0.010))]
+STAND = ('pwm_us', 'force_N', 'torque_N_m', 'voltage_V', 'temperature', 'file_voltage')
+
+
+@pytest.fixture(scope='module')
+def made(tmp_path_factory):
+    """Folder with logs of a known robot, and the file written from them."""
+    folder = tmp_path_factory.mktemp('made')
+    zeros = [TRUE[0] | {'offset': 0.015}, *TRUE[1:]]
+    logs = [write(folder / 'slow.csv', log_of(*sweep(5.0), zeros, seed=1)),
+            write(folder / 'fast.csv', log_of(*sweep(
+                3.0, periods=(0.3, 0.5), amplitudes=(0.3, 0.5)), TRUE, seed=2)),
+            write_rows(folder / 'stand.csv', stand(np.random.default_rng(0)), STAND),
+            write_rows(folder / 'series.csv', series(np.random.default_rng(0)), SERIES)]
+    rest = np.repeat(stand(np.random.default_rng(1))[-1:], 60, axis=0)
+    rest[:2, 0], rest[:, 1] = 1000, rest[:, 1] * np.linspace(0, 1, 60)
+    rest[:, 2] *= np.linspace(0, 1, 60)
+    logs.append(write_rows(folder / 'untimed.csv', rest, STAND))
+    assert cli.main(['identify', 'robot', *map(str, logs), '--params', str(folder / 'mine.yaml'),
+                     '--json', str(folder / 'r.json'), '--picture', str(folder / 'p.svg')]) == 0
+    return folder
+
+
+def test_the_intervals_hold_the_true_robot(made):
+    robot = RobotParameters.load(made / 'mine.yaml')
+    kp = [PUBLISHED.joints.inertia * one['frequency']**2 for one in TRUE]
+    truth = {
+        'effects.joint_bandwidth.kp': kp,
+        'effects.joint_bandwidth.kd': [2 * one['damping'] * k / one['frequency']
+                                       for one, k in zip(TRUE, kp, strict=True)],
+        'effects.joint_friction.coulomb': [
+            one['coulomb'] * k for one, k in zip(TRUE, kp, strict=True)],
+        'effects.joint_command_latency.delay': TRUE[0]['delay'] - own_delay(),
+        'rotors.torque_to_thrust_ratio': RATIO}
+    assert set(truth) | {'rotors.time_constant', 'effects.joint_friction.stiction'} \
+        == set(robot.intervals)
+    for key, value in truth.items():
+        low, high = robot.interval(key)
+        assert np.all((low <= value) & (value <= high)), (key, low, value, high)
+    low, high = robot.interval('rotors.time_constant')
+    assert low < 0.07 and high > 0.045      # rising and falling
+
+
+def test_the_file_has_command_logs_and_what_no_log_shows_but_no_zero(made):
+    content = yaml.safe_load((made / 'mine.yaml').read_text())
+    origin = content['provenance']['origin']
+    assert set(content['provenance']['logs']) == {path.name for path in made.glob('*.csv')}
+    assert 'joint_offset' not in content['effects'] and 'not written: joint_offset' in origin
+    assert set(content['intervals']) <= set(origin)
+    left = content['provenance']['of_the_extended_file']
+    assert {'mass', 'inertia', 'joints.inertia', 'battery', 'rotors.thrust_max'} <= set(left)
+    assert not set(left) & {'joints.kp', 'rotors.map', 'rotors.time_constant'}
+    assert 'untimed.csv' in (made / 'r.json').read_text()
+    assert (made / 'p.svg').read_text().startswith('<?xml')
+
+
+def test_a_log_of_another_kind_is_refused_in_one_line(tmp_path, capsys):
+    (tmp_path / 'x.csv').write_text('a,b\n1,2\n')
+    assert cli.main(['identify', 'robot', str(tmp_path / 'x.csv'), '--params',
+                     str(tmp_path / 'y.yaml')]) == 2
+    assert 'expected the header' in capsys.readouterr().err
+
+
+def varied(tmp_path, key, end):
+    """The measured robot with one value at an end of its interval."""
+    content = yaml.safe_load(share_path('params/robot_measured.yaml').read_text())
+    at, *names = content, *key.split('.')
+    for name in names[:-1]:
+        at = at[name]
+    at[names[-1]] = np.array(MEASURED.interval(key)[end]).tolist()
+    del content['intervals']
+    if key.endswith('stiction'):    # not below the friction that slides
+        content['effects']['joint_friction']['coulomb'] = 0.0
+    path = tmp_path / 'varied.yaml'
+    path.write_text(yaml.safe_dump(content))
+    return RobotParameters.load(path)
+
+
+def predicted(robot):
+    """States of the NMPC's and of the training's model after commands."""
+    start, u = np.zeros(STATE_SIZE), np.r_[np.full(4, 0.3), 9.0, 8.0, 7.0, 6.0]
+    start[QUATERNION], start[THRUST] = (0, 0, 0, 1), 6.0
+    nmpc, trained, body = integrator(robot), substep(robot, 0.0025), nominal_body(robot)
+    for advance in (lambda x: nmpc(x, u, np.zeros(DISTURBANCE_SIZE), 0.01),
+                    lambda x: trained(x, u, np.zeros(WRENCH_SIZE), body)):
+        x = start
+        for _ in range(10):
+            x = advance(x)
+        yield np.array(x).ravel()
+
+
+def simulated(robot):
+    """State of the plant after commands."""
+    simulator = Simulator(robot, SimulatorParameters.load())
+    simulator.reset(np.array([0.0, 0.0, 20.0]))
+    for _ in range(40):
+        simulator.command(Command(simulator.time, np.full(4, 0.3), np.array([9.0, 8, 7, 6])))
+        truth = simulator.step().truth
+    return np.r_[truth.tilt, truth.thrust, truth.angular_velocity]
+
+
+@pytest.mark.parametrize('key', sorted(MEASURED.intervals))
+def test_every_interval_matters_to_plant_and_models(tmp_path, key):
+    low, high = (varied(tmp_path, key, end) for end in (0, 1))
+    assert np.abs(simulated(low) - simulated(high)).max() > 1e-6
+    if 'latency' in key:
+        assert low.command_delays != high.command_delays
+        return
+    for one, other in zip(predicted(low), predicted(high), strict=True):
+        assert np.abs(one - other).max() > 1e-6
+
+
+def test_the_measured_robot_hovers_under_a_controller_that_believes_the_published_one():
+    flight = Flight(controller='nmpc', conditions='nominal', seed=0, plant='measured')
+    flight.loop.take_off()
+    flight.aim((0.0, 0.0, 1.0))
+    flight.fly(6.0)
+    truth = flight.simulator.truth
+    assert not truth.broken
+    assert truth.position == pytest.approx([0, 0, 1], abs=0.05)
+    assert rotations.geodesic_angle(truth.quaternion, [0, 0, 0, 1]) < 0.15
+
+
+def test_the_measured_map_hovers_and_reaches_as_far_as_the_published_one():
+    measured, published = (ThrustMap(robot.rotors) for robot in (MEASURED, PUBLISHED))
+    assert not measured.repaired
+    for voltage in (21.4, 23.0, 25.0):
+        assert measured.thrust_limit(voltage) > 2.5 * MEASURED.hover_thrust
+        assert measured.thrust_limit(voltage) == pytest.approx(
+            published.thrust_limit(voltage), rel=0.12)
+        duty = published.duty(np.array([3.0, MEASURED.hover_thrust, 15.0]), voltage)
+        assert measured.thrust(duty, voltage) == pytest.approx(
+            [3.0, MEASURED.hover_thrust, 15.0], abs=1.0)
+
+
+@pytest.mark.skipif(not (ROOT / '../shared/data/joint_response_100Hz.csv').is_file(),
+                    reason='the measured logs are not there')
+def test_the_recorded_command_gives_the_shipped_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    shipped = yaml.safe_load(share_path('params/robot_measured.yaml').read_text())
+    _, *words = shlex.split(shipped['provenance']['command'])
+    words[words.index('--params') + 1] = str(tmp_path / 'made.yaml')
+    assert cli.main(words) == 0
+    again = RobotParameters.load(tmp_path / 'made.yaml')
+    assert again.rotors.map[0].coefficients == pytest.approx(MEASURED.rotors.map[0].coefficients)
+    for key, ends in MEASURED.intervals.items():
+        assert again._value(key) == pytest.approx(MEASURED._value(key), rel=0.02, abs=2e-5)
+        for one, other in zip(again.interval(key), ends, strict=True):
+            assert one == pytest.approx(other, rel=0.05, abs=2e-5)

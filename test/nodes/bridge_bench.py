@@ -1,0 +1,159 @@
+"""Test bench of the bridges: a process, an emulated device and an operator that commands."""
+
+from contextlib import contextmanager
+from dataclasses import replace
+import threading
+import time
+
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+import numpy as np
+from sensor_msgs.msg import BatteryState, JointState
+from std_srvs.srv import Trigger
+
+from beetle_omni_ros.control.base import Command
+from beetle_omni_ros.messages.topics import SENSOR
+from beetle_omni_ros.nodes import discovery, wire
+from beetle_omni_ros.nodes.graph import Graph
+from beetle_omni_ros.nodes.operator import Operator
+from beetle_omni_ros.robot.parameters import JOINT_NAMES
+from beetle_omni_ros.sim.emulated.board_parameters import EmulatedBoardParameters
+
+JOINT, ROTOR = 'joint_bridge_node', 'rotor_bridge_node'
+WITHIN = 40     # [s] timeout of expected events on a busy machine
+# Answers come from a thread of the test: wait longer for them than on a robot.
+PATIENT = {JOINT: {'timing': {'reply': 0.03, 'probe_first': 0.02, 'probe_longest': 0.1,
+                              'health': 0.04, 'reconnect': 0.02}},
+           ROTOR: {'reconnect_period': 0.1, 'silence': 1.0}}
+QUICK = replace(EmulatedBoardParameters.load(), boot_time=0.05, throttle_low_time=0.2,
+                reception_rate=10.0)
+COUNT = 2 * np.pi / 4096    # [rad]
+
+
+class BridgeOperator(Operator):
+    """
+    Operator that commands a bridge, stands in for the supervisor, and stores messages.
+
+    Attributes:
+        tilt, thrust: what a thread commands; both None: no commands.
+        period: time between two commands [s].
+        age: age of their stamps [s].
+
+    """
+
+    def __init__(self, number, bridge):
+        super().__init__(number)
+        self.bridge, node = bridge, self._node
+        self.bridge_states, self.batteries, self.joints, self.rotors = [], [], [], []
+        self.tilt = self.thrust = None
+        self.period, self.age = 0.01, 0.0
+        self._supervisor = wire.Publisher(node, 'supervisor/state')
+        self._commands = wire.Publisher(node, 'command')
+        self._clients_of_bridge = {}
+        wire.subscribe(node, f'{bridge.removesuffix("_node")}/state', self.bridge_states.append)
+        for kind, topic, received in ((BatteryState, 'battery_state', self.batteries),
+                                      (JointState, 'rotor_states', self.rotors)):
+            node.create_subscription(kind, topic, received.append, wire.profile(SENSOR))
+        node.create_subscription(JointState, 'joint_states', lambda message: self.joints.append(
+            (message, time.time())), wire.profile(SENSOR))
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._command, daemon=True)
+        self._thread.start()
+
+    def _command(self):
+        while not self._stop.wait(self.period):
+            tilt, thrust = self.tilt, self.thrust
+            if tilt is not None or thrust is not None:
+                self._commands.publish(Command(time.time() - self.age, *(
+                    np.zeros(4) if part is None else np.array(part, float)
+                    for part in (tilt, thrust))))
+
+    def supervise(self, state):
+        """Publish a state of the supervisor."""
+        self._supervisor.publish(state)
+
+    def ask(self, name, kind=Trigger, request=None):
+        """Call a service of the bridge; return its response."""
+        if name not in self._clients_of_bridge:
+            self._clients_of_bridge[name] = self._node.create_client(kind, f'{self.bridge}/{name}')
+        client = self._clients_of_bridge[name]
+        self.until(client.service_is_ready, f'no service {name}')
+        future = client.call_async(request or kind.Request())
+        self.until(future.done, f'{name}: no answer')
+        return future.result()
+
+    def change(self, name):
+        """Request a lifecycle transition such as 'configure'; return whether it succeeded."""
+        number = getattr(Transition, f'TRANSITION_{name.upper()}')
+        return self.ask('change_state', ChangeState, ChangeState.Request(
+            transition=Transition(id=number))).success
+
+    @property
+    def stage(self):
+        """Lifecycle state of the bridge."""
+        return self.ask('get_state', GetState).current_state.label
+
+    def go_to(self, stage):
+        """Bring the bridge to a lifecycle state from any other."""
+        path = {'unconfigured': 0, 'inactive': 1, 'active': 2}
+        end = time.monotonic() + WITHIN
+        while (here := path[self.stage]) != path[stage]:
+            name = ('configure', 'activate')[here] if here < path[stage] \
+                else ('cleanup', 'deactivate')[here - 1]
+            # An answer may be late on a busy machine.
+            assert self.change(name) or time.monotonic() < end, f'{name}: {self.now}'
+
+    @property
+    def now(self):
+        """Newest state of the bridge."""
+        return self.bridge_states[-1] if self.bridge_states else ''
+
+    def until(self, condition, why=''):
+        """Wait until a condition holds."""
+        assert self.wait(condition, WITHIN), f'{why} {self.bridge_states[-3:]}'
+
+    def reaches(self, state):
+        """Wait for a state of the bridge."""
+        self.until(lambda: self.now.startswith(state), state)
+
+    def status(self, name):
+        """Return the next message of a status."""
+        self.diagnostics.pop(f'{self.bridge}: {name}', None)
+        self.until(lambda: f'{self.bridge}: {name}' in self.diagnostics, f'no status {name}')
+        return self.diagnostics[f'{self.bridge}: {name}']
+
+    def counts(self, name, key, above=0):
+        """Wait until a counter in a status is above a number."""
+        self.until(lambda: int(self.status(name).values.get(key, 0)) > above, f'{name} {key}')
+
+    def stands_at(self, goal):
+        """Whether the newest message has these angles of all joints."""
+        message = self.joints[-1][0] if self.joints else JointState()
+        return list(message.name) == list(JOINT_NAMES) and np.allclose(
+            message.position, goal, atol=3 * COUNT)
+
+    def close(self):
+        """Stop publishing."""
+        self._stop.set()
+        self._thread.join()
+        super().close()
+
+
+@contextmanager
+def running_bridge(folder, bridge, others=(), **parameters):
+    """Run a bridge in a separate process, or composed with others; yield graph and operator."""
+    with discovery.reserved_domain() as number:
+        graph = Graph({bridge: {**PATIENT[bridge], **parameters}, **{name: {} for name in others}},
+                      folder, number, composed=bool(others))
+        operator = None
+        try:
+            graph.start()
+            operator = BridgeOperator(number, bridge)
+            operator.supervise('disarmed')
+            operator.until(lambda: operator.bridge_states, 'no state')
+            yield graph, operator
+        finally:
+            stubborn = graph.stop()
+            if operator:
+                operator.close()
+        assert not stubborn
