@@ -30,7 +30,7 @@ import torch
 
 from beetle_omni_ros.control import onnx_runtime
 from beetle_omni_ros.control.base import Command, PoseTarget, State
-from beetle_omni_ros.control.guidance.guidance import Guidance
+from beetle_omni_ros.control.guidance.guidance import Guidance, LAYERS
 from beetle_omni_ros.control.policy import PolicyParameters
 from beetle_omni_ros.control.policy_network import find, PolicyNetwork
 from beetle_omni_ros.robot import dynamics as model
@@ -48,8 +48,6 @@ SEGMENT, AT_TARGET, ON_THE_WAY = 750, (700, 750), (100, 700)    # steps of 10 ms
 DEPTHS, HEIGHT = (0.15, 0.25, 0.4), 0.3      # [m] counted: below start and target; above ground
 REACHED = (0.1, np.radians(10))
 PART = 512      # robots of one piece of work
-OFF = {'unwinding': {'attempts': 0}, 'routing': {'tilt': 100.0}, 'trimming': {'rate': 0.0},
-       'turning': {'height': -1000.0, 'distance': 1000.0, 'climb': 0.0}}
 
 
 class Batched:
@@ -223,13 +221,12 @@ def main() -> int:
     parser.add_argument('--moves', type=int, default=5, help='of each robot that count')
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--conditions', choices=('nominal', 'published'), default='nominal')
-    parser.add_argument('--without', nargs='*', choices=sorted(OFF), default=[])
+    parser.add_argument('--without', nargs='*', choices=LAYERS, default=[])
     parser.add_argument('--jobs', type=int, default=-1, help='processes; -1: one for each core')
     parser.add_argument('--json', type=Path)
     given = parser.parse_args()
     robot, parameters = RobotParameters.load(), PolicyParameters.load()
-    parameters = replace(parameters, **{part: replace(getattr(parameters, part), **OFF[part])
-                                        for part in given.without})
+    parameters = replace(parameters, without=','.join(given.without))
     path = given.policy or parameters.policy
     try:
         contract = PolicyNetwork(path, robot).contract

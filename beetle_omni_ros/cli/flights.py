@@ -114,6 +114,10 @@ def evaluate(controllers: Annotated[str, typer.Option(
              nmpc_file: NmpcOption = None,
              policy: PolicyOption = None,
              allow_other_robot: OtherRobotOption = False,
+             without: Annotated[str, typer.Option(
+                 '--without', metavar='LAYER,...',
+                 help='Layers of the guidance that are off: unwinding, routing, turning, '
+                      'trimming, or all.')] = '',
              bag: Annotated[Optional[Path], typer.Option(
                  '--bag', metavar='DIR', help='New folder for the bag; with several controllers '
                                               'it contains one bag for each.')] = None,
@@ -127,7 +131,13 @@ def evaluate(controllers: Annotated[str, typer.Option(
     Example: beetle_omni evaluate --controllers nmpc --task random100 --json result.json
     """
     chosen = names('--controllers', controllers)
-    options = {name: ControllerOptions(allow_other_robot=allow_other_robot) for name in chosen}
+    guided = [name for name in chosen if registry.find(name).guidance != 'none']
+    if without and not guided:
+        raise ParameterError(f'--without {without}: no controller with guidance among '
+                             f"{', '.join(chosen)}")
+    options = {name: ControllerOptions(allow_other_robot=allow_other_robot,
+                                       without=without if name in guided else '')
+               for name in chosen}
     for option, file, key in (('--nmpc', nmpc_file, 'parameters'), ('--policy', policy, 'policy')):
         name = owner(option)
         if file and name not in chosen:

@@ -49,12 +49,14 @@ class ControllerOptions:
         parameters: file of parameters.
         policy: network.
         allow_other_robot: fly a policy that was trained for other robot parameters.
+        without: layers of the guidance that are off.
 
     """
 
     parameters: Path | None = None
     policy: Path | None = None
     allow_other_robot: bool = False
+    without: str = ''
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -156,6 +158,11 @@ class ControllerEntry:
         mapping = schema.load_yaml(file) if file else {}
         parameters = schema.bind(kind, self.completed(mapping, bool(options.parameters)),
                                  str(file or ''))
+        if options.without:
+            if not hasattr(parameters, 'without'):
+                raise ParameterError(f"--without {options.without}: controller "
+                                     f"'{self.reference}' has no layers of guidance")
+            parameters = replace(parameters, without=options.without)
         if not (self.policy_file and hasattr(parameters, 'policy')):
             return parameters
         return replace(parameters, policy=str(options.policy or self.policy_file),

@@ -27,6 +27,13 @@ rl = ControllerEntry(
     guidance='unwinding, routing, turning, trimming', stands_by=True, compared=True, cost=0.07,
     line=Line('#1b5fb4', '-', 'o'))
 
+rl_bare = ControllerEntry(
+    name='rl_bare', label='RL, bare', description='the learned policy without guidance',
+    controller='beetle_omni_ros.control.policy:PolicyController',
+    parameters='beetle_omni_ros.control.policy:PolicyParameters',
+    parameters_file='params/rl.yaml', policy_file='policies/rl.onnx', fixed={'without': 'all'},
+    compared=True, cost=0.07, line=Line('#0b2d5c', (0, (2, 1)), 'x'))
+
 rl_memory = ControllerEntry(
     name='rl_memory', label='RL, memory',
     description='the learned policy with the estimated disturbance as input',

@@ -21,15 +21,17 @@ SEGMENT = 8.0                       # [s] duration of a pose; windows of the tas
 AT_TARGET, ON_THE_WAY = (7.0, 7.5), (1.0, 7.0)
 # Latencies of the simulated robot, and the conditions of the publication's table.
 NOMINAL = {'command_latency': [0.010, 0.010], 'velocity_latency': [0.0, 0.0],
-           'tilt_latency': [0.010, 0.010]}
+           'tilt_latency': [0.010, 0.010], 'actuator_spread': [0.0, 0.0]}
+MEASURED = {**NOMINAL, 'actuator_spread': [1.0, 1.0]}
 PUBLISHED = {'command_latency': [0.005, 0.015], 'velocity_latency': [0.015, 0.025],
-             'tilt_latency': [0.005, 0.010], 'carried_share': 1.0, 'noise_power': 0.0}
+             'tilt_latency': [0.005, 0.010], 'carried_share': 1.0, 'noise_power': 0.0,
+             'actuator_spread': [0.0, 0.0]}
 SILENT = {'force_bias': 0.0, 'torque_bias': 0.0, 'force_noise': 0.0, 'torque_noise': 0.0}
 DISTURBANCES = ('force_share', 'strong_share', 'payload_share', 'push_share')
 
 
 def conditions(name: str, random: RandomParameters) -> RandomParameters:
-    """Randomisation of the conditions 'nominal' or 'published'."""
+    """Randomisation of 'nominal', 'published', or 'measured': nominal with drawn actuators."""
     if name == 'published':
         own = {key: np.array(value) if isinstance(value, list) else value
                for key, value in PUBLISHED.items()}
@@ -37,7 +39,8 @@ def conditions(name: str, random: RandomParameters) -> RandomParameters:
     zero = {entry.name: 0.0 for entry in fields(RandomParameters)
             if isinstance(getattr(random, entry.name), float)}
     zero.update(push_period=1.0, thrust_sag=random.thrust_sag)
-    return replace(random, **zero, **{key: np.array(value) for key, value in NOMINAL.items()})
+    own = MEASURED if name == 'measured' else NOMINAL
+    return replace(random, **zero, **{key: np.array(value) for key, value in own.items()})
 
 
 def assess(mean: Callable[[torch.Tensor], torch.Tensor], parameters: TrainParameters,
@@ -52,7 +55,7 @@ def assess(mean: Callable[[torch.Tensor], torch.Tensor], parameters: TrainParame
         parameters: parameters of its training.
         robot: nominal robot.
         device: torch device.
-        name: 'nominal' or 'published'.
+        name: 'nominal', 'published' or 'measured'.
         robots: N.
         segments: poses for each robot, after a first one that does not count.
         random: randomisation in place of the named one.
@@ -72,7 +75,7 @@ def assess(mean: Callable[[torch.Tensor], torch.Tensor], parameters: TrainParame
     env = TiltableQuadrotorEnv(replace(
         parameters, ppo=replace(parameters.ppo, robots=robots), episode=episode,
         start=StartParameters(**start),
-        estimate=replace(parameters.estimate, **SILENT) if name == 'nominal'
+        estimate=replace(parameters.estimate, **SILENT) if name != 'published'
         else parameters.estimate,
         random=random if random is not None else conditions(name, parameters.random)),
         robot, device, compiled=False)

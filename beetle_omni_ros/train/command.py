@@ -136,7 +136,7 @@ def _finish(runner, robot, output, device, smoke, json_path, console):
     parameters, actor = runner.parameters, runner.alg.actor
     robots, segments = (ROBOTS, 2) if device.startswith('cuda') else (CPU_ROBOTS, 1)
     metrics = {name: assess(actor.mean, parameters, robot, device, name, robots, segments)
-               for name in ('nominal', 'published')} if not smoke else {}
+               for name in ('nominal', 'published', 'measured')} if not smoke else {}
     path = output / POLICY_FILE
     training = {'iterations_done': runner.current_learning_iteration,
                 'samples': runner.current_learning_iteration * parameters.ppo.steps

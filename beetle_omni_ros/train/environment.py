@@ -32,7 +32,7 @@ from beetle_omni_ros.train.replays import (
     spread,
 )
 
-NUMBERS = 141       # random numbers for each robot and step
+NUMBERS = 166       # random numbers for each robot and step
 REACHED_POSITION, REACHED_ATTITUDE = 0.10, 0.17453    # [m], [rad] limits of the task metrics
 
 
@@ -97,7 +97,7 @@ class TiltableQuadrotorEnv(VecEnv):
         self._finish = self._after_physics
         if compiled if compiled is not None else self.device.type == 'cuda':
             self._finish = torch.compile(self._after_physics, fullgraph=True, dynamic=False)
-        self.observation, self.critic = self._observe(self.state, batch.Draw(numbers[:, 104:]))
+        self.observation, self.critic = self._observe(self.state, batch.Draw(numbers[:, 129:]))
         self.reward = torch.zeros(self.num_envs, device=self.device)
         self.done = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self.timeout = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)

@@ -3,24 +3,29 @@ Model of the robot in the training environment, as one CasADi function.
 
 Rigid-body equations, rotor lag and effects come from :mod:`robot.dynamics`. This module adds the
 integration over a short substep, the limits of the servos and the quantities that differ between
-robots: mass, inertia and centre of mass. With a multibody section in the robot file, the model
-includes the reaction of the tilting modules and their shift of the centre of mass. Without these a
-policy does not hold level attitudes on the multibody plant.
+robots: mass, inertia, centre of mass, servos and rotor lag. With a multibody section in the robot
+file, the model includes the reaction of the tilting modules and their shift of the centre of mass.
+Without these a policy does not hold level attitudes on the multibody plant.
 """
 
 from dataclasses import replace
-from math import exp
 
 import casadi as ca
 import numpy as np
 
 from beetle_omni_ros.robot import dynamics as model
+from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.servo import CASADI, SLIDING_RATE, Step
 
-# Quantities of each robot: mass [kg], inertia (3) [kg m^2], centre of mass (3) [m].
+# Quantities of each robot: mass [kg], inertia (3) [kg m^2], centre of mass (3) [m]; for the four
+# joints stiffness [N m/rad], damping [N m s/rad], Coulomb friction and stiction [N m] and play
+# [rad]; lag of the rotors [s].
 MASS, INERTIA, CENTRE = slice(0, 1), slice(1, 4), slice(4, 7)
-BODY_SIZE = 7
+STIFFNESS, DAMPING, COULOMB, STICTION, PLAY = (slice(k, k + 4) for k in range(7, 27, 4))
+LAG = slice(27, 28)
+ACTUATORS = slice(7, 28)
+BODY_SIZE = 28
 SERVO_STEPS = 2    # servo steps in a substep; a servo reaches its rate limit within 1 ms
 WRENCH_SIZE = 6    # external force in world [N], torque in body [N m]
 
@@ -40,22 +45,52 @@ def module_reaction(robot: RobotParameters) -> dict[str, float]:
 
 
 def nominal_body(robot: RobotParameters) -> list[float]:
-    """(7,) mass, inertia and centre of mass of the robot file, with its effects."""
+    """(28,) quantities of the robot file, with its effects."""
     effects = robot.effects
     return [effects.get('mass', {}).get('mass', robot.mass),
             *effects.get('inertia', {}).get('inertia', tuple(robot.inertia)),
-            *effects.get('centre_of_mass', {}).get('offset', (0.0, 0.0, 0.0))]
+            *effects.get('centre_of_mass', {}).get('offset', (0.0, 0.0, 0.0)),
+            *actuator_intervals(replace(robot, intervals={}))[0]]
 
 
-def _servos(robot, x, target, h):
+def actuator_intervals(robot: RobotParameters) -> np.ndarray:
+    """(2, 21) lowest and highest measured values of the quantities ``ACTUATORS``."""
+    def joints(effect, name, otherwise=(0.0, 0.0)):
+        pair = robot.interval(f'effects.{effect}.{name}') if effect in robot.effects else otherwise
+        return [np.broadcast_to(bound, 4) for bound in pair]
+
+    return np.hstack([
+        joints('joint_bandwidth', 'kp', robot.interval('joints.kp')),
+        joints('joint_bandwidth', 'kd', robot.interval('joints.kd')),
+        joints('joint_friction', 'coulomb'), joints('joint_friction', 'stiction'),
+        joints('joint_backlash', 'gap'),
+        np.reshape(robot.interval('effects.rotor_lag.time_constant'
+                                  if 'rotor_lag' in robot.effects else 'rotors.time_constant'),
+                   (2, 1))])
+
+
+def delay_intervals(robot: RobotParameters) -> np.ndarray:
+    """(2, 2) shortest and longest measured delays of tilt and of thrust commands [s]."""
+    total = np.zeros((2, 2))
+    for name in robot.effects:
+        for k, what in enumerate(('tilt', 'thrust')):
+            if what in CATALOGUE[name].delays:
+                total[:, k] += robot.interval(f'effects.{name}.delay')
+    return total
+
+
+def _servos(robot, x, target, h, body):
     """Tilts (4,) and rates (4,) after ``h`` seconds, within rate limit and stops."""
     tilts, rates = [], []
     for i in range(4):
         tilt, rate, thrust = x[model.TILT][i], x[model.TILT_RATE][i], x[model.THRUST][i]
         servo, terms = model.tilt_servo(robot, i, target[i], thrust, model.gyroscopic_load(
             robot, x[model.RATE], tilt, thrust, i))
-        step = Step(CASADI, replace(servo, position_limit=robot.joints.position_limit),
-                    h / SERVO_STEPS)
+        coulomb = body[COULOMB][i]
+        step = Step(CASADI, replace(
+            servo, kp=body[STIFFNESS][i], kd=body[DAMPING][i], coulomb=coulomb,
+            stiction=ca.fmax(coulomb, body[STICTION][i]),
+            position_limit=robot.joints.position_limit), h / SERVO_STEPS)
         for _ in range(SERVO_STEPS):
             tilt, rate = step(terms.target, tilt, rate, terms.load)
         tilts.append(tilt)
@@ -63,16 +98,15 @@ def _servos(robot, x, target, h):
     return ca.vertcat(*tilts), ca.vertcat(*rates)
 
 
-def _behind_play(robot, tilt, rate):
+def _behind_play(gap, tilt, rate):
     """
     Tilts of the rotors (4,) behind the play of the joints.
 
     A turning motor leads by half the gap. The state has no side of contact at rest, so the rotor
     is then in the middle.
     """
-    half = ca.DM(np.broadcast_to(robot.effects.get('joint_backlash', {}).get('gap', 0.0), 4) / 2)
     speed = rate / SLIDING_RATE
-    return tilt - half * speed / ca.sqrt(1 + speed * speed)
+    return tilt - 0.5 * gap * speed / ca.sqrt(1 + speed * speed)
 
 
 def substep(robot: RobotParameters, duration: float) -> ca.Function:
@@ -87,7 +121,7 @@ def substep(robot: RobotParameters, duration: float) -> ca.Function:
         duration: duration of the step [s].
 
     Returns:
-        substep(x (25), u (8), wrench (6), body (7)) -> x_next (25), in the slices of
+        substep(x (25), u (8), wrench (6), body (28)) -> x_next (25), in the slices of
         :mod:`robot.dynamics` and of this module.
 
     """
@@ -100,11 +134,11 @@ def substep(robot: RobotParameters, duration: float) -> ca.Function:
 
     rate = x[model.TILT_RATE]
     target = clip(u[model.TILT_COMMAND], -joints.position_limit, joints.position_limit)
-    new_tilt, new_rate = _servos(robot, x, target, h)
+    new_tilt, new_rate = _servos(robot, x, target, h, body)
 
     thrust_target = clip(u[model.THRUST_COMMAND], rotors.thrust_min, rotors.thrust_max)
     thrust = x[model.THRUST]
-    new_thrust = thrust + (1 - exp(-h / rotors.time_constant)) * (thrust_target - thrust)
+    new_thrust = thrust + (1 - ca.exp(-h / body[LAG])) * (thrust_target - thrust)
 
     effects = dict(robot.effects)
     if robot.multibody is not None:
@@ -114,7 +148,7 @@ def substep(robot: RobotParameters, duration: float) -> ca.Function:
     order = ['mass', *(name for name in effects if name != 'mass')]
     acceleration, angular_acceleration = model.rigid_body(
         robot, x[model.VELOCITY], x[model.QUATERNION], x[model.RATE],
-        _behind_play(robot, new_tilt, new_rate),
+        _behind_play(body[PLAY], new_tilt, new_rate),
         (thrust + new_thrust) / 2, wrench[:3], wrench[3:], (new_rate - rate) / h,
         {name: effects[name] for name in order}, tilt_rate=new_rate,
         thrust_rate=(new_thrust - thrust) / h, position=x[model.POSITION])

@@ -102,6 +102,12 @@ class RandomParameters:
                                          unit='s', shape=(2,), low=0, high=0.02)
     command_latency: np.ndarray = parameter([0.005, 0.015], doc='delay of commands', unit='s',
                                             shape=(2,), low=0, high=0.02)
+    actuators: str = parameter(
+        'measured', doc='robot file whose measured intervals of servos, rotors and delays the '
+        'robots cover')
+    actuator_spread: np.ndarray = parameter(
+        [-0.3, 1.1], doc='place of a robot on the line from the nominal one (0) to one drawn from '
+        'these intervals (1)', shape=(2,), low=-1, high=2)
     thrust_limit: np.ndarray = parameter(
         [18.0, 22.0], doc='largest thrust that the battery allows while four rotors hover',
         unit='N', shape=(2,), low=0, high=100)
@@ -132,7 +138,7 @@ class RandomParameters:
     def __post_init__(self):
         """Check the ranges."""
         _check_ranges(self, 'velocity_latency', 'tilt_latency', 'command_latency',
-                      'thrust_limit')
+                      'actuator_spread', 'thrust_limit')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,7 +169,7 @@ class RewardWeights:
     angular_velocity: float = parameter(-0.05, doc='published')
     joint_limit: float = parameter(-0.02, doc='published')
     thrust_limit: float = parameter(-0.01, doc='published')
-    joint_action_rate: float = parameter(-0.05, doc='published -5e-4')
+    joint_action_rate: float = parameter(-0.1, doc='published -5e-4')
     thrust_action_rate: float = parameter(-2e-3, doc='published -1e-4')
     thrust_power: float = parameter(-1e-4, doc='published -1e-5; saves thrust for a low battery')
     joint_acceleration: float = parameter(-1.5e-5, doc='published')
@@ -175,8 +181,8 @@ class RewardWeights:
     near_pose: float = parameter(1.5, doc='own: slope close to the target')
     exact_pose: float = parameter(1.5, doc='own: slope in the last centimetres')
     joint_winding: float = parameter(-3.0, doc='own: joints beyond half a turn')
-    hover_tilt_rate: float = parameter(-5.0, doc='own: smooth commands at the target')
-    hover_thrust_rate: float = parameter(-0.15, doc='own: smooth commands at the target')
+    hover_tilt_rate: float = parameter(-60.0, doc='own: smooth commands at the target')
+    hover_thrust_rate: float = parameter(-1.5, doc='own: smooth commands at the target')
     sinking: float = parameter(-26.0, doc='own: below both start and target')
     termination: float = parameter(-800.0, doc='own: smaller than the cost of the worst flight')
     scale: float = parameter(0.01, doc='scale of the sum')
@@ -239,9 +245,9 @@ class ScheduleParameters:
                            high=1)
     kl: np.ndarray = parameter([0.01, 0.005], doc='desired divergence of an update', shape=(2,))
     entropy: np.ndarray = parameter([5e-4, 0.0], doc='weight of the entropy', shape=(2,))
-    tilt_std_limit: np.ndarray = parameter([0.7, 0.12], doc='largest standard deviation of the '
+    tilt_std_limit: np.ndarray = parameter([0.7, 0.08], doc='largest standard deviation of the '
                                            'tilt actions, in actions', shape=(2,))
-    thrust_std_limit: np.ndarray = parameter([2.5, 0.32], doc='largest standard deviation of the '
+    thrust_std_limit: np.ndarray = parameter([2.5, 0.25], doc='largest standard deviation of the '
                                              'thrust actions, in actions', shape=(2,))
     smooth: np.ndarray = parameter([0.1, 1.0], doc='factor on the weights of *_action_rate and '
                                    'hover_*_rate', shape=(2,))

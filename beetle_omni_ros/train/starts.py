@@ -7,12 +7,18 @@ from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.train import batch
-from beetle_omni_ros.train.model import nominal_body
+from beetle_omni_ros.train.model import (
+    actuator_intervals,
+    ACTUATORS,
+    delay_intervals,
+    nominal_body,
+)
 from beetle_omni_ros.train.parameters import TrainParameters
 
 STRATA = ('wound_back', 'level', 'wound', 'mixed', 'hover', 'hold', 'moving')
 NEAR_POSITION, NEAR_ANGLE = 0.3, 0.6   # [m], [rad] of a target near the present pose
 HISTORY = 2     # stored periods of commands and tilts
+LEAST = 0.2     # smallest drawn quantity of an actuator, as a fraction of the smallest measured
 PAYLOAD_DEPTH = 0.08                   # [m] below base_link, as in the simulated plant
 
 
@@ -79,6 +85,12 @@ class Starts:
                              for t in parameters.episode.target_time]
         r = parameters.random
         self._latencies = latencies(parameters, robot)
+        self._longest_delay = HISTORY * parameters.episode.period
+        self._spread = [float(share) for share in r.actuator_spread]
+        measured = RobotParameters.load(r.actuators)
+        self._nominal = tensor([*nominal_body(robot)[ACTUATORS], *robot.command_delays])
+        self._measured = tensor(np.hstack([actuator_intervals(measured),
+                                           delay_intervals(measured)]))
         self._thrust_limit = [float(t) for t in r.thrust_limit]
 
     def draw(self, d: batch.Draw) -> dict[str, torch.Tensor]:
@@ -134,6 +146,22 @@ class Starts:
                 'floor': torch.minimum(place[:, 2:], position[:, 2:]),
                 'deepest': torch.zeros_like(place[:, 2])}
 
+    def _actuators(self, d):
+        """
+        Quantities of servos and rotors (N, 21), and delays by effects beyond the nominal (N, 2).
+
+        A robot lies on the line from the nominal one to one that is drawn from the measured
+        intervals, also somewhat beyond both; with one place for its servos, one for its rotors.
+        """
+        low, high = self._measured
+        count = low.shape[0]
+        drawn = low + (high - low) * d.uniform(count)
+        servo, rotor = d.uniform(2, *self._spread).split(1, -1)
+        share = torch.cat((servo.expand(-1, count - 3), rotor, servo, rotor), -1)
+        made = torch.maximum(self._nominal + share * (drawn - self._nominal),
+                             LEAST * torch.minimum(low, self._nominal))
+        return made[:, :-2], made[:, -2:] - self._nominal[-2:]
+
     def _randomisation(self, d):
         r = self._p.random
         body = self._body.expand(self._count, -1)
@@ -154,12 +182,15 @@ class Starts:
             d.around(r.velocity_bias, 3), d.around(r.rate_bias, 3), d.around(r.tilt_bias, 4),
             d.around(self._p.estimate.force_bias, 3),
             d.around(self._p.estimate.torque_bias, 3)), -1)
+        actuators, later = self._actuators(d)
         delays = torch.cat([d.uniform(1, *span) for span in self._latencies], -1)
+        delays = torch.cat(((delays[:, :2] + later).clamp(0.0, self._longest_delay),
+                            delays[:, 2:]), -1)
         pushed = d.chance(r.push_share)
         extrapolated = d.chance(r.carried_share).float()
         disturbed = (forced | strong | pushed | (load > 0)).float()
         return {'thrust_limit': d.uniform(1, *self._thrust_limit),
-                'body': torch.cat((total, inertia, centre), -1), 'wrench': wrench,
+                'body': torch.cat((total, inertia, centre, actuators), -1), 'wrench': wrench,
                 'noise': noise, 'bias': bias, 'delays': delays, 'extrapolated': extrapolated,
                 'pushed': pushed.float(),
                 'disturbed': disturbed, 'estimate': torch.zeros_like(wrench)}

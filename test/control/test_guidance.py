@@ -1,13 +1,13 @@
 """Guidance as a wrapper of any controller: targets, trim, reach, description."""
 
-from dataclasses import replace
-
 import numpy as np
+import pytest
 
 from beetle_omni_ros.control.base import Command, PoseTarget, State, TrajectoryTarget
 from beetle_omni_ros.control.guidance.guidance import Guidance, GuidanceParameters, Guided
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import ParameterError
 
 AXES = RobotParameters.load().tilt_axes
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
@@ -85,9 +85,15 @@ def test_guidance_reports_the_reach_of_its_controller():
     assert Guided(keeper, Guidance(GuidanceParameters(), AXES)).reach == 3.0
 
 
-def test_the_description_names_the_active_parts():
-    p = GuidanceParameters()
-    assert p.text == 'unwinding, routing, turning, trimming'
-    off = replace(p, unwinding=replace(p.unwinding, attempts=0),
-                  routing=replace(p.routing, tilt=100.0), trimming=replace(p.trimming, rate=0.0))
-    assert off.text == 'turning'
+def test_layers_that_are_off_do_not_act_and_are_not_in_the_description():
+    keeper = TargetRecorder()
+    assert Guidance(GuidanceParameters(), AXES).text == 'unwinding, routing, turning, trimming'
+    off = Guidance(GuidanceParameters(without='trimming, routing'), AXES)
+    assert off.text == 'unwinding, turning'
+    rest(Guided(keeper, off), lambda given: given)
+    assert np.array_equal(keeper.shown[-1].position, [0.0, 0.0, 1.0])
+    bare = Guidance(GuidanceParameters(without='all'), AXES)
+    low = PoseTarget(np.array([0.0, 0.0, 0.5]), rotations.exp(np.array([1.5, 0.0, 0.0])))
+    assert bare.text == 'none' and bare.target(state_at(0.0, (0, 0, 0.5), None), low) is low
+    with pytest.raises(ParameterError, match=r"'without'.*trimming or all, found 'trim'"):
+        GuidanceParameters(without='trim')

@@ -301,3 +301,11 @@ def test_the_registry_is_the_only_list_of_controllers():
     files = [*(ROOT / PACKAGE).rglob('*.py'), *(ROOT / 'launch').glob('*.py')]
     found = [line for path in files for line in names_together(path)]
     assert not found
+
+
+def test_layers_of_the_guidance_are_switched_off_by_an_option():
+    options = ControllerOptions(without='routing,trimming')
+    assert registry.make('rl', ROBOT, options).guidance == 'unwinding, turning'
+    assert registry.make('rl_bare', ROBOT).guidance == 'none'
+    with pytest.raises(ParameterError, match="controller 'nmpc' has no layers"):
+        registry.find('nmpc').load_parameters(options)

@@ -19,7 +19,8 @@ QUIET = {f'random.{name}': 0.0 for name in (
     'push_share', 'carried_share')} | {f'estimate.{name}': 0.0 for name in (
         'force_bias', 'force_noise', 'torque_bias', 'torque_noise')} | {
     'random.velocity_latency': [0.0, 0.0], 'random.tilt_latency': [0.0, 0.0],
-    'random.command_latency': [0.01, 0.01], 'random.thrust_limit': [20.0, 20.0]}
+    'random.command_latency': [0.01, 0.01], 'random.actuator_spread': [0.0, 0.0],
+    'random.thrust_limit': [20.0, 20.0]}
 
 
 def small(changes=None, **more):

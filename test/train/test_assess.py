@@ -122,7 +122,7 @@ def test_nominal_conditions_have_no_disturbance_and_published_ones_equal_severit
     nominal = conditions('nominal', RandomParameters())
     for name in QUIET:
         group, key = name.split('.')
-        if group == 'random' and not key.endswith(('latency', 'limit')):
+        if group == 'random' and not key.endswith(('latency', 'limit', 'spread')):
             assert getattr(nominal, key) == 0, key
     np.testing.assert_allclose(nominal.command_latency, 0.01)
     published = conditions('published', RandomParameters())

@@ -44,7 +44,7 @@ def states(count, seed=0, dtype=torch.float64):
     x = torch.cat((torch.randn(count, 6, generator=g), quaternion,
                    torch.randn(count, 3, generator=g), tilt, joint_rate, thrust), -1)
     u = torch.cat((uniform(g, -6, 6, count, 4), uniform(g, -5, 25, count, 4)), -1)
-    body = torch.tensor(model.nominal_body(EVERYTHING)) * uniform(g, 0.9, 1.1, count, 7)
+    body = torch.tensor(model.nominal_body(EVERYTHING)) * uniform(g, 0.9, 1.1, count, 28)
     return [value.to(dtype) for value in (x, u, torch.randn(count, 6, generator=g), body)]
 
 
@@ -95,7 +95,7 @@ def test_an_unknown_operation_is_refused_by_name():
 def test_the_kernel_loads_uses_and_stores_each_number():
     source = physics._kernel_source(model.substep(EVERYTHING, 0.0025))
     ast.parse(source)
-    for name, array, size in (('x', 'x_in', 25), ('wrench', 'wrench', 6), ('body', 'body', 7),
+    for name, array, size in (('x', 'x_in', 25), ('wrench', 'wrench', 6), ('body', 'body', 28),
                               ('newest', 'newest', 8), ('previous', 'previous', 8),
                               ('oldest', 'oldest', 8)):
         for k in range(size):

@@ -166,8 +166,8 @@ def test_reaction_parameters_are_those_of_the_modules():
 def test_effects_of_the_robot_file_are_the_initial_body_parameters():
     robot = replace(ROBOT, effects={'mass': {'mass': 3.5}, 'centre_of_mass': {
         'offset': (0.01, 0.0, -0.01)}})
-    assert model.nominal_body(ROBOT) == [ROBOT.mass, *ROBOT.inertia, 0.0, 0.0, 0.0]
-    assert model.nominal_body(robot) == [3.5, *ROBOT.inertia, 0.01, 0.0, -0.01]
+    assert model.nominal_body(ROBOT)[:7] == [ROBOT.mass, *ROBOT.inertia, 0.0, 0.0, 0.0]
+    assert model.nominal_body(robot)[:7] == [3.5, *ROBOT.inertia, 0.01, 0.0, -0.01]
 
 
 def hovering(count, seed, tilt_step, thrust_step):

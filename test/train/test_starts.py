@@ -7,7 +7,15 @@ from scipy.spatial.transform import Rotation
 import torch
 
 from beetle_omni_ros.robot import dynamics as model
+from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.train.batch import Draw
+from beetle_omni_ros.train.model import (
+    actuator_intervals,
+    ACTUATORS,
+    LAG,
+    nominal_body,
+    STIFFNESS,
+)
 from beetle_omni_ros.train.starts import Starts, STRATA
 
 PERIOD = 0.01
@@ -93,7 +101,7 @@ def test_targets_lie_in_the_region_or_near_the_robot():
 def drawn_starts(env, severity):
     starts = Starts(env.cfg, ROBOT, env.num_envs, 'cpu')
     starts.severity.fill_(severity)
-    return starts.draw(Draw(torch.rand(env.num_envs, 120,
+    return starts.draw(Draw(torch.rand(env.num_envs, 145,
                                        generator=torch.Generator().manual_seed(0))))
 
 
@@ -102,10 +110,34 @@ def test_severity_scales_forces_and_payloads_of_new_robots():
     none, half, full = (drawn_starts(env, severity) for severity in (0.0, 0.5, 1.0))
     assert full['wrench'].any(0).all() and not none['wrench'].any()
     torch.testing.assert_close(half['wrench'], 0.5 * full['wrench'])
-    nominal = torch.tensor([ROBOT.mass, *map(float, ROBOT.inertia), 0.0, 0.0, 0.0])
-    torch.testing.assert_close(none['body'], nominal.expand(env.num_envs, 7))
+    nominal = torch.tensor(nominal_body(ROBOT)).float()
+    torch.testing.assert_close(none['body'], nominal.expand(env.num_envs, -1))
     load = full['body'][:, 0] - ROBOT.mass
     assert float(load.min()) >= 0 and 0.8 * env.cfg.random.payload < float(load.max()) \
         <= env.cfg.random.payload
     torch.testing.assert_close(half['body'][:, 0] - ROBOT.mass, 0.5 * load, atol=1e-5, rtol=1e-4)
     assert (full['body'][:, 6] <= 0).all()     # it hangs below
+
+
+def test_drawn_actuators_lie_between_the_nominal_robot_and_the_measured_intervals():
+    low, high = (torch.tensor(each).float()
+                 for each in actuator_intervals(RobotParameters.load('measured')))
+    nominal = torch.tensor(nominal_body(ROBOT))[ACTUATORS].float()
+    measured = quiet({'random.actuator_spread': [1.0, 1.0]}, robots=2000)
+    body, later = measured.state['body'][:, ACTUATORS], measured.state['delays'][:, :2] - 0.01
+    assert ((low - 1e-6 <= body) & (body <= high + 1e-6)).all()
+    middle = 0.5 * (low + high)
+    torch.testing.assert_close(body.mean(0), middle, rtol=0.05, atol=1e-4)
+    assert later.min() >= -1e-6 and later[:, 0].max() > 0.004 and not later[:, 1].any()
+    # as the robot file draws its robots
+    drawn = [nominal_body(RobotParameters.load('measured').drawn(np.random.default_rng(seed)))
+             for seed in range(20)]
+    drawn = torch.tensor(drawn).float()[:, ACTUATORS]
+    assert ((low - 1e-6 <= drawn) & (drawn <= high + 1e-6)).all()
+    between = quiet({'random.actuator_spread': [0.0, 1.0]}, robots=2000)
+    for part in (STIFFNESS, LAG):
+        place = between.state['body'][:, part]
+        limits = torch.stack((low, high, nominal))[:, part.start - 7:part.stop - 7]
+        assert (place >= limits.min(0).values - 1e-6).all()
+        assert (place <= limits.max(0).values + 1e-6).all()
+        assert float(place.max()) > 0.95 * float(nominal[part.start - 7])

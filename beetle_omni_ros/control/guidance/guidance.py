@@ -7,7 +7,7 @@ dives in large turns and for steady errors. Guidance is optional: a controller m
 """
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -25,17 +25,20 @@ from beetle_omni_ros.control.guidance.trimming import Trimming, TrimmingParamete
 from beetle_omni_ros.control.guidance.turning import Turning, TurningParameters
 from beetle_omni_ros.control.guidance.unwinding import Unwinding, UnwindingParameters
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth
-from beetle_omni_ros.robot.schema import group
+from beetle_omni_ros.robot.schema import group, parameter, ParameterError
+from beetle_omni_ros.robot.yaml_file import quoted
 
 LATEST = 10     # steps within which a command is reported as the executed command
 NONE = 'none'   # text for a controller without guidance
-ALWAYS = 100.0  # [rad] as the limit of routing: routing is off
+ALL = 'all'     # in place of the names of all layers
 
 
 @dataclass(frozen=True, kw_only=True)
 class GuidanceParameters:
     """Parameters of the guidance; params/rl.yaml gives the reasons."""
 
+    without: str = parameter('', doc="layers that are off: names with commas, or 'all'",
+                             read_only=True)
     unwinding: UnwindingParameters = group(
         UnwindingParameters, 'through a level attitude where joints end at their stops')
     routing: RoutingParameters = group(
@@ -45,13 +48,23 @@ class GuidanceParameters:
     trimming: TrimmingParameters = group(
         TrimmingParameters, 'the steady error at a target is taken off')
 
+    def __post_init__(self):
+        """Check the names of the layers that are off."""
+        if unknown := self._off - {*LAYERS, ALL}:
+            raise ParameterError(f"key 'without': expected {', '.join(LAYERS)} or {ALL}, found "
+                                 f'{quoted(", ".join(sorted(unknown)))}')
+
     @property
-    def text(self) -> str:
-        """Text that lists the active parts, for result tables."""
-        parts = {'unwinding': self.unwinding.attempts > 0,
-                 'routing': self.routing.tilt < ALWAYS, 'turning': True,
-                 'trimming': self.trimming.rate > 0}
-        return ', '.join(name for name, is_on in parts.items() if is_on)
+    def _off(self):
+        return {name.strip() for name in self.without.split(',')} - {''}
+
+    @property
+    def layers(self) -> tuple[str, ...]:
+        """Names of the active layers."""
+        return tuple(name for name in LAYERS if not self._off & {name, ALL})
+
+
+LAYERS = tuple(entry.name for entry in fields(GuidanceParameters) if entry.name != 'without')
 
 
 class Guidance:
@@ -63,12 +76,13 @@ class Guidance:
         axes: (4, 3) unit tilt axes in base_link.
 
     Attributes:
-        text: lists the active parts.
+        text: lists the active layers.
 
     """
 
     def __init__(self, parameters: GuidanceParameters, axes: np.ndarray):
-        self.text = parameters.text
+        self._on = parameters.layers
+        self.text = ', '.join(self._on) or NONE
         self._unwinding = Unwinding(parameters.unwinding, axes)
         self._routing = Routing(parameters.routing, axes)
         self._turning = Turning(parameters.turning)
@@ -89,11 +103,11 @@ class Guidance:
             in_charge: whether this controller is active.
 
         """
-        aim = self._unwinding.target(state, given)
-        if aim is given:
+        aim = self._unwinding.target(state, given) if 'unwinding' in self._on else given
+        if aim is given and 'routing' in self._on:
             aim = self._routing.target(state, given)
-        shown = self._turning.target(state, given, aim)
-        if shown is given:
+        shown = self._turning.target(state, given, aim) if 'turning' in self._on else aim
+        if shown is given and 'trimming' in self._on:
             return self._trimming.target(state, given, in_charge)
         self._trimming.reset()      # the joints may be wound differently afterwards
         return shown

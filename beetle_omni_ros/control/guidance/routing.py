@@ -32,7 +32,7 @@ class RoutingParameters:
 
     tilt: float = parameter(
         3.4, doc='largest tilt along the shortest turn, above which an intermediate attitude is '
-        'searched; 100: never', unit='rad', low=0.5, high=100)
+        'searched', unit='rad', low=0.5, high=100)
     aim: float = parameter(
         3.2, doc='largest tilt by way of the intermediate attitude, if possible', unit='rad',
         low=0.5, high=100)

@@ -20,7 +20,7 @@ LONGEST_STEP = 0.1      # [s] between two states; after a longer gap no update
 class TrimmingParameters:
     """Rate of the integral, and the criteria of a steady error."""
 
-    rate: float = parameter(1.0, doc='rate of the integral; 0: off', unit='1/s', low=0, high=5)
+    rate: float = parameter(1.0, doc='rate of the integral', unit='1/s', low=0, high=5)
     distance: float = parameter(0.06, doc='largest shift of the target', unit='m', low=0, high=1)
     angle: float = parameter(0.15, doc='the same, attitude', unit='rad', low=0, high=1)
     near_distance: float = parameter(
