@@ -18,7 +18,7 @@ from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.messages.bag_types import from_bytes
 from beetle_omni_ros.messages.topics import controller_of, SENSOR, topic_of
 from beetle_omni_ros.nodes import runner, wire
-from beetle_omni_ros.nodes.discovery import confine
+from beetle_omni_ros.nodes.graph import confine
 from beetle_omni_ros.nodes.wire import AnyQosSubscription
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError

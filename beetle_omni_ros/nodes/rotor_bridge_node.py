@@ -7,8 +7,8 @@ import time
 from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters
 from beetle_omni_ros.drivers.motor_board import Arming, FLIES, MotorBoard
 from beetle_omni_ros.drivers.serial_port import SerialPortError
-from beetle_omni_ros.nodes.command_source import CommandSource
 from beetle_omni_ros.nodes.lifecycle_node import AUTOSTART, LifecycleFlightNode
+from beetle_omni_ros.nodes.node import CommandSource
 from beetle_omni_ros.nodes.rotor_bridge_report import RotorBridgeReport, TargetStream
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import RotorReading

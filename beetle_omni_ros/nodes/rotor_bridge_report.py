@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from beetle_omni_ros.drivers.motor_board import Arming, FLIES, LOST, MotorBoard, Sent
-from beetle_omni_ros.nodes import health
+from beetle_omni_ros.nodes.node import Distribution, ERROR, Health, OK, WARN
 
 
 class TargetStream:
@@ -32,8 +32,8 @@ class TargetStream:
         self._last: float | None = None
         self.cycles = self.missed = 0
         self.unsent: Counter = Counter()
-        self.latency, self.latency_from = health.Distribution(), 'no command yet'
-        self.age = health.Distribution()
+        self.latency, self.latency_from = Distribution(), 'no command yet'
+        self.age = Distribution()
         self.command = np.zeros(4)
         self.saturated = np.zeros(4, dtype=int)
 
@@ -65,7 +65,7 @@ class TargetStream:
 class RotorBridgeReport:
     """Sources of the diagnostic statuses of the bridge."""
 
-    def __init__(self, reports: health.Health, board: MotorBoard, arming: Arming,
+    def __init__(self, reports: Health, board: MotorBoard, arming: Arming,
                  stream: TargetStream):
         self._board, self._arming, self._stream = board, arming, stream
         self._battery = self._rotors = None
@@ -85,8 +85,8 @@ class RotorBridgeReport:
         values = {'phase': arming.phase, 'cycles': stream.cycles, 'missed_cycles': stream.missed}
         values.update((f'not sent: {reason}', n) for reason, n in stream.unsent.items())
         missed, self._missed = stream.missed - self._missed, stream.missed
-        level = health.ERROR if arming.phase == LOST else \
-            health.OK if text == 'ready' and not missed else health.WARN
+        level = ERROR if arming.phase == LOST else \
+            OK if text == 'ready' and not missed else WARN
         if missed and text == 'ready':
             text = f'{missed} cycles missed'
         if status := self._board.state.status:
@@ -100,7 +100,7 @@ class RotorBridgeReport:
 
     def _latency_status(self):
         times, ages = self._stream.latency, self._stream.age
-        return health.OK, f'from {self._stream.latency_from} to the last byte written', {
+        return OK, f'from {self._stream.latency_from} to the last byte written', {
             **times.milliseconds(), 'count': times.count, **ages.milliseconds('age_')}
 
     def _rotor_status(self, k):
@@ -110,7 +110,7 @@ class RotorBridgeReport:
         saturates = stream.saturated[k] > self._saturated[k]
         self._saturated[k] = stream.saturated[k]
         if rotors is None:
-            return health.OK, 'no data yet', values
+            return OK, 'no data yet', values
         faults = list(rotors.failures[k])
         if math.isnan(rotors.rpm[k]):
             faults.append('offline')
@@ -120,7 +120,7 @@ class RotorBridgeReport:
             'temperature_C': float(rotors.temperature[k]), 'failures': ', '.join(faults),
             'error_count': int(rotors.error_count[k])})
         if faults:
-            return health.ERROR, ', '.join(faults), values
+            return ERROR, ', '.join(faults), values
         if saturates:
-            return health.WARN, 'target above the thrust that the battery permits', values
-        return health.OK, 'ok', values
+            return WARN, 'target above the thrust that the battery permits', values
+        return OK, 'ok', values

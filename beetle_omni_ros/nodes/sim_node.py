@@ -11,9 +11,8 @@ from beetle_omni_ros.drivers.device_parameters import ServoBusParameters
 from beetle_omni_ros.messages.conversions import set_time
 from beetle_omni_ros.messages.topics import SENSOR
 from beetle_omni_ros.messages.values import Odom
-from beetle_omni_ros.nodes import health, wire
-from beetle_omni_ros.nodes.command_source import CommandSource
-from beetle_omni_ros.nodes.node import FlightNode
+from beetle_omni_ros.nodes import wire
+from beetle_omni_ros.nodes.node import CommandSource, Distribution, ERROR, FlightNode, OK, WARN
 from beetle_omni_ros.nodes.pacing import RealTimePacing, SimulatedTimePacing
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import group, parameter, ParameterError
@@ -91,7 +90,7 @@ class SimNode(FlightNode):
         self._simulator.set_payload(given.payload)
         self._set_faults(given)
         self._pacing = self._make_pacing(given)
-        self._latency = health.Distribution()
+        self._latency = Distribution()
         self._publish_to = {
             'mocap': self.publisher('mocap/pose'), 'imu': self.publisher('imu/data_raw'),
             'truth': self.publisher('ground_truth/odom')}
@@ -246,7 +245,7 @@ class SimNode(FlightNode):
 
     def _pacing_status(self):
         pacing = self._pacing
-        level = health.WARN if pacing.lost_ticks else health.OK
+        level = WARN if pacing.lost_ticks else OK
         return level, f'{pacing.lost_ticks} ticks lost', {
             'ticks': pacing.ticks, 'lost_ticks': pacing.lost_ticks,
             'lost_s': pacing.lost_ticks * self._simulator.tick,
@@ -260,15 +259,15 @@ class SimNode(FlightNode):
             values.update(impact_m_s=impact.speed, impact_s=impact.stamp,
                           inclination_deg=degrees(impact.inclination))
         if simulator.truth.broken:
-            return health.ERROR, 'broken by a crash', values
-        return health.WARN if faults else health.OK, values['faults'] or 'whole', values
+            return ERROR, 'broken by a crash', values
+        return WARN if faults else OK, values['faults'] or 'whole', values
 
     def _devices_status(self):
         faults = self._devices.faults
-        level = health.WARN if faults else health.OK
+        level = WARN if faults else OK
         return level, 'faults: ' + (', '.join(faults) or 'none'), self._devices.status()
 
     def _latency_status(self):
         times = self._latency
-        return health.OK, 'stamp of the answered IMU sample to the arrival of its command', {
+        return OK, 'stamp of the answered IMU sample to the arrival of its command', {
             **times.milliseconds(), 'count': times.count}
