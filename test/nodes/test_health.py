@@ -8,7 +8,7 @@ pytest.importorskip('serial')
 
 from beetle_omni_ros.drivers.motor_board import Sent
 from beetle_omni_ros.nodes.node import Distribution
-from beetle_omni_ros.nodes.rotor_bridge_report import TargetStream
+from beetle_omni_ros.nodes.rotor_bridge_node import TargetStream
 
 
 def test_quantiles_agree_with_sorting_within_two_percent():
