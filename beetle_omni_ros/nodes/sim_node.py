@@ -230,8 +230,8 @@ class SimNode(FlightNode):
         self._pacing = self._make_pacing(given)
         self._latency = Distribution()
         self._publish_to = {
-            'mocap': self.publisher('mocap/pose'), 'imu': self.publisher('imu/data_raw'),
-            'truth': self.publisher('ground_truth/odom')}
+            'mocap': self.publisher('mocap/pose'), 'imu': self.publisher('imu/data_raw')}
+        self._truth = self.publisher('ground_truth/odom')
         self.listen('disturbance', self._on_wrench, stale_after=None)
         self.health.track_compute(self._simulator.tick)
         self.health.report('pacing', self._pacing_status)
@@ -357,19 +357,12 @@ class SimNode(FlightNode):
     def _publish(self, frame):
         epoch, publish_to = self._pacing.epoch, self._publish_to
         # Delayed readings first: the IMU sample triggers the estimate, which should include them.
-        if frame.mocap is not None:
-            publish_to['mocap'].publish(replace(frame.mocap, stamp=epoch + frame.mocap.stamp))
-        if self._devices is None and frame.joints is not None:
-            publish_to['joints'].publish(replace(frame.joints, stamp=epoch + frame.joints.stamp))
-        if frame.imu is not None:
-            publish_to['imu'].publish(replace(frame.imu, stamp=epoch + frame.imu.stamp))
-        publish_to['truth'].publish(Odom.of(frame.truth, stamp=epoch + frame.truth.stamp))
-        if self._devices is None and frame.rotors is not None:
-            publish_to['rotors'].publish(replace(frame.rotors, stamp=epoch + frame.rotors.stamp))
-        if self._devices is None and frame.battery is not None:
-            publish_to['battery'].publish(replace(
-                frame.battery, stamp=epoch + frame.battery.stamp,
-                cells=self._robot.battery.cells))
+        for name in ('mocap', 'joints', 'imu', 'rotors', 'battery'):
+            reading = getattr(frame, name)
+            if reading is not None and name in publish_to:
+                more = {'cells': self._robot.battery.cells} if name == 'battery' else {}
+                publish_to[name].publish(replace(reading, stamp=epoch + reading.stamp, **more))
+        self._truth.publish(Odom.of(frame.truth, stamp=epoch + frame.truth.stamp))
 
     def _on_command(self, command):
         self._latency.add(self.now() - command.stamp)
