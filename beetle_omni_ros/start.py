@@ -13,14 +13,15 @@ import sys
 
 PACKAGE = 'beetle_omni_ros'
 INTERRUPTED = 130
-# Executables with a module and its ``main``; all others are nodes.
-PROGRAMS = {'beetle_omni': f'{PACKAGE}.cli', 'composed': f'{PACKAGE}.nodes.composed'}
+# Executables with a function; all others are nodes.
+PROGRAMS = {'beetle_omni': f'{PACKAGE}.cli:main', 'composed': f'{PACKAGE}.nodes.runner:composed'}
 
 
 def load(name: str):
     """Import an executable and return its entry point."""
     if name in PROGRAMS:
-        return import_module(PROGRAMS[name]).main
+        module, _, function = PROGRAMS[name].partition(':')
+        return getattr(import_module(module), function)
     runner = import_module(f'{PACKAGE}.nodes.runner')
     return partial(runner.main, runner.node_class(name))
 

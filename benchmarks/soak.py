@@ -27,11 +27,15 @@ from rich.console import Console
 from rich.table import Table
 import yaml
 
-from beetle_omni_ros.nodes import discovery
-from beetle_omni_ros.nodes.discovery import confine
-from beetle_omni_ros.nodes.graph import Graph
+from beetle_omni_ros.nodes.graph import (
+    bridge_parameters,
+    BRIDGES,
+    confine,
+    Graph,
+    in_simulated_time,
+    reserved_domain,
+)
 from beetle_omni_ros.nodes.operator import Operator
-from beetle_omni_ros.nodes.plan import bridge_parameters, BRIDGES
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.runs.targets import COLUMNS
 from beetle_omni_ros.runs.tasks import POSE_DURATION, WAYPOINTS
@@ -116,8 +120,9 @@ def make_graph(folder: Path, number: int, given) -> Graph:
     if given.actuators == 'emulated':
         for node, values in bridge_parameters(folder, {}).items():
             parameters[node] = {**parameters.get(node, {}), **values}
-    return Graph(parameters, folder, number, composed=not given.separate,
-                 simulated=given.clock == 'simulated')
+    if given.clock == 'simulated':
+        parameters = in_simulated_time(parameters)
+    return Graph(parameters, folder, number, composed=not given.separate)
 
 
 def take_off(operator: Operator, bridges: list[str]) -> None:
@@ -164,7 +169,7 @@ def soak(given, console: Console) -> dict:
     operator, graph, ended = None, None, 'no take-off'
     samples: dict[str, list[Sample]] = {}
     try:
-        with discovery.reserved_domain() as number:
+        with reserved_domain() as number:
             try:
                 graph = make_graph(folder, number, given)
                 graph.start()

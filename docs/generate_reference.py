@@ -84,9 +84,8 @@ A file that extends another moves what depends on its numbers:
 """
 
 # Nodes whose code is not in a file of their own name; '' is no node of its own.
-SHARED = {'controller_node': 'nmpc_node, rl_node', 'health': 'every node', 'operator': '',
-          'driver': '', 'listener': '', 'node': '', 'recorder_node': '', 'command_source': '',
-          'graph': '', 'wire': ''}
+SHARED = {'controller_node': 'nmpc_node, rl_node', 'node': 'every node', 'operator': '',
+          'driver': '', 'recorder_node': '', 'wire': ''}
 
 # Topics that viewers and clocks need, which no other part of the package reads.
 OTHERS = {
@@ -221,7 +220,7 @@ def _ends() -> dict[str, dict[str, list[str]]]:
     """Topic -> its publishers and its subscribers, from the files of the nodes."""
     found: dict[str, dict[str, list[str]]] = {}
     nodes = ROOT / PACKAGE / 'nodes'
-    shared = _constants(ast.parse((nodes / 'command_source.py').read_text(encoding='utf-8')))
+    shared = _constants(ast.parse((nodes / 'node.py').read_text(encoding='utf-8')))
     ways = {'publisher': ('from', 0), 'Publisher': ('from', 1), 'create_publisher': ('from', 1),
             'listen': ('to', 0), 'follow': ('to', 0)}
     for path in sorted(nodes.glob('*.py')):

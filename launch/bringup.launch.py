@@ -73,7 +73,7 @@ def ports():
 
 def options(given):
     """Put the arguments into the terms of the graph's plan."""
-    from beetle_omni_ros.nodes.plan import GraphOptions
+    from beetle_omni_ros.nodes.graph import GraphOptions
     simulated = given['backend'] == 'sim'
     actuators = given['actuators'] or (
         'direct' if given['clock'] == 'simulated' else 'bridges')
@@ -130,11 +130,10 @@ def viewing(given):
 
 def actions(context):
     """Turn the arguments into processes."""
-    from beetle_omni_ros.nodes import plan
-    from beetle_omni_ros.nodes.discovery import confine
+    from beetle_omni_ros.nodes import graph
     given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
-    confine(requested=given['discovery'])
-    planned = plan.plan(options(given))
+    graph.confine(requested=given['discovery'])
+    planned = graph.plan(options(given))
     nodes = planned.nodes
     for name, reason in planned.left_out.items():
         print(f'{name} does not stand by: {reason}', file=sys.stderr)
@@ -151,11 +150,12 @@ def actions(context):
     if given['view'] == 'true':
         processes.append(viewing(given))
     if given['composed'] == 'true':
-        processes += [composed(plan.arguments(nodes, names), {name: nodes[name] for name in names},
+        processes += [composed(graph.arguments(nodes, names),
+                               {name: nodes[name] for name in names},
                                given['namespace'].strip('/'))
-                      for names in plan.processes(nodes).values()]
+                      for names in graph.processes(nodes).values()]
     else:
-        processes += [Node(package=PACKAGE, executable=plan.executable(name), name=name,
+        processes += [Node(package=PACKAGE, executable=graph.executable(name), name=name,
                            parameters=[values], namespace=given['namespace'], output='screen')
                       for name, values in nodes.items()]
     return processes
@@ -163,7 +163,7 @@ def actions(context):
 
 def generate_launch_description():
     """Declare the arguments; the rest follows from them."""
-    from beetle_omni_ros.nodes.discovery import confine
+    from beetle_omni_ros.nodes.graph import confine
     confine()       # here, so that it holds for `ros2 bag record` too
     declared = []
     for name, (default, choices, description) in ARGUMENTS.items():

@@ -8,7 +8,7 @@ import subprocess
 
 import pytest
 
-from beetle_omni_ros.nodes import plan
+from beetle_omni_ros.nodes import graph
 from beetle_omni_ros.nodes.lifecycle_node import AUTOSTART, INACTIVE
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -77,7 +77,7 @@ def test_the_service_starts_the_bridges_without_arming(tmp_path):
     start = re.search(r'^ExecStart=(.*)$', unit, re.M)[1]
     assert AUTOSTART['configure'] == INACTIVE
     for node in ('joint_bridge_node', 'rotor_bridge_node'):
-        assert node in plan.NODES
+        assert node in graph.NODES
         assert re.findall(rf'-p {node}:autostart:=(\w+)', start) == ['configure']
         assert f'-p {node}:robot_file:={robot}' in start
     assert f'-p joint_bridge_node:servo_bus_file:={robot}' in start

@@ -18,7 +18,7 @@ def launch(tmp_path, text, before=''):
     (tmp_path / 'program.py').write_text(text)
     return subprocess.Popen(
         [sys.executable, '-c', f'import sys, signal\n{before}\nsys.path.insert(0, "{tmp_path}")\n'
-         'from beetle_omni_ros import start\nstart.PROGRAMS["program"] = "program"\n'
+         'from beetle_omni_ros import start\nstart.PROGRAMS["program"] = "program:main"\n'
          'sys.exit(start.run("program"))'],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler))

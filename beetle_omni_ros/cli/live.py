@@ -42,7 +42,7 @@ def check(servo_port: Annotated[Optional[str], typer.Option(
     Example: beetle_omni check --servo-port /dev/ttyUSB0 --skip board
     """
     def listen(duration):
-        from beetle_omni_ros.nodes.listener import listen as listen_to_ros
+        from beetle_omni_ros.nodes.operator import listen as listen_to_ros
         return listen_to_ros(duration, namespace, discovery)
 
     from beetle_omni_ros.bringup.command import run_check

@@ -10,9 +10,7 @@ from beetle_omni_ros.control.base import guidance_of, PoseTarget, State
 from beetle_omni_ros.control.host import ControllerHost, MOTORS_OFF
 from beetle_omni_ros.control.registry import ControllerEntry
 from beetle_omni_ros.messages.values import MessageError
-from beetle_omni_ros.nodes import health
-from beetle_omni_ros.nodes.command_source import CommandSource
-from beetle_omni_ros.nodes.node import FlightNode
+from beetle_omni_ros.nodes.node import CommandSource, ERROR, FlightNode, OK, REPEAT
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import parameter, ParameterError
 from beetle_omni_ros.runs.targets import TargetChecks
@@ -131,7 +129,7 @@ class ControllerNode(FlightNode):
 
     def _log(self, error):
         text, at = self._logged
-        if text != error and not 0 <= (now := self.elapsed()) - at < health.REPEAT:
+        if text != error and not 0 <= (now := self.elapsed()) - at < REPEAT:
             self._logged = error, now
             self.get_logger().error(error)
 
@@ -162,8 +160,8 @@ class ControllerNode(FlightNode):
         if host.errors:
             values['errors'] = host.errors
         if new:
-            return health.ERROR, host.error, values
-        return health.OK, getattr(controller, 'name', self._entry.name), values
+            return ERROR, host.error, values
+        return OK, getattr(controller, 'name', self._entry.name), values
 
 
 class NmpcNode(ControllerNode):

@@ -27,7 +27,7 @@ from beetle_omni_ros.drive import (
 from beetle_omni_ros.messages.topics import SENSOR
 from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes import wire
-from beetle_omni_ros.nodes.discovery import confine
+from beetle_omni_ros.nodes.graph import confine
 from beetle_omni_ros.nodes.operator import Operator
 from beetle_omni_ros.nodes.runner import sigterm_as_interrupt
 from beetle_omni_ros.robot import rotations

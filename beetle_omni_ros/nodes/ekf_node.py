@@ -6,8 +6,7 @@ from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.estimation.samples import pose_covariance, twist_covariance
 from beetle_omni_ros.messages.values import Odom
-from beetle_omni_ros.nodes import health
-from beetle_omni_ros.nodes.node import FlightNode
+from beetle_omni_ros.nodes.node import ERROR, FlightNode, OK, WARN
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import parameter
 
@@ -59,6 +58,6 @@ class EkfNode(FlightNode):
             twist_covariance(estimate, self.parameters.imu.gyroscope_noise)))
 
     def _estimator_status(self):
-        level = {'tracking': health.OK, 'dead_reckoning': health.WARN, 'lost': health.ERROR}
+        level = {'tracking': OK, 'dead_reckoning': WARN, 'lost': ERROR}
         values = {f'rejected: {reason}': count for reason, count in self._ekf.rejected.items()}
-        return level.get(self._status, health.OK), self._status, values
+        return level.get(self._status, OK), self._status, values

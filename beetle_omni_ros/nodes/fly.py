@@ -1,6 +1,6 @@
 """`beetle_omni fly`: fly the ROS graph, record a bag, and print the results from the bag."""
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from contextlib import contextmanager, ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -10,18 +10,29 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 
+import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.nodes import runner, speed
-from beetle_omni_ros.nodes.discovery import confine, reserved_domain
-from beetle_omni_ros.nodes.flight import Flight, TooSlowError
-from beetle_omni_ros.nodes.graph import child_environment, Graph
+from beetle_omni_ros.estimation.ekf import ErrorStateEkf
+from beetle_omni_ros.estimation.parameters import EkfParameters
+from beetle_omni_ros.nodes import runner
+from beetle_omni_ros.nodes.graph import (
+    ACTUATORS,
+    BRIDGES,
+    child_environment,
+    confine,
+    Graph,
+    GraphOptions,
+    plan,
+    reserved_domain,
+)
+from beetle_omni_ros.nodes.node import ERROR
 from beetle_omni_ros.nodes.operator import Operator
-from beetle_omni_ros.nodes.plan import ACTUATORS, GraphOptions, plan
 from beetle_omni_ros.nodes.runner import signals_ignored, sigterm_as_interrupt
 from beetle_omni_ros.robot.parameters import find_robot, RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError, RunError
@@ -32,10 +43,43 @@ from beetle_omni_ros.runs.files import check_writable, write_json
 from beetle_omni_ros.runs.metrics import failed, metrics
 from beetle_omni_ros.runs.tasks import make_task, Task
 from beetle_omni_ros.sim.faults import listed
+from beetle_omni_ros.sim.parameters import SimulatorParameters
+from beetle_omni_ros.sim.simulator import Simulator
 
 INTERRUPTED = 130
 VIEWER_STOP_TIMEOUT = 3.0       # s
 CLOCKS = {'auto': ('system', 'simulated'), 'system': ('system',), 'simulated': ('simulated',)}
+
+READY_TIMEOUT = 300.0   # s; the first start compiles the controller
+BRIDGES_TIMEOUT = 20.0  # s; the simulator makes their devices at its start
+ARM_TIMEOUT = 10.0      # s
+TAKEOFF_TIMEOUT = 30.0  # s
+TAKEOFF_ATTEMPTS = 3
+SETTLE_TIME = 1.0       # s before arming, in which start-up work ends
+LANDING_TIMEOUT = 30.0  # s
+SPARE_TIME = 10.0       # s beyond the task's duration before a flight counts as stuck
+CHECK_PERIOD = 0.1      # s between checks of processes and progress
+ON_GROUND = ('disarmed', 'emergency_stop')
+
+MAX_LOAD = 0.9          # part of a core that the composed nodes may need
+PROBED = 1.0            # s of simulated time
+PER_NODE = 1.8          # CPU of a node relative to plant and estimator: seven nodes needed 12.8
+                        # times as much, six 11.9 times, on two busy cores of a Xeon
+WATCH_TIME = 2.0        # s before arming in which the simulator is checked for real time
+LOST_TIME = 0.2         # s that the simulator may lose in this time
+# s lost by the simulator above which a failure is attributed to the slow computer: the actuators
+# stop after so long without a command.
+SLOW_TIME = 0.1
+PAUSED = 'supervisor_paused'
+PACING = 'sim_node: pacing'
+# bridge -> (name of its status in diagnostics, prefix of the keys of a flight's measurements)
+MEASURED = {
+    'joint_bridge_node': ('bus', 'servos'), 'rotor_bridge_node': ('board', 'motor_board')}
+QUANTILES = ('median_ms', 'p99_ms', 'max_ms')
+
+
+class TooSlowError(RunError):
+    """The computer is too slow to fly this flight in real time."""
 
 
 def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
@@ -73,14 +117,14 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             flown_task = make_task(task, seed, registry.find(controller).reach(
                 RobotParameters.load(robot)))
             RobotParameters.load(plant or robot)
-            robot_file, plant_file = (file and find_robot(file) for file in (robot, plant))
             injected = listed.load_faults(faults) if faults else []
             actuators = _actuators_for(injected, actuators)
             clocks = _clocks(clock, actuators)
             options = GraphOptions(
                 controller=controller, nmpc=_absolute(nmpc), policy=str(policy or ''),
                 standby=standby, allow_other_robot=allow_other_robot,
-                robot_file=_absolute(robot_file), plant_file=_absolute(plant_file),
+                robot_file=_absolute(robot and find_robot(robot)),
+                plant_file=_absolute(plant and find_robot(plant)),
                 conditions=conditions, seed=int(seed),
                 task=_absolute(task) if Path(task).is_file() else str(task), bag=str(bag),
                 compression=compression, actuators='direct', ports=str(folder))
@@ -102,30 +146,11 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
                 return status or runner.FAILED
             return max(status, _report(bag, controller, flown_task, meta, json_path, console))
     except (ParameterError, BagError, OSError) as error:
-        print(f'beetle_omni fly: error: {error}', file=sys.stderr)
+        _complain(error)
         return runner.UNUSABLE
     except KeyboardInterrupt:
         print('beetle_omni fly: interrupted; everything is stopped', file=sys.stderr)
         return INTERRUPTED
-
-
-def _attempt(clocks, actuators, options, meta, folder, number, task, faults, console) -> int:
-    """Fly by the first clock that the computer is fast enough for; extends ``meta``."""
-    bag = Path(options.bag)
-    for kind in clocks:
-        meta |= {'clock': kind, 'actuators': actuators or (
-            'direct' if kind == 'simulated' else 'emulated')}
-        graph, last = _make_graph(options, meta, folder, number), kind == clocks[-1]
-        try:
-            if graph.composed and not last and (load := speed.load(graph.nodes)) > speed.MAX_LOAD:
-                raise TooSlowError(f'the nodes would need {load:.0%} of a core')
-            return _fly(graph, meta['controller'], task, meta, console, faults, may_be_slow=last)
-        except TooSlowError as error:
-            _discard_attempt(bag, folder, error, console)
-        except KeyboardInterrupt:
-            _save_meta(bag, meta)
-            raise
-    return runner.FAILED
 
 
 def _actuators_for(faults, actuators):
@@ -148,9 +173,74 @@ def _actuators_for(faults, actuators):
     return actuators
 
 
+def _clocks(clock, actuators):
+    """Clocks to try in turn, until the computer is fast enough."""
+    for key, value, known in (('actuators', actuators, (None, *ACTUATORS)),
+                              ('clock', clock, CLOCKS)):
+        if value not in known:
+            raise ParameterError(f"{key} '{value}': expected {' or '.join(filter(None, known))}")
+    if clock == 'simulated' and actuators == 'emulated':
+        raise ParameterError("actuators 'emulated': serial devices keep real time; expected "
+                             "direct with clock 'simulated'")
+    return CLOCKS['system' if actuators == 'emulated' else clock]
+
+
+def _absolute(path):
+    return str(Path(path).absolute()) if path else ''
+
+
+def _attempt(clocks, actuators, options, meta, folder, number, task, faults, console) -> int:
+    """Fly by the first clock that the computer is fast enough for; extends ``meta``."""
+    bag = Path(options.bag)
+    for kind in clocks:
+        meta |= {'clock': kind, 'actuators': actuators or (
+            'direct' if kind == 'simulated' else 'emulated')}
+        nodes = plan(replace(options, clock=kind, actuators='bridges' if meta[
+            'actuators'] == 'emulated' else 'direct')).nodes
+        graph, last = Graph(nodes, folder, number, meta['composed']), kind == clocks[-1]
+        try:
+            if graph.composed and not last and (load := needed_load(graph.nodes)) > MAX_LOAD:
+                raise TooSlowError(f'the nodes would need {load:.0%} of a core')
+            return _fly(graph, meta['controller'], task, meta, console, faults, may_be_slow=last)
+        except TooSlowError as error:
+            _print(console, f'this computer is too slow for real time: {error}; it flies in '
+                   'simulated time, which waits for the nodes, and without serial devices')
+            shutil.rmtree(bag, ignore_errors=True)
+            for log in folder.glob('*.log'):
+                log.unlink()
+        except KeyboardInterrupt:
+            with signals_ignored():
+                if (bag / 'metadata.yaml').exists():
+                    add_meta(bag, {**meta, 'interrupted': True})
+            raise
+    return runner.FAILED
+
+
+def needed_load(nodes: Sequence[str]) -> float:
+    """
+    Predict the CPU of composed nodes without bridges, as a part of a core.
+
+    Plant and estimator run in this process for a simulated second. The nodes do the same work and
+    move its messages, mostly in Python, too. So their CPU time is a multiple of it on any
+    computer. The median of CPU times ignores other programs.
+    """
+    robot = RobotParameters.load()
+    simulator = Simulator(robot, SimulatorParameters.load())
+    estimator = ErrorStateEkf(EkfParameters.load().of_robot(robot), robot.gravity)
+    used = []
+    for _ in range(round(PROBED / simulator.tick)):
+        begin = time.thread_time()
+        frame = simulator.step()
+        if frame.mocap is not None:
+            estimator.pose(frame.mocap)
+        if frame.imu is not None:
+            estimator.imu(frame.imu)
+        used.append(time.thread_time() - begin)
+    return PER_NODE * len(set(nodes) - set(BRIDGES)) * float(np.median(used)) / simulator.tick
+
+
 @contextmanager
-def viewer_process(domain_id: int, robot: Path | None, allow_targets: bool, console: Console
-           ) -> Iterator[subprocess.Popen]:
+def viewer_process(domain_id: int, robot: Path | None, allow_targets: bool, console: Console):
     """Run `beetle_omni view` during a flight and print its lines on the console."""
     process = subprocess.Popen(
         [sys.executable, '-m', 'beetle_omni_ros.start', 'beetle_omni', 'view',
@@ -172,56 +262,17 @@ def viewer_process(domain_id: int, robot: Path | None, allow_targets: bool, cons
             process.wait()
 
 
-def _clocks(clock, actuators):
-    """Clocks to try in turn, until the computer is fast enough."""
-    for key, value, known in (('actuators', actuators, (None, *ACTUATORS)),
-                              ('clock', clock, CLOCKS)):
-        if value not in known:
-            raise ParameterError(f"{key} '{value}': expected {' or '.join(filter(None, known))}")
-    if clock == 'simulated' and actuators == 'emulated':
-        raise ParameterError("actuators 'emulated': serial devices keep real time; expected "
-                             "direct with clock 'simulated'")
-    return CLOCKS['system' if actuators == 'emulated' else clock]
+def _print(console, text, **style):
+    console.print(text, markup=False, emoji=False, highlight=False, **style)
 
 
-def _make_graph(options, meta, folder, number):
-    if meta['actuators'] == 'emulated':
-        options = replace(options, actuators='bridges')
-    return Graph(plan(options).nodes, folder, number, meta['composed'],
-                 meta['clock'] == 'simulated')
-
-
-def _discard_attempt(bag, folder, error, console):
-    """Print why the flight is repeated, and delete bag and logs of the first attempt."""
-    _print(console, f'this computer is too slow for real time: {error}; it flies in simulated '
-          'time, which waits for the nodes, and without serial devices')
-    shutil.rmtree(bag, ignore_errors=True)
-    for log in folder.glob('*.log'):
-        log.unlink()
-
-
-def _save_meta(bag, meta):
-    """Write the metadata into the bag of an interrupted flight, if there is one."""
-    with signals_ignored():
-        try:
-            if (bag / 'metadata.yaml').exists():
-                add_meta(bag, {**meta, 'interrupted': True})
-        except BagError as error:
-            print(f'beetle_omni fly: error: {error}', file=sys.stderr)
-
-
-def _print(console, text):
-    console.print(text, markup=False, emoji=False, highlight=False)
-
-
-def _absolute(path):
-    return str(Path(path).absolute()) if path else ''
+def _complain(error):
+    print(f'beetle_omni fly: error: {error}', file=sys.stderr)
 
 
 def _fly(graph: Graph, controller: str, task: Task, meta: dict, console: Console,
          faults: str, may_be_slow: bool) -> int:
-    status, failure = runner.OK, None
-    operator = None
+    failure, operator = '', None
     try:
         graph.start()
         operator = Operator(graph.domain, controller)
@@ -234,8 +285,8 @@ def _fly(graph: Graph, controller: str, task: Task, meta: dict, console: Console
             except TooSlowError:
                 raise
             except RunError as error:
-                print(f'beetle_omni fly: error: {error}', file=sys.stderr)
-                status, failure = runner.FAILED, str(error)
+                _complain(error)
+                failure = str(error)
             flight.land()
         meta['graph'] = flight.measured
         operator.report('fly: run', 'what is flown', {k: v for k, v in meta.items()
@@ -248,12 +299,187 @@ def _fly(graph: Graph, controller: str, task: Task, meta: dict, console: Console
             if operator:
                 operator.close()
     for name in stubborn:
-        print(f'beetle_omni fly: error: {name} did not stop and was killed', file=sys.stderr)
+        _complain(f'{name} did not stop and was killed')
     for line in graph.warnings():
-        if failure and line.endswith(failure):
-            continue        # printed above
-        console.print(line, markup=False, emoji=False, highlight=False, style='yellow')
-    return status
+        if not failure or not line.endswith(failure):       # printed above
+            _print(console, line, style='yellow')
+    return runner.FAILED if failure else runner.OK
+
+
+class Flight:
+    """
+    One flight of a running graph: start, arm, take off, fly the task, land.
+
+    Args:
+        graph: started nodes.
+        operator: operator in the same ROS domain.
+        task: task to fly.
+        progress: display of the progress.
+        may_be_slow: fly even if the simulator does not keep real time.
+        faults: value of sim_node's parameter ``faults`` from the task's start on.
+
+    Attributes:
+        measured: CPU of the graph and of its bridges [% of one core], latencies [ms], cycles of
+            the bridges; with simulated time, its ratio to real time and no latencies.
+
+    """
+
+    def __init__(self, graph: Graph, operator: Operator, task: Task, progress: Progress,
+                 may_be_slow: bool = True, faults: str = ''):
+        self._graph, self._operator, self._task = graph, operator, task
+        self._bridges = [node for node in graph.nodes if node in BRIDGES]
+        self._progress, self._faults, self._may_be_slow = progress, faults, may_be_slow
+        self._bar = progress.add_task('', total=task.duration, at='')
+        self._reported: set[str] = set()
+        self.measured: dict[str, float] = {}
+
+    def fly(self) -> None:
+        """
+        Wait for the graph, take off and fly the task to its end.
+
+        Raises:
+            TooSlowError: the simulator does not keep real time and ``may_be_slow`` is not set.
+            RunError: any other failure.
+
+        """
+        operator = self._operator
+        self._await('starting (the first time compiles the controller)',
+                    lambda: operator.ready and operator.progress, READY_TIMEOUT)
+        self._await('actuators', lambda: not operator.waits_for(self._bridges), BRIDGES_TIMEOUT)
+        self._await('watching the simulator', lambda: PACING in operator.diagnostics,
+                    BRIDGES_TIMEOUT)
+        lost, begin = self._lost_time(), operator.time()
+        if not self._may_be_slow:
+            self._spin(WATCH_TIME)
+            if (late := self._lost_time() - lost) > LOST_TIME:
+                raise TooSlowError(f'the simulator fell {late:.1f} s behind in {WATCH_TIME:g} s')
+        try:
+            self._take_off()
+            self._fly_task()
+        except RunError as error:
+            late, flown = self._lost_time() - lost, operator.time() - begin
+            paused = any(PAUSED in state for state in operator.states)
+            if late < SLOW_TIME and not paused:
+                raise
+            kind = RunError if self._may_be_slow else TooSlowError
+            raise kind(f'{error}; the simulator fell {late:.1f} s behind in {flown:.0f} s'
+                       + (', and supervisor_node was not scheduled' if paused else '')) from None
+
+    def _lost_time(self):
+        """Return the time that the simulator skipped because it was late [s]."""
+        return float(self._operator.values(PACING).get('lost_s', 0.0))
+
+    def _take_off(self):
+        """Arm and take off; repeat if the supervisor disarms on the ground."""
+        operator = self._operator
+        for _ in range(TAKEOFF_ATTEMPTS):
+            self._show('arming')
+            left = operator.countdown(ARM_TIMEOUT)
+            self._spin(SETTLE_TIME)
+            while not (answer := operator.call('arm'))[0]:
+                if next(left, None) is None:
+                    raise RunError(f'supervisor_node refuses to arm: {answer[1]}')
+                self._spin()
+            operator.states.clear()
+            # The state may name a fault: disarmed:joint1_jammed.
+            self._await('taking off', lambda: operator.state.startswith('flying') or any(
+                state.partition(':')[0] == 'disarmed' for state in operator.states),
+                        TAKEOFF_TIMEOUT)
+            if operator.state.startswith('flying'):
+                return
+        raise RunError(f'no take-off in {TAKEOFF_ATTEMPTS} attempts; see the warnings below')
+
+    def _fly_task(self):
+        operator, graph, first = self._operator, self._graph, self._cycles()
+        cpu, bridges_cpu = graph.cpu_seconds(), graph.cpu_seconds(bridges=True)
+        start, steady = operator.time(), time.monotonic()
+        if self._faults:
+            self._inject_faults()
+        left = operator.countdown(self._task.duration + SPARE_TIME)
+        while not operator.progress.startswith('done'):
+            self._spin()
+            flown, passed = operator.time() - start, time.monotonic() - steady
+            self._show(f'{self._task.name} ({operator.state})', operator.progress, flown)
+            self.measured['cpu_percent'] = 100 * (graph.cpu_seconds() - cpu) / passed
+            if self._bridges:
+                self.measured['bridges_cpu_percent'] = \
+                    100 * (graph.cpu_seconds(bridges=True) - bridges_cpu) / passed
+            if graph.simulated:
+                self.measured['real_time_factor'] = flown / passed
+            if operator.state in ON_GROUND:
+                raise RunError(f"the flight ended early, supervisor in '{operator.state}'")
+            if next(left, None) is None:
+                raise RunError(f"the task does not continue at '{operator.progress}'")
+        if not graph.simulated:
+            self._take_latencies(first)
+
+    def _inject_faults(self):
+        """Set the faults as the task begins, so that their times count from there."""
+        operator = self._operator
+        if not operator.wait(lambda: operator.progress.startswith('flying'), TAKEOFF_TIMEOUT):
+            raise RunError(f"the task does not begin: '{operator.progress}'")
+        accepted, answer = operator.set('sim_node', 'faults', self._faults)
+        if not accepted:
+            raise RunError(f'sim_node refuses the faults: {answer}')
+
+    def _cycles(self):
+        """Counts of the bridges' cycles, from their diagnostics."""
+        return {f'{name}_{key}': int(value) for node, (status, name) in MEASURED.items()
+                for key, value in self._operator.values(f'{node}: {status}').items()
+                if key in ('cycles', 'missed_cycles')}
+
+    def _take_latencies(self, first):
+        """Add latencies, and cycles since ``first``; a bridge's begins with `command`."""
+        status, prefix = ('rotor_bridge_node', 'age_') if self._bridges else ('sim_node', '')
+        sources = [('latency', status, prefix), *(
+            (f'{name}_latency', node, '') for node, (_, name) in MEASURED.items())]
+        for name, node, prefix in sources:
+            values = self._operator.values(f'{node}: latency')
+            self.measured.update({f'{name}_{key}': float(values[prefix + key])
+                                  for key in QUANTILES if prefix + key in values})
+        self.measured.update({key: cycles - first.get(key, 0)
+                              for key, cycles in self._cycles().items()})
+
+    def land(self) -> None:
+        """Land if the robot flies, and wait for the motors to stop."""
+        operator = self._operator
+        if operator.state in ('', *ON_GROUND):
+            return
+        self._show('landing')
+        accepted, answer = operator.call('land')
+        if not accepted:
+            _complain(f'no landing: {answer}')
+        else:
+            operator.wait(lambda: operator.state in ON_GROUND, LANDING_TIMEOUT)
+            operator.spin(1.1)      # the last diagnostics
+
+    def _await(self, text, condition, timeout):
+        self._show(text)
+        left = self._operator.countdown(timeout)
+        while not condition():
+            self._spin()
+            if next(left, None) is None:
+                waits = self._operator.waits_for(self._bridges)
+                raise RunError(f'{text}: nothing after {timeout:g} s, supervisor in '
+                               f"'{self._operator.state}'" + (waits and f'; {waits}'))
+
+    def _spin(self, seconds=CHECK_PERIOD):
+        """Process messages; an ended process and a failing controller end the flight."""
+        operator = self._operator
+        operator.spin(seconds)
+        dead = {name: how for name, how in self._graph.dead().items()
+                if name not in self._reported}
+        self._reported |= set(dead)
+        if dead:
+            raise RunError('; '.join(f'{name} died ({how})' for name, how in dead.items()))
+        status = operator.diagnostics.get(f'{operator.controller}_node: controller')
+        if status is not None and status.level >= ERROR \
+                and not operator.state.startswith('flying'):
+            raise RunError(status.message)
+
+    def _show(self, text, at='', completed=0.0):
+        self._progress.update(self._bar, description=text, at=at,
+                              completed=min(completed, self._task.duration))
 
 
 def _report(bag, controller, task, meta, json_path, console) -> int:
@@ -261,7 +487,7 @@ def _report(bag, controller, task, meta, json_path, console) -> int:
         add_meta(bag, {k: v for k, v in meta.items() if k != 'graph'})
     log = read_bag(bag)
     for line in log.warnings:
-        console.print(line, markup=False, emoji=False, style='yellow')
+        _print(console, line, style='yellow')
     results = {'meta': meta, controller: metrics(log, task)}
     if log.controllers():       # a controller flew
         table.print_results(results, console)

@@ -1,57 +1,352 @@
-"""The nodes of one flight as processes of this computer: start, CPU time, stop."""
+"""
+Nodes of a ROS graph as data, and their processes on this computer; imports no ROS.
 
+:func:`plan` lists the nodes of `beetle_omni fly` and of the launch file, :class:`Graph` runs them,
+:func:`confine` limits their discovery, by default to this computer: a second robot or simulation
+in the same network would publish on the same topics.
+"""
+
+from collections.abc import Iterable, MutableMapping
+from contextlib import contextmanager
+from copy import deepcopy
+from dataclasses import dataclass
+from itertools import count
 import os
 from pathlib import Path
 import signal
+import socket
 import subprocess
 import sys
 import time
+from typing import NamedTuple
 
 import yaml
 
 import beetle_omni_ros
-from beetle_omni_ros.nodes import plan
-from beetle_omni_ros.nodes.discovery import confine
-from beetle_omni_ros.nodes.plan import BRIDGES, BRIDGES_COMPOSED, COMPOSED
+from beetle_omni_ros.control import registry
+from beetle_omni_ros.robot import schema
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import ParameterError
 
+BRIDGES = ('joint_bridge_node', 'rotor_bridge_node')
+ACTUATORS = ('emulated', 'direct')
+READY = 'ready'         # begin of a bridge's state
+# Executables: modules of this folder with a class of the same name, and the classes of two
+# controllers in `controller_node`, which runs any registered one as `<controller>_node`.
+NODES = ('sim_node', 'ekf_node', 'nmpc_node', 'rl_node', 'controller_node', 'supervisor_node',
+         *BRIDGES, 'reference_node', 'recorder_node', 'viewer_node')
+GENERIC = 'controller_node'
+COMPOSED, BRIDGES_COMPOSED = 'composed', 'bridges'      # processes of several nodes
 PORT_TIMEOUT = 30.0     # s for the simulator to make its serial ports
 STOP_TIMEOUT = 8.0      # s from SIGINT to SIGKILL
+Parameters = dict[str, dict]        # node name -> parameters that differ from the shipped ones
 
+# --- discovery --------------------------------------------------------------------------------
+
+VARIABLE, ARGUMENT = 'BEETLE_OMNI_DISCOVERY', '--discovery'
+RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
+# Settings of ROS; if the user set one of them, it has precedence over the default.
+ROS_SETTINGS = (RANGE, 'ROS_LOCALHOST_ONLY', 'ROS_STATIC_PEERS')
+RANGES = ('LOCALHOST', 'SUBNET', 'OFF', 'SYSTEM_DEFAULT')
+# The ports of domains up to 101 are below the ephemeral ports of Linux; 0 is the default domain.
+DOMAINS = range(101, 0, -1)
+# Ports of the RTPS standard: base + gain * domain + offset. Offset 0: discovery, shared by all
+# participants of a domain; USER_UNICAST: first participant.
+PORT_BASE, DOMAIN_GAIN, USER_UNICAST = 7400, 250, 11
+_starts = count(os.getpid())
+
+
+def confine(environment: MutableMapping[str, str] | None = None,
+            requested: str | None = None) -> None:
+    """
+    Set the range of discovery; must run before the first context is made.
+
+    Args:
+        environment: variables to change; None: those of this process.
+        requested: one of ``RANGES``, for this process and its children; '' or None: the value of
+            ``BEETLE_OMNI_DISCOVERY``, else this computer only.
+
+    Raises:
+        ParameterError: not one of ``RANGES``.
+
+    """
+    environment = os.environ if environment is None else environment
+    source, wanted = (ARGUMENT, requested) if requested else \
+        (VARIABLE, environment.get(VARIABLE, ''))
+    wanted = wanted.strip().upper()
+    if wanted and wanted not in RANGES:
+        raise ParameterError(f"{source}: expected one of {', '.join(RANGES)}, "
+                             f'found {wanted[:40]!r}')
+    if wanted:
+        environment[VARIABLE] = environment[RANGE] = wanted
+    elif not any(environment.get(name) for name in ROS_SETTINGS):
+        environment[RANGE] = RANGES[0]
+
+
+def claim(name: str) -> socket.socket | None:
+    """
+    Take a name on this computer, until the socket is closed or the process ends.
+
+    Returns:
+        A socket of Linux' abstract namespace, which leaves no file; None: the name is taken.
+
+    """
+    holder = socket.socket(socket.AF_UNIX)
+    try:
+        holder.bind(f'\0beetle_omni/{name}')
+    except OSError:
+        holder.close()
+        return None
+    return holder
+
+
+@contextmanager
+def reserved_domain():
+    """
+    Yield the number of a free ROS domain, reserved while the context lasts.
+
+    Each call begins its search at another number, because participants that are shutting down may
+    still send discovery data to new ones in the same domain.
+
+    Raises:
+        OSError: no domain is free.
+
+    """
+    first = next(_starts) % len(DOMAINS)
+    for number in [*DOMAINS[first:], *DOMAINS[:first]]:
+        holder = claim(f'domain/{number}')
+        if holder is not None:
+            with holder:
+                if _ports_are_free(number):
+                    yield number
+                    return
+    raise OSError('no free ROS domain between 1 and 101')
+
+
+def _ports_are_free(domain):
+    for offset in (0, USER_UNICAST):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.bind(('', PORT_BASE + DOMAIN_GAIN * domain + offset))
+            except OSError:
+                return False
+    return True
+
+
+# --- nodes ------------------------------------------------------------------------------------
+
+@dataclass(frozen=True, kw_only=True)
+class GraphOptions:
+    """
+    Options of a graph; a file '' is the shipped one.
+
+    Attributes:
+        controller: active controller: a name, or a reference to a class.
+        standby: whether the standby controllers run too, so that they can be selected in flight.
+        nmpc, policy: files of the controllers that have the options `--nmpc` and `--policy`.
+        allow_other_robot: whether a policy trained for other robot parameters may fly.
+        simulated: whether sim_node provides sensors and actuators. Otherwise nodes started
+            elsewhere do; on the robot deploy/install.sh starts the bridges.
+        actuators: 'bridges' to emulated devices, or 'direct': from the topic to the simulator.
+        ports: folder of the names of the emulated devices' ports.
+        robot_file: robot file of estimator and controllers.
+        plant_file: robot file of the simulation; '': the same.
+        task: task of reference_node; '': targets from elsewhere.
+        bag, compression: folder of the bag, '' for no recording; 'none' or 'zstd'.
+        clock: 'system', or 'simulated': time on /clock that waits for nodes that are late.
+
+    """
+
+    controller: str = registry.DEFAULT
+    standby: bool = True
+    nmpc: str = ''
+    policy: str = ''
+    allow_other_robot: bool = False
+    simulated: bool = True
+    actuators: str = 'bridges'
+    ports: str = ''
+    robot_file: str = ''
+    plant_file: str = ''
+    conditions: str = 'nominal'
+    seed: int = 0
+    task: str = ''
+    bag: str = ''
+    compression: str = 'none'
+    viewer: bool = False
+    clock: str = 'system'
+
+
+class Plan(NamedTuple):
+    """Nodes of a graph, and the reasons of the standby controllers that are left out."""
+
+    nodes: Parameters
+    left_out: dict[str, str]
+
+
+def plan(options: GraphOptions) -> Plan:
+    """
+    List the nodes of a graph.
+
+    Raises:
+        ParameterError: the active controller is unusable, or the clock does not fit the actuators.
+
+    """
+    if options.clock == 'simulated' and (
+            not options.simulated or options.actuators == 'bridges'):
+        raise ParameterError("clock 'simulated': serial devices keep real time; expected the "
+                             'simulator, with direct actuators')
+    robot = {'robot_file': options.robot_file} if options.robot_file else {}
+    plant = {'robot_file': options.plant_file} if options.plant_file else robot
+    controllers, left_out = controller_nodes(
+        options.controller, robot_file=options.robot_file, nmpc=options.nmpc,
+        policy=options.policy, allow_other_robot=options.allow_other_robot,
+        standby=options.standby)
+    active = registry.find(options.controller).name
+    # The default of these nodes is the list of standby controllers.
+    others = {} if active in registry.standing_by() else {
+        'controllers': [active, *registry.standing_by()]}
+    packed = {} if options.compression == 'none' else {'compression': options.compression}
+    bridges = bridge_parameters(Path(options.ports), robot) \
+        if options.simulated and options.actuators == 'bridges' else {}
+    table = (
+        ('recorder_node', options.bag, {'bag': options.bag, **packed, **others}),
+        ('sim_node', options.simulated, {
+            **plant, 'conditions': options.conditions, 'seed': options.seed,
+            **bridges.get('sim_node', {})}),
+        ('ekf_node', True, robot),
+        *((name, True, values) for name, values in controllers.items()),
+        ('supervisor_node', True, {**robot, 'controller': active, **others}),
+        ('reference_node', options.task, {'task': options.task, 'seed': options.seed}),
+        ('viewer_node', options.viewer, robot),
+        *((name, bridges, bridges.get(name)) for name in BRIDGES))
+    # Copies: YAML would write a shared list as an alias, which ROS cannot read.
+    nodes = {name: deepcopy(values) for name, is_used, values in table if is_used}
+    return Plan(in_simulated_time(nodes) if options.clock == 'simulated' else nodes, left_out)
+
+
+def bridge_parameters(folder: Path, robot: dict) -> Parameters:
+    """
+    Return the parameters of simulator and bridges that share pseudo-terminals.
+
+    The names of the pseudo-terminals are in ``folder``; ``robot`` holds the parameter robot_file.
+    """
+    servos, board = str(Path(folder) / 'servo_bus'), str(Path(folder) / 'motor_board')
+    return {'sim_node': {'actuators': 'emulated', 'servo_port': servos, 'board_port': board},
+            'joint_bridge_node': {**robot, 'port': servos, 'autostart': 'activate'},
+            'rotor_bridge_node': {**robot, 'port': board}}
+
+
+def in_simulated_time(nodes: Parameters) -> Parameters:
+    """Return the parameters with simulated time, published by sim_node."""
+    return {name: {**values, **({'clock': 'simulated'} if name == 'sim_node'
+                                else {'use_sim_time': True})}
+            for name, values in nodes.items()}
+
+
+def controller_nodes(active: str, *, robot_file: str = '', nmpc: str = '', policy: str = '',
+                     allow_other_robot: bool = False, standby: bool = True
+                     ) -> tuple[Parameters, dict[str, str]]:
+    """
+    Return the parameters of the controllers' nodes; arguments as in :class:`GraphOptions`.
+
+    A standby policy that is not for this robot is omitted, because a node that refuses its
+    parameters ends the shared process.
+
+    Returns:
+        Node name -> parameters, the active one first; omitted standby controller -> reason.
+
+    Raises:
+        ParameterError: the active controller cannot be built, or its policy is unusable.
+
+    """
+    first = registry.find(active)
+    if first.reference not in registry.SHIPPED:     # in one line here, not in another process
+        first.make(RobotParameters.load(robot_file or None))
+    entries = [first, *(registry.find(name) for name in registry.standing_by()
+                        if standby and name != first.name)]
+    if nmpc and not any(entry.option == '--nmpc' for entry in entries):
+        raise ParameterError(f"--nmpc {nmpc}: for the controller '{registry.owner('--nmpc')}', "
+                             'which does not run')
+    nodes, left_out = {}, {}
+    for entry in entries:
+        node = f'{entry.name}_node'
+        values = {} if node in NODES else {'controller': entry.reference}
+        values |= {'robot_file': robot_file} if robot_file else {}
+        if nmpc and entry.option == '--nmpc' and entry.parameter_class:
+            schema.load(entry.parameter_class, nmpc)    # an error here, not in another process
+            values[entry.file_key] = nmpc
+        if entry.policy_file:
+            given = policy if entry.name == registry.owner('--policy') else ''
+            values |= {'policy': str(Path(given).absolute())} if given else {}
+            values |= {'allow_other_robot': True} if allow_other_robot else {}
+            if reason := unfit(given or entry.policy_file, robot_file, allow_other_robot):
+                if entry is first:
+                    raise ParameterError(reason)
+                left_out[entry.name] = reason
+                continue
+        nodes[node] = values
+    return nodes, left_out
+
+
+def unfit(policy: str, robot_file: str = '', allow_other_robot: bool = False) -> str:
+    """Return why a policy is unusable for a robot file ('': the shipped one), or ''."""
+    try:
+        from beetle_omni_ros.control.policy_network import PolicyNetwork
+        PolicyNetwork(policy, RobotParameters.load(robot_file or None), allow_other_robot)
+    except (ParameterError, ImportError) as error:
+        return str(error)
+    return ''
+
+
+def executable(node: str) -> str:
+    """Return the executable of a node."""
+    return node if node in NODES else GENERIC
+
+
+def arguments(nodes: Parameters, names: Iterable[str]) -> list[str]:
+    """Return the arguments of `composed`: executables, and references of other controllers."""
+    return [name if name in NODES else nodes[name].get(
+        'controller', name.removesuffix('_node')) for name in names]
+
+
+def processes(nodes: Parameters) -> dict[str, list[str]]:
+    """Return process -> its nodes; the bridges, which block on their ports, have their own."""
+    groups = {COMPOSED: [name for name in nodes if name not in BRIDGES],
+              BRIDGES_COMPOSED: [name for name in nodes if name in BRIDGES]}
+    return {name: names for name, names in groups.items() if names}
+
+
+# --- processes --------------------------------------------------------------------------------
 
 class Graph:
     """
     Processes that run nodes.
 
     Args:
-        parameters: node name -> parameters that differ from the shipped ones.
+        nodes: parameters of each node.
         folder: existing folder for the parameter file and the output of the processes.
         domain: ROS domain.
-        composed: one process for the bridges, which block on serial ports, and one for all other
-            nodes; otherwise one process for each node.
-        simulated: simulated time, which waits for nodes that are late.
+        composed: one process for the bridges and one for all other nodes; otherwise one process
+            for each node.
 
     """
 
-    def __init__(self, parameters: dict[str, dict], folder: Path, domain: int,
-                 composed: bool = True, simulated: bool = False):
-        if simulated:
-            parameters = plan.in_simulated_time(parameters)
-        self.folder, self.domain = Path(folder), domain
-        self.composed, self.simulated = composed, simulated
-        self.nodes = list(parameters)
-        simulator = parameters.get('sim_node', {})
+    def __init__(self, nodes: Parameters, folder: Path, domain: int, composed: bool = True):
+        self.folder, self.domain, self.composed = Path(folder), domain, composed
+        self.nodes = list(nodes)
+        simulator = nodes.get('sim_node', {})
+        self.simulated = simulator.get('clock') == 'simulated'
         self._ports = [port for port in map(simulator.get, ('servo_port', 'board_port')) if port]
         self._file = self.folder / 'parameters.yaml'
         self._file.write_text(yaml.safe_dump(
-            {f'/**/{node}': {'ros__parameters': values}
-             for node, values in parameters.items() if values}) if any(parameters.values())
-            else '/**: {ros__parameters: {}}\n')
+            {f'/**/{node}': {'ros__parameters': values} for node, values in nodes.items()
+             if values} or {'/**': {'ros__parameters': {}}}))
         if composed:
-            self._commands = {name: [COMPOSED, *plan.arguments(parameters, nodes), '--ros-args']
-                              for name, nodes in plan.processes(parameters).items()}
+            self._commands = {name: [COMPOSED, *arguments(nodes, names), '--ros-args']
+                              for name, names in processes(nodes).items()}
         else:
-            self._commands = {node: [plan.executable(node), '--ros-args', *(
-                () if node in plan.NODES else ('-r', f'__node:={node}'))] for node in self.nodes}
+            self._commands = {node: [executable(node), '--ros-args', *(
+                () if node in NODES else ('-r', f'__node:={node}'))] for node in nodes}
         self.processes: dict[str, subprocess.Popen] = {}
 
     def start(self) -> None:
@@ -60,17 +355,17 @@ class Graph:
 
         Each process ends with this one, even if this one is killed.
         """
+        bridges = [name for name in self._commands if name in (BRIDGES_COMPOSED, *BRIDGES)]
         for name in self._commands:
-            if name not in (BRIDGES_COMPOSED, *BRIDGES):
+            if name not in bridges:
                 self.start_process(name)
         # Bridges also wait for their ports, but log a warning.
         deadline = time.monotonic() + PORT_TIMEOUT
         while not all(map(os.path.exists, self._ports)) and time.monotonic() < deadline \
                 and not self.dead():
             time.sleep(0.05)
-        for name in self._commands:
-            if name in (BRIDGES_COMPOSED, *BRIDGES):
-                self.start_process(name)
+        for name in bridges:
+            self.start_process(name)
 
     def start_process(self, name: str) -> subprocess.Popen:
         """Start one process, or start it again."""
@@ -103,14 +398,10 @@ class Graph:
 
     def stop(self) -> list[str]:
         """
-        Stop all processes.
+        Stop all processes; return the names of those that had to be killed.
 
         Bridges stop first, because they switch off the actuators, which the simulator emulates.
         The recorder stops last, so that the bag contains the end.
-
-        Returns:
-            Names of the processes that had to be killed.
-
         """
         first = [name for name in self.processes if name in (BRIDGES_COMPOSED, *BRIDGES)]
         last = [name for name in self.processes if name == 'recorder_node']
@@ -119,16 +410,14 @@ class Graph:
 
     def _end(self, names):
         """Send SIGINT every second: a process that still imports may lose the first one."""
-        deadline = time.monotonic() + STOP_TIMEOUT
-        left = list(names)
-        while left and time.monotonic() < deadline:
-            for name in left:
-                if self.processes[name].poll() is None:
+        deadline, again, left = time.monotonic() + STOP_TIMEOUT, 0.0, names
+        while (left := [name for name in left if self.processes[name].poll() is None]) \
+                and (now := time.monotonic()) < deadline:
+            if now >= again:
+                again = now + 1.0
+                for name in left:
                     self.processes[name].send_signal(signal.SIGINT)
-            again = time.monotonic() + 1.0
-            while left and time.monotonic() < again:
-                time.sleep(0.02)
-                left = [name for name in left if self.processes[name].poll() is None]
+            time.sleep(0.02)
         for name in left:
             self.kill(name)
         return left
@@ -153,15 +442,15 @@ def child_environment(domain: int) -> dict[str, str]:
     return environment
 
 
-def _ending(code: int, log: Path) -> str:
+def _ending(code, log):
     if code < 0:
         return f'ended by {signal.Signals(-code).name}'
     lines = log.read_text(errors='replace').strip().splitlines()
     return f"exit status {code}{': ' + lines[-1] if lines else ''}"
 
 
-def _cpu_seconds(pid: int) -> float:
-    """User and system time from /proc; 0 if that does not exist."""
+def _cpu_seconds(pid):
+    """User and system time from /proc; 0 for a process that has just ended."""
     try:
         fields = Path(f'/proc/{pid}/stat').read_text().rsplit(')', 1)[1].split()
     except OSError:

@@ -11,9 +11,8 @@ from beetle_omni_ros.drivers.serial_port import SerialPortError
 from beetle_omni_ros.drivers.servo_bus import ServoBus
 from beetle_omni_ros.drivers.servo_link import ServoBusError
 from beetle_omni_ros.drivers.servo_loop import ServoLoop
-from beetle_omni_ros.nodes import health
-from beetle_omni_ros.nodes.command_source import CommandSource
 from beetle_omni_ros.nodes.lifecycle_node import ACTIVE, AUTOSTART, INACTIVE, LifecycleFlightNode
+from beetle_omni_ros.nodes.node import CommandSource, Distribution, ERROR, OK, WARN
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters
 from beetle_omni_ros.robot.readings import JointReading
 from beetle_omni_ros.robot.schema import parameter
@@ -48,7 +47,7 @@ class JointBridgeNode(LifecycleFlightNode):
         self._travel = RobotParameters.load(self.parameters.robot_file or None).joints
         self._bus = self._loop = None
         self._lost_reason = ''
-        self._latency, self._since = health.Distribution(), 'publication'
+        self._latency, self._since = Distribution(), 'publication'
         self._state = self.publisher('joint_bridge/state')
         self._published = ''
         self._joints = self.publisher('joint_states')
@@ -193,7 +192,7 @@ class JointBridgeNode(LifecycleFlightNode):
     def _bus_status(self):
         loop, bus, text, now = self._loop, self._bus, self._published, time.monotonic()
         if loop is None:
-            return (health.WARN if self.stage == ACTIVE else health.OK), text, {
+            return (WARN if self.stage == ACTIVE else OK), text, {
                 'stage': self.stage}
         before, cycles, missed, then = self._counted
         if loop is not before:
@@ -207,22 +206,22 @@ class JointBridgeNode(LifecycleFlightNode):
         missed = loop.pace.missed - missed
         self._counted = (loop, loop.cycles, loop.pace.missed, now)
         if text.startswith('lost'):
-            return health.ERROR, text, values
+            return ERROR, text, values
         if not bus.link.is_open:
-            return health.WARN, 'no connection', values
-        return (health.WARN, f'{missed} cycles missed', values) if missed else \
-            (health.OK, text, values)
+            return WARN, 'no connection', values
+        return (WARN, f'{missed} cycles missed', values) if missed else \
+            (OK, text, values)
 
     def _latency_status(self):
         times = self._latency
-        return health.OK, f'{self._since} of command to its last byte written', {
+        return OK, f'{self._since} of command to its last byte written', {
             **times.milliseconds(), 'count': times.count}
 
 
 def servo_status(bus, index):
     """Return level, text and values of one servo."""
     if bus is None:
-        return health.OK, 'not configured', {}
+        return OK, 'not configured', {}
     one = bus.servos[index]
     recovering = one.recovery is not None or one.restarting
     values = {'id': one.identifier, 'responding': not one.silent,
@@ -232,5 +231,5 @@ def servo_status(bus, index):
               'watchdog_expired': one.watchdog_expired, 'recovering': recovering}
     if one.message:
         bad = one.silent or (one.errors and not one.torque)
-        return (health.ERROR if bad else health.WARN), one.message, values
-    return health.OK, 'being brought back' if recovering else 'ok', values
+        return (ERROR if bad else WARN), one.message, values
+    return OK, 'being brought back' if recovering else 'ok', values

@@ -8,20 +8,16 @@ from pathlib import Path
 import threading
 
 from rcl_interfaces.srv import SetParameters
-import rclpy
 from rclpy.clock import Clock, ClockType
-from rclpy.exceptions import NameValidationException
-from rclpy.signals import SignalHandlerOptions
 from rich.console import Console
 
 from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.messages.bag_types import from_bytes
 from beetle_omni_ros.messages.topics import controller_of, SENSOR, topic_of
 from beetle_omni_ros.nodes import runner, wire
-from beetle_omni_ros.nodes.discovery import confine
+from beetle_omni_ros.nodes.operator import join, leave
 from beetle_omni_ros.nodes.wire import AnyQosSubscription
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.robot.urdf import Model
 from beetle_omni_ros.view.frames import Sampler
 from beetle_omni_ros.view.live import Live
@@ -50,17 +46,8 @@ class LiveGraph:
 
     def __init__(self, namespace: str = '', domain: int | None = None,
                  discovery: str | None = None, writable: bool = False):
-        confine(requested=discovery)
-        self._context = rclpy.Context()
-        rclpy.init(args=[], context=self._context, domain_id=domain,
-                   signal_handler_options=SignalHandlerOptions.NO)
-        try:
-            self._node = node = rclpy.create_node('view', context=self._context,
-                                                  namespace=namespace)
-        except NameValidationException as error:
-            self._context.try_shutdown()
-            raise ParameterError(f"--namespace '{namespace}': "
-                                 f'{str(error).splitlines()[0]}') from None
+        self._node, self._executor = join('view', domain, namespace, discovery)
+        node = self._node
         self._lock = threading.Lock()
         self._newest: dict[str, bytes] = {}
         self._waiting: dict[str, list[bytes]] = defaultdict(list)
@@ -75,8 +62,6 @@ class LiveGraph:
         self._targets = wire.Publisher(node, 'target_pose') if writable else None
         self._setting = node.create_client(SetParameters, f'{SUPERVISOR}/set_parameters') \
             if writable else None
-        self._executor = runner.make_executor(self._context)
-        self._executor.add_node(node)
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._spin, daemon=True)
         self._thread.start()
@@ -141,8 +126,7 @@ class LiveGraph:
         """Leave the graph."""
         self._stopped.set()
         self._thread.join(2.0)
-        self._node.destroy_node()
-        self._context.try_shutdown()
+        leave(self._node)
 
 
 def run_live(*, namespace: str = '', domain_id: int | None = None, discovery: str | None = None,

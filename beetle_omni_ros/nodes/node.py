@@ -1,41 +1,38 @@
-"""Base class of the package's nodes: parameters, checked inputs, diagnostics."""
+"""Base class of the package's nodes: parameters, checked inputs, commands, diagnostics."""
 
+from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass, field
+import math
+import secrets
 import time
+from typing import Any
 
+import numpy as np
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
+from beetle_omni_ros.control.base import Command
+from beetle_omni_ros.messages.conversions import take_command
 from beetle_omni_ros.messages.topics import Qos, topic_of
-from beetle_omni_ros.messages.values import MessageError
+from beetle_omni_ros.messages.values import Diagnostic, MessageError
 from beetle_omni_ros.nodes import parameters, wire
-from beetle_omni_ros.nodes.discovery import claim
-from beetle_omni_ros.nodes.health import Health
-from beetle_omni_ros.safety.events import ERROR, WARNING
+from beetle_omni_ros.nodes.graph import claim
+from beetle_omni_ros.safety.events import ERROR as EVENT_ERROR
+from beetle_omni_ros.safety.events import WARNING as EVENT_WARNING
 
-FUTURE = 0.05       # s ahead of the clock above which a stamp is refused
+OK, WARN, ERROR, STALE = range(4)   # of diagnostic_msgs/DiagnosticStatus
+PERIOD = 1.0            # s between two diagnostics
+REPEAT = 1.0            # s between two log lines about refusals of one kind
+KINDS = 20              # kinds of refusals that are counted separately for each topic
+FUTURE = 0.05           # s ahead of the clock above which a stamp is refused
 UNIQUE_CHECKS = 3
+IDENTITY = 'supervisor/identity'
+TEXT_LIMIT = 40         # characters of a foreign frame_id in an error message
 
 
 class StartError(RuntimeError):
     """A node cannot start or continue; the text is one line for the operator."""
-
-
-def check_unique_name(node: Node) -> None:
-    """
-    Check that the ROS graph has no other node of the same name.
-
-    The commands of two supervisors or the estimates of two estimators would alternate on one
-    topic.
-
-    Raises:
-        StartError: there is one.
-
-    """
-    own = (node.get_name(), node.get_namespace())
-    if node.get_node_names_and_namespaces().count(own) > 1:
-        raise StartError(f'{node.get_fully_qualified_name()} runs already on another computer '
-                         f'(ROS domain {node.context.get_domain_id()}); stop it first')
 
 
 class FlightNode(Node):
@@ -83,6 +80,16 @@ class FlightNode(Node):
         self._unique_checks = 0
         self._unique_timer = self.create_timer(1.0, self._check_unique, clock=self.steady_clock)
 
+    def _check_unique(self):
+        """End if another computer runs a node of this name; its discovery takes seconds."""
+        own = (self.get_name(), self.get_namespace())
+        if self.get_node_names_and_namespaces().count(own) > 1:
+            raise StartError(f'{self.get_fully_qualified_name()} runs already on another computer '
+                             f'(ROS domain {self.context.get_domain_id()}); stop it first')
+        self._unique_checks += 1
+        if self._unique_checks >= UNIQUE_CHECKS:
+            self._unique_timer.cancel()
+
     def now(self) -> float:
         """ROS time [s]."""
         return self.get_clock().now().nanoseconds * 1e-9
@@ -95,9 +102,9 @@ class FlightNode(Node):
         """Log ``text`` with a severity of :mod:`~beetle_omni_ros.safety.events`."""
         # One call for each severity: rclpy ties a severity to the line of the call.
         logger = self.get_logger()
-        if severity == ERROR:
+        if severity == EVENT_ERROR:
             logger.error(text)
-        elif severity == WARNING:
+        elif severity == EVENT_WARNING:
             logger.warning(text)
         else:
             logger.info(text)
@@ -134,13 +141,14 @@ class FlightNode(Node):
         """
         entry, health = topic_of(topic), self.health
         read = read or entry.take
-        health.watch(topic, stale_after)
+        health.inputs[topic] = Input(stale_after)
 
         def callback(message, *publication):
             try:
                 value = read(message)
                 age = self.now() - value.stamp
-                _check_age(age, max_age)
+                if max_age is not None and not -FUTURE <= age <= max_age:
+                    raise MessageError('stale stamp' if age > 0 else 'stamp in the future')
                 if check is not None:
                     check(value, *publication)
             except MessageError as error:
@@ -164,13 +172,6 @@ class FlightNode(Node):
         self.health.computed(time.thread_time() - cpu, time.perf_counter() - wall)
         return result
 
-    def _check_unique(self):
-        # Discovery needs some seconds, so one check is not enough.
-        check_unique_name(self)
-        self._unique_checks += 1
-        if self._unique_checks >= UNIQUE_CHECKS:
-            self._unique_timer.cancel()
-
     def waits_for(self) -> str:
         """Return the inputs without which the node does not work, as text; '' for none."""
         return ', '.join(self.health.waits_for())
@@ -191,8 +192,190 @@ class FlightNode(Node):
             self._claim.close()
 
 
-def _check_age(age, limit):
-    if limit is not None and age > limit:
-        raise MessageError('stale stamp')
-    if limit is not None and age < -FUTURE:
-        raise MessageError('stamp in the future')
+def new_identity(name: str) -> str:
+    """Return an identity for one run of a node: its name and 8 random hex digits."""
+    return f'{name}:{secrets.token_hex(4)}'
+
+
+class CommandSource:
+    """
+    Reads commands for a node that executes them.
+
+    Until a supervisor publishes its identity, every command is accepted. After that, only commands
+    whose frame_id is the newest identity are accepted.
+    """
+
+    def __init__(self, node):
+        self._identity = ''
+        wire.subscribe(node, IDENTITY, self._on_identity)
+
+    def _on_identity(self, identity):
+        self._identity = identity
+
+    def read(self, message: Any) -> Command:
+        """Read a command; MessageError if it is malformed or not from the supervisor."""
+        source = message.header.frame_id
+        if self._identity and source != self._identity:
+            name = f"'{source[:TEXT_LIMIT]}'" if source else 'no identity'
+            raise MessageError(
+                f"2nd publisher: frame_id has {name}, expected '{self._identity[:TEXT_LIMIT]}'",
+                'not from the supervisor')
+        return take_command(message)
+
+
+# --- diagnostics ------------------------------------------------------------------------------
+
+class Distribution:
+    """Quantiles of durations in constant memory: a histogram with 2 % wide bins."""
+
+    LOW, RATIO, BINS = 1e-6, 1.02, 1000     # 1 us to 400 s
+
+    def __init__(self):
+        self.counts = np.zeros(self.BINS, dtype=np.int64)
+        self.count, self.max = 0, 0.0
+
+    def add(self, seconds: float) -> None:
+        """Count one duration [s]."""
+        k = int(math.log(max(seconds, self.LOW) / self.LOW) / math.log(self.RATIO))
+        self.counts[min(k, self.BINS - 1)] += 1
+        self.count += 1
+        self.max = max(self.max, seconds)
+
+    def quantile(self, fraction: float) -> float:
+        """Return a quantile [s], accurate to 1 %; NaN if nothing was counted."""
+        if not self.count:
+            return float('nan')
+        k = int(np.searchsorted(np.cumsum(self.counts), fraction * self.count))
+        return min(self.LOW * self.RATIO ** (k + 0.5), self.max)
+
+    def milliseconds(self, prefix: str = '') -> dict[str, float]:
+        """Return median, 99th percentile and maximum [ms] under their keys in diagnostics."""
+        return {f'{prefix}median_ms': 1e3 * self.quantile(0.5),
+                f'{prefix}p99_ms': 1e3 * self.quantile(0.99), f'{prefix}max_ms': 1e3 * self.max}
+
+
+@dataclass
+class Input:
+    """Counts of one subscribed topic; silence of ``stale_after`` [s] is an error, None never."""
+
+    stale_after: float | None
+    received: int = 0
+    reported: int = 0
+    age: float = float('nan')
+    seen: float | None = None           # elapsed() at the last good message
+    rejected: Counter = field(default_factory=Counter)
+    rejected_reported: int = 0
+    last_refusal: str = ''
+    logged: dict = field(default_factory=dict)      # kind -> elapsed() of its last line
+
+
+class Health:
+    """
+    Collects counts and status values and publishes them on ``diagnostics`` once a second.
+
+    An input that stops is an error; an input that has never come is not.
+    """
+
+    def __init__(self, node: FlightNode):
+        self._node = node
+        self.inputs: dict[str, Input] = {}
+        self._compute: Distribution | None = None
+        self._deadline = float('inf')
+        self._misses = 0
+        self._wall_max = 0.0
+        self._extra = []
+        self._publisher = wire.Publisher(node, 'diagnostics')
+        node.create_timer(PERIOD, self._publish, clock=node.steady_clock)
+        self._last = node.elapsed()
+
+    def received(self, topic: str, age: float) -> None:
+        """Count an accepted message whose stamp is ``age`` [s] old."""
+        entry = self.inputs[topic]
+        entry.received += 1
+        entry.age = age
+        first, entry.seen = entry.seen is None, self._node.elapsed()
+        if first and entry.stale_after is not None and not self.waits_for():
+            self._node.get_logger().info('all required inputs have arrived')
+
+    def waits_for(self) -> list[str]:
+        """Return the required topics without a message so far."""
+        return [topic for topic, entry in self.inputs.items()
+                if entry.seen is None and entry.stale_after is not None]
+
+    def rejected(self, topic: str, reason: str, kind: str = '') -> None:
+        """
+        Count a refused message under ``kind``, or under its reason.
+
+        The first message of a kind is logged, except old stamps before the first accepted message.
+        If reasons differ within a kind, at most one a second is logged.
+        """
+        entry, now = self.inputs[topic], self._node.elapsed()
+        kind, detailed = kind or reason, bool(kind) and kind != reason
+        if kind not in entry.rejected and len(entry.rejected) >= KINDS:
+            kind, detailed = 'other reasons', True
+        if detailed:
+            is_news = not 0 <= now - entry.logged.get(kind, -math.inf) < REPEAT
+        else:
+            is_news = kind not in entry.rejected and (entry.received or 'stamp' not in kind)
+        if is_news:
+            entry.logged[kind] = now
+            self._node.get_logger().warning(f'{topic}: message refused, {reason}')
+        entry.rejected[kind] += 1
+        entry.last_refusal = reason if detailed else ''
+
+    def track_compute(self, deadline: float) -> None:
+        """Report compute times against a ``deadline`` [s] under '<node>: compute'."""
+        self._compute, self._deadline = Distribution(), deadline
+
+    def computed(self, cpu: float, wall: float) -> None:
+        """Count one cycle: CPU time and wall time [s]."""
+        self._compute.add(cpu)
+        self._misses += cpu > self._deadline
+        self._wall_max = max(self._wall_max, wall)
+
+    def report(self, name: str, source) -> None:
+        """Add a status '<node>: <name>'; ``source()`` returns (level, message, values)."""
+        self._extra.append((name, source))
+
+    def _publish(self):
+        statuses = [('inputs', self._input_status)] if self.inputs else []
+        if self._compute is not None:
+            statuses.append(('compute', self._compute_status))
+        statuses = [*statuses, *self._extra] or [('node', lambda: (OK, 'running', {}))]
+        stamp, name = self._node.get_clock().now().nanoseconds * 1e-9, self._node.get_name()
+        found = [(part, *source()) for part, source in statuses]
+        self._publisher.publish([Diagnostic(stamp, f'{name}: {part}', level, text, texts(values))
+                                 for part, level, text, values in found])
+
+    def _input_status(self):
+        level, faults, values, now = OK, [], {}, self._node.elapsed()
+        passed, self._last = max(now - self._last, 1e-9), now
+        for topic, entry in self.inputs.items():
+            count = entry.rejected.total()
+            values |= {f'{topic} rate_hz': (entry.received - entry.reported) / passed,
+                       f'{topic} age_ms': 1e3 * entry.age, f'{topic} received': entry.received,
+                       f'{topic} rejected': count,
+                       **{f'{topic} rejected: {why}': n for why, n in entry.rejected.items()}}
+            if entry.seen is not None and entry.stale_after is not None \
+                    and now - entry.seen > entry.stale_after:
+                level = ERROR
+                faults.append(f'{topic} silent for {now - entry.seen:.1f} s')
+            if count > entry.rejected_reported:
+                level = max(level, WARN)
+                faults.append(f'{topic}: {count - entry.rejected_reported} rejected' + (
+                    f', {entry.last_refusal}' if entry.last_refusal else ''))
+            elif entry.seen is None and entry.stale_after is not None:
+                faults.append(f'waiting for {topic}')
+            entry.reported, entry.rejected_reported = entry.received, count
+        return level, '; '.join(faults) or 'all arriving', values
+
+    def _compute_status(self):
+        return WARN if self._misses else OK, f'{self._misses} deadline misses', {
+            **self._compute.milliseconds(), 'deadline_misses': self._misses,
+            'count': self._compute.count, 'wall_max_ms': 1e3 * self._wall_max}
+
+
+def texts(values: dict) -> dict[str, str]:
+    """Return the values of a status as text, floats with six digits."""
+    return {key: f'{value:.6g}' if isinstance(value, float) else str(value)
+            for key, value in values.items()}

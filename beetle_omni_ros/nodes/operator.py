@@ -1,26 +1,63 @@
-"""ROS client of an operator: services, parameters, states and diagnostics of a flight."""
+"""ROS clients outside the flight: an operator, and the listener of `beetle_omni check`."""
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 import time
 
+import numpy as np
 from rcl_interfaces.srv import SetParameters
 import rclpy
+from rclpy.exceptions import NameValidationException
 from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
+from beetle_omni_ros.bringup import graph as bringup
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.messages.conversions import seconds
-from beetle_omni_ros.messages.topics import command_topic, SENSOR
-from beetle_omni_ros.messages.values import Diagnostic
-from beetle_omni_ros.nodes import health, runner, wire
-from beetle_omni_ros.nodes.discovery import confine
-from beetle_omni_ros.nodes.plan import READY, STATES
+from beetle_omni_ros.messages.conversions import seconds as seconds_of
+from beetle_omni_ros.messages.topics import command_topic, LOG, SENSOR, TOPICS
+from beetle_omni_ros.messages.values import Diagnostic, MessageError
+from beetle_omni_ros.nodes import node as nodes
+from beetle_omni_ros.nodes import runner, wire
+from beetle_omni_ros.nodes.graph import BRIDGES, confine, READY
+from beetle_omni_ros.robot.schema import ParameterError
 
 # Simulated time may be slow, or stop if the simulator dies: waiting ends after this much steady
 # time for each second of the timeout.
 SLOWEST = 20.0
 SERVICES = ('arm', 'disarm', 'land', 'emergency_stop')
+# Topic -> attribute of its values that changes with every sample of a working sensor.
+STREAMS = {'mocap/pose': 'position', 'imu/data_raw': 'specific_force',
+           'joint_states': 'position', 'battery_state': 'voltage'}
+
+
+def join(name: str, domain: int | None = None, namespace: str = '',
+         discovery: str | None = None):
+    """
+    Make a node with its own context and executor; return (node, executor).
+
+    Raises:
+        ParameterError: invalid namespace or range of discovery.
+
+    """
+    confine(requested=discovery)
+    context = rclpy.Context()
+    rclpy.init(args=[], context=context, domain_id=domain,
+               signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        node = rclpy.create_node(name, context=context, namespace=namespace)
+    except NameValidationException as error:
+        context.try_shutdown()
+        raise ParameterError(f"--namespace '{namespace}': {str(error).splitlines()[0]}") from None
+    executor = runner.make_executor(context)
+    executor.add_node(node)
+    return node, executor
+
+
+def leave(node) -> None:
+    """Destroy a node of :func:`join` and its context."""
+    node.destroy_node()
+    node.context.try_shutdown()
 
 
 class Operator:
@@ -41,14 +78,8 @@ class Operator:
 
     def __init__(self, domain: int, controller: str = registry.DEFAULT):
         """Join ``domain`` and count the commands of ``controller``."""
-        confine()
         self.controller = controller
-        self._context = rclpy.Context()
-        rclpy.init(args=[], context=self._context, domain_id=domain,
-                   signal_handler_options=SignalHandlerOptions.NO)
-        self._node = rclpy.create_node('operator', context=self._context)
-        self._executor = runner.make_executor(self._context)
-        self._executor.add_node(self._node)
+        self._node, self._executor = join('operator', domain)
         self.state = self.progress = ''
         self.states: list[str] = []
         self.bridges: dict[str, str] = {}
@@ -58,42 +89,33 @@ class Operator:
         node = self._node
         node.create_subscription(Clock, '/clock', self._on_clock, wire.profile(SENSOR))
         wire.subscribe(node, 'supervisor/state', self._on_state)
-        wire.subscribe(node, 'reference/state', self._on_progress)
-        for bridge, topic in STATES.items():
-            wire.subscribe(node, topic, self._on_bridge(bridge))
+        wire.subscribe(node, 'reference/state', partial(setattr, self, 'progress'))
+        for bridge in BRIDGES:
+            wire.subscribe(node, f"{bridge.removesuffix('_node')}/state",
+                           partial(self.bridges.__setitem__, bridge))
         node.create_subscription(wire.message_class(command_topic(controller).type),
                                  f'{controller}/command', self._on_command, wire.profile(SENSOR),
                                  raw=True)
-        wire.subscribe(node, 'diagnostics', self._on_diagnostics)
+        wire.subscribe(node, 'diagnostics', lambda statuses: self.diagnostics.update(
+            (status.name, status) for status in statuses))
         self._diagnostics = wire.Publisher(node, 'diagnostics')
         self._clients = {name: node.create_client(Trigger, f'supervisor_node/{name}')
                          for name in SERVICES}
 
     def _on_clock(self, message):
-        self._simulated = seconds(message.clock)
-
-    def time(self) -> float:
-        """Return simulated time if it is used, else steady time [s]."""
-        return time.monotonic() if self._simulated is None else self._simulated
+        self._simulated = seconds_of(message.clock)
 
     def _on_state(self, text):
         state = text.partition(':')[0]
         self.state = text if state == 'flying' else state
         self.states.append(text)
 
-    def _on_progress(self, progress):
-        self.progress = progress
-
-    def _on_bridge(self, name):
-        def handle(state):
-            self.bridges[name] = state
-        return handle
-
     def _on_command(self, _):
         self.commands += 1
 
-    def _on_diagnostics(self, statuses):
-        self.diagnostics.update((status.name, status) for status in statuses)
+    def time(self) -> float:
+        """Return simulated time if it is used, else steady time [s]."""
+        return time.monotonic() if self._simulated is None else self._simulated
 
     @property
     def answers(self) -> bool:
@@ -162,10 +184,56 @@ class Operator:
     def report(self, name: str, text: str, values: dict) -> None:
         """Publish a status on ``diagnostics``, from where it gets into the bag."""
         self._diagnostics.publish([Diagnostic(
-            self._node.get_clock().now().nanoseconds * 1e-9, name, health.OK, text,
-            health.texts(values))])
+            self._node.get_clock().now().nanoseconds * 1e-9, name, nodes.OK, text,
+            nodes.texts(values))])
 
     def close(self) -> None:
         """Leave the graph."""
-        self._node.destroy_node()
-        self._context.try_shutdown()
+        leave(self._node)
+
+
+def listen(seconds: float, namespace: str = '', discovery: str | None = None
+           ) -> bringup.ObservedGraph:
+    """
+    Record the traffic of a graph for ``seconds``; publishes nothing.
+
+    Raises:
+        ParameterError: invalid namespace or range of discovery.
+
+    """
+    node, executor = join('check', namespace=namespace, discovery=discovery)
+    try:
+        graph = bringup.ObservedGraph(node.context.get_domain_id(), seconds,
+                                      {topic: bringup.Stream() for topic in STREAMS})
+        for topic in STREAMS:
+            node.create_subscription(
+                wire.message_class(TOPICS[topic].type), topic,
+                partial(_take, node, topic, graph.streams[topic]), wire.profile(LOG))
+        for bridge in bringup.BRIDGES:
+            wire.subscribe(node, f'{bridge}/state', partial(graph.states.__setitem__, bridge))
+        wire.subscribe(node, 'diagnostics', lambda statuses: graph.diagnostics.update(
+            (status.name, bringup.Status(status.level, status.message, status.values))
+            for status in statuses))
+        deadline = time.monotonic() + seconds
+        while (left := deadline - time.monotonic()) > 0:
+            executor.spin_once(timeout_sec=left)
+        for topic, stream in graph.streams.items():
+            for publisher in node.get_publishers_info_by_topic(topic):
+                if publisher.topic_type == TOPICS[topic].type:
+                    stream.publishers.append(publisher.node_name)
+                elif publisher.topic_type not in stream.other_types:
+                    stream.other_types.append(publisher.topic_type)
+    finally:
+        leave(node)
+    return graph
+
+
+def _take(node, topic, stream, message):
+    now = node.get_clock().now().nanoseconds * 1e-9
+    stream.arrivals.append(time.monotonic())
+    stream.ages.append(now - seconds_of(message.header.stamp))
+    try:
+        stream.norms.append(float(np.linalg.norm(getattr(TOPICS[topic].take(message),
+                                                         STREAMS[topic]))))
+    except MessageError as error:
+        stream.refused[str(error)] += 1

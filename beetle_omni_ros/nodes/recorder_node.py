@@ -7,8 +7,8 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.messages.topics import ALL, LATCHED_LOG, LOG, topics_with
-from beetle_omni_ros.nodes import health, wire
-from beetle_omni_ros.nodes.node import FlightNode
+from beetle_omni_ros.nodes import wire
+from beetle_omni_ros.nodes.node import ERROR, FlightNode, OK, WARN
 from beetle_omni_ros.robot.schema import NAMES, parameter, ParameterError
 from beetle_omni_ros.robot.urdf import description
 from beetle_omni_ros.runs.bag import BagError
@@ -108,8 +108,8 @@ class RecorderNode(FlightNode):
     def _bag_status(self):
         values = {'written': self._written, 'lost': self._lost}
         if self._failure:
-            return health.ERROR, self._failure, values
-        return health.WARN if self._lost else health.OK, self.parameters.bag, values
+            return ERROR, self._failure, values
+        return WARN if self._lost else OK, self.parameters.bag, values
 
     def close(self):
         """Finish the bag."""

@@ -8,8 +8,8 @@ from rcl_interfaces.srv import SetParameters
 from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
 from beetle_omni_ros.messages.topics import SENSOR
 from beetle_omni_ros.messages.values import Wrench
-from beetle_omni_ros.nodes import health, wire
-from beetle_omni_ros.nodes.node import FlightNode
+from beetle_omni_ros.nodes import wire
+from beetle_omni_ros.nodes.node import FlightNode, OK
 from beetle_omni_ros.robot.schema import parameter
 from beetle_omni_ros.runs.tasks import make_task, TaskPlayer
 
@@ -52,7 +52,7 @@ class ReferenceNode(FlightNode):
         disturbed = self._task.kind in ('force', 'torque')
         if disturbed:       # the loss of control ends these tasks
             self.listen('odom', self._on_odom, qos=SENSOR)
-        self.health.report('task', lambda: (health.OK, self._state, {'task': self._task.name}))
+        self.health.report('task', lambda: (OK, self._state, {'task': self._task.name}))
         self.create_timer(IMPULSE_PERIOD if disturbed else PERIOD, self._on_timer,
                           clock=self.flight_clock)
 

@@ -1,6 +1,11 @@
-"""Runs nodes in one process: start, spin, stop; errors are one line and an exit status."""
+"""
+Runs nodes in one process: start, spin, stop; errors are one line and an exit status.
 
-from collections.abc import Sequence
+``python -m beetle_omni_ros.start composed NODE...`` runs several nodes. NODE is an executable, a
+registered controller name, or the reference of a controller's class.
+"""
+
+from collections.abc import Callable, Sequence
 from contextlib import contextmanager
 import ctypes
 import gc
@@ -18,9 +23,9 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
 
-from beetle_omni_ros.nodes import discovery
+from beetle_omni_ros.control import registry
+from beetle_omni_ros.nodes.graph import ARGUMENT, COMPOSED, confine, GENERIC, NODES
 from beetle_omni_ros.nodes.node import StartError
-from beetle_omni_ros.nodes.plan import GENERIC
 from beetle_omni_ros.robot.schema import load_yaml, ParameterError
 
 OK, FAILED, UNUSABLE = 0, 1, 2
@@ -35,21 +40,62 @@ ENDING = (signal.SIGINT, signal.SIGTERM)
 
 def main(node_class: type, args: Sequence[str] | None = None) -> None:
     """Entry point of a node's executable."""
-    argv = list(sys.argv if args is None else args)
-    name = executable(node_class)
-    rest = own_arguments(argv, name)
+    argv, name = list(sys.argv if args is None else args), executable(node_class)
+    usage = f'usage: {name} [{ARGUMENT} RANGE] [--ros-args -p KEY:=VALUE --params-file FILE ...]'
+    rest = _own_arguments(argv, name, f'{usage}\n\n{(node_class.__doc__ or "").strip()}')
     if rest:
-        usage = (f'usage: {name} [{discovery.ARGUMENT} RANGE] '
-                 '[--ros-args -p KEY:=VALUE --params-file FILE ...]')
-        if rest[0] in ('-h', '--help'):
-            print(f'{usage}\n\n{(node_class.__doc__ or "").strip()}')
-            sys.exit(OK)
-        print(f"{name}: unknown argument '{rest[0]}'; {usage}", file=sys.stderr)
-        sys.exit(UNUSABLE)
+        sys.exit(_fail(name, f"unknown argument '{rest[0]}'; {usage}", UNUSABLE))
     sys.exit(run([node_class], argv, name))
 
 
-def run(node_classes: Sequence[type], argv: Sequence[str], name: str) -> int:
+def composed(args: Sequence[str] | None = None) -> None:
+    """Run the named nodes on one events executor."""
+    argv = list(sys.argv if args is None else args)
+    usage = ('usage: composed NODE... [--discovery RANGE] [--ros-args -p NODE:KEY:=VALUE ...]; '
+             f"NODE: {', '.join(NODES)}, a controller's name, {registry.CLASS}")
+    names = _own_arguments(argv, COMPOSED, usage)
+    unknown = [name for name in names if name not in NODES and ':' not in name
+               and name not in registry.names()]
+    if unknown or not names or len(set(names)) < len(names):
+        problem = f"unknown node '{unknown[0]}'" if unknown else 'each node once, at least one'
+        sys.exit(_fail(COMPOSED, f'{problem}; {usage}', UNUSABLE))
+    try:
+        classes = [node_class(name) if name in NODES else _controller_class(name)
+                   for name in names]
+    except ModuleNotFoundError as error:
+        sys.exit(_fail(COMPOSED, f"a node needs the Python package '{error.name}'; what bridges "
+                       "need installs the extra 'hardware' of beetle_omni_ros", UNUSABLE))
+    except ParameterError as error:
+        sys.exit(_fail(COMPOSED, error, UNUSABLE))
+    sys.exit(run(classes, [argument for argument in argv if argument not in names], COMPOSED))
+
+
+def node_class(name: str) -> type:
+    """Import the class of a node's executable: ekf_node -> EkfNode."""
+    kind = ''.join(part.capitalize() for part in name.split('_'))
+    module = GENERIC if name in ('nmpc_node', 'rl_node') else name
+    return getattr(import_module(f'{__package__}.{module}'), kind)
+
+
+def _controller_class(reference):
+    entry = registry.find(reference)
+
+    class Named(node_class(GENERIC)):
+        executable = f'{entry.name}_node'
+
+        def __init__(self):
+            super().__init__(entry)
+
+    return Named
+
+
+def executable(node_class: type) -> str:
+    """Return a node class's attribute ``executable``, or its name as one: EkfNode -> ekf_node."""
+    return getattr(node_class, 'executable', '') \
+        or re.sub(r'(?<=[a-z])(?=[A-Z])', '_', node_class.__name__).lower()
+
+
+def run(node_classes: Sequence[Callable], argv: Sequence[str], name: str) -> int:
     """
     Run the nodes on one events executor until a signal or a fatal error.
 
@@ -66,7 +112,7 @@ def run(node_classes: Sequence[type], argv: Sequence[str], name: str) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)   # KeyboardInterrupt during start-up
     end_with_parent()
     try:
-        discovery.confine()
+        confine()
         # rclpy's handlers would end the context while a callback still publishes.
         rclpy.init(args=list(argv), signal_handler_options=SignalHandlerOptions.NO)
         executor = make_executor()
@@ -80,12 +126,12 @@ def run(node_classes: Sequence[type], argv: Sequence[str], name: str) -> int:
         # garbage collector of some 10 ms in a control cycle.
         gc.collect()
         gc.freeze()
-        if any(getattr(node, 'real_time', False) for node in nodes):
+        if any(node.real_time for node in nodes):
             sys.setswitchinterval(THREAD_SWITCH)
-        # Not for a single node: real-time processes that wait for one another delayed the
-        # simulator by a third of a second.
-        if len(nodes) > 1 and any(getattr(node, 'real_time', False) for node in nodes):
-            use_real_time_priority()
+            # Not for a single node: real-time processes that wait for one another delayed the
+            # simulator by a third of a second.
+            if len(nodes) > 1:
+                use_real_time_priority()
         executor.spin_until_future_complete(_stop_on_signal(), FOREVER)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
@@ -95,41 +141,36 @@ def run(node_classes: Sequence[type], argv: Sequence[str], name: str) -> int:
         status = _fail(name, error, FAILED)
     finally:
         # A second signal, forwarded by a launch system, must not interrupt the clean-up.
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        for number in ENDING:
+            signal.signal(number, signal.SIG_IGN)
         for node in reversed(nodes):
             node.destroy_node()
         rclpy.try_shutdown()
     return status
 
 
-def own_arguments(argv: Sequence[str], name: str) -> list[str]:
-    """
-    Return the arguments that are neither for ROS nor for discovery; apply the latter.
-
-    Ends the process if arguments are unusable.
-    """
+def _own_arguments(argv, name, help_text):
+    """Apply ``--discovery RANGE``, print the help; return what is not for ROS either."""
     try:
-        _check_parameter_files(argv)
-        return discovery.apply_argument(remove_ros_args(list(argv))[1:])
+        for flag, path in zip(argv, argv[1:]):
+            if flag == '--params-file':     # by file and line; ROS would print a traceback
+                load_yaml(path)
+        rest, left = [], iter(remove_ros_args(list(argv))[1:])
+        for argument in left:
+            flag, equals, value = argument.partition('=')
+            if flag == ARGUMENT:
+                confine(requested=(value if equals else next(left, '')) or 'nothing')
+            else:
+                rest.append(argument)
     except Exception as error:
         # rclpy does not export the class of its error on bad arguments.
         if not isinstance(error, ParameterError) and 'ROSArgs' not in type(error).__name__:
             raise
         sys.exit(_fail(name, error, UNUSABLE))
-
-
-def node_class(name: str) -> type:
-    """Import the class of a node's executable: ekf_node -> EkfNode."""
-    kind = ''.join(part.capitalize() for part in name.split('_'))
-    module = GENERIC if name in ('nmpc_node', 'rl_node') else name
-    return getattr(import_module(f'{__package__}.{module}'), kind)
-
-
-def executable(node_class: type) -> str:
-    """Return a node class's attribute ``executable``, or its name as one: EkfNode -> ekf_node."""
-    return getattr(node_class, 'executable', '') \
-        or re.sub(r'(?<=[a-z])(?=[A-Z])', '_', node_class.__name__).lower()
+    if rest and rest[0] in ('-h', '--help'):
+        print(help_text)
+        sys.exit(OK)
+    return rest
 
 
 def make_executor(context=None):
@@ -157,7 +198,7 @@ def _stop_on_signal() -> Future:
         waiting.recv(1)
         stop.set_result((waiting, written))     # keeps both ends open for further signals
 
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in ENDING:
         signal.signal(number, lambda *_: None)
     signal.set_wakeup_fd(written.fileno(), warn_on_full_buffer=False)
     threading.Thread(target=wait, daemon=True).start()
@@ -185,13 +226,6 @@ def end_with_parent():
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
         if os.getppid() != int(parent):     # it ended before prctl
             os.kill(os.getpid(), signal.SIGTERM)
-
-
-def _check_parameter_files(argv):
-    """Refuse unusable files by file and line; ROS would print a traceback."""
-    for flag, path in zip(argv, argv[1:]):
-        if flag == '--params-file':
-            load_yaml(path)
 
 
 def _fail(name, error, status):

@@ -11,10 +11,8 @@ from beetle_omni_ros.drivers.device_parameters import ServoBusParameters
 from beetle_omni_ros.messages.conversions import set_time
 from beetle_omni_ros.messages.topics import SENSOR
 from beetle_omni_ros.messages.values import Odom
-from beetle_omni_ros.nodes import health, wire
-from beetle_omni_ros.nodes.command_source import CommandSource
-from beetle_omni_ros.nodes.node import FlightNode
-from beetle_omni_ros.nodes.pacing import RealTimePacing, SimulatedTimePacing
+from beetle_omni_ros.nodes import wire
+from beetle_omni_ros.nodes.node import CommandSource, Distribution, ERROR, FlightNode, OK, WARN
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import group, parameter, ParameterError
 from beetle_omni_ros.sim.emulated.fault_switches import (
@@ -31,10 +29,149 @@ from beetle_omni_ros.sim.faults.listed import DEVICES, parse_faults
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.simulator import Simulator
 
+# Ticks that are caught up after a stall of the computer; more would delay the next ones.
+CATCH_UP_TICKS = 8
+EARLY = 0.3             # part of a tick that the timer may come before the tick
+PHASE_WINDOW = 50       # calls of the timer from which its phase is estimated
+SLEW = 0.01             # largest shift of a tick towards the timer's phase, in ticks
+CLOCK_STEP = 0.005      # s of change between ROS and steady time above which the clock was set
+CLOCK_READING = 0.001   # s within which both clocks must have been read to be compared
+# Simulated time waits for a node that is farther behind than in real time, where the newest sample
+# is one period old. It does not wait for a node that has stopped.
+LAG = 0.02              # s between the newest sample and the newest answered one
+PATIENCE = 0.3          # s of steady time without an answer after which a node has stopped
 COMMAND_AGE = 0.1       # s, older commands are not executed
 # Switches of single events, which are reset after they happened.
 EVENTS = {*(f'servo_faults.{name}' for name in SERVO_EVENTS),
           *(f'board_faults.{name}' for name in BOARD_EVENTS)}
+
+
+class RealTimePacing:
+    """
+    Ticks on the steady clock, stamps in ROS time; starts with the first call of :meth:`due`.
+
+    Attributes:
+        ticks: number of ticks so far.
+        lost_ticks: ticks skipped after stalls; the simulation stopped meanwhile.
+        clock_steps: how often the ROS clock was set.
+
+    """
+
+    def __init__(self, tick: float, steady, ros):
+        self._tick, self._steady, self._ros = tick, steady, ros
+        self._started: float | None = None
+        self._offset = ros() - steady()     # ROS time minus steady time
+        self._lateness: list[float] = []
+        self._slew = 0.0
+        self.ticks = self.lost_ticks = self.clock_steps = 0
+
+    @property
+    def started(self) -> bool:
+        """Whether the first tick was due."""
+        return self._started is not None
+
+    @property
+    def epoch(self) -> float:
+        """ROS time at which simulated time is zero [s]."""
+        return self._offset + self._started
+
+    def due(self) -> int:
+        """Return the number of ticks that are due now; called by the timer, once a tick."""
+        now, tick = self._steady(), self._tick
+        if self._started is None:
+            self._started = now - tick
+        self._follow_clock()
+        due = int((now - self._started) / tick + EARLY) - self.ticks
+        lost = max(0, due - CATCH_UP_TICKS)
+        self.lost_ticks += lost
+        self._started += lost * tick
+        due -= lost
+        self._follow_timer(now, due)
+        self.ticks += due
+        return due
+
+    def _follow_timer(self, now, due):
+        """
+        Shift the ticks towards the times at which the timer fires.
+
+        The phase of the timer is unknown at first. If ticks were always due some milliseconds
+        before the timer, every stamp would be too old by this time.
+        """
+        if due > 0:
+            self._lateness.append(now - self._started - (self.ticks + due) * self._tick)
+        if len(self._lateness) == PHASE_WINDOW:
+            self._slew = min(self._lateness)
+            self._lateness.clear()
+        limit = SLEW * self._tick
+        step = min(max(self._slew, -limit), limit)
+        self._slew -= step
+        self._started += step
+
+    def _follow_clock(self):
+        """Detect that the ROS clock was set, and update its offset from the steady clock."""
+        before = self._steady()
+        ros = self._ros()
+        after = self._steady()
+        if after - before > CLOCK_READING:
+            return      # preempted between the readings
+        offset = ros - 0.5 * (before + after)
+        if abs(offset - self._offset) > CLOCK_STEP:
+            self.clock_steps += 1
+            self._offset = offset
+
+
+class SimulatedTimePacing:
+    """
+    Ticks of simulated time: one each time the timer fires, none while a node is late.
+
+    On a slow computer, time passes more slowly and no deadline is missed. For a node that has
+    stopped, simulated time waits once.
+
+    Args:
+        tick: period [s].
+        steady: steady clock [s].
+        epoch: time of the stamps at which simulated time is zero [s].
+
+    Attributes:
+        ticks: number of ticks so far.
+        waits: calls of :meth:`due` that returned no tick.
+        started, lost_ticks, clock_steps: as in :class:`RealTimePacing`; no tick is lost.
+
+    """
+
+    started, lost_ticks, clock_steps = True, 0, 0
+
+    def __init__(self, tick: float, steady, epoch: float):
+        self._tick, self._steady, self.epoch = tick, steady, epoch
+        self._sent = float('-inf')
+        self._answers: dict[str, tuple[float, float]] = {}
+        self._last = steady()
+        self.ticks = self.waits = 0
+
+    @property
+    def now(self) -> float:
+        """Simulated time [s]."""
+        return self.epoch + self.ticks * self._tick
+
+    def sample_sent(self, stamp: float) -> None:
+        """Record the stamp of a published sample."""
+        self._sent = stamp
+
+    def answered(self, name: str, stamp: float) -> None:
+        """Record that ``name`` has answered the sample with this stamp."""
+        self._answers[name] = (stamp, self._steady())
+
+    def due(self) -> int:
+        """Return the number of ticks that are due now: 1 or 0."""
+        now = self._steady()
+        late = any(self._sent - stamp > LAG and now - arrived < PATIENCE
+                   for stamp, arrived in self._answers.values())
+        if late and now - self._last < PATIENCE:
+            self.waits += 1
+            return 0
+        self._last = now
+        self.ticks += 1
+        return 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,10 +228,10 @@ class SimNode(FlightNode):
         self._simulator.set_payload(given.payload)
         self._set_faults(given)
         self._pacing = self._make_pacing(given)
-        self._latency = health.Distribution()
+        self._latency = Distribution()
         self._publish_to = {
-            'mocap': self.publisher('mocap/pose'), 'imu': self.publisher('imu/data_raw'),
-            'truth': self.publisher('ground_truth/odom')}
+            'mocap': self.publisher('mocap/pose'), 'imu': self.publisher('imu/data_raw')}
+        self._truth = self.publisher('ground_truth/odom')
         self.listen('disturbance', self._on_wrench, stale_after=None)
         self.health.track_compute(self._simulator.tick)
         self.health.report('pacing', self._pacing_status)
@@ -220,19 +357,12 @@ class SimNode(FlightNode):
     def _publish(self, frame):
         epoch, publish_to = self._pacing.epoch, self._publish_to
         # Delayed readings first: the IMU sample triggers the estimate, which should include them.
-        if frame.mocap is not None:
-            publish_to['mocap'].publish(replace(frame.mocap, stamp=epoch + frame.mocap.stamp))
-        if self._devices is None and frame.joints is not None:
-            publish_to['joints'].publish(replace(frame.joints, stamp=epoch + frame.joints.stamp))
-        if frame.imu is not None:
-            publish_to['imu'].publish(replace(frame.imu, stamp=epoch + frame.imu.stamp))
-        publish_to['truth'].publish(Odom.of(frame.truth, stamp=epoch + frame.truth.stamp))
-        if self._devices is None and frame.rotors is not None:
-            publish_to['rotors'].publish(replace(frame.rotors, stamp=epoch + frame.rotors.stamp))
-        if self._devices is None and frame.battery is not None:
-            publish_to['battery'].publish(replace(
-                frame.battery, stamp=epoch + frame.battery.stamp,
-                cells=self._robot.battery.cells))
+        for name in ('mocap', 'joints', 'imu', 'rotors', 'battery'):
+            reading = getattr(frame, name)
+            if reading is not None and name in publish_to:
+                more = {'cells': self._robot.battery.cells} if name == 'battery' else {}
+                publish_to[name].publish(replace(reading, stamp=epoch + reading.stamp, **more))
+        self._truth.publish(Odom.of(frame.truth, stamp=epoch + frame.truth.stamp))
 
     def _on_command(self, command):
         self._latency.add(self.now() - command.stamp)
@@ -246,7 +376,7 @@ class SimNode(FlightNode):
 
     def _pacing_status(self):
         pacing = self._pacing
-        level = health.WARN if pacing.lost_ticks else health.OK
+        level = WARN if pacing.lost_ticks else OK
         return level, f'{pacing.lost_ticks} ticks lost', {
             'ticks': pacing.ticks, 'lost_ticks': pacing.lost_ticks,
             'lost_s': pacing.lost_ticks * self._simulator.tick,
@@ -260,15 +390,15 @@ class SimNode(FlightNode):
             values.update(impact_m_s=impact.speed, impact_s=impact.stamp,
                           inclination_deg=degrees(impact.inclination))
         if simulator.truth.broken:
-            return health.ERROR, 'broken by a crash', values
-        return health.WARN if faults else health.OK, values['faults'] or 'whole', values
+            return ERROR, 'broken by a crash', values
+        return WARN if faults else OK, values['faults'] or 'whole', values
 
     def _devices_status(self):
         faults = self._devices.faults
-        level = health.WARN if faults else health.OK
+        level = WARN if faults else OK
         return level, 'faults: ' + (', '.join(faults) or 'none'), self._devices.status()
 
     def _latency_status(self):
         times = self._latency
-        return health.OK, 'stamp of the answered IMU sample to the arrival of its command', {
+        return OK, 'stamp of the answered IMU sample to the arrival of its command', {
             **times.milliseconds(), 'count': times.count}

@@ -10,9 +10,7 @@ from beetle_omni_ros.control.base import State
 from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.messages.conversions import take_known_joints
 from beetle_omni_ros.messages.values import HealthReport, TargetOverride
-from beetle_omni_ros.nodes import health
-from beetle_omni_ros.nodes.command_source import new_identity, TOPIC
-from beetle_omni_ros.nodes.node import FlightNode
+from beetle_omni_ros.nodes.node import ERROR, FlightNode, IDENTITY, new_identity, OK, WARN
 from beetle_omni_ros.robot.actuator_health import ALL_HEALTHY
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import NAMES, parameter, ParameterError
@@ -21,7 +19,7 @@ from beetle_omni_ros.safety.supervisor import DISARMED, FALLBACK, FLYING, STOPPE
 
 WATCH_PERIOD = 0.01     # s between checks for silent inputs
 SENSOR_AGE = 0.2        # s, the descent without estimator uses no older sample
-LEVELS = {FALLBACK: health.WARN, STOPPED: health.ERROR}
+LEVELS = {FALLBACK: WARN, STOPPED: ERROR}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +62,7 @@ class SupervisorNode(FlightNode):
         self._state = ''
         self._publisher = self.publisher('command')
         self._identity = new_identity('supervisor_node')
-        self._identities = self.publisher(TOPIC)
+        self._identities = self.publisher(IDENTITY)
         self._identities.publish(self._identity)
         self._states = self.publisher('supervisor/state')
         self._targets = self.publisher('supervisor/target')
@@ -168,6 +166,6 @@ class SupervisorNode(FlightNode):
         values = supervisor.diagnostics()
         for name, at in supervisor.faults.items():
             values[f'fault.{name}'] = f'{at:.3f}'     # [s]: six digits are too few for a stamp
-        level = LEVELS.get(supervisor.state, health.WARN if supervisor.faults else health.OK)
+        level = LEVELS.get(supervisor.state, WARN if supervisor.faults else OK)
         named = ', '.join(supervisor.faults)
         return level, f'{self._state}; faults: {named}' if named else self._state, values

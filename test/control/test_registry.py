@@ -16,7 +16,7 @@ from beetle_omni_ros.control.base import Command, Controller
 from beetle_omni_ros.control.entry import ControllerEntry, entry_of, RESERVED
 from beetle_omni_ros.control.host import checked
 from beetle_omni_ros.control.registry import ControllerOptions
-from beetle_omni_ros.nodes.plan import NODES
+from beetle_omni_ros.nodes.graph import NODES
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import PACKAGE
 from beetle_omni_ros.robot.schema import ParameterError

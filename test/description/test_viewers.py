@@ -11,7 +11,7 @@ import yaml
 
 from beetle_omni_ros.messages.bag_types import from_bytes, TYPESTORE
 from beetle_omni_ros.messages.topics import ALL
-from beetle_omni_ros.nodes import plan
+from beetle_omni_ros.nodes import graph
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, ROTOR_NAMES
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.urdf import description, SHIPPED
@@ -117,10 +117,10 @@ def test_the_aggregator_has_one_group_for_each_node():
     content = yaml.safe_load((VIEWERS / 'diagnostic_aggregator.yaml').read_text())
     groups = [group for group in content['analyzers']['ros__parameters'].values()
               if isinstance(group, dict)]
-    for node in plan.NODES:
+    for node in graph.NODES:
         found = [group for group in groups
                  if any(node.startswith(prefix) for prefix in group['startswith'])]
-        assert len(found) == 1 or node == plan.GENERIC, node
+        assert len(found) == 1 or node == graph.GENERIC, node
 
 
 def test_a_bag_contains_the_frames_and_topics_of_all_layouts(tmp_path):

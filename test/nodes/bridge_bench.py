@@ -13,8 +13,8 @@ from std_srvs.srv import Trigger
 
 from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.messages.topics import SENSOR
-from beetle_omni_ros.nodes import discovery, wire
-from beetle_omni_ros.nodes.graph import Graph
+from beetle_omni_ros.nodes import wire
+from beetle_omni_ros.nodes.graph import Graph, reserved_domain
 from beetle_omni_ros.nodes.operator import Operator
 from beetle_omni_ros.robot.parameters import JOINT_NAMES
 from beetle_omni_ros.sim.emulated.board_parameters import EmulatedBoardParameters
@@ -142,7 +142,7 @@ class BridgeOperator(Operator):
 @contextmanager
 def running_bridge(folder, bridge, others=(), **parameters):
     """Run a bridge in a separate process, or composed with others; yield graph and operator."""
-    with discovery.reserved_domain() as number:
+    with reserved_domain() as number:
         graph = Graph({bridge: {**PATIENT[bridge], **parameters}, **{name: {} for name in others}},
                       folder, number, composed=bool(others))
         operator = None

@@ -12,13 +12,13 @@ pytest.importorskip('rclpy')
 
 import rclpy
 
-from beetle_omni_ros.nodes import discovery
+from beetle_omni_ros.nodes import graph
 
 
 @pytest.fixture
 def ros_domain(monkeypatch):
     """Hold a free ROS domain for one test, so that tests can run at the same time."""
-    with discovery.reserved_domain() as number:
+    with graph.reserved_domain() as number:
         monkeypatch.setenv('ROS_DOMAIN_ID', str(number))
         yield number
 

@@ -11,8 +11,7 @@ import pytest
 from std_srvs.srv import Trigger
 from witness import PATIENT, running_graph, Witness
 
-from beetle_omni_ros.nodes.graph import BRIDGES_COMPOSED
-from beetle_omni_ros.nodes.plan import bridge_parameters, BRIDGES
+from beetle_omni_ros.nodes.graph import bridge_parameters, BRIDGES, BRIDGES_COMPOSED
 
 pytestmark = pytest.mark.alone
 

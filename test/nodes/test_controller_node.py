@@ -15,7 +15,8 @@ from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import Command, PoseTarget
 from beetle_omni_ros.control.registry import ControllerEntry
 from beetle_omni_ros.messages.values import Odom
-from beetle_omni_ros.nodes import health, plan
+from beetle_omni_ros.nodes import graph
+from beetle_omni_ros.nodes import node as base
 from beetle_omni_ros.nodes.controller_node import ControllerNode
 from beetle_omni_ros.nodes.supervisor_node import SupervisorNode
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth
@@ -151,8 +152,8 @@ def test_an_exception_of_step_is_logged_and_reported_and_publishes_no_command(
     error = "controller 'failing': step raised AttributeError: 'State' object has no attribute " \
             "'positon' (bad.py:7)"
     level, text, values = node._controller_status()
-    assert (level, text, values['errors']) == (health.ERROR, error, 2)
-    assert node._controller_status()[0] == health.OK      # none since the last report
+    assert (level, text, values['errors']) == (base.ERROR, error, 2)
+    assert node._controller_status()[0] == base.OK      # none since the last report
     assert node._publisher.stamps().tolist() == [1.0]
     lines = [line for line in capfd.readouterr().err.splitlines() if 'ERROR' in line]
     assert len(lines) == 1 and lines[0].endswith(error)     # at most one a second
@@ -193,13 +194,13 @@ def test_an_active_controller_outside_the_supervisors_list_is_refused(make):
 
 
 def test_the_plan_of_a_graph_with_another_controller():
-    nodes = plan.plan(plan.GraphOptions(controller=OWN, actuators='direct', bag='/b',
+    nodes = graph.plan(graph.GraphOptions(controller=OWN, actuators='direct', bag='/b',
                                         task='hover')).nodes
     known = ['pose_controller', *registry.standing_by()]
     assert nodes['pose_controller_node'] == {'controller': OWN}
     assert nodes['supervisor_node']['controller'] == 'pose_controller'
     for name in ('supervisor_node', 'recorder_node'):
         assert nodes[name]['controllers'] == known
-    assert plan.arguments(nodes, ['ekf_node', 'pose_controller_node']) == ['ekf_node', OWN]
-    alone = plan.plan(plan.GraphOptions(controller=OWN, actuators='direct', standby=False)).nodes
+    assert graph.arguments(nodes, ['ekf_node', 'pose_controller_node']) == ['ekf_node', OWN]
+    alone = graph.plan(graph.GraphOptions(controller=OWN, actuators='direct', standby=False)).nodes
     assert list(alone) == ['sim_node', 'ekf_node', 'pose_controller_node', 'supervisor_node']

@@ -7,8 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from beetle_omni_ros.nodes import discovery, plan
-from beetle_omni_ros.nodes.graph import Graph
+from beetle_omni_ros.nodes import graph
 from beetle_omni_ros.robot.schema import ParameterError
 
 PROBE = ('import os, sys\n'
@@ -20,7 +19,7 @@ PROBE = ('import os, sys\n'
 
 @pytest.fixture
 def unset(monkeypatch):
-    for name in (*discovery.ROS_SETTINGS, discovery.VARIABLE):
+    for name in (*graph.ROS_SETTINGS, graph.VARIABLE):
         monkeypatch.delenv(name, raising=False)
 
 
@@ -31,13 +30,13 @@ def unset(monkeypatch):
     ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}, 'SUBNET'),
     ({'ROS_STATIC_PEERS': '192.168.1.2'}, None), ({'ROS_LOCALHOST_ONLY': '0'}, None)])
 def test_the_users_setting_has_precedence(given, holds):
-    discovery.confine(given)
+    graph.confine(given)
     assert given.get('ROS_AUTOMATIC_DISCOVERY_RANGE') == holds
 
 
 def test_an_unknown_range_is_refused():
     with pytest.raises(ParameterError, match='expected one of LOCALHOST, SUBNET'):
-        discovery.confine({'BEETLE_OMNI_DISCOVERY': 'world'})
+        graph.confine({'BEETLE_OMNI_DISCOVERY': 'world'})
 
 
 @pytest.mark.parametrize(('start', 'variable', 'holds'), [
@@ -51,7 +50,7 @@ def test_an_unknown_range_is_refused():
 def test_a_separate_or_composed_node_is_limited_to_this_computer_unless_requested(
         ros_domain, unset, start, variable, holds):
     done = subprocess.run([sys.executable, '-c', PROBE + start], capture_output=True, text=True,
-                          timeout=60, env={**os.environ, discovery.VARIABLE: variable})
+                          timeout=60, env={**os.environ, graph.VARIABLE: variable})
     assert done.stderr.strip() == f'probe_node: error: {holds}'
 
 
@@ -59,37 +58,37 @@ def test_a_separate_or_composed_node_is_limited_to_this_computer_unless_requeste
 @pytest.mark.parametrize(('requested', 'holds'), [('', 'LOCALHOST'), ('subnet', 'SUBNET')])
 def test_an_argument_of_fly_reaches_every_node_of_the_plan(tmp_path, unset, monkeypatch, composed,
                                                            requested, holds):
-    monkeypatch.setenv(discovery.RANGE, '')        # put back afterwards
-    monkeypatch.setenv(discovery.VARIABLE, '')
+    monkeypatch.setenv(graph.RANGE, '')        # put back afterwards
+    monkeypatch.setenv(graph.VARIABLE, '')
     ranges = []
 
     def start(arguments, env, **_):
-        ranges.append(env[discovery.RANGE])
+        ranges.append(env[graph.RANGE])
         return SimpleNamespace(poll=lambda: 0, returncode=0)
 
     monkeypatch.setattr(subprocess, 'Popen', start)
     monkeypatch.setattr(os.path, 'exists', lambda _: True)
-    discovery.confine(requested=requested)
-    nodes = plan.plan(plan.GraphOptions(controller='hover', ports=str(tmp_path), task='hover',
+    graph.confine(requested=requested)
+    nodes = graph.plan(graph.GraphOptions(controller='hover', ports=str(tmp_path), task='hover',
                                         bag=str(tmp_path / 'bag'))).nodes
-    Graph(nodes, tmp_path, 7, composed).start()
+    graph.Graph(nodes, tmp_path, 7, composed).start()
     assert ranges == [holds] * (2 if composed else len(nodes))
 
 
 def test_a_name_is_free_again_when_its_process_ends():
     name = f'test/{os.getpid()}'
-    with discovery.claim(name):
-        assert discovery.claim(name) is None
-    code = f'from beetle_omni_ros.nodes import discovery; print(discovery.claim({name!r}))'
+    with graph.claim(name):
+        assert graph.claim(name) is None
+    code = f'from beetle_omni_ros.nodes import graph; print(graph.claim({name!r}))'
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
                           check=True, timeout=60)
     assert 'socket' in done.stdout
-    with discovery.claim(name):
+    with graph.claim(name):
         pass
 
 
 def test_two_reserved_domains_differ(monkeypatch):
-    with discovery.reserved_domain() as first:
-        monkeypatch.setattr(discovery, '_starts', iter([discovery.DOMAINS.index(first)]))
-        with discovery.reserved_domain() as second:
+    with graph.reserved_domain() as first:
+        monkeypatch.setattr(graph, '_starts', iter([graph.DOMAINS.index(first)]))
+        with graph.reserved_domain() as second:
             assert second != first

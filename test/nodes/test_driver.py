@@ -19,7 +19,8 @@ from witness import running_graph
 from beetle_omni_ros import cli
 from beetle_omni_ros.drive import DriveParameters
 from beetle_omni_ros.messages.topics import EVENT
-from beetle_omni_ros.nodes import discovery, driver, wire
+from beetle_omni_ros.nodes import driver, wire
+from beetle_omni_ros.nodes.graph import in_simulated_time, reserved_domain
 from beetle_omni_ros.robot import rotations
 
 NODES = ('sim_node', 'ekf_node', 'nmpc_node', 'supervisor_node')
@@ -31,9 +32,9 @@ PATIENCE = 60       # [s]
 @pytest.fixture(scope='module')
 def graph(tmp_path_factory):
     """A graph in simulated time without targets; (domain, witness)."""
-    with discovery.reserved_domain() as domain, running_graph(
-            {name: {} for name in NODES}, tmp_path_factory.mktemp('graph'), domain,
-            simulated=True) as (_, witness):
+    with reserved_domain() as domain, running_graph(
+            in_simulated_time({name: {} for name in NODES}), tmp_path_factory.mktemp('graph'),
+            domain) as (_, witness):
         yield domain, witness
 
 

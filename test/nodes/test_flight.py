@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from witness import HEADER, READY, running_graph
 
+from beetle_omni_ros.nodes.graph import in_simulated_time
 from beetle_omni_ros.runs.bag import read_bag
 from beetle_omni_ros.runs.metrics import metrics
 from beetle_omni_ros.runs.tasks import make_task
@@ -36,7 +37,7 @@ def test_switches_and_the_loss_of_recorder_reference_controller_and_estimator(ro
     parameters = {name: {} for name in (*NODES, 'rl_node')}
     parameters['recorder_node'] = {'bag': str(bag)}
     parameters['reference_node'] = {'task': str(task)}
-    with running_graph(parameters, tmp_path, ros_domain, composed=False, simulated=True,
+    with running_graph(in_simulated_time(parameters), tmp_path, ros_domain, composed=False,
                        ready=lambda one: one.ready and one.progress) as (graph, witness):
         witness.take_off(lambda: witness.progress.startswith('flying'))
         switches(witness)

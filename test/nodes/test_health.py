@@ -7,8 +7,8 @@ pytest.importorskip('pymavlink')
 pytest.importorskip('serial')
 
 from beetle_omni_ros.drivers.motor_board import Sent
-from beetle_omni_ros.nodes.health import Distribution
-from beetle_omni_ros.nodes.rotor_bridge_report import TargetStream
+from beetle_omni_ros.nodes.node import Distribution
+from beetle_omni_ros.nodes.rotor_bridge_node import TargetStream
 
 
 def test_quantiles_agree_with_sorting_within_two_percent():
@@ -24,7 +24,7 @@ def test_quantiles_agree_with_sorting_within_two_percent():
 
 
 def sent(saturated=(False,) * 4, reason=''):
-    return Sent(not reason, reason, np.array(saturated), np.full(4, 0.5))
+    return Sent(reason, np.array(saturated), np.full(4, 0.5))
 
 
 @pytest.mark.parametrize(('gaps', 'cycles', 'missed'), [

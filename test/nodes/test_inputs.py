@@ -26,10 +26,11 @@ from beetle_omni_ros.control.registry import ControllerEntry
 from beetle_omni_ros.messages import conversions
 from beetle_omni_ros.messages.topics import COMMAND, EVENT, LATCHED, SENSOR
 from beetle_omni_ros.messages.values import MessageError
-from beetle_omni_ros.nodes import command_source, wire
+from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.controller_node import ControllerNode
 from beetle_omni_ros.nodes.ekf_node import EkfNode
 from beetle_omni_ros.nodes.joint_bridge_node import JointBridgeNode
+from beetle_omni_ros.nodes.node import IDENTITY
 from beetle_omni_ros.nodes.recorder_node import RecorderNode
 from beetle_omni_ros.nodes.rotor_bridge_node import RotorBridgeNode
 from beetle_omni_ros.nodes.sim_node import SimNode
@@ -80,7 +81,7 @@ def test_a_bad_target_pose_is_refused_with_its_reason_and_the_old_one_stays(benc
     assert bench.wait(lambda: node._host.target.position[2] == 1.4)
     poses.publish(pose(1.5, time.time()))
     assert bench.wait(lambda: node._host.target.position[2] == 1.5)
-    kinds = node.health._inputs['target_pose'].rejected
+    kinds = node.health.inputs['target_pose'].rejected
     assert kinds['cannot be flown'] == 4 and kinds.total() == 5
 
 
@@ -122,7 +123,7 @@ def test_every_point_of_a_target_trajectory_is_checked(bench):
 def test_bad_and_stale_samples_are_refused_and_counted_by_reason(bench):
     node = bench.add(EkfNode())
     samples = bench.publisher(Imu, 'imu/data_raw', wire.profile(SENSOR))
-    rejected = node.health._inputs['imu/data_raw'].rejected
+    rejected = node.health.inputs['imu/data_raw'].rejected
     for specific_force, age in (([np.nan, 0, 9.8], 0.0), ([0, 0, 9.8], 30.0)):
         before = rejected.total()
         samples.publish(wire.message('imu/data_raw', ImuReading(
@@ -141,8 +142,8 @@ def test_only_the_supervisors_commands_are_executed_and_others_are_named(make_be
     bench.user.create_subscription(
         DiagnosticArray, 'diagnostics', lambda m: texts.extend(s.message for s in m.status), 10)
     commands = bench.publisher(JointState, 'command', wire.profile(COMMAND))
-    identities = bench.publisher(String, command_source.TOPIC, wire.profile(LATCHED))
-    entry = node.health._inputs['command']
+    identities = bench.publisher(String, IDENTITY, wire.profile(LATCHED))
+    entry = node.health.inputs['command']
 
     def answer(source):
         before = entry.received, entry.rejected.total()
@@ -170,7 +171,7 @@ def test_only_the_supervisors_commands_are_executed_and_others_are_named(make_be
 
 def test_the_supervisor_signs_its_commands_and_publishes_its_identity(bench):
     received, sent = [], []
-    wire.subscribe(bench.user, command_source.TOPIC, received.append)
+    wire.subscribe(bench.user, IDENTITY, received.append)
     node = bench.add(SupervisorNode())
     assert bench.wait(lambda: received)
     node._publisher._publisher = SimpleNamespace(publish=sent.append)

@@ -14,9 +14,9 @@ import pytest
 from test_deploy import install, UNIT
 
 from beetle_omni_ros.messages.topics import TOPICS
-from beetle_omni_ros.nodes import discovery, plan
+from beetle_omni_ros.nodes import graph
+from beetle_omni_ros.nodes.graph import BRIDGES
 from beetle_omni_ros.nodes.operator import Operator
-from beetle_omni_ros.nodes.plan import BRIDGES
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
 
@@ -41,8 +41,8 @@ def bringup(monkeypatch):
         for member in members:
             setattr(module, member, type(member, (Recorded,), {}))
         monkeypatch.setitem(sys.modules, name, module)
-    monkeypatch.setenv(discovery.RANGE, 'LOCALHOST')        # put back afterwards
-    monkeypatch.setattr(plan, 'unfit', lambda *_: '')    # a compatible policy exists
+    monkeypatch.setenv(graph.RANGE, 'LOCALHOST')        # put back afterwards
+    monkeypatch.setattr(graph, 'unfit', lambda *_: '')    # a compatible policy exists
     spec = spec_from_file_location('bringup', share_path('launch/bringup.launch.py'))
     module = module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -68,7 +68,7 @@ def test_composed_is_one_process_and_one_for_the_bridges(bringup):
     command = process.kwargs['cmd']
     nodes = command[4:command.index('--ros-args')]
     assert nodes == ['sim_node', 'ekf_node', 'nmpc_node', 'rl_node', 'supervisor_node']
-    assert {*nodes, *BRIDGES} <= set(plan.NODES)
+    assert {*nodes, *BRIDGES} <= set(graph.NODES)
     assert 'sim_node:seed:=7' in command
     assert command[-2:] == ['-r', '__ns:=/robot1']
 
@@ -144,7 +144,7 @@ def test_each_controller_can_be_active_with_the_other_on_standby(bringup, capsys
     process, _ = bringup.start(allow_other_robot='true')
     assert 'rl_node:allow_other_robot:=True' in process.kwargs['cmd']
     assert not capsys.readouterr().err
-    monkeypatch.setattr(plan, 'unfit', lambda *_: 'robot_hash: another robot')
+    monkeypatch.setattr(graph, 'unfit', lambda *_: 'robot_hash: another robot')
     assert controllers() == ('nmpc', {'nmpc_node': {}})
     assert 'rl does not stand by: robot_hash' in capsys.readouterr().err
     with pytest.raises(ParameterError, match='robot_hash'):
@@ -167,15 +167,15 @@ def test_ros2_bag_records_where_it_is_installed_else_the_recorder(bringup, monke
 
 
 def test_a_launch_is_visible_on_this_computer_only(bringup, monkeypatch):
-    for name in (*discovery.ROS_SETTINGS, discovery.VARIABLE):
+    for name in (*graph.ROS_SETTINGS, graph.VARIABLE):
         monkeypatch.delenv(name, raising=False)
     bringup.generate_launch_description()
-    assert os.environ[discovery.RANGE] == 'LOCALHOST'
-    monkeypatch.setenv(discovery.VARIABLE, 'SUBNET')
+    assert os.environ[graph.RANGE] == 'LOCALHOST'
+    monkeypatch.setenv(graph.VARIABLE, 'SUBNET')
     bringup.generate_launch_description()
-    assert os.environ[discovery.RANGE] == 'SUBNET'
+    assert os.environ[graph.RANGE] == 'SUBNET'
     bringup.start(composed='false', discovery='OFF')
-    assert os.environ[discovery.RANGE] == 'OFF'
+    assert os.environ[graph.RANGE] == 'OFF'
 
 
 def test_the_ports_of_a_launch_are_in_a_private_folder(bringup):

@@ -16,7 +16,7 @@ from beetle_omni_ros.bringup.limits import CheckLimits
 from beetle_omni_ros.bringup.topics import check_topics
 from beetle_omni_ros.messages.topics import EVENT, LATCHED, SENSOR
 from beetle_omni_ros.nodes import wire
-from beetle_omni_ros.nodes.listener import listen
+from beetle_omni_ros.nodes.operator import listen
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import PoseReading
 from beetle_omni_ros.robot.schema import ParameterError

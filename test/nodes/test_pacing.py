@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from beetle_omni_ros.nodes.pacing import (
+from beetle_omni_ros.nodes.sim_node import (
     CATCH_UP_TICKS,
     LAG,
     PATIENCE,

@@ -6,7 +6,7 @@ import time
 import pytest
 from witness import running_graph
 
-from beetle_omni_ros.nodes.plan import COMPOSED, GraphOptions, plan
+from beetle_omni_ros.nodes.graph import COMPOSED, GraphOptions, plan
 
 pytestmark = pytest.mark.real_time
 PAUSE = 0.5     # [s]

@@ -10,7 +10,7 @@ from beetle_omni_ros.control.base import PoseTarget, State
 from beetle_omni_ros.control.policy import PolicyController, PolicyParameters
 from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes.controller_node import RlNode
-from beetle_omni_ros.nodes.plan import controller_nodes
+from beetle_omni_ros.nodes.graph import controller_nodes
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import JointReading
 from beetle_omni_ros.robot.resources import share_path

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from rclpy.parameter import Parameter
 
-from beetle_omni_ros.nodes import health
+from beetle_omni_ros.nodes import node as base
 from beetle_omni_ros.nodes.sim_node import SimNode
 from beetle_omni_ros.robot.schema import ParameterError
 
@@ -44,10 +44,10 @@ def test_commands_and_joint_states_pass_through_ports_or_topics(sim):
 
 def test_faults_are_switched_in_flight_and_reported(sim):
     node = sim('faults:="mocap_lost"', actuators='direct')
-    assert node._robot_status()[0] == health.OK
+    assert node._robot_status()[0] == base.OK
     node._simulator.step()
     level, text, values = node._robot_status()
-    assert level == health.WARN and text == 'mocap_lost' and values['broken'] == 0
+    assert level == base.WARN and text == 'mocap_lost' and values['broken'] == 0
     assert put(node, faults='mocap_lost; rotor_stops rotor=2').successful
     node._simulator.step()
     assert node._simulator.faults == ['mocap_lost', 'rotor_stops']
@@ -100,10 +100,10 @@ def test_faults_of_devices_change_in_flight_and_are_in_the_diagnostics(sim, tmp_
     assert put(node, servo_faults__overheated=[], servo_faults__silent=[2],
                board_faults__voltage_sag=1.5).successful
     level, text, values = node._devices_status()
-    assert level == health.WARN and text == 'faults: servo silent [2], board voltage_sag 1.5'
+    assert level == base.WARN and text == 'faults: servo silent [2], board voltage_sag 1.5'
     assert values['armed'] is False and values['torque'] == [False] * 4
     assert put(node, servo_faults__silent=[], board_faults__voltage_sag=0.0).successful
-    assert node._devices_status()[0] == health.OK
+    assert node._devices_status()[0] == base.OK
     for name, value, text in (('servo_faults__silent', [9], 'servo_faults.silent: no servo has'),
                               ('board_faults__failed_escs', [5], '5 is outside 1 to 4')):
         refused = put(node, **{name: value})

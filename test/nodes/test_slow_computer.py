@@ -8,8 +8,8 @@ import pytest
 from rich.console import Console
 from rich.progress import Progress
 
-from beetle_omni_ros.nodes import fly, speed
-from beetle_omni_ros.nodes.flight import Flight, PACING, TooSlowError
+from beetle_omni_ros.nodes import fly
+from beetle_omni_ros.nodes.fly import Flight, PACING, TooSlowError
 from beetle_omni_ros.robot.schema import RunError
 from beetle_omni_ros.runs.tasks import make_task
 
@@ -85,17 +85,17 @@ def busy(seconds):
     (busy, 10, False),          # single ticks are disturbed
     (busy, 1, True)])           # the computer is slow
 def test_the_load_is_predicted_from_the_cpu_time_of_most_ticks(monkeypatch, wait, every, counts):
-    step, ticks, before = speed.Simulator.step, count(), speed.load(NODES)
+    step, ticks, before = fly.Simulator.step, count(), fly.needed_load(NODES)
 
     def slower(simulator):
         if next(ticks) % every == 0:
             wait(0.005)         # a whole core
         return step(simulator)
 
-    monkeypatch.setattr(speed.Simulator, 'step', slower)
-    more = (speed.load(NODES) - before) / len(NODES)
-    assert (more > 0.9 * speed.PER_NODE) == counts
-    assert counts or abs(more) < 0.2 * speed.PER_NODE
+    monkeypatch.setattr(fly.Simulator, 'step', slower)
+    more = (fly.needed_load(NODES) - before) / len(NODES)
+    assert (more > 0.9 * fly.PER_NODE) == counts
+    assert counts or abs(more) < 0.2 * fly.PER_NODE
 
 
 @pytest.fixture
@@ -110,7 +110,7 @@ def attempts(monkeypatch):
         return 1        # flown, but without a bag
 
     monkeypatch.setattr(fly, '_fly', one)
-    monkeypatch.setattr(speed, 'load', lambda nodes: 0.99)
+    monkeypatch.setattr(fly, 'needed_load', lambda nodes: 0.99)
     return graphs
 
 
@@ -128,7 +128,7 @@ def test_fly_changes_to_simulated_time_without_serial_devices_and_reports_it(
     assert slow.simulated and slow_meta['actuators'] == 'direct' and may_be_slow
     assert slow_meta['clock'] == 'simulated'
     assert not {'joint_bridge_node', 'rotor_bridge_node'} & set(slow.nodes)
-    monkeypatch.setattr(speed, 'load', lambda nodes: 0.5)
+    monkeypatch.setattr(fly, 'needed_load', lambda nodes: 0.5)
     assert 'too slow for real time: the simulator fell 0.5 s behind' in run('b')
     (real, real_meta, _), (slow, _, _) = attempts
     assert not real.simulated and real_meta['actuators'] == 'emulated' and slow.simulated
