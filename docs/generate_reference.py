@@ -62,7 +62,7 @@ FILES = {
     'recording.yaml': ('identify.recording.limits:RecordingLimits',
                        'Limits of the checks of a recording against itself.'),
     'train.yaml': ('train.parameters:TrainParameters', 'The training of a policy.'),
-    'faults.yaml': ('sim.faults.listed:FaultList', 'The listed faults.'),
+    'faults.yaml': ('sim.fault_lists:FaultList', 'The listed faults.'),
     'identify.yaml': ('identify.parameters:IdentifyParameters',
                       'Identification of servos and rotors from logs.'),
     'gap.yaml': ('identify.gap.parameters:GapParameters', 'The gap finder.')}

@@ -26,8 +26,8 @@ from beetle_omni_ros.runs.log import FlightLog
 from beetle_omni_ros.runs.pose_file import check_steps
 from beetle_omni_ros.runs.recorder import LogRecorder, Tee
 from beetle_omni_ros.runs.tasks import make_task, Task
+from beetle_omni_ros.sim.fault_lists import load_faults
 from beetle_omni_ros.sim.faults import Fault
-from beetle_omni_ros.sim.faults.listed import load_faults
 
 
 def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotParameters,

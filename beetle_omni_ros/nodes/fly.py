@@ -30,7 +30,7 @@ from beetle_omni_ros.runs.bag import add_meta, BagError, check_new, read_bag
 from beetle_omni_ros.runs.json_file import check_writable, write_json
 from beetle_omni_ros.runs.metrics import failed, metrics
 from beetle_omni_ros.runs.tasks import make_task, Task
-from beetle_omni_ros.sim.faults import listed
+from beetle_omni_ros.sim import fault_lists as listed
 
 INTERRUPTED = 130
 VIEWER_STOP_TIMEOUT = 3.0       # s
