@@ -19,7 +19,7 @@ from beetle_omni_ros.runs.bag_writer import BagWriter
 from beetle_omni_ros.runs.report import make_page, make_runs, results_of
 from beetle_omni_ros.runs.targets import COLUMNS
 from beetle_omni_ros.runs.tasks import make_task, WAYPOINTS
-from beetle_omni_ros.sim.faults.listed import load_faults
+from beetle_omni_ros.sim.fault_lists import load_faults
 
 LEVEL, ZERO = np.array([0, 0, 0, 1.0]), np.zeros(3)
 LONGEST_TEXT = 2000     # characters of a refusal

@@ -47,7 +47,7 @@ class Processes:
         if self._schedule.empty:
             return frame
         self._schedule.update(frame.time)
-        self.clock_step = sum(effect.clock_step for effect in self._schedule.active)
+        self.clock_step = sum(self._schedule.each('clock'))
         if not self.supervisor_waits:
             self._deliver_queued()
         if not self.clock_step:
@@ -60,7 +60,7 @@ class Processes:
     @property
     def supervisor_waits(self) -> bool:
         """Whether the supervisor is not scheduled at present."""
-        return any(effect.supervisor_waits for effect in self._schedule.active)
+        return bool(self._schedule.each('waits'))
 
     def send(self, method: str, *message) -> None:
         """Call one of the supervisor's ``on_`` methods, or queue the message."""
@@ -77,25 +77,16 @@ class Processes:
 
     def estimate(self, state: State) -> State | None:
         """Estimate after the faults; None if it is not sent."""
-        for effect in self._schedule.active:
-            if state is None:
-                return None
-            state = effect.estimate(state)
-        return state
+        return next(iter(self._schedule.through('estimate', state, 0.0)), None)
 
     def requests(self, command: Command | None, now: float) -> list[Command]:
         """Commands of the active controller that arrive now; None: delayed ones only."""
-        passed = [] if command is None else [command]
-        for effect in self._schedule.active:
-            passed = [out for one in passed or [None] for out in effect.request(one, now)]
-        return passed
+        return self._schedule.through('request', command, now)
 
     def target(self, target: Target) -> PoseTarget | None:
         """Target of a fault while ``target`` is in force, or None."""
-        for effect in self._schedule.active:
-            pose = effect.target()
-            if pose is not None:
-                return PoseTarget(*pose, stamp=target.stamp)
+        for pose in self._schedule.each('target'):
+            return PoseTarget(*pose, stamp=target.stamp)
         return None
 
     @property
@@ -103,8 +94,8 @@ class Processes:
         """Bridge -> its reported state, if that has changed."""
         if self._schedule.empty:
             return {}
-        states = {name: text for effect in self._schedule.active
-                  for name, text in effect.bridges.items()}
+        states = {name: text for bridges in self._schedule.each('bridges')
+                  for name, text in bridges.items()}
         new = {name: text for name, text in states.items() if self._reported.get(name) != text}
         self._reported.update(new)
         return new

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 import joblib
 import numpy as np
 
-from beetle_omni_ros.sim.faults.listed import FaultList
+from beetle_omni_ros.sim.fault_lists import FaultList
 
 
 def fly_all(function: Callable, trials: Iterable, *arguments, jobs: int | None = None,

@@ -30,7 +30,7 @@ from beetle_omni_ros.pages.page import print_grids
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.files import check_writable, write_json
-from beetle_omni_ros.sim.faults.listed import FaultList
+from beetle_omni_ros.sim.fault_lists import FaultList
 
 PAGE = 'faults.html'
 

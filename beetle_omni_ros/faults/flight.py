@@ -16,8 +16,8 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.log import Tee
 from beetle_omni_ros.safety.events import INFO
 from beetle_omni_ros.safety.parameters import SupervisorParameters
+from beetle_omni_ros.sim.fault_lists import FaultList, FlightPlan
 from beetle_omni_ros.sim.faults import Fault
-from beetle_omni_ros.sim.faults.listed import FaultList, FlightPlan
 
 STARTS = ('hover', 'moving', 'upside_down')      # default
 ALL_STARTS = (*STARTS, 'random')

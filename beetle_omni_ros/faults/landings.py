@@ -10,8 +10,8 @@ from beetle_omni_ros.faults.flight import Flight
 from beetle_omni_ros.faults.trial import observed
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.safety.events import INFO
+from beetle_omni_ros.sim.fault_lists import FaultList
 from beetle_omni_ros.sim.faults import Fault
-from beetle_omni_ros.sim.faults.listed import FaultList
 
 CONDITIONS = ('nominal', 'published', 'effects')
 FRESH = 0.5     # [-] charge below which the pack is replaced before the next pose

@@ -9,7 +9,7 @@ import numpy as np
 
 from beetle_omni_ros.faults.trial import Trial
 from beetle_omni_ros.pages.page import ABSENT, frame, Grid, html, markdown, section, verdict_head
-from beetle_omni_ros.sim.faults.listed import OutcomeLimits
+from beetle_omni_ros.sim.fault_lists import OutcomeLimits
 
 BEGIN = '<!-- faults: begin, written by beetle_omni faults --docs -->'
 END = '<!-- faults: end -->'

@@ -14,7 +14,7 @@ from beetle_omni_ros.faults.watch import as_expected
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.runs.bag import read_bag
 from beetle_omni_ros.runs.bag_writer import BagWriter
-from beetle_omni_ros.sim.faults.listed import FaultList, FlightPlan
+from beetle_omni_ros.sim.fault_lists import FaultList, FlightPlan
 
 IN_FLIGHT = ('flying', 'fallback')
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from beetle_omni_ros.sim.faults.listed import OutcomeLimits
+from beetle_omni_ros.sim.fault_lists import OutcomeLimits
 from beetle_omni_ros.sim.readings import Impact, Truth
 
 # Expected outcome -> outcomes that are equal or better.

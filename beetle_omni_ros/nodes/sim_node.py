@@ -25,7 +25,7 @@ from beetle_omni_ros.sim.emulated.fault_switches import (
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
 from beetle_omni_ros.sim.emulated_actuators import EmulatedActuators
-from beetle_omni_ros.sim.faults.listed import DEVICES, parse_faults
+from beetle_omni_ros.sim.fault_lists import DEVICES, parse_faults
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.simulator import Simulator
 

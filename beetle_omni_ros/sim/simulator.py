@@ -13,14 +13,12 @@ from beetle_omni_ros.sim.battery import Battery
 from beetle_omni_ros.sim.command_link import CommandLink
 from beetle_omni_ros.sim.conditions import draw
 from beetle_omni_ros.sim.crash import CrashWatch
-from beetle_omni_ros.sim.faults.base import Actuation, Fault, World
-from beetle_omni_ros.sim.faults.schedule import Schedule
+from beetle_omni_ros.sim.faults import Actuation, Fault, READINGS, Schedule
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.plant import Plant, XYZW
 from beetle_omni_ros.sim.readings import Drive, Frame, Truth
 from beetle_omni_ros.sim.sensors import Sensors
 
-SENSORS = ('imu', 'mocap', 'joints', 'rotors', 'battery')     # attributes of a Frame
 POWERED, INTACT = (True,) * 4, np.ones(4)
 
 
@@ -92,7 +90,7 @@ class Simulator:
         self._link = CommandLink(self._robot, self._parameters.actuators, self.conditions)
         self.truth = self._truth()
         *seeds, fault_seed = np.random.SeedSequence(self._seed).spawn(7)[1:]
-        self._schedule = Schedule(self.tick, fault_seed)
+        self._schedule = Schedule(self.tick, fault_seed, self.battery)
         self._sensors = Sensors(self._parameters, self.conditions, seeds, self.truth,
                                 self._plant.effort, self._robot.sensors)
         self._sensors.start_imu(self.truth, self._plant.specific_force)
@@ -113,17 +111,9 @@ class Simulator:
 
         """
         accepted = True
-        for one in self._through_faults(command):
+        for one in self._schedule.through('command', command, self.time):
             accepted = self._link.push(one, self.time)
         return accepted
-
-    def _through_faults(self, command):
-        """Commands that arrive now if ``command``, or None, is sent through the active faults."""
-        arriving = [] if command is None else [command]
-        for effect in self._schedule.active:
-            arriving = [out for one in arriving or [None]
-                        for out in effect.command(one, self.time)]
-        return arriving
 
     def set_faults(self, faults: Sequence[Fault]) -> None:
         """
@@ -140,7 +130,7 @@ class Simulator:
             if fault.is_process:
                 raise ParameterError(f"fault '{fault.kind}': affects a process, not the simulated "
                                      'robot')
-        self._schedule.set(faults, self.time, self._world())
+        self._schedule.set(faults, self.time)
         self._apply_wrench()
 
     @property
@@ -158,18 +148,11 @@ class Simulator:
         """Delays of tilt and thrust commands from their stamps [s], effects included."""
         return self.conditions.command_delays(self._robot)
 
-    def _world(self):
-        return World(self.truth, self.battery, self._link.tilt)
-
     def _apply_wrench(self):
         """Set wrench and payload of the plant: those of the task and those of the faults."""
-        wrench, payload = self._wrench.copy(), self._payload
-        for effect in self._schedule.active:
-            payload += effect.payload
-            if effect.wrench is not None:
-                wrench += effect.wrench
+        wrench = sum(self._schedule.each('wrench'), self._wrench)
         self._plant.set_wrench(wrench[:3], wrench[3:])
-        self._plant.set_payload(payload)
+        self._plant.set_payload(sum(self._schedule.each('payload'), self._payload))
 
     @property
     def rejected(self) -> Counter:
@@ -242,10 +225,10 @@ class Simulator:
     def _switch_faults(self):
         """Start and end faults, and send commands that faults have delayed."""
         before = self._schedule.active
-        self._schedule.update(self.time, self._world())
+        self._schedule.update(self.time, self.truth, self._link.tilt)
         if self._schedule.active is not before:
             self._apply_wrench()
-        for command in self._through_faults(None):
+        for command in self._schedule.through('command', None, self.time):
             self._link.push(command, self.time)
 
     def _actuate(self, tilt, thrust, powered):
@@ -257,8 +240,7 @@ class Simulator:
             return INTACT
         drive = Actuation(np.array(tilt), np.array(thrust), np.array(powered), np.zeros(4, bool),
                           np.ones(4))
-        for effect in self._schedule.active:
-            effect.drive(drive)
+        self._schedule.each('drive', drive)
         if broken:
             drive.thrust[:], drive.powered[:] = 0.0, False
         limit = self._robot.joints.position_limit
@@ -268,13 +250,8 @@ class Simulator:
 
     def _with_sensor_faults(self, frame):
         """Frame with the readings changed by sensor faults."""
-        changed = {}
-        for name in SENSORS:
-            reading = getattr(frame, name)
-            for effect in self._schedule.active:
-                reading = getattr(effect, name)(reading, self.time)
-            changed[name] = reading
-        return replace(frame, **changed)
+        return replace(frame, **{name: next(iter(self._schedule.through(
+            name, getattr(frame, name), self.time)), None) for name in READINGS})
 
     def _truth(self):
         qpos, qvel = self._plant.state

@@ -10,7 +10,7 @@ import numpy as np
 from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters
 from beetle_omni_ros.drivers.motor_board import MotorBoard
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.sim.emulated.board_parameters import EmulatedBoardParameters
+from beetle_omni_ros.sim.emulated.board_firmware import EmulatedBoardParameters
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 
 QUICK = replace(EmulatedBoardParameters.load(), boot_time=0.05, heartbeat_timeout=0.5,

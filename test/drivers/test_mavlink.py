@@ -8,7 +8,7 @@ import reference_packets as reference
 
 from beetle_omni_ros.sim.emulated import board_firmware
 from beetle_omni_ros.sim.emulated import mavlink as emulated
-from beetle_omni_ros.sim.emulated.board_parameters import EmulatedBoardParameters
+from beetle_omni_ros.sim.emulated.board_firmware import EmulatedBoardParameters
 
 pytest.importorskip('pymavlink')
 

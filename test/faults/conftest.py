@@ -2,7 +2,7 @@
 
 import pytest
 
-from beetle_omni_ros.sim.faults.listed import FaultList
+from beetle_omni_ros.sim.fault_lists import FaultList
 
 
 @pytest.fixture(scope='session')

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.faults.watch import as_expected, FlightWatch
-from beetle_omni_ros.sim.faults.listed import OUTCOMES
+from beetle_omni_ros.sim.fault_lists import OUTCOMES
 from beetle_omni_ros.sim.readings import Impact, Truth
 
 TICK = 0.005

@@ -16,7 +16,7 @@ from beetle_omni_ros.comparison.page import page as comparison_page
 from beetle_omni_ros.comparison.page import Section
 from beetle_omni_ros.faults.page import as_page
 from beetle_omni_ros.pages.page import Grid, page, section, verdict_head
-from beetle_omni_ros.sim.faults.listed import FaultList
+from beetle_omni_ros.sim.fault_lists import FaultList
 
 ROOT = Path(__file__).parents[2]
 LONG = 'a text of many words that says what was found and what to do about it ' * 3

@@ -5,8 +5,7 @@ import pytest
 
 from beetle_omni_ros.sim.emulated import board_firmware as firmware
 from beetle_omni_ros.sim.emulated import mavlink
-from beetle_omni_ros.sim.emulated.board_firmware import BoardFirmware
-from beetle_omni_ros.sim.emulated.board_parameters import EmulatedBoardParameters
+from beetle_omni_ros.sim.emulated.board_firmware import BoardFirmware, EmulatedBoardParameters
 
 PARAMETERS = EmulatedBoardParameters.load()
 BOOTED = 100.0

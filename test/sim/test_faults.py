@@ -11,15 +11,13 @@ from sim_robots import HIGH, ROBOT, WORLD
 from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.sim.emulated.board_parameters import EmulatedBoardParameters
-from beetle_omni_ros.sim.faults import Fault, KINDS
-from beetle_omni_ros.sim.faults.base import Effect
-from beetle_omni_ros.sim.faults.listed import FaultList, load_faults, parse_faults
-from beetle_omni_ros.sim.faults.listed import text as text_of
+from beetle_omni_ros.sim.emulated.board_firmware import EmulatedBoardParameters
+from beetle_omni_ros.sim.fault_lists import FaultList, load_faults, parse_faults
+from beetle_omni_ros.sim.fault_lists import text as text_of
+from beetle_omni_ros.sim.faults import Fault, KINDS, OF_PROCESSES, READINGS
 from beetle_omni_ros.sim.simulator import Simulator
 
 HOVER = np.full(4, ROBOT.hover_thrust)
-READINGS = ('imu', 'mocap', 'joints', 'rotors', 'battery')
 # A value for each number that has no default.
 GIVEN = {'rotor': 2, 'servo': 3, 'share': 0.5, 'time_constant': 0.1, 'rate': 1.0, 'angle': 0.5,
          'delay': 0.03, 'period': 0.1, 'step': 0.5, 'axis': 5, 'charge': 0.3, 'resistance': 0.2,
@@ -73,12 +71,11 @@ def differing(frames, others, start=0):
     return found
 
 
-ROBOT_KINDS = sorted(name for name, kind in KINDS.items() if not kind.process)
-SENSING = {name: [hook for hook in READINGS if getattr(kind, hook) is not getattr(Effect, hook)]
-           for name, kind in KINDS.items()}
-PHYSICAL = {name for name in ROBOT_KINDS if KINDS[name].wrench is not Effect.wrench
-            or any(getattr(KINDS[name], hook) is not getattr(Effect, hook)
-                   for hook in ('drive', 'command', 'payload'))}
+ROBOT_KINDS = sorted(name for name, kind in KINDS.items()
+                     if OF_PROCESSES.isdisjoint(kind.functions))
+SENSING = {name: kind.functions.keys() & set(READINGS) for name, kind in KINDS.items()}
+PHYSICAL = {name for name in ROBOT_KINDS
+            if KINDS[name].functions.keys() & {'drive', 'command', 'wrench', 'payload'}}
 
 
 @pytest.fixture(scope='module')
@@ -96,7 +93,7 @@ def test_a_fault_kind_changes_its_quantity_from_its_start_only(kind, healthy):
     elif kind.startswith('battery_') and kind != 'battery_unread':
         assert 'battery' in changed
     else:
-        assert changed == set(SENSING[kind])
+        assert changed == SENSING[kind]
 
 
 @pytest.mark.parametrize('kind', ROBOT_KINDS)

@@ -5,11 +5,11 @@ All times are arguments [s] on a clock without steps. Each call first advances t
 time, so that the results do not depend on the frequency of calls.
 """
 
+from dataclasses import dataclass
 import math
 
+from beetle_omni_ros.robot.schema import parameter, ParameterFile
 from beetle_omni_ros.sim.emulated import mavlink
-from beetle_omni_ros.sim.emulated.board_parameters import EmulatedBoardParameters
-from beetle_omni_ros.sim.emulated.board_telemetry import BoardTelemetry
 
 BOOT, DISARMED, ARMED, RUNNING = range(4)
 NONE, ASKED, HEARTBEAT_LOST, IDLE, WATCHDOG = range(5)      # reasons of the last disarming
@@ -20,6 +20,169 @@ CONTRACT_VERSION = 1
 ARM_DISARM = 400                                            # MAV_CMD_COMPONENT_ARM_DISARM
 ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED = range(4)
 STOP = (0.0, 0.0, 0.0, 0.0)
+UNKNOWN_CELL, UNKNOWN_CURRENT = 65535, -1       # of BATTERY_STATUS
+GENERIC_FAILURE = 64                            # ESC_FAILURE_GENERIC
+PWM = 0                                         # ESC_CONNECTION_TYPE_PPM
+MIN_HEARTBEAT_PERIOD = 0.02                     # [s]
+
+
+@dataclass(frozen=True, kw_only=True)
+class EmulatedBoardParameters(ParameterFile, file='emulated_board.yaml'):
+    """Parameters of the firmware contract and of the emulated sensors."""
+
+    system: int = parameter(doc='MAVLink system ID', low=1, high=255)
+    component: int = parameter(doc='MAVLink component ID', low=1, high=255)
+    host_system: int = parameter(doc='system ID of the accepted sender', low=1, high=255)
+    host_component: int = parameter(doc='component ID of the accepted sender', low=1,
+                                    high=255)
+    target_timeout: float = parameter(doc='time without a new target after which the rotors stop',
+                                      unit='s', low=0.01, high=1)
+    heartbeat_timeout: float = parameter(doc='time without a heartbeat after which it disarms',
+                                         unit='s', low=0.1, high=10)
+    idle_timeout: float = parameter(doc='time armed without a target after which it disarms',
+                                    unit='s', low=0.1, high=60)
+    throttle_low_time: float = parameter(doc='time without a nonzero target before arming',
+                                         unit='s', low=0, high=10)
+    target_age_limit: float = parameter(doc='largest age of a target', unit='s', low=0.01, high=10)
+    target_future_limit: float = parameter(doc='largest lead of a stamp over the clock',
+                                           unit='s', low=0, high=10)
+    watchdog_time: float = parameter(doc='time from a hang to the reset', unit='s', low=0.001,
+                                     high=1)
+    boot_time: float = parameter(doc='time from a reset to the first heartbeat', unit='s', low=0,
+                                 high=10)
+    arm_cell_voltage: float = parameter(doc='smallest cell voltage for arming', unit='V', low=0,
+                                        high=5)
+    heartbeat_rate: float = parameter(doc='rate of HEARTBEAT', unit='Hz', low=1, high=50)
+    battery_rate: float = parameter(doc='rate of BATTERY_STATUS', unit='Hz', low=1, high=200)
+    rotor_rate: float = parameter(doc='rate of ESC_STATUS', unit='Hz', low=1, high=500)
+    rotor_info_rate: float = parameter(doc='rate of ESC_INFO', unit='Hz', low=0.1, high=50)
+    reception_rate: float = parameter(doc='rate of SYS_STATUS', unit='Hz', low=0.1, high=50)
+    clock_start: float = parameter(doc='clock of the board at the start', unit='s', low=0,
+                                   high=1e6)
+    clock_drift: float = parameter(doc='drift of the clock of the board', unit='s/s', low=-0.01,
+                                   high=0.01)
+    rpm_at_1_newton: float = parameter(doc='speed of a rotor at 1 N', unit='1/min', low=1,
+                                       high=1e5)
+    idle_temperature: float = parameter(doc='temperature of the ESCs', unit='C', low=-40, high=150)
+
+
+class Timer:
+    """Is due at a fixed rate without drift, and once after a pause."""
+
+    def __init__(self, rate: float):
+        self._period = 1 / rate
+        self.next = 0.0
+
+    def due(self, now: float) -> bool:
+        """Whether it is due at ``now`` [s]; then set the next time."""
+        if now < self.next:
+            return False
+        self.next += self._period * (1 + math.floor((now - self.next) / self._period))
+        return True
+
+
+class BoardTelemetry:
+    """
+    Measurements and the rates of their messages.
+
+    Attributes:
+        voltage: battery voltage [V]; NaN without a measurement.
+        current: current drawn from the battery [A]; NaN without a measurement.
+        rpm: speeds of the four rotors [1/min].
+        rotor_current: currents of the four rotors [A].
+        temperature: temperatures of the four ESCs [C].
+        failed: rotors (0 to 3) whose ESC has failed.
+
+    """
+
+    def __init__(self, parameters: EmulatedBoardParameters, cells: int):
+        self._arm_voltage = cells * parameters.arm_cell_voltage
+        self._heartbeat = Timer(parameters.heartbeat_rate)
+        self._reception = Timer(parameters.reception_rate)
+        self._battery = Timer(parameters.battery_rate)
+        self._rotors = Timer(parameters.rotor_rate)
+        self._info = Timer(parameters.rotor_info_rate)
+        self.voltage = self.current = math.nan
+        self.rpm, self.rotor_current = [0.0] * 4, [0.0] * 4
+        self.temperature = [parameters.idle_temperature] * 4
+        self.failed: frozenset[int] = frozenset()
+
+    def restart(self, at: float) -> None:
+        """Restart all messages at time ``at`` [s]."""
+        for timer in (self._heartbeat, self._reception, self._battery, self._rotors, self._info):
+            timer.next = at
+        self._sent_mode, self._sent_at, self._sent_failed = None, -math.inf, None
+        self._errors, self._packets = [0] * 4, 0
+
+    @property
+    def battery_low(self) -> bool:
+        """Whether the voltage is too low for arming, or unknown."""
+        return not self.voltage >= self._arm_voltage
+
+    def next(self) -> float:
+        """Time of the next message [s]."""
+        return min(self._heartbeat.next, self._reception.next, self._battery.next,
+                   self._rotors.next, self._info.next)
+
+    def heartbeat_due(self, now: float, beat: tuple[int, tuple]) -> bool:
+        """Whether to send the heartbeat, because it is due or its content has changed."""
+        mode = beat[1][0]
+        changed = mode != self._sent_mode and now - self._sent_at >= MIN_HEARTBEAT_PERIOD
+        if not self._heartbeat.due(now) and not changed:
+            return False
+        self._sent_mode, self._sent_at = mode, now
+        return True
+
+    def reception_due(self, now: float) -> bool:
+        """Whether to send SYS_STATUS."""
+        return self._reception.due(now)
+
+    def due(self, now: float, stamp: int) -> list[tuple[int, tuple]]:
+        """Telemetry messages that are due; ``stamp`` [us] is the clock of the board."""
+        messages = []
+        if self._info.due(now) or self.failed != self._sent_failed:
+            self._sent_failed = self.failed
+            messages.append(self._esc_info(stamp))
+        if self._rotors.due(now):
+            messages.append(self._esc_status(stamp))
+        if self._battery.due(now):
+            messages.append(self._battery_status())
+        return messages
+
+    def reception(self, counts: tuple[int, int, int, int]) -> tuple[int, tuple]:
+        """SYS_STATUS with ``counts``: lost, bad checksum, refused targets, timeouts."""
+        lost, bad, refused, timeouts = (min(count, 65535) for count in counts)
+        voltage = UNKNOWN_CELL if math.isnan(self.voltage) else round(1000 * self.voltage)
+        return mavlink.SYS_STATUS, (0, 0, 0, 0, voltage, self._centiampere(), 0,
+                                    min(lost + bad, 65535), lost, bad, refused, timeouts, -1)
+
+    def _centiampere(self):
+        return UNKNOWN_CURRENT if math.isnan(self.current) else \
+            max(-32768, min(32767, round(100 * self.current)))
+
+    def _battery_status(self):
+        total = UNKNOWN_CELL if math.isnan(self.voltage) else \
+            max(0, min(UNKNOWN_CELL - 1, round(1000 * self.voltage)))
+        return mavlink.BATTERY_STATUS, (-1, -1, 32767, total, *[UNKNOWN_CELL] * 9,
+                                        self._centiampere(), 0, 0, 1, -1)
+
+    def _esc_status(self, stamp):
+        self._packets += 1
+        volts = 0.0 if math.isnan(self.voltage) else self.voltage
+        dead = self.failed
+        return mavlink.ESC_STATUS, (
+            stamp, *(0 if k in dead else round(self.rpm[k]) for k in range(4)),
+            *(0.0 if k in dead else volts for k in range(4)),
+            *(0.0 if k in dead else self.rotor_current[k] for k in range(4)), 0)
+
+    def _esc_info(self, stamp):
+        self._errors = [count + (k in self.failed) for k, count in enumerate(self._errors)]
+        online = sum(1 << k for k in range(4) if k not in self.failed)
+        return mavlink.ESC_INFO, (
+            stamp, *self._errors, self._packets % 65536,
+            *(GENERIC_FAILURE * (k in self.failed) for k in range(4)),
+            *(32767 if k in self.failed else round(100 * self.temperature[k]) for k in range(4)),
+            0, 4, PWM, online)
 
 
 class BoardFirmware:

@@ -15,8 +15,7 @@ import numpy as np
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.thrust_map import duty_of_command, ThrustMap
 from beetle_omni_ros.sim.emulated import mavlink
-from beetle_omni_ros.sim.emulated.board_firmware import BoardFirmware
-from beetle_omni_ros.sim.emulated.board_parameters import EmulatedBoardParameters
+from beetle_omni_ros.sim.emulated.board_firmware import BoardFirmware, EmulatedBoardParameters
 from beetle_omni_ros.sim.emulated.fault_switches import BoardFaults
 from beetle_omni_ros.sim.emulated.pseudo_terminal import PseudoTerminal
 

@@ -12,9 +12,9 @@ from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import parameter, ParameterError
 from beetle_omni_ros.robot.yaml_file import quoted, shortened
-from beetle_omni_ros.sim.faults.base import Fault, KINDS
+from beetle_omni_ros.sim.faults import Fault, KINDS
 
-# Hooks without effect if the devices are emulated.
+# Signals without effect if the devices are emulated.
 DEVICES = 'joints', 'rotors', 'battery', 'command'
 GROUPS = ('limits', 'flight', 'healthy')
 OUTCOMES = ('flies_on', 'lands', 'stops', 'refused')
