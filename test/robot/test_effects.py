@@ -10,8 +10,8 @@ from beetle_omni_ros.robot.effects import CATALOGUE, delaying
 
 PACKAGE = Path(__file__).resolve().parents[2] / 'beetle_omni_ros'
 PARAMETERS = {name for effect in CATALOGUE.values() for name in effect.parameters}
-# The response log's own terms (natural frequency, damping ratio, dead bands) and the numbers of the
-# simulator's faults share a few of the catalogue's words: delay, offset, stiction, velocity_limit.
+# The response log's own terms (natural frequency, damping ratio, dead bands) and the numbers of
+# simulated faults share a few of the catalogue's words: delay, offset, stiction, velocity_limit.
 MOST_TABLES = 6
 
 
