@@ -47,14 +47,16 @@ class SerialPort:
 
     def read(self, size: int = 4096) -> bytes:
         """Return the received bytes, at most ``size``, also if there are none."""
+        # Asked before the read: bytes that arrive after an empty read are no lost port.
+        if not select.select([self.fd], [], [], 0)[0]:
+            return b''
         try:
             data = os.read(self.fd, size)
         except BlockingIOError:
             return b''
         except OSError as error:
             raise SerialPortError(f'{self.name}: {_cause(error)}') from None
-        if not data and select.select([self.fd], [], [], 0)[0]:
-            # A tty whose other end is closed is readable and empty.
+        if not data:    # a tty whose other end is closed is readable and empty
             raise SerialPortError(f'{self.name}: unplugged')
         return data
 

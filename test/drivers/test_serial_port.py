@@ -57,6 +57,24 @@ def test_an_unplugged_device_is_an_error_of_one_line(ends):
     port.close()
 
 
+def test_bytes_that_arrive_during_a_read_are_no_lost_port(ends, monkeypatch):
+    far, name = ends
+    port, read = SerialPort(name, 1_000_000), os.read
+
+    def late(descriptor, size):
+        data = read(descriptor, size)
+        os.write(far, b'late')
+        return data
+
+    monkeypatch.setattr(os, 'read', late)
+    received = [port.read() for _ in range(3)]
+    os.write(far, b'early')
+    received += [port.read() for _ in range(3)]
+    monkeypatch.undo()
+    port.close()
+    assert b'early' in b''.join(received)
+
+
 def test_a_port_that_cannot_be_opened_is_refused_with_the_remedy(ends, tmp_path):
     port = SerialPort(ends[1], 921600)
     with pytest.raises(SerialPortError, match='in use by another process'):
