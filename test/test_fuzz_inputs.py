@@ -34,11 +34,11 @@ VALUES = ('.nan', '.inf', '-.inf', '3', '-1', '0', '1e400', '9' * 5000, '0x' + '
           '[' * 5000, '1:90', '<<', '? {a: b}', '"\\0"', '[.nan, 1]', '[x, 1, 2]', '!!set {a, b}')
 
 
-def mutate_bytes(rng, data):
-    """Flip, cut out, repeat or append some bytes."""
+def mutate_bytes(rng, data, changes=5, longest=39):
+    """Flip, cut out, repeat or replace some bytes."""
     data = bytearray(data)
-    for _ in range(rng.integers(1, 6)):
-        at, length = int(rng.integers(len(data) + 1)), int(rng.integers(1, 40))
+    for _ in range(rng.integers(1, changes + 1)):
+        at, length = int(rng.integers(len(data) + 1)), int(rng.integers(1, longest + 1))
         match rng.integers(5):
             case 0 if at < len(data):
                 data[at] ^= 1 << int(rng.integers(8))

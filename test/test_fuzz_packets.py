@@ -6,6 +6,7 @@ import time
 
 import numpy as np
 import pytest
+from test_fuzz_inputs import mutate_bytes
 
 pytest.importorskip('rclpy')
 pytest.importorskip('pymavlink')
@@ -33,22 +34,8 @@ LONGEST_TEXT = 500
 
 
 def mutated(rng, data):
-    """Flip, cut, repeat or replace some bytes."""
-    data = bytearray(data)
-    for _ in range(rng.integers(1, 4)):
-        at, length = int(rng.integers(len(data) + 1)), int(rng.integers(1, 12))
-        match rng.integers(5):
-            case 0 if at < len(data):
-                data[at] ^= 1 << int(rng.integers(8))
-            case 1:
-                del data[at:at + length]
-            case 2:
-                data[at:at] = data[at:at + length]
-            case 3:
-                data[at:at + length] = rng.bytes(length)
-            case 4:
-                del data[at:]
-    return bytes(data)
+    """Change some bytes of a packet."""
+    return mutate_bytes(rng, data, changes=3, longest=11)
 
 
 class Board:
