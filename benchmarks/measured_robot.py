@@ -5,11 +5,11 @@ False alarms and reached poses on the measured robot, and on robots drawn from i
                                         [--robot FILE] [--plant measured] [--jobs 2] [--json FILE]
 
 Each controller flies `--hours` in each condition to random poses of 8 s, in flights of 15 poses.
-It also flies ten poses with each of `--draws` robots, whose measured values are drawn uniformly
-from the intervals of the robot file. No fault is injected, so each reported fault, fallback or
-landing is a false alarm. The bound is the largest rate with which so few alarms still occur in 5 %
-of such campaigns; without an alarm it is 3 / hours. The flight stack has the shipped robot file,
-or `--robot`.
+It also flies ten poses with each of `--draws` robots, whose measured values are drawn from the
+intervals of the robot file (`RobotParameters.drawn`). No fault is injected, so each reported
+fault, fallback or landing is a false alarm. The bound is the largest rate with which so few alarms
+still occur in 5 % of such campaigns; without an alarm it is 3 / hours. The flight stack has the
+shipped robot file, or `--robot`.
 """
 
 from __future__ import annotations
