@@ -70,7 +70,7 @@ def assess(mean: Callable[[torch.Tensor], torch.Tensor], parameters: TrainParame
     start = {entry.name: 0.0 for entry in fields(StartParameters)}
     start.update(hold=1.0)
     episode = replace(
-        parameters.episode, duration=1e6, hold_targets=0.0, replay_share=0.0,
+        parameters.episode, duration=1e6, hold_targets=0.0, replay_share=0.0, trim_share=1.0,
         target_time=np.array([SEGMENT, SEGMENT]), region=np.array([4.0, 4.0, 1.4]))
     env = TiltableQuadrotorEnv(replace(
         parameters, ppo=replace(parameters.ppo, robots=robots), episode=episode,

@@ -31,11 +31,17 @@ def from_rotation_vector(vector: torch.Tensor) -> torch.Tensor:
 def geodesic(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     """Angle (N,) [rad] between rotation matrices (N, 3, 3), accurate also for small angles."""
     relative = transpose_product(a, b)
-    sine = 0.5 * torch.stack((relative[:, 2, 1] - relative[:, 1, 2],
-                              relative[:, 0, 2] - relative[:, 2, 0],
-                              relative[:, 1, 0] - relative[:, 0, 1]), -1).norm(dim=-1)
+    sine = small_turn(a, b).norm(dim=-1)
     cosine = 0.5 * (relative[:, 0, 0] + relative[:, 1, 1] + relative[:, 2, 2] - 1)
     return torch.atan2(sine, cosine)
+
+
+def small_turn(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Rotation vectors (N, 3) [rad] from matrices a to b, in the axes of a, for small angles."""
+    relative = transpose_product(a, b)
+    return 0.5 * torch.stack((relative[:, 2, 1] - relative[:, 1, 2],
+                              relative[:, 0, 2] - relative[:, 2, 0],
+                              relative[:, 1, 0] - relative[:, 0, 1]), -1)
 
 
 def transpose_product(rotation: torch.Tensor, other: torch.Tensor) -> torch.Tensor:

@@ -11,6 +11,7 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 import torch
 
+from beetle_omni_ros.control.guidance.trimming import TrimmingParameters
 from beetle_omni_ros.control.policy_file import PolicyContract
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -32,7 +33,7 @@ from beetle_omni_ros.train.replays import (
     spread,
 )
 
-NUMBERS = 166       # random numbers for each robot and step
+NUMBERS = 167       # random numbers for each robot and step
 REACHED_POSITION, REACHED_ATTITUDE = 0.10, 0.17453    # [m], [rad] limits of the task metrics
 
 
@@ -80,6 +81,7 @@ class TiltableQuadrotorEnv(VecEnv):
         self._axes = self._tensor(robot.tilt_axes)
         self._sideways = self._tensor(np.cross(robot.tilt_axes, [0.0, 0.0, 1.0]))
         self._nominal_mass = nominal_body(robot)[0]
+        self._trimming = TrimmingParameters()
         self.base_weights = self._tensor([getattr(parameters.reward, name)
                                           for name in rewards.TERMS]) * parameters.reward.scale
         self.weights = self.base_weights.clone()
@@ -97,7 +99,7 @@ class TiltableQuadrotorEnv(VecEnv):
         self._finish = self._after_physics
         if compiled if compiled is not None else self.device.type == 'cuda':
             self._finish = torch.compile(self._after_physics, fullgraph=True, dynamic=False)
-        self.observation, self.critic = self._observe(self.state, batch.Draw(numbers[:, 129:]))
+        self.observation, self.critic = self._observe(self.state, batch.Draw(numbers[:, 130:]))
         self.reward = torch.zeros(self.num_envs, device=self.device)
         self.done = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self.timeout = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
@@ -110,7 +112,7 @@ class TiltableQuadrotorEnv(VecEnv):
         return torch.rand(self.num_envs, NUMBERS, device=self.device)
 
     def get_observations(self) -> TensorDict:
-        """Observation groups 'actor' (N, 33 or 39) and 'critic' (N, 41 or 47)."""
+        """Observation groups 'actor' (N, 33 or 39) and 'critic' (N, 47 or 53)."""
         return TensorDict({'actor': self.observation, 'critic': self.critic},
                           batch_size=[self.num_envs], device=self.device)
 
@@ -218,8 +220,24 @@ class TiltableQuadrotorEnv(VecEnv):
             target_left=s['target_left'] - 1, deepest=torch.maximum(s['deepest'], depth),
             past_motion=torch.cat((motion[:, None], s['past_motion'][:, :3]), 1),
             past_tilt=torch.cat((s['x'][:, None, model.TILT], s['past_tilt'][:, :1]), 1),
+            trim=self._trim(s, x),
             estimate=self._disturbance_estimate(s, x, rotation))
         return new
+
+    def _trim(self, s, x):
+        """(N, 6) shift of the target, as :class:`control.guidance.trimming.Trimming`."""
+        p, rate = self._trimming, self._trimming.rate * self.cfg.episode.period
+        way = s['target_position'] - x[:, model.POSITION] - s['bias'][:, 0:3]
+        seen = batch.product(x[:, model.QUATERNION],
+                             batch.from_rotation_vector(s['bias'][:, 3:6]))
+        turn = batch.small_turn(batch.matrix(seen), batch.matrix(s['target_attitude']))
+        steady = (way.norm(dim=-1) <= p.near_distance) & (turn.norm(dim=-1) <= p.near_angle) \
+            & (x[:, model.VELOCITY].norm(dim=-1) <= p.speed) \
+            & (x[:, model.RATE].norm(dim=-1) <= p.turn_rate)
+        made = s['trim'] + rate * s['trimmed'] * steady[:, None] * torch.cat((way, turn), -1)
+        parts = [part * (limit / part.norm(dim=-1, keepdim=True).clamp(min=limit))
+                 for part, limit in zip(made.split(3, -1), (p.distance, p.angle))]
+        return torch.cat(parts, -1)
 
     def _disturbance_estimate(self, s, x, rotation):
         """
@@ -261,6 +279,12 @@ class TiltableQuadrotorEnv(VecEnv):
         changed = dict(new)
         for name, value in target.items():
             changed[name] = torch.where(spread(due, value), value, new[name])
+        way = changed['target_position'] - new['target_position']
+        turn = batch.geodesic(batch.matrix(changed['target_attitude']),
+                              batch.matrix(new['target_attitude']))
+        near = (way.norm(dim=-1) <= self._trimming.near_distance) \
+            & (turn <= self._trimming.near_angle)
+        changed['trim'] = new['trim'] * near[:, None]
         return changed
 
     def _observe(self, s, draw):

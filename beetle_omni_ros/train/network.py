@@ -21,7 +21,7 @@ RATE, FORCE, TORQUE, THRUST, TILT_ACTION, THRUST_ACTION = 0.5, 0.1, 2.0, 0.1, 0.
 VELOCITY, ANGULAR_VELOCITY, TARGET = slice(0, 3), slice(3, 6), slice(6, 9)
 ATTITUDES, TILT = slice(9, 21), slice(21, 25)     # of body and target; joints
 ACTION, ACTOR_SIZE = slice(25, 33), 33
-ROTORS, CRITIC_ACTION, CRITIC_SIZE = slice(25, 33), slice(33, 41), 41
+ROTORS, CRITIC_ACTION, TRIM, CRITIC_SIZE = slice(25, 33), slice(33, 41), slice(41, 47), 47
 
 
 def features(observation: torch.Tensor) -> torch.Tensor:
@@ -31,11 +31,11 @@ def features(observation: torch.Tensor) -> torch.Tensor:
 
 
 def critic_features(state: torch.Tensor) -> torch.Tensor:
-    """(N, 58) features of the (N, 41) privileged state, or (N, 64) of (N, 47)."""
+    """(N, 64) features of the (N, 47) privileged state, or (N, 70) of (N, 53)."""
     shared = _shared(state, state[..., CRITIC_ACTION])
     rotors = state[..., ROTORS]
     return torch.cat([*shared, rotors[..., :4], THRUST * rotors[..., 4:],
-                      *_disturbance(state[..., CRITIC_SIZE:])], -1)
+                      state[..., TRIM] / NEAR, *_disturbance(state[..., CRITIC_SIZE:])], -1)
 
 
 def _shared(o, action):
@@ -104,7 +104,7 @@ class CriticModel(MLPModel):
     """Critic: value of the privileged state."""
 
     def value(self, state: torch.Tensor) -> torch.Tensor:
-        """(N, 1) values of (N, 41 or 47) states."""
+        """(N, 1) values of (N, 47 or 53) states."""
         return self.mlp(critic_features(state))
 
     def forward(self, obs, masks=None, hidden_state=None, stochastic_output=False):

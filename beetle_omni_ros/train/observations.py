@@ -81,9 +81,12 @@ def extrapolated(history: torch.Tensor, delay: torch.Tensor, ahead: torch.Tensor
 
 def actor_observation(signals: Signals, s, previous_action, estimate=None, draw=None):
     """(N, 33) observation; with ``estimate``, (N, 39) with the disturbance estimate."""
-    target = batch.matrix(s['target_attitude'])
+    trim = s['trim']
+    target = batch.matrix(batch.product(s['target_attitude'],
+                                        batch.from_rotation_vector(trim[:, 3:])))
     blocks = [signals.velocity, signals.rate,
-              batch.transpose_product(signals.rotation, s['target_position'] - signals.position),
+              batch.transpose_product(signals.rotation,
+                                      s['target_position'] + trim[:, :3] - signals.position),
               signals.rotation[:, :, 0], signals.rotation[:, :, 2], target[:, :, 0],
               target[:, :, 2], signals.tilt, previous_action]
     if estimate is not None:
@@ -95,14 +98,14 @@ def actor_observation(signals: Signals, s, previous_action, estimate=None, draw=
 
 
 def critic_observation(s, previous_action, torque_ratio, memory: bool = False):
-    """(N, 41) true state with reaction torques and thrusts of the rotors; + 6 with memory."""
+    """(N, 47) true state with torques and thrusts of the rotors and trim; + 6 with memory."""
     x = s['x']
     rotation, target = batch.matrix(x[:, model.QUATERNION]), batch.matrix(s['target_attitude'])
     thrust = x[:, model.THRUST]
     blocks = [batch.transpose_product(rotation, x[:, model.VELOCITY]), x[:, model.RATE],
               batch.transpose_product(rotation, s['target_position'] - x[:, model.POSITION]),
               rotation[:, :, 0], rotation[:, :, 2], target[:, :, 0], target[:, :, 2],
-              x[:, model.TILT], torque_ratio * thrust, thrust, previous_action]
+              x[:, model.TILT], torque_ratio * thrust, thrust, previous_action, s['trim']]
     if memory:
         blocks += [batch.transpose_product(rotation, s['estimate'][:, :3]), s['estimate'][:, 3:]]
     return torch.cat(blocks, -1)

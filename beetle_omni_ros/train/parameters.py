@@ -38,6 +38,9 @@ class EpisodeParameters:
                                   low=1, high=200)
     hold_targets: float = parameter(0.1, doc='fraction of new targets near the present pose, '
                                              'to train holding', low=0, high=1)
+    trim_share: float = parameter(
+        0.5, doc='fraction of robots that fly with the trimming, whose integral needs damping; '
+        'the others need accuracy', low=0, high=1)
     replay_share: float = parameter(
         0.3, doc='largest fraction of the episodes that begin with an earlier miss',
         low=0, high=0.9)
@@ -176,10 +179,10 @@ class RewardWeights:
     z_axis_align: float = parameter(-0.1, doc='published')
     thrust_allocation: float = parameter(-1e-5, doc='published')
     attitude: float = parameter(-2.5, doc='own: slope far from the target')
-    near_position: float = parameter(2.5, doc='own: slope close to the target')
-    near_attitude: float = parameter(1.5, doc='own: slope close to the target')
+    near_position: float = parameter(3.5, doc='own: slope close to the target')
+    near_attitude: float = parameter(2.5, doc='own: slope close to the target')
     near_pose: float = parameter(1.5, doc='own: slope close to the target')
-    exact_pose: float = parameter(1.5, doc='own: slope in the last centimetres')
+    exact_pose: float = parameter(2.5, doc='own: slope in the last centimetres')
     joint_winding: float = parameter(-3.0, doc='own: joints beyond half a turn')
     hover_tilt_rate: float = parameter(-60.0, doc='own: smooth commands at the target')
     hover_thrust_rate: float = parameter(-1.5, doc='own: smooth commands at the target')
@@ -265,7 +268,7 @@ class TrainParameters(ParameterFile, file='train.yaml'):
     """All parameters of a training; each run saves them beside its checkpoints."""
 
     seed: int = parameter(0, doc='random seed', low=0, high=2**31 - 1)
-    iterations: int = parameter(6800, doc='PPO iterations', low=1, high=10**7)
+    iterations: int = parameter(6400, doc='PPO iterations', low=1, high=10**7)
     memory: bool = parameter(False, doc='whether the policy observes the disturbance estimate')
     log_every: int = parameter(50, doc='iterations between two rows of progress', low=1,
                                high=10**6)

@@ -115,11 +115,12 @@ class Starts:
         state = {'x': x, 'previous': command, 'older': command,
                  'past_motion': motion[:, None].expand(-1, 4, -1),
                  'past_tilt': tilt[:, None].expand(-1, 2, -1),
-                 'age': torch.zeros_like(tilt[:, 0])}
+                 'age': torch.zeros_like(tilt[:, 0]), 'trim': torch.zeros_like(x[:, :6])}
         state.update(self.target(d, x[:, :3], attitude))
         state['target_attitude'] = torch.where(self._is['hold'], attitude,
                                                state['target_attitude'])
         state.update(self._randomisation(d))
+        state['trimmed'] = d.chance(self._p.episode.trim_share).float()
         return {name: value.contiguous() for name, value in state.items()}
 
     def _hover(self, d, attitude):

@@ -327,6 +327,6 @@ def test_the_interface_is_that_of_rsl_rl():
     env = environment()
     observations, reward, done, extras = env.step(torch.zeros(env.num_envs, 8))
     assert observations['actor'].shape == (env.num_envs, 33)
-    assert observations['critic'].shape == (env.num_envs, 41)
+    assert observations['critic'].shape == (env.num_envs, 47)
     assert reward.shape == done.shape == extras['time_outs'].shape == (env.num_envs,)
     assert env.episode_length_buf.dtype == torch.long

@@ -6,7 +6,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 import torch
 
-from beetle_omni_ros.control.base import Reference, State
+from beetle_omni_ros.control.base import PoseTarget, Reference, State
+from beetle_omni_ros.control.guidance.trimming import Trimming, TrimmingParameters
 from beetle_omni_ros.control.observation import observation
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.train import batch
@@ -62,7 +63,7 @@ def test_the_critic_observes_the_truth_with_rotor_torques_and_thrusts(memory):
     env = environment({'memory': memory, 'random.noise_power': 0})
     s = scattered(env)
     _, seen = env._observe(s, draw(env))
-    assert seen.shape == (env.num_envs, 47 if memory else 41)
+    assert seen.shape == (env.num_envs, 53 if memory else 47)
     x, seen = s['x'].double().numpy(), seen.double().numpy()
     body = Rotation.from_quat(x[:, 6:10])
     goal = Rotation.from_quat(s['target_attitude'].numpy()).as_matrix()
@@ -72,7 +73,7 @@ def test_the_critic_observes_the_truth_with_rotor_torques_and_thrusts(memory):
     columns = [back.apply(x[:, 3:6]), x[:, 10:13],
                back.apply(s['target_position'].numpy() - x[:, :3]),
                body.as_matrix()[:, :, 0], body.as_matrix()[:, :, 2], goal[:, :, 0], goal[:, :, 2],
-               x[:, 13:17], torque, x[:, 21:25], action]
+               x[:, 13:17], torque, x[:, 21:25], action, s['trim']]
     if memory:
         columns += [back.apply(s['estimate'][:, :3].numpy()), s['estimate'][:, 3:]]
     np.testing.assert_allclose(seen, np.hstack(columns), atol=2e-5)
@@ -195,3 +196,44 @@ def test_the_estimate_is_observed_with_its_noise_and_bias():
     force = batch.transpose_product(batch.matrix(s['x'][:, 6:10]), s['estimate'][:, :3])
     assert 0.295 < float((seen[:, 33:36] - force).abs().max()) < 0.3001
     assert 0.195 < float((seen[:, 36:] - s['estimate'][:, 3:]).abs().max()) < 0.2001
+
+
+def test_the_trimming_of_the_batch_is_that_of_the_controller():
+    """Steady and moving robots near and far from their targets, for 2 s."""
+    env = quiet({'episode.trim_share': 0.5})
+    s = scattered(env)
+    near = torch.arange(env.num_envs) % 3 > 0
+    s['x'][near, model.VELOCITY] = 0.05
+    s['x'][near, model.RATE] = 0.1
+    offset = torch.tensor([0.04, -0.03, 0.05])
+    s['x'][near, :3] = (s['target_position'] + offset)[near]
+    turn = batch.from_rotation_vector(torch.tensor([[0.02, -0.05, 0.04]]))
+    s['x'][near, model.QUATERNION] = batch.product(s['target_attitude'], turn)[near]
+    steps = 200
+    for _ in range(steps):
+        s['trim'] = env._trim(s, s['x'])
+    for k in range(env.num_envs):
+        x = s['x'][k].double().numpy()
+        given = PoseTarget(s['target_position'][k].double().numpy(),
+                           s['target_attitude'][k].double().numpy(), 0.0)
+        trimming = Trimming(TrimmingParameters())
+        for step in range(steps + 1):
+            trimming.target(State(0.01 * step, x[:3], x[model.VELOCITY], x[model.QUATERNION],
+                                  x[model.RATE], x[model.TILT], x[model.TILT_RATE], 0.0), given)
+        expected = s['trimmed'][k, 0].item() * np.array(trimming.position + trimming.rotation)
+        np.testing.assert_allclose(s['trim'][k], expected, atol=2e-4)
+    assert (s['trim'].norm(dim=-1) > 0.05).sum() > env.num_envs / 5
+
+
+def test_the_actor_observes_the_target_that_the_trimming_shifts():
+    env = quiet({})
+    s = scattered(env)
+    trim = torch.linspace(-0.05, 0.05, 6).expand(env.num_envs, -1).contiguous()
+    s['trim'] = trim
+    shifted, _ = env._observe(s, draw(env))
+    turn = batch.from_rotation_vector(trim[:, 3:])
+    s['target_attitude'] = batch.product(s['target_attitude'], turn)
+    s['target_position'] = s['target_position'] + trim[:, :3]
+    s['trim'] = torch.zeros_like(trim)
+    given, _ = env._observe(s, draw(env))
+    torch.testing.assert_close(shifted, given)
