@@ -9,8 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from beetle_omni_ros.robot import rotations, schema
-from beetle_omni_ros.robot.schema import parameter, ParameterError, ParameterFile
-from beetle_omni_ros.robot.yaml_file import quoted
+from beetle_omni_ros.robot.schema import parameter, ParameterError, ParameterFile, quoted
 
 BUTTONS = ('arm', 'land', 'hold', 'home')
 NEAR = 1e-9     # [m, rad] distance from the goal that counts as arrived

@@ -25,9 +25,8 @@ import numpy as np
 
 from beetle_omni_ros.control.base import Command, Followed, State
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
-from beetle_omni_ros.robot.allocation import clipped, nearest_turn
-from beetle_omni_ros.robot.degraded_allocation import allocator, DegradedAllocator, LocalWeights
+from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY, clipped, nearest_turn
+from beetle_omni_ros.robot.degraded import allocator, DegradedAllocator, LocalWeights
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import group, parameter, ParameterFile
 

@@ -11,8 +11,7 @@ import numpy as np
 from beetle_omni_ros.control.base import PoseTarget, Target
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import parameter, ParameterError, ParameterFile
-from beetle_omni_ros.robot.yaml_file import quoted
+from beetle_omni_ros.robot.schema import parameter, ParameterError, ParameterFile, quoted
 from beetle_omni_ros.runs.files import read_table
 
 UNIT_TOLERANCE = 0.02   # of a quaternion's squared length

@@ -3,8 +3,13 @@
 import mujoco
 import numpy as np
 
-from beetle_omni_ros.robot.mass_properties import combined, mass_properties, RigidPart, Variation
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.parameters import (
+    combined,
+    mass_properties,
+    RigidPart,
+    RobotParameters,
+    Variation,
+)
 from beetle_omni_ros.sim.parameters import PlantParameters
 
 BASE = 1                        # body index of base_link; 0 is the world

@@ -8,8 +8,7 @@ import numpy as np
 from beetle_omni_ros.robot import dynamics, rotations
 from beetle_omni_ros.robot.allocation import clipped
 from beetle_omni_ros.robot.effects import CATALOGUE
-from beetle_omni_ros.robot.mass_properties import Variation
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.parameters import RobotParameters, Variation
 from beetle_omni_ros.robot.servo import NUMPY
 from beetle_omni_ros.sim.effects import CatalogueForces, MotionForces
 from beetle_omni_ros.sim.mjcf import BASE, base_part, build_model, set_base_part, thrust_scale

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
-from beetle_omni_ros.robot.allocation import Allocation, Allocator
-from beetle_omni_ros.robot.degraded_allocation import allocator, DegradedAllocator, LocalWeights
+from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY, Allocation, Allocator
+from beetle_omni_ros.robot.degraded import allocator, DegradedAllocator, LocalWeights
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 ROBOT = RobotParameters.load()

@@ -8,8 +8,7 @@ import pytest
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import bind, load_yaml, ParameterError
-from beetle_omni_ros.robot.yaml_file import quoted
+from beetle_omni_ros.robot.schema import bind, load_yaml, ParameterError, quoted
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.train.run_folder import parse_changes
 

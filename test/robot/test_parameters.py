@@ -7,8 +7,7 @@ import pytest
 import yaml
 
 from beetle_omni_ros.identify.robot_file import write_robot_file
-from beetle_omni_ros.robot.mass_properties import mass_properties
-from beetle_omni_ros.robot.parameters import find_robot, RobotParameters
+from beetle_omni_ros.robot.parameters import find_robot, mass_properties, RobotParameters
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.response import Responses
+from beetle_omni_ros.robot.servo import Responses
 
 RANGES = ('servo_lag', 'servo_delay', 'rotor_lag', 'rotor_delay')
 

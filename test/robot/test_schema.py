@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.robot import schema
-from beetle_omni_ros.robot.holding import HoldingParameters
+from beetle_omni_ros.robot.degraded import HoldingParameters
 from beetle_omni_ros.robot.schema import group, parameter, ParameterError
 
 

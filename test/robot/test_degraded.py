@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
-from beetle_omni_ros.robot.degraded_allocation import allocator
-from beetle_omni_ros.robot.holding import Holding, leaned, sphere, up
+from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY
+from beetle_omni_ros.robot.degraded import allocator, Holding, leaned, sphere, up
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 ROBOT = RobotParameters.load()
