@@ -159,8 +159,8 @@ def _load(name: str):
 def parameters() -> str:
     """Every parameter of every shipped file."""
     text = [f'# Parameters\n\n{MADE}\n'
-            'The files of `params/` hold the values below. A comment beside each number gives '
-            'its source.\nA value outside its range and an unknown key are refused. '
+            'These are all values: the defaults of the code, with the changes of the files of '
+            '`params/`.\nA value outside its range and an unknown key are refused. '
             'In ROS, `ros2 param describe` shows unit\nand range. '
             '[Nodes](nodes.md#parameters) lists which source overrides which.\n']
     seen: dict[str, str] = {}

@@ -52,7 +52,7 @@ class AxisGains:
 
 @dataclass(frozen=True, kw_only=True)
 class HoverParameters(ParameterFile, file='hover.yaml'):
-    """Tuning of the hover controller; params/hover.yaml gives the reasons."""
+    """Tuning of the hover controller."""
 
     period: float = parameter(0.01, doc='time between commands', unit='s', low=0.001, high=0.1)
     position: AxisGains = group(AxisGains, 'position and velocity in world')

@@ -55,7 +55,7 @@ GOLDEN = np.pi * (1 + np.sqrt(5))
 
 @dataclass(frozen=True, kw_only=True)
 class LocalWeights:
-    """Weights of the allocation near present tilts; params/hover.yaml gives the reasons."""
+    """Weights of the allocation near present tilts."""
 
     turning: float = parameter(1.0, doc='weight of an angular against a linear acceleration',
                                unit='m/rad', low=0.1, high=100)
@@ -292,7 +292,7 @@ def allocator(robot: RobotParameters, health: ActuatorHealth = ALL_HEALTHY) -> A
 
 @dataclass(frozen=True, kw_only=True)
 class HoldingParameters(ParameterFile, file='degraded.yaml'):
-    """Selection of attitudes; params/degraded.yaml gives the reasons."""
+    """Selection of attitudes."""
 
     reach_time: float = parameter(0.1, doc='time within which actuators must act', unit='s',
                                   low=0.01, high=1)

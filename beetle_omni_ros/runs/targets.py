@@ -21,7 +21,7 @@ COLUMNS = ('x_m', 'y_m', 'z_m', 'roll_deg', 'pitch_deg', 'yaw_deg')
 
 @dataclass(frozen=True, kw_only=True)
 class TargetLimits(ParameterFile, file='targets.yaml'):
-    """Limits of a target; params/targets.yaml gives the reasons."""
+    """Limits of a target."""
 
     half_width: float = parameter(18.0, doc='largest |x| and |y|', unit='m', low=0.5, high=1000)
     height: float = parameter(18.0, doc='largest z', unit='m', low=0.5, high=1000)

@@ -34,7 +34,7 @@ ALL = 'all'     # in place of the names of all layers
 
 @dataclass(frozen=True, kw_only=True)
 class GuidanceParameters:
-    """Parameters of the guidance; params/rl.yaml gives the reasons."""
+    """Parameters of the guidance."""
 
     without: str = parameter('', doc="layers that are off: names with commas, or 'all'",
                              read_only=True)
