@@ -1,7 +1,9 @@
-"""Parameter files bound to dataclasses, with units, ranges and one-line errors.
+"""
+Parameters: dataclass fields with default, unit, range and meaning, and the YAML files of changes.
 
 A parameter file is YAML, either plain or in the ROS 2 form (``/**: ros__parameters: ...``). The
-same file serves a node's ``--params-file`` and tools without ROS.
+same file serves a node's ``--params-file`` and tools without ROS. Every error is one line that
+names file, key and expected value.
 """
 
 from copy import deepcopy
@@ -10,48 +12,39 @@ from difflib import get_close_matches
 from functools import lru_cache
 from pathlib import Path
 import reprlib
-import types
-from typing import Any, ClassVar, get_args, get_origin, get_type_hints, TypeVar, Union
+from types import NoneType
+from typing import Any, ClassVar, get_args, get_type_hints, TypeVar
 
 import numpy as np
 import yaml
 
 from beetle_omni_ros.robot.resources import share_path
 
-# Parameters with more than numbers, from lists and mappings of a file.
-STRUCTURED: dict[Any, tuple[tuple[type, ...], str]] = {
-    tuple: ((list, tuple), 'a list'), dict: ((dict, type(None)), 'a mapping')}
 File = TypeVar('File', bound='ParameterFile')
 NAMES = tuple[str, ...]     # type of a parameter that is a list of names
-FILE_NAME, KEY, WHOLE = 500, 80, 1000    # characters of them in a message
-MAX_BYTES = 1 << 20     # the shipped files have 2 to 8 kB
-MAX_NODES = 50_000      # with every alias written out
-MAX_DEPTH = 40          # nested lists and mappings
+# Type of a field that is no number -> types of its value in a file, and their name.
+KINDS: dict[Any, tuple[tuple[type, ...], str]] = {
+    bool: ((bool,), 'true or false'), str: ((str,), 'text'), tuple: ((list, tuple), 'a list'),
+    NAMES: ((list, tuple), 'a list of names'), dict: ((dict, NoneType), 'a mapping')}
+MAX_BYTES = 1 << 20     # of a file; the shipped ones have up to 16 kB
 QUOTED = 200            # characters of a value in a message
+FILE_NAME, KEY, WHOLE = 500, 80, 1000    # characters of them in a message
 
-# Errors of PyYAML's constructors beside its own, for example for `0b_`, `!!bool x`, a date with
-# month 13, or an integer of more than 4300 digits.
-CONSTRUCTION = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
+_short = reprlib.Repr()
+_short.maxlevel, _short.maxlist, _short.maxtuple, _short.maxdict = 3, 8, 8, 8
+_short.maxstring, _short.maxother = 120, 120
 
 
-class YamlError(ValueError):
+class RunError(RuntimeError):
+    """A flight, a comparison or a training failed; the text is one line."""
+
+
+class ParameterError(ValueError):
+    """A parameter file or value cannot be used; the text names file, key and expected value."""
+
+
+class YamlError(ParameterError):
     """A file that cannot be read as YAML; the text is one line without the file's name."""
-
-
-class _Short(reprlib.Repr):
-    """Representations of bounded length and cost."""
-
-    def __init__(self):
-        super().__init__()
-        self.maxlevel, self.maxlist, self.maxtuple, self.maxdict = 3, 8, 8, 8
-        self.maxstring, self.maxother = 120, 120
-
-    def repr_int(self, x, level):
-        """Decimal digits; for a large integer, the number of its bits."""
-        return repr(x) if x.bit_length() < 256 else f'an integer of {x.bit_length()} bits'
-
-
-_short = _Short()
 
 
 def quoted(value: Any) -> str:
@@ -63,92 +56,6 @@ def shortened(text: str, length: int = QUOTED) -> str:
     """Shorten to one line of at most ``length`` characters."""
     line = ' '.join(text[:4 * length].split())
     return line if len(line) <= length and len(text) <= 4 * length else f'{line[:length - 3]}...'
-
-
-def read_yaml(path: str | Path) -> Any:
-    """
-    Read the one document of a YAML file.
-
-    Raises:
-        YamlError: missing, unreadable or too large file, broken YAML, too deep nesting, or
-            aliases that stand for more than ``MAX_NODES`` values.
-
-    """
-    try:
-        with open(path, 'rb') as file:
-            data = file.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise YamlError(f'cannot be read ({error.strerror})') from None
-    except ValueError:
-        raise YamlError('cannot be read (no name of a file)') from None
-    if len(data) > MAX_BYTES:
-        raise YamlError(f'larger than {MAX_BYTES} bytes')
-    return parse_yaml(data)
-
-
-def parse_yaml(data: bytes | str) -> Any:
-    """
-    Read the one document of a YAML text.
-
-    Raises:
-        YamlError: as :func:`read_yaml`.
-
-    """
-    return deepcopy(_parsed(data))
-
-
-@lru_cache(maxsize=32)      # one flight reads the same files several times, each in 40 ms
-def _parsed(data):
-    loader = None
-    try:
-        loader = yaml.SafeLoader(data)
-        node = loader.get_single_node()
-        if node is None:
-            return None
-        _size(node, {}, 0)
-        return loader.construct_document(node)
-    except RecursionError:
-        raise YamlError(f'nested deeper than {MAX_DEPTH} levels') from None
-    except yaml.YAMLError as error:
-        raise YamlError(_problem(error)) from None
-    except YamlError:
-        raise
-    except CONSTRUCTION as error:
-        raise YamlError(f'not valid YAML ({shortened(str(error))})') from None
-    finally:
-        if loader is not None:
-            loader.dispose()
-
-
-def _size(node, sizes, depth):
-    """Number of values of a node, with aliases expanded."""
-    if depth > MAX_DEPTH:
-        raise YamlError(f'nested deeper than {MAX_DEPTH} levels')
-    if isinstance(node, yaml.ScalarNode):
-        return 1
-    if id(node) not in sizes:
-        children = node.value if isinstance(node, yaml.SequenceNode) else \
-            [child for pair in node.value for child in pair]
-        sizes[id(node)] = 1 + sum(_size(child, sizes, depth + 1) for child in children)
-    if sizes[id(node)] > MAX_NODES:
-        raise YamlError(f'more than {MAX_NODES} values, with aliases written out')
-    return sizes[id(node)]
-
-
-def _problem(error):
-    """One line about a syntax error, with its position if known."""
-    mark = getattr(error, 'problem_mark', None)
-    where = f' at line {mark.line + 1}, column {mark.column + 1}' if mark else ''
-    problem = getattr(error, 'problem', None) or str(error).splitlines()[0]
-    return f'not valid YAML{where} ({shortened(problem)})'
-
-
-class RunError(RuntimeError):
-    """A flight, a comparison or a training failed; the text is one line."""
-
-
-class ParameterError(ValueError):
-    """A parameter file or value cannot be used; the text names file, key and expected value."""
 
 
 def parameter(default: Any = MISSING, *, doc: str, unit: str = '', low: float | None = None,
@@ -171,16 +78,60 @@ def parameter(default: Any = MISSING, *, doc: str, unit: str = '', low: float | 
     metadata = {'doc': doc, 'unit': unit, 'low': low, 'high': high, 'shape': shape,
                 'choices': choices, 'read_only': read_only}
     if isinstance(default, (list, np.ndarray)):
-        value = np.array(default, dtype=float)
-        return field(default_factory=lambda: value.copy(), metadata=metadata)
-    if isinstance(default, dict):
-        return field(default_factory=lambda: dict(default), metadata=metadata)
+        default = np.array(default, dtype=float)
+    if isinstance(default, (dict, np.ndarray)):
+        return field(default_factory=default.copy, metadata=metadata)
     return field(default=default, metadata=metadata)
 
 
 def group(cls: type, doc: str = ''):
     """Declare a nested dataclass of parameters that defaults to ``cls()``."""
     return field(default_factory=cls, metadata={'doc': doc})
+
+
+def read_yaml(path: str | Path) -> Any:
+    """
+    Read the one document of a YAML file.
+
+    Raises:
+        YamlError: missing, unreadable or too large file, or broken YAML.
+
+    """
+    try:
+        with open(path, 'rb') as file:
+            data = file.read(MAX_BYTES + 1)
+    except (OSError, ValueError) as error:
+        raise YamlError(f'cannot be read ({getattr(error, "strerror", error)})') from None
+    if len(data) > MAX_BYTES:
+        raise YamlError(f'larger than {MAX_BYTES} bytes')
+    return parse_yaml(data)
+
+
+def parse_yaml(data: bytes | str) -> Any:
+    """
+    Read the one document of a YAML text.
+
+    Raises:
+        YamlError: broken YAML.
+
+    """
+    return deepcopy(_parsed(data))
+
+
+@lru_cache(maxsize=32)      # one flight reads the same files several times, each in 40 ms
+def _parsed(data):
+    try:
+        return yaml.safe_load(data)
+    except yaml.YAMLError as error:
+        mark = getattr(error, 'problem_mark', None)
+        where = f' at line {mark.line + 1}, column {mark.column + 1}' if mark else ''
+        problem = getattr(error, 'problem', None) or str(error)
+        raise YamlError(f'not valid YAML{where} ({shortened(problem)})') from None
+    except RecursionError:
+        raise YamlError('not valid YAML (too deep)') from None
+    except (AttributeError, LookupError, TypeError, ValueError) as error:
+        # PyYAML's own errors about values such as `0b_` or a date with month 13
+        raise YamlError(f'not valid YAML ({shortened(str(error))})') from None
 
 
 def load_yaml(path: str | Path) -> dict:
@@ -199,11 +150,9 @@ def load_yaml(path: str | Path) -> dict:
         if isinstance(value, dict) and set(value) == {'ros__parameters'}:
             data = value['ros__parameters']
             break
-    if data is None:
-        return {}
-    if not isinstance(data, dict):
+    if not isinstance(data, dict | None):
         raise ParameterError(f'{path}: expected a mapping of keys, found {type(data).__name__}')
-    return data
+    return data or {}
 
 
 class ParameterFile:
@@ -264,17 +213,19 @@ def bind(cls: type, mapping: dict, where: str = '', prefix: str = ''):
             raise ParameterError(f'{_at(where, _join(prefix, key))}: unknown key{hint}')
     values = {}
     for name, entry in known.items():
-        key = _join(prefix, name)
+        key, hint = _join(prefix, name), hints[name]
         if name not in mapping:
             if entry.default is MISSING and entry.default_factory is MISSING:
-                raise ParameterError(f'{_at(where, key)}: missing'
-                                     f'{_unit_text(entry)}')
+                raise ParameterError(f'{_at(where, key)}: missing{_unit(entry, " [{}]")}')
             continue
-        nested = _nested(hints[name])
-        if nested and not (mapping[name] is None and nested is not hints[name]):
-            values[name] = bind(nested, mapping[name], where, key)
-        else:
-            values[name] = check(entry, hints[name], mapping[name], _at(where, key))
+        value = mapping[name]
+        if NoneType in get_args(hint):      # Class | None
+            hint = get_args(hint)[0]
+            if value is None:
+                values[name] = None
+                continue
+        values[name] = bind(hint, value, where, key) if is_dataclass(hint) \
+            else check(entry, hint, value, _at(where, key))
     try:
         return cls(**values)
     except ParameterError as error:
@@ -282,12 +233,7 @@ def bind(cls: type, mapping: dict, where: str = '', prefix: str = ''):
         raise ParameterError(shortened(text, FILE_NAME + WHOLE)) from None
 
 
-def _nested(hint):
-    """Dataclass of a nested field, also as ``Class | None``; else None."""
-    return next((part for part in (hint, *get_args(hint)) if is_dataclass(part)), None)
-
-
-def check(entry, hint: type, value: Any, at: str) -> Any:
+def check(entry, hint: Any, value: Any, at: str) -> Any:
     """
     Validate one value against its declaration and convert it to its declared type.
 
@@ -298,83 +244,64 @@ def check(entry, hint: type, value: Any, at: str) -> Any:
         at: file and key, for messages.
 
     """
-    meta = entry.metadata
-    optional = get_origin(hint) in (Union, types.UnionType)
-    if optional:
-        if value is None:
-            return None
-        hint = next(a for a in get_args(hint) if a is not type(None))
-    if meta.get('shape') is not None or hint is np.ndarray:
-        return _check_array(meta, value, at)
-    if hint is bool:
-        if not isinstance(value, bool):
-            raise ParameterError(f'{at}: expected true or false, found {quoted(value)}')
-        return value
+    if hint is np.ndarray:
+        return _array(entry, value, at)
     if hint in (int, float):
-        return _check_number(entry, hint, value, at)
-    if hint is str:
-        if not isinstance(value, str):
-            raise ParameterError(f'{at}: expected text, found {quoted(value)}')
-        if meta.get('choices') and value not in meta['choices']:
-            raise ParameterError(f"{at}: expected one of {', '.join(meta['choices'])}, "
-                                 f'found {quoted(value)}')
-        return value
-    if hint == NAMES:
-        if not isinstance(value, (list, tuple)) or not all(isinstance(v, str) for v in value):
-            raise ParameterError(f'{at}: expected a list of names, found {quoted(value)}')
-        return tuple(value)
-    if hint in STRUCTURED:
-        kinds, what = STRUCTURED[hint]
-        if not isinstance(value, kinds):
-            raise ParameterError(f'{at}: expected {what}, found {quoted(value)}')
-        return hint(value or ())
-    return value
+        return _number(entry, hint, value, at)
+    kinds, what = KINDS[hint]
+    if not isinstance(value, kinds) or (
+            hint == NAMES and not all(isinstance(name, str) for name in value)):
+        raise ParameterError(f'{at}: expected {what}, found {quoted(value)}')
+    choices = entry.metadata['choices']
+    if choices and value not in choices:
+        raise ParameterError(f"{at}: expected one of {', '.join(choices)}, found {quoted(value)}")
+    return hint(value or ()) if hint in (tuple, dict, NAMES) else value
 
 
-def _check_number(entry, hint, value, at):
+def _number(entry, hint, value, at):
     """Finite int or float within its range."""
-    kind = 'an integer' if hint is int else 'a number'
-    found = f'{at}: expected {kind}{_unit_text(entry)}, found {quoted(value)}'
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)):
-        raise ParameterError(found)
     try:
-        number = float(value)
-    except (OverflowError, TypeError):      # an integer beyond float's range; a complex number
-        raise ParameterError(found) from None
-    _check_range(entry.metadata, number, at)
-    if hint is int and value != int(value):
-        raise ParameterError(found)
+        if isinstance(value, bool) or not isinstance(value, (int, float, np.number)):
+            raise TypeError
+        _check_range(entry, float(value), at)
+        if value != hint(value):
+            raise TypeError
+    except (OverflowError, TypeError):
+        kind = 'an integer' if hint is int else 'a number'
+        raise ParameterError(f'{at}: expected {kind}{_unit(entry, " [{}]")}, '
+                             f'found {quoted(value)}') from None
     return hint(value)
 
 
-def _check_array(meta, value, at):
+def _array(entry, value, at):
     """(n,) or the declared shape, of finite numbers within their range."""
     try:
         array = np.array(value, dtype=float)
     except (OverflowError, TypeError, ValueError):
         raise ParameterError(f'{at}: expected numbers, found {quoted(value)}') from None
-    shape = meta.get('shape')
+    shape = entry.metadata['shape']
     if shape is not None and array.shape != tuple(shape):
         raise ParameterError(f'{at}: expected shape {tuple(shape)}, found {array.shape}')
     if shape is None and array.ndim != 1:
         raise ParameterError(f'{at}: expected a list of numbers, found {quoted(value)}')
     for element in array.ravel():
-        _check_range(meta, float(element), at)
+        _check_range(entry, float(element), at)
     return array
 
 
-def _check_range(meta, value, at):
-    low, high, unit = meta.get('low'), meta.get('high'), meta.get('unit')
+def _check_range(entry, value, at):
+    low, high = (entry.metadata[name] for name in ('low', 'high'))
+    low, high = -np.inf if low is None else low, np.inf if high is None else high
     if not np.isfinite(value):
         raise ParameterError(f'{at}: {value} is not finite')
-    if (low is not None and value < low) or (high is not None and value > high):
-        span = f'{-np.inf if low is None else low:g} to {np.inf if high is None else high:g}'
-        raise ParameterError(f'{at}: {value:g} is outside {span}' + (f' {unit}' if unit else ''))
+    if not low <= value <= high:
+        raise ParameterError(f'{at}: {value:g} is outside {low:g} to {high:g}'
+                             f'{_unit(entry, " {}")}')
 
 
-def _unit_text(entry):
+def _unit(entry, form):
     unit = entry.metadata.get('unit')
-    return f' [{unit}]' if unit else ''
+    return form.format(unit) if unit else ''
 
 
 def _join(prefix, key):
@@ -415,4 +342,3 @@ def nest(flat: dict[str, Any]) -> dict:
             level = level.setdefault(part, {})
         level[leaf] = value
     return nested
-
