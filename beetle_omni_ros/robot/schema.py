@@ -23,7 +23,7 @@ from beetle_omni_ros.robot.resources import share_path
 File = TypeVar('File', bound='ParameterFile')
 NAMES = tuple[str, ...]     # type of a parameter that is a list of names
 # Type of a field that is no number -> types of its value in a file, and their name.
-KINDS: dict[Any, tuple[tuple[type, ...], str]] = {
+KINDS: dict[Any, tuple[Any, str]] = {
     bool: ((bool,), 'true or false'), str: ((str,), 'text'), tuple: ((list, tuple), 'a list'),
     NAMES: ((list, tuple), 'a list of names'), dict: ((dict, NoneType), 'a mapping')}
 MAX_BYTES = 1 << 20     # of a file; the shipped ones have up to 16 kB
@@ -204,14 +204,14 @@ def bind(cls: type, mapping: dict, where: str = '', prefix: str = ''):
     if not isinstance(mapping, dict):
         raise ParameterError(f'{_at(where, prefix)}: expected a mapping, '
                              f'found {type(mapping).__name__}')
-    hints = get_type_hints(cls)
+    hints: dict[str, Any] = get_type_hints(cls)
     known = {f.name: f for f in fields(cls) if f.init}
     for key in mapping:
         if key not in known:
             near = get_close_matches(str(key)[:KEY], known, n=1)
             hint = f"; did you mean '{near[0]}'?" if near else f"; known: {', '.join(known)}"
             raise ParameterError(f'{_at(where, _join(prefix, key))}: unknown key{hint}')
-    values = {}
+    values: dict[str, Any] = {}
     for name, entry in known.items():
         key, hint = _join(prefix, name), hints[name]
         if name not in mapping:
