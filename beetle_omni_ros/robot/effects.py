@@ -16,7 +16,7 @@ its kind:
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -37,94 +37,49 @@ MEASURED = {'voltage_ratio': 'it has no voltage and assumes a full pack',
 
 @dataclass(frozen=True)
 class EffectParameter:
-    """
-    One number, or vector, of an effect.
-
-    Attributes:
-        unit: SI.
-        neutral: value without effect; NaN if that is the robot file's own number.
-        low: smallest legal value.
-        high: largest legal value.
-        typical: realistic deviation from neutral; a fraction if neutral is NaN.
-        smallest: smallest significant deviation; a fraction if neutral is NaN.
-        default: value if a file omits it; None: it is required.
-        of_each: whether a file may give a list of four, one for each joint.
-        number: dotted key of the robot file's number that it replaces.
-        sensor: field of :class:`SensorErrors` that it sets.
-        tolerance: kind of tolerance between robots of one type, a number ``tolerance_...`` of
-            params/gap.yaml.
-        least: smallest ratio to the robot file's own number in a fit.
-        step: step of a fit's derivatives; of the logarithm for the file's own numbers.
-        curved: whether these derivatives change during a fit.
-        form: whether it only chooses a form of the effect and is not fitted.
-
-    """
+    """One number, or vector, of an effect; SI units."""
 
     unit: str
-    neutral: float | tuple[float, ...]
-    low: float
+    neutral: float | tuple[float, ...]      # without effect; NaN: the robot file's own number
+    low: float                              # smallest and largest legal value
     high: float
-    typical: float = float('nan')
-    smallest: float = float('nan')
-    default: float | tuple[float, ...] | None = None
-    of_each: bool = False
-    number: str = ''
-    sensor: str = ''
-    tolerance: str = ''
-    least: float = 0.02
-    step: float = 1e-3
-    curved: bool = False
-    form: bool = False
+    typical: float = NAN    # realistic deviation from neutral; a fraction if neutral is NaN
+    smallest: float = NAN   # smallest significant deviation, likewise
+    default: float | tuple[float, ...] | None = None    # if a file omits it; None: it is required
+    of_each: bool = False   # a file may give a list of four, one for each joint
+    number: str = ''        # dotted key of the robot file's number that it replaces
+    sensor: str = ''        # field of SensorErrors that it sets
+    tolerance: str = ''     # between robots of one type: tolerance_... of params/gap.yaml
+    least: float = 0.02     # smallest ratio to the robot file's own number in a fit
+    step: float = 1e-3      # of a fit's derivatives; of the logarithm for the file's own numbers
+    curved: bool = False    # these derivatives change during a fit
+    form: bool = False      # it only chooses a form of the effect and is not fitted
 
 
 @dataclass(frozen=True)
 class LimitStarts:
-    """
-    Start values of a fitted limit, relative to the demand of a flight.
+    """Start values of a fitted limit, relative to the demand of a flight."""
 
-    Attributes:
-        of: 'tilt_rate', 'torque' or 'thrust'.
-        parts: fractions of the largest demand, one start each.
-        below: fraction of the file's limit below which a start must lie.
-
-    """
-
-    of: str
-    parts: tuple[float, ...]
-    below: float
+    of: str                     # 'tilt_rate', 'torque' or 'thrust'
+    parts: tuple[float, ...]    # fractions of the largest demand, one start each
+    below: float                # fraction of the file's limit below which a start must lie
 
 
 @dataclass(frozen=True)
 class SensorErrors:
-    """
-    Errors of the robot's sensors by the effects of the robot file.
+    """Errors of the robot's sensors by the effects of the robot file."""
 
-    Attributes:
-        accelerometer_bias: (3,) measured minus true [m/s^2].
-        gyroscope_bias: (3,) measured minus true [rad/s].
-        imu_rotation: (3,) rotation vector from base_link to the IMU's axes [rad].
-        imu_position: (3,) position of the IMU in base_link [m].
-        mocap_rotation: (3,) rotation vector from base_link to the markers' axes [rad].
-        imu_delay: age of readings at their stamps [s].
-        mocap_delay: age of poses at their stamps [s].
-        encoder_delay: age of readings at their stamps [s].
-        encoder_gain: (4,) error of the readings per angle [1].
-        encoder_sine: (4,) error by the sine of the angle [rad].
-        encoder_cosine: (4,) error by the cosine of the angle minus 1 [rad].
-
-    """
-
-    accelerometer_bias: tuple[float, ...] = (0.0,) * 3
-    gyroscope_bias: tuple[float, ...] = (0.0,) * 3
-    imu_rotation: tuple[float, ...] = (0.0,) * 3
-    imu_position: tuple[float, ...] = (0.0,) * 3
-    mocap_rotation: tuple[float, ...] = (0.0,) * 3
-    imu_delay: float = 0.0
+    accelerometer_bias: tuple[float, ...] = (0.0,) * 3  # measured minus true [m/s^2]
+    gyroscope_bias: tuple[float, ...] = (0.0,) * 3      # measured minus true [rad/s]
+    imu_rotation: tuple[float, ...] = (0.0,) * 3        # vector from base_link to its axes [rad]
+    imu_position: tuple[float, ...] = (0.0,) * 3        # in base_link [m]
+    mocap_rotation: tuple[float, ...] = (0.0,) * 3      # from base_link to the markers' axes [rad]
+    imu_delay: float = 0.0          # age of readings at their stamps [s]
     mocap_delay: float = 0.0
     encoder_delay: float = 0.0
-    encoder_gain: tuple[float, ...] = (0.0,) * 4
-    encoder_sine: tuple[float, ...] = (0.0,) * 4
-    encoder_cosine: tuple[float, ...] = (0.0,) * 4
+    encoder_gain: tuple[float, ...] = (0.0,) * 4        # error per angle [1]
+    encoder_sine: tuple[float, ...] = (0.0,) * 4        # by the sine of the angle [rad]
+    encoder_cosine: tuple[float, ...] = (0.0,) * 4      # by its cosine minus 1 [rad]
 
     @property
     def encoders_err(self) -> bool:
@@ -149,56 +104,33 @@ class Terms:
     """
     Terms of the body's equations at one instant, as CasADi expressions; effects change them.
 
-    Attributes:
-        mass: [kg].
-        inertia: (3,) diagonal about the centre of mass [kg m^2].
-        centre_of_mass: (3,) in base_link [m], or None for its origin.
-        torque: (3,) added torque on the body, in base_link [N m].
-        tilt: (4,) tilt angles [rad].
-        tilt_acceleration: (4,) [rad/s^2].
-        tilt_axes: list of four (3,) unit vectors in base_link, outward along the arms.
-        thrust: (4,) rotor thrusts after their lag [N].
-        velocity: (3,) of the centre of gravity in world [m/s].
-        angular_velocity: (3,) in base_link [rad/s].
-        rotation: (3, 3) body to world.
-        thrust_directions: list of four (3,) unit vectors in base_link.
-        rotor_positions: list of four (3,) in base_link [m].
-        hover_thrust: thrust of each rotor in hover [N].
-        force_world: (3,) added force in world [N].
-        rotor_forces: list of four (3,) added forces at the rotors, in base_link [N].
-        torque_ratio: reaction torque for each newton [m].
-        tilt_rate: (4,) [rad/s].
-        thrust_rate: (4,) [N/s].
-        spin: (4,) direction of rotation, +1 along the thrust.
-        position: (3,) of base_link in world [m], or None if unknown.
-        voltage_ratio: pack voltage over that of a full pack, or None if unknown.
-        charge_drawn: charge drawn from the pack [A h], or None if unknown; in the simulator
-            since the pack was inserted, in a recording since its first battery message.
-
+    Vectors are in base_link, unless stated otherwise. Lists have an entry for each rotor.
     """
 
-    mass: ca.SX
-    inertia: ca.SX
-    centre_of_mass: ca.SX | None
-    torque: ca.SX
-    tilt: ca.SX
-    tilt_acceleration: ca.SX
-    tilt_axes: list
-    thrust: ca.SX
-    velocity: ca.SX
-    angular_velocity: ca.SX
-    rotation: ca.SX
-    thrust_directions: list
-    rotor_positions: list
-    hover_thrust: float
-    force_world: ca.SX
-    rotor_forces: list
-    torque_ratio: ca.SX
-    tilt_rate: ca.SX
-    thrust_rate: ca.SX
-    spin: tuple[float, ...]
-    position: ca.SX | None = None
-    voltage_ratio: ca.SX | None = None
+    mass: ca.SX                     # [kg]
+    inertia: ca.SX                  # (3,) diagonal about the centre of mass [kg m^2]
+    centre_of_mass: ca.SX | None    # (3,) [m]; None: base_link's origin
+    torque: ca.SX                   # (3,) added on the body [N m]
+    tilt: ca.SX                     # (4,) [rad]
+    tilt_acceleration: ca.SX        # (4,) [rad/s^2]
+    tilt_axes: list                 # of (3,) unit vectors, outward along the arms
+    thrust: ca.SX                   # (4,) after the rotors' lag [N]
+    velocity: ca.SX                 # (3,) of the centre of gravity in world [m/s]
+    angular_velocity: ca.SX         # (3,) [rad/s]
+    rotation: ca.SX                 # (3, 3) body to world
+    thrust_directions: list         # of (3,) unit vectors
+    rotor_positions: list           # of (3,) [m]
+    hover_thrust: float             # of each rotor [N]
+    force_world: ca.SX              # (3,) added, in world [N]
+    rotor_forces: list              # of (3,) added at the rotors [N]
+    torque_ratio: ca.SX             # reaction torque for each newton [m]
+    tilt_rate: ca.SX                # (4,) [rad/s]
+    thrust_rate: ca.SX              # (4,) [N/s]
+    spin: tuple[float, ...]         # (4,) +1 along the thrust
+    position: ca.SX | None = None       # (3,) of base_link in world [m]; None: unknown
+    voltage_ratio: ca.SX | None = None  # of the pack over that of a full pack; None: unknown
+    # Drawn from the pack [A h], None: unknown. In the simulator since the pack was inserted, in a
+    # recording since its first battery message.
     charge_drawn: ca.SX | None = None
 
     def rotor_speeds(self) -> list:
@@ -213,38 +145,18 @@ class Terms:
 
 @dataclass
 class ServoTerms:
-    """
-    Terms that act on one tilt servo at one instant, numbers of any namespace.
+    """Terms that act on one tilt servo at one instant, numbers of any namespace."""
 
-    Attributes:
-        target: commanded angle [rad].
-        thrust: thrust of the joint's rotor [N].
-        gyroscopic: load on the joint for each N m s of the rotor's angular momentum in hover
-            [rad/s]; 0 if the body's rate is unknown.
-        load: torque beside the motor's [N m].
-        coulomb: sliding friction [N m], or None.
-        stiction: friction at rest [N m], or None.
-
-    """
-
-    target: Any
-    thrust: Any = 0.0
-    gyroscopic: Any = 0.0
-    load: Any = 0.0
-    coulomb: Any = None
-    stiction: Any = None
+    target: Any             # commanded angle [rad]
+    thrust: Any = 0.0       # of the joint's rotor [N]
+    gyroscopic: Any = 0.0   # load for each N m s of the rotor's momentum in hover [rad/s]
+    load: Any = 0.0         # torque beside the motor's [N m]
+    coulomb: Any = None     # sliding friction [N m]
+    stiction: Any = None    # friction at rest [N m]
 
 
-@dataclass(frozen=True)
-class Treatment:
-    """
-    How a consumer treats an effect.
-
-    Attributes:
-        acts: whether a change of its parameters changes the consumer's results.
-        reason: reason why it does not act.
-
-    """
+class Treatment(NamedTuple):
+    """Whether a change of an effect changes a consumer's results, else the reason."""
 
     acts: bool
     reason: str = ''
@@ -252,59 +164,36 @@ class Treatment:
 
 @dataclass(frozen=True)
 class Effect:
-    """
-    One catalogue entry.
+    """One catalogue entry."""
 
-    Attributes:
-        layer: 'body', 'rotor', 'joint', 'timing' or 'sensor'.
-        parameters: name -> :class:`EffectParameter`.
-        source: equation and its source.
-        excited_by: flight that excites it.
-        confused_with: names of entries that poor data cannot distinguish from it.
-        separated_by: experiment that distinguishes them.
-        apply: equation of a body effect; changes :class:`Terms` in place, called as
-            apply(terms, **values).
-        servo: equation of a joint effect; changes :class:`ServoTerms` in place, called as
-            servo(terms, joint, **values).
-        each: 'rotor' or 'joint' if the parameters are (4,), one for each.
-        delays: delayed quantities, 'tilt' and 'thrust' commands or readings of 'imu', 'mocap' and
-            'encoders'.
-        own_clock: whether these readings are stamped by another clock and may appear early.
-        channels: measurements that it affects. B: forces and torques, J: joints, A: MoCap's
-            acceleration, W: MoCap's angular velocity; A and W against the IMU.
-        starts: start values of a fit, if the effect has no slope at its neutral value.
-        forms: for each form of the effect, the parameters that choose it.
-        one_regime: whether it acts in one regime only, such as near the ground.
-        same_response: entry that is another form of the same response.
-        allocated: whether the allocation includes it.
-        measured: terms that not every consumer has, of ``MEASURED``. Where one is None, the
-            effect is left out.
-        plant: how the simulated plant includes a body effect. 'model': numbers of its bodies and
-            rotors, 'own': equations of its own, else the equation of this entry.
-        treatments: 'nmpc', 'training', 'plant', 'estimator', 'buses' or 'gap' -> its
-            :class:`Treatment`, if that does not follow from the kind of effect.
-
-    """
-
-    layer: str
+    layer: str      # 'body', 'rotor', 'joint', 'timing' or 'sensor'
     parameters: dict[str, EffectParameter]
-    source: str
-    excited_by: str = ''
-    confused_with: tuple[str, ...] = ()
-    separated_by: str = ''
+    source: str     # equation and its source
+    excited_by: str = ''                    # flight that shows it
+    confused_with: tuple[str, ...] = ()     # entries that poor data cannot distinguish from it
+    separated_by: str = ''                  # experiment that distinguishes them
+    # Equation of a body effect, which changes Terms in place: apply(terms, **values).
     apply: Callable | None = None
+    # Equation of a joint effect, which changes ServoTerms: servo(terms, joint, **values).
     servo: Callable | None = None
-    each: str = ''
+    each: str = ''      # 'rotor' or 'joint' if the parameters are (4,), one for each
+    # Delayed quantities: 'tilt' and 'thrust' commands, readings of 'imu', 'mocap', 'encoders'.
     delays: tuple[str, ...] = ()
-    own_clock: bool = False
+    own_clock: bool = False     # these readings are stamped by another clock and may appear early
+    # Affected measurements. B: forces and torques, J: joints, A: MoCap's acceleration, W: MoCap's
+    # angular velocity; A and W against the IMU.
     channels: str = 'B'
+    # Start values of a fit, if the effect has no slope at its neutral value.
     starts: tuple[tuple[float, ...], ...] | LimitStarts = ()
-    forms: tuple[dict[str, float], ...] = ({},)
-    one_regime: bool = False
-    same_response: str = ''
-    allocated: bool = False
-    measured: tuple[str, ...] = ()
+    forms: tuple[dict[str, float], ...] = ({},)     # the parameters that choose each form
+    one_regime: bool = False    # it acts in one regime only, such as near the ground
+    same_response: str = ''     # entry that is another form of the same response
+    allocated: bool = False     # the allocation includes it
+    measured: tuple[str, ...] = ()  # terms of MEASURED; where one is None, it is left out
+    # How the simulated plant includes a body effect. 'model': numbers of its bodies and rotors,
+    # 'own': equations of its own, '': the equation of this entry.
     plant: str = ''
+    # Name of CONSUMERS -> treatment that does not follow from the kind of effect.
     treatments: dict[str, Treatment] = field(default_factory=dict)
 
     @property
@@ -379,12 +268,7 @@ def _module_reaction(terms, module_inertia, mass_moment):
 
 
 def _thrust_coefficient(terms, scale):
-    terms.thrust = scale * terms.thrust
-
-
-def _rotor_thrust_coefficient(terms, scale):
-    terms.thrust = ca.vertcat(*scale) * terms.thrust if isinstance(scale, tuple) \
-        else scale * terms.thrust
+    terms.thrust = vector(scale) * terms.thrust
 
 
 def _torque_coefficient(terms, torque_to_thrust_ratio):
@@ -508,7 +392,14 @@ def _number(key, unit, low, high, typical, smallest, step=0.01, **more):
                            curved=True, **more)
 
 
-BODY: dict[str, Effect] = {
+# In order of application: the true tilt first, because it changes the thrust directions.
+CATALOGUE: dict[str, Effect] = {
+    'joint_offset': Effect(
+        'joint', {'offset': EffectParameter('rad', (0.0,) * 4, -0.5, 0.5, 0.03, 0.008,
+                                            tolerance='angle')},
+        'true tilt = encoder + offset', 'several attitudes',
+        ('joint_offset', 'torque_coefficient', 'imu_misalignment'),
+        'attitudes with different sets of tilts; a jig', _joint_offset, each='joint'),
     'mass': Effect(
         'body', {'mass': EffectParameter('kg', NAN, 0.05, 200, 0.05, 0.01, number='mass',
                                          tolerance='mass')},
@@ -549,7 +440,7 @@ BODY: dict[str, Effect] = {
                                           tolerance='thrust')},
         'f_i = scale_i f*_i: damaged propeller or other speed controller',
         'hover in several attitudes', ('centre_of_mass', 'rotor_thrust_coefficient'),
-        'tilted attitudes; exchange propellers 1 and 2', _rotor_thrust_coefficient, each='rotor',
+        'tilted attitudes; exchange propellers 1 and 2', _thrust_coefficient, each='rotor',
         allocated=True, plant='model'),
     'torque_coefficient': Effect(
         'body', {'torque_to_thrust_ratio': EffectParameter(
@@ -616,9 +507,6 @@ BODY: dict[str, Effect] = {
         "-h' s n with h ~ sqrt(f): a change of rotor speed turns the body", 'thrust steps',
         ('torque_coefficient', 'propeller_gyroscopic_torque', 'rotor_lag'),
         'differential thrust chirp', _rotor_acceleration_torque),
-}
-
-ACTUATOR: dict[str, Effect] = {
     'voltage_sag': Effect(
         'rotor', {'exponent': EffectParameter('1', 0.0, -1.0, 5.0, 1.0, 0.15)},
         'f = f* (V / V_full)^k: thrust of a thrust map without voltage; 6.9 %/V on this '
@@ -694,12 +582,6 @@ ACTUATOR: dict[str, Effect] = {
         'thrust off the axis deflects the servo from its target: q* + c f', 'thrust steps',
         ('joint_friction', 'joint_offset'), 'internal force at rest, two levels',
         servo=_joint_deflection, channels='J'),
-    'joint_offset': Effect(
-        'joint', {'offset': EffectParameter('rad', (0.0,) * 4, -0.5, 0.5, 0.03, 0.008,
-                                            tolerance='angle')},
-        'true tilt = encoder + offset', 'several attitudes',
-        ('joint_offset', 'torque_coefficient', 'imu_misalignment'),
-        'attitudes with different sets of tilts; a jig', _joint_offset, each='joint'),
     'joint_encoder_error': Effect(
         'joint', {name: EffectParameter(unit, (0.0,) * 4, -0.3, 0.3, typical, smallest,
                                         default=(0.0,) * 4, sensor=f'encoder_{name}')
@@ -717,9 +599,6 @@ ACTUATOR: dict[str, Effect] = {
         'the encoder reading is older than its stamp by d',
         'fast tilting', ('joint_command_latency', 'mocap_time_offset', 'joint_backlash'),
         'tilting by internal force with the body at rest', delays=('encoders',), channels='BJ'),
-}
-
-SENSOR: dict[str, Effect] = {
     'mocap_time_offset': Effect(
         'timing', _delay(0.01, 0.002, sensor='mocap_delay', tolerance='delay'),
         'the pose is older than its stamp by d', 'fast turns', ('imu_filter_lag',),
@@ -759,12 +638,6 @@ SENSOR: dict[str, Effect] = {
         'marker axes rotated by exp(rotation) against base_link', 'several attitudes',
         ('imu_misalignment', 'wind'), 'hover at yaw 0, 90, 180 and 270 deg', channels='AW'),
 }
-
-# In order of application: the true tilt first, because it changes the thrust directions.
-CATALOGUE: dict[str, Effect] = {'joint_offset': ACTUATOR['joint_offset'], **BODY, **ACTUATOR,
-                                **SENSOR}
-
-JOINTS = 4
 
 CONSUMERS = {'nmpc': 'NMPC and allocation', 'training': 'training', 'plant': 'simulated plant',
              'estimator': 'estimator', 'buses': 'delays of the buses', 'gap': 'gap finder'}
@@ -853,10 +726,10 @@ def _value(at, spec, value):
         raise ParameterError(f'{at}: expected numbers [{spec.unit}], '
                              f'found {quoted(value)}') from None
     shape = np.shape(spec.neutral)
-    if spec.of_each and array.shape == (JOINTS,):
+    if spec.of_each and array.shape == (4,):
         shape = array.shape
     if array.shape != shape:
-        each = f' or {(JOINTS,)}' if spec.of_each else ''
+        each = ' or (4,)' if spec.of_each else ''
         raise ParameterError(f'{at}: expected shape {shape}{each}, found {array.shape}')
     if not np.all((array >= spec.low) & (array <= spec.high)):
         raise ParameterError(f'{at}: {quoted(value)} is outside '

@@ -224,7 +224,8 @@ def bind(cls: type, mapping: dict, where: str = '', prefix: str = ''):
             if value is None:
                 values[name] = None
                 continue
-        values[name] = bind(hint, value, where, key) if is_dataclass(hint) \
+        nested = is_dataclass(hint)
+        values[name] = bind(hint, value, where, key) if nested \
             else check(entry, hint, value, _at(where, key))
     try:
         return cls(**values)
