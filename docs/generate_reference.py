@@ -75,7 +75,6 @@ They are optional checks. A file that contradicts itself by more than 0.5 mm is 
 
 A file that extends another moves what depends on its numbers:
 
-- `rotors.arm_length` [m] moves all rotor centres outwards to this mean horizontal distance.
 - If mass, rotor positions or parts change and the file has no `inertia`, the inertia follows. The
   main body keeps its radii of gyration. Without `multibody`, changed positions need the `inertia`
   beside them.

@@ -31,33 +31,13 @@ NO_ZEROS = (0.0,) * 4
 
 @dataclass(frozen=True)
 class ActuatorHealth:
-    """
-    State of the four rotors and four tilt servos.
+    """State of the four rotors and four tilt servos."""
 
-    Attributes:
-        rotors: four bools, False for a rotor without thrust.
-        stuck: true angle of each stuck joint [rad], None for a joint that moves.
-        held: thrust of each rotor that ignores its command [N], else None.
-        zeros: reading minus true tilt of each joint, estimated in flight [rad].
-        thrust_limit: largest thrust of every rotor that the pack allows [N], None if it is not
-            below the robot's own limit.
-
-    Raises:
-        ValueError: a field does not have four entries.
-
-    """
-
-    rotors: tuple[bool, ...] = (True,) * 4
-    stuck: tuple[float | None, ...] = (None,) * 4
-    held: tuple[float | None, ...] = (None,) * 4
-    zeros: tuple[float, ...] = NO_ZEROS
-    thrust_limit: float | None = None
-
-    def __post_init__(self):
-        """Check that each field has four entries."""
-        for name in ('rotors', 'stuck', 'held', 'zeros'):
-            if len(getattr(self, name)) != 4:
-                raise ValueError(f'{name}: expected four, found {len(getattr(self, name))}')
+    rotors: tuple[bool, ...] = (True,) * 4      # False: without thrust
+    stuck: tuple[float | None, ...] = (None,) * 4   # true angle [rad]; None: the joint moves
+    held: tuple[float | None, ...] = (None,) * 4    # thrust that ignores the command [N]
+    zeros: tuple[float, ...] = NO_ZEROS     # reading minus true tilt, estimated in flight [rad]
+    thrust_limit: float | None = None       # that the pack allows, if below the robot's own [N]
 
     @cached_property
     def healthy(self) -> bool:
@@ -101,19 +81,11 @@ ALL_HEALTHY = ActuatorHealth()
 
 @dataclass(frozen=True)
 class Allocation:
-    """
-    Actuator targets for one wrench.
+    """Actuator targets for one wrench, within their limits."""
 
-    Attributes:
-        tilt: (4,) tilt angles [rad], inside the joints' travel.
-        thrust: (4,) thrusts [N], inside the rotors' range.
-        saturated: (4,) bool, True for a rotor at a limit; the wrench is then not met.
-
-    """
-
-    tilt: np.ndarray
-    thrust: np.ndarray
-    saturated: np.ndarray
+    tilt: np.ndarray        # (4,) [rad]
+    thrust: np.ndarray      # (4,) [N]
+    saturated: np.ndarray   # (4,) bool: at a limit; the wrench is then not met
 
 
 class Allocator:
@@ -261,16 +233,3 @@ def nearest_turn(angle: np.ndarray, present: np.ndarray) -> np.ndarray:
 def clipped(values: np.ndarray, low: np.ndarray | float, high: np.ndarray | float) -> np.ndarray:
     """As np.clip, which takes three times as long for a few numbers."""
     return np.minimum(np.maximum(values, low), high)
-
-
-def allocate(robot: RobotParameters, force: np.ndarray, torque: np.ndarray,
-             present_tilt: np.ndarray) -> Allocation:
-    """One allocation by :meth:`Allocator.allocate`; for many, construct an Allocator once."""
-    return Allocator(robot).allocate(force, torque, present_tilt)
-
-
-def hover_allocation(robot: RobotParameters, quaternion: np.ndarray, present_tilt: np.ndarray,
-                     extra_force_world: np.ndarray | None = None,
-                     extra_torque_body: np.ndarray | None = None) -> Allocation:
-    """One allocation by :meth:`Allocator.hover`; for many, construct an Allocator once."""
-    return Allocator(robot).hover(quaternion, present_tilt, extra_force_world, extra_torque_body)

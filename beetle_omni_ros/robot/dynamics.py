@@ -202,8 +202,10 @@ def tilt_servo(robot: RobotParameters, joint: int, target, thrust=0.0,
     return Servo.of(robot.joints.of(joint), coulomb=terms.coulomb, stiction=stiction), terms
 
 
-def derivative(robot: RobotParameters, x, u, d):
-    """State derivative (25,) of the full model; see the slices of this module."""
+def full_model(robot: RobotParameters) -> ca.Function:
+    """State derivative f(x (25), u (8), d (10)) -> (25,); slices of this module."""
+    x, u, d = ca.SX.sym('x', STATE_SIZE), ca.SX.sym('u', INPUT_SIZE), \
+        ca.SX.sym('d', DISTURBANCE_SIZE)
     limit = robot.joints.position_limit
     target = ca.fmin(ca.fmax(u[TILT_COMMAND], -limit), limit) + d[TILT_OFFSET]
     thrust_target = ca.fmin(ca.fmax(u[THRUST_COMMAND], robot.rotors.thrust_min),
@@ -216,17 +218,9 @@ def derivative(robot: RobotParameters, x, u, d):
     acceleration, angular_acceleration = rigid_body(
         robot, x[VELOCITY], x[QUATERNION], x[RATE], x[TILT], x[THRUST], d[FORCE], d[TORQUE],
         tilt_acceleration, tilt_rate=x[TILT_RATE], thrust_rate=thrust_rate, position=x[POSITION])
-    return ca.vertcat(
+    return ca.Function('dynamics', [x, u, d], [ca.vertcat(
         x[VELOCITY], acceleration, quaternion_rate(x[QUATERNION], x[RATE]), angular_acceleration,
-        x[TILT_RATE], tilt_acceleration, thrust_rate)
-
-
-def full_model(robot: RobotParameters) -> ca.Function:
-    """State derivative f(x (25), u (8), d (10)) -> (25,); slices of this module."""
-    x, u, d = ca.SX.sym('x', STATE_SIZE), ca.SX.sym('u', INPUT_SIZE), \
-        ca.SX.sym('d', DISTURBANCE_SIZE)
-    return ca.Function('dynamics', [x, u, d], [derivative(robot, x, u, d)],
-                       ['x', 'u', 'd'], ['x_dot'])
+        x[TILT_RATE], tilt_acceleration, thrust_rate)], ['x', 'u', 'd'], ['x_dot'])
 
 
 def body_acceleration(robot: RobotParameters) -> ca.Function:

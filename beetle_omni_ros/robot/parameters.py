@@ -19,8 +19,6 @@ from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import parameter, ParameterError, quoted
 
 LONGEST_NAME = 255      # characters of a file's name
-ARM_LENGTH = parameter(doc='mean horizontal distance of the rotor centres from the centre of '
-                       'gravity', unit='m', low=0.01, high=5)     # of a file that extends another
 CLOSE = 5e-4        # [m] within which a described part agrees with the totals; 2.4e-4 as shipped
 MISSING = 0.1       # [1] of the inertia that a described main body may lack; 0.07 as shipped
 JOINT_NAMES = ('gimbal1', 'gimbal2', 'gimbal3', 'gimbal4')
@@ -190,18 +188,7 @@ class MultibodyParameters:
 
 @dataclass(frozen=True, kw_only=True)
 class RobotParameters:
-    """
-    All parameters of one robot.
-
-    Attributes:
-        mass: [kg].
-        gravity: [m/s^2].
-        inertia: (3,) diagonal about the centre of gravity [kg m^2].
-        effects: deviations from the model, effect -> parameter -> value.
-        intervals: 95 % intervals of measured values, dotted key -> (lowest, highest), each with
-            the value's shape.
-
-    """
+    """All parameters of one robot; effects are effect -> parameter -> value."""
 
     mass: float = parameter(doc='total mass', unit='kg', low=0.05, high=200)
     gravity: float = parameter(9.80665, doc='gravity', unit='m/s^2', low=0, high=30)
@@ -411,18 +398,16 @@ def _extended(base: Path, below: dict, path: Path, content: dict) -> dict:
     """
     Merge a file with the file that it extends, whose content is ``below``.
 
-    A length of the arms moves the rotors. Changed masses and positions change the inertia, if the
-    file does not state it, and the checks of the extended file do not apply to them.
+    Changed masses and positions change the inertia, if the file does not state it, and the checks
+    of the extended file do not apply to them.
     """
     rotors = content.get('rotors')
-    if isinstance(rotors, dict) and 'arm_length' in rotors:
-        content = content | {'rotors': _with_arms(base, below, path, rotors)}
     if 'intervals' in below:    # those of values that the file replaces do not hold for it
         below = below | {'intervals': {key: pair for key, pair in below['intervals'].items()
                                        if not _states(content, key.split('.'))}}
     merged, own = _overlaid(below, content), content.get('multibody', {})
     moves = {'mass', 'multibody'} & set(content) or (
-        isinstance(rotors, dict) and {'arm_length', 'positions'} & set(rotors))
+        isinstance(rotors, dict) and 'positions' in rotors)
     if (moves or 'inertia' in content) and isinstance(own, dict) and merged.get('multibody'):
         merged['multibody'] = _unchecked(merged['multibody'], own)
     if moves and 'inertia' not in content:
@@ -438,18 +423,6 @@ def _states(content: Any, names: list[str]) -> bool:
     first, *rest = names
     return isinstance(content, dict) and first in content and (
         not rest or first == 'effects' or _states(content[first], rest))
-
-
-def _with_arms(base: Path, below: dict, path: Path, rotors: dict) -> dict:
-    """``rotors`` of a file with positions in place of the length of the arms."""
-    at = f"{path}: key 'rotors.arm_length'"
-    if 'positions' in rotors:
-        raise ParameterError(f'{at}: expected either this key or rotors.positions')
-    length = schema.check(ARM_LENGTH, float, rotors['arm_length'], at)
-    positions = schema.bind(RobotParameters, {**below, 'effects': {}}, str(base)).rotors.positions
-    scale = length / np.linalg.norm(positions[:, :2], axis=1).mean()
-    return {key: value for key, value in rotors.items() if key != 'arm_length'} | {
-        'positions': positions * [scale, scale, 1.0]}
 
 
 def _unchecked(multibody: dict, own: dict) -> dict:
@@ -482,19 +455,11 @@ def _overlaid(base: dict, content: dict) -> dict:
 
 @dataclass(frozen=True)
 class Variation:
-    """
-    Deviation of one robot from its file.
-
-    Attributes:
-        mass_scale: factor of the total mass.
-        inertia_scale: (3,) factors of the total inertia.
-        centre_of_mass: (3,) centre of mass of the whole robot in base_link [m].
-
-    """
+    """Deviation of one robot from its file."""
 
     mass_scale: float = 1.0
     inertia_scale: np.ndarray = field(default_factory=lambda: np.ones(3))
-    centre_of_mass: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    centre_of_mass: np.ndarray = field(default_factory=lambda: np.zeros(3))  # of the whole [m]
 
 
 @dataclass(frozen=True)
@@ -514,24 +479,18 @@ class RigidPart:
 @dataclass(frozen=True)
 class MassProperties:
     """
-    All parts of the robot with its tilts at zero.
+    All parts of the robot with its tilts at zero, in base_link.
 
-    Attributes:
-        main_body: totals minus the other parts.
-        modules: the four tilting modules.
-        end_effector: the ball.
-        main_origin: (3,) origin of the main body's frame in base_link [m].
-        joint_origins: (4, 3) origins of the tilt joints in base_link [m].
-        module_rotations: (4, 3, 3), columns outward, sideways, up, in base_link.
-
+    A robot file contains the totals (mass, inertia about the centre of gravity), the tilting
+    modules and the end-effector. The main body is the difference.
     """
 
     main_body: RigidPart
-    modules: tuple[RigidPart, ...]
-    end_effector: RigidPart
-    main_origin: np.ndarray
-    joint_origins: np.ndarray
-    module_rotations: np.ndarray
+    modules: tuple[RigidPart, ...]  # tilting, four
+    end_effector: RigidPart         # the ball
+    main_origin: np.ndarray         # (3,) of the main body's frame [m]
+    joint_origins: np.ndarray       # (4, 3) of the tilt joints [m]
+    module_rotations: np.ndarray    # (4, 3, 3), columns outward, sideways, up
 
 
 def combined(parts: list[RigidPart]) -> RigidPart:
@@ -544,11 +503,6 @@ def combined(parts: list[RigidPart]) -> RigidPart:
 def inertia_about(point: np.ndarray, parts: list[RigidPart]) -> np.ndarray:
     """Inertia (3, 3) of several parts about ``point`` [m]."""
     return np.sum([part.inertia_about(point) for part in parts], axis=0)
-
-
-def total_mass(robot: RobotParameters, variation: Variation) -> float:
-    """Mass of the whole robot [kg] with the effect ``mass`` and the variation."""
-    return robot.effects.get('mass', {}).get('mass', robot.mass) * variation.mass_scale
 
 
 def mass_properties(robot: RobotParameters, variation: Variation | None = None) -> MassProperties:
@@ -566,7 +520,7 @@ def mass_properties(robot: RobotParameters, variation: Variation | None = None) 
     variation = variation or Variation()
     made = _described(robot)
     known = [*made.modules, made.end_effector]
-    mass = total_mass(robot, variation)
+    mass = robot.effects.get('mass', {}).get('mass', robot.mass) * variation.mass_scale
     offset = robot.effects.get('centre_of_mass', {}).get('offset', (0.0,) * 3)
     total_inertia = np.array(robot.effects.get('inertia', {}).get('inertia', robot.inertia))
     centre = variation.centre_of_mass + np.array(offset)

@@ -40,34 +40,18 @@ CASADI = Namespace(ca.fmin, ca.fmax, ca.exp, ca.sqrt, ca.if_else, ca.sin, ca.cos
 
 @dataclass(frozen=True)
 class Servo:
-    """
-    Numbers of a servo, or arrays of them; None disables a limit or friction.
+    """Numbers of a servo, or arrays of them; None disables a limit or friction."""
 
-    Attributes:
-        inertia: [kg m^2].
-        kp: stiffness [N m/rad].
-        kd: damping [N m s/rad].
-        velocity_limit: [rad/s].
-        effort_limit: largest torque of the motor [N m].
-        position_limit: travel to each side [rad].
-        coulomb: sliding friction [N m].
-        stiction: friction at rest [N m].
-        fading_rate: rate over which stiction falls to sliding friction [rad/s].
-        gaussian: whether stiction fades as exp(-x^2), else as exp(-|x|), with x = rate / fading
-            rate.
-
-    """
-
-    inertia: Any
-    kp: Any
-    kd: Any
-    velocity_limit: Any = None
-    effort_limit: Any = None
-    position_limit: Any = None
-    coulomb: Any = None
-    stiction: Any = None
-    fading_rate: Any = SLIDING_RATE
-    gaussian: bool = True
+    inertia: Any                # [kg m^2]
+    kp: Any                     # stiffness [N m/rad]
+    kd: Any                     # damping [N m s/rad]
+    velocity_limit: Any = None  # [rad/s]
+    effort_limit: Any = None    # largest torque of the motor [N m]
+    position_limit: Any = None  # travel to each side [rad]
+    coulomb: Any = None         # sliding friction [N m]
+    stiction: Any = None        # friction at rest [N m]
+    fading_rate: Any = SLIDING_RATE     # over which stiction falls to sliding friction [rad/s]
+    gaussian: bool = True       # stiction fades as exp(-x^2), else as exp(-|x|), x = rate / fading
 
     @classmethod
     def of(cls, joints: JointParameters, **more) -> Servo:
@@ -205,23 +189,13 @@ def _within(space, value, limit):
 
 @dataclass(frozen=True)
 class Responses:
-    """
-    Limits of the response of any servo and rotor of one robot, (lowest, highest).
+    """Limits of the response of any servo and rotor of one robot, (lowest, highest)."""
 
-    Attributes:
-        servo_lag: time constant of the first-order reduction [s].
-        servo_delay: delay of tilt commands and encoders by the effects [s].
-        rotor_lag: time constant of the thrust [s].
-        rotor_delay: delay of thrust commands by the effects [s].
-        friction: largest angle at which friction holds a servo beside its target [rad].
-
-    """
-
-    servo_lag: tuple[float, float]
-    servo_delay: tuple[float, float]
-    rotor_lag: tuple[float, float]
-    rotor_delay: tuple[float, float]
-    friction: float
+    servo_lag: tuple[float, float]      # time constant of the first-order reduction [s]
+    servo_delay: tuple[float, float]    # of tilt commands and encoders by the effects [s]
+    rotor_lag: tuple[float, float]      # time constant of the thrust [s]
+    rotor_delay: tuple[float, float]    # of thrust commands by the effects [s]
+    friction: float     # largest angle at which friction holds a servo beside its target [rad]
 
     @classmethod
     def of(cls, robot: RobotParameters) -> Responses:

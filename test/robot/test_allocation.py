@@ -8,7 +8,7 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.allocation import allocate, Allocator, hover_allocation
+from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 ROBOT = RobotParameters.load()
@@ -145,7 +145,7 @@ def test_excess_thrust_is_clipped_and_reported():
 
 def test_a_tilt_without_a_permitted_turn_is_clipped_and_reported():
     short = replace(ROBOT, joints=replace(ROBOT.joints, position_limit=1.0))
-    got = allocate(short, np.array([0.0, 0.0, -20.0]), np.zeros(3), np.zeros(4))
+    got = Allocator(short).allocate(np.array([0.0, 0.0, -20.0]), np.zeros(3), np.zeros(4))
     assert np.all(np.abs(got.tilt) <= 1.0)
     assert got.saturated.all()
 
@@ -182,7 +182,7 @@ def test_hover_carries_the_weight_within_the_thrust_that_the_paper_robot_needs()
 
 def test_extra_force_is_in_world_and_extra_torque_in_base_link():
     attitude = rotations.from_rpy(0.8, -0.4, 2.0)
-    got = hover_allocation(ROBOT, attitude, np.zeros(4), np.array([3.0, -2.0, 1.0]),
+    got = ALLOCATOR.hover(attitude, np.zeros(4), np.array([3.0, -2.0, 1.0]),
                            np.array([0.1, 0.2, -0.3]))
     force, torque = ALLOCATOR.wrench(got.tilt, got.thrust)
     np.testing.assert_allclose(rotations.matrix(attitude) @ force,

@@ -122,9 +122,3 @@ def test_a_rotor_stuck_at_a_thrust_is_compensated_by_the_others():
         if not got.saturated.any():
             np.testing.assert_allclose(np.concatenate(ours.wrench(got.tilt, got.thrust)),
                                        np.concatenate([force, torque]), atol=1e-6)
-
-
-def test_health_refuses_lengths_other_than_four():
-    with pytest.raises(ValueError, match='rotors: expected four, found 3'):
-        ActuatorHealth(rotors=(True,) * 3)
-    assert ALL_HEALTHY.healthy and not lost(1).healthy and not stuck(0, 0.0).healthy

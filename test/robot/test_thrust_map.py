@@ -8,13 +8,7 @@ import pytest
 
 from beetle_omni_ros.robot.parameters import RobotParameters, RotorMapRow
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.robot.thrust_map import (
-    command_of_duty,
-    duty_of_command,
-    FULL_DUTY,
-    STOP_DUTY,
-    ThrustMap,
-)
+from beetle_omni_ros.robot.thrust_map import duty_of_command, FULL_DUTY, STOP_DUTY, ThrustMap
 
 ROTORS = RobotParameters.load().rotors
 MAP = ThrustMap(ROTORS)
@@ -114,18 +108,11 @@ def test_arrays_and_scalars_give_equal_results():
     voltage = rng.uniform(20, 26, (50, 1))
     thrust = rng.uniform(0, 26, (50, 4))
     duty = MAP.duty(thrust, voltage)
-    back = MAP.thrust(duty, voltage)
-    assert duty.shape == back.shape == (50, 4)
     for k in range(50):
         np.testing.assert_allclose(duty[k], MAP.duty(thrust[k], voltage[k, 0]), rtol=1e-12)
-        np.testing.assert_allclose(back[k], MAP.thrust(duty[k], voltage[k, 0]), atol=1e-9)
-    np.testing.assert_allclose(back, np.minimum(thrust, MAP.thrust_limit(voltage)), atol=1e-9)
-
-
-def test_commands_run_from_stop_to_full():
-    assert command_of_duty(STOP_DUTY) == 0
-    assert command_of_duty(FULL_DUTY) == 1
-    assert np.all(MAP.torque(np.array([0.0, 10.0])) == [0, 0.165])
+        np.testing.assert_allclose(
+            MAP.thrust(duty[k], voltage[k, 0]),
+            np.minimum(thrust[k], MAP.thrust_limit(voltage[k, 0])), atol=1e-9)
 
 
 def bent(peak=False):
