@@ -1,17 +1,138 @@
-"""Attitudes that can be held: shares, singularities, the nearest one with margin, heading."""
+"""Allocation with lost and stuck actuators, and the attitudes that can be held."""
 
 import numpy as np
 import pytest
 
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY
-from beetle_omni_ros.robot.degraded import allocator, Holding, leaned, sphere, up
+from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY, Allocation, Allocator
+from beetle_omni_ros.robot.degraded import (
+    allocator,
+    DegradedAllocator,
+    Holding,
+    leaned,
+    LocalWeights,
+    sphere,
+    up,
+)
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 ROBOT = RobotParameters.load()
+LIMIT = ROBOT.joints.position_limit
+WEIGHTS = LocalWeights()
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 LOST = ActuatorHealth(rotors=(False, True, True, True))
 STUCK = ActuatorHealth(stuck=(None, 1.5, None, None))
+
+
+def lost(*rotors):
+    return ActuatorHealth(rotors=tuple(i not in rotors for i in range(4)))
+
+
+def stuck(joint, angle):
+    return ActuatorHealth(stuck=tuple(angle if i == joint else None for i in range(4)))
+
+
+KINDS = [*[lost(i) for i in range(4)], *[stuck(i, 0.9 * i - 1.2) for i in range(4)], stuck(2, 3.5)]
+
+
+def draws(count, seed):
+    rng = np.random.default_rng(seed)
+    for _ in range(count):
+        yield rng.normal(size=3) * 12, rng.normal(size=3) * 0.5, rng.uniform(-LIMIT, LIMIT, 4)
+
+
+def keeps_to(health, tilt, thrust):
+    assert all(thrust[i] == 0.0 for i in range(4) if not health.rotors[i])
+    assert all(tilt[i] == angle for i, angle in enumerate(health.stuck) if angle is not None)
+    assert np.all(np.abs(tilt) <= LIMIT)
+    assert np.all((thrust >= 0.0) & (thrust <= ROBOT.rotors.thrust_max))
+
+
+@pytest.mark.parametrize('health', KINDS)
+def test_the_remaining_actuators_give_the_wrench_within_limits(health):
+    ours, met = allocator(ROBOT, health), 0
+    for force, torque, present in draws(100, 1):
+        got = ours.allocate(force, torque, present)
+        keeps_to(health, got.tilt, got.thrust)
+        if not got.saturated.any():
+            met += 1
+            made = Allocator(ROBOT).wrench(got.tilt, got.thrust)
+            np.testing.assert_allclose(np.concatenate(made), np.r_[force, torque], atol=0.01)
+    assert met > 60
+
+
+def test_with_all_actuators_it_is_the_healthy_allocation():
+    ours, healthy = DegradedAllocator(ROBOT, ALL_HEALTHY), Allocator(ROBOT)
+    assert type(allocator(ROBOT)) is Allocator
+    for force, torque, present in draws(50, 2):
+        got, right = (a.allocate(force, torque, present) for a in (ours, healthy))
+        if not right.saturated.any():
+            np.testing.assert_allclose(got.tilt, right.tilt, atol=1e-9)
+            np.testing.assert_allclose(got.thrust, right.thrust, atol=1e-9)
+
+
+def test_a_stuck_rotor_that_would_need_negative_thrust_is_off():
+    health = stuck(0, np.pi)
+    got = allocator(ROBOT, health).hover(np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(4))
+    assert got.thrust[0] == 0.0
+    assert not got.saturated.any()
+
+
+@pytest.mark.parametrize('health', [lost(0), stuck(1, 0.8)])
+def test_beyond_the_limits_the_error_is_smaller_than_by_clipping(health):
+    ours = allocator(ROBOT, health)
+    scale = 1 / np.r_[np.full(3, ROBOT.mass), ROBOT.inertia]
+    nearer, clipped = [], []
+    for force, torque, present in draws(200, 3):
+        force, torque = 2 * force, 2 * torque
+        got = ours.allocate(force, torque, present)
+        if not got.saturated.any():
+            continue
+        wrench = np.concatenate([force, torque])
+        columns, inverse, _ = ours.choices[0]
+        pairs = (inverse @ wrench).reshape(4, 2)
+        if any(pairs[i, 0] < 0 for i in ours.stuck):
+            continue
+        lengths = np.maximum(np.linalg.norm(pairs, axis=1), 1e-9)
+        pairs *= np.minimum(1.0, ROBOT.rotors.thrust_max / lengths)[:, None]
+        clipped.append(np.linalg.norm(scale * (columns @ pairs.ravel() - wrench)))
+        nearer.append(np.linalg.norm(scale * (np.concatenate(
+            ours.wrench(got.tilt, got.thrust)) - wrench)))
+    assert len(nearer) > 20
+    assert np.median(nearer) < 0.7 * np.median(clipped)
+
+
+@pytest.mark.parametrize('health', KINDS)
+def test_solutions_near_the_present_tilts_respect_range_and_health(health):
+    ours = allocator(ROBOT, health)
+    for force, torque, present in draws(40, 4):
+        present, _ = health.possible(present, np.zeros(4))
+        aim = ours.allocate(force, torque, present)
+        got = ours.allocate_near(force, torque, present, aim, WEIGHTS)
+        keeps_to(health, got.tilt, got.thrust)
+        assert np.all(np.abs(got.tilt - present) <= WEIGHTS.tilt_reach + 1e-9)
+
+
+def test_near_a_solution_the_tilts_do_not_change():
+    health = lost(3)
+    ours = allocator(ROBOT, health)
+    attitude = rotations.from_rpy(0.25, 0.25, 0.0)
+    aim = ours.hover(attitude, np.zeros(4))
+    force = ours.weight @ rotations.matrix(attitude)
+    got = ours.allocate_near(force, np.zeros(3), aim.tilt,
+                             Allocation(aim.tilt, aim.thrust, aim.saturated), WEIGHTS)
+    np.testing.assert_allclose(got.tilt, aim.tilt, atol=1e-6)
+    np.testing.assert_allclose(got.thrust, aim.thrust, atol=1e-5)
+
+
+def test_a_rotor_stuck_at_a_thrust_is_compensated_by_the_others():
+    ours = DegradedAllocator(ROBOT, ActuatorHealth(held=(None, 9.0, None, None)))
+    for force, torque, present in draws(50, 5):
+        got = ours.allocate(force, torque, present)
+        assert got.thrust[1] == pytest.approx(9.0)
+        if not got.saturated.any():
+            np.testing.assert_allclose(np.concatenate(ours.wrench(got.tilt, got.thrust)),
+                                       np.concatenate([force, torque]), atol=1e-6)
 
 
 @pytest.fixture(scope='module')
@@ -54,46 +175,16 @@ def test_heading_does_not_change_the_margin(holdings):
         assert holdings[STUCK].margin(turned) == pytest.approx(holdings[STUCK].margin(quaternion))
 
 
-@pytest.mark.parametrize('health', [LOST, STUCK])
-def test_the_nearest_attitude_has_the_margin_and_no_sample_is_nearer(holdings, health):
+@pytest.mark.parametrize('health, margin', [(LOST, 1.0), (STUCK, 1.0), (LOST, 15.0)])
+def test_the_nearest_attitude_has_the_margin_and_no_sample_is_nearer(holdings, health, margin):
     holding = holdings[health]
+    best = min(margin, 0.8 * holding.margins.max())
     for desired in attitudes(30):
-        got = holding.nearest(desired, 1.0)
-        assert holding.margin(got) >= 1.0 - 1e-9
-        firm = holding.directions[holding.margins >= 1.0]
+        got = holding.nearest(desired, margin)
+        assert holding.margin(got) >= best - 1e-9
+        firm = holding.directions[holding.margins >= best]
         least = np.arccos(np.clip((firm @ up(desired)).max(), -1, 1))
         assert rotations.geodesic_angle(got, desired) <= least + 1e-6
-
-
-def test_an_attitude_with_margin_is_kept(holdings):
-    firm = leaned(LEVEL, holdings[LOST].directions[np.argmax(holdings[LOST].margins)])
-    np.testing.assert_allclose(holdings[LOST].nearest(firm, 2.0), firm)
-
-
-def test_without_any_margin_the_nearest_of_the_best_is_taken(holdings):
-    holding = holdings[LOST]
-    nearly = 0.8 * holding.margins.max()
-    for desired in (LEVEL, *attitudes(10)):
-        got = holding.nearest(desired, 15.0)
-        assert holding.margin(got) >= nearly - 1e-9
-        firm = holding.directions[holding.margins >= nearly]
-        least = np.arccos(np.clip((firm @ up(desired)).max(), -1, 1))
-        assert rotations.geodesic_angle(got, desired) <= least + 1e-6
-
-
-def test_the_quickest_attitude_is_the_present_one_if_all_have_margin(holdings):
-    got = holdings[ALL_HEALTHY].quickest(LEVEL, np.zeros(3), np.zeros(4), 1.0, 0.8)
-    assert rotations.geodesic_angle(got, LEVEL) < 0.2
-    turning = holdings[ALL_HEALTHY].quickest(LEVEL, np.array([5.0, 0, 0]), np.zeros(4), 1.0,
-                                            0.8)
-    assert rotations.log(turning)[0] > rotations.log(got)[0] + 0.05
-
-
-def test_the_nearest_attitude_has_the_flight_margin_near_the_requested_one():
-    holding = Holding(ROBOT, LOST)
-    got = holding.nearest(LEVEL, holding.parameters.flying_margin)
-    assert holding.margin(got) >= 2.0
-    assert rotations.geodesic_angle(got, LEVEL) < np.radians(20)
 
 
 def test_leaning_is_the_shortest_rotation():
