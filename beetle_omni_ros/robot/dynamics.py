@@ -59,25 +59,10 @@ def rigid_body(robot: RobotParameters, velocity, quaternion, angular_velocity, t
 
     Forces are summed at base_link, and the body turns about its centre of mass. The acceleration
     is that of the origin of base_link. The two points differ only if an effect moves the centre
-    of mass. An absent argument counts as zero, unless stated otherwise.
-
-    Args:
-        robot: parameters and effects.
-        velocity: (3,) in world [m/s].
-        quaternion: (4,) body to world, (x, y, z, w).
-        angular_velocity: (3,) in body [rad/s].
-        tilt: (4,) [rad].
-        thrust: (4,) after the rotors' lag [N].
-        force_world: (3,) external force in world [N].
-        torque_body: (3,) external torque in body [N m].
-        tilt_acceleration: (4,) [rad/s^2].
-        effects: name -> parameter -> value or symbol, in place of the robot file's.
-        tilt_rate: (4,) [rad/s].
-        thrust_rate: (4,) [N/s].
-        position: (3,) in world [m]; None: no ground effect.
-        voltage_ratio: pack voltage over that of a full pack; None: no effect of it.
-        charge_drawn: charge drawn from the pack [A h]; None: no effect of it.
-        rotor_positions: (4, 3) in place of the robot file's [m].
+    of mass. Arguments are named as the fields of :class:`Terms`, ``quaternion`` is body to world.
+    An absent argument counts as zero; without position, voltage_ratio or charge_drawn their
+    effects are absent. ``effects`` (name -> parameter -> value or symbol) and ``rotor_positions``
+    (4, 3) [m] replace those of the robot file.
 
     Returns:
         (3,) acceleration in world [m/s^2], (3,) angular acceleration in body [rad/s^2].

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from copy import deepcopy
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 import hashlib
+import json
 from pathlib import Path
 from typing import Any
 
@@ -254,25 +254,17 @@ class RobotParameters:
         The values of one joint have one place in their intervals: logs determine their ratios, the
         lag Kd / Kp and the angle at which friction holds, better than the values.
         """
-        place = rng.random(4)
-        sections: dict[str, dict] = {}
-        effects = deepcopy(self.effects)
-        own: dict[str, Any] = {}
+        place, drawn = rng.random(4), {}
         for key, (low, high) in self.intervals.items():
             share = place if np.shape(low) == (4,) else rng.random(np.shape(low))
             value = (low * (high / low)**share if np.all(low > 0) else low + (high - low) * share)
-            value = value.tolist() if np.ndim(value) else float(value)
-            section, *rest = key.split('.')
-            if section == 'effects':
-                effects[rest[0]][rest[1]] = value
-            elif rest:
-                sections.setdefault(section, {})[rest[0]] = value
-            else:
-                own[section] = value
-        own |= {name: replace(getattr(self, name), **{
-            each: np.array(value) if np.ndim(value) else value for each, value in values.items()})
-            for name, values in sections.items()}
-        return replace(self, **own, effects=effects, intervals={})
+            drawn[key] = value if np.ndim(value) else float(value)
+        nested = schema.nest(drawn)
+        effects = nested.pop('effects', {})
+        own = {name: replace(getattr(self, name), **value) if isinstance(value, dict) else value
+               for name, value in nested.items()}
+        return replace(self, **own, intervals={}, effects={
+            name: values | effects.get(name, {}) for name, values in self.effects.items()})
 
     @classmethod
     def load(cls, path: str | Path | None = None) -> RobotParameters:
@@ -336,19 +328,9 @@ class RobotParameters:
 
     def as_dict(self) -> dict:
         """All physical values as plain nested data, without name, intervals and provenance."""
-        def plain(value):
-            if hasattr(value, '__dataclass_fields__'):
-                return {key: plain(getattr(value, key)) for key in value.__dataclass_fields__}
-            if isinstance(value, np.ndarray):
-                return value.tolist()
-            if isinstance(value, (list, tuple)):
-                return [plain(item) for item in value]
-            if isinstance(value, dict):
-                return {key: plain(item) for key, item in value.items()}
-            return value
-        data = plain(self)
-        del data['name'], data['intervals'], data['provenance']
-        return data
+        values = asdict(self)
+        del values['name'], values['intervals'], values['provenance']
+        return json.loads(json.dumps(values, default=np.ndarray.tolist))
 
 
 def find_robot(name: str | Path, beside: Path | None = None) -> Path:

@@ -281,6 +281,8 @@ def _array(entry, value, at):
     except (OverflowError, TypeError, ValueError):
         raise ParameterError(f'{at}: expected numbers, found {quoted(value)}') from None
     shape = entry.metadata['shape']
+    if shape is not None and array.shape == (np.prod(shape),):
+        array = array.reshape(shape)    # ROS has flat arrays only
     if shape is not None and array.shape != tuple(shape):
         raise ParameterError(f'{at}: expected shape {tuple(shape)}, found {array.shape}')
     if shape is None and array.ndim != 1:
