@@ -106,20 +106,16 @@ class Allocator:
     """
 
     def __init__(self, robot: RobotParameters):
-        rotors, effects = robot.rotors, robot.effects
-        ratio = effects.get('torque_coefficient', {}).get(
-            'torque_to_thrust_ratio', rotors.torque_to_thrust_ratio)
-        scale = np.full(ROTORS, effects.get('thrust_coefficient', {}).get('scale', 1.0)) \
-            * np.asarray(effects.get('rotor_thrust_coefficient', {}).get('scale', 1.0))
-        self.mass = effects.get('mass', {}).get('mass', robot.mass)
+        rotors, scale = robot.rotors, robot.thrust_scale
+        self.mass = robot.true_mass
         self.weight = np.array([0.0, 0.0, self.mass * robot.gravity]) \
-            - np.asarray(effects.get('wind', {}).get('force', (0.0, 0.0, 0.0)))
+            - robot.effect('wind.force', (0.0, 0.0, 0.0))
         self.matrix = np.zeros((6, 2 * ROTORS))
         up = np.array([0.0, 0.0, 1.0])
         for i, axis in enumerate(robot.tilt_axes):
             for column, direction in ((2 * i, up), (2 * i + 1, np.cross(axis, up))):
                 torque = np.cross(rotors.positions[i], direction) \
-                    - rotors.spin[i] * ratio * direction
+                    - rotors.spin[i] * robot.torque_ratio * direction
                 self.matrix[:, column] = scale[i] * np.concatenate([direction, torque])
         self.axes = robot.tilt_axes
         self.inverse = np.linalg.pinv(self.matrix, rcond=SINGULAR)

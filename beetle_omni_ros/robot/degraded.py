@@ -1,5 +1,5 @@
 """
-Allocation for a robot with failed actuators.
+Allocation for a robot with failed actuators, and the attitudes that it can hold.
 
 A lost rotor has no column in the wrench map. A rotor with a stuck joint has one column, along its
 present direction, and a thrust that cannot be negative. Every other rotor keeps its two force
@@ -9,8 +9,6 @@ or is off. The solution is therefore the best of at most 2^stuck pseudo-inverses
 A rotor beyond its limit is fixed at the limit in its direction, and the others are solved again
 for the remaining wrench (active set). A rotor with a fixed thrust pushes along its minimum-norm
 share. The others are solved for the remaining wrench.
-
-Attitudes that a robot with failed actuators can hold, and the margin of each.
 
 Whether an attitude can be held depends on the direction of up in the body, not on heading. For a
 grid of directions the allocation of the weight gives tilts and thrusts. About these the

@@ -294,6 +294,28 @@ class RobotParameters:
                 key: robot._checked_interval(key, pair) for key, pair in robot.intervals.items()
                 if key not in replaced})
 
+    def effect(self, key: str, neutral):
+        """Value of an effect's parameter, 'effect.parameter'; ``neutral`` without the effect."""
+        name, parameter = key.split('.')
+        return self.effects.get(name, {}).get(parameter, neutral)
+
+    @property
+    def true_mass(self) -> float:
+        """Mass with the effect ``mass`` [kg]."""
+        return self.effect('mass.mass', self.mass)
+
+    @property
+    def torque_ratio(self) -> float:
+        """Reaction torque for each newton of thrust with the effects [m]."""
+        return self.effect('torque_coefficient.torque_to_thrust_ratio',
+                           self.rotors.torque_to_thrust_ratio)
+
+    @property
+    def thrust_scale(self) -> np.ndarray:
+        """(4,) true thrust relative to the commanded thrust, by the effects."""
+        return self.effect('thrust_coefficient.scale', 1.0) * np.array(
+            self.effect('rotor_thrust_coefficient.scale', (1.0,) * 4))
+
     @property
     def parts(self) -> MultibodyParameters:
         """The described parts, else parts from the totals."""
@@ -502,10 +524,9 @@ def mass_properties(robot: RobotParameters, variation: Variation | None = None) 
     variation = variation or Variation()
     made = _described(robot)
     known = [*made.modules, made.end_effector]
-    mass = robot.effects.get('mass', {}).get('mass', robot.mass) * variation.mass_scale
-    offset = robot.effects.get('centre_of_mass', {}).get('offset', (0.0,) * 3)
-    total_inertia = np.array(robot.effects.get('inertia', {}).get('inertia', robot.inertia))
-    centre = variation.centre_of_mass + np.array(offset)
+    mass = robot.true_mass * variation.mass_scale
+    total_inertia = np.array(robot.effect('inertia.inertia', robot.inertia))
+    centre = variation.centre_of_mass + robot.effect('centre_of_mass.offset', (0.0,) * 3)
     point_mass = _remaining(mass, centre, known)
     inertia = np.diag(total_inertia * variation.inertia_scale) - inertia_about(
         centre, [point_mass, *known])
