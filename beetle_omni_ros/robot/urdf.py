@@ -93,28 +93,6 @@ class Model:
         except UNUSABLE as error:
             raise ParameterError(f'{path}: not a usable URDF: {error}') from None
 
-    def poses(self, angles: dict[str, float]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """
-        Poses of all links.
-
-        Args:
-            angles: joint -> angle [rad]; 0 for absent joints.
-
-        Returns:
-            Link -> (3,) position [m] and (4,) quaternion in the root's frame.
-
-        """
-        placed = {}
-        for link in self.links.values():
-            if link.joint is None:
-                placed[link.name] = np.zeros(3), IDENTITY
-                continue
-            position, quaternion = placed[link.joint.parent]
-            placed[link.name] = (
-                position + rotations.matrix(quaternion) @ link.joint.position,
-                rotations.multiply(quaternion, link.turned(angles.get(link.moves, 0.0))))
-        return placed
-
 
 def description(path: str | Path = '') -> str:
     """
