@@ -6,8 +6,8 @@ of the parameter files refuse both at the start of the node, in one line that na
 """
 
 from collections.abc import Callable
-from types import NoneType
-from typing import get_args
+import types
+from typing import get_args, get_origin, Union
 
 import numpy as np
 from rcl_interfaces.msg import (
@@ -96,7 +96,9 @@ def _plain(value, hint):
 
 
 def _kind(hint):
-    return get_args(hint)[0] if NoneType in get_args(hint) else hint
+    if get_origin(hint) in (Union, types.UnionType):
+        return next(a for a in get_args(hint) if a is not type(None))
+    return hint
 
 
 def _descriptor(entry, hint, fixed, absent) -> ParameterDescriptor:
@@ -112,14 +114,14 @@ def _descriptor(entry, hint, fixed, absent) -> ParameterDescriptor:
     low, high = meta.get('low'), meta.get('high')
     if absent or (low is None and high is None) or _kind(hint) not in (int, float):
         return descriptor   # NaN, which stands for an absent number, is in no range
-    end = 2**31 if _kind(hint) is int else UNBOUNDED
-    ends = [_kind(hint)(value) for value in (-end if low is None else low,
-                                             end if high is None else high)]
     if _kind(hint) is int:
-        descriptor.integer_range = [IntegerRange(from_value=ends[0], to_value=ends[1], step=0)]
+        descriptor.integer_range = [IntegerRange(
+            from_value=int(-2**31 if low is None else low),
+            to_value=int(2**31 if high is None else high), step=0)]
     else:
         descriptor.floating_point_range = [FloatingPointRange(
-            from_value=ends[0], to_value=ends[1], step=0.0)]
+            from_value=float(-UNBOUNDED if low is None else low),
+            to_value=float(UNBOUNDED if high is None else high), step=0.0)]
     return descriptor
 
 
