@@ -56,16 +56,14 @@ def simulate(controller: str | Callable = 'nmpc', task: Any = 'waypoints', *,
         ParameterError, BagError, RunError: with a message of one line.
 
     """
-    from pathlib import Path
-
     from beetle_omni_ros.evaluation.command import fly
     believed, flown = _robot(robot), _task(task, seed)
+    given = robot is None or robot is believed
     return fly(_reference(controller), flown, robot=believed,
                plant=believed if plant is None else _robot(plant), conditions=conditions,
-               seed=seed, bag=None if bag is None else Path(bag), meta={
+               seed=seed, bag=_path(bag), meta={
                    'task': flown.name, 'conditions': conditions, 'seed': seed,
-                   'robot': str(robot) if isinstance(robot, (str, Path)) else 'params/robot.yaml',
-                   'version': __version__})
+                   'robot': 'params/robot.yaml' if given else str(robot), 'version': __version__})
 
 
 def evaluate(controllers: str | Callable | Sequence[str | Callable], task: Any = 'waypoints', *,
@@ -89,8 +87,6 @@ def evaluate(controllers: str | Callable | Sequence[str | Callable], task: Any =
         The content of `evaluate --json`: ``meta``, and a key for each controller's name.
 
     """
-    from pathlib import Path
-
     from rich.console import Console
 
     from beetle_omni_ros.evaluation.command import run_evaluate
@@ -98,9 +94,8 @@ def evaluate(controllers: str | Callable | Sequence[str | Callable], task: Any =
         else controllers
     return run_evaluate(
         controllers=[_reference(one) for one in several], task=_task(task, seed),
-        conditions=conditions, seed=seed, bag=None if bag is None else Path(bag),
-        robot=None if robot is None else Path(robot),
-        plant=None if plant is None else Path(plant), console=Console(quiet=quiet))
+        conditions=conditions, seed=seed, bag=_path(bag), robot=_path(robot), plant=_path(plant),
+        console=Console(quiet=quiet))
 
 
 def read_run(path: str | Path) -> FlightLog:
@@ -139,15 +134,11 @@ def find_gap(runs: Sequence[str | Path], holdout: Sequence[str | Path] = (), *,
         The content of `gap --json`: ``verdict``, ``effects``, ``closure`` and further keys.
 
     """
-    from pathlib import Path
-
     from rich.console import Console
 
     from beetle_omni_ros.identify.gap.command import gap_results
-    robot, apply, report = (None if path is None else Path(path)
-                            for path in (robot, apply, report))
-    return gap_results(list(map(Path, runs)), list(map(Path, holdout)), robot, apply, None, report,
-                       Console(quiet=quiet))
+    return gap_results(list(map(_path, runs)), list(map(_path, holdout)), _path(robot),
+                       _path(apply), None, _path(report), Console(quiet=quiet))
 
 
 def trajectory(times, positions, quaternions, name: str = 'own trajectory'):
@@ -163,6 +154,11 @@ def trajectory(times, positions, quaternions, name: str = 'own trajectory'):
     """
     from beetle_omni_ros.runs.tasks import trajectory_task
     return trajectory_task(name, times, positions, quaternions)
+
+
+def _path(given):
+    from pathlib import Path
+    return None if given is None else Path(given)
 
 
 def _reference(controller):

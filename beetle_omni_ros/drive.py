@@ -9,8 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from beetle_omni_ros.robot import rotations, schema
-from beetle_omni_ros.robot.schema import parameter, ParameterError, ParameterFile
-from beetle_omni_ros.robot.yaml_file import quoted
+from beetle_omni_ros.robot.schema import parameter, ParameterError, ParameterFile, quoted
 
 BUTTONS = ('arm', 'land', 'hold', 'home')
 NEAR = 1e-9     # [m, rad] distance from the goal that counts as arrived
@@ -37,17 +36,18 @@ MAX_TURN = 180.0    # [deg]; the shortest path to a larger rotation has the othe
 class DriveParameters(ParameterFile, file='drive.yaml'):
     """Content of params/drive.yaml."""
 
-    speed: float = parameter(doc='largest speed of the target', unit='m/s', low=0.01, high=5)
-    rate: float = parameter(doc='largest rate of the target attitude', unit='rad/s', low=0.01,
-                            high=10)
-    leash: float = parameter(doc='distance from the robot at which the target waits', unit='m',
-                             low=0.05, high=5)
-    step: float = parameter(doc='shift by one key', unit='m', low=0.001, high=1)
-    turn: float = parameter(doc='rotation by one key', unit='rad', low=0.001, high=1.6)
-    dead_zone: float = parameter(doc='deflection of a joystick axis that counts as none', low=0,
-                                 high=0.9)
-    joystick_timeout: float = parameter(doc='time without a message after which the joystick '
-                                        'counts as released', unit='s', low=0.05, high=10)
+    speed: float = parameter(0.5, doc='largest speed of the target', unit='m/s', low=0.01, high=5)
+    rate: float = parameter(
+        0.8, doc='largest rate of the target attitude', unit='rad/s', low=0.01, high=10)
+    leash: float = parameter(
+        0.5, doc='distance from the robot at which the target waits', unit='m', low=0.05, high=5)
+    step: float = parameter(0.1, doc='shift by one key', unit='m', low=0.001, high=1)
+    turn: float = parameter(0.17453, doc='rotation by one key', unit='rad', low=0.001, high=1.6)
+    dead_zone: float = parameter(
+        0.12, doc='deflection of a joystick axis that counts as none', low=0, high=0.9)
+    joystick_timeout: float = parameter(
+        0.5, doc='time without a message after which the joystick ' 'counts as released', unit='s',
+        low=0.05, high=10)
     axes: np.ndarray = parameter(doc='axes of sensor_msgs/Joy for x, y, z, yaw, pitch, roll; '
                                  '-1: none', low=-1, high=63, shape=(6,))
     signs: np.ndarray = parameter(doc='signs of these axes', low=-1, high=1, shape=(6,))

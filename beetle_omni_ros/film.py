@@ -15,7 +15,7 @@ from rich.progress import track
 from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.pages.figures import COLOURS
 from beetle_omni_ros.pages.page import Terminal
-from beetle_omni_ros.robot.allocation import hover_allocation
+from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.bag import no_pose, read_bag, runs_in
@@ -179,7 +179,7 @@ def _targets(log, times):
         pose = target if isinstance(target, PoseTarget) else target.at(float(t))
         key = np.round(pose.quaternion, 4).tobytes()
         if key not in tilts:
-            tilts[key] = hover_allocation(robot, pose.quaternion, np.zeros(4)).tilt
+            tilts[key] = Allocator(robot).hover(pose.quaternion, np.zeros(4)).tilt
         found.append(Pose(pose.position, pose.quaternion, tilts[key], time=t))
     return found
 

@@ -12,8 +12,7 @@ import numpy as np
 import trimesh
 from trimesh.creation import box, capsule, cylinder, icosphere
 
-from beetle_omni_ros.robot.mass_properties import mass_properties
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.parameters import mass_properties, RobotParameters
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 
 OUTPUT = Path(__file__).parent / 'meshes'

@@ -5,8 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
-from beetle_omni_ros.robot.mass_properties import mass_properties
-from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters, ROTOR_NAMES
+from beetle_omni_ros.robot.parameters import (
+    JOINT_NAMES,
+    mass_properties,
+    RobotParameters,
+    ROTOR_NAMES,
+)
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 
 OUTPUT = Path(__file__).parent / 'beetle_omni.urdf'

@@ -45,7 +45,7 @@ FILES = {
                             'The NMPC with the settings of the publication.'),
     'rl.yaml': ('control.policy:PolicyParameters', 'The policy and its guidance.'),
     'hover.yaml': ('control.hover:HoverParameters', 'The hover controller.'),
-    'degraded.yaml': ('robot.holding:HoldingParameters',
+    'degraded.yaml': ('robot.degraded:HoldingParameters',
                       'Attitudes that can be held with a failed actuator.'),
     'ekf.yaml': ('estimation.parameters:EkfParameters', 'The estimator.'),
     'supervisor.yaml': ('safety.parameters:SupervisorParameters',
@@ -75,7 +75,6 @@ They are optional checks. A file that contradicts itself by more than 0.5 mm is 
 
 A file that extends another moves what depends on its numbers:
 
-- `rotors.arm_length` [m] moves all rotor centres outwards to this mean horizontal distance.
 - If mass, rotor positions or parts change and the file has no `inertia`, the inertia follows. The
   main body keeps its radii of gyration. Without `multibody`, changed positions need the `inertia`
   beside them.
@@ -159,8 +158,8 @@ def _load(name: str):
 def parameters() -> str:
     """Every parameter of every shipped file."""
     text = [f'# Parameters\n\n{MADE}\n'
-            'The files of `params/` hold the values below. A comment beside each number gives '
-            'its source.\nA value outside its range and an unknown key are refused. '
+            'These are all values: the defaults of the code, with the changes of the files of '
+            '`params/`.\nA value outside its range and an unknown key are refused. '
             'In ROS, `ros2 param describe` shows unit\nand range. '
             '[Nodes](nodes.md#parameters) lists which source overrides which.\n']
     seen: dict[str, str] = {}

@@ -35,8 +35,7 @@ FILES = {
     'word_joint.csv': JOINTS + '0,0,0,0,0,x\n0.01,0,0,0,0,0\n', 'columns.csv': 'a,b\n1,2\n',
     'process.yaml': 'faults: [{what: controller_silent, at: 1}]\n',
     'device.yaml': 'faults: [{what: joints_lost}]\n',
-    'baud.yaml': share_path('params/servo_bus.yaml').read_text().replace(
-        'baud_rate: 1000000', 'baud_rate: fast'),
+    'baud.yaml': share_path('params/servo_bus.yaml').read_text() + '    baud_rate: fast\n',
     'ids.yaml': 'ids: [1, 2, 3]\n', 'port.yaml': 'prt: /dev/x\n'}
 DB3 = 'old/old_0.db3'
 

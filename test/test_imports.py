@@ -2,7 +2,6 @@
 
 import ast
 from pathlib import Path
-import subprocess
 import sys
 
 import pytest
@@ -70,24 +69,6 @@ def is_below(name, place):
 
 FILES = sorted(path for path in SOURCE.rglob('*.py') if path.parent != SOURCE
                or path.stem != '__init__')
-
-
-def test_no_parameter_file_is_read_by_an_import():
-    # Such a file, when it is broken, would fail every command in place of those that need it.
-    code = """if True:
-        import contextlib, importlib, sys
-        def refuse(event, given):
-            if event == 'open' and str(given[0]).endswith('.yaml'):
-                raise RuntimeError(f'{given[0]} is read by an import')
-        sys.addaudithook(refuse)
-        for name in sys.argv[1:]:
-            with contextlib.suppress(ModuleNotFoundError):      # without some extra
-                importlib.import_module(name)"""
-    names = ['.'.join((PACKAGE, *path.relative_to(SOURCE).with_suffix('').parts))
-             for path in FILES if subpackage_of(path) not in ('nodes', 'train', 'start')]
-    done = subprocess.run([sys.executable, '-c', code, *names], capture_output=True, text=True,
-                          timeout=100)
-    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize('folder', ALLOWED)

@@ -61,11 +61,6 @@ def dependencies(*tags):
     return {entry.text for tag in tags for entry in MANIFEST.findall(tag)}
 
 
-def test_manifest_is_format_3_for_ament_python():
-    assert MANIFEST.get('format') == '3'
-    assert MANIFEST.find('export/build_type').text == 'ament_python'
-
-
 def test_maintainer_has_an_address_that_colcon_accepts(setup_arguments):
     # With an address that it refuses, colcon silently builds a plain Python package.
     address = MANIFEST.find('maintainer').get('email')

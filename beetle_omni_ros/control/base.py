@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from beetle_omni_ros.robot.actuator_health import ActuatorHealth, NO_ZEROS
+from beetle_omni_ros.robot.allocation import ActuatorHealth, NO_ZEROS
 
 ROTORS = 4
 # Folders of the package, of installed packages and of Python itself.

@@ -19,7 +19,7 @@ from beetle_omni_ros.control.base import (
     State,
     Target,
 )
-from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
+from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY
 from beetle_omni_ros.robot.schema import ParameterError
 
 MOTORS_OFF = ('disarmed', 'emergency_stop')     # states of the supervisor

@@ -25,9 +25,8 @@ import numpy as np
 
 from beetle_omni_ros.control.base import Command, Followed, State
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
-from beetle_omni_ros.robot.allocation import clipped, nearest_turn
-from beetle_omni_ros.robot.degraded_allocation import allocator, DegradedAllocator, LocalWeights
+from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY, clipped, nearest_turn
+from beetle_omni_ros.robot.degraded import allocator, DegradedAllocator, LocalWeights
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import group, parameter, ParameterFile
 
@@ -53,7 +52,7 @@ class AxisGains:
 
 @dataclass(frozen=True, kw_only=True)
 class HoverParameters(ParameterFile, file='hover.yaml'):
-    """Tuning of the hover controller; params/hover.yaml gives the reasons."""
+    """Tuning of the hover controller."""
 
     period: float = parameter(0.01, doc='time between commands', unit='s', low=0.001, high=0.1)
     position: AxisGains = group(AxisGains, 'position and velocity in world')

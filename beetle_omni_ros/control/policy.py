@@ -31,7 +31,7 @@ class EstimateParameters:
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyParameters(GuidanceParameters, ParameterFile, file='rl.yaml'):
-    """Policy file and guidance; params/rl.yaml gives the reasons."""
+    """Policy file and guidance."""
 
     policy: str = parameter(DEFAULT, doc="ONNX file, in the package's share or any path",
                             read_only=True)

@@ -17,8 +17,7 @@ import numpy as np
 from beetle_omni_ros.control.observation import Block, blocks, DISTURBANCES, size
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters, ROTOR_NAMES
-from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.robot.yaml_file import quoted, shortened
+from beetle_omni_ros.robot.schema import ParameterError, quoted, shortened
 
 FORMAT = 'beetle_omni_policy/1'
 INPUT, OUTPUT = 'observation', 'action'

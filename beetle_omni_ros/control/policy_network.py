@@ -10,8 +10,7 @@ from beetle_omni_ros.control import onnx_runtime, policy_checksum
 from beetle_omni_ros.control.policy_file import ACTIONS, INPUT, OUTPUT, PolicyContract
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.robot.yaml_file import shortened
+from beetle_omni_ros.robot.schema import ParameterError, shortened
 
 onnxruntime = onnx_runtime.load()
 log = logging.getLogger(__name__)

@@ -7,9 +7,8 @@ from beetle_omni_ros.control.base import PoseTarget, Target, TrajectoryTarget
 from beetle_omni_ros.control.ocp import REFERENCE_SIZE
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.actuator_health import ActuatorHealth
-from beetle_omni_ros.robot.allocation import Allocator
-from beetle_omni_ros.robot.degraded_allocation import allocator
+from beetle_omni_ros.robot.allocation import ActuatorHealth, Allocator
+from beetle_omni_ros.robot.degraded import allocator
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
 

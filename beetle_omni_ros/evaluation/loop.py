@@ -23,7 +23,7 @@ from beetle_omni_ros.estimation.samples import pose_covariance, twist_covariance
 from beetle_omni_ros.evaluation.compute import collector_off, ComputeTimer
 from beetle_omni_ros.evaluation.processes import Processes
 from beetle_omni_ros.messages.values import Odom, Wrench
-from beetle_omni_ros.robot.actuator_health import ALL_HEALTHY
+from beetle_omni_ros.robot.allocation import ALL_HEALTHY
 from beetle_omni_ros.robot.effects import SensorErrors
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import RunError

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from beetle_omni_ros.control.base import TrajectoryTarget
-from beetle_omni_ros.robot.actuator_health import ActuatorHealth
+from beetle_omni_ros.robot.allocation import ActuatorHealth
 
 
 class MessageError(ValueError):

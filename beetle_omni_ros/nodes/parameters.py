@@ -7,7 +7,7 @@ of the parameter files refuse both at the start of the node, in one line that na
 
 from collections.abc import Callable
 import types
-from typing import get_args, get_origin, get_type_hints, Union
+from typing import get_args, get_origin, Union
 
 import numpy as np
 from rcl_interfaces.msg import (
@@ -62,9 +62,8 @@ def declare(node: Node, cls: type, file: str | None = None, file_key: str | None
     mapping = schema.load_yaml(start_from) if start_from else {}
     if completed is not None:
         mapping = completed(mapping, bool(own_file))
-    leaves = _leaves(cls)
     for name, value in overrides.items():
-        _put(mapping, name, _shaped(leaves.get(name), value))
+        _put(mapping, name, value)
     instance = schema.bind(cls, mapping)
     for name, entry, hint, value in schema.flatten(instance):
         if isinstance(value, (dict, tuple)) and hint != NAMES:
@@ -76,28 +75,6 @@ def declare(node: Node, cls: type, file: str | None = None, file_key: str | None
     if on_change:
         _validate_changes(node, cls, instance, on_change)
     return instance
-
-
-def _leaves(cls, prefix=''):
-    """Dotted name -> dataclass field, without an instance."""
-    found, hints = {}, get_type_hints(cls)
-    for name, entry in cls.__dataclass_fields__.items():
-        dotted = f'{prefix}.{name}' if prefix else name
-        if hasattr(hints[name], '__dataclass_fields__'):
-            found.update(_leaves(hints[name], dotted))
-        else:
-            found[dotted] = entry
-    return found
-
-
-def _shaped(entry, value):
-    """ROS has flat arrays only: give a matrix its shape back."""
-    shape = entry.metadata.get('shape') if entry is not None else None
-    if shape and len(shape) > 1 and np.size(value) == np.prod(shape):
-        return np.reshape(value, shape)
-    if not isinstance(value, (str, bytes)) and hasattr(value, '__len__'):
-        return list(value)
-    return value
 
 
 def _put(mapping, name, value):
@@ -153,11 +130,7 @@ def _validate_changes(node, cls, instance, on_change):
 
     def changed(parameters):
         # ROS itself refuses read-only and unknown names.
-        leaves = _leaves(cls)
-        proposed = dict(current)
-        for parameter in parameters:
-            if parameter.name in leaves:
-                proposed[parameter.name] = _shaped(leaves[parameter.name], parameter.value)
+        proposed = current | {each.name: each.value for each in parameters if each.name in current}
         try:
             new = schema.bind(cls, schema.nest(proposed), node.get_name())
             on_change(new)

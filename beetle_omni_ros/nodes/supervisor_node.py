@@ -11,7 +11,7 @@ from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.messages.conversions import take_known_joints
 from beetle_omni_ros.messages.values import HealthReport, TargetOverride
 from beetle_omni_ros.nodes.node import ERROR, FlightNode, IDENTITY, new_identity, OK, WARN
-from beetle_omni_ros.robot.actuator_health import ALL_HEALTHY
+from beetle_omni_ros.robot.allocation import ALL_HEALTHY
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import NAMES, parameter, ParameterError
 from beetle_omni_ros.safety.parameters import SupervisorParameters

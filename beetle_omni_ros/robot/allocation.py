@@ -10,7 +10,10 @@ B and the hover wrench include the known effects of the robot file: mass, thrust
 coefficients, wind.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from functools import cached_property
 from math import atan2, copysign, cos, hypot, pi, sin
 
 import numpy as np
@@ -23,23 +26,66 @@ NEGLIGIBLE = 1e-6   # of the hover thrust: below it the direction of a rotor is 
 SINGULAR = 1e-6     # of the largest singular value: below it the rotors cannot push a direction
 OVERLAP = 0.05      # [rad] beyond a stop, for which a joint at the stop does not turn to the other
                     # side: ten deviations of the tilts of a held pose under published noise
+NO_ZEROS = (0.0,) * 4
+
+
+@dataclass(frozen=True)
+class ActuatorHealth:
+    """State of the four rotors and four tilt servos."""
+
+    rotors: tuple[bool, ...] = (True,) * 4      # False: without thrust
+    stuck: tuple[float | None, ...] = (None,) * 4   # true angle [rad]; None: the joint moves
+    held: tuple[float | None, ...] = (None,) * 4    # thrust that ignores the command [N]
+    zeros: tuple[float, ...] = NO_ZEROS     # reading minus true tilt, estimated in flight [rad]
+    thrust_limit: float | None = None       # that the pack allows, if below the robot's own [N]
+
+    @cached_property
+    def healthy(self) -> bool:
+        """Whether every actuator follows commands; a wrong joint zero counts as healthy."""
+        return all(self.rotors) and self.stuck == self.held == (None,) * 4 \
+            and self.thrust_limit is None
+
+    def same_actuators(self, other: ActuatorHealth) -> bool:
+        """Whether the same actuators have failed; angles, thrusts, limit and zeros may differ."""
+        return self.rotors == other.rotors and all(
+            (a is None) == (b is None) for a, b in zip(
+                (*self.stuck, *self.held, self.thrust_limit),
+                (*other.stuck, *other.held, other.thrust_limit)))
+
+    def limited(self, thrust: float) -> float:
+        """Limit ``thrust`` [N] to what the pack allows."""
+        return thrust if self.thrust_limit is None else min(thrust, self.thrust_limit)
+
+    def possible(self, tilt: np.ndarray, thrust: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Tilts (4,) [rad] and thrusts (4,) [N] that the failed actuators and the pack allow.
+
+        Stuck joints keep their angle, and lost rotors have no thrust.
+        """
+        angles = [own if angle is None else angle for own, angle in zip(tilt, self.stuck)]
+        thrusts = [self.limited(own) if held is None else held
+                   for own, held in zip(thrust, self.held)]
+        return np.array(angles, dtype=float), np.where(self.rotors, thrusts, 0.0)
+
+    def true(self, tilt: np.ndarray) -> np.ndarray:
+        """True tilts (4,) for readings or joint targets [rad]."""
+        return tilt if self.zeros == NO_ZEROS else tilt - np.array(self.zeros)
+
+    def read(self, tilt: np.ndarray) -> np.ndarray:
+        """Readings (4,) for true tilts [rad]; these are also the joint targets for them."""
+        return tilt if self.zeros == NO_ZEROS else tilt + np.array(self.zeros)
+
+
+ALL_HEALTHY = ActuatorHealth()
 
 
 @dataclass(frozen=True)
 class Allocation:
-    """
-    Actuator targets for one wrench.
+    """Actuator targets for one wrench, within their limits."""
 
-    Attributes:
-        tilt: (4,) tilt angles [rad], inside the joints' travel.
-        thrust: (4,) thrusts [N], inside the rotors' range.
-        saturated: (4,) bool, True for a rotor at a limit; the wrench is then not met.
-
-    """
-
-    tilt: np.ndarray
-    thrust: np.ndarray
-    saturated: np.ndarray
+    tilt: np.ndarray        # (4,) [rad]
+    thrust: np.ndarray      # (4,) [N]
+    saturated: np.ndarray   # (4,) bool: at a limit; the wrench is then not met
 
 
 class Allocator:
@@ -60,20 +106,16 @@ class Allocator:
     """
 
     def __init__(self, robot: RobotParameters):
-        rotors, effects = robot.rotors, robot.effects
-        ratio = effects.get('torque_coefficient', {}).get(
-            'torque_to_thrust_ratio', rotors.torque_to_thrust_ratio)
-        scale = np.full(ROTORS, effects.get('thrust_coefficient', {}).get('scale', 1.0)) \
-            * np.asarray(effects.get('rotor_thrust_coefficient', {}).get('scale', 1.0))
-        self.mass = effects.get('mass', {}).get('mass', robot.mass)
+        rotors, scale = robot.rotors, robot.thrust_scale
+        self.mass = robot.true_mass
         self.weight = np.array([0.0, 0.0, self.mass * robot.gravity]) \
-            - np.asarray(effects.get('wind', {}).get('force', (0.0, 0.0, 0.0)))
+            - robot.effect('wind.force', (0.0, 0.0, 0.0))
         self.matrix = np.zeros((6, 2 * ROTORS))
         up = np.array([0.0, 0.0, 1.0])
         for i, axis in enumerate(robot.tilt_axes):
             for column, direction in ((2 * i, up), (2 * i + 1, np.cross(axis, up))):
                 torque = np.cross(rotors.positions[i], direction) \
-                    - rotors.spin[i] * ratio * direction
+                    - rotors.spin[i] * robot.torque_ratio * direction
                 self.matrix[:, column] = scale[i] * np.concatenate([direction, torque])
         self.axes = robot.tilt_axes
         self.inverse = np.linalg.pinv(self.matrix, rcond=SINGULAR)
@@ -187,16 +229,3 @@ def nearest_turn(angle: np.ndarray, present: np.ndarray) -> np.ndarray:
 def clipped(values: np.ndarray, low: np.ndarray | float, high: np.ndarray | float) -> np.ndarray:
     """As np.clip, which takes three times as long for a few numbers."""
     return np.minimum(np.maximum(values, low), high)
-
-
-def allocate(robot: RobotParameters, force: np.ndarray, torque: np.ndarray,
-             present_tilt: np.ndarray) -> Allocation:
-    """One allocation by :meth:`Allocator.allocate`; for many, construct an Allocator once."""
-    return Allocator(robot).allocate(force, torque, present_tilt)
-
-
-def hover_allocation(robot: RobotParameters, quaternion: np.ndarray, present_tilt: np.ndarray,
-                     extra_force_world: np.ndarray | None = None,
-                     extra_torque_body: np.ndarray | None = None) -> Allocation:
-    """One allocation by :meth:`Allocator.hover`; for many, construct an Allocator once."""
-    return Allocator(robot).hover(quaternion, present_tilt, extra_force_world, extra_torque_body)

@@ -59,25 +59,10 @@ def rigid_body(robot: RobotParameters, velocity, quaternion, angular_velocity, t
 
     Forces are summed at base_link, and the body turns about its centre of mass. The acceleration
     is that of the origin of base_link. The two points differ only if an effect moves the centre
-    of mass. An absent argument counts as zero, unless stated otherwise.
-
-    Args:
-        robot: parameters and effects.
-        velocity: (3,) in world [m/s].
-        quaternion: (4,) body to world, (x, y, z, w).
-        angular_velocity: (3,) in body [rad/s].
-        tilt: (4,) [rad].
-        thrust: (4,) after the rotors' lag [N].
-        force_world: (3,) external force in world [N].
-        torque_body: (3,) external torque in body [N m].
-        tilt_acceleration: (4,) [rad/s^2].
-        effects: name -> parameter -> value or symbol, in place of the robot file's.
-        tilt_rate: (4,) [rad/s].
-        thrust_rate: (4,) [N/s].
-        position: (3,) in world [m]; None: no ground effect.
-        voltage_ratio: pack voltage over that of a full pack; None: no effect of it.
-        charge_drawn: charge drawn from the pack [A h]; None: no effect of it.
-        rotor_positions: (4, 3) in place of the robot file's [m].
+    of mass. Arguments are named as the fields of :class:`Terms`, ``quaternion`` is body to world.
+    An absent argument counts as zero; without position, voltage_ratio or charge_drawn their
+    effects are absent. ``effects`` (name -> parameter -> value or symbol) and ``rotor_positions``
+    (4, 3) [m] replace those of the robot file.
 
     Returns:
         (3,) acceleration in world [m/s^2], (3,) angular acceleration in body [rad/s^2].
@@ -202,8 +187,10 @@ def tilt_servo(robot: RobotParameters, joint: int, target, thrust=0.0,
     return Servo.of(robot.joints.of(joint), coulomb=terms.coulomb, stiction=stiction), terms
 
 
-def derivative(robot: RobotParameters, x, u, d):
-    """State derivative (25,) of the full model; see the slices of this module."""
+def full_model(robot: RobotParameters) -> ca.Function:
+    """State derivative f(x (25), u (8), d (10)) -> (25,); slices of this module."""
+    x, u, d = ca.SX.sym('x', STATE_SIZE), ca.SX.sym('u', INPUT_SIZE), \
+        ca.SX.sym('d', DISTURBANCE_SIZE)
     limit = robot.joints.position_limit
     target = ca.fmin(ca.fmax(u[TILT_COMMAND], -limit), limit) + d[TILT_OFFSET]
     thrust_target = ca.fmin(ca.fmax(u[THRUST_COMMAND], robot.rotors.thrust_min),
@@ -216,17 +203,9 @@ def derivative(robot: RobotParameters, x, u, d):
     acceleration, angular_acceleration = rigid_body(
         robot, x[VELOCITY], x[QUATERNION], x[RATE], x[TILT], x[THRUST], d[FORCE], d[TORQUE],
         tilt_acceleration, tilt_rate=x[TILT_RATE], thrust_rate=thrust_rate, position=x[POSITION])
-    return ca.vertcat(
+    return ca.Function('dynamics', [x, u, d], [ca.vertcat(
         x[VELOCITY], acceleration, quaternion_rate(x[QUATERNION], x[RATE]), angular_acceleration,
-        x[TILT_RATE], tilt_acceleration, thrust_rate)
-
-
-def full_model(robot: RobotParameters) -> ca.Function:
-    """State derivative f(x (25), u (8), d (10)) -> (25,); slices of this module."""
-    x, u, d = ca.SX.sym('x', STATE_SIZE), ca.SX.sym('u', INPUT_SIZE), \
-        ca.SX.sym('d', DISTURBANCE_SIZE)
-    return ca.Function('dynamics', [x, u, d], [derivative(robot, x, u, d)],
-                       ['x', 'u', 'd'], ['x_dot'])
+        x[TILT_RATE], tilt_acceleration, thrust_rate)], ['x', 'u', 'd'], ['x_dot'])
 
 
 def body_acceleration(robot: RobotParameters) -> ca.Function:

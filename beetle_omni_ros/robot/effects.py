@@ -13,35 +13,632 @@ its kind:
 - Sensor effects are in :attr:`RobotParameters.sensors`. The gap finder fits them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from difflib import get_close_matches
+from typing import Any, NamedTuple
 
+import casadi as ca
 import numpy as np
 
-from beetle_omni_ros.robot.effect_types import (
-    Effect,
-    EffectParameter,
-    LimitStarts,
-    MEASURED,
-    SensorErrors,
-    ServoTerms,
-    Terms,
-    Treatment,
-)
-from beetle_omni_ros.robot.effects_actuator import ACTUATOR, SENSOR
-from beetle_omni_ros.robot.effects_body import BODY
-from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.robot.yaml_file import quoted, shortened
+from beetle_omni_ros.robot.schema import ParameterError, quoted, shortened
+
+NAN = float('nan')
+UP = ca.DM([0, 0, 1])
+REFERENCE_HEIGHT = 0.25     # [m] of the rotor, for which the gain of the ground effect is given
+EXPONENTIAL_HEIGHT = 0.25   # [m] over which the exponential form falls to 1/e
+LEAST_HEIGHT = 0.08         # [m] below which the forms are not valid
+LAYERS = ('body', 'rotor', 'joint', 'timing', 'sensor')
+# Terms that the simulated plant and the gap finder have -> why NMPC and training leave out an
+# effect of them.
+MEASURED = {'voltage_ratio': 'it has no voltage and assumes a full pack',
+            'charge_drawn': 'it has no current of the pack and assumes that no charge was drawn'}
+
+
+@dataclass(frozen=True)
+class EffectParameter:
+    """One number, or vector, of an effect; SI units."""
+
+    unit: str
+    neutral: float | tuple[float, ...]      # without effect; NaN: the robot file's own number
+    low: float                              # smallest and largest legal value
+    high: float
+    typical: float = NAN    # realistic deviation from neutral; a fraction if neutral is NaN
+    smallest: float = NAN   # smallest significant deviation, likewise
+    default: float | tuple[float, ...] | None = None    # if a file omits it; None: it is required
+    of_each: bool = False   # a file may give a list of four, one for each joint
+    number: str = ''        # dotted key of the robot file's number that it replaces
+    sensor: str = ''        # field of SensorErrors that it sets
+    tolerance: str = ''     # between robots of one type: tolerance_... of params/gap.yaml
+    least: float = 0.02     # smallest ratio to the robot file's own number in a fit
+    step: float = 1e-3      # of a fit's derivatives; of the logarithm for the file's own numbers
+    curved: bool = False    # these derivatives change during a fit
+    form: bool = False      # it only chooses a form of the effect and is not fitted
+
+
+@dataclass(frozen=True)
+class LimitStarts:
+    """Start values of a fitted limit, relative to the demand of a flight."""
+
+    of: str                     # 'tilt_rate', 'torque' or 'thrust'
+    parts: tuple[float, ...]    # fractions of the largest demand, one start each
+    below: float                # fraction of the file's limit below which a start must lie
+
+
+@dataclass(frozen=True)
+class SensorErrors:
+    """Errors of the robot's sensors by the effects of the robot file."""
+
+    accelerometer_bias: tuple[float, ...] = (0.0,) * 3  # measured minus true [m/s^2]
+    gyroscope_bias: tuple[float, ...] = (0.0,) * 3      # measured minus true [rad/s]
+    imu_rotation: tuple[float, ...] = (0.0,) * 3        # vector from base_link to its axes [rad]
+    imu_position: tuple[float, ...] = (0.0,) * 3        # in base_link [m]
+    mocap_rotation: tuple[float, ...] = (0.0,) * 3      # from base_link to the markers' axes [rad]
+    imu_delay: float = 0.0          # age of readings at their stamps [s]
+    mocap_delay: float = 0.0
+    encoder_delay: float = 0.0
+    encoder_gain: tuple[float, ...] = (0.0,) * 4        # error per angle [1]
+    encoder_sine: tuple[float, ...] = (0.0,) * 4        # by the sine of the angle [rad]
+    encoder_cosine: tuple[float, ...] = (0.0,) * 4      # by its cosine minus 1 [rad]
+
+    @property
+    def encoders_err(self) -> bool:
+        """Whether the encoders' readings depend on the angle."""
+        return any((*self.encoder_gain, *self.encoder_sine, *self.encoder_cosine))
+
+    def encoders(self, tilt: np.ndarray) -> np.ndarray:
+        """Readings [rad] of the encoders at tilts (..., 4) [rad]."""
+        return tilt + tilt * self.encoder_gain + np.sin(tilt) * self.encoder_sine \
+            + (np.cos(tilt) - 1) * self.encoder_cosine
+
+    def tilts(self, readings: np.ndarray) -> np.ndarray:
+        """Tilts (..., 4) [rad] at readings of the encoders, by three fixed-point steps."""
+        tilt = readings
+        for _ in range(3):
+            tilt = tilt + readings - self.encoders(tilt)
+        return tilt
+
+
+@dataclass
+class Terms:
+    """
+    Terms of the body's equations at one instant, as CasADi expressions; effects change them.
+
+    Vectors are in base_link, unless stated otherwise. Lists have an entry for each rotor.
+    """
+
+    mass: ca.SX                     # [kg]
+    inertia: ca.SX                  # (3,) diagonal about the centre of mass [kg m^2]
+    centre_of_mass: ca.SX | None    # (3,) [m]; None: base_link's origin
+    torque: ca.SX                   # (3,) added on the body [N m]
+    tilt: ca.SX                     # (4,) [rad]
+    tilt_acceleration: ca.SX        # (4,) [rad/s^2]
+    tilt_axes: list                 # of (3,) unit vectors, outward along the arms
+    thrust: ca.SX                   # (4,) after the rotors' lag [N]
+    velocity: ca.SX                 # (3,) of the centre of gravity in world [m/s]
+    angular_velocity: ca.SX         # (3,) [rad/s]
+    rotation: ca.SX                 # (3, 3) body to world
+    thrust_directions: list         # of (3,) unit vectors
+    rotor_positions: list           # of (3,) [m]
+    hover_thrust: float             # of each rotor [N]
+    force_world: ca.SX              # (3,) added, in world [N]
+    rotor_forces: list              # of (3,) added at the rotors [N]
+    torque_ratio: ca.SX             # reaction torque for each newton [m]
+    tilt_rate: ca.SX                # (4,) [rad/s]
+    thrust_rate: ca.SX              # (4,) [N/s]
+    spin: tuple[float, ...]         # (4,) +1 along the thrust
+    position: ca.SX | None = None       # (3,) of base_link in world [m]; None: unknown
+    voltage_ratio: ca.SX | None = None  # of the pack over that of a full pack; None: unknown
+    # Drawn from the pack [A h], None: unknown. In the simulator since the pack was inserted, in a
+    # recording since its first battery message.
+    charge_drawn: ca.SX | None = None
+
+    def rotor_speeds(self) -> list:
+        """Rotor speeds relative to hover, computed from thrust; list of four scalars."""
+        return [ca.sqrt(ca.fmax(self.thrust[i], 0) / self.hover_thrust + 1e-9) for i in range(4)]
+
+    def hub_velocities(self) -> list:
+        """List of four (3,) velocities of the rotor hubs through still air in base_link [m/s]."""
+        body = self.rotation.T @ self.velocity
+        return [body + ca.cross(self.angular_velocity, r) for r in self.rotor_positions]
+
+
+@dataclass
+class ServoTerms:
+    """Terms that act on one tilt servo at one instant, numbers of any namespace."""
+
+    target: Any             # commanded angle [rad]
+    thrust: Any = 0.0       # of the joint's rotor [N]
+    gyroscopic: Any = 0.0   # load for each N m s of the rotor's momentum in hover [rad/s]
+    load: Any = 0.0         # torque beside the motor's [N m]
+    coulomb: Any = None     # sliding friction [N m]
+    stiction: Any = None    # friction at rest [N m]
+
+
+class Treatment(NamedTuple):
+    """Whether a change of an effect changes a consumer's results, else the reason."""
+
+    acts: bool
+    reason: str = ''
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One catalogue entry."""
+
+    layer: str      # 'body', 'rotor', 'joint', 'timing' or 'sensor'
+    parameters: dict[str, EffectParameter]
+    source: str     # equation and its source
+    excited_by: str = ''                    # flight that shows it
+    confused_with: tuple[str, ...] = ()     # entries that poor data cannot distinguish from it
+    separated_by: str = ''                  # experiment that distinguishes them
+    # Equation of a body effect, which changes Terms in place: apply(terms, **values).
+    apply: Callable | None = None
+    # Equation of a joint effect, which changes ServoTerms: servo(terms, joint, **values).
+    servo: Callable | None = None
+    each: str = ''      # 'rotor' or 'joint' if the parameters are (4,), one for each
+    # Delayed quantities: 'tilt' and 'thrust' commands, readings of 'imu', 'mocap', 'encoders'.
+    delays: tuple[str, ...] = ()
+    own_clock: bool = False     # these readings are stamped by another clock and may appear early
+    # Affected measurements. B: forces and torques, J: joints, A: MoCap's acceleration, W: MoCap's
+    # angular velocity; A and W against the IMU.
+    channels: str = 'B'
+    # Start values of a fit, if the effect has no slope at its neutral value.
+    starts: tuple[tuple[float, ...], ...] | LimitStarts = ()
+    forms: tuple[dict[str, float], ...] = ({},)     # the parameters that choose each form
+    one_regime: bool = False    # it acts in one regime only, such as near the ground
+    same_response: str = ''     # entry that is another form of the same response
+    allocated: bool = False     # the allocation includes it
+    measured: tuple[str, ...] = ()  # terms of MEASURED; where one is None, it is left out
+    # How the simulated plant includes a body effect. 'model': numbers of its bodies and rotors,
+    # 'own': equations of its own, '': the equation of this entry.
+    plant: str = ''
+    # Name of CONSUMERS -> treatment that does not follow from the kind of effect.
+    treatments: dict[str, Treatment] = field(default_factory=dict)
+
+    @property
+    def settings(self) -> dict[str, str]:
+        """Parameter -> dotted key of the robot file's number that it replaces."""
+        return {} if self.apply else {name: spec.number for name, spec in self.parameters.items()
+                                      if spec.number}
+
+    def in_readings(self, parameter: str) -> bool:
+        """Whether a parameter affects sensor readings only, not the model's equations."""
+        return bool(self.parameters[parameter].sensor) or self.kind == 'play'
+
+    @property
+    def kind(self) -> str:
+        """
+        How it acts.
+
+        'body' or 'servo': by its equation. 'number': replaces one of the robot file. 'command':
+        delays commands. 'sensor': in readings of IMU and MoCap. 'feedback': in readings of the
+        encoders. 'play': between encoder and rotor.
+        """
+        if self.apply or self.servo:
+            return 'body' if self.apply else 'servo'
+        if self.settings:
+            return 'number'
+        if any(spec.sensor for spec in self.parameters.values()):
+            return 'feedback' if 'encoders' in self.delays else 'sensor'
+        return 'command' if self.delays else 'play'
+
+    @property
+    def numbers(self) -> list[str]:
+        """Names of the fitted parameters."""
+        return [name for name, spec in self.parameters.items() if not spec.form]
+
+
+def vector(values):
+    """(n,) column of a tuple of numbers or symbols; any other value unchanged."""
+    return ca.vertcat(*ca.vertsplit(ca.SX(ca.vertcat(*values)))) if isinstance(values, tuple) \
+        else values
+
+
+def _mass(terms, mass):
+    terms.mass = mass
+
+
+def _inertia(terms, inertia):
+    terms.inertia = vector(inertia)
+
+
+def _centre_of_mass(terms, offset):
+    terms.centre_of_mass = _moved(terms.centre_of_mass, vector(offset))
+
+
+def _moved(centre, shift):
+    return shift if centre is None else centre + shift
+
+
+def _module_reaction(terms, module_inertia, mass_moment):
+    shift = 0
+    for i in range(4):
+        rate, acceleration = terms.tilt_rate[i], terms.tilt_acceleration[i]
+        n, e = terms.thrust_directions[i], terms.tilt_axes[i]
+        terms.torque = terms.torque - module_inertia * acceleration * e
+        # The centre of mass of the module is below the joint axis. It moves against the thrust,
+        # and its acceleration pushes back on the axis.
+        shift = shift - mass_moment / terms.mass * (n - UP)
+        sideways = ca.cross(e, n)
+        terms.rotor_forces[i] = terms.rotor_forces[i] + mass_moment * (
+            acceleration * sideways - rate * rate * n
+            + 2 * rate * ca.cross(terms.angular_velocity, sideways))
+    terms.centre_of_mass = _moved(terms.centre_of_mass, shift)
+
+
+def _thrust_coefficient(terms, scale):
+    terms.thrust = vector(scale) * terms.thrust
+
+
+def _torque_coefficient(terms, torque_to_thrust_ratio):
+    terms.torque_ratio = torque_to_thrust_ratio
+
+
+def _wind(terms, force):
+    terms.force_world = terms.force_world + vector(force)
+
+
+def _body_drag(terms, coefficient):
+    speed = ca.sqrt(ca.sumsqr(terms.velocity) + 1e-12)
+    terms.force_world = terms.force_world - coefficient * speed * terms.velocity
+
+
+def _rotor_drag(terms, coefficient):
+    speeds = terms.rotor_speeds()
+    for i, v in enumerate(terms.hub_velocities()):
+        n = terms.thrust_directions[i]
+        in_plane = v - n * ca.dot(n, v)
+        terms.rotor_forces[i] = terms.rotor_forces[i] - coefficient / 4 * speeds[i] * in_plane
+
+
+def _axial_inflow(terms, per_rotor):
+    speeds = terms.rotor_speeds()
+    loss = [per_rotor * speeds[i] * ca.dot(terms.thrust_directions[i], v)
+            for i, v in enumerate(terms.hub_velocities())]
+    terms.thrust = terms.thrust - ca.vertcat(*loss)
+
+
+def _translational_lift(terms, per_rotor):
+    gain = []
+    for i, v in enumerate(terms.hub_velocities()):
+        n = terms.thrust_directions[i]
+        gain.append(per_rotor * ca.sumsqr(v - n * ca.dot(n, v)))
+    terms.thrust = terms.thrust + ca.vertcat(*gain)
+
+
+def _tilt_thrust_loss(terms, loss_at_60deg, cosine_share=0.0):
+    sine, cosine = ca.sin(terms.tilt), ca.cos(terms.tilt)
+    shape = (1 - cosine_share) * sine * sine / 0.75 + cosine_share * 2 * (1 - cosine)
+    terms.thrust = terms.thrust * (1 - loss_at_60deg * shape)
+
+
+def _ground_effect(terms, exponential_share=0.0, **values):
+    if terms.position is None:
+        return
+    scale = []
+    for i in range(4):
+        height = ca.fmax(terms.position[2] + (terms.rotation @ terms.rotor_positions[i])[2],
+                         LEAST_HEIGHT)
+        upright = (terms.rotation @ terms.thrust_directions[i])[2]
+        ratio = REFERENCE_HEIGHT / height
+        shape = (1 - exponential_share) * ratio * ratio + exponential_share * ca.exp(
+            (REFERENCE_HEIGHT - height) / EXPONENTIAL_HEIGHT)
+        scale.append(1 + values['gain_at_0.25m'] * shape * upright * upright)
+    terms.thrust = terms.thrust * ca.vertcat(*scale)
+
+
+def _gyroscopic_load(servo, joint, angular_momentum_at_hover, spin_up_share=1.0,
+                     joint_share=0.0):
+    servo.load = servo.load + joint_share * angular_momentum_at_hover * servo.gyroscopic
+
+
+def _propeller_gyroscopic_torque(terms, angular_momentum_at_hover, spin_up_share=1.0,
+                                 joint_share=0.0):
+    speeds = terms.rotor_speeds()
+    for i in range(4):
+        momentum = angular_momentum_at_hover * terms.spin[i] * speeds[i]
+        turning = terms.angular_velocity + terms.tilt_rate[i] * terms.tilt_axes[i]
+        terms.torque = terms.torque - momentum * ca.cross(turning, terms.thrust_directions[i])
+    _rotor_acceleration_torque(terms, spin_up_share * angular_momentum_at_hover)
+
+
+def _rotor_acceleration_torque(terms, angular_momentum_at_hover):
+    speeds = terms.rotor_speeds()
+    for i in range(4):
+        # h ~ sqrt(f), so h' = h f' / 2 f; the floor keeps a stopped rotor finite
+        rate = terms.thrust_rate[i] / (2 * terms.hover_thrust * ca.fmax(speeds[i], 0.1))
+        terms.torque = terms.torque - angular_momentum_at_hover * terms.spin[i] * rate \
+            * terms.thrust_directions[i]
+
+
+def _voltage_sag(terms, exponent):
+    terms.thrust = terms.thrust * ca.exp(exponent * ca.log(terms.voltage_ratio))
+
+
+def _joint_offset(terms, offset):
+    offset = vector(offset)
+    turned = []
+    for i in range(4):
+        n, e = terms.thrust_directions[i], terms.tilt_axes[i]
+        turned.append(ca.cos(offset[i]) * n + ca.sin(offset[i]) * ca.cross(e, n))
+    terms.tilt, terms.thrust_directions = terms.tilt + offset, turned
+
+
+def _joint_deflection(servo, joint, deflection_per_newton):
+    servo.target = servo.target + per_joint(deflection_per_newton, joint) * servo.thrust
+
+
+def per_joint(value, joint: int):
+    """Value of a joint, from one number for all joints or a tuple of four."""
+    return value[joint] if isinstance(value, tuple) else value
+
+
+def _joint_friction(servo, joint, coulomb, stiction):
+    servo.coulomb = per_joint(coulomb, joint)
+    servo.stiction = per_joint(stiction, joint)
+
+
+def _delay(typical, smallest=0.003, **more):
+    return {'delay': EffectParameter('s', 0.0, -0.05, 0.2, typical, smallest, curved=True, **more)}
+
+
+def _friction():
+    return EffectParameter('N m', 0.0, 0.0, 1.0, 0.01, 0.002, of_each=True, step=5e-4, curved=True)
+
+
+def _number(key, unit, low, high, typical, smallest, step=0.01, **more):
+    return EffectParameter(unit, NAN, low, high, typical, smallest, number=key, step=step,
+                           curved=True, **more)
+
 
 # In order of application: the true tilt first, because it changes the thrust directions.
-CATALOGUE: dict[str, Effect] = {'joint_offset': ACTUATOR['joint_offset'], **BODY, **ACTUATOR,
-                                **SENSOR}
+CATALOGUE: dict[str, Effect] = {
+    'joint_offset': Effect(
+        'joint', {'offset': EffectParameter('rad', (0.0,) * 4, -0.5, 0.5, 0.03, 0.008,
+                                            tolerance='angle')},
+        'true tilt = encoder + offset', 'several attitudes',
+        ('joint_offset', 'torque_coefficient', 'imu_misalignment'),
+        'attitudes with different sets of tilts; a jig', _joint_offset, each='joint'),
+    'mass': Effect(
+        'body', {'mass': EffectParameter('kg', NAN, 0.05, 200, 0.05, 0.01, number='mass',
+                                         tolerance='mass')},
+        "m v' = F, Newton; INTERFACES: total mass", 'any flight',
+        ('thrust_coefficient', 'voltage_sag', 'wind'),
+        'weigh the robot, or fly fast turns: thrust scales torques too, mass does not', _mass,
+        allocated=True, plant='model'),
+    'inertia': Effect(
+        'body', {'inertia': EffectParameter('kg m^2', (NAN,) * 3, 1e-5, 50, 0.2, 0.05,
+                                            number='inertia', tolerance='inertia')},
+        "I w' = tau - w x I w, Euler", 'fast turns about every axis',
+        ('rotor_lag', 'propeller_gyroscopic_torque', 'thrust_coefficient'),
+        'flips by 90 and 180 deg about each axis', _inertia, plant='model'),
+    'centre_of_mass': Effect(
+        'body', {'offset': EffectParameter('m', (0.0,) * 3, -0.2, 0.2, 0.005, 0.0015)},
+        'forces turn the body about its centre of mass, which is displaced from base_link',
+        'hover in several attitudes', ('rotor_thrust_coefficient', 'module_reaction'),
+        'hover at roll 0, 90, 180 deg and pitch 90 deg', _centre_of_mass, plant='model'),
+    'module_reaction': Effect(
+        'body', {'module_inertia': EffectParameter('kg m^2', 0.0, 0.0, 0.1, 1e-4, 2e-5,
+                                                   step=2e-5),
+                 'mass_moment': EffectParameter('kg m', 0.0, 0.0, 1.0, 2e-3, 3e-4, 0.0,
+                                                step=2e-4)},
+        "servo torque J q'' on the body; centre of mass moved by -moment / m (t(q) - t(0)), "
+        "reaction force moment (n'' + 2 w x n'); "
+        'multibody section of the robot file', 'fast tilting, turned attitudes',
+        ('centre_of_mass', 'inertia'), 'the same attitude with tilts turned by 180 deg',
+        _module_reaction, channels='BJ', plant='model', treatments={'plant': Treatment(
+            False, 'its modules are bodies with the masses of the multibody section; without '
+                   'that section it acts')}),
+    'thrust_coefficient': Effect(
+        'body', {'scale': EffectParameter('1', 1.0, 0.2, 2.0, 0.05, 0.01, tolerance='thrust')},
+        'f = scale f*, all rotors', 'any flight', ('mass', 'voltage_sag', 'tilt_thrust_loss'),
+        'weigh the robot; flights at two states of charge', _thrust_coefficient, allocated=True,
+        plant='model'),
+    'rotor_thrust_coefficient': Effect(
+        'body', {'scale': EffectParameter('1', (1.0,) * 4, 0.0, 2.0, 0.08, 0.015,
+                                          tolerance='thrust')},
+        'f_i = scale_i f*_i: damaged propeller or other speed controller',
+        'hover in several attitudes', ('centre_of_mass', 'rotor_thrust_coefficient'),
+        'tilted attitudes; exchange propellers 1 and 2', _thrust_coefficient, each='rotor',
+        allocated=True, plant='model'),
+    'torque_coefficient': Effect(
+        'body', {'torque_to_thrust_ratio': EffectParameter(
+            'm', NAN, 0.0, 0.2, 0.2, 0.03, number='rotors.torque_to_thrust_ratio',
+            tolerance='torque_ratio')},
+        'tau_i = -spin_i ratio f_i about the thrust axis', 'yaw steps, differential thrust',
+        ('joint_offset', 'rotor_acceleration_torque'), 'yaw steps at zero tilt',
+        _torque_coefficient, allocated=True, plant='model'),
+    'ground_effect': Effect(
+        'body', {'gain_at_0.25m': EffectParameter('1', 0.0, 0.0, 1.0, 0.08, 0.01),
+                 'exponential_share': EffectParameter('1', 0.0, 0.0, 1.0, default=0.0, form=True)},
+        'f_i (1 + g s(h) n_z^2), s = (0.25 m / h)^2 after Cheeseman and Bennett 1955, or '
+        'exp((0.25 m - h) / 0.25 m); h: rotor above the floor', 'hover below 0.6 m',
+        ('thrust_coefficient', 'mass', 'tilt_thrust_loss'),
+        'hover ladder at 0.2, 0.3, 0.5, 1.0 and 1.5 m at one state of charge', _ground_effect,
+        forms=({'exponential_share': 0.0}, {'exponential_share': 1.0}), one_regime=True,
+        plant='own'),
+    'rotor_drag': Effect(
+        'body', {'coefficient': EffectParameter('N s/m', 0.0, 0.0, 5.0, 0.4, 0.06)},
+        'H-force of Faessler et al. 2018, in the rotor plane, grows with rotor speed '
+        'sqrt(f / f_h)', 'translation above 1 m/s', ('body_drag', 'wind'),
+        'passes at three speeds with two rotor tilts', _rotor_drag, plant='own'),
+    'body_drag': Effect(
+        'body', {'coefficient': EffectParameter('N s^2/m^2', 0.0, 0.0, 5.0, 0.05, 0.02)},
+        'F = -c |v| v', 'translation above 2 m/s', ('rotor_drag', 'wind'),
+        'passes above 4 m/s', _body_drag, plant='own'),
+    'axial_inflow': Effect(
+        'body', {'per_rotor': EffectParameter('N s/m', 0.0, 0.0, 5.0, 0.4, 0.04)},
+        'f_i - k sqrt(f_i / f_h) v.n: momentum theory, linear part (Leishman 2006, ch. 2)',
+        'climb and descent', ('rotor_lag', 'rotor_drag'),
+        'steady climb and descent at 1 m/s beside thrust steps', _axial_inflow, plant='own'),
+    'translational_lift': Effect(
+        'body', {'per_rotor': EffectParameter('N s^2/m^2', 0.0, 0.0, 1.0, 0.03, 0.01)},
+        'f_i + k |v_in_plane|^2: induced velocity falls with the flow through the disc '
+        '(Leishman 2006, ch. 2)', 'fast passes', ('thrust_coefficient', 'axial_inflow'),
+        'level passes at 1, 2 and 3 m/s', _translational_lift),
+    'tilt_thrust_loss': Effect(
+        'body', {'loss_at_60deg': EffectParameter('1', 0.0, 0.0, 0.9, 0.06, 0.01),
+                 'cosine_share': EffectParameter('1', 0.0, 0.0, 1.0, default=0.0, form=True)},
+        'f_i (1 - L s(q)), s = sin^2 q / 0.75 or 2 (1 - cos q): arm and body in the wake',
+        'large tilts', ('thrust_coefficient', 'mass', 'ground_effect'),
+        'one attitude with tilts changed by internal force', _tilt_thrust_loss,
+        forms=({'cosine_share': 0.0}, {'cosine_share': 1.0}), one_regime=True, plant='own'),
+    'wind': Effect(
+        'body', {'force': EffectParameter('N', (0.0,) * 3, -100, 100, 1.0, 0.1)},
+        'constant force in world', 'any flight; yaw turns', ('mass', 'imu_misalignment',
+                                                            'mocap_misalignment'),
+        'hover at yaw 0 and 180 deg; fan off', _wind, allocated=True, plant='own'),
+    'propeller_gyroscopic_torque': Effect(
+        'body', {'angular_momentum_at_hover': EffectParameter('N m s', 0.0, 0.0, 1.0, 0.066,
+                                                              0.008, step=5e-3),
+                 'spin_up_share': EffectParameter('1', 1.0, 0.0, 1.0, default=1.0, form=True),
+                 'joint_share': EffectParameter('1', 0.0, 0.0, 1.0, default=0.0, form=True)},
+        "-(w + q' e) x h s n - h' s n with h ~ sqrt(f): the propellers' angular momentum; the "
+        'part about the tilt axis loads the servo where joint_share is 1',
+        'fast turns and fast tilting', ('inertia', 'rotor_acceleration_torque', 'rotor_lag'),
+        'fast tilting by internal force at rest', _propeller_gyroscopic_torque,
+        _gyroscopic_load, channels='BJ',
+        forms=({'spin_up_share': 0.0}, {'spin_up_share': -1.0}, {'joint_share': 1.0}),
+        one_regime=True),
+    'rotor_acceleration_torque': Effect(
+        'body', {'angular_momentum_at_hover': EffectParameter('N m s', 0.0, 0.0, 1.0, 0.066,
+                                                              0.008)},
+        "-h' s n with h ~ sqrt(f): a change of rotor speed turns the body", 'thrust steps',
+        ('torque_coefficient', 'propeller_gyroscopic_torque', 'rotor_lag'),
+        'differential thrust chirp', _rotor_acceleration_torque),
+    'voltage_sag': Effect(
+        'rotor', {'exponent': EffectParameter('1', 0.0, -1.0, 5.0, 1.0, 0.15)},
+        'f = f* (V / V_full)^k: thrust of a thrust map without voltage; 6.9 %/V on this '
+        "robot's map", 'flights at several states of charge', ('thrust_coefficient', 'mass'),
+        'three flights at different charge; thrust steps by internal force', _voltage_sag,
+        measured=('voltage_ratio',)),
+    'rotor_lag': Effect(
+        'rotor', {'time_constant': _number('rotors.time_constant', 's', 0.001, 2.0, 0.4, 0.12,
+                                           step=0.02, tolerance='lag')},
+        "T f' + f = f*", 'thrust steps', ('rotor_dead_time', 'axial_inflow', 'command_latency'),
+        'thrust chirp 0.5 to 8 Hz: a lag reduces the amplitude, a delay shifts the phase only',
+        same_response='rotor_dead_time'),
+    'rotor_dead_time': Effect(
+        'rotor', _delay(0.015), 'f*(t - d): delay of speed controllers and PWM', 'thrust steps',
+        ('rotor_lag', 'command_latency'), 'thrust chirp 0.5 to 8 Hz', delays=('thrust',),
+        same_response='rotor_lag'),
+    'thrust_saturation': Effect(
+        'rotor', {'thrust_max': _number('rotors.thrust_max', 'N', 1.0, 200, 0.3, 0.02)},
+        'f = min(f*, f_max): voltage or speed controller limit', 'commands at the limit',
+        ('voltage_sag', 'thrust_coefficient'), 'climb at full thrust',
+        starts=LimitStarts('thrust', (0.95, 0.8), 1.2)),
+    'command_latency': Effect(
+        'timing', _delay(0.02), 'all commands act d later', 'fast tilting and thrust steps',
+        ('joint_command_latency', 'rotor_dead_time', 'joint_bandwidth'),
+        'sine sweep of the tilts 0.5 to 6 Hz with thrust steps', delays=('tilt', 'thrust'),
+        channels='BJ'),
+    'joint_command_latency': Effect(
+        'joint', _delay(0.02),
+        'q*(t - d)', 'fast tilting',
+        ('joint_bandwidth', 'command_latency', 'joint_feedback_delay'),
+        'sine sweep of the tilts 0.5 to 6 Hz', delays=('tilt',), channels='J'),
+    'joint_bandwidth': Effect(
+        'joint', {
+            'kp': _number('joints.kp', 'N m/rad', 1e-4, 1e3, 0.3, 0.1, tolerance='lag',
+                          of_each=True),
+            'kd': _number('joints.kd', 'N m s/rad', 0.0, 1e2, 0.3, 0.1, tolerance='lag',
+                          of_each=True)},
+        "J q'' = Kp (q* - q) - Kd q'", 'fast tilting', ('joint_command_latency',
+                                                       'joint_torque_limit'),
+        'sine sweep of the tilts 0.5 to 6 Hz with two amplitudes', channels='J'),
+    'joint_velocity_limit': Effect(
+        'joint', {
+            'velocity_limit': _number('joints.velocity_limit', 'rad/s', 0.1, 100, 0.5, 0.05)},
+        "|q'| <= limit: voltage and gearing", 'large tilt steps',
+        ('joint_torque_limit', 'joint_bandwidth'), 'tilt steps of 30, 90 and 180 deg',
+        channels='J', starts=LimitStarts('tilt_rate', (0.95, 0.8), 0.95)),
+    'joint_torque_limit': Effect(
+        'joint', {
+            # The file's 3 N m is 60 times the demand of quick poses; the real limit may be lower.
+            'effort_limit': _number('joints.effort_limit', 'N m', 0.001, 100, 0.8, 0.05,
+                                    least=1e-3)},
+        '|tau| <= limit: current limit, stall', 'large tilt steps',
+        ('joint_velocity_limit', 'joint_bandwidth'), 'tilt steps of 30, 90 and 180 deg',
+        channels='J', starts=LimitStarts('torque', (1.1, 0.8, 0.5), 0.98)),
+    'joint_friction': Effect(
+        'joint', {
+            'coulomb': _friction(), 'stiction': _friction()},
+        "-coulomb sgn(q') while sliding, up to stiction at rest (Armstrong-Helouvry 1994); "
+        'smooth over 0.05 rad/s in the model', 'slow reversals of the tilts',
+        ('joint_backlash', 'joint_bandwidth'), 'triangle of 2 deg at 0.1 Hz',
+        servo=_joint_friction, channels='J', starts=((0.004, 0.004), (0.012, 0.015))),
+    'joint_backlash': Effect(
+        'joint', {'gap': EffectParameter('rad', 0.0, 0.0, 0.3, 0.01, 0.003, of_each=True,
+                                         curved=True),
+                  'at_encoder': EffectParameter('1', 0.0, 0.0, 1.0, default=0.0, form=True)},
+        'play of width gap between motor and rotor; the encoder is on the side of the motor, with '
+        'at_encoder 1 on that of the rotor', 'reversals of the tilts',
+        ('joint_friction', 'joint_feedback_delay'), 'reversals loaded and unloaded',
+        starts=((0.005,), (0.02,))),
+    'joint_deflection': Effect(
+        'joint', {'deflection_per_newton': EffectParameter('rad/N', 0.0, -0.05, 0.05, 0.002,
+                                                           0.0004, step=1e-4, curved=True)},
+        'thrust off the axis deflects the servo from its target: q* + c f', 'thrust steps',
+        ('joint_friction', 'joint_offset'), 'internal force at rest, two levels',
+        servo=_joint_deflection, channels='J'),
+    'joint_encoder_error': Effect(
+        'joint', {name: EffectParameter(unit, (0.0,) * 4, -0.3, 0.3, typical, smallest,
+                                        default=(0.0,) * 4, sensor=f'encoder_{name}')
+                  for name, unit, typical, smallest in (
+                      ('gain', '1', 0.02, 0.005), ('sine', 'rad', 0.02, 0.008),
+                      ('cosine', 'rad', 0.02, 0.008))},
+        "encoder = q + gain q + sine sin q + cosine (cos q - 1): an axis off the encoder's",
+        'large tilts', ('joint_offset', 'joint_bandwidth'), 'tilts held over the whole travel',
+        each='joint', channels='J', treatments={
+            'estimator': Treatment(False, 'the filter does not read the joints'),
+            'gap': Treatment(False, 'a flight does not separate it from joint_offset: fit it to a '
+                                    'response log')}),
+    'joint_feedback_delay': Effect(
+        'timing', _delay(0.01, sensor='encoder_delay', tolerance='delay'),
+        'the encoder reading is older than its stamp by d',
+        'fast tilting', ('joint_command_latency', 'mocap_time_offset', 'joint_backlash'),
+        'tilting by internal force with the body at rest', delays=('encoders',), channels='BJ'),
+    'mocap_time_offset': Effect(
+        'timing', _delay(0.01, 0.002, sensor='mocap_delay', tolerance='delay'),
+        'the pose is older than its stamp by d', 'fast turns', ('imu_filter_lag',),
+        'any turn above 1 rad/s', delays=('mocap',), own_clock=True, channels='AW'),
+    'imu_filter_lag': Effect(
+        'timing', _delay(0.01, 0.002, sensor='imu_delay', tolerance='delay'),
+        'specific force and rates are older than their stamp by d: '
+        'filters of the IMU', 'fast turns', ('mocap_time_offset', 'rotor_dead_time'),
+        'turns above 1 rad/s with thrust steps; log the raw gyroscope', delays=('imu',),
+        channels='BAWJ'),
+    'imu_accelerometer_bias': Effect(
+        'sensor', {'bias': EffectParameter('m/s^2', (0.0,) * 3, -5, 5, 0.15, 0.03,
+                                           sensor='accelerometer_bias',
+                                           tolerance='bias_accelerometer')},
+        'a_measured = a + b', 'several attitudes', ('wind', 'imu_misalignment', 'joint_offset'),
+        'at rest in three attitudes before take-off', channels='BA'),
+    'imu_gyroscope_bias': Effect(
+        'sensor', {'bias': EffectParameter('rad/s', (0.0,) * 3, -1, 1, 0.02, 0.004,
+                                           sensor='gyroscope_bias', tolerance='bias_gyroscope')},
+        'w_measured = w + b', 'any flight', (), 'at rest before take-off', channels='BW'),
+    'imu_misalignment': Effect(
+        'sensor', {'rotation': EffectParameter('rad', (0.0,) * 3, -0.5, 0.5, 0.02, 0.004,
+                                               sensor='imu_rotation', tolerance='angle',
+                                               curved=True)},
+        'IMU axes rotated by exp(rotation) against base_link',
+        'several attitudes', ('mocap_misalignment', 'wind', 'joint_offset'),
+        'hover in three attitudes', channels='BAW'),
+    'imu_lever_arm': Effect(
+        'sensor', {'offset': EffectParameter('m', (0.0,) * 3, -0.5, 0.5, 0.02, 0.006,
+                                             sensor='imu_position')},
+        "a + w' x l + w x (w x l)", 'fast turns', ('centre_of_mass', 'inertia'),
+        'flips by 180 deg', channels='BA'),
+    'mocap_misalignment': Effect(
+        'sensor', {'rotation': EffectParameter('rad', (0.0,) * 3, -0.5, 0.5, 0.02, 0.004,
+                                               sensor='mocap_rotation', tolerance='angle',
+                                               curved=True)},
+        'marker axes rotated by exp(rotation) against base_link', 'several attitudes',
+        ('imu_misalignment', 'wind'), 'hover at yaw 0, 90, 180 and 270 deg', channels='AW'),
+}
 
-JOINTS = 4
-
-__all__ = ['CATALOGUE', 'command_delays', 'delaying', 'Effect', 'EffectParameter', 'LimitStarts',
-           'sensor_errors', 'SensorErrors', 'separating_experiment', 'ServoTerms', 'settings',
-           'Terms', 'validated']
 CONSUMERS = {'nmpc': 'NMPC and allocation', 'training': 'training', 'plant': 'simulated plant',
              'estimator': 'estimator', 'buses': 'delays of the buses', 'gap': 'gap finder'}
 ACTS = Treatment(True)
@@ -129,10 +726,10 @@ def _value(at, spec, value):
         raise ParameterError(f'{at}: expected numbers [{spec.unit}], '
                              f'found {quoted(value)}') from None
     shape = np.shape(spec.neutral)
-    if spec.of_each and array.shape == (JOINTS,):
+    if spec.of_each and array.shape == (4,):
         shape = array.shape
     if array.shape != shape:
-        each = f' or {(JOINTS,)}' if spec.of_each else ''
+        each = ' or (4,)' if spec.of_each else ''
         raise ParameterError(f'{at}: expected shape {shape}{each}, found {array.shape}')
     if not np.all((array >= spec.low) & (array <= spec.high)):
         raise ParameterError(f'{at}: {quoted(value)} is outside '

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 import hashlib
+import json
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +15,12 @@ import yaml
 
 from beetle_omni_ros.robot import effects as catalogue
 from beetle_omni_ros.robot import schema
-from beetle_omni_ros.robot.mass_properties import check_parts, moved_inertia
 from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import parameter, ParameterError
-from beetle_omni_ros.robot.yaml_file import quoted
+from beetle_omni_ros.robot.schema import parameter, ParameterError, quoted
 
 LONGEST_NAME = 255      # characters of a file's name
-ARM_LENGTH = parameter(doc='mean horizontal distance of the rotor centres from the centre of '
-                       'gravity', unit='m', low=0.01, high=5)     # of a file that extends another
+CLOSE = 5e-4        # [m] within which a described part agrees with the totals; 2.4e-4 as shipped
+MISSING = 0.1       # [1] of the inertia that a described main body may lack; 0.07 as shipped
 JOINT_NAMES = ('gimbal1', 'gimbal2', 'gimbal3', 'gimbal4')
 ROTOR_NAMES = ('rotor1', 'rotor2', 'rotor3', 'rotor4')
 
@@ -190,18 +188,7 @@ class MultibodyParameters:
 
 @dataclass(frozen=True, kw_only=True)
 class RobotParameters:
-    """
-    All parameters of one robot.
-
-    Attributes:
-        mass: [kg].
-        gravity: [m/s^2].
-        inertia: (3,) diagonal about the centre of gravity [kg m^2].
-        effects: deviations from the model, effect -> parameter -> value.
-        intervals: 95 % intervals of measured values, dotted key -> (lowest, highest), each with
-            the value's shape.
-
-    """
+    """All parameters of one robot; effects are effect -> parameter -> value."""
 
     mass: float = parameter(doc='total mass', unit='kg', low=0.05, high=200)
     gravity: float = parameter(9.80665, doc='gravity', unit='m/s^2', low=0, high=30)
@@ -267,25 +254,17 @@ class RobotParameters:
         The values of one joint have one place in their intervals: logs determine their ratios, the
         lag Kd / Kp and the angle at which friction holds, better than the values.
         """
-        place = rng.random(4)
-        sections: dict[str, dict] = {}
-        effects = deepcopy(self.effects)
-        own: dict[str, Any] = {}
+        place, drawn = rng.random(4), {}
         for key, (low, high) in self.intervals.items():
             share = place if np.shape(low) == (4,) else rng.random(np.shape(low))
             value = (low * (high / low)**share if np.all(low > 0) else low + (high - low) * share)
-            value = value.tolist() if np.ndim(value) else float(value)
-            section, *rest = key.split('.')
-            if section == 'effects':
-                effects[rest[0]][rest[1]] = value
-            elif rest:
-                sections.setdefault(section, {})[rest[0]] = value
-            else:
-                own[section] = value
-        own |= {name: replace(getattr(self, name), **{
-            each: np.array(value) if np.ndim(value) else value for each, value in values.items()})
-            for name, values in sections.items()}
-        return replace(self, **own, effects=effects, intervals={})
+            drawn[key] = value if np.ndim(value) else float(value)
+        nested = schema.nest(drawn)
+        effects = nested.pop('effects', {})
+        own = {name: replace(getattr(self, name), **value) if isinstance(value, dict) else value
+               for name, value in nested.items()}
+        return replace(self, **own, intervals={}, effects={
+            name: values | effects.get(name, {}) for name, values in self.effects.items()})
 
     @classmethod
     def load(cls, path: str | Path | None = None) -> RobotParameters:
@@ -314,6 +293,28 @@ class RobotParameters:
             return replace(robot, intervals={
                 key: robot._checked_interval(key, pair) for key, pair in robot.intervals.items()
                 if key not in replaced})
+
+    def effect(self, key: str, neutral):
+        """Value of an effect's parameter, 'effect.parameter'; ``neutral`` without the effect."""
+        name, parameter = key.split('.')
+        return self.effects.get(name, {}).get(parameter, neutral)
+
+    @property
+    def true_mass(self) -> float:
+        """Mass with the effect ``mass`` [kg]."""
+        return self.effect('mass.mass', self.mass)
+
+    @property
+    def torque_ratio(self) -> float:
+        """Reaction torque for each newton of thrust with the effects [m]."""
+        return self.effect('torque_coefficient.torque_to_thrust_ratio',
+                           self.rotors.torque_to_thrust_ratio)
+
+    @property
+    def thrust_scale(self) -> np.ndarray:
+        """(4,) true thrust relative to the commanded thrust, by the effects."""
+        return self.effect('thrust_coefficient.scale', 1.0) * np.array(
+            self.effect('rotor_thrust_coefficient.scale', (1.0,) * 4))
 
     @property
     def parts(self) -> MultibodyParameters:
@@ -349,19 +350,9 @@ class RobotParameters:
 
     def as_dict(self) -> dict:
         """All physical values as plain nested data, without name, intervals and provenance."""
-        def plain(value):
-            if hasattr(value, '__dataclass_fields__'):
-                return {key: plain(getattr(value, key)) for key in value.__dataclass_fields__}
-            if isinstance(value, np.ndarray):
-                return value.tolist()
-            if isinstance(value, (list, tuple)):
-                return [plain(item) for item in value]
-            if isinstance(value, dict):
-                return {key: plain(item) for key, item in value.items()}
-            return value
-        data = plain(self)
-        del data['name'], data['intervals'], data['provenance']
-        return data
+        values = asdict(self)
+        del values['name'], values['intervals'], values['provenance']
+        return json.loads(json.dumps(values, default=np.ndarray.tolist))
 
 
 def find_robot(name: str | Path, beside: Path | None = None) -> Path:
@@ -411,18 +402,16 @@ def _extended(base: Path, below: dict, path: Path, content: dict) -> dict:
     """
     Merge a file with the file that it extends, whose content is ``below``.
 
-    A length of the arms moves the rotors. Changed masses and positions change the inertia, if the
-    file does not state it, and the checks of the extended file do not apply to them.
+    Changed masses and positions change the inertia, if the file does not state it, and the checks
+    of the extended file do not apply to them.
     """
     rotors = content.get('rotors')
-    if isinstance(rotors, dict) and 'arm_length' in rotors:
-        content = content | {'rotors': _with_arms(base, below, path, rotors)}
     if 'intervals' in below:    # those of values that the file replaces do not hold for it
         below = below | {'intervals': {key: pair for key, pair in below['intervals'].items()
                                        if not _states(content, key.split('.'))}}
     merged, own = _overlaid(below, content), content.get('multibody', {})
     moves = {'mass', 'multibody'} & set(content) or (
-        isinstance(rotors, dict) and {'arm_length', 'positions'} & set(rotors))
+        isinstance(rotors, dict) and 'positions' in rotors)
     if (moves or 'inertia' in content) and isinstance(own, dict) and merged.get('multibody'):
         merged['multibody'] = _unchecked(merged['multibody'], own)
     if moves and 'inertia' not in content:
@@ -438,18 +427,6 @@ def _states(content: Any, names: list[str]) -> bool:
     first, *rest = names
     return isinstance(content, dict) and first in content and (
         not rest or first == 'effects' or _states(content[first], rest))
-
-
-def _with_arms(base: Path, below: dict, path: Path, rotors: dict) -> dict:
-    """``rotors`` of a file with positions in place of the length of the arms."""
-    at = f"{path}: key 'rotors.arm_length'"
-    if 'positions' in rotors:
-        raise ParameterError(f'{at}: expected either this key or rotors.positions')
-    length = schema.check(ARM_LENGTH, float, rotors['arm_length'], at)
-    positions = schema.bind(RobotParameters, {**below, 'effects': {}}, str(base)).rotors.positions
-    scale = length / np.linalg.norm(positions[:, :2], axis=1).mean()
-    return {key: value for key, value in rotors.items() if key != 'arm_length'} | {
-        'positions': positions * [scale, scale, 1.0]}
 
 
 def _unchecked(multibody: dict, own: dict) -> dict:
@@ -478,3 +455,173 @@ def _overlaid(base: dict, content: dict) -> dict:
         both = isinstance(value, dict) and isinstance(merged.get(key), dict)
         merged[key] = _overlaid(merged[key], value) if both and key != 'effects' else value
     return merged
+
+
+@dataclass(frozen=True)
+class Variation:
+    """Deviation of one robot from its file."""
+
+    mass_scale: float = 1.0
+    inertia_scale: np.ndarray = field(default_factory=lambda: np.ones(3))
+    centre_of_mass: np.ndarray = field(default_factory=lambda: np.zeros(3))  # of the whole [m]
+
+
+@dataclass(frozen=True)
+class RigidPart:
+    """Mass [kg], centre of mass (3,) [m], inertia (3, 3) there [kg m^2], in base_link's axes."""
+
+    mass: float
+    centre: np.ndarray
+    inertia: np.ndarray
+
+    def inertia_about(self, point: np.ndarray) -> np.ndarray:
+        """Inertia (3, 3) about ``point`` [m], by the parallel axis theorem."""
+        r = self.centre - point
+        return self.inertia + self.mass * (r @ r * np.eye(3) - np.outer(r, r))
+
+
+@dataclass(frozen=True)
+class MassProperties:
+    """
+    All parts of the robot with its tilts at zero, in base_link.
+
+    A robot file contains the totals (mass, inertia about the centre of gravity), the tilting
+    modules and the end-effector. The main body is the difference.
+    """
+
+    main_body: RigidPart
+    modules: tuple[RigidPart, ...]  # tilting, four
+    end_effector: RigidPart         # the ball
+    main_origin: np.ndarray         # (3,) of the main body's frame [m]
+    joint_origins: np.ndarray       # (4, 3) of the tilt joints [m]
+    module_rotations: np.ndarray    # (4, 3, 3), columns outward, sideways, up
+
+
+def combined(parts: list[RigidPart]) -> RigidPart:
+    """Combine parts into one rigid part."""
+    mass = sum(part.mass for part in parts)
+    centre = np.sum([part.mass * part.centre for part in parts], axis=0) / mass
+    return RigidPart(mass, centre, inertia_about(centre, parts))
+
+
+def inertia_about(point: np.ndarray, parts: list[RigidPart]) -> np.ndarray:
+    """Inertia (3, 3) of several parts about ``point`` [m]."""
+    return np.sum([part.inertia_about(point) for part in parts], axis=0)
+
+
+def mass_properties(robot: RobotParameters, variation: Variation | None = None) -> MassProperties:
+    """
+    Mass properties of all parts.
+
+    The tilt axes contain the rotor centres of ``robot.rotors.positions``. Mass, centre and inertia
+    of the main body follow from the totals.
+
+    Raises:
+        ParameterError: the parts are heavier than the robot, or the inertia of the main body is
+            impossible.
+
+    """
+    variation = variation or Variation()
+    made = _described(robot)
+    known = [*made.modules, made.end_effector]
+    mass = robot.true_mass * variation.mass_scale
+    total_inertia = np.array(robot.effect('inertia.inertia', robot.inertia))
+    centre = variation.centre_of_mass + robot.effect('centre_of_mass.offset', (0.0,) * 3)
+    point_mass = _remaining(mass, centre, known)
+    inertia = np.diag(total_inertia * variation.inertia_scale) - inertia_about(
+        centre, [point_mass, *known])
+    moments = np.linalg.eigvalsh(inertia)
+    if moments[0] <= 0 or moments[0] + moments[1] < moments[2]:
+        raise ParameterError(f'inertia: {_text(total_inertia)} kg m^2 leaves the main body the '
+                             f'principal moments {_text(moments)} kg m^2, which are impossible')
+    return replace(made, main_body=replace(point_mass, inertia=inertia))
+
+
+def _described(robot):
+    """All parts, without the main body."""
+    parts, nothing = robot.parts, RigidPart(0.0, np.zeros(3), np.zeros((3, 3)))
+    outward = robot.tilt_axes
+    up = np.tile([0.0, 0.0, 1.0], (4, 1))
+    module_rotations = np.stack([outward, np.cross(up, outward), up], axis=2)
+    joint_origins = robot.rotors.positions - parts.module.rotor_offset * outward
+    main_origin = joint_origins.mean(axis=0) - [0.0, 0.0, parts.module.joint_height]
+
+    modules = tuple(
+        RigidPart(parts.module.mass, origin + rotation @ parts.module.centre_of_mass,
+                  rotation @ np.diag(parts.module.inertia) @ rotation.T)
+        for origin, rotation in zip(joint_origins, module_rotations))
+    end_effector = RigidPart(parts.end_effector.mass,
+                             main_origin + [0.0, 0.0, parts.end_effector.height], np.zeros((3, 3)))
+    return MassProperties(nothing, modules, end_effector, main_origin, joint_origins,
+                          module_rotations)
+
+
+def _remaining(mass, centre, known):
+    """Point mass that completes the ``known`` parts to a total mass with its centre."""
+    rest = mass - sum(part.mass for part in known)
+    if rest <= 0:
+        raise ParameterError(f'multibody: modules and end-effector weigh {mass - rest:g} kg, '
+                             f'the whole robot {mass:g} kg; expected a main body with mass')
+    moment = mass * centre - np.sum([part.mass * part.centre for part in known], axis=0)
+    return RigidPart(rest, moment / rest, np.zeros((3, 3)))
+
+
+def moved_inertia(robot: RobotParameters, base: RobotParameters) -> np.ndarray:
+    """
+    Inertia (3,) of a robot that differs from ``base`` in mass, rotor positions or parts.
+
+    The main body keeps its radii of gyration. A robot without described parts keeps those of the
+    whole robot.
+
+    Raises:
+        ParameterError: the arms of a robot without described parts have changed.
+
+    """
+    if robot.multibody is None or base.multibody is None:
+        if not np.array_equal(robot.rotors.positions, base.rotors.positions):
+            raise ParameterError('inertia: without multibody it does not follow from the changed '
+                                 'rotors.positions; expected the key beside them')
+        return base.inertia * robot.mass / base.mass
+    before, made, origin = mass_properties(base).main_body, _described(robot), np.zeros(3)
+    known = [*made.modules, made.end_effector]
+    main = _remaining(robot.mass, origin, known)
+    main = replace(main, inertia=before.inertia * main.mass / before.mass)
+    return np.diag(inertia_about(origin, [main, *known]))
+
+
+def check_parts(robot: RobotParameters) -> None:
+    """
+    Compare the described parts with the totals, of which the main body is the rest.
+
+    Raises:
+        ParameterError: names the key that contradicts the totals, its value and the expected one.
+
+    """
+    made, parts = mass_properties(replace(robot, effects={})), robot.multibody
+    if parts is None:
+        return
+    joints, main = made.joint_origins - made.main_origin, parts.main_body
+    checks = [('module.joint_offset', parts.module.joint_offset, np.abs(joints[:, :2])),
+              ('centre_of_gravity_height', parts.centre_of_gravity_height, -made.main_origin[2]),
+              ('main_body.centre_of_mass', main.centre_of_mass if main else None,
+               made.main_body.centre - made.main_origin)]
+    for key, found, expected in checks:
+        if found is not None and np.abs(found - expected).max() > CLOSE:
+            right = expected if np.ndim(found) else np.mean(expected)
+            raise ParameterError(
+                f'multibody.{key}: {_text(found)} m contradicts mass {robot.mass:g} kg, '
+                f'rotors.positions and the other parts; expected {_text(right)} m within '
+                f'{CLOSE:g} m, or no such key')
+    if main:
+        rest = np.diag(made.main_body.inertia)
+        missing = (rest - main.inertia) / robot.inertia
+        if not 0 <= missing.min() <= missing.max() <= MISSING:
+            raise ParameterError(
+                f'inertia: {_text(robot.inertia)} kg m^2 leaves the main body {_text(rest)}, but '
+                f'multibody.main_body.inertia is {_text(main.inertia)}; expected it to lack at '
+                f'most {MISSING:.0%} of the total, or no such key')
+
+
+def _text(numbers):
+    return np.array2string(np.asarray(numbers), precision=5, separator=', ',
+                           suppress_small=True)

@@ -14,57 +14,31 @@ from beetle_omni_ros.robot.parameters import JOINT_NAMES
 
 @dataclass(frozen=True, slots=True)
 class ImuReading:
-    """
-    One IMU reading (REP-145), in the IMU's own axes.
-
-    Attributes:
-        stamp: time of measurement [s].
-        specific_force: (3,) acceleration minus gravity [m/s^2]; +g upward at rest.
-        angular_velocity: (3,) [rad/s].
-
-    """
+    """One IMU reading (REP-145), in the IMU's own axes."""
 
     stamp: float
-    specific_force: np.ndarray
-    angular_velocity: np.ndarray
+    specific_force: np.ndarray      # (3,) acceleration minus gravity [m/s^2]; +g upward at rest
+    angular_velocity: np.ndarray    # (3,) [rad/s]
 
 
 @dataclass(frozen=True, slots=True)
 class PoseReading:
-    """
-    One MoCap pose of the tracked body in world.
-
-    Attributes:
-        stamp: time of capture [s], not of arrival.
-        position: (3,) [m].
-        quaternion: (4,) body to world (x, y, z, w), of either sign.
-
-    """
+    """One MoCap pose of the tracked body in world."""
 
     stamp: float
-    position: np.ndarray
-    quaternion: np.ndarray
+    position: np.ndarray        # (3,) [m]
+    quaternion: np.ndarray      # (4,) body to world (x, y, z, w), of either sign
 
 
 @dataclass(frozen=True, slots=True)
 class JointReading:
-    """
-    One reading of the tilt joints.
-
-    Attributes:
-        stamp: time of capture [s].
-        position: (4,) [rad].
-        velocity: (4,) [rad/s], or None if not measured.
-        effort: (4,) [N m], or None if not measured.
-        names: joint names; fewer than four are legal in a written message.
-
-    """
+    """One reading of the tilt joints."""
 
     stamp: float
-    position: np.ndarray
-    velocity: np.ndarray | None
-    effort: np.ndarray | None = None
-    names: Sequence[str] = JOINT_NAMES
+    position: np.ndarray                # (4,) [rad]
+    velocity: np.ndarray | None         # (4,) [rad/s], None if not measured
+    effort: np.ndarray | None = None    # (4,) [N m], None if not measured
+    names: Sequence[str] = JOINT_NAMES  # fewer than four are legal in a written message
 
     def corrected(self, errors: SensorErrors) -> JointReading:
         """The reading without the errors of the encoders that the robot file states."""

@@ -1,26 +1,38 @@
-"""Parameter files bound to dataclasses, with units, ranges and one-line errors.
+"""
+Parameters: dataclass fields with default, unit, range and meaning, and the YAML files of changes.
 
 A parameter file is YAML, either plain or in the ROS 2 form (``/**: ros__parameters: ...``). The
-same file serves a node's ``--params-file`` and tools without ROS.
+same file serves a node's ``--params-file`` and tools without ROS. Every error is one line that
+names file, key and expected value.
 """
 
+from copy import deepcopy
 from dataclasses import field, fields, is_dataclass, MISSING
 from difflib import get_close_matches
+from functools import lru_cache
 from pathlib import Path
-import types
-from typing import Any, ClassVar, get_args, get_origin, get_type_hints, TypeVar, Union
+import reprlib
+from types import NoneType
+from typing import Any, ClassVar, get_args, get_type_hints, TypeVar
 
 import numpy as np
+import yaml
 
 from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.yaml_file import quoted, read_yaml, shortened, YamlError
 
-# Parameters with more than numbers, from lists and mappings of a file.
-STRUCTURED: dict[Any, tuple[tuple[type, ...], str]] = {
-    tuple: ((list, tuple), 'a list'), dict: ((dict, type(None)), 'a mapping')}
 File = TypeVar('File', bound='ParameterFile')
 NAMES = tuple[str, ...]     # type of a parameter that is a list of names
+# Type of a field that is no number -> types of its value in a file, and their name.
+KINDS: dict[Any, tuple[Any, str]] = {
+    bool: ((bool,), 'true or false'), str: ((str,), 'text'), tuple: ((list, tuple), 'a list'),
+    NAMES: ((list, tuple), 'a list of names'), dict: ((dict, NoneType), 'a mapping')}
+MAX_BYTES = 1 << 20     # of a file; the shipped ones have up to 16 kB
+QUOTED = 200            # characters of a value in a message
 FILE_NAME, KEY, WHOLE = 500, 80, 1000    # characters of them in a message
+
+_short = reprlib.Repr()
+_short.maxlevel, _short.maxlist, _short.maxtuple, _short.maxdict = 3, 8, 8, 8
+_short.maxstring, _short.maxother = 120, 120
 
 
 class RunError(RuntimeError):
@@ -29,6 +41,21 @@ class RunError(RuntimeError):
 
 class ParameterError(ValueError):
     """A parameter file or value cannot be used; the text names file, key and expected value."""
+
+
+class YamlError(ParameterError):
+    """A file that cannot be read as YAML; the text is one line without the file's name."""
+
+
+def quoted(value: Any) -> str:
+    """Represent any value in one line of at most ``QUOTED`` characters."""
+    return shortened(_short.repr(value), QUOTED)
+
+
+def shortened(text: str, length: int = QUOTED) -> str:
+    """Shorten to one line of at most ``length`` characters."""
+    line = ' '.join(text[:4 * length].split())
+    return line if len(line) <= length and len(text) <= 4 * length else f'{line[:length - 3]}...'
 
 
 def parameter(default: Any = MISSING, *, doc: str, unit: str = '', low: float | None = None,
@@ -51,16 +78,60 @@ def parameter(default: Any = MISSING, *, doc: str, unit: str = '', low: float | 
     metadata = {'doc': doc, 'unit': unit, 'low': low, 'high': high, 'shape': shape,
                 'choices': choices, 'read_only': read_only}
     if isinstance(default, (list, np.ndarray)):
-        value = np.array(default, dtype=float)
-        return field(default_factory=lambda: value.copy(), metadata=metadata)
-    if isinstance(default, dict):
-        return field(default_factory=lambda: dict(default), metadata=metadata)
+        default = np.array(default, dtype=float)
+    if isinstance(default, (dict, np.ndarray)):
+        return field(default_factory=default.copy, metadata=metadata)
     return field(default=default, metadata=metadata)
 
 
 def group(cls: type, doc: str = ''):
     """Declare a nested dataclass of parameters that defaults to ``cls()``."""
     return field(default_factory=cls, metadata={'doc': doc})
+
+
+def read_yaml(path: str | Path) -> Any:
+    """
+    Read the one document of a YAML file.
+
+    Raises:
+        YamlError: missing, unreadable or too large file, or broken YAML.
+
+    """
+    try:
+        with open(path, 'rb') as file:
+            data = file.read(MAX_BYTES + 1)
+    except (OSError, ValueError) as error:
+        raise YamlError(f'cannot be read ({getattr(error, "strerror", error)})') from None
+    if len(data) > MAX_BYTES:
+        raise YamlError(f'larger than {MAX_BYTES} bytes')
+    return parse_yaml(data)
+
+
+def parse_yaml(data: bytes | str) -> Any:
+    """
+    Read the one document of a YAML text.
+
+    Raises:
+        YamlError: broken YAML.
+
+    """
+    return deepcopy(_parsed(data))
+
+
+@lru_cache(maxsize=32)      # one flight reads the same files several times, each in 40 ms
+def _parsed(data):
+    try:
+        return yaml.safe_load(data)
+    except yaml.YAMLError as error:
+        mark = getattr(error, 'problem_mark', None)
+        where = f' at line {mark.line + 1}, column {mark.column + 1}' if mark else ''
+        problem = getattr(error, 'problem', None) or str(error)
+        raise YamlError(f'not valid YAML{where} ({shortened(problem)})') from None
+    except RecursionError:
+        raise YamlError('not valid YAML (too deep)') from None
+    except (AttributeError, LookupError, TypeError, ValueError) as error:
+        # PyYAML's own errors about values such as `0b_` or a date with month 13
+        raise YamlError(f'not valid YAML ({shortened(str(error))})') from None
 
 
 def load_yaml(path: str | Path) -> dict:
@@ -79,11 +150,9 @@ def load_yaml(path: str | Path) -> dict:
         if isinstance(value, dict) and set(value) == {'ros__parameters'}:
             data = value['ros__parameters']
             break
-    if data is None:
-        return {}
-    if not isinstance(data, dict):
+    if not isinstance(data, dict | None):
         raise ParameterError(f'{path}: expected a mapping of keys, found {type(data).__name__}')
-    return data
+    return data or {}
 
 
 class ParameterFile:
@@ -135,26 +204,29 @@ def bind(cls: type, mapping: dict, where: str = '', prefix: str = ''):
     if not isinstance(mapping, dict):
         raise ParameterError(f'{_at(where, prefix)}: expected a mapping, '
                              f'found {type(mapping).__name__}')
-    hints = get_type_hints(cls)
+    hints: dict[str, Any] = get_type_hints(cls)
     known = {f.name: f for f in fields(cls) if f.init}
     for key in mapping:
         if key not in known:
             near = get_close_matches(str(key)[:KEY], known, n=1)
             hint = f"; did you mean '{near[0]}'?" if near else f"; known: {', '.join(known)}"
             raise ParameterError(f'{_at(where, _join(prefix, key))}: unknown key{hint}')
-    values = {}
+    values: dict[str, Any] = {}
     for name, entry in known.items():
-        key = _join(prefix, name)
+        key, hint = _join(prefix, name), hints[name]
         if name not in mapping:
             if entry.default is MISSING and entry.default_factory is MISSING:
-                raise ParameterError(f'{_at(where, key)}: missing'
-                                     f'{_unit_text(entry)}')
+                raise ParameterError(f'{_at(where, key)}: missing{_unit(entry, " [{}]")}')
             continue
-        nested = _nested(hints[name])
-        if nested and not (mapping[name] is None and nested is not hints[name]):
-            values[name] = bind(nested, mapping[name], where, key)
-        else:
-            values[name] = check(entry, hints[name], mapping[name], _at(where, key))
+        value = mapping[name]
+        if NoneType in get_args(hint):      # Class | None
+            hint = get_args(hint)[0]
+            if value is None:
+                values[name] = None
+                continue
+        nested = is_dataclass(hint)
+        values[name] = bind(hint, value, where, key) if nested \
+            else check(entry, hint, value, _at(where, key))
     try:
         return cls(**values)
     except ParameterError as error:
@@ -162,12 +234,7 @@ def bind(cls: type, mapping: dict, where: str = '', prefix: str = ''):
         raise ParameterError(shortened(text, FILE_NAME + WHOLE)) from None
 
 
-def _nested(hint):
-    """Dataclass of a nested field, also as ``Class | None``; else None."""
-    return next((part for part in (hint, *get_args(hint)) if is_dataclass(part)), None)
-
-
-def check(entry, hint: type, value: Any, at: str) -> Any:
+def check(entry, hint: Any, value: Any, at: str) -> Any:
     """
     Validate one value against its declaration and convert it to its declared type.
 
@@ -178,83 +245,66 @@ def check(entry, hint: type, value: Any, at: str) -> Any:
         at: file and key, for messages.
 
     """
-    meta = entry.metadata
-    optional = get_origin(hint) in (Union, types.UnionType)
-    if optional:
-        if value is None:
-            return None
-        hint = next(a for a in get_args(hint) if a is not type(None))
-    if meta.get('shape') is not None or hint is np.ndarray:
-        return _check_array(meta, value, at)
-    if hint is bool:
-        if not isinstance(value, bool):
-            raise ParameterError(f'{at}: expected true or false, found {quoted(value)}')
-        return value
+    if hint is np.ndarray:
+        return _array(entry, value, at)
     if hint in (int, float):
-        return _check_number(entry, hint, value, at)
-    if hint is str:
-        if not isinstance(value, str):
-            raise ParameterError(f'{at}: expected text, found {quoted(value)}')
-        if meta.get('choices') and value not in meta['choices']:
-            raise ParameterError(f"{at}: expected one of {', '.join(meta['choices'])}, "
-                                 f'found {quoted(value)}')
-        return value
-    if hint == NAMES:
-        if not isinstance(value, (list, tuple)) or not all(isinstance(v, str) for v in value):
-            raise ParameterError(f'{at}: expected a list of names, found {quoted(value)}')
-        return tuple(value)
-    if hint in STRUCTURED:
-        kinds, what = STRUCTURED[hint]
-        if not isinstance(value, kinds):
-            raise ParameterError(f'{at}: expected {what}, found {quoted(value)}')
-        return hint(value or ())
-    return value
+        return _number(entry, hint, value, at)
+    kinds, what = KINDS[hint]
+    if not isinstance(value, kinds) or (
+            hint == NAMES and not all(isinstance(name, str) for name in value)):
+        raise ParameterError(f'{at}: expected {what}, found {quoted(value)}')
+    choices = entry.metadata['choices']
+    if choices and value not in choices:
+        raise ParameterError(f"{at}: expected one of {', '.join(choices)}, found {quoted(value)}")
+    return hint(value or ()) if hint in (tuple, dict, NAMES) else value
 
 
-def _check_number(entry, hint, value, at):
+def _number(entry, hint, value, at):
     """Finite int or float within its range."""
-    kind = 'an integer' if hint is int else 'a number'
-    found = f'{at}: expected {kind}{_unit_text(entry)}, found {quoted(value)}'
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)):
-        raise ParameterError(found)
     try:
-        number = float(value)
-    except (OverflowError, TypeError):      # an integer beyond float's range; a complex number
-        raise ParameterError(found) from None
-    _check_range(entry.metadata, number, at)
-    if hint is int and value != int(value):
-        raise ParameterError(found)
+        if isinstance(value, bool) or not isinstance(value, (int, float, np.number)):
+            raise TypeError
+        _check_range(entry, float(value), at)
+        if value != hint(value):
+            raise TypeError
+    except (OverflowError, TypeError):
+        kind = 'an integer' if hint is int else 'a number'
+        raise ParameterError(f'{at}: expected {kind}{_unit(entry, " [{}]")}, '
+                             f'found {quoted(value)}') from None
     return hint(value)
 
 
-def _check_array(meta, value, at):
+def _array(entry, value, at):
     """(n,) or the declared shape, of finite numbers within their range."""
     try:
         array = np.array(value, dtype=float)
     except (OverflowError, TypeError, ValueError):
         raise ParameterError(f'{at}: expected numbers, found {quoted(value)}') from None
-    shape = meta.get('shape')
+    shape = entry.metadata['shape']
+    if shape is not None and array.shape == (np.prod(shape),):
+        array = array.reshape(shape)    # ROS has flat arrays only
     if shape is not None and array.shape != tuple(shape):
         raise ParameterError(f'{at}: expected shape {tuple(shape)}, found {array.shape}')
     if shape is None and array.ndim != 1:
         raise ParameterError(f'{at}: expected a list of numbers, found {quoted(value)}')
     for element in array.ravel():
-        _check_range(meta, float(element), at)
+        _check_range(entry, float(element), at)
     return array
 
 
-def _check_range(meta, value, at):
-    low, high, unit = meta.get('low'), meta.get('high'), meta.get('unit')
+def _check_range(entry, value, at):
+    low, high = (entry.metadata[name] for name in ('low', 'high'))
+    low, high = -np.inf if low is None else low, np.inf if high is None else high
     if not np.isfinite(value):
         raise ParameterError(f'{at}: {value} is not finite')
-    if (low is not None and value < low) or (high is not None and value > high):
-        span = f'{-np.inf if low is None else low:g} to {np.inf if high is None else high:g}'
-        raise ParameterError(f'{at}: {value:g} is outside {span}' + (f' {unit}' if unit else ''))
+    if not low <= value <= high:
+        raise ParameterError(f'{at}: {value:g} is outside {low:g} to {high:g}'
+                             f'{_unit(entry, " {}")}')
 
 
-def _unit_text(entry):
+def _unit(entry, form):
     unit = entry.metadata.get('unit')
-    return f' [{unit}]' if unit else ''
+    return form.format(unit) if unit else ''
 
 
 def _join(prefix, key):
@@ -295,7 +345,3 @@ def nest(flat: dict[str, Any]) -> dict:
             level = level.setdefault(part, {})
         level[leaf] = value
     return nested
-
-
-__all__ = ['ParameterError', 'ParameterFile', 'bind', 'check', 'flatten', 'group', 'load',
-           'load_yaml', 'NAMES', 'nest', 'parameter']

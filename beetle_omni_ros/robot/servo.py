@@ -16,7 +16,8 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from beetle_omni_ros.robot.parameters import JointParameters
+from beetle_omni_ros.robot.effects import delaying
+from beetle_omni_ros.robot.parameters import JointParameters, RobotParameters
 
 SLIDING_RATE = 0.05     # [rad/s] over which friction falls from stiction to Coulomb friction
 
@@ -39,34 +40,18 @@ CASADI = Namespace(ca.fmin, ca.fmax, ca.exp, ca.sqrt, ca.if_else, ca.sin, ca.cos
 
 @dataclass(frozen=True)
 class Servo:
-    """
-    Numbers of a servo, or arrays of them; None disables a limit or friction.
+    """Numbers of a servo, or arrays of them; None disables a limit or friction."""
 
-    Attributes:
-        inertia: [kg m^2].
-        kp: stiffness [N m/rad].
-        kd: damping [N m s/rad].
-        velocity_limit: [rad/s].
-        effort_limit: largest torque of the motor [N m].
-        position_limit: travel to each side [rad].
-        coulomb: sliding friction [N m].
-        stiction: friction at rest [N m].
-        fading_rate: rate over which stiction falls to sliding friction [rad/s].
-        gaussian: whether stiction fades as exp(-x^2), else as exp(-|x|), with x = rate / fading
-            rate.
-
-    """
-
-    inertia: Any
-    kp: Any
-    kd: Any
-    velocity_limit: Any = None
-    effort_limit: Any = None
-    position_limit: Any = None
-    coulomb: Any = None
-    stiction: Any = None
-    fading_rate: Any = SLIDING_RATE
-    gaussian: bool = True
+    inertia: Any                # [kg m^2]
+    kp: Any                     # stiffness [N m/rad]
+    kd: Any                     # damping [N m s/rad]
+    velocity_limit: Any = None  # [rad/s]
+    effort_limit: Any = None    # largest torque of the motor [N m]
+    position_limit: Any = None  # travel to each side [rad]
+    coulomb: Any = None         # sliding friction [N m]
+    stiction: Any = None        # friction at rest [N m]
+    fading_rate: Any = SLIDING_RATE     # over which stiction falls to sliding friction [rad/s]
+    gaussian: bool = True       # stiction fades as exp(-x^2), else as exp(-|x|), x = rate / fading
 
     @classmethod
     def of(cls, joints: JointParameters, **more) -> Servo:
@@ -200,3 +185,48 @@ def play(positions: np.ndarray, half: float | np.ndarray,
 
 def _within(space, value, limit):
     return space.minimum(space.maximum(value, -limit), limit)
+
+
+@dataclass(frozen=True)
+class Responses:
+    """Limits of the response of any servo and rotor of one robot, (lowest, highest)."""
+
+    servo_lag: tuple[float, float]      # time constant of the first-order reduction [s]
+    servo_delay: tuple[float, float]    # of tilt commands and encoders by the effects [s]
+    rotor_lag: tuple[float, float]      # time constant of the thrust [s]
+    rotor_delay: tuple[float, float]    # of thrust commands by the effects [s]
+    friction: float     # largest angle at which friction holds a servo beside its target [rad]
+
+    @classmethod
+    def of(cls, robot: RobotParameters) -> Responses:
+        """Limits by a robot file with or without intervals and effects."""
+        kp = _range(robot, 'joints.kp', 'joint_bandwidth')
+        kd = _range(robot, 'joints.kd', 'joint_bandwidth')
+        fastest, slowest = (np.maximum(damping / stiff, np.sqrt(robot.joints.inertia / stiff))
+                            for damping, stiff in zip(kd, kp[::-1]))
+        friction = 0.0
+        if 'joint_friction' in robot.effects:
+            friction = max(float(np.max(robot.interval(f'effects.joint_friction.{name}')[1]
+                                        / kp[0]))
+                           for name in ('coulomb', 'stiction'))
+        return cls(
+            servo_lag=(float(np.min(fastest)), float(np.max(slowest))),
+            servo_delay=_delay(robot, 'tilt', 'encoders'),
+            rotor_lag=_pair(_range(robot, 'rotors.time_constant', 'rotor_lag')),
+            rotor_delay=_delay(robot, 'thrust'), friction=friction)
+
+
+def _range(robot, key, effect):
+    """Interval of a number of the file, or of the effect that replaces it."""
+    return robot.interval(f"effects.{effect}.{key.split('.')[1]}" if effect in robot.effects
+                          else key)
+
+
+def _delay(robot, *what):
+    return _pair(sum(np.array(robot.interval(f'effects.{name}.delay'))
+                     for name in delaying(*what) if name in robot.effects) + np.zeros(2))
+
+
+def _pair(interval):
+    low, high = interval
+    return float(low), float(high)

@@ -14,6 +14,7 @@ from beetle_omni_ros.robot.schema import ParameterError
 STOP_DUTY, FULL_DUTY = 50.0, 100.0  # [% of 2000 us] 1000 us and 2000 us
 CELLS = 2048                        # linear pieces of a cubic; error at most 1e-5 of 0.5 N
 SLOPE_MIN = 1e-3                    # [% of duty / whole thrust range] keeps flat parts invertible
+FRACTIONS = np.linspace(0, 1, CELLS + 1)
 
 
 class ThrustMap:
@@ -45,7 +46,6 @@ class ThrustMap:
         if np.any(np.diff(self.voltages) <= 0):
             raise ParameterError(f'rotors.map: two rows at one voltage, {self.voltages} V')
         self.thrust_limits = np.array([row.thrust_max for row in rows])
-        self._torque_ratio = rotors.torque_to_thrust_ratio
         self._duty = np.empty((len(rows), CELLS + 1))
         repaired = []
         for duty, row in zip(self._duty, rows):
@@ -90,31 +90,22 @@ class ThrustMap:
         right = (1 - weight) * table[low, cell + 1] + weight * table[high, cell + 1]
         return np.where(thrust > 0, left + (position - cell) * (right - left), STOP_DUTY)
 
-    def thrust(self, duty, voltage) -> np.ndarray:
+    def thrust(self, duty, voltage: float) -> np.ndarray:
         """
-        Thrust [N] at ``duty`` [% of 2000 us] and ``voltage`` [V]; shapes broadcast.
+        Thrust [N] at duties [% of 2000 us] and one voltage [V], the exact inverse of :meth:`duty`.
 
-        Exact inverse of :meth:`duty`. Thrust is zero below the duty of zero thrust, and the limit
-        above the largest measured duty.
+        It is zero below the duty of zero thrust, and the limit above the largest measured duty.
         """
-        if np.ndim(voltage) == 0:
-            if voltage != self._blend_voltage:
-                low, weight = self._rows(voltage)
-                high = min(low + 1, len(self.voltages) - 1)
-                blend = (1 - weight) * self._duty[low] + weight * self._duty[high]
-                self._blend_voltage, self._blend = voltage, blend
-            fraction = np.interp(duty, self._blend, _FRACTIONS)
-            return fraction * self.thrust_limit(voltage)
-        duty, voltage = np.broadcast_arrays(np.asarray(duty, dtype=float), voltage)
-        return self._fractions(duty, voltage) * self.thrust_limit(voltage)
+        if voltage != self._blend_voltage:
+            low, weight = self._rows(voltage)
+            high = min(low + 1, len(self.voltages) - 1)
+            self._blend_voltage = voltage
+            self._blend = (1 - weight) * self._duty[low] + weight * self._duty[high]
+        return np.interp(duty, self._blend, FRACTIONS) * self.thrust_limit(voltage)
 
     def command(self, thrust, voltage) -> np.ndarray:
         """Normalised command, 0 (stop) to 1 (2000 us), for ``thrust`` [N] at ``voltage`` [V]."""
-        return command_of_duty(self.duty(thrust, voltage))
-
-    def torque(self, thrust) -> np.ndarray:
-        """Magnitude of the reaction torque [N m] about the rotor's axis at ``thrust`` [N]."""
-        return self._torque_ratio * np.asarray(thrust)
+        return (self.duty(thrust, voltage) - STOP_DUTY) / (FULL_DUTY - STOP_DUTY)
 
     def _rows(self, voltage):
         """Row below ``voltage`` and weight of the row above."""
@@ -124,29 +115,6 @@ class ThrustMap:
         place = np.interp(voltage, self.voltages, np.arange(rows))
         low = np.minimum(np.asarray(place).astype(int), rows - 2)[()]
         return low, place - low
-
-    def _fractions(self, duty, voltage):
-        """Fraction of the thrust limit, by bisection in the interpolated rows of each element."""
-        low, weight = self._rows(voltage)
-        high = np.minimum(low + 1, len(self.voltages) - 1)
-
-        def blend(cell):
-            return (1 - weight) * self._duty[low, cell] + weight * self._duty[high, cell]
-
-        cell, step = np.zeros(duty.shape, dtype=int), CELLS // 2
-        while step:
-            cell = np.where(blend(cell + step) <= duty, cell + step, cell)
-            step //= 2
-        left, right = blend(cell), blend(cell + 1)
-        return (cell + np.clip((duty - left) / (right - left), 0, 1)) / CELLS
-
-
-_FRACTIONS = np.linspace(0, 1, CELLS + 1)
-
-
-def command_of_duty(duty) -> np.ndarray:
-    """Normalised command, 0 to 1, of ``duty`` [% of 2000 us]."""
-    return (np.asarray(duty) - STOP_DUTY) / (FULL_DUTY - STOP_DUTY)
 
 
 def duty_of_command(command) -> np.ndarray:

@@ -21,23 +21,14 @@ UNUSABLE = (ElementTree.ParseError, AttributeError, KeyError, TypeError, ValueEr
 
 @dataclass(frozen=True)
 class Joint:
-    """
-    Connection of a link to its parent.
-
-    Attributes:
-        name: joint name.
-        parent, child: link names.
-        position, quaternion: (3,) [m], (4,) of the child in the parent's frame at angle 0.
-        axis: (3,) axis of rotation in the child's frame; None if fixed.
-
-    """
+    """Connection of a link to its parent."""
 
     name: str
-    parent: str
+    parent: str     # link names
     child: str
-    position: np.ndarray
-    quaternion: np.ndarray
-    axis: np.ndarray | None = None
+    position: np.ndarray    # (3,) of the child in the parent's frame at angle 0 [m]
+    quaternion: np.ndarray  # (4,) likewise
+    axis: np.ndarray | None = None  # (3,) of rotation in the child's frame; None if fixed
 
     def turned(self, angle: float) -> np.ndarray:
         """Quaternion (4,) of the child in the parent's frame at ``angle`` [rad]."""
@@ -48,40 +39,22 @@ class Joint:
 
 @dataclass(frozen=True)
 class Visual:
-    """
-    One visible shape of a link.
+    """One visible shape of a link."""
 
-    Attributes:
-        shape: 'box', 'cylinder', 'sphere' or 'mesh'.
-        size: edges; radius and length; radius; scale along each axis [m, mesh: 1].
-        position, quaternion: (3,) [m], (4,) in the link's frame.
-        colour: red, green, blue, opacity, each 0 to 1.
-        file: path of a mesh.
-
-    """
-
-    shape: str
-    size: tuple[float, ...]
-    position: np.ndarray
-    quaternion: np.ndarray
-    colour: tuple[float, ...] = GREY
-    file: Path | None = None
+    shape: str                  # 'box', 'cylinder', 'sphere' or 'mesh'
+    size: tuple[float, ...]     # edges; radius and length; radius; scale of each axis [m, mesh: 1]
+    position: np.ndarray        # (3,) in the link's frame [m]
+    quaternion: np.ndarray      # (4,) likewise
+    colour: tuple[float, ...] = GREY    # red, green, blue, opacity, each 0 to 1
+    file: Path | None = None    # of a mesh
 
 
 @dataclass(frozen=True)
 class Link:
-    """
-    A link with its joint and its visible shapes.
-
-    Attributes:
-        name: link name.
-        joint: joint to its parent; None for the root.
-        visuals: visible shapes.
-
-    """
+    """A link with its visible shapes."""
 
     name: str
-    joint: Joint | None
+    joint: Joint | None     # to its parent; None for the root
     visuals: tuple[Visual, ...] = ()
 
     @property
@@ -96,17 +69,10 @@ class Link:
 
 @dataclass(frozen=True)
 class Model:
-    """
-    Links of a robot, parents before children.
-
-    Attributes:
-        links: name -> link.
-        limits: joint -> lower and upper limit [rad].
-
-    """
+    """Links of a robot, parents before children."""
 
     links: dict[str, Link]
-    limits: dict[str, tuple[float, float]]
+    limits: dict[str, tuple[float, float]]      # joint -> lower and upper [rad]
 
     @classmethod
     def load(cls, path: str | Path | None = None) -> Model:
@@ -126,28 +92,6 @@ class Model:
             return cls(_links(root, joints(text), path), _limits(root))
         except UNUSABLE as error:
             raise ParameterError(f'{path}: not a usable URDF: {error}') from None
-
-    def poses(self, angles: dict[str, float]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """
-        Poses of all links.
-
-        Args:
-            angles: joint -> angle [rad]; 0 for absent joints.
-
-        Returns:
-            Link -> (3,) position [m] and (4,) quaternion in the root's frame.
-
-        """
-        placed = {}
-        for link in self.links.values():
-            if link.joint is None:
-                placed[link.name] = np.zeros(3), IDENTITY
-                continue
-            position, quaternion = placed[link.joint.parent]
-            placed[link.name] = (
-                position + rotations.matrix(quaternion) @ link.joint.position,
-                rotations.multiply(quaternion, link.turned(angles.get(link.moves, 0.0))))
-        return placed
 
 
 def description(path: str | Path = '') -> str:

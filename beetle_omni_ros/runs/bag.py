@@ -29,7 +29,7 @@ from beetle_omni_ros.messages.topics import (
     topic_of,
     TOPICS,
 )
-from beetle_omni_ros.robot.yaml_file import quoted, read_yaml, YamlError
+from beetle_omni_ros.robot.schema import quoted, read_yaml, YamlError
 from beetle_omni_ros.runs.log import FlightLog, LogRecorder, Recorder, SERIES_OF
 
 AT_ONCE = 4096      # messages that are read together

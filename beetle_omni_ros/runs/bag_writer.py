@@ -21,8 +21,8 @@ import yaml
 from beetle_omni_ros.messages.bag_types import BAG, from_bytes, offered, to_bytes, TYPESTORE
 from beetle_omni_ros.messages.conversions import BODY, nanoseconds, WORLD
 from beetle_omni_ros.messages.topics import ALL, EVENT, LATCHED, Qos, topic_of, TOPICS
+from beetle_omni_ros.robot.schema import read_yaml
 from beetle_omni_ros.robot.urdf import joints
-from beetle_omni_ros.robot.yaml_file import read_yaml
 from beetle_omni_ros.runs.bag import BagError, META_KEY
 from beetle_omni_ros.runs.log import Recorder, RUN_STATUS
 

@@ -19,7 +19,7 @@ from beetle_omni_ros.control.base import PoseTarget, Target
 from beetle_omni_ros.pages.figures import INK, PARTS
 from beetle_omni_ros.pages.page import shipped
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.yaml_file import shortened
+from beetle_omni_ros.robot.schema import shortened
 from beetle_omni_ros.runs.log import (
     EDGE,
     errors,

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.robot.yaml_file import quoted
+from beetle_omni_ros.robot.schema import ParameterError, quoted
 
 
 class LogError(ParameterError):

@@ -11,7 +11,7 @@ import numpy as np
 
 from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.yaml_file import shortened
+from beetle_omni_ros.robot.schema import shortened
 from beetle_omni_ros.runs.log import (
     errors,
     estimate_errors,

@@ -12,8 +12,7 @@ from beetle_omni_ros import __version__
 from beetle_omni_ros.pages.figures import COLOURS
 from beetle_omni_ros.pages.page import frame, Grid, html, section, Terminal
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.robot.yaml_file import shortened
+from beetle_omni_ros.robot.schema import ParameterError, shortened
 from beetle_omni_ros.runs import charts, table
 from beetle_omni_ros.runs.bag import no_pose, read_bag, runs_in
 from beetle_omni_ros.runs.charts import Run, target_poses, TimeAxis

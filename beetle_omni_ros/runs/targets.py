@@ -11,8 +11,7 @@ import numpy as np
 from beetle_omni_ros.control.base import PoseTarget, Target
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import parameter, ParameterError, ParameterFile
-from beetle_omni_ros.robot.yaml_file import quoted
+from beetle_omni_ros.robot.schema import parameter, ParameterError, ParameterFile, quoted
 from beetle_omni_ros.runs.files import read_table
 
 UNIT_TOLERANCE = 0.02   # of a quaternion's squared length
@@ -22,7 +21,7 @@ COLUMNS = ('x_m', 'y_m', 'z_m', 'roll_deg', 'pitch_deg', 'yaw_deg')
 
 @dataclass(frozen=True, kw_only=True)
 class TargetLimits(ParameterFile, file='targets.yaml'):
-    """Limits of a target; params/targets.yaml gives the reasons."""
+    """Limits of a target."""
 
     half_width: float = parameter(18.0, doc='largest |x| and |y|', unit='m', low=0.5, high=1000)
     height: float = parameter(18.0, doc='largest z', unit='m', low=0.5, high=1000)

@@ -7,9 +7,8 @@ import numpy as np
 
 from beetle_omni_ros.control.base import Command, Fallback, Reference, TrajectoryTarget
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
-from beetle_omni_ros.robot.allocation import Allocator
-from beetle_omni_ros.robot.holding import Holding
+from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY, Allocator
+from beetle_omni_ros.robot.degraded import Holding
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.events import ERROR, EventLog
 from beetle_omni_ros.safety.levelling import plan, Way

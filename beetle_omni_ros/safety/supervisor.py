@@ -12,7 +12,7 @@ import numpy as np
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import Command, Fallback, PoseTarget, Target
-from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY, NO_ZEROS
+from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY, NO_ZEROS
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.events import Answer, ERROR, INFO, WARNING
 from beetle_omni_ros.safety.handover import Handover

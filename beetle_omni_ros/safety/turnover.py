@@ -14,9 +14,8 @@ from itertools import combinations
 
 import numpy as np
 
-from beetle_omni_ros.robot.actuator_health import ActuatorHealth
-from beetle_omni_ros.robot.allocation import Allocator, nearest_turn, ROTORS
-from beetle_omni_ros.robot.holding import Holding, leaned, up
+from beetle_omni_ros.robot.allocation import ActuatorHealth, Allocator, nearest_turn, ROTORS
+from beetle_omni_ros.robot.degraded import Holding, leaned, up
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import parameter
 from beetle_omni_ros.safety.levelling import LevellingParameters, lost_lift

@@ -4,8 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from beetle_omni_ros.robot.mass_properties import Variation
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.parameters import RobotParameters, Variation
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 

@@ -10,8 +10,7 @@ from typing import Any
 
 from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import parameter, ParameterError
-from beetle_omni_ros.robot.yaml_file import quoted, shortened
+from beetle_omni_ros.robot.schema import parameter, ParameterError, quoted, shortened
 from beetle_omni_ros.sim.faults import Fault, KINDS
 
 # Signals without effect if the devices are emulated.

@@ -32,8 +32,7 @@ from typing import Any
 import numpy as np
 
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.robot.yaml_file import quoted
+from beetle_omni_ros.robot.schema import ParameterError, quoted
 
 ROUNDING = 1e-9     # [s] bound of the rounding error of sums of ticks
 LARGEST = 1e9       # bound of any number, against typing errors

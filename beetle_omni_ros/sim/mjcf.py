@@ -3,8 +3,13 @@
 import mujoco
 import numpy as np
 
-from beetle_omni_ros.robot.mass_properties import combined, mass_properties, RigidPart, Variation
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.parameters import (
+    combined,
+    mass_properties,
+    RigidPart,
+    RobotParameters,
+    Variation,
+)
 from beetle_omni_ros.sim.parameters import PlantParameters
 
 BASE = 1                        # body index of base_link; 0 is the world
@@ -100,27 +105,17 @@ def _module(robot, plant, parts, k):
 
 
 def _actuators(robot):
-    rotors, joints, effects = robot.rotors, robot.joints, robot.effects
-    ratio = effects.get('torque_coefficient', {}).get('torque_to_thrust_ratio',
-                                                      rotors.torque_to_thrust_ratio)
-    scale = thrust_scale(robot)
+    rotors, joints, scale = robot.rotors, robot.joints, robot.thrust_scale
     rotor = ''.join(
         f'<general name="rotor{k + 1}" site="rotor{k + 1}" dyntype="filter" '
         f'dynprm="{rotors.time_constant!r}" gear="{_text(0, 0, scale[k], 0, 0)} '
-        f'{_text(-rotors.spin[k] * ratio * scale[k])}"/>\n' for k in range(4))
+        f'{_text(-rotors.spin[k] * robot.torque_ratio * scale[k])}"/>\n' for k in range(4))
     servo = ''.join(
         f'<general name="servo{k + 1}" joint="gimbal{k + 1}" gainprm="{joints.of(k).kp!r}" '
         f'biastype="affine" biasprm="{_text(0, -joints.of(k).kp, -joints.of(k).kd)}" '
         f'forcelimited="true" forcerange="{_text(-joints.effort_limit, joints.effort_limit)}"/>\n'
         for k in range(4))
     return rotor + servo
-
-
-def thrust_scale(robot: RobotParameters) -> np.ndarray:
-    """(4,) true thrust relative to the commanded thrust."""
-    effects = robot.effects
-    return (effects.get('thrust_coefficient', {}).get('scale', 1.0)
-            * np.array(effects.get('rotor_thrust_coefficient', {}).get('scale', (1.0,) * 4)))
 
 
 def _mjcf(robot, plant, variation):

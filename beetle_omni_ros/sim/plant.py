@@ -8,11 +8,10 @@ import numpy as np
 from beetle_omni_ros.robot import dynamics, rotations
 from beetle_omni_ros.robot.allocation import clipped
 from beetle_omni_ros.robot.effects import CATALOGUE
-from beetle_omni_ros.robot.mass_properties import Variation
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.parameters import RobotParameters, Variation
 from beetle_omni_ros.robot.servo import NUMPY
 from beetle_omni_ros.sim.effects import CatalogueForces, MotionForces
-from beetle_omni_ros.sim.mjcf import BASE, base_part, build_model, set_base_part, thrust_scale
+from beetle_omni_ros.sim.mjcf import BASE, base_part, build_model, set_base_part
 from beetle_omni_ros.sim.parameters import PlantParameters
 
 # MuJoCo would write warnings into a file in the working directory; step() checks the state.
@@ -56,7 +55,7 @@ class Plant:
         self._servo_terms = [dynamics.tilt_servo(robot, i, 0.0)[0] for i in range(4)]
         self._has_friction = self._servo_terms[0].coulomb is not None
         self._friction = np.zeros(4)
-        self._scale = thrust_scale(robot)
+        self._scale = robot.thrust_scale
         self.model = build_model(robot, parameters, variation)
         self.data = mujoco.MjData(self.model)
         self._tick, self._substeps = parameters.tick, parameters.substeps

@@ -1,4 +1,4 @@
-"""Parameters of the training; params/train.yaml has the shipped values and their sources."""
+"""Parameters of the training."""
 
 from dataclasses import dataclass
 from typing import Any

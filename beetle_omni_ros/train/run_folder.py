@@ -5,8 +5,7 @@ import re
 
 import yaml
 
-from beetle_omni_ros.robot.schema import bind, nest, ParameterError
-from beetle_omni_ros.robot.yaml_file import parse_yaml, quoted, YamlError
+from beetle_omni_ros.robot.schema import bind, nest, ParameterError, parse_yaml, quoted, YamlError
 from beetle_omni_ros.train.parameters import TrainParameters
 
 PARAMETER_FILE = 'train.yaml'

@@ -9,8 +9,8 @@ from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.control.nmpc import NmpcController
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
-from beetle_omni_ros.robot.holding import Holding
+from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY
+from beetle_omni_ros.robot.degraded import Holding
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 ROBOT = RobotParameters.load()

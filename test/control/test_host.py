@@ -7,7 +7,7 @@ import pytest
 
 from beetle_omni_ros.control.base import Command, PoseTarget, State, TrajectoryTarget
 from beetle_omni_ros.control.host import ControllerHost
-from beetle_omni_ros.robot.actuator_health import ActuatorHealth
+from beetle_omni_ros.robot.allocation import ActuatorHealth
 
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 

@@ -121,20 +121,6 @@ def test_every_mesh_is_shipped_closed_and_faces_outwards():
         assert np.abs(mesh.bounds).max() < 0.5, name
 
 
-def test_meshes_equal_the_output_of_the_generator():
-    trimesh = pytest.importorskip('trimesh')
-    script = Path(__file__).parents[2] / 'description' / 'generate_meshes.py'
-    if not script.is_file():
-        pytest.skip('no source checkout')
-    spec = importlib.util.spec_from_file_location('generate_meshes', script)
-    generator = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(generator)
-    for name, made in generator.meshes(ROBOT, SimulatorParameters.load().plant).items():
-        kept = trimesh.load(share_path(f'description/meshes/{name}.stl'))
-        np.testing.assert_allclose(kept.bounds, made.bounds, atol=1e-6, err_msg=name)
-        assert kept.volume == pytest.approx(made.volume, rel=1e-4), name
-
-
 def test_feet_and_propellers_have_the_contact_geometry_of_the_plant():
     trimesh = pytest.importorskip('trimesh')
     plant = SimulatorParameters.load().plant

@@ -4,7 +4,6 @@ import json
 import re
 import xml.etree.ElementTree as ElementTree
 
-import numpy as np
 from rosbags.interfaces import Nodetype
 from synthetic_flights import fly
 import yaml
@@ -64,20 +63,6 @@ def test_each_path_of_the_foxglove_layout_has_a_value():
     assert panels['3D!robot']['topics']['/robot_description']['visible']
 
 
-def test_every_panel_of_the_foxglove_layout_is_placed_once():
-    layout = json.loads((VIEWERS / 'foxglove.json').read_text())
-
-    def leaves(part):
-        if isinstance(part, str):
-            return [part]
-        return leaves(part['first']) + leaves(part['second'])
-
-    placed = leaves(layout['layout'])
-    for tab in layout['configById']['Tab!plots']['tabs']:
-        placed += leaves(tab['layout'])
-    assert sorted(placed) == sorted(layout['configById'])
-
-
 def test_each_curve_of_the_plotjuggler_layout_has_a_value():
     curves = [curve.get('name') for curve in
               ElementTree.parse(VIEWERS / 'plotjuggler.xml').getroot().iter('curve')]
@@ -123,14 +108,12 @@ def test_the_aggregator_has_one_group_for_each_node():
         assert len(found) == 1 or node == graph.GENERIC, node
 
 
-def test_a_bag_contains_the_frames_and_topics_of_all_layouts(tmp_path):
+def test_a_bag_contains_the_frames_of_all_layouts(tmp_path):
     urdf = description(share_path(SHIPPED))
     with BagWriter(tmp_path / 'bag', description=urdf) as writer:
         fly(writer, make_task('waypoints'), duration=2.0)
-    held, newest, parents = {}, {}, {}
+    parents = {}
     for message in read_messages(tmp_path / 'bag'):
-        held[message.topic] = message.type
-        newest[message.topic] = message
         if message.topic in ('/tf', '/tf_static'):
             for transform in from_bytes(message.data, message.type).transforms:
                 parents[transform.child_frame_id] = transform.header.frame_id
@@ -146,21 +129,3 @@ def test_a_bag_contains_the_frames_and_topics_of_all_layouts(tmp_path):
     for link in links:      # each has world as its root
         while link != 'world':
             link = parents[link]
-    plotted = {split(curve.get('name'))[0] for curve in
-               ElementTree.parse(VIEWERS / 'plotjuggler.xml').getroot().iter('curve')}
-    plotted |= {split(path['value'])[0] for panel in layout.values()
-                for path in panel.get('paths', ())}
-    plotted |= {'robot_description'}
-    missing = {name for name in plotted if f'/{name}' not in held}
-    # Topics between nodes, which a flight in one process does not have.
-    assert missing <= {name for name in plotted if name.endswith('/state')}, missing
-    for name in plotted - missing:
-        assert held[f'/{name}'] == TYPES[name]
-    for panel in layout.values():
-        for path in panel.get('paths', ()):
-            topic, fields = split(path['value'])
-            if topic in plotted - missing:
-                value = from_bytes(newest[f'/{topic}'].data, TYPES[topic])
-                for field in re.findall(r'\w+', fields):
-                    value = value[int(field)] if field.isdigit() else getattr(value, field)
-                assert isinstance(value, str) or np.isfinite(value), path['value']

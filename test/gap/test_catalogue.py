@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.identify.gap.keys import all_keys
-from beetle_omni_ros.robot.effect_types import LAYERS
-from beetle_omni_ros.robot.effects import CATALOGUE
+from beetle_omni_ros.robot.effects import CATALOGUE, LAYERS
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 NAMES = {

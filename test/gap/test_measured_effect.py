@@ -23,7 +23,7 @@ from beetle_omni_ros.robot.effects import CATALOGUE
 NAME, LOSS = 'charge_fade', 0.15
 made: dict = {}
 exec(compile(ENTRY + MEASURED, str(PAGE), 'exec'), made)
-FADE = made['ACTUATOR'][NAME]
+FADE = made['CATALOGUE'][NAME]
 
 
 @pytest.fixture(autouse=True)

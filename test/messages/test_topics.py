@@ -20,7 +20,7 @@ from beetle_omni_ros.messages.values import (
     Wrench,
 )
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.actuator_health import ActuatorHealth
+from beetle_omni_ros.robot.allocation import ActuatorHealth
 from beetle_omni_ros.robot.readings import (
     BatteryReading,
     ImuReading,

@@ -1,54 +1,14 @@
 """Facts about an effect are in its declaration only, not in tables of names elsewhere."""
 
-import ast
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from beetle_omni_ros.robot.effects import CATALOGUE, delaying
 
-PACKAGE = Path(__file__).resolve().parents[2] / 'beetle_omni_ros'
-PARAMETERS = {name for effect in CATALOGUE.values() for name in effect.parameters}
+
 # The response log's own terms (natural frequency, damping ratio, dead bands) and the numbers of
 # simulated faults share a few of the catalogue's words: delay, offset, stiction, velocity_limit.
-MOST_TABLES = 6
-
-
-def is_name(text):
-    """Whether a string names an effect, a parameter, or 'effect.parameter[index]'."""
-    effect, dot, parameter = text.partition('[')[0].partition('.')
-    return effect in CATALOGUE or (dot and parameter in PARAMETERS) or text in PARAMETERS
-
-
-def tables(package):
-    """'file: name' of each module-level literal with two or more such names."""
-    found = []
-    for path in sorted(package.rglob('*.py')):
-        if path.is_relative_to(package / 'robot'):
-            continue
-        for node in ast.parse(path.read_text()).body:
-            if not isinstance(node, (ast.Assign, ast.AnnAssign)) or node.value is None:
-                continue
-            names = {item.value for item in ast.walk(node.value) if isinstance(item, ast.Constant)
-                     and isinstance(item.value, str) and is_name(item.value)}
-            if len(names) >= 2:
-                target = node.target if isinstance(node, ast.AnnAssign) else node.targets[0]
-                found.append(f'{path.relative_to(package)}: {ast.unparse(target)}')
-    return found
-
-
-def test_few_tables_outside_robot_have_effect_names_as_keys():
-    found = tables(PACKAGE)
-    assert len(found) <= MOST_TABLES, '\n'.join(found)
-
-
-def test_the_check_counts_a_table_of_effects(tmp_path):
-    (tmp_path / 'a.py').write_text("LATE = {'mocap_time_offset.delay': 1, 'imu_filter_lag': 2}\n"
-                                   "ONE = ('mass',)\nWORDS = ('force_x', 'torque')\n")
-    assert tables(tmp_path) == ['a.py: LATE']
-
-
 @pytest.mark.parametrize('name', CATALOGUE)
 def test_a_declaration_is_complete_and_consistent(name):
     effect = CATALOGUE[name]

@@ -6,9 +6,9 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from beetle_omni_ros.robot import dynamics, native
+from beetle_omni_ros.robot import native
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.servo import CASADI, NUMPY, play, Servo, Step
+from beetle_omni_ros.robot.servo import CASADI, NUMPY, play, Responses, Servo, Step
 
 torch = pytest.importorskip('torch')
 
@@ -102,25 +102,26 @@ def test_backlash_follows_only_when_pushed():
     np.testing.assert_allclose(play(driving, 0.1), [0.0, 0.0, 0.1, 0.1, 0.05])
 
 
-@pytest.mark.parametrize('effects', [
-    {'joint_friction': {'coulomb': 0.01, 'stiction': 0.02}},
-    {'joint_deflection': {'deflection_per_newton': 0.002}},
-    {'propeller_gyroscopic_torque': {'angular_momentum_at_hover': 0.066, 'joint_share': 1.0}}])
-def test_a_joint_effect_changes_controller_model_and_training_step(effects):
-    from beetle_omni_ros.train import model
-    rng = np.random.default_rng(3)
-    x = np.concatenate([rng.normal(size=6), [0, 0, 0, 1.0], rng.normal(size=3),
-                        rng.uniform(-1, 1, 4), [3, -3, 4, -4], rng.uniform(4, 9, 4)])
-    u = np.concatenate([x[13:17] + [0.1, -0.1, 0.1, -0.1], x[21:]])
-    changed = replace(ROBOT, effects=effects)
+@pytest.mark.parametrize('name', ['measured', None])
+def test_a_drawn_robot_responds_within_the_limits_of_its_file(name):
+    robot = RobotParameters.load(name)
+    allowed = Responses.of(robot)
+    for seed in range(50):
+        own = Responses.of(robot.drawn(np.random.default_rng(seed)))
+        for key in ('servo_lag', 'servo_delay', 'rotor_lag', 'rotor_delay'):
+            (low, high), (least, most) = getattr(own, key), getattr(allowed, key)
+            assert least - 1e-12 <= low <= high <= most + 1e-12, key
+        assert own.friction <= allowed.friction
 
-    def tilting(robot):
-        after = model.substep(robot, 0.0025)(x, u, np.zeros(6), model.nominal_body(robot))
-        rates = np.array(after).ravel()[dynamics.TILT_RATE]
-        there = np.array(dynamics.full_model(robot)(x, u, np.zeros(10))).ravel()
-        return (rates - x[dynamics.TILT_RATE]) / 0.0025, there[dynamics.TILT_RATE]
 
-    trained, modelled = (a - b for a, b in zip(tilting(changed), tilting(ROBOT), strict=True))
-    assert np.abs(modelled).max() > 1
-    # The mean of the change in the step, reduced by damping.
-    np.testing.assert_allclose(trained, modelled, rtol=0.35, atol=0.1 * np.abs(modelled).max())
+def test_without_intervals_the_limits_are_the_numbers_of_file_and_effects():
+    robot = replace(RobotParameters.load(), intervals={}, effects={
+        'command_latency': {'delay': 0.01}, 'joint_command_latency': {'delay': 0.02},
+        'joint_feedback_delay': {'delay': 0.005}, 'rotor_lag': {'time_constant': 0.2},
+        'joint_friction': {'coulomb': 0.01, 'stiction': 0.02}})
+    found = Responses.of(robot)
+    expected = {'servo_lag': robot.joints.time_constant, 'servo_delay': 0.035, 'rotor_lag': 0.2,
+                'rotor_delay': 0.01}
+    for key, value in expected.items():
+        assert getattr(found, key) == pytest.approx((value, value))
+    assert found.friction == pytest.approx(0.02 / robot.joints.kp)

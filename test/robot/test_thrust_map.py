@@ -8,13 +8,7 @@ import pytest
 
 from beetle_omni_ros.robot.parameters import RobotParameters, RotorMapRow
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.robot.thrust_map import (
-    command_of_duty,
-    duty_of_command,
-    FULL_DUTY,
-    STOP_DUTY,
-    ThrustMap,
-)
+from beetle_omni_ros.robot.thrust_map import duty_of_command, FULL_DUTY, STOP_DUTY, ThrustMap
 
 ROTORS = RobotParameters.load().rotors
 MAP = ThrustMap(ROTORS)
@@ -28,16 +22,6 @@ def cubic_thrust(row, duty):
     roots = 10 * np.polynomial.polynomial.polyroots(coefficients)
     real = roots[np.abs(roots.imag) < 1e-9].real
     return real[(real >= -1e-9) & (real <= row.thrust_max + 1e-6)]
-
-
-@pytest.mark.parametrize('row', ROTORS.map, ids=lambda row: f'{row.voltage} V')
-def test_every_shipped_cubic_rises_over_its_whole_range(row):
-    slope = np.polynomial.polynomial.polyder(row.coefficients)
-    turning = np.polynomial.polynomial.polyroots(slope)
-    real = 10 * turning[np.abs(turning.imag) < 1e-12].real
-    assert not np.any((real >= 0) & (real <= row.thrust_max))
-    assert slope[0] > 0
-    assert row.voltage not in MAP.repaired
 
 
 @pytest.mark.parametrize('row', ROTORS.map, ids=lambda row: f'{row.voltage} V')
@@ -56,25 +40,6 @@ def test_round_trip_through_a_float32_command_is_exact_to_a_thousandth(share, vo
     back = MAP.thrust(duty_of_command(float(sent)), voltage)
     assert back == pytest.approx(thrust, rel=1e-3)
     assert back == pytest.approx(thrust, rel=2e-6)
-
-
-@given(VOLTAGES)
-def test_more_thrust_needs_more_duty(voltage):
-    thrust = np.linspace(1e-3, MAP.thrust_limit(voltage), 500)
-    assert np.all(np.diff(MAP.duty(thrust, voltage)) > 0)
-
-
-@given(strategies.floats(0.5, 18.7), VOLTAGES, strategies.floats(0.01, 1))
-def test_less_voltage_needs_more_duty(thrust, voltage, sag):
-    low = max(voltage - sag, 21.4)
-    assert MAP.duty(thrust, low) >= MAP.duty(thrust, voltage) - 1e-9
-
-
-@given(strategies.floats(0.5, 18), strategies.integers(0, 4))
-def test_the_map_is_continuous_at_a_measured_voltage(thrust, k):
-    voltage = MAP.voltages[k]
-    around = MAP.duty(thrust, np.array([voltage - 1e-7, voltage, voltage + 1e-7]))
-    assert np.ptp(around) < 1e-4
 
 
 def test_interpolation_between_voltages_predicts_an_omitted_row():
@@ -114,18 +79,11 @@ def test_arrays_and_scalars_give_equal_results():
     voltage = rng.uniform(20, 26, (50, 1))
     thrust = rng.uniform(0, 26, (50, 4))
     duty = MAP.duty(thrust, voltage)
-    back = MAP.thrust(duty, voltage)
-    assert duty.shape == back.shape == (50, 4)
     for k in range(50):
         np.testing.assert_allclose(duty[k], MAP.duty(thrust[k], voltage[k, 0]), rtol=1e-12)
-        np.testing.assert_allclose(back[k], MAP.thrust(duty[k], voltage[k, 0]), atol=1e-9)
-    np.testing.assert_allclose(back, np.minimum(thrust, MAP.thrust_limit(voltage)), atol=1e-9)
-
-
-def test_commands_run_from_stop_to_full():
-    assert command_of_duty(STOP_DUTY) == 0
-    assert command_of_duty(FULL_DUTY) == 1
-    assert np.all(MAP.torque(np.array([0.0, 10.0])) == [0, 0.165])
+        np.testing.assert_allclose(
+            MAP.thrust(duty[k], voltage[k, 0]),
+            np.minimum(thrust[k], MAP.thrust_limit(voltage[k, 0])), atol=1e-9)
 
 
 def bent(peak=False):

@@ -7,7 +7,7 @@ import pytest
 from vehicle_rig import flown, hover_command, PARAMETERS, TICK, VehicleRig
 
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
+from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY
 from beetle_omni_ros.safety.ramp import inclination
 
 

@@ -8,7 +8,7 @@ import pytest
 from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import Allocator
-from beetle_omni_ros.robot.holding import Holding
+from beetle_omni_ros.robot.degraded import Holding
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.levelling import LevellingParameters, lost_lift, plan
 from beetle_omni_ros.safety.turnover import find_turnover, TurnoverParameters

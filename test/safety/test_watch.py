@@ -7,8 +7,7 @@ import pytest
 
 from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.actuator_health import ALL_HEALTHY
-from beetle_omni_ros.robot.allocation import Allocator
+from beetle_omni_ros.robot.allocation import ALL_HEALTHY, Allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.servo import NUMPY, Servo, Step
 from beetle_omni_ros.safety.parameters import SupervisorParameters

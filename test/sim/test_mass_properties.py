@@ -8,8 +8,7 @@ from sim_robots import plant, ROBOT
 import yaml
 
 from beetle_omni_ros.robot import schema
-from beetle_omni_ros.robot.mass_properties import combined, mass_properties, Variation
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.parameters import combined, mass_properties, RobotParameters, Variation
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
 

@@ -34,9 +34,22 @@ def loaded(tmp_path, text):
     return Model.load(file)
 
 
+def placed(model, angles):
+    """Link -> position and quaternion in the root's frame, with joints at ``angles``."""
+    found = {}
+    for link in model.links.values():
+        if link.joint is None:
+            found[link.name] = np.zeros(3), link.turned()
+            continue
+        position, quaternion = found[link.joint.parent]
+        found[link.name] = (position + rotations.matrix(quaternion) @ link.joint.position,
+                            rotations.multiply(quaternion, link.turned(angles.get(link.moves, 0))))
+    return found
+
+
 def test_the_rotors_of_the_description_are_those_of_the_robot_file():
     robot, tilt = RobotParameters.load(), np.array([0.3, -1.2, 2.5, 0.0])
-    poses = Model.load().poses(dict(zip(JOINT_NAMES, tilt, strict=True)))
+    poses = placed(Model.load(), dict(zip(JOINT_NAMES, tilt, strict=True)))
     centres, axes = rotor_frames(robot, tilt)
     for k, name in enumerate(ROTOR_NAMES):
         position, quaternion = poses[name]
@@ -50,7 +63,7 @@ def test_shapes_colours_and_joints_are_read(tmp_path):
     mesh, = model.links['b'].visuals
     assert (box.shape, box.size, box.colour) == ('box', (1, 2, 3), (1, 0, 0, 0.5))
     assert (mesh.shape, mesh.size, mesh.file) == ('mesh', (2, 2, 2), tmp_path / 'b.stl')
-    position, quaternion = model.poses({'turn': np.pi / 2})['b']
+    position, quaternion = placed(model, {'turn': np.pi / 2})['b']
     np.testing.assert_allclose(position, [0, 0, 1])
     # About the joint's own y, which its origin has turned to world -x.
     np.testing.assert_allclose(rotations.matrix(quaternion) @ [0, 0, 1], [0, 1, 0], atol=1e-12)

@@ -24,9 +24,8 @@ from beetle_omni_ros.control.guidance.routing import Routing, RoutingParameters
 from beetle_omni_ros.control.guidance.trimming import Trimming, TrimmingParameters
 from beetle_omni_ros.control.guidance.turning import Turning, TurningParameters
 from beetle_omni_ros.control.guidance.unwinding import Unwinding, UnwindingParameters
-from beetle_omni_ros.robot.actuator_health import ActuatorHealth
-from beetle_omni_ros.robot.schema import group, parameter, ParameterError
-from beetle_omni_ros.robot.yaml_file import quoted
+from beetle_omni_ros.robot.allocation import ActuatorHealth
+from beetle_omni_ros.robot.schema import group, parameter, ParameterError, quoted
 
 LATEST = 10     # steps within which a command is reported as the executed command
 NONE = 'none'   # text for a controller without guidance
@@ -35,7 +34,7 @@ ALL = 'all'     # in place of the names of all layers
 
 @dataclass(frozen=True, kw_only=True)
 class GuidanceParameters:
-    """Parameters of the guidance; params/rl.yaml gives the reasons."""
+    """Parameters of the guidance."""
 
     without: str = parameter('', doc="layers that are off: names with commas, or 'all'",
                              read_only=True)

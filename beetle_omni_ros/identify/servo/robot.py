@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from beetle_omni_ros.identify.servo.model import INDEX, NAMES, OFF, TERMS
-from beetle_omni_ros.robot.effects import delaying
-from beetle_omni_ros.robot.effects_actuator import per_joint
+from beetle_omni_ros.robot.effects import delaying, per_joint
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 # Catalogue entry -> the terms that it changes.

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from beetle_omni_ros.control.base import Command
-from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
-from beetle_omni_ros.robot.allocation import Allocator, ROTORS
+from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY, Allocator, ROTORS
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.thrust_map import ThrustMap
 from beetle_omni_ros.safety.watch.joints import JointWatch

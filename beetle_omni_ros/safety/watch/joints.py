@@ -7,7 +7,7 @@ import numpy as np
 
 from beetle_omni_ros.robot.allocation import ROTORS
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.response import Responses
+from beetle_omni_ros.robot.servo import Responses
 from beetle_omni_ros.safety.watch.parameters import ServoLimits
 
 KEPT = 64               # commands, 0.3 s at 200 Hz

@@ -3,9 +3,9 @@
 import numpy as np
 
 from beetle_omni_ros.robot.allocation import Allocator, ROTORS
-from beetle_omni_ros.robot.holding import sphere
+from beetle_omni_ros.robot.degraded import sphere
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.response import Responses
+from beetle_omni_ros.robot.servo import Responses
 from beetle_omni_ros.robot.thrust_map import ThrustMap
 from beetle_omni_ros.safety.watch.parameters import PackLimits
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from beetle_omni_ros.robot.allocation import ROTORS
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.response import Responses
+from beetle_omni_ros.robot.servo import Responses
 from beetle_omni_ros.safety.watch.parameters import RotorLimits
 
 LEARNT = 1.0            # [s] time constant of the learnt factor between speed and thrust

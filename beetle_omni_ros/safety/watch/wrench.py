@@ -5,10 +5,9 @@ from math import exp, expm1, sqrt
 
 import numpy as np
 
-from beetle_omni_ros.robot.actuator_health import ActuatorHealth
-from beetle_omni_ros.robot.allocation import Allocator, ROTORS
+from beetle_omni_ros.robot.allocation import ActuatorHealth, Allocator, ROTORS
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.response import Responses
+from beetle_omni_ros.robot.servo import Responses
 from beetle_omni_ros.safety.watch.parameters import ContactLimits, RotorLimits
 
 LONGEST = 0.05          # [s] between two IMU samples; a longer gap resets the filters

@@ -1,17 +1,27 @@
-"""Allocation with lost and stuck actuators: residual, limits, agreement with the healthy one."""
+"""Allocation with lost and stuck actuators, and the attitudes that can be held."""
 
 import numpy as np
 import pytest
 
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
-from beetle_omni_ros.robot.allocation import Allocation, Allocator
-from beetle_omni_ros.robot.degraded_allocation import allocator, DegradedAllocator, LocalWeights
+from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY, Allocation, Allocator
+from beetle_omni_ros.robot.degraded import (
+    allocator,
+    DegradedAllocator,
+    Holding,
+    leaned,
+    LocalWeights,
+    sphere,
+    up,
+)
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 ROBOT = RobotParameters.load()
 LIMIT = ROBOT.joints.position_limit
 WEIGHTS = LocalWeights()
+LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
+LOST = ActuatorHealth(rotors=(False, True, True, True))
+STUCK = ActuatorHealth(stuck=(None, 1.5, None, None))
 
 
 def lost(*rotors):
@@ -125,7 +135,86 @@ def test_a_rotor_stuck_at_a_thrust_is_compensated_by_the_others():
                                        np.concatenate([force, torque]), atol=1e-6)
 
 
-def test_health_refuses_lengths_other_than_four():
-    with pytest.raises(ValueError, match='rotors: expected four, found 3'):
-        ActuatorHealth(rotors=(True,) * 3)
-    assert ALL_HEALTHY.healthy and not lost(1).healthy and not stuck(0, 0.0).healthy
+@pytest.fixture(scope='module')
+def holdings():
+    return {health: Holding(ROBOT, health) for health in (ALL_HEALTHY, LOST, STUCK)}
+
+
+def attitudes(count, seed=0):
+    return [rotations.normalized(q) for q in np.random.default_rng(seed).normal(size=(count, 4))]
+
+
+def test_a_healthy_robot_holds_every_attitude(holdings):
+    assert holdings[ALL_HEALTHY].margins.min() > 0.0
+
+
+def test_with_a_rotor_lost_every_attitude_near_level_is_held_but_level_is_singular(holdings):
+    holding = holdings[LOST]
+    near = holding.directions[:, 2] > np.cos(np.radians(29))
+    tilt, thrust, met = holding._held(holding.directions[near])
+    assert met.all() and thrust.max() <= ROBOT.rotors.thrust_max
+    assert 0.55 < np.mean(holding.margins > 0) < 0.65
+    assert holding.margin(LEVEL) < 0.05
+
+
+@pytest.mark.parametrize('health', [LOST, STUCK])
+def test_an_attitude_with_margin_is_held_by_the_allocation(holdings, health):
+    ours = allocator(ROBOT, health)
+    for quaternion in attitudes(60):
+        if holdings[health].margin(quaternion) > 0:
+            got = ours.hover(quaternion, np.zeros(4))
+            force, torque = ours.wrench(got.tilt, got.thrust)
+            np.testing.assert_allclose(rotations.matrix(quaternion) @ force, ours.weight,
+                                       atol=0.01)
+            np.testing.assert_allclose(torque, 0.0, atol=0.01)
+
+
+def test_heading_does_not_change_the_margin(holdings):
+    for quaternion in attitudes(20):
+        turned = rotations.multiply(rotations.from_rpy(0, 0, 1.1), quaternion)
+        assert holdings[STUCK].margin(turned) == pytest.approx(holdings[STUCK].margin(quaternion))
+
+
+@pytest.mark.parametrize('health, margin', [(LOST, 1.0), (STUCK, 1.0), (LOST, 15.0)])
+def test_the_nearest_attitude_has_the_margin_and_no_sample_is_nearer(holdings, health, margin):
+    holding = holdings[health]
+    best = min(margin, 0.8 * holding.margins.max())
+    for desired in attitudes(30):
+        got = holding.nearest(desired, margin)
+        assert holding.margin(got) >= best - 1e-9
+        firm = holding.directions[holding.margins >= best]
+        least = np.arccos(np.clip((firm @ up(desired)).max(), -1, 1))
+        assert rotations.geodesic_angle(got, desired) <= least + 1e-6
+
+
+def test_leaning_is_the_shortest_rotation():
+    for quaternion, direction in zip(attitudes(20), sphere(20)):
+        got = leaned(quaternion, direction)
+        np.testing.assert_allclose(up(got), direction, atol=1e-9)
+        assert rotations.geodesic_angle(got, quaternion) == pytest.approx(
+            np.arccos(np.clip(up(quaternion) @ direction, -1, 1)), abs=1e-6)
+    upside_down = leaned(LEVEL, np.array([0.0, 0.0, -1.0]))
+    np.testing.assert_allclose(up(upside_down), [0, 0, -1], atol=1e-9)
+
+
+@pytest.mark.parametrize('lost, up_now, rate, tilt', [
+    # States of two random flights when the rotor was named. By angle and travel only, an inverted
+    # attitude would be chosen, from which level is reached only with a fall of 2 m.
+    (3, (0.99, 0.14, -0.04), -1.9, (1.6, 1.6, -1.6, -1.5)),
+    (2, (-0.97, 0.24, -0.07), 1.8, (-1.6, -1.6, 1.6, 1.7))])
+def test_from_the_side_the_escape_leads_towards_level(lost, up_now, rate, tilt):
+    holding = Holding(ROBOT, ActuatorHealth(rotors=tuple(i != lost for i in range(4))))
+    start = leaned(LEVEL, np.array(up_now) / np.linalg.norm(up_now))
+    got = holding.quickest(start, np.array([0.0, 0.0, rate]), np.array(tilt), 2.0, 0.8)
+    assert holding.margin(got) >= 2.0 - 1e-9
+    assert up(got)[2] > 0.8
+
+
+def test_less_thrust_reduces_all_margins_and_level_keeps_the_largest(holdings):
+    weak = Holding(ROBOT, ActuatorHealth(thrust_limit=8.8))
+    assert np.all(weak.margins <= holdings[ALL_HEALTHY].margins + 1e-9)
+    on_its_side = np.abs(weak.directions[:, 2]) < 0.5
+    assert np.all(weak.margins[on_its_side] == 0.0)
+    got = weak.quickest(rotations.from_rpy(np.radians(170.0), 0, 0), np.zeros(3), np.zeros(4),
+                        2.0, 0.8)
+    assert up(got)[2] > 0.9     # in the inverted attitude it could not turn further
