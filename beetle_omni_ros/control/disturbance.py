@@ -15,10 +15,10 @@ estimator therefore models the play of each servo, and the targets overcome it.
 from collections import deque
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, State
-from beetle_omni_ros.control.call import FunctionCall
 from beetle_omni_ros.control.nmpc_parameters import DisturbanceParameters
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
@@ -30,6 +30,25 @@ SHORT = 0.002           # [s] a command change nearer to an end of a span is tre
 UNNOTICED = 0.3     # [s] before a fault is reported: the estimates contain the fault
 RESOLUTION = 0.0015  # [rad] change of a target that reverses a servo: an encoder count
 HISTORY = 64        # number of stored states and commands, more than any latency needs
+
+
+class FunctionCall:
+    """A CasADi function of vectors with fixed buffers, for fast calls with numpy arrays."""
+
+    def __init__(self, function: ca.Function):
+        self._buffer, self._evaluate = function.buffer()
+        self._arguments = [np.zeros(function.numel_in(i)) for i in range(function.n_in())]
+        self._result = np.zeros(function.numel_out(0))
+        for i, array in enumerate(self._arguments):
+            self._buffer.set_arg(i, array.data)
+        self._buffer.set_res(0, self._result.data)
+
+    def __call__(self, *values) -> np.ndarray:
+        """The result for these arguments, a fresh array."""
+        for array, value in zip(self._arguments, values):
+            array[:] = value
+        self._evaluate()
+        return self._result.copy()
 
 
 class DisturbanceEstimator:

@@ -87,7 +87,7 @@ class HoverController:
 
     """
 
-    name = 'hover'
+    name, Parameters = 'hover', HoverParameters
 
     def __init__(self, robot: RobotParameters, parameters: HoverParameters | None = None):
         self.parameters = parameters or HoverParameters.load()

@@ -155,7 +155,6 @@ class SolverParameters:
     max_iterations: int = parameter(
         30, doc='largest number of iterations of the interior-point method', low=1, high=500,
         read_only=True)
-    compile: bool = parameter(True, doc='use a C compiler if available', read_only=True)
 
 
 @dataclass(frozen=True, kw_only=True)

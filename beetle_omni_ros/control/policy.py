@@ -6,13 +6,10 @@ from math import isfinite
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, PoseTarget, Reference, State, Target
-from beetle_omni_ros.control.call import FunctionCall
-from beetle_omni_ros.control.disturbance import DisturbanceEstimator
+from beetle_omni_ros.control.disturbance import DisturbanceEstimator, FunctionCall
 from beetle_omni_ros.control.guidance.guidance import Charge, Guidance, GuidanceParameters
 from beetle_omni_ros.control.nmpc_parameters import DisturbanceParameters
-from beetle_omni_ros.control.observation import disturbed, observed
-from beetle_omni_ros.control.policy_file import kind
-from beetle_omni_ros.control.policy_network import PolicyNetwork
+from beetle_omni_ros.control.policy_file import kind, PolicyNetwork
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import group, parameter, ParameterFile
@@ -74,19 +71,21 @@ class PolicyController:
 
     """
 
+    Parameters = PolicyParameters
+
     def __init__(self, robot: RobotParameters, parameters: PolicyParameters | None = None):
         p = self._parameters = parameters or PolicyParameters.load()
         self.network = PolicyNetwork(p.policy, robot, p.allow_other_robot)
         self.contract = contract = self.network.contract
         self.name = kind(contract.memory)
         self.period, self.reach = 1 / contract.rate_hz, p.reach
-        self._scale, self._offset = contract.action_scale.tolist(), contract.action_offset.tolist()
+        self._scale, self._offset = contract.action_scale, contract.action_offset
         tilt, rotors = robot.joints.position_limit, robot.rotors
         self._limits = [(-tilt, tilt)] * 4 + [(rotors.thrust_min, rotors.thrust_max)] * 4
         self._hover = [robot.hover_thrust] * 4
         self._estimator = DisturbanceEstimator(
             robot, p.disturbance, p.model.command_delay,
-            FunctionCall(model.integrator(robot), None)) if contract.memory else None
+            FunctionCall(model.integrator(robot))) if contract.memory else None
         self._guidance, self._charge = Guidance(p, robot.tilt_axes), Charge()
         self.guidance = self._guidance.text
         self.reset()
@@ -186,3 +185,54 @@ class PolicyController:
             return Command(state.stamp, last.tilt, last.thrust)
         tilt = state.tilt if np.isfinite(state.tilt).all() else np.zeros(4)
         return Command(state.stamp, tilt, np.array(self._hover))
+
+
+# Plain floats below: on vectors of three, numpy's calls cost ten times the arithmetic.
+
+
+def observed(state: State, reference: Reference, previous_action) -> list[float]:
+    """
+    Observation (33) in the blocks of :data:`policy_file.OBSERVATIONS`, in SI units.
+
+    All vectors are in base_link, so that they do not depend on position, and on heading only by
+    the attitude columns.
+
+    Args:
+        state: position, velocity, attitude, rates and tilts of the robot.
+        reference: at the time of the state plus the lookahead.
+        previous_action: (8,) the executed command as an action.
+
+    """
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = _rotation(state.quaternion)
+    ax, bx, cx, ay, by, cy, az, bz, cz = _rotation(reference.quaternion)
+    px, py, pz = (reference.position - state.position).tolist()
+    vx, vy, vz = (state.velocity - reference.velocity).tolist()
+    wx, wy, wz = state.angular_velocity.tolist()
+    p, q, r = reference.angular_velocity.tolist()
+    if p or q or r:     # the reference's rates, to world and from there to base_link
+        p, q, r = ax * p + bx * q + cx * r, ay * p + by * q + cy * r, az * p + bz * q + cz * r
+        wx -= xx * p + yx * q + zx * r
+        wy -= xy * p + yy * q + zy * r
+        wz -= xz * p + yz * q + zz * r
+    return [xx * vx + yx * vy + zx * vz, xy * vx + yy * vy + zy * vz,
+            xz * vx + yz * vy + zz * vz, wx, wy, wz,
+            xx * px + yx * py + zx * pz, xy * px + yy * py + zy * pz,
+            xz * px + yz * py + zz * pz,
+            xx, yx, zx, xz, yz, zz, ax, ay, az, cx, cy, cz,
+            *state.tilt.tolist(), *previous_action]
+
+
+def disturbed(state: State, disturbance: np.ndarray) -> list[float]:
+    """Force and torque (6) in base_link, of a disturbance (10,) with its force in world."""
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = _rotation(state.quaternion)
+    fx, fy, fz, *torque = disturbance[:6].tolist()
+    return [xx * fx + yx * fy + zx * fz, xy * fx + yy * fy + zy * fz,
+            xz * fx + yz * fy + zz * fz, *torque]
+
+
+def _rotation(quaternion):
+    """Matrix of a unit quaternion (x, y, z, w), row by row."""
+    x, y, z, w = quaternion.tolist()
+    return (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
+            2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
+            2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y))

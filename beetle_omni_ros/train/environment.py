@@ -2,7 +2,7 @@
 The batched training environment: thousands of robots that fly from target to target.
 
 The physics is the robot's own model (:mod:`train.model`). Observations are those of
-:mod:`control.observation`, delayed and noisy as on the robot. A step does not synchronise with
+:func:`control.policy.observed`, delayed and noisy as on the robot. A step does not synchronise with
 the host, so that a whole rollout can be captured as one CUDA graph.
 """
 

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 import torch
 
 from beetle_omni_ros.control.base import Reference, State
-from beetle_omni_ros.control.observation import observation
+from beetle_omni_ros.control.policy import disturbed, observed
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.train import batch
 from beetle_omni_ros.train.observations import delayed, extrapolated, Signals
@@ -44,7 +44,8 @@ def on_board(env, k):
     zero = np.zeros(3)
     target = Reference(s['target_position'], s['target_attitude'], zero, zero)
     action = (s['previous'] - env.offset.double().numpy()) / env.scale.double().numpy()
-    return observation(state, target, action, s['estimate'] if env.cfg.memory else None)
+    return np.array(observed(state, target, action)
+                    + (disturbed(state, s['estimate']) if env.cfg.memory else []))
 
 
 @pytest.mark.parametrize('memory', [False, True])
