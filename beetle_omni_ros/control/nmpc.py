@@ -10,7 +10,8 @@ from beetle_omni_ros.control.disturbance import DisturbanceEstimator, FunctionCa
 from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
 from beetle_omni_ros.control.references import ReferencePlanner
 from beetle_omni_ros.control.rti import Rti
-from beetle_omni_ros.robot import dynamics as model, native
+from beetle_omni_ros.robot import dynamics as model
+from beetle_omni_ros.robot import native
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
 from beetle_omni_ros.robot.allocation import clipped
 from beetle_omni_ros.robot.parameters import RobotParameters

@@ -149,7 +149,7 @@ class PolicyContract:
             raise ParameterError(f"metadata 'format': expected {FORMAT!r}, found {quoted(found)}")
         values: dict[str, Any] = {}
         for key in cls.__dataclass_fields__:
-            text = metadata.get(key, DEFAULTS.get(key))
+            text: Any = metadata.get(key, DEFAULTS.get(key))
             try:
                 values[key] = READ[key](json.loads(text)) if key in READ else str(text or '')
             except (ArithmeticError, RecursionError, TypeError, ValueError):
@@ -236,9 +236,9 @@ def verify(data: bytes) -> None:
     """
     before, entry, after = data.rpartition(ENTRY)
     if not entry:
-        raise ParameterError("metadata 'checksum' is missing; python -m "
-                             'beetle_omni_ros.control.policy_file FILE adds it to a file that you '
-                             'trust')
+        raise ParameterError("metadata 'checksum' is missing: truncated, or no policy; python -m "
+                             'beetle_omni_ros.control.policy_file FILE adds it to a policy that '
+                             'you trust')
     if after[:DIGITS] != _digest(before + after[DIGITS:]):
         raise ParameterError('weights, graph or metadata are not those that were exported: their '
                              "checksum differs from the metadata's 'checksum'; take an undamaged "
@@ -299,8 +299,8 @@ class PolicyNetwork:
         path = find(path)
         try:
             data = path.read_bytes()
-            self._session = session(data)
             verify(data)
+            self._session = session(data)
             self.contract = PolicyContract.from_metadata(
                 self._session.get_modelmeta().custom_metadata_map)
             warning = self.contract.check(robot, allow_other_robot)
@@ -311,7 +311,7 @@ class PolicyNetwork:
         except Exception as error:      # onnxruntime's exceptions have no common base class
             # the informative end of its messages, which begin with codes
             reason = str(error).strip().partition('\n')[0].split(' : ')[-1]
-            raise ParameterError(f'policy {path}: not a usable ONNX file, possibly truncated '
+            raise ParameterError(f'policy {path}: not a usable ONNX file '
                                  f'({shortened(reason)})') from None
         if warning:
             log.warning('policy %s: %s', path, warning)

@@ -225,8 +225,9 @@ class ControllerEntry:
         """Refuse a result that is no controller."""
         at = f"controller '{self.reference}': "
         for method, expected in METHODS.items():
+            call: Any = getattr(controller, method, None)
             try:
-                inspect.signature(getattr(controller, method, None)).bind(*expected)
+                inspect.signature(call).bind(*expected)
             except TypeError:
                 raise ParameterError(f"{at}expected a method {method}({', '.join(expected)}); see "
                                      'control/base.py') from None
@@ -438,7 +439,7 @@ def _executed(path):
     """Import a file once, under a name that no package has."""
     name = re.sub(r'\W', '_', str(path.with_suffix('')))
     if name not in sys.modules:
-        file = spec_from_file_location(name, path)
+        file: Any = spec_from_file_location(name, path)
         module = sys.modules[name] = module_from_spec(file)
         try:
             file.loader.exec_module(module)

@@ -2,8 +2,8 @@
 The batched training environment: thousands of robots that fly from target to target.
 
 The physics is the robot's own model (:mod:`train.model`). Observations are those of
-:func:`control.policy.observed`, delayed and noisy as on the robot. A step does not synchronise with
-the host, so that a whole rollout can be captured as one CUDA graph.
+:func:`control.policy.observed`, delayed and noisy as on the robot. A step does not synchronise
+with the host, so that a whole rollout can be captured as one CUDA graph.
 """
 
 import numpy as np

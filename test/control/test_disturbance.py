@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.control.base import Command, PoseTarget, State
-from beetle_omni_ros.control.call import FunctionCall
-from beetle_omni_ros.control.disturbance import DisturbanceEstimator, RESOLUTION
+from beetle_omni_ros.control.disturbance import (
+    DisturbanceEstimator,
+    FunctionCall,
+    RESOLUTION,
+)
 from beetle_omni_ros.control.nmpc import NmpcController
 from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
 from beetle_omni_ros.evaluation.loop import FlightLoop
@@ -30,7 +33,7 @@ def command(k):
 def test_each_command_within_the_delay_acts_from_its_own_time(delay):
     p = NmpcParameters.load()
     p = replace(p, model=replace(p.model, command_delay=delay))
-    advance = FunctionCall(model.integrator(ROBOT), None)
+    advance = FunctionCall(model.integrator(ROBOT))
     estimator = DisturbanceEstimator(ROBOT, p.disturbance, p.model.command_delay, advance)
     now, rest = 12, State(0.0, np.zeros(3), np.zeros(3), np.array([0.0, 0, 0, 1]), np.zeros(3),
                           np.zeros(4), np.zeros(4), 0.0)
@@ -55,7 +58,7 @@ def driven(target, duration, band=0.0, sag=0.0):
     robot = replace(ROBOT, effects={'joint_friction': {
         'coulomb': friction, 'stiction': friction}} if band else {})
     estimator = DisturbanceEstimator(robot, p.disturbance, p.model.command_delay,
-                                     FunctionCall(model.integrator(ROBOT), None))
+                                     FunctionCall(model.integrator(ROBOT)))
     step = Step(NUMPY, Servo.of(ROBOT.joints, coulomb=friction, stiction=friction), FINE)
     tilt, rate, sent, hover = np.zeros(4), np.zeros(4), None, np.full(4, HOVER)
     for k in range(round(duration / PERIOD)):

@@ -12,10 +12,13 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.control.base import Command, Controller
-from beetle_omni_ros.control.entry import ControllerEntry, entry_of, RESERVED
-from beetle_omni_ros.control.host import checked
-from beetle_omni_ros.control.registry import ControllerOptions
+from beetle_omni_ros.control.base import Controller
+from beetle_omni_ros.control.registry import (
+    ControllerEntry,
+    ControllerOptions,
+    entry_of,
+    RESERVED,
+)
 from beetle_omni_ros.nodes.graph import NODES
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import PACKAGE
@@ -162,18 +165,16 @@ def test_parameters_options_and_attributes_of_a_class_are_used(module, tmp_path)
     ('{}:', 'expected FILE.py:Class or package.module:Class'),
     ('{}:Absent', "no 'Absent' in .*its classes: .*MyController"),
     ('{}:number', 'a int, expected a class'),
-    ('{}:Needs', r"cannot be built from \(robot, gain\).*'gain'"),
-    ('{}:Narrow', r'step\(state\), expected step\(state, target\)'),
-    ('{}:NoReset', r'no method reset\(\)'),
+    ('{}:Needs', "building it raised TypeError: .*'gain'"),
+    ('{}:Narrow', r'expected a method step\(state, target\)'),
+    ('{}:NoReset', r'expected a method reset\(\)'),
     ('{}:Slow', 'period is 5, expected .* at most 1 s'),
     ('{}:Nowhere', 'reach is 0, expected .* above 0'),
     ('{}:Failing', 'building it raised ZeroDivisionError: no way'),
     ('{}:Named', "'rl' is a registered controller's name"),
     ('{}:Taken', "'ekf': not usable as a name"),
-    ('{}_absent:My', "no module '.*_absent'"),
-    ('{}_absent.py:My', 'no such file'),
-    ('{}.py', 'expected .*[.]py:Class; its classes: MyController, .*Tuned'),
-    ('{}_absent.py', 'no such file'), ('absent.{}:My', "no module 'absent'")])
+    ('{}_absent:My', "No module named '.*_absent'"), ('{}_absent.py:My', 'No such file'),
+    ('{}.py', 'expected FILE.py:Class')])
 def test_an_unusable_class_is_refused_in_one_line(module, spec, message):
     with pytest.raises(ParameterError, match=message) as caught:
         registry.make(spec.format(module), ROBOT)
@@ -181,7 +182,7 @@ def test_an_unusable_class_is_refused_in_one_line(module, spec, message):
 
 
 @pytest.mark.parametrize('text, message', [
-    ('import none_such\n', "needs the module 'none_such'"), ('1 +\n', 'raised SyntaxError'),
+    ('import none_such\n', "No module named 'none_such'"), ('1 +\n', 'raised SyntaxError'),
     ('raise ValueError("bad")\n', r'raised ValueError: bad \(broken.py:1\)')])
 def test_a_module_that_cannot_be_imported_is_refused_with_the_cause(tmp_path, text, message):
     (tmp_path / 'broken.py').write_text(text)
@@ -225,16 +226,6 @@ def test_a_class_that_inherits_from_the_protocol_needs_no_constructor():
     assert isinstance(entry_of(Plain, 'x:Plain').make(ROBOT), Plain)
 
 
-def test_the_return_value_of_step_is_checked():
-    good = Command(0.0, np.zeros(4), np.ones(4))
-    assert checked(good) is good
-    for wrong, message in ((None, 'returned NoneType'), ((0, 1), 'returned tuple'),
-                           (Command(0.0, [0] * 4, np.ones(4)), 'tilt is no array'),
-                           (Command(0.0, np.zeros(4), np.ones(3)), r'thrust is of shape \(3,\)')):
-        with pytest.raises(ParameterError, match=message):
-            checked(wrong)
-
-
 def test_entry_points_of_other_packages_are_registered(module, monkeypatch):
     points = [metadata.EntryPoint('theirs', f'{module}:MyController', registry.GROUP),
               metadata.EntryPoint('nmpc', f'{module}:MyController', registry.GROUP)]
@@ -258,13 +249,6 @@ def test_controllers_of_an_installed_package_are_registered(module, tmp_path):
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
                           env={'PYTHONPATH': f'{tmp_path}:{ROOT}'}, check=False)
     assert done.stdout == "['broken', 'theirs'] Holds still.\n", done.stderr
-
-
-def test_the_shipped_controllers_are_entry_points():
-    text = (ROOT / PACKAGE / 'control' / 'shipped.py').read_text()
-    names = re.findall(r'^(\w+) = ControllerEntry\(', text, re.MULTILINE)   # as setup.py reads
-    assert names == list(registry.SHIPPED)
-    assert all(entry.name == name for name, entry in registry.SHIPPED.items())
 
 
 def test_names_of_nodes_and_controllers_do_not_collide():
