@@ -19,9 +19,15 @@ from filterpy.kalman import KalmanFilter
 import numpy as np
 from scipy.special import gammaincinv
 
+from beetle_omni_ros.estimation.model import FIRST_SPEED
 from beetle_omni_ros.estimation.parameters import EkfParameters
-from beetle_omni_ros.estimation.propagation import Node, SAME_INSTANT, STATES
-from beetle_omni_ros.estimation.samples import ACCELEROMETER_BIAS, ATTITUDE
+from beetle_omni_ros.estimation.state import (
+    ACCELEROMETER_BIAS,
+    ATTITUDE,
+    Node,
+    SAME_INSTANT,
+    STATES,
+)
 from beetle_omni_ros.robot import rotations
 
 POSES = 20          # averaged in one update
@@ -45,7 +51,6 @@ class MarkerAlignment:
         """
         self._priors, self._gravity = parameters.dead_reckoning, gravity
         self._lever = parameters.mocap.position - parameters.imu.position
-        self._first_speed = parameters.initial.velocity_std ** 2
         self._walk = self._priors.velocity_walk ** 2
         self._walk_by_rate = self._priors.velocity_walk_by_rate ** 2
         self._bias_walk = parameters.imu.accelerometer_bias_walk ** 2
@@ -104,7 +109,7 @@ class MarkerAlignment:
         kalman = self._kalman
         kalman.x[MOTION] = *position, 0.0, 0.0, 0.0
         kalman.P[MOTION, :] = kalman.P[:, MOTION] = 0.0
-        kalman.P[range(6), range(6)] = [1.0] * 3 + [self._first_speed] * 3
+        kalman.P[range(6), range(6)] = [1.0] * 3 + [FIRST_SPEED ** 2] * 3
         self._window.clear()
 
     def _use(self, variance):

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from beetle_omni_ros.estimation.alignment import MarkerAlignment, POSES
 from beetle_omni_ros.estimation.parameters import EkfParameters
-from beetle_omni_ros.estimation.propagation import Node
+from beetle_omni_ros.estimation.state import Node
 from beetle_omni_ros.robot import rotations
 
 PERIOD, NOISE, DOWN = 0.01, 0.01, np.array([0.0, 0.0, -GRAVITY])
