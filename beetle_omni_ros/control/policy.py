@@ -7,44 +7,32 @@ import numpy as np
 
 from beetle_omni_ros.control.base import Command, PoseTarget, Reference, State, Target
 from beetle_omni_ros.control.disturbance import DisturbanceEstimator, FunctionCall
-from beetle_omni_ros.control.guidance.guidance import Charge, Guidance, GuidanceParameters
+from beetle_omni_ros.control.guidance import Charge, Guidance
 from beetle_omni_ros.control.nmpc_parameters import DisturbanceParameters
 from beetle_omni_ros.control.policy_file import kind, PolicyNetwork
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import group, parameter, ParameterFile
+from beetle_omni_ros.robot.schema import parameter, ParameterFile
 
 DEFAULT = 'policies/rl.onnx'
+COMMAND_DELAY = 0.01    # [s] from the state stamp to the actuators, for the disturbance estimate
+# An action beyond is a fault: it is sent to the supervisor unchanged; smaller ones are clipped to
+# the limits of the actuators, as in training (100: 25 rad, 50 N).
+ACTION_LIMIT = 100.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class EstimateParameters:
-    """Parameters of the disturbance estimate."""
-
-    command_delay: float = parameter(
-        0.01, doc='delay from the state stamp to the actuators', unit='s', low=0, high=0.1,
-        read_only=True)
-
-
-@dataclass(frozen=True, kw_only=True)
-class PolicyParameters(GuidanceParameters, ParameterFile, file='rl.yaml'):
+class PolicyParameters(ParameterFile, file='rl.yaml'):
     """Policy file and guidance; params/rl.yaml gives the reasons."""
 
     policy: str = parameter(DEFAULT, doc="ONNX file, in the package's share or any path",
                             read_only=True)
     allow_other_robot: bool = parameter(
         False, doc='fly a policy that was trained for other robot parameters', read_only=True)
-    trajectory_lookahead: float = parameter(
-        0.0, doc='time after the state at which the reference of a trajectory is evaluated',
-        unit='s', low=0, high=1)
-    action_limit: float = parameter(
-        100.0, doc='a larger output is a fault and is not clipped to the limits of the actuators',
-        unit='1', low=1, high=1e6)
     reach: float = parameter(6.5, doc='a target farther from the robot is refused', unit='m',
                              low=0.5, high=1000, read_only=True)
-    model: EstimateParameters = group(EstimateParameters, 'for the estimate')
-    disturbance: DisturbanceParameters = group(
-        DisturbanceParameters, 'disturbance estimate in the input of a policy with memory')
+    without: str = parameter('', doc="layers of the guidance that are off: names with commas, or "
+                             "'all'", read_only=True)
 
 
 class PolicyController:
@@ -54,7 +42,7 @@ class PolicyController:
     Its previous action is the executed command, of any controller, so that it can take over from
     another controller. Targets are clipped to the limits of the actuators, as in training. An
     output that is not finite or extremely large is returned unchanged, so that the supervisor
-    refuses it. :mod:`control.guidance.guidance` modifies pose targets.
+    refuses it. :mod:`control.guidance` modifies pose targets.
 
     Args:
         robot: the controller's model of the robot.
@@ -74,7 +62,7 @@ class PolicyController:
     Parameters = PolicyParameters
 
     def __init__(self, robot: RobotParameters, parameters: PolicyParameters | None = None):
-        p = self._parameters = parameters or PolicyParameters.load()
+        p = parameters or PolicyParameters.load()
         self.network = PolicyNetwork(p.policy, robot, p.allow_other_robot)
         self.contract = contract = self.network.contract
         self.name = kind(contract.memory)
@@ -84,9 +72,9 @@ class PolicyController:
         self._limits = [(-tilt, tilt)] * 4 + [(rotors.thrust_min, rotors.thrust_max)] * 4
         self._hover = [robot.hover_thrust] * 4
         self._estimator = DisturbanceEstimator(
-            robot, p.disturbance, p.model.command_delay,
+            robot, DisturbanceParameters(), COMMAND_DELAY,
             FunctionCall(model.integrator(robot))) if contract.memory else None
-        self._guidance, self._charge = Guidance(p, robot.tilt_axes), Charge()
+        self._guidance, self._charge = Guidance(robot.tilt_axes, p.without), Charge()
         self.guidance = self._guidance.text
         self.reset()
 
@@ -142,7 +130,7 @@ class PolicyController:
         """The reference of the policy for this state."""
         if isinstance(target, PoseTarget):
             return self._guidance.target(state, target, self._charge.holds(state)).at(state.stamp)
-        return target.at(state.stamp + self._parameters.trajectory_lookahead)
+        return target.at(state.stamp)
 
     def _observe(self, state, reference):
         """Inputs of the network, or None when one of them is not finite."""
@@ -168,9 +156,8 @@ class PolicyController:
     def _targets(self, action):
         """Tilt and thrust targets, within limits unless the action is a fault."""
         values = [s * a + o for a, o, s in zip(action, self._offset, self._scale)]
-        limit = self._parameters.action_limit
         # also false for NaN
-        if not all(-limit <= a <= limit for a in action):
+        if not all(-ACTION_LIMIT <= a <= ACTION_LIMIT for a in action):
             self._faults += 1
             return values
         cut = [low if v < low else high if v > high else v

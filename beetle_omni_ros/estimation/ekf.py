@@ -13,7 +13,6 @@ from math import sqrt
 
 import numpy as np
 
-from beetle_omni_ros.estimation.alignment import MarkerAlignment
 from beetle_omni_ros.estimation.inputs import GAP, InputGuard, NoiseMonitor
 from beetle_omni_ros.estimation.model import ErrorStateModel, MEASUREMENTS
 from beetle_omni_ros.estimation.parameters import EkfParameters
@@ -91,18 +90,17 @@ class Track:
             del nodes[0]
             self._model.covariance(nodes[0])    # otherwise it would keep its predecessors
 
-    def expect_poses(self, period: float, alignment: MarkerAlignment) -> None:
+    def expect_poses(self, period: float) -> None:
         """Prepare the newest state for dead reckoning if no pose was used for ``period`` [s]."""
         if self._waits_since is None:
             self._waits_since = self.newest.stamp
         if self.newest.stamp - self._waits_since > period:
             self._waits_since = np.inf      # once after each pose
-            known = alignment.corrected(self.newest, self._model.covariance(self.newest))
-            if known is not self.newest:
-                self.nodes[-1], self._aligned = known, (known.stamp, alignment.turn.copy())
+            self.nodes[-1], turn = self._model.without_marker_error(self.newest)
+            self._aligned = self.newest.stamp, turn
 
     def correct(self, stamp: float, position: np.ndarray, quaternion: np.ndarray,
-                doubt_span: float = 0.0) -> tuple[Node, Node] | None:
+                doubt_span: float = 0.0) -> bool:
         """
         Apply a pose at its capture time and replay the later readings.
 
@@ -113,9 +111,7 @@ class Track:
             doubt_span: duration for which the IMU may have been wrong [s], 0: not at all.
 
         Returns:
-            the oldest state, which is that after the previous pose unless the time since then was
-            too long, and the one predicted to this pose; None if the pose fails the gate, and the
-            track is then unchanged.
+            False if the pose fails the gate; the track is then unchanged.
 
         """
         nodes = self.nodes
@@ -135,8 +131,7 @@ class Track:
             prior = self._model.doubt(prior, doubt_span)
         posterior = self._model.correct(prior, position, quaternion)
         if posterior is None:
-            return None
-        first = prior if aligned else nodes[0]
+            return False
         self.fixes += 1
         if self.fixes == VELOCITY_KNOWN:
             self._model.add_time_uncertainty(posterior, self._time_deviation)
@@ -147,7 +142,7 @@ class Track:
         self.nodes = replayed
         self.last_fix = stamp
         self._waits_since = self._aligned = None
-        return first, prior
+        return True
 
 
 def _stamp(node):
@@ -177,7 +172,6 @@ class ErrorStateEkf:
         self._noise_scale = self._noise.scale
         self._model.scale_noise(*self._noise_scale)
         self._readings: deque = deque()  # (stamp, force, rate, after_impact), base_link axes
-        self._alignment = MarkerAlignment(self._parameters, self._model.gravity)
         self._early: deque = deque()     # poses captured after the newest IMU sample
         self._track: Track | None = None
         self._candidate: Track | None = None
@@ -240,8 +234,7 @@ class ErrorStateEkf:
         while self._early and self._early[0][0] <= stamp + SAME_INSTANT:
             self._apply(*self._early.popleft())
         if self._track is not None:
-            self._track.expect_poses(self._parameters.status.dead_reckoning_after,
-                                     self._alignment)
+            self._track.expect_poses(self._parameters.status.dead_reckoning_after)
         return True
 
     def pose(self, sample: PoseReading) -> bool:
@@ -280,10 +273,8 @@ class ErrorStateEkf:
             self._model.scale_noise(*self._noise_scale)
         track = self._track if self._valid else None
         if track is not None:
-            interval = track.correct(stamp, position, quaternion)
-            if interval:
-                self._alignment.add(*interval, position, float(self._model.filter.R[0, 0]))
-            if interval or self._corrected_with_doubt(track, stamp, position, quaternion):
+            if track.correct(stamp, position, quaternion) \
+                    or self._corrected_with_doubt(track, stamp, position, quaternion):
                 self._candidate, self._contradictions = None, 0
                 self._good_pose = stamp, position, quaternion
                 return True
@@ -313,7 +304,7 @@ class ErrorStateEkf:
         self._doubt_until = stamp + DOUBT_TIME
         self.rejected['imu_contradicts'] += 1
         since = stamp - self._good_pose[0] if self._good_pose is not None else 0.0
-        return track.correct(stamp, position, quaternion, doubt_span=since) is not None
+        return track.correct(stamp, position, quaternion, doubt_span=since)
 
     def _continues_smoothly(self, track: Track, stamp, position, quaternion) -> bool:
         """Whether a pose continues smoothly from the last good one."""
@@ -350,7 +341,7 @@ class ErrorStateEkf:
         candidate = self._candidate
         agrees = candidate is None
         if candidate is not None:
-            agrees = candidate.correct(stamp, position, quaternion) is not None
+            agrees = candidate.correct(stamp, position, quaternion)
             if agrees:
                 if candidate.fixes >= (START_POSES if valid is None else JUMP_POSES):
                     if valid is not None and self._attitude_jumped(valid, candidate):

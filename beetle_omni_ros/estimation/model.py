@@ -81,7 +81,6 @@ class ErrorStateModel:
         density[GYROSCOPE_BIAS] = imu.gyroscope_bias_walk ** 2
         density[TIME_OFFSET] = OFFSET_WALK ** 2
         self._process = np.diag(density)
-        self._time_walk = float(self._process[TIME_OFFSET, TIME_OFFSET])
         self._period = 1 / imu.rate
         # a missing reading was at the limit of the sensor's range or beyond, in any direction
         self._shock = np.zeros(STATES)
@@ -192,6 +191,35 @@ class ErrorStateModel:
         return replace(node, quaternion=quaternion, rotation=rotations.matrix(quaternion),
                        accelerometer_bias=bias, covariance=self.covariance(node), before=None)
 
+    def without_marker_error(self, node: Node) -> tuple[Node, np.ndarray]:
+        """
+        Correct attitude and bias of a state, for the time after the last pose.
+
+        An attitude error of the markers appears as an accelerometer bias perpendicular to gravity,
+        which is wrong as soon as the robot turns. In one attitude only the sum of both errors is
+        known, and their priors divide it.
+
+        Returns:
+            the state, and the error of the markers (3,), a rotation vector in base_link [rad]; it
+            is zero if the bias is beyond three standard deviations of both: then it is another
+            error.
+
+        """
+        priors, up = self.parameters.dead_reckoning, node.rotation[2]
+        markers = (self.gravity * priors.marker_attitude_std) ** 2
+        both = priors.accelerometer_bias_std ** 2 + markers
+        share = markers / both
+        turn = share / self.gravity * rotations.cross(up, node.accelerometer_bias)
+        if turn.dot(turn) > (3 * share / self.gravity) ** 2 * both:
+            return node, np.zeros(3)
+        corrected = self.turned(node, -turn)
+        change = np.zeros((STATES, 3))
+        change[ATTITUDE] = np.eye(3)
+        change[ACCELEROMETER_BIAS] = -self.gravity * rotations.skew(up)
+        corrected.covariance = corrected.covariance \
+            + (1 - share) * priors.marker_attitude_std ** 2 * change @ change.T
+        return corrected, turn
+
     def after_clock_jump(self, node: Node, stamp: float, force: np.ndarray,
                          rate: np.ndarray) -> Node:
         """Move a state across an unknown time; only the biases remain known."""
@@ -217,30 +245,19 @@ class ErrorStateModel:
         return node.covariance
 
     def time_deviation(self, node: Node) -> float:
-        """
-        Standard deviation of a node's time offset [s].
-
-        A prediction adds only the random walk to its variance. No pending covariance is needed.
-        """
+        """Standard deviation of a node's time offset [s], without its walk while pending."""
         steps = node.pending()
         known = steps[0][0] if steps else node
-        variance, walk = known.covariance[TIME_OFFSET, TIME_OFFSET], self._time_walk
-        for before, after in steps:
-            variance += walk * self._noise_time(after.stamp - before.stamp)
-        return sqrt(variance)
-
-    def _noise_time(self, dt) -> float:
-        """Time [s] over which the process noise of a step acts."""
-        # Missing samples are interpolated, and the error grows with each of them.
-        return dt * max(1.0, dt / self._period) ** 3
+        return sqrt(known.covariance[TIME_OFFSET, TIME_OFFSET])
 
     def _predicted_covariance(self, before: Node, after: Node) -> np.ndarray:
         """Covariance (16, 16) after one step of :func:`propagate`."""
         dt, kalman = after.stamp - before.stamp, self.filter
         kalman.x = self._no_error
         kalman.P = before.covariance
+        # Missing samples are interpolated, and the error grows with each of them.
         kalman.predict(F=transition(before, after, self._transition),
-                       Q=self._process * self._noise_time(dt))
+                       Q=self._process * (dt * max(1.0, dt / self._period) ** 3))
         change = after.force - before.force
         squared_change = float(change.dot(change))
         if not (after.after_impact or squared_change > IMPACT ** 2):

@@ -106,11 +106,6 @@ class DeadReckoningParameters:
     marker_attitude_std: float = parameter(
         0.006, doc="standard deviation of the markers' attitude error, each axis; 0: none",
         unit='rad', low=0, high=0.3)
-    velocity_walk: float = parameter(
-        0.01, doc='random walk of the integrated acceleration', unit='m/s/sqrt(s)', low=1e-6,
-        high=10)
-    velocity_walk_by_rate: float = parameter(
-        0.1, doc='the same in proportion to the body rate', unit='m/sqrt(s)/rad', low=0, high=10)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,14 +1,16 @@
-"""Bad input is refused, counted by its reason, and changes nothing; bad files are named."""
+"""Bad input is refused and counted, and changes nothing; noise of the MoCap is measured."""
 
 from copy import deepcopy
 from dataclasses import replace
 import warnings
 
-from ekf_flights import feed, fly, GRAVITY, ImuReading, run
+from ekf_flights import feed, fly, GRAVITY, ImuReading, run, Sensors
 import numpy as np
 import pytest
 
 from beetle_omni_ros.estimation.ekf import EkfParameters, ErrorStateEkf
+from beetle_omni_ros.estimation.inputs import NoiseMonitor
+from beetle_omni_ros.estimation.parameters import MocapParameters
 from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.resources import share_path
 
@@ -156,13 +158,40 @@ def test_shipped_file_names_every_parameter_with_its_default():
         assert np.array_equal(entry, value), f'{name}: file {entry}, default {value}'
 
 
-@pytest.mark.parametrize('line, named', [
-    ('{status: {lost_after: 0.05}}', 'status.lost_after'),
-    ('{imu: {gap_limit: 0.004, rate: 200.0}}', 'imu.gap_limit'),
-])
-def test_bad_file_is_refused_with_file_and_key(tmp_path, line, named):
+def test_bad_file_is_refused_with_file_and_key(tmp_path):
     path = tmp_path / 'mine.yaml'
-    path.write_text(line)
-    with pytest.raises(schema.ParameterError, match='mine.yaml') as error:
+    path.write_text('{status: {lost_after: 0.05}}')
+    with pytest.raises(schema.ParameterError, match='mine.yaml.*status.lost_after') as error:
         EkfParameters.load(path)
-    assert named in str(error.value) and '\n' not in str(error.value)
+    assert '\n' not in str(error.value)
+
+
+def scale_after(poses):
+    """Feed poses to a monitor with the default noise."""
+    monitor = NoiseMonitor(MocapParameters())
+    for pose in poses:
+        monitor.add(pose.stamp, pose.position, pose.quaternion)
+    return np.array(monitor.scale)
+
+
+@pytest.mark.parametrize('sensors', [Sensors(), Sensors.perfect()])
+def test_noise_up_to_its_parameter_is_not_rescaled(sensors):
+    assert np.array_equal(scale_after(fly(1, 5.0, sensors).poses), [1.0, 1.0])
+
+
+@pytest.mark.parametrize('position, orientation', [(5.0, 1.0), (1.0, 4.0)])
+def test_excess_noise_is_estimated_for_each_measurement_kind(position, orientation):
+    claim = MocapParameters()
+    sensors = Sensors(position_noise=position * claim.position_noise,
+                      orientation_noise=orientation * claim.orientation_noise)
+    scale = np.sqrt(scale_after(fly(2, 8.0, sensors).poses))
+    np.testing.assert_allclose(scale, [position, orientation], rtol=0.25)
+
+
+def test_uneven_captures_and_jumps_are_not_noise():
+    poses = fly(3, 6.0).poses
+    uneven = [pose for k, pose in enumerate(poses) if k % 5]
+    assert np.array_equal(scale_after(uneven), [1.0, 1.0])
+    for pose in poses[300:]:
+        pose.position[:] += 1.0
+    assert np.array_equal(scale_after(poses[:500]), [1.0, 1.0])
