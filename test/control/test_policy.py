@@ -12,7 +12,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.control.base import Command, PoseTarget, Reference, State, TrajectoryTarget
-from beetle_omni_ros.control.guidance.routing import RoutingParameters
 from beetle_omni_ros.control.policy import (
     disturbed,
     observed,
@@ -207,26 +206,6 @@ def test_the_policy_with_memory_observes_a_push_in_body_axes(tmp_path):
     assert policy.diagnostics()['force_estimate_N'] == pytest.approx(6.0, abs=0.3)
 
 
-def test_preview_applies_to_trajectories_and_not_to_poses(tmp_path):
-    # action = target_position / 4, on the rotors
-    weights = np.zeros((33, 8))
-    weights[6:9, 4:7] = 0.25 * np.eye(3)
-    path = write(tmp_path / 'p.onnx', weights=weights)
-    times = np.linspace(0, 10, 101)
-    line = TrajectoryTarget(times, np.outer(times, [0.5, 0, 0]), np.tile(LEVEL, (101, 1)),
-                            np.tile([0.5, 0, 0], (101, 1)), np.zeros((101, 3)))
-    at_rest = state(2.0, position=np.array([1.0, 0, 0]), quaternion=LEVEL)
-
-    def ahead(lookahead, target):
-        command = controller(path, trajectory_lookahead=lookahead).step(at_rest, target)
-        return (command.thrust[0] - ROBOT.hover_thrust) / 0.5 / 0.25
-
-    assert ahead(0.0, line) == pytest.approx(0.0, abs=1e-5)
-    assert ahead(0.2, line) == pytest.approx(0.1, abs=1e-5)
-    held = PoseTarget(np.array([1.5, 0, 0]), LEVEL)
-    assert ahead(0.0, held) == ahead(0.2, held)
-
-
 def test_a_policy_of_another_robot_needs_permission(tmp_path, caplog):
     other = RobotParameters.load(share_path('params/robot_weak_and_heavy.yaml'))
     path = write(tmp_path / 'p.onnx')
@@ -252,7 +231,7 @@ def test_wound_joints_lead_through_level_for_a_pose_but_not_for_a_trajectory(
         tmp_path):
     # the last two tilt commands are z of the target's x and z axes in world
     policy = controller(write(tmp_path / 'p.onnx', weights=selecting([0, 1, 17, 20, 4, 5, 6, 7])),
-                        routing=RoutingParameters(tilt=100.0))
+                        without='routing')
     scale = policy.contract.action_scale[3]
     on_its_head = PoseTarget(np.array([0.0, 0.0, 1.5]), np.array([1.0, 0.0, 0.0, 0.0]))
     times = np.array([0.0, 10.0])
