@@ -359,7 +359,7 @@ def test_a_route_is_searched_once_for_each_attitude_and_again_after_reset():
     little = rotations.multiply(END, rotations.exp(np.array([0.1, 0.0, 0.0])))
     for same in (inverted(END), inverted(END, position=PLACE + 1), inverted(little)):
         assert routing.target(wound_state(5.0), same) is same
-    assert routing.target(wound_state(6.0), inverted(START)).quaternion is START    # nothing to turn
+    assert routing.target(wound_state(6.0), inverted(START)).quaternion is START    # no turn
     assert routing.target(wound_state(7.0), inverted(END)).quaternion is not END
     assert routing.routed == 2
     routing.reset()
