@@ -19,6 +19,10 @@ from beetle_omni_ros.robot.schema import ParameterError
 
 FIRST_ITERATIONS = 5     # from a cold start, before the first command
 NARROW = 1e-3            # [rad or N] between bounds of a failed actuator; the QP needs an interior
+# Cost of exceeding velocity, rate or height, the published ones of velocity and rate: linear,
+# squared, and squared height [1/m^2], so large that the plan is lower only if unavoidable.
+SLACKS = 10.0, 100.0, 1e5
+TOLERANCE = 1e-6         # largest residual of a solved QP
 NO_HEIGHT = -1000.0      # [m] a bound that is never reached
 FAILURES_TO_RESTART = 5  # unsolved cycles in a row after which the horizon is initialised again
 
@@ -52,14 +56,12 @@ class NmpcController:
         problem = ocp.build(robot, actuators.servo_lag, p.model.rotor_lag,
                             p.horizon.change_time)
         intervals = p.horizon.intervals
-        soft = (p.limits.slack_linear, p.limits.slack_quadratic,
-                p.limits.height_quadratic) if p.limits.soft else None
         # The estimator has its own model of the servos' friction.
         advance = model.integrator(replace(robot, effects={
             name: values for name, values in robot.effects.items() if name != 'joint_friction'}))
         try:
-            self._rti = Rti(problem, intervals, soft, p.solver.tolerance, p.solver.max_iterations,
-                            p.limits.tilt_rate_intervals - 1)
+            self._rti = Rti(problem, intervals, SLACKS if p.limits.soft else None, TOLERANCE,
+                            p.solver.max_iterations, p.limits.tilt_rate_intervals - 1)
         except native.CompilerError as error:
             raise ParameterError(f'the NMPC needs a C compiler: {error}') from None
         self._estimator = DisturbanceEstimator(robot, p.disturbance, p.model.command_delay,

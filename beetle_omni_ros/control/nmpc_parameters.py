@@ -91,13 +91,6 @@ class LimitParameters:
         0.5, doc='smallest height of base_link in world, unless the target is lower; inactive '
         'until the robot was above it; -1000: none',
         unit='m', low=-1000, high=1000)
-    height_quadratic: float = parameter(1e5, doc='cost of a lower height, squared', unit='1/m^2',
-                                        low=0, high=1e6, read_only=True)
-    slack_linear: float = parameter(
-        10.0, doc='cost of exceeding velocity or rate, or of a lower height', unit='', low=0,
-        high=1e6, read_only=True)
-    slack_quadratic: float = parameter(100.0, doc='cost of exceeding velocity or rate, squared',
-                                       low=0, high=1e6, read_only=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,22 +129,12 @@ class DisturbanceParameters:
         4.0, doc='bandwidth of the external torque', unit='rad/s', low=0, high=50)
     tilt_bandwidth: float = parameter(
         3.0, doc='bandwidth of the servo offsets', unit='rad/s', low=0, high=50)
-    tilt_correction: float = parameter(
-        0.2, doc='share of a measured tilt error that corrects the tilt model in each step', low=0,
-        high=1)
-    force_limit: float = parameter(60.0, doc='largest estimated force', unit='N', low=0, high=1000)
-    torque_limit: float = parameter(
-        5.0, doc='largest estimated torque', unit='N m', low=0, high=100)
-    tilt_limit: float = parameter(
-        0.3, doc='largest estimated servo offset', unit='rad', low=0, high=2)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SolverParameters:
     """Numerics."""
 
-    tolerance: float = parameter(
-        1e-6, doc='largest residual of a solved QP', low=1e-12, high=1e-2, read_only=True)
     max_iterations: int = parameter(
         30, doc='largest number of iterations of the interior-point method', low=1, high=500,
         read_only=True)

@@ -106,7 +106,7 @@ def test_holds_a_pose_for_which_a_joint_is_barely_beyond_its_stop():
 def test_a_smallest_height_that_is_not_active_costs_no_iterations(height):
     parameters = NmpcParameters.load()
     limits = parameters.limits
-    without = replace(limits, height=-1000.0, height_quadratic=limits.slack_quadratic)
+    without = replace(limits, height=-1000.0)
     means = []
     for each in (limits, without):
         counted = Counted(ROBOT, replace(parameters, limits=each))
