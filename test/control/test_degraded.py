@@ -108,13 +108,3 @@ def test_the_disturbance_estimate_is_reset_after_an_actuator_loss(nmpc):
     assert np.linalg.norm(nmpc.disturbance[model.TORQUE]) > 0.1
     nmpc.set_health(LOST)
     assert np.linalg.norm(nmpc.disturbance[model.TORQUE]) < 0.01
-
-
-def test_the_plan_respects_the_bounds(nmpc):
-    nmpc.set_health(ALL_HEALTHY)
-    nmpc.reset()
-    body = Body().fly(nmpc, PoseTarget(PLACE, LEVEL), 0.3)
-    nmpc.set_health(LOST)
-    body.fly(nmpc, PoseTarget(PLACE, held(LOST)), 0.1)
-    assert np.abs(nmpc.predicted_states[:, 18]).max() < 0.01
-    assert nmpc.diagnostics()['unsolved'] == 0

@@ -86,14 +86,6 @@ def test_a_servo_held_by_friction_does_not_wind_up_the_offset():
     assert np.abs(estimator._state[model.TILT]).max() < 0.1 * band
 
 
-def test_targets_overcome_the_friction_once_and_the_model_turns_by_the_plan():
-    estimator, _ = driven(lambda t: 0.1, 1.0, band=0.02)
-    resting = estimator._commands[-1].tilt
-    plan = resting + [0.01, -0.01, 0.03, 0.0]
-    assert np.allclose(estimator._moving(Command(1.0, estimator.sent(plan), np.zeros(4))).tilt,
-                       plan)
-
-
 def test_targets_reverse_by_more_than_noise_only():
     estimator, _ = driven(lambda t: 0.1, 1.0, band=0.02)
     plan = estimator._commands[-1].tilt + 0.01

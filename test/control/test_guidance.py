@@ -15,8 +15,6 @@ from beetle_omni_ros.control.guidance import (
     CLIMB,
     Guidance,
     LARGE,
-    TRIM_ANGLE,
-    TRIM_DISTANCE,
     Trimming,
     TURN_DISTANCE,
     TURN_HEIGHT,
@@ -77,14 +75,6 @@ def test_the_trim_does_not_change_in_motion_or_for_nan_states(where):
     assert shown.quaternion == pytest.approx(TARGET.quaternion)
 
 
-def test_the_trim_is_limited():
-    trimming = Trimming()
-    shown = wait(trimming, 20.0, way=(0.05, -0.05, 0.02), turn=(0.1, 0.1, 0.0))
-    assert np.linalg.norm(shown.position - TARGET.position) == pytest.approx(TRIM_DISTANCE)
-    assert rotations.geodesic_angle(shown.quaternion, TARGET.quaternion) \
-        == pytest.approx(TRIM_ANGLE, abs=1e-3)
-
-
 def test_the_trim_is_kept_for_equal_and_nearby_targets_only():
     trimming = Trimming()
     wait(trimming, 3.0, way=(0.02, 0, 0))
@@ -96,13 +86,6 @@ def test_the_trim_is_kept_for_equal_and_nearby_targets_only():
         assert shown.position - target.position == pytest.approx(found)
     far = replace(TARGET, position=TARGET.position + [0, 0.5, 0])
     assert trimming.target(state(9.0, target=far), far).position == pytest.approx(far.position)
-
-
-def test_the_trim_does_not_change_over_a_pause():
-    trimming = Trimming()
-    for stamp in (0.0, 5.0, 10.0, 9.0, 9.0):
-        shown = trimming.target(state(stamp, way=(0.05, 0, 0)), TARGET)
-    assert shown.position == pytest.approx(TARGET.position)
 
 
 def test_a_policy_on_standby_does_not_trim_the_error_of_another_controller():
@@ -155,12 +138,6 @@ def test_the_distance_of_an_inverted_target_is_limited_during_a_large_rotation(x
         assert np.cross(step, way) == pytest.approx(np.zeros(3), abs=1e-9) and step @ way > 0
 
 
-def test_an_inverted_far_target_passes_unchanged_once_the_rotation_is_small():
-    inverted = rotations.from_rpy(3.0, 0.0, 0.0)
-    target = pose(1.5, rotations.from_rpy(2.5, 0.0, 0.0), place=(4.0, 0.0))
-    assert Turning().target(turned(inverted), target) is target
-
-
 @pytest.mark.parametrize('attitude, height, sinking, begin, caught', [
     (FAR, 1.25, 0.0, 1.3, False),        # above its start, less the depth
     (FAR, 1.15, 0.0, 1.3, True),
@@ -178,23 +155,6 @@ def test_a_predicted_descent_below_start_and_target_raises_the_target(attitude, 
     shown = turning.target(turned(attitude, height, sinking), target)
     assert shown.position[:2] == pytest.approx([0.3, -0.4])
     assert shown.position[2] == pytest.approx(1.5 + CLIMB if caught else 1.5)
-
-
-def test_a_new_target_restarts_at_the_robot_and_a_repeated_one_does_not():
-    turning = Turning()
-    turning.target(turned(FAR, 1.3), pose(1.5))
-    assert turning.target(turned(FAR, 1.1), pose(1.5)).position[2] > 1.5
-    assert turning.target(turned(FAR, 1.1), pose(1.5, place=(0.5, 0.0))).position[2] == 1.5
-    turning.reset()
-    assert turning.target(turned(FAR, 0.7), pose(1.5)).position[2] == 1.5
-
-
-def test_intermediate_attitudes_are_raised_in_the_same_way():
-    turning, target = Turning(), pose(0.4, LEVEL)
-    between = replace(target, quaternion=NEAR)
-    shown = turning.target(turned(NEAR), target, between)
-    assert shown.quaternion is NEAR and shown.position[2] == TURN_HEIGHT
-    assert turning.target(turned(NEAR), target, target) is target
 
 
 @pytest.mark.parametrize('broken', ['quaternion', 'height'])

@@ -91,13 +91,6 @@ def test_a_target_beyond_the_reach_is_dropped_at_the_takeover_only():
     assert host.on_mode('flying:own', 0.0) == '' and flown(host, 10.0) == 17.0
 
 
-def test_the_controller_gets_true_tilts():
-    host, health = ControllerHost('own', Own()), ActuatorHealth(zeros=(0.1, 0.0, 0.0, -0.2))
-    host.on_health(health)
-    flown(host, 0.0)
-    assert np.array_equal(host.controller.states[0].tilt, health.true(np.zeros(4)))
-
-
 @pytest.mark.parametrize('method', ['step', 'reset', 'set_health'])
 def test_an_exception_of_any_method_is_counted_and_reported(method):
     reported = []

@@ -6,7 +6,6 @@ import subprocess
 import sys
 
 import numpy as np
-import onnx
 from policy_files import write
 import pytest
 from scipy.spatial.transform import Rotation
@@ -18,7 +17,7 @@ from beetle_omni_ros.control.policy import (
     PolicyController,
     PolicyParameters,
 )
-from beetle_omni_ros.control.policy_file import add_checksum, PolicyContract
+from beetle_omni_ros.control.policy_file import PolicyContract
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
@@ -98,14 +97,6 @@ def test_targets_follow_from_the_observation_by_scale_and_offset(tmp_path, memor
     command = policy.step(given, TARGET)
     assert command.stamp == given.stamp
     assert np.allclose(np.r_[command.tilt, command.thrust], expected, atol=1e-5)
-
-
-def test_a_policy_that_repeats_its_last_action_takes_over_without_a_jump(tmp_path):
-    policy = controller(write(tmp_path / 'p.onnx', weights=selecting(PREVIOUS)))
-    others = Command(0.99, np.array([0.3, -1.2, 3.0, 0.0]), np.array([3.0, 8.0, 12.0, 6.0]))
-    taken = policy.step(state(command=others), TARGET)
-    assert np.allclose(taken.tilt, others.tilt, atol=1e-6)
-    assert np.allclose(taken.thrust, others.thrust, atol=1e-5)
 
 
 def test_before_the_first_command_measured_tilts_and_hover_thrust_are_the_last_action(tmp_path):
@@ -215,16 +206,6 @@ def test_a_policy_of_another_robot_needs_permission(tmp_path, caplog):
     assert 'mass' in caplog.text
     # The offset of training is kept, because the network was trained with it.
     assert np.allclose(policy.step(state(), TARGET).thrust, ROBOT.hover_thrust)
-
-
-def test_a_dynamic_batch_dimension_is_accepted(tmp_path):
-    path = write(tmp_path / 'p.onnx')
-    network = onnx.load(path)
-    for tensor in (network.graph.input[0], network.graph.output[0]):
-        tensor.type.tensor_type.shape.dim[0].dim_param = 'batch'
-    onnx.save(network, path)
-    add_checksum(path)
-    assert np.isfinite(controller(path).step(state(), TARGET).thrust).all()
 
 
 def test_wound_joints_lead_through_level_for_a_pose_but_not_for_a_trajectory(

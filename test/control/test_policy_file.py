@@ -8,7 +8,6 @@ import sys
 import numpy as np
 import onnx
 from onnx import TensorProto
-import onnxruntime
 from policy_files import write
 import pytest
 
@@ -186,24 +185,3 @@ def test_a_policy_without_checksum_is_refused_with_the_way_to_add_it(tmp_path):
     before = path.read_bytes()
     add_checksum(path)
     assert path.read_bytes() == before
-
-
-def test_weights_in_another_file_are_refused(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    path = write(tmp_path / 'p.onnx', hidden=(64,), checksum=False)
-    onnx.save_model(onnx.load(path), str(path), save_as_external_data=True, location='w.bin',
-                    size_threshold=0)
-    add_checksum(path)
-    assert (tmp_path / 'w.bin').stat().st_size > 1000
-    refusal(path)
-
-
-@pytest.mark.parametrize('path', SHIPPED, ids=lambda path: path.stem)
-def test_actions_are_those_of_the_plain_network(path):
-    plain = onnxruntime.InferenceSession(path, providers=['CPUExecutionProvider'])
-    network = PolicyNetwork(path, ROBOT)
-    rng = np.random.default_rng(1)
-    for _ in range(50):
-        seen = rng.normal(size=network.contract.observation_size).astype(np.float32)
-        expected = plain.run(['action'], {'observation': seen[None]})[0][0]
-        assert network(seen.tolist()) == expected.tolist()

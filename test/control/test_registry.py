@@ -1,9 +1,6 @@
 """The registry: controllers by names and classes, and refusals."""
 
-import ast
-from importlib import metadata
 from pathlib import Path
-import re
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -21,7 +18,6 @@ from beetle_omni_ros.control.registry import (
 )
 from beetle_omni_ros.nodes.graph import NODES
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.resources import PACKAGE
 from beetle_omni_ros.robot.schema import ParameterError
 
 ROBOT = RobotParameters.load()
@@ -202,12 +198,6 @@ def test_the_reach_of_a_controller_is_infinite_unless_declared(
     assert registry.find('rl').reach(ROBOT) == registry.make('rl', ROBOT).reach
 
 
-def test_a_parameter_file_for_a_controller_without_parameters_is_refused(module, tmp_path):
-    with pytest.raises(ParameterError, match='reads no parameter file'):
-        registry.make(f'{module}:MyController', ROBOT,
-                      ControllerOptions(parameters=tmp_path / 'tuned.yaml'))
-
-
 def test_two_controllers_of_the_same_name_are_refused(module, tmp_path):
     with pytest.raises(ParameterError, match='both are called my_controller'):
         registry.find_all(['nmpc', f'{module}:MyController', f'{module}.py:MyController'])
@@ -224,18 +214,6 @@ def test_a_class_that_inherits_from_the_protocol_needs_no_constructor():
             return None
 
     assert isinstance(entry_of(Plain, 'x:Plain').make(ROBOT), Plain)
-
-
-def test_entry_points_of_other_packages_are_registered(module, monkeypatch):
-    points = [metadata.EntryPoint('theirs', f'{module}:MyController', registry.GROUP),
-              metadata.EntryPoint('nmpc', f'{module}:MyController', registry.GROUP)]
-    monkeypatch.setattr(metadata, 'entry_points', lambda group: points)
-    monkeypatch.setattr(registry, '_points', registry._points.__wrapped__)
-    monkeypatch.setattr(registry, '_registered', registry._registered.__wrapped__)
-    assert 'theirs' in registry.names() and registry.names().count('nmpc') == 1
-    entry = registry.find('theirs')
-    assert (entry.name, entry.reference) == ('theirs', 'theirs')
-    assert registry.find('nmpc') is registry.SHIPPED['nmpc']    # the shipped one has precedence
 
 
 def test_controllers_of_an_installed_package_are_registered(module, tmp_path):
@@ -262,34 +240,3 @@ def test_the_fallback_is_the_first_controller_that_flies_with_lost_actuators():
     assert registry.pilot() == 'nmpc'
     assert registry.pilot(['rl', 'hover']) == 'hover'
     assert registry.pilot(['rl']) == ''
-
-
-def names_together(path):
-    """Lines of a file that name several controllers, apart from docstrings."""
-    tree = ast.parse(path.read_text(encoding='utf-8'))
-    texts = {id(node.body[0].value) for node in ast.walk(tree)
-             if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)) and node.body
-             and isinstance(node.body[0], ast.Expr)}
-    known = set(registry.SHIPPED)
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Constant) and isinstance(node.value, str):
-            together = set() if id(node) in texts else set(re.findall(r'\w+', node.value)) & known
-        else:
-            together = {part.value for part in ast.iter_child_nodes(node)
-                        if isinstance(part, ast.Constant) and isinstance(part.value, str)} & known
-        if len(together) > 1:
-            yield f'{path.relative_to(ROOT)}:{node.lineno}: {sorted(together)}'
-
-
-def test_the_registry_is_the_only_list_of_controllers():
-    files = [*(ROOT / PACKAGE).rglob('*.py'), *(ROOT / 'launch').glob('*.py')]
-    found = [line for path in files for line in names_together(path)]
-    assert not found
-
-
-def test_layers_of_the_guidance_are_switched_off_by_an_option():
-    options = ControllerOptions(without='routing,trimming')
-    assert registry.make('rl', ROBOT, options).guidance == 'unwinding, turning'
-    assert registry.make('rl_bare', ROBOT).guidance == 'none'
-    with pytest.raises(ParameterError, match="controller 'nmpc' has no layers"):
-        registry.find('nmpc').load_parameters(options)

@@ -135,29 +135,10 @@ def test_an_unsolved_qp_leaves_the_plan_unchanged(problem):
     assert np.array_equal(before[1], rti.inputs)
 
 
-def test_inputs_stay_inside_their_bounds(problem):
-    x0, references, disturbance, bounds = setting()
-    references[:, 2] = 30.0
-    rti = Rti(problem, INTERVALS, SOFT, 1e-8, 80, REACHES)
-    rti.fill(x0, np.r_[np.zeros(4), x0[17:]])
-    for _ in range(5):
-        rti.step(x0, references, disturbance, WEIGHTS, bounds)
-        assert np.all(rti.inputs <= bounds[8:16] + 1e-6)
-        assert np.all(rti.inputs >= bounds[:8] - 1e-6)
-
-
 @pytest.mark.parametrize('compilers, expected', [
     ('no-such-cc', 'no C compiler'), ('false', 'failed')])
 def test_an_unusable_compiler_is_named(problem, tmp_path, monkeypatch, compilers, expected):
     monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
     monkeypatch.setenv('CC', compilers)
     with pytest.raises(native.CompilerError, match=expected):
-        Rti(problem, INTERVALS, SOFT, 1e-6, 50, REACHES)
-
-
-def test_an_unwritable_cache_is_named(problem, tmp_path, monkeypatch):
-    blocked = tmp_path / 'file'
-    blocked.write_text('')
-    monkeypatch.setenv('XDG_CACHE_HOME', str(blocked))
-    with pytest.raises(native.CompilerError, match='cannot build in'):
         Rti(problem, INTERVALS, SOFT, 1e-6, 50, REACHES)

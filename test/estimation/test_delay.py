@@ -78,14 +78,3 @@ def test_late_stamps_of_the_mocap_do_not_shift_the_estimate_in_time():
     assert ekf.status == 'tracking'
     error = error_state(ekf.estimate, flight)
     assert np.linalg.norm(error[:3]) < 0.004 and np.linalg.norm(error[6:9]) < np.deg2rad(0.3)
-
-
-def test_constant_offset_given_as_parameter_is_applied():
-    parameters = EkfParameters.load()
-    parameters = replace(parameters, initial=replace(parameters.initial, time_offset_std=0.0))
-    flight = fly(7, 2.0)
-    plain = estimate_of(flight, parameters)
-    flight.poses = [replace(s, stamp=s.stamp - 0.3) for s in flight.poses]
-    flight.delay = 0.31
-    shifted = replace(parameters, mocap=replace(parameters.mocap, time_offset=0.3))
-    np.testing.assert_allclose(estimate_of(flight, shifted).position, plain.position, atol=1e-6)
