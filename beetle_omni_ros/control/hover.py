@@ -20,10 +20,11 @@ side of its travel is a full turn away.
 
 from dataclasses import dataclass
 from math import exp, expm1, inf, sqrt
+from typing import Any
 
 import numpy as np
 
-from beetle_omni_ros.control.base import Command, Followed, State
+from beetle_omni_ros.control.base import Command, State
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
 from beetle_omni_ros.robot.allocation import clipped, nearest_turn
@@ -103,7 +104,7 @@ class HoverController:
         self._errors = (0.0, 0.0)
         self._saturations = 0
 
-    def step(self, state: State, target: Followed) -> Command:
+    def step(self, state: State, target: Any) -> Command:
         """
         One command for one state.
 
