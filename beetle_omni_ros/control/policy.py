@@ -90,7 +90,9 @@ class PolicyController:
     def step(self, state: State, target: Target) -> Command:
         """One command for one state; a non-finite state repeats the last command."""
         self._steps += 1
-        values = self.infer(state, self._reference(state, target))
+        if isinstance(target, PoseTarget):
+            target = self._guidance.target(state, target, self._charge.holds(state))
+        values = self.infer(state, target.at(state.stamp))
         if values is None:
             self._rejected += 1
             return self._repeated(state)
@@ -126,15 +128,13 @@ class PolicyController:
             values['torque_estimate_Nm'] = float(np.linalg.norm(d[model.TORQUE]))
         return values
 
-    def _reference(self, state, target):
-        """The reference of the policy for this state."""
-        if isinstance(target, PoseTarget):
-            return self._guidance.target(state, target, self._charge.holds(state)).at(state.stamp)
-        return target.at(state.stamp)
-
     def _observe(self, state, reference):
         """Inputs of the network, or None when one of them is not finite."""
-        observation = observed(state, reference, self._previous_action(state))
+        command = state.command     # before the first: the measured tilts and hover thrust
+        before = state.tilt.tolist() + self._hover if command is None else \
+            command.tilt.tolist() + command.thrust.tolist()
+        observation = observed(state, reference, [
+            (v - o) / s for v, o, s in zip(before, self._offset, self._scale)])
         if not isfinite(sum(observation)):
             return None
         if self._estimator:
@@ -145,13 +145,6 @@ class PolicyController:
                 self._estimator.reset()
             observation += disturbed(state, self._estimator.disturbance)
         return observation
-
-    def _previous_action(self, state):
-        """The executed command; before the first, the measured tilts and hover thrust."""
-        command = state.command
-        values = state.tilt.tolist() + self._hover if command is None else \
-            command.tilt.tolist() + command.thrust.tolist()
-        return [(v - o) / s for v, o, s in zip(values, self._offset, self._scale)]
 
     def _targets(self, action):
         """Tilt and thrust targets, within limits unless the action is a fault."""

@@ -206,7 +206,7 @@ def level_between(start: np.ndarray, end: np.ndarray, axes: np.ndarray,
     levels = Rotation.from_rotvec(heading[:, None] * STRAIGHT_UP) \
         * Rotation.from_quat(levelled(start))
     cost = turning_cost(begin, levels, axes) + turning_cost(levels, goal, axes)
-    tilts = tilts_at_end(levels, goal, axes)
+    tilts = tilts_along(turned(levels, goal)[1], axes)[:, -1]
     failures = np.zeros(HEADINGS)
     for wound in failed:
         failures += np.all(np.abs(tilts - wound) < np.pi, axis=1)
@@ -356,19 +356,6 @@ def turning_cost(start: Rotation, end: Rotation, axes: np.ndarray) -> np.ndarray
     angle, up = turned(start, end)
     upright = np.max((up @ axes.T) ** 2, axis=-1)
     return angle * np.mean(1 / np.maximum(1 - upright, LEAST_USE ** 2), axis=1)
-
-
-def tilts_at_end(start: Rotation, end: Rotation, axes: np.ndarray) -> np.ndarray:
-    """
-    Tilts (n, 4) [rad] after the shortest turns from level attitudes, all thrusts kept upward.
-
-    Args:
-        start: n level attitudes, with all tilts zero.
-        end: one attitude or n of them.
-        axes: (4, 3) unit tilt axes in base_link.
-
-    """
-    return tilts_along(turned(start, end)[1], axes)[:, -1]
 
 
 def tilts_along(up: np.ndarray, axes: np.ndarray) -> np.ndarray:
