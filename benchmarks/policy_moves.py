@@ -29,7 +29,7 @@ from rich.table import Table
 import torch
 
 from beetle_omni_ros.control.base import Command, PoseTarget, State
-from beetle_omni_ros.control.guidance.guidance import Guidance, LAYERS
+from beetle_omni_ros.control.guidance import Guidance, LAYERS
 from beetle_omni_ros.control.policy import PolicyParameters
 from beetle_omni_ros.control.policy_file import find, PolicyNetwork, session
 from beetle_omni_ros.robot import dynamics as model
@@ -109,7 +109,7 @@ class Fleet:
 
     def __init__(self, env, parameters, axes):
         self.env = env
-        self._guidance = [Guidance(parameters, axes) for _ in range(env.num_envs)]
+        self._guidance = [Guidance(axes, parameters.without) for _ in range(env.num_envs)]
         self._steps = 0
 
     def show(self, targets: list[PoseTarget]) -> None:
