@@ -23,13 +23,6 @@ def version():
     return re.search(r"^__version__ = '([^']+)'", text, re.MULTILINE).group(1)
 
 
-def controllers():
-    """List the entry points of the controllers that the package ships."""
-    text = Path(PACKAGE, 'control', 'shipped.py').read_text(encoding='utf-8')
-    return [f'{name} = {PACKAGE}.control.shipped:{name}'
-            for name in re.findall(r'^(\w+) = ControllerEntry\(', text, re.MULTILINE)]
-
-
 def shared(*folders):
     """List the files below ``folders`` as data files under ``share/beetle_omni_ros``."""
     files = [path for folder in folders for path in sorted(Path(folder).rglob('*'))
@@ -148,6 +141,5 @@ setup(
         'console_scripts': [
             *(f'{name} = {PACKAGE}.start:{name}' for name in ('beetle_omni', *NODES)),
         ],
-        'beetle_omni_ros.controllers': controllers(),
     },
 )

@@ -27,7 +27,7 @@ from rich.progress import track
 from rich.table import Table
 from scipy.stats import chi2
 
-from beetle_omni_ros.control.entry import ControllerOptions
+from beetle_omni_ros.control.registry import ControllerOptions
 from beetle_omni_ros.evaluation.command import fly
 from beetle_omni_ros.faults.campaign import fly_all
 from beetle_omni_ros.robot.parameters import RobotParameters

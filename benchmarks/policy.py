@@ -29,7 +29,6 @@ from rich.table import Table
 
 from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.control.nmpc import NmpcController
-from beetle_omni_ros.control.observation import blocks, size
 from beetle_omni_ros.control.policy import PolicyController, PolicyParameters
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.parameters import EkfParameters
@@ -103,7 +102,7 @@ def measure(parameters: PolicyParameters, poses: int, seed: int) -> tuple[Clock,
                         supervisor, LogRecorder(), estimator.imu.gyroscope_noise)
     flight.fly(make_task(f'random{poses}', seed))
     return clock, f'{policy.contract.name}, ' \
-                  f'{size(blocks(policy.contract.memory))} inputs, {parameters.policy}'
+                  f'{policy.contract.observation_size} inputs, {parameters.policy}'
 
 
 def summary(times: list) -> dict[str, float]:

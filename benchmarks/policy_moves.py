@@ -28,11 +28,10 @@ from rich.progress import track
 from rich.table import Table
 import torch
 
-from beetle_omni_ros.control import onnx_runtime
 from beetle_omni_ros.control.base import Command, PoseTarget, State
-from beetle_omni_ros.control.guidance.guidance import Guidance, LAYERS
+from beetle_omni_ros.control.guidance import Guidance, LAYERS
 from beetle_omni_ros.control.policy import PolicyParameters
-from beetle_omni_ros.control.policy_network import find, PolicyNetwork
+from beetle_omni_ros.control.policy_file import find, PolicyNetwork, session
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -41,8 +40,6 @@ from beetle_omni_ros.runs.tasks import pose_target, random_poses
 from beetle_omni_ros.train.assess import conditions
 from beetle_omni_ros.train.environment import TiltableQuadrotorEnv
 from beetle_omni_ros.train.parameters import StartParameters, TrainParameters
-
-onnxruntime = onnx_runtime.load()
 
 SEGMENT, AT_TARGET, ON_THE_WAY = 750, (700, 750), (100, 700)    # steps of 10 ms
 DEPTHS, HEIGHT = (0.15, 0.25, 0.4), 0.3      # [m] counted: below start and target; above ground
@@ -63,15 +60,15 @@ class Batched:
 
     def __init__(self, path: Path):
         graph = onnx.load(path)
-        self._single = _session(graph)
+        self._single = session(graph.SerializeToString())
         for value in (*graph.graph.input, *graph.graph.output):
             value.type.tensor_type.shape.dim[0].dim_param = 'robots'
         del graph.graph.value_info[:]
-        self._many = _session(graph)
+        self._many = session(graph.SerializeToString())
         size = self._single.get_inputs()[0].shape[1]
         try:
             self._call(self._many, np.zeros((2, size), np.float32))
-        except onnxruntime.capi.onnxruntime_pybind11_state.Fail:
+        except Exception:       # onnxruntime's have no common base class
             self._many = None
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
@@ -82,14 +79,6 @@ class Batched:
 
     def _call(self, session, observations):
         return session.run(['action'], {'observation': observations})[0]
-
-
-def _session(graph):
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    options.log_severity_level = 4      # exceptions of workers are raised
-    return onnxruntime.InferenceSession(graph.SerializeToString(), options,
-                                        providers=['CPUExecutionProvider'])
 
 
 def environment(robots: int, name: str, memory: bool, robot: RobotParameters):
@@ -120,7 +109,7 @@ class Fleet:
 
     def __init__(self, env, parameters, axes):
         self.env = env
-        self._guidance = [Guidance(parameters, axes) for _ in range(env.num_envs)]
+        self._guidance = [Guidance(axes, parameters.without) for _ in range(env.num_envs)]
         self._steps = 0
 
     def show(self, targets: list[PoseTarget]) -> None:

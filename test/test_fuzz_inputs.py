@@ -8,7 +8,7 @@ import numpy as np
 from test_packaging import parameter_classes
 
 from beetle_omni_ros.control.base import Command, PoseTarget
-from beetle_omni_ros.control.policy_network import PolicyNetwork
+from beetle_omni_ros.control.policy_file import PolicyNetwork
 from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import BatteryReading, ImuReading, JointReading, PoseReading

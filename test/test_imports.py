@@ -33,8 +33,7 @@ ALLOWED = {
     'view': ('robot', 'control.base', 'runs', 'messages'),
     'nodes': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs', 'drivers', 'drive',
               'messages', 'view', 'bringup.graph'),
-    'train': ('robot', 'control.observation', 'control.onnx_runtime', 'control.policy_file',
-              'control.policy_checksum', 'runs.files'),
+    'train': ('robot', 'control.policy_file', 'runs.files'),
     'cli': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs', 'evaluation', 'comparison',
             'faults', 'film', 'nodes', 'train', 'identify', 'bringup', 'view'),
 }

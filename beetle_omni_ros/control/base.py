@@ -177,13 +177,6 @@ class TrajectoryTarget:
 Target = PoseTarget | TrajectoryTarget
 
 
-class Followed(Protocol):
-    """An object with a reference at each time, like both targets."""
-
-    def at(self, time: float) -> Reference:
-        """The reference at ``time`` [s]."""
-
-
 class Controller(Protocol):
     """
     A function of state and target with internal memory.
@@ -197,7 +190,7 @@ class Controller(Protocol):
 
     - ``diagnostics() -> dict``: health of the last step and since reset, for operators and logs;
     - ``set_health(health)``, if it can fly with failed actuators, see :func:`forward_health`;
-    - ``reach``: largest distance to a target [m], see :mod:`control.reach`;
+    - ``reach``: largest distance to a target [m], see :func:`reach_of`;
     - ``guidance``: text for result tables, names the functions that modify its targets.
 
     :mod:`control.registry` builds a controller from a class and defines its name.
@@ -215,8 +208,8 @@ class Controller(Protocol):
 class Fallback(Controller, Protocol):
     """A controller that the supervisor uses for takeoff, fallback and landing."""
 
-    def step(self, state: State, target: Followed) -> Command:
-        """One command for one state."""
+    def step(self, state: State, target: Any) -> Command:
+        """One command for one state; the target only needs ``at``."""
 
     def observe(self, state: State, free: bool = True) -> None:
         """Update estimates while another controller is active, unless ``free`` is False."""

@@ -15,10 +15,10 @@ estimator therefore models the play of each servo, and the targets overcome it.
 from collections import deque
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, State
-from beetle_omni_ros.control.call import FunctionCall
 from beetle_omni_ros.control.nmpc_parameters import DisturbanceParameters
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY, clipped
@@ -28,7 +28,28 @@ LONGEST_STEP = 0.1  # [s] a longer gap between states restarts the actuator mode
 SHORT = 0.002           # [s] a command change nearer to an end of a span is treated as at this end
 UNNOTICED = 0.3     # [s] before a fault is reported: the estimates contain the fault
 RESOLUTION = 0.0015  # [rad] change of a target that reverses a servo: an encoder count
+LIMIT = np.repeat([60.0, 5.0, 0.3], [3, 3, 4])  # of the estimates [N], [N m], [rad]
+TILT_CORRECTION = 0.2   # share of a measured tilt error that corrects the tilt model in each step
 HISTORY = 64        # number of stored states and commands, more than any latency needs
+
+
+class FunctionCall:
+    """A CasADi function of vectors with fixed buffers, for fast calls with numpy arrays."""
+
+    def __init__(self, function: ca.Function):
+        self._buffer, self._evaluate = function.buffer()
+        self._arguments = [np.zeros(function.numel_in(i)) for i in range(function.n_in())]
+        self._result = np.zeros(function.numel_out(0))
+        for i, array in enumerate(self._arguments):
+            self._buffer.set_arg(i, array.data)
+        self._buffer.set_res(0, self._result.data)
+
+    def __call__(self, *values) -> np.ndarray:
+        """The result for these arguments, a fresh array."""
+        for array, value in zip(self._arguments, values):
+            array[:] = value
+        self._evaluate()
+        return self._result.copy()
 
 
 class DisturbanceEstimator:
@@ -56,12 +77,10 @@ class DisturbanceEstimator:
         self._robot, self._advance = robot, advance
         self.delay = max(command_delay + sum(robot.command_delays) / 2, 0.0)
         p = parameters
-        self._limit = np.r_[np.full(3, p.force_limit), np.full(3, p.torque_limit),
-                            np.full(4, p.tilt_limit)]
         # bandwidth times inertia: turns a velocity error of one step into a change of force
         self._force_gain = p.force_bandwidth * robot.mass
         self._torque_gain = p.torque_bandwidth * robot.inertia
-        self._tilt_bandwidth, self._tilt_correction = p.tilt_bandwidth, p.tilt_correction
+        self._tilt_bandwidth = p.tilt_bandwidth
         servos = [model.tilt_servo(robot, joint, 0.0)[0] for joint in range(4)]
         self._band = np.array([(servo.coulomb or 0.0) / servo.kp for servo in servos])
         self._health = ALL_HEALTHY
@@ -191,16 +210,16 @@ class DisturbanceEstimator:
         change[model.FORCE] = self._force_gain * (state.velocity - predicted[model.VELOCITY])
         change[model.TORQUE] = self._torque_gain * (
             state.angular_velocity - predicted[model.RATE])
-        self.disturbance = clipped(self.disturbance + change, -self._limit, self._limit)
+        self.disturbance = clipped(self.disturbance + change, -LIMIT, LIMIT)
 
     def _correct_tilt(self, state, present, step):
         """Compare the encoders with the tilt model at their capture time."""
         modelled = self._modelled_tilt(state.tilt_stamp)
         if modelled is None:
             return
-        limit = self._limit[model.TILT_OFFSET]
+        limit = LIMIT[model.TILT_OFFSET]
         error = self._movable * clipped(state.tilt - modelled, -limit, limit)
-        present[model.TILT] += self._tilt_correction * error
+        present[model.TILT] += TILT_CORRECTION * error
         change = self._tilt_bandwidth * step * error
         if self._commands:
             # Friction explains a reading within the band, the offset only what is beyond.

@@ -20,10 +20,11 @@ side of its travel is a full turn away.
 
 from dataclasses import dataclass
 from math import exp, expm1, inf, sqrt
+from typing import Any
 
 import numpy as np
 
-from beetle_omni_ros.control.base import Command, Followed, State
+from beetle_omni_ros.control.base import Command, State
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY, clipped, nearest_turn
 from beetle_omni_ros.robot.degraded import allocator, DegradedAllocator, LocalWeights
@@ -32,6 +33,12 @@ from beetle_omni_ros.robot.schema import group, parameter, ParameterFile
 
 LONGEST_STEP = 0.1   # [s] between two states from which an acceleration is computed
 DAMPING = 1e-2   # [(1/kg)^2] keeps the thrusts near the plain projection where directions agree
+DISTURBANCE_TIME = 0.3  # [s] of the observer: slower than the loop (0.1 s), faster than levelling
+THRUST_RESPONSE = 0.04  # [s] time constant of the thrust with the lead
+THRUST_RATE = 300.0     # [N/s] 3 N a period: no step at a take-over
+TILT_RATE_SHARE = 0.9   # of the servos' velocity limit, so that they can follow
+FULL_THRUST = 1.0       # [N] below it a joint turns more slowly: its direction is mostly noise
+STOP_OVERLAP = 0.3      # [rad] beyond the stop: the rotor keeps 95 % of its useful thrust
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,25 +61,8 @@ class AxisGains:
 class HoverParameters(ParameterFile, file='hover.yaml'):
     """Tuning of the hover controller."""
 
-    period: float = parameter(0.01, doc='time between commands', unit='s', low=0.001, high=0.1)
     position: AxisGains = group(AxisGains, 'position and velocity in world')
     attitude: AxisGains = group(AxisGains, 'attitude and rate in base_link')
-    disturbance_time: float = parameter(
-        0.3, doc='time constant of the disturbance observer', unit='s', low=0.02, high=100)
-    thrust_response: float = parameter(
-        0.04, doc='time constant that the lead gives the thrust', unit='s', low=0.005, high=1)
-    thrust_rate: float = parameter(300.0, doc='fastest change of a thrust target', unit='N/s',
-                                   low=1, high=1e5)
-    tilt_rate_share: float = parameter(
-        0.9, doc="fastest change of a tilt target, as a share of the servos' velocity limit",
-        low=0.01, high=1)
-    tilt_full_thrust: float = parameter(
-        1.0, doc='a rotor with less thrust turns its joint proportionally slower', unit='N',
-        low=0, high=20)
-    stop_overlap: float = parameter(
-        0.3, doc='a joint waits at its stop if the tilt that holds the weight is at most this far '
-        'beyond it', unit='rad', low=0, high=1.5)
-
     degraded: LocalWeights = group(LocalWeights, 'allocation with what is left of the actuators')
 
 
@@ -86,11 +76,11 @@ class HoverController:
 
     """
 
-    name = 'hover'
+    name, Parameters = 'hover', HoverParameters
+    period = 0.01   # [s]
 
     def __init__(self, robot: RobotParameters, parameters: HoverParameters | None = None):
         self.parameters = parameters or HoverParameters.load()
-        self.period = self.parameters.period
         self._robot = robot
         self.set_health(ALL_HEALTHY)
         self.reset()
@@ -113,7 +103,7 @@ class HoverController:
         self._errors = (0.0, 0.0)
         self._saturations = 0
 
-    def step(self, state: State, target: Followed) -> Command:
+    def step(self, state: State, target: Any) -> Command:
         """
         One command for one state.
 
@@ -161,7 +151,7 @@ class HoverController:
             return
         force, torque = self._allocator.wrench(state.tilt, self._thrust)
         rate, inertia, p = state.angular_velocity, self._robot.inertia, self.parameters
-        gain = -expm1(-dt / p.disturbance_time)
+        gain = -expm1(-dt / DISTURBANCE_TIME)
         mass, weight = self._allocator.mass, self._allocator.weight.tolist()
         # plain floats, because each numpy operation takes longer than these together
         (x, y, z), (i, j, k), (a, b, c) = rate.tolist(), inertia.tolist(), torque.tolist()
@@ -191,7 +181,7 @@ class HoverController:
             return goal
         steady = nearest_turn(self._allocator.hover(quaternion, present).tilt, present)
         limit = self._allocator.tilt_limit
-        waits = over & (np.abs(steady) <= limit + self.parameters.stop_overlap)
+        waits = over & (np.abs(steady) <= limit + STOP_OVERLAP)
         return np.where(waits, np.copysign(limit, present), goal)
 
     def _near(self, degraded: DegradedAllocator, state, target, present, force, torque):
@@ -233,18 +223,17 @@ class HoverController:
 
     def _targets(self, state, goal, goal_tilt, present, dt):
         """Tilt and thrust targets after rate limits, projection and lead."""
-        p, rotors = self.parameters, self._robot.rotors
-        busy = np.ones(4) if p.tilt_full_thrust == 0 or not self._health.healthy else \
-            np.minimum(1.0, goal.thrust / p.tilt_full_thrust)
+        rotors = self._robot.rotors
+        busy = np.minimum(1.0, goal.thrust / FULL_THRUST) if self._health.healthy else np.ones(4)
         joints = self._robot.joints
         limit = joints.position_limit
-        reach = p.tilt_rate_share * joints.velocity_limit * dt * busy
+        reach = TILT_RATE_SHARE * joints.velocity_limit * dt * busy
         tilt = clipped(present + clipped(goal_tilt - present, -reach, reach), -limit, limit)
         thrust = self._thrust_on_the_way(goal, state.tilt)
-        lead = rotors.time_constant / p.thrust_response
+        lead = rotors.time_constant / THRUST_RESPONSE
         thrust = self._thrust + max(lead, 1.0) * (thrust - self._thrust)
         if state.command is not None:
-            reach = p.thrust_rate * dt
+            reach = THRUST_RATE * dt
             thrust = clipped(thrust, state.command.thrust - reach, state.command.thrust + reach)
         thrust = clipped(thrust, rotors.thrust_min, self._thrust_max)
         return (tilt, thrust) if self._health.healthy else self._health.possible(tilt, thrust)

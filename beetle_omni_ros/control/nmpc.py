@@ -1,25 +1,27 @@
 """Nonlinear model predictive control by real-time iteration."""
 
 from dataclasses import replace
-import logging
 
 import numpy as np
 
 from beetle_omni_ros.control import ocp
 from beetle_omni_ros.control.base import Command, State, Target
-from beetle_omni_ros.control.call import FunctionCall
-from beetle_omni_ros.control.disturbance import DisturbanceEstimator
+from beetle_omni_ros.control.disturbance import DisturbanceEstimator, FunctionCall
 from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
 from beetle_omni_ros.control.references import ReferencePlanner
-from beetle_omni_ros.control.rti import CompiledRti, InterpretedRti
+from beetle_omni_ros.control.rti import Rti
 from beetle_omni_ros.robot import dynamics as model
+from beetle_omni_ros.robot import native
 from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY, clipped
-from beetle_omni_ros.robot.native import CompilerError
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import ParameterError
 
-log = logging.getLogger(__name__)
 FIRST_ITERATIONS = 5     # from a cold start, before the first command
 NARROW = 1e-3            # [rad or N] between bounds of a failed actuator; the QP needs an interior
+# Cost of exceeding velocity, rate or height, the published ones of velocity and rate: linear,
+# squared, and squared height [1/m^2], so large that the plan is lower only if unavoidable.
+SLACKS = 10.0, 100.0, 1e5
+TOLERANCE = 1e-6         # largest residual of a solved QP
 NO_HEIGHT = -1000.0      # [m] a bound that is never reached
 FAILURES_TO_RESTART = 5  # unsolved cycles in a row after which the horizon is initialised again
 
@@ -36,12 +38,12 @@ class NmpcController:
         robot: the controller's model of the robot.
         parameters: weights, limits, horizon.
 
-    Attributes:
-        compiled: whether the solver runs as machine code.
+    Raises:
+        ParameterError: there is no usable compiler.
 
     """
 
-    name = 'nmpc'
+    name, Parameters = 'nmpc', NmpcParameters
     period = 0.01  # [s] 100 Hz, as published
 
     def __init__(self, robot: RobotParameters, parameters: NmpcParameters | None = None):
@@ -53,19 +55,16 @@ class NmpcController:
         problem = ocp.build(robot, actuators.servo_lag, p.model.rotor_lag,
                             p.horizon.change_time)
         intervals = p.horizon.intervals
-        soft = (p.limits.slack_linear, p.limits.slack_quadratic,
-                p.limits.height_quadratic) if p.limits.soft else None
-        options = {'ocp': problem, 'intervals': intervals, 'soft': soft,
-                   'tolerance': p.solver.tolerance, 'max_iterations': p.solver.max_iterations,
-                   'reaches': p.limits.tilt_rate_intervals - 1}
         # The estimator has its own model of the servos' friction.
         advance = model.integrator(replace(robot, effects={
             name: values for name, values in robot.effects.items() if name != 'joint_friction'}))
-        self._rti = self._make_solver(options, advance, p.solver.compile)
-        library = self._rti.library if isinstance(self._rti, CompiledRti) else None
-        self.compiled = library is not None
+        try:
+            self._rti = Rti(problem, intervals, SLACKS if p.limits.soft else None, TOLERANCE,
+                            p.solver.max_iterations, p.limits.tilt_rate_intervals - 1)
+        except native.CompilerError as error:
+            raise ParameterError(f'the NMPC needs a C compiler: {error}') from None
         self._estimator = DisturbanceEstimator(robot, p.disturbance, p.model.command_delay,
-                                               FunctionCall(advance, library))
+                                               FunctionCall(native.compiled(advance)))
         self._planner = ReferencePlanner(robot, np.r_[0.0, np.cumsum(intervals)], p.unwind,
                                          actuators.servo_lag)
         self._state_size = problem.state_size
@@ -101,15 +100,6 @@ class NmpcController:
             elif held is not None:
                 lower[4 + i], upper[4 + i] = held - NARROW, held + NARROW
         self._iterate = FIRST_ITERATIONS
-
-    @staticmethod
-    def _make_solver(options, advance, compile_allowed) -> CompiledRti | InterpretedRti:
-        if compile_allowed:
-            try:
-                return CompiledRti(**options, extra=(advance,))
-            except CompilerError as error:
-                log.warning('NMPC runs interpreted, four to five times slower: %s', error)
-        return InterpretedRti(**options)
 
     def reset(self) -> None:
         """Reset estimates and horizon."""
@@ -177,8 +167,7 @@ class NmpcController:
         steps = sum(self._statuses.values())
         unsolved = steps - self._statuses.get(0, 0)
         d = self._estimator.disturbance
-        return {'solver': 'compiled' if self.compiled else 'interpreted', 'steps': steps,
-                'unsolved': unsolved, 'rejected_states': self._rejected,
+        return {'steps': steps, 'unsolved': unsolved, 'rejected_states': self._rejected,
                 'iterations': self._iterations,
                 'force_estimate_N': float(np.linalg.norm(d[model.FORCE])),
                 'torque_estimate_Nm': float(np.linalg.norm(d[model.TORQUE])),

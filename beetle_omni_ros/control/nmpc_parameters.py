@@ -1,7 +1,7 @@
 """Parameters of the NMPC, as read from params/nmpc.yaml or nmpc_published.yaml."""
 
+from collections import namedtuple
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -10,24 +10,9 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import group, parameter, ParameterError, ParameterFile
 
 LONGEST_HORIZON = 64  # MAX_STAGES of rti.c
-
-
-class Actuators(NamedTuple):
-    """
-    Servos and rotors in the optimal control problem.
-
-    Attributes:
-        servo_lag: time constant of the first-order servo model [s].
-        tilt: largest tilt target, to each side [rad].
-        tilt_rate: largest tilt rate [rad/s].
-        thrust_max: largest thrust [N].
-
-    """
-
-    servo_lag: float
-    tilt: float
-    tilt_rate: float
-    thrust_max: float
+# Servos and rotors in the optimal control problem: time constant of the first-order servo model
+# [s], largest tilt target to each side [rad], largest tilt rate [rad/s], largest thrust [N].
+Actuators = namedtuple('Actuators', 'servo_lag tilt tilt_rate thrust_max')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,35 +76,28 @@ class LimitParameters:
         0.5, doc='smallest height of base_link in world, unless the target is lower; inactive '
         'until the robot was above it; -1000: none',
         unit='m', low=-1000, high=1000)
-    height_quadratic: float = parameter(1e5, doc='cost of a lower height, squared', unit='1/m^2',
-                                        low=0, high=1e6, read_only=True)
-    slack_linear: float = parameter(
-        10.0, doc='cost of exceeding velocity or rate, or of a lower height', unit='', low=0,
-        high=1e6, read_only=True)
-    slack_quadratic: float = parameter(100.0, doc='cost of exceeding velocity or rate, squared',
-                                       low=0, high=1e6, read_only=True)
+
+
+def weight(default: float, doc: str, unit: str):
+    """Weight of a squared error."""
+    return parameter(default, doc=doc, unit=unit, low=0, high=1e5)
 
 
 @dataclass(frozen=True, kw_only=True)
 class NmpcWeights:
     """Weights of the squared errors."""
 
-    position_xy: float = parameter(300.0, doc='horizontal position', unit='1/m^2', low=0, high=1e5)
-    position_z: float = parameter(400.0, doc='height', unit='1/m^2', low=0, high=1e5)
-    velocity: float = parameter(10.0, doc='linear velocity', unit='s^2/m^2', low=0, high=1e5)
-    attitude_xy: float = parameter(300.0, doc='x and y of the error quaternion', low=0, high=1e5)
-    attitude_z: float = parameter(600.0, doc='z of the error quaternion', low=0, high=1e5)
-    rate: float = parameter(5.0, doc='body rate', unit='s^2/rad^2', low=0, high=1e5)
-    tilt: float = parameter(20.0, doc='tilt against the hover allocation', unit='1/rad^2', low=0,
-                            high=1e5)
-    thrust: float = parameter(1.0, doc='thrust against the hover allocation', unit='1/N^2', low=0,
-                              high=1e5)
-    tilt_change: float = parameter(250.0, doc='tilt target against present tilt', unit='1/rad^2',
-                                   low=0, high=1e5)
-    thrust_change: float = parameter(1.0, doc='thrust target against present thrust',
-                                     unit='1/N^2', low=0, high=1e5)
-    thrust_command: float = parameter(0.0, doc='thrust target against the hover allocation',
-                                      unit='1/N^2', low=0, high=1e5)
+    position_xy: float = weight(300.0, 'horizontal position', '1/m^2')
+    position_z: float = weight(400.0, 'height', '1/m^2')
+    velocity: float = weight(10.0, 'linear velocity', 's^2/m^2')
+    attitude_xy: float = weight(300.0, 'x and y of the error quaternion', '1')
+    attitude_z: float = weight(600.0, 'z of the error quaternion', '1')
+    rate: float = weight(5.0, 'body rate', 's^2/rad^2')
+    tilt: float = weight(20.0, 'tilt against the hover allocation', '1/rad^2')
+    thrust: float = weight(1.0, 'thrust against the hover allocation', '1/N^2')
+    tilt_change: float = weight(250.0, 'tilt target against present tilt', '1/rad^2')
+    thrust_change: float = weight(1.0, 'thrust target against present thrust', '1/N^2')
+    thrust_command: float = weight(0.0, 'thrust target against the hover allocation', '1/N^2')
 
     def vector(self) -> np.ndarray:
         """In the order of :data:`ocp.WEIGHTS`."""
@@ -136,26 +114,15 @@ class DisturbanceParameters:
         4.0, doc='bandwidth of the external torque', unit='rad/s', low=0, high=50)
     tilt_bandwidth: float = parameter(
         3.0, doc='bandwidth of the servo offsets', unit='rad/s', low=0, high=50)
-    tilt_correction: float = parameter(
-        0.2, doc='share of a measured tilt error that corrects the tilt model in each step', low=0,
-        high=1)
-    force_limit: float = parameter(60.0, doc='largest estimated force', unit='N', low=0, high=1000)
-    torque_limit: float = parameter(
-        5.0, doc='largest estimated torque', unit='N m', low=0, high=100)
-    tilt_limit: float = parameter(
-        0.3, doc='largest estimated servo offset', unit='rad', low=0, high=2)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SolverParameters:
     """Numerics."""
 
-    tolerance: float = parameter(
-        1e-6, doc='largest residual of a solved QP', low=1e-12, high=1e-2, read_only=True)
     max_iterations: int = parameter(
         30, doc='largest number of iterations of the interior-point method', low=1, high=500,
         read_only=True)
-    compile: bool = parameter(True, doc='use a C compiler if available', read_only=True)
 
 
 @dataclass(frozen=True, kw_only=True)

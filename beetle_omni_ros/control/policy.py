@@ -6,48 +6,33 @@ from math import isfinite
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, PoseTarget, Reference, State, Target
-from beetle_omni_ros.control.call import FunctionCall
-from beetle_omni_ros.control.disturbance import DisturbanceEstimator
-from beetle_omni_ros.control.guidance.guidance import Charge, Guidance, GuidanceParameters
+from beetle_omni_ros.control.disturbance import DisturbanceEstimator, FunctionCall
+from beetle_omni_ros.control.guidance import Charge, Guidance
 from beetle_omni_ros.control.nmpc_parameters import DisturbanceParameters
-from beetle_omni_ros.control.observation import disturbed, observed
-from beetle_omni_ros.control.policy_file import kind
-from beetle_omni_ros.control.policy_network import PolicyNetwork
+from beetle_omni_ros.control.policy_file import kind, PolicyNetwork
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import group, parameter, ParameterFile
+from beetle_omni_ros.robot.schema import parameter, ParameterFile
 
 DEFAULT = 'policies/rl.onnx'
+COMMAND_DELAY = 0.01    # [s] from the state stamp to the actuators, for the disturbance estimate
+# An action beyond is a fault: it is sent to the supervisor unchanged; smaller ones are clipped to
+# the limits of the actuators, as in training (100: 25 rad, 50 N).
+ACTION_LIMIT = 100.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class EstimateParameters:
-    """Parameters of the disturbance estimate."""
-
-    command_delay: float = parameter(
-        0.01, doc='delay from the state stamp to the actuators', unit='s', low=0, high=0.1,
-        read_only=True)
-
-
-@dataclass(frozen=True, kw_only=True)
-class PolicyParameters(GuidanceParameters, ParameterFile, file='rl.yaml'):
+class PolicyParameters(ParameterFile, file='rl.yaml'):
     """Policy file and guidance."""
 
     policy: str = parameter(DEFAULT, doc="ONNX file, in the package's share or any path",
                             read_only=True)
     allow_other_robot: bool = parameter(
         False, doc='fly a policy that was trained for other robot parameters', read_only=True)
-    trajectory_lookahead: float = parameter(
-        0.0, doc='time after the state at which the reference of a trajectory is evaluated',
-        unit='s', low=0, high=1)
-    action_limit: float = parameter(
-        100.0, doc='a larger output is a fault and is not clipped to the limits of the actuators',
-        unit='1', low=1, high=1e6)
     reach: float = parameter(6.5, doc='a target farther from the robot is refused', unit='m',
                              low=0.5, high=1000, read_only=True)
-    model: EstimateParameters = group(EstimateParameters, 'for the estimate')
-    disturbance: DisturbanceParameters = group(
-        DisturbanceParameters, 'disturbance estimate in the input of a policy with memory')
+    without: str = parameter('', doc="layers of the guidance that are off: names with commas, or "
+                             "'all'", read_only=True)
 
 
 class PolicyController:
@@ -57,7 +42,7 @@ class PolicyController:
     Its previous action is the executed command, of any controller, so that it can take over from
     another controller. Targets are clipped to the limits of the actuators, as in training. An
     output that is not finite or extremely large is returned unchanged, so that the supervisor
-    refuses it. :mod:`control.guidance.guidance` modifies pose targets.
+    refuses it. :mod:`control.guidance` modifies pose targets.
 
     Args:
         robot: the controller's model of the robot.
@@ -74,20 +59,22 @@ class PolicyController:
 
     """
 
+    Parameters = PolicyParameters
+
     def __init__(self, robot: RobotParameters, parameters: PolicyParameters | None = None):
-        p = self._parameters = parameters or PolicyParameters.load()
+        p = parameters or PolicyParameters.load()
         self.network = PolicyNetwork(p.policy, robot, p.allow_other_robot)
         self.contract = contract = self.network.contract
         self.name = kind(contract.memory)
         self.period, self.reach = 1 / contract.rate_hz, p.reach
-        self._scale, self._offset = contract.action_scale.tolist(), contract.action_offset.tolist()
+        self._scale, self._offset = contract.action_scale, contract.action_offset
         tilt, rotors = robot.joints.position_limit, robot.rotors
         self._limits = [(-tilt, tilt)] * 4 + [(rotors.thrust_min, rotors.thrust_max)] * 4
         self._hover = [robot.hover_thrust] * 4
         self._estimator = DisturbanceEstimator(
-            robot, p.disturbance, p.model.command_delay,
-            FunctionCall(model.integrator(robot), None)) if contract.memory else None
-        self._guidance, self._charge = Guidance(p, robot.tilt_axes), Charge()
+            robot, DisturbanceParameters(), COMMAND_DELAY,
+            FunctionCall(model.integrator(robot))) if contract.memory else None
+        self._guidance, self._charge = Guidance(robot.tilt_axes, p.without), Charge()
         self.guidance = self._guidance.text
         self.reset()
 
@@ -103,7 +90,9 @@ class PolicyController:
     def step(self, state: State, target: Target) -> Command:
         """One command for one state; a non-finite state repeats the last command."""
         self._steps += 1
-        values = self.infer(state, self._reference(state, target))
+        if isinstance(target, PoseTarget):
+            target = self._guidance.target(state, target, self._charge.holds(state))
+        values = self.infer(state, target.at(state.stamp))
         if values is None:
             self._rejected += 1
             return self._repeated(state)
@@ -139,15 +128,13 @@ class PolicyController:
             values['torque_estimate_Nm'] = float(np.linalg.norm(d[model.TORQUE]))
         return values
 
-    def _reference(self, state, target):
-        """The reference of the policy for this state."""
-        if isinstance(target, PoseTarget):
-            return self._guidance.target(state, target, self._charge.holds(state)).at(state.stamp)
-        return target.at(state.stamp + self._parameters.trajectory_lookahead)
-
     def _observe(self, state, reference):
         """Inputs of the network, or None when one of them is not finite."""
-        observation = observed(state, reference, self._previous_action(state))
+        command = state.command     # before the first: the measured tilts and hover thrust
+        before = state.tilt.tolist() + self._hover if command is None else \
+            command.tilt.tolist() + command.thrust.tolist()
+        observation = observed(state, reference, [
+            (v - o) / s for v, o, s in zip(before, self._offset, self._scale)])
         if not isfinite(sum(observation)):
             return None
         if self._estimator:
@@ -159,19 +146,11 @@ class PolicyController:
             observation += disturbed(state, self._estimator.disturbance)
         return observation
 
-    def _previous_action(self, state):
-        """The executed command; before the first, the measured tilts and hover thrust."""
-        command = state.command
-        values = state.tilt.tolist() + self._hover if command is None else \
-            command.tilt.tolist() + command.thrust.tolist()
-        return [(v - o) / s for v, o, s in zip(values, self._offset, self._scale)]
-
     def _targets(self, action):
         """Tilt and thrust targets, within limits unless the action is a fault."""
         values = [s * a + o for a, o, s in zip(action, self._offset, self._scale)]
-        limit = self._parameters.action_limit
         # also false for NaN
-        if not all(-limit <= a <= limit for a in action):
+        if not all(-ACTION_LIMIT <= a <= ACTION_LIMIT for a in action):
             self._faults += 1
             return values
         cut = [low if v < low else high if v > high else v
@@ -186,3 +165,54 @@ class PolicyController:
             return Command(state.stamp, last.tilt, last.thrust)
         tilt = state.tilt if np.isfinite(state.tilt).all() else np.zeros(4)
         return Command(state.stamp, tilt, np.array(self._hover))
+
+
+# Plain floats below: on vectors of three, numpy's calls cost ten times the arithmetic.
+
+
+def observed(state: State, reference: Reference, previous_action) -> list[float]:
+    """
+    Observation (33) in the blocks of :data:`policy_file.OBSERVATIONS`, in SI units.
+
+    All vectors are in base_link, so that they do not depend on position, and on heading only by
+    the attitude columns.
+
+    Args:
+        state: position, velocity, attitude, rates and tilts of the robot.
+        reference: at the time of the state plus the lookahead.
+        previous_action: (8,) the executed command as an action.
+
+    """
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = _rotation(state.quaternion)
+    ax, bx, cx, ay, by, cy, az, bz, cz = _rotation(reference.quaternion)
+    px, py, pz = (reference.position - state.position).tolist()
+    vx, vy, vz = (state.velocity - reference.velocity).tolist()
+    wx, wy, wz = state.angular_velocity.tolist()
+    p, q, r = reference.angular_velocity.tolist()
+    if p or q or r:     # the reference's rates, to world and from there to base_link
+        p, q, r = ax * p + bx * q + cx * r, ay * p + by * q + cy * r, az * p + bz * q + cz * r
+        wx -= xx * p + yx * q + zx * r
+        wy -= xy * p + yy * q + zy * r
+        wz -= xz * p + yz * q + zz * r
+    return [xx * vx + yx * vy + zx * vz, xy * vx + yy * vy + zy * vz,
+            xz * vx + yz * vy + zz * vz, wx, wy, wz,
+            xx * px + yx * py + zx * pz, xy * px + yy * py + zy * pz,
+            xz * px + yz * py + zz * pz,
+            xx, yx, zx, xz, yz, zz, ax, ay, az, cx, cy, cz,
+            *state.tilt.tolist(), *previous_action]
+
+
+def disturbed(state: State, disturbance: np.ndarray) -> list[float]:
+    """Force and torque (6) in base_link, of a disturbance (10,) with its force in world."""
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = _rotation(state.quaternion)
+    fx, fy, fz, *torque = disturbance[:6].tolist()
+    return [xx * fx + yx * fy + zx * fz, xy * fx + yy * fy + zy * fz,
+            xz * fx + yz * fy + zz * fz, *torque]
+
+
+def _rotation(quaternion):
+    """Matrix of a unit quaternion (x, y, z, w), row by row."""
+    x, y, z, w = quaternion.tolist()
+    return (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
+            2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
+            2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y))

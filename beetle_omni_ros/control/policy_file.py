@@ -1,32 +1,70 @@
 """
-The metadata of a policy file, without torch and onnx.
+A policy file: its contract, its checksum and its network; read without torch and onnx.
 
 A policy is only valid with the names, order, scales, rate and robot of its training. The metadata
 contain all of these. The loader compares them with the inputs and outputs of this version, and
-refuses a file that differs. See docs/reference/policy_file.md.
+refuses a file that differs. A flipped bit in a weight changes the policy, but the file still
+loads; the checksum therefore covers every byte of the file except its own entry.
+``python -m beetle_omni_ros.control.policy_file FILE`` adds it. See docs/reference/policy_file.md.
 """
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, replace
+import hashlib
+from itertools import zip_longest
 import json
-from math import isfinite
+import logging
+from math import isclose, isfinite
+import os
+from pathlib import Path
+import sys
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from beetle_omni_ros.control.observation import Block, blocks, DISTURBANCES, size
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters, ROTOR_NAMES
+from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError, quoted, shortened
 
+log = logging.getLogger(__name__)
 FORMAT = 'beetle_omni_policy/1'
 INPUT, OUTPUT = 'observation', 'action'
 ACTIONS = JOINT_NAMES + ROTOR_NAMES
 TILT_SCALE, THRUST_SCALE = 0.25, 0.5   # [rad], [N] for an action of 1, as published
-RATE_HZ = 100.0
-NAMED = 5                              # differing parameters in a message
-LARGEST = 1e12                         # of a scale or an offset
-TOLERANCE = 1e-6                       # of scales and offsets, which travel as text
+RATE_HZ = 100
+NAMED = 5               # differing parameters in a message
+LONGEST = 1000          # characters of a refusal: the metadata may hold anything
+WARM_UP = 20            # calls at start, because the first calls are slow
+FATAL_ONLY = 4          # onnxruntime's log level: errors are raised, and reported by this module
+LEVEL = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0)   # x and z axis of a level body
+# The checksum as ONNX's protobuf stores it; DIGITS hexadecimal digits follow.
+ENTRY, DIGITS = b'rS\n\x08checksum\x12Gsha256:', 64
+
+
+class Block(NamedTuple):
+    """One named part of the observation: values, SI unit ('1': none), and what it belongs to."""
+
+    name: str
+    size: int
+    unit: str
+    frame: str
+
+
+OBSERVATIONS = (
+    Block('velocity', 3, 'm/s', 'base_link'),                 # R^T (v - v_ref)
+    Block('angular_velocity', 3, 'rad/s', 'base_link'),       # w - R^T R_ref w_ref
+    Block('target_position', 3, 'm', 'base_link'),            # R^T (p_ref - p)
+    Block('attitude', 6, '1', 'world'),                       # x and z axis of base_link
+    Block('target_attitude', 6, '1', 'world'),                # x and z axis of the reference
+    Block('tilt', 4, 'rad', 'joint'),                         # measured
+    Block('previous_action', 8, '1', 'action'),               # the command in force
+)
+DISTURBANCES = (
+    Block('disturbance_force', 3, 'N', 'base_link'),          # estimated external force
+    Block('disturbance_torque', 3, 'N m', 'base_link'),       # estimated external torque
+)
 
 
 def kind(memory: bool) -> str:
@@ -59,8 +97,8 @@ class PolicyContract:
 
     observations: tuple[Block, ...]
     actions: tuple[str, ...] = ACTIONS
-    action_scale: np.ndarray
-    action_offset: np.ndarray
+    action_scale: tuple[float, ...]
+    action_offset: tuple[float, ...]
     rate_hz: float = RATE_HZ
     robot: str
     robot_hash: str
@@ -75,11 +113,10 @@ class PolicyContract:
     @classmethod
     def default(cls, robot: RobotParameters, memory: bool = False) -> PolicyContract:
         """Describe a policy that this version can fly on ``robot``."""
-        return cls(observations=blocks(memory), robot=robot.name, robot_hash=robot.hash(),
-                   robot_values=robot.as_dict(),
-                   action_scale=np.repeat([TILT_SCALE, THRUST_SCALE], 4),
-                   action_offset=np.repeat([0.0, robot.hover_thrust], 4),
-                   name=kind(memory))
+        return cls(observations=OBSERVATIONS + DISTURBANCES if memory else OBSERVATIONS,
+                   robot=robot.name, robot_hash=robot.hash(), robot_values=robot.as_dict(),
+                   action_scale=(TILT_SCALE,) * 4 + (THRUST_SCALE,) * 4,
+                   action_offset=(0.0,) * 4 + (robot.hover_thrust,) * 4, name=kind(memory))
 
     @property
     def memory(self) -> bool:
@@ -89,20 +126,13 @@ class PolicyContract:
     @property
     def observation_size(self) -> int:
         """Length of the input."""
-        return size(self.observations)
+        return sum(block.size for block in self.observations)
 
     def to_metadata(self) -> dict[str, str]:
         """Texts for the ONNX file's custom metadata."""
-        return {'format': FORMAT, 'name': self.name,
-                'observations': json.dumps([asdict(block) for block in self.observations]),
-                'actions': json.dumps(list(self.actions)),
-                'action_scale': json.dumps(np.asarray(self.action_scale).tolist()),
-                'action_offset': json.dumps(np.asarray(self.action_offset).tolist()),
-                'rate_hz': f'{self.rate_hz:g}', 'robot': self.robot,
-                'robot_hash': self.robot_hash,
-                'robot_values': json.dumps(self.robot_values),
-                'training': json.dumps(self.training), 'metrics': json.dumps(self.metrics),
-                'commit': self.commit, 'version': self.version, 'created': self.created}
+        values = {**asdict(self), 'observations': [b._asdict() for b in self.observations]}
+        return {'format': FORMAT, **{key: json.dumps(value) if key in READ else value
+                                     for key, value in values.items()}}
 
     @classmethod
     def from_metadata(cls, metadata: dict[str, str]) -> PolicyContract:
@@ -116,17 +146,15 @@ class PolicyContract:
         found = metadata.get('format')
         if found != FORMAT:
             raise ParameterError(f"metadata 'format': expected {FORMAT!r}, found {quoted(found)}")
-        for key in ('robot', 'robot_hash'):
-            if not metadata.get(key):
-                raise ParameterError(f"metadata '{key}' is missing")
-        texts = {key: metadata.get(key, '') for key in ('name', 'robot', 'robot_hash', 'commit',
-                                                        'version', 'created')}
-        return cls(observations=_blocks(metadata), actions=_names(metadata),
-                   action_scale=_eight(metadata, 'action_scale'),
-                   action_offset=_eight(metadata, 'action_offset'), rate_hz=_rate(metadata),
-                   robot_values=_mapping(metadata, 'robot_values'),
-                   training=_mapping(metadata, 'training'), metrics=_mapping(metadata, 'metrics'),
-                   **texts)
+        values: dict[str, Any] = {}
+        for key in cls.__dataclass_fields__:
+            text: Any = metadata.get(key, DEFAULTS.get(key))
+            try:
+                values[key] = READ[key](json.loads(text)) if key in READ else str(text or '')
+            except (ArithmeticError, RecursionError, TypeError, ValueError):
+                raise ParameterError(f"metadata '{key}': missing or unusable, found "
+                                     f'{quoted(text)}') from None
+        return cls(**values)
 
     def check(self, robot: RobotParameters, allow_other_robot: bool = False) -> str:
         """
@@ -144,21 +172,19 @@ class PolicyContract:
 
         """
         expected = PolicyContract.default(robot, self.memory)
-        _check_blocks(self.observations, expected.observations)
-        if self.actions != expected.actions:
-            raise ParameterError(f"actions: expected the order {', '.join(expected.actions)}, "
-                                 f"found {', '.join(self.actions)}")
-        _check_numbers('action_scale', self.action_scale, expected.action_scale)
-        if abs(self.rate_hz - expected.rate_hz) > TOLERANCE:
-            raise ParameterError(f'rate_hz: expected {expected.rate_hz:g}, found '
-                                 f'{self.rate_hz:g}')
         warning = self._other_robot(robot)
+        for key in ('observations', 'actions', 'action_scale', 'rate_hz',
+                    *([] if warning else ['action_offset'])):
+            for ours, theirs in zip_longest(np.atleast_1d(getattr(expected, key)),
+                                            np.atleast_1d(getattr(self, key))):
+                same = isclose(ours, theirs) if isinstance(ours, float) and theirs is not None \
+                    else np.array_equal(ours, theirs)
+                if not same:
+                    raise ParameterError(f'{key}: expected {ours}, found {theirs}')
         if warning and not allow_other_robot:
             raise ParameterError(f'{warning}; train a policy for this robot, or fly this policy '
                                  'with --allow-other-robot (evaluate and fly; '
                                  'allow_other_robot:=true of launch file and nodes)')
-        if not warning:
-            _check_numbers('action_offset', self.action_offset, expected.action_offset)
         return warning
 
     def _other_robot(self, robot):
@@ -177,6 +203,17 @@ class PolicyContract:
         return f"trained for other robot parameters: {'; '.join(found[:NAMED])}{more}"
 
 
+def _floats(values):
+    return tuple(map(float, values))
+
+
+# How JSON entries are read; the others are plain text. Entries that a file need not have.
+READ = {'observations': lambda rows: tuple(Block(**row) for row in rows), 'actions': tuple,
+        'action_scale': _floats, 'action_offset': _floats, 'rate_hz': float,
+        'robot_values': dict, 'training': dict, 'metrics': dict}
+DEFAULTS = dict.fromkeys(('robot_values', 'training', 'metrics'), '{}')
+
+
 def _differences(flown, trained, prefix=''):
     """Yield a text for each parameter of ``flown`` that differs in ``trained``."""
     for key, value in flown.items():
@@ -188,80 +225,147 @@ def _differences(flown, trained, prefix=''):
                    f'{shortened(str(value), 60)} here')
 
 
-def _entry(metadata, key, kind, what):
-    """JSON value of one entry, of the expected kind."""
-    if key not in metadata:
-        raise ParameterError(f"metadata '{key}' is missing")
+def verify(data: bytes) -> None:
+    """
+    Compare an ONNX file's content with the checksum in it.
+
+    Raises:
+        ParameterError: they differ, or there is none.
+
+    """
+    before, entry, after = data.rpartition(ENTRY)
+    if not entry:
+        raise ParameterError("metadata 'checksum' is missing: truncated, or no policy; python -m "
+                             'beetle_omni_ros.control.policy_file FILE adds it to a policy that '
+                             'you trust')
+    if after[:DIGITS] != _digest(before + after[DIGITS:]):
+        raise ParameterError('weights, graph or metadata are not those that were exported: their '
+                             "checksum differs from the metadata's 'checksum'; take an undamaged "
+                             'copy')
+
+
+def add_checksum(path: str | Path) -> None:
+    """Write the checksum into a file, in place of an older one; the rest is unchanged."""
+    path = Path(path)
+    data = path.read_bytes()
+    before, entry, after = data.rpartition(ENTRY)
+    if entry:
+        data = before + after[DIGITS:]
+    part = path.with_name(f'{path.name}.part')
+    part.write_bytes(data + ENTRY + _digest(data))
+    part.replace(path)
+
+
+def _digest(data):
+    return hashlib.sha256(data).hexdigest().encode()
+
+
+def session(data: bytes):
+    """Open an ONNX file's content with onnxruntime: one thread, without spinning."""
+    # From version 1.29 on it starts threads and sends reports unless this is set.
+    os.environ.setdefault('ORT_DISABLE_TELEMETRY', '1')
+    import onnxruntime
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
+    options.add_session_config_entry('session.intra_op.allow_spinning', '0')
+    options.add_session_config_entry('session.inter_op.allow_spinning', '0')
+    options.log_severity_level = FATAL_ONLY
+    return onnxruntime.InferenceSession(data, options, providers=['CPUExecutionProvider'])
+
+
+class PolicyNetwork:
+    """
+    One policy, ready to be called.
+
+    Runs on the calling thread alone, with fixed buffers for input and output.
+
+    Args:
+        path: ONNX file with the metadata of :class:`PolicyContract`.
+        robot: the robot that it flies.
+        allow_other_robot: accept one that was trained for other robot parameters.
+
+    Attributes:
+        contract: the metadata of the file.
+
+    Raises:
+        ParameterError: one line with the file and what is missing, broken or different.
+
+    """
+
+    def __init__(self, path: str | Path, robot: RobotParameters,
+                 allow_other_robot: bool = False):
+        path = find(path)
+        try:
+            data = path.read_bytes()
+            verify(data)
+            self._session = session(data)
+            self.contract = PolicyContract.from_metadata(
+                self._session.get_modelmeta().custom_metadata_map)
+            warning = self.contract.check(robot, allow_other_robot)
+            self._bind(self.contract.observation_size)
+            self._warm_up()
+        except ParameterError as error:
+            raise ParameterError(f'policy {path}: {shortened(str(error), LONGEST)}') from None
+        except Exception as error:      # onnxruntime's exceptions have no common base class
+            # the informative end of its messages, which begin with codes
+            reason = str(error).strip().partition('\n')[0].split(' : ')[-1]
+            raise ParameterError(f'policy {path}: not a usable ONNX file '
+                                 f'({shortened(reason)})') from None
+        if warning:
+            log.warning('policy %s: %s', path, warning)
+
+    def __call__(self, observation: list[float]) -> list[float]:
+        """Action (8) for an observation (n), both in plain numbers."""
+        self._input[0] = observation
+        self._session.run_with_iobinding(self._binding)
+        return self._output[0].tolist()
+
+    def _bind(self, size):
+        """Let the session read and write the same two arrays at every call."""
+        self._input = np.zeros((1, size), np.float32)
+        self._output = np.zeros((1, len(ACTIONS)), np.float32)
+        binding = self._binding = self._session.io_binding()
+        for bind, name, array, found in (
+                (binding.bind_input, INPUT, self._input, self._session.get_inputs()),
+                (binding.bind_output, OUTPUT, self._output, self._session.get_outputs())):
+            tensors = [(tensor.name, tensor.type, *tensor.shape[1:]) for tensor in found]
+            expected = [(name, 'tensor(float)', array.shape[1])]
+            if tensors != expected:
+                raise ParameterError(f'{bind.__name__[5:]}: expected {expected}, found {tensors}')
+            bind(name, 'cpu', 0, np.float32, array.shape, array.ctypes.data)
+
+    def _warm_up(self):
+        """Call as in level flight; refuse a network whose output is not finite."""
+        rest: list[float] = []
+        for block in self.contract.observations:
+            rest += LEVEL if 'attitude' in block.name else [0.0] * block.size
+        for _ in range(WARM_UP):
+            action = self(rest)
+        if not all(map(isfinite, action)):
+            raise ParameterError('the action for a robot at rest is not finite')
+
+
+def find(path: str | Path) -> Path:
+    """
+    Locate a policy: an absolute path, or one in the package's share or the present folder.
+
+    Raises:
+        ParameterError: there is no such file.
+
+    """
+    path = Path(path)
     try:
-        value = json.loads(metadata[key])
-    except (RecursionError, ValueError):
-        value = None
-    if not isinstance(value, kind):
-        raise ParameterError(f"metadata '{key}': expected {what}, found "
-                             f'{_short(metadata[key])}')
-    return value
+        found = share_path(str(path))
+    except FileNotFoundError:
+        found = path
+    if not found.is_file():
+        where = '' if path.is_absolute() else \
+            f", neither in the package's share nor in {Path.cwd()}"
+        raise ParameterError(f'policy {path}: no such file{where}')
+    return found
 
 
-def _blocks(metadata):
-    what = 'a JSON list of blocks with name, size, unit and frame'
-    table = _entry(metadata, 'observations', list, what)
-    try:
-        return tuple(Block(str(b['name']), int(b['size']), str(b['unit']), str(b['frame']))
-                     for b in table)
-    except (KeyError, OverflowError, TypeError, ValueError):
-        raise ParameterError(f"metadata 'observations': expected {what}, found "
-                             f"{_short(metadata['observations'])}") from None
-
-
-def _names(metadata):
-    return tuple(str(name) for name in _entry(metadata, 'actions', list, 'a JSON list of names'))
-
-
-def _eight(metadata, key):
-    what = f'a JSON list of {len(ACTIONS)} finite numbers'
-    values = _entry(metadata, key, list, what)
-    good = len(values) == len(ACTIONS) and all(
-        isinstance(v, (int, float)) and not isinstance(v, bool) and abs(v) <= LARGEST
-        for v in values)
-    if not good:
-        raise ParameterError(f"metadata '{key}': expected {what}, found {_short(metadata[key])}")
-    return np.array(values, dtype=float)
-
-
-def _rate(metadata):
-    try:
-        rate = float(metadata['rate_hz'])
-    except (KeyError, ValueError):
-        rate = 0.0
-    if not (isfinite(rate) and rate > 0):
-        raise ParameterError("metadata 'rate_hz': expected a positive number, found "
-                             f"{quoted(metadata.get('rate_hz'))}")
-    return rate
-
-
-def _mapping(metadata, key):
-    return _entry(metadata, key, dict, 'a JSON object') if metadata.get(key) else {}
-
-
-def _short(text):
-    return repr(shortened(text, 60))
-
-
-def _check_blocks(found, expected):
-    if found == expected:
-        return
-    names = [block.name for block in found]
-    if names != [block.name for block in expected]:
-        raise ParameterError('observations: expected '
-                             f"{', '.join(block.name for block in expected)}; found "
-                             f"{', '.join(names) or 'none'}")
-    ours, theirs = next((a, b) for a, b in zip(expected, found) if a != b)
-    key = next(k for k in ('size', 'unit', 'frame') if getattr(ours, k) != getattr(theirs, k))
-    raise ParameterError(f'observations: {key} of {ours.name}: expected '
-                         f'{getattr(ours, key)!r}, found {getattr(theirs, key)!r}')
-
-
-def _check_numbers(key, found, expected):
-    for name, ours, theirs in zip(ACTIONS, expected, found):
-        if abs(ours - theirs) > TOLERANCE * max(1.0, abs(ours)):
-            raise ParameterError(f'{key} of {name}: expected {ours:g}, found {theirs:g}')
+if __name__ == '__main__':
+    for name in sys.argv[1:]:
+        add_checksum(name)

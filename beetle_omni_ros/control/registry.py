@@ -1,38 +1,285 @@
 """
 The table of controllers, for all programs that accept a controller's name.
 
-Names are entry points of the group ``beetle_omni_ros.controllers``, which any installed package
-may extend. ``package.module:Class`` and ``path/to/file.py:Class`` refer to a class that is not
-registered. The entry points of this package are read from :mod:`control.shipped`, so that a
-checkout needs no installation.
+Shipped controllers are in :data:`SHIPPED`. Any installed package may add others by entry points of
+the group ``beetle_omni_ros.controllers``. ``package.module:Class`` and ``path/to/file.py:Class``
+refer to a class that is not registered. A controller is imported when it is built, because the
+large libraries that it needs take seconds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cache
-from importlib import metadata
+from importlib import import_module, metadata
+from importlib.util import module_from_spec, spec_from_file_location
+import inspect
+from math import inf
+from pathlib import Path
+import re
+import sys
 from typing import Any, TYPE_CHECKING
 
-from beetle_omni_ros.control import shipped
-from beetle_omni_ros.control.base import Controller
-from beetle_omni_ros.control.entry import (
-    absolute,
-    CLASS,
-    ControllerEntry,
-    ControllerOptions,
-    entry_of,
-    loaded,
-)
+from beetle_omni_ros.control.base import Controller, error_text, reach_of
+from beetle_omni_ros.robot import schema
+from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
 
 if TYPE_CHECKING:       # imports CasADi, which a list of names does not need
     from beetle_omni_ros.robot.parameters import RobotParameters
 
 GROUP = 'beetle_omni_ros.controllers'
-SHIPPED: Mapping[str, ControllerEntry] = {
-    name: entry for name, entry in vars(shipped).items() if isinstance(entry, ControllerEntry)}
+PERIOD = 0.01               # [s] of a controller whose class has no period
+LONGEST_PERIOD = 1.0        # [s]
+METHODS = {'step': ('state', 'target'), 'reset': ()}     # and their arguments
+CLASS = 'FILE.py:Class or package.module:Class'    # reference to an unregistered controller
+NAME = re.compile(r'[a-z][a-z0-9_]*')
+# Names whose `<name>_node` or `<name>/command` exists, and words of results and states.
+RESERVED = ('controller', 'ekf', 'joint_bridge', 'meta', 'none', 'operator', 'recorder',
+            'reference', 'rotor_bridge', 'sim', 'supervisor', 'viewer')
+
+
+@dataclass(frozen=True)
+class Line:
+    """Line style of a controller in figures; without a colour one is chosen."""
+
+    colour: str = ''
+    dashes: str | tuple = '-'
+    marker: str = 'o'
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControllerOptions:
+    """
+    Files that replace a controller's own files.
+
+    Attributes:
+        parameters: file of parameters.
+        policy: network.
+        allow_other_robot: fly a policy that was trained for other robot parameters.
+        without: layers of the guidance that are off.
+
+    """
+
+    parameters: Path | None = None
+    policy: Path | None = None
+    allow_other_robot: bool = False
+    without: str = ''
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ControllerEntry:
+    """
+    One controller; all programs that accept a controller's name use this entry.
+
+    Attributes:
+        name: of its results, its topic ``<name>/command`` and its node ``<name>_node``.
+        controller: class or function, or 'package.module:Class', called with the robot and, where
+            its signature has them, ``parameters`` and ``options``. Its attribute ``Parameters`` is
+            the class of its parameters (:mod:`robot.schema`).
+        spec: reference by which another process finds it; '' means its name.
+        label: short, for headings of figures.
+        description: one line.
+        period: between its commands [s].
+        parameters_file: shipped file of them; in the package's share, or any path.
+        fixed: parameters that override the shipped file.
+        policy_file: its network; '' for none. With a network its parameters have ``policy`` and
+            ``allow_other_robot``.
+        option: of the command line that replaces the file of this controller only.
+        guidance: names the functions that modify its targets, see :mod:`control.guidance`.
+        flies_degraded: whether it can fly with failed actuators (``set_health``).
+        stands_by: whether it runs in the ROS graph on standby.
+        compared: whether `beetle_omni compare` flies it by default.
+        cost: core seconds for a simulated second, to order flights; without influence on results.
+        line: style in figures.
+
+    """
+
+    name: str
+    controller: str | Callable[..., Controller]
+    spec: str = ''
+    label: str = ''
+    description: str = ''
+    period: float = PERIOD
+    parameters_file: str = ''
+    fixed: Mapping[str, Any] = field(default_factory=dict)
+    policy_file: str = ''
+    option: str = ''
+    guidance: str = 'none'
+    flies_degraded: bool = False
+    stands_by: bool = False
+    compared: bool = False
+    cost: float = 0.1
+    line: Line = field(default_factory=Line)
+
+    def __post_init__(self):
+        """Refuse an invalid name."""
+        if not NAME.fullmatch(self.name) or self.name in RESERVED:
+            raise ParameterError(
+                f"controller '{self.name}': not usable as a name; expected small letters, digits "
+                f"and _, and none of {', '.join(RESERVED)}")
+
+    @property
+    def reference(self) -> str:
+        """Reference by which another process finds it: its name, or the path of its class."""
+        return self.spec or self.name
+
+    @property
+    def file_key(self) -> str:
+        """Parameter of its node that names another parameter file."""
+        return f'{self.name}_file'
+
+    @property
+    def builder(self) -> Callable[..., Controller]:
+        """Class or function that builds it."""
+        return loaded(self.controller) if isinstance(self.controller, str) else self.controller
+
+    @property
+    def parameter_class(self) -> type | None:
+        """Class of its parameters, or None."""
+        return getattr(self.builder, 'Parameters', None)
+
+    def completed(self, mapping: dict, from_user: bool) -> dict:
+        """Values of a parameter file and of ``fixed``; a user's file takes precedence."""
+        return {**self.fixed, **mapping} if from_user else {**mapping, **self.fixed}
+
+    def load_parameters(self, options: ControllerOptions = ControllerOptions()):
+        """
+        Parameters from a file and the options; None for a controller without parameters.
+
+        Raises:
+            ParameterError: an unusable file, or a file for a controller without parameters.
+
+        """
+        kind = self.parameter_class
+        if kind is None:
+            if options.parameters:
+                raise ParameterError(f"controller '{self.reference}': reads no parameter file, "
+                                     f'given {options.parameters}')
+            return None
+        file = options.parameters or self.parameters_file and (
+            self.parameters_file if Path(self.parameters_file).is_file()
+            else share_path(self.parameters_file))
+        mapping = schema.load_yaml(file) if file else {}
+        parameters = schema.bind(kind, self.completed(mapping, bool(options.parameters)),
+                                 str(file or ''))
+        if options.without:
+            if not hasattr(parameters, 'without'):
+                raise ParameterError(f"--without {options.without}: controller "
+                                     f"'{self.reference}' has no layers of guidance")
+            parameters = replace(parameters, without=options.without)
+        if not (self.policy_file and hasattr(parameters, 'policy')):
+            return parameters
+        return replace(parameters, policy=str(options.policy or self.policy_file),
+                       allow_other_robot=parameters.allow_other_robot
+                       or options.allow_other_robot)
+
+    def make(self, robot: RobotParameters, options: ControllerOptions = ControllerOptions(),
+             parameters: Any = None) -> Controller:
+        """
+        Build the controller.
+
+        Args:
+            robot: its model of the robot.
+            options: files that replace its own.
+            parameters: replace those of files and options.
+
+        Raises:
+            ParameterError: what is wrong with its class or its files, in one line.
+
+        """
+        builder = self.builder
+        given = {'parameters': parameters or self.load_parameters(options), 'options': options}
+        try:
+            # Plain arguments: those of Protocol's own constructor, (*args, **kwargs), do not count
+            names = [name for name, each in inspect.signature(builder).parameters.items()
+                     if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)]
+            controller = builder(*[robot][:len(set(names) - set(given))], **{
+                key: value for key, value in given.items()
+                if key in names and value is not None})
+        except ParameterError:
+            raise
+        except Exception as error:
+            raise ParameterError(f"controller '{self.reference}': building it raised "
+                                 f'{error_text(error)}') from error
+        self._check(controller)
+        return controller
+
+    def reach(self, robot: RobotParameters, options: ControllerOptions = ControllerOptions()
+              ) -> float:
+        """
+        Largest distance to a target [m]; inf if it has none.
+
+        The value comes from its parameters if they have it, because building may take seconds.
+
+        Raises:
+            ParameterError: as :meth:`make`.
+
+        """
+        parameters = self.load_parameters(options)
+        return float(parameters.reach) if hasattr(parameters, 'reach') \
+            else reach_of(self.make(robot, options))
+
+    def _check(self, controller):
+        """Refuse a result that is no controller."""
+        at = f"controller '{self.reference}': "
+        for method, expected in METHODS.items():
+            call: Any = getattr(controller, method, None)
+            try:
+                inspect.signature(call).bind(*expected)
+            except TypeError:
+                raise ParameterError(f"{at}expected a method {method}({', '.join(expected)}); see "
+                                     'control/base.py') from None
+        period = getattr(controller, 'period', None)
+        if not isinstance(period, (int, float)) or not 0 < period <= LONGEST_PERIOD:
+            raise ParameterError(f'{at}period is {period!r}, expected the time between two steps, '
+                                 f'above 0 and at most {LONGEST_PERIOD:g} s')
+        reach = getattr(controller, 'reach', inf)
+        if not isinstance(reach, (int, float)) or not reach > 0:
+            raise ParameterError(f'{at}reach is {reach!r}, expected the distance of the farthest '
+                                 'target [m], above 0')
+
+
+# Line styles: blue for RL and red for NMPC as in the publication. The variants are lighter and
+# dashed, so that readers who cannot distinguish the colours can also read the figures.
+_NMPC = 'beetle_omni_ros.control.nmpc:NmpcController'
+_POLICY = 'beetle_omni_ros.control.policy:PolicyController'
+SHIPPED: Mapping[str, ControllerEntry] = {entry.name: entry for entry in (
+    ControllerEntry(
+        name='nmpc', label='NMPC', description='offset-free, params/nmpc.yaml', controller=_NMPC,
+        parameters_file='params/nmpc.yaml', option='--nmpc', flies_degraded=True, stands_by=True,
+        compared=True, cost=0.1, line=Line('#c8281e', '-', '^')),
+    ControllerEntry(
+        name='rl', label='RL', description='the learned policy, 33 observations',
+        controller=_POLICY, parameters_file='params/rl.yaml', policy_file='policies/rl.onnx',
+        option='--policy', guidance='unwinding, routing, turning, trimming', stands_by=True,
+        compared=True, cost=0.07, line=Line('#1b5fb4', '-', 'o')),
+    ControllerEntry(
+        name='rl_bare', label='RL, bare', description='the learned policy without guidance',
+        controller=_POLICY, parameters_file='params/rl.yaml', policy_file='policies/rl.onnx',
+        fixed={'without': 'all'}, compared=True, cost=0.07,
+        line=Line('#0b2d5c', (0, (2, 1)), 'x')),
+    ControllerEntry(
+        name='rl_memory', label='RL, memory',
+        description='the learned policy with the estimated disturbance as input',
+        controller=_POLICY, parameters_file='params/rl.yaml',
+        policy_file='policies/rl_memory.onnx', fixed={'policy': 'policies/rl_memory.onnx'},
+        guidance='unwinding, routing, turning, trimming', compared=True, cost=0.08,
+        line=Line('#58b4e8', (0, (5, 1.6)), 's')),
+    ControllerEntry(
+        name='nmpc_published', label='NMPC, published settings',
+        description='params/nmpc_published.yaml', controller=_NMPC,
+        parameters_file='params/nmpc_published.yaml', flies_degraded=True, compared=True,
+        cost=0.13, line=Line('#e8960c', (0, (3, 1.2, 1, 1.2)), 'v')),
+    ControllerEntry(
+        name='hover', label='hover PD',
+        description="PD with allocation, the supervisor's fallback",
+        controller='beetle_omni_ros.control.hover:HoverController',
+        parameters_file='params/hover.yaml', flies_degraded=True, cost=0.05,
+        line=Line('#5b6770', (0, (1, 1.2)), 'D')))}
 DEFAULT = next(iter(SHIPPED))       # the default controller
+_ADDED: dict[str, ControllerEntry] = {}     # of this process alone
 
 
 @cache
@@ -42,12 +289,43 @@ def _points() -> dict[str, metadata.EntryPoint]:
             if point.name not in SHIPPED}
 
 
-_ADDED: dict[str, ControllerEntry] = {}     # of this process alone
-
-
 def names() -> list[str]:
     """Every registered name, the shipped ones first."""
     return list(dict.fromkeys((*SHIPPED, *_points(), *_ADDED)))
+
+
+def entry_of(found: Any, spec: str, name: str = '') -> ControllerEntry:
+    """
+    Make an entry from an entry, a class or a function.
+
+    Args:
+        found: an entry, a class, or a function that builds a controller. A class may have
+            ``name``, ``Parameters``, ``parameters_file``, ``policy_file`` and ``guidance``.
+        spec: reference by which other processes find it.
+        name: under which it is registered; '' uses its own name.
+
+    Raises:
+        ParameterError: it cannot be registered.
+
+    """
+    if isinstance(found, ControllerEntry):
+        return replace(found, name=name or found.name, spec=spec)
+    if not callable(found):
+        raise ParameterError(f"controller '{spec}': a {type(found).__name__}, expected a class "
+                             'with step(state, target), reset() and period')
+    snake = re.sub(r'(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])', '_', found.__name__).lower()
+    file = getattr(found, 'parameters_file', '')
+    beside = Path(getattr(sys.modules.get(found.__module__), '__file__', None) or '').parent / file
+    period, guidance = getattr(found, 'period', PERIOD), getattr(found, 'guidance', 'none')
+    return ControllerEntry(
+        # an inherited name would be that of another controller
+        name=name or vars(found).get('name') or snake, controller=found, spec=spec,
+        label=found.__name__, description=(found.__doc__ or '').strip().partition('\n')[0],
+        period=PERIOD if isinstance(period, property) else period,
+        parameters_file=str(beside) if file and beside.is_file() else file,
+        policy_file=getattr(found, 'policy_file', ''),
+        guidance='none' if isinstance(guidance, property) else guidance,
+        flies_degraded=hasattr(found, 'set_health'))
 
 
 def add(found: Any) -> ControllerEntry:
@@ -61,9 +339,7 @@ def add(found: Any) -> ControllerEntry:
         ParameterError: it is no controller, or its name is used by another package.
 
     """
-    entry = entry_of(found, '')
-    if entry.name in SHIPPED or entry.name in _points():
-        raise ParameterError(_taken(entry.name, entry.name))
+    entry = _untaken(entry_of(found, ''))
     _ADDED[entry.name] = entry
     return entry
 
@@ -81,8 +357,10 @@ def find(reference: str) -> ControllerEntry:
     """
     if reference in SHIPPED:
         return SHIPPED[reference]
-    if ':' in reference or reference.endswith('.py'):
-        return _named(absolute(reference))
+    module, _, name = reference.rpartition(':')
+    if module or reference.endswith('.py'):
+        return _named(f'{Path(module).absolute()}:{name}' if module.endswith('.py')
+                      else reference)
     if reference in _ADDED:
         return _ADDED[reference]
     if reference in _points():
@@ -112,20 +390,63 @@ def find_all(references: Iterable[str]) -> list[ControllerEntry]:
 
 @cache
 def _named(spec: str) -> ControllerEntry:
-    entry = entry_of(loaded(spec, spec), spec)
-    if entry.name in SHIPPED or entry.name in _points():
-        raise ParameterError(_taken(spec, entry.name))
-    return entry
-
-
-def _taken(reference, name):
-    return f"controller '{reference}': '{name}' is a registered controller's name; expected " \
-           "another one (the class's attribute 'name')"
+    return _untaken(entry_of(loaded(spec), spec))
 
 
 @cache
 def _registered(name: str) -> ControllerEntry:
-    return entry_of(loaded(_points()[name].value.replace(' ', ''), name), '', name)
+    return entry_of(loaded(_points()[name].value.replace(' ', '')), '', name)
+
+
+def _untaken(entry):
+    if entry.name in SHIPPED or entry.name in _points():
+        raise ParameterError(f"controller '{entry.reference}': '{entry.name}' is a registered "
+                             "controller's name; expected another one (the class's attribute "
+                             "'name')")
+    return entry
+
+
+def loaded(reference: str) -> Any:
+    """
+    Import the object of ``package.module:Name`` or ``path/to/file.py:Name``.
+
+    Modules are also searched in the working folder.
+
+    Raises:
+        ParameterError: what is missing, in one line.
+
+    """
+    place, _, name = reference.rpartition(':')
+    if not place or not name.isidentifier():
+        raise ParameterError(f"controller '{reference}': expected {CLASS}")
+    folder = str(Path(place).parent if place.endswith('.py') else Path.cwd())
+    if folder not in sys.path:
+        sys.path.append(folder)
+    try:
+        module = _executed(Path(place)) if place.endswith('.py') else import_module(place)
+    except Exception as error:
+        raise ParameterError(f"controller '{reference}': importing {place} raised "
+                             f'{error_text(error)}') from error
+    if not hasattr(module, name):
+        there = [key for key, value in vars(module).items() if inspect.isclass(value)
+                 and value.__module__ == module.__name__]
+        raise ParameterError(f"controller '{reference}': no '{name}' in {place}; its classes: "
+                             f"{', '.join(there) or 'none'}")
+    return getattr(module, name)
+
+
+def _executed(path):
+    """Import a file once, under a name that no package has."""
+    name = re.sub(r'\W', '_', str(path.with_suffix('')))
+    if name not in sys.modules:
+        file: Any = spec_from_file_location(name, path)
+        module = sys.modules[name] = module_from_spec(file)
+        try:
+            file.loader.exec_module(module)
+        except BaseException:
+            del sys.modules[name]
+            raise
+    return sys.modules[name]
 
 
 def make(reference: str, robot: RobotParameters,
@@ -164,7 +485,3 @@ def compared() -> list[str]:
 def owner(option: str) -> str:
     """Name of the controller whose file an option of the command line replaces."""
     return next(name for name, entry in SHIPPED.items() if entry.option == option)
-
-
-__all__ = ['add', 'CLASS', 'compared', 'ControllerEntry', 'ControllerOptions', 'DEFAULT', 'find',
-           'find_all', 'GROUP', 'make', 'names', 'owner', 'pilot', 'SHIPPED', 'standing_by']

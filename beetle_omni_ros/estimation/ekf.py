@@ -7,20 +7,16 @@ candidate until enough poses agree with it and the IMU. This includes agreement 
 gravity: an IMU with wrong axes or units predicts a motion that the poses contradict.
 """
 
+from bisect import bisect_right
 from collections import Counter, deque
 from math import sqrt
 
 import numpy as np
 
-from beetle_omni_ros.estimation.alignment import MarkerAlignment
-from beetle_omni_ros.estimation.guard import InputGuard
+from beetle_omni_ros.estimation.inputs import GAP, InputGuard, NoiseMonitor
 from beetle_omni_ros.estimation.model import ErrorStateModel, MEASUREMENTS
-from beetle_omni_ros.estimation.mounting import Mounting
-from beetle_omni_ros.estimation.noise import NoiseMonitor
 from beetle_omni_ros.estimation.parameters import EkfParameters
-from beetle_omni_ros.estimation.propagation import SAME_INSTANT
-from beetle_omni_ros.estimation.samples import ATTITUDE, Estimate, POSITION
-from beetle_omni_ros.estimation.track import interpolate, Track
+from beetle_omni_ros.estimation.state import ATTITUDE, Estimate, Node, POSITION, SAME_INSTANT
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.readings import ImuReading, PoseReading
 from beetle_omni_ros.robot.rotations import geodesic_angle
@@ -29,6 +25,128 @@ __all__ = ['EkfParameters', 'ErrorStateEkf', 'Estimate', 'ImuReading', 'PoseRead
 
 ALIGNED = 0.8   # least cosine between residuals of one cause; 3 % of random pairs in 6-D reach it
 SURE = 5.0      # standard deviations of the attitude that noise does not reach
+START_POSES = 20    # in a row that must agree with the IMU before the first fix, and when lost
+JUMP_POSES = 100    # that must agree with the IMU and each other before a jump is followed
+JUMP_ATTITUDE = 0.35    # [rad] largest jump that is followed; the gyroscope rules out larger ones
+# Poses that contradict the IMU, and not each other: number of the first, and the time [s] in which
+# one suffices afterwards. Further steps from the last good pose are jumps of the MoCap: distance
+# [m] and angle [rad], and their increase for each second since [m/s], [rad/s].
+DOUBT_POSES, DOUBT_TIME = 3, 1.0
+DISTANCE, ANGLE, SPEED, RATE = 0.05, 0.05, 2.0, 8.0
+VELOCITY_KNOWN = 5  # poses after which the velocity is known, so that the time can be uncertain
+
+
+def interpolate(stamp, before, after) -> tuple[np.ndarray, np.ndarray]:
+    """Force and rate at ``stamp``, linear between two readings (stamp, force, rate)."""
+    share = (stamp - before[0]) / (after[0] - before[0])
+    return (before[1] + share * (after[1] - before[1]),
+            before[2] + share * (after[2] - before[2]))
+
+
+class Track:
+    """
+    States from the last correction, or from the largest age of a pose, to the newest reading.
+
+    A pose is applied to the state at its capture time. The later readings are then replayed, so
+    that the result is the same as without the delay.
+    """
+
+    def __init__(self, model: ErrorStateModel, first: Node, history: float,
+                 time_deviation: float = 0.0):
+        """
+        Start with one state.
+
+        Args:
+            model: prediction and correction.
+            first: state with its covariance.
+            history: largest age of a pose [s].
+            time_deviation: standard deviation of the first state's time offset [s].
+
+        """
+        self._time_deviation = time_deviation
+        self._model = model
+        self._history = history
+        self.nodes = [first]
+        self.last_fix = first.stamp
+        self._waits_since: float | None = None     # first reading after a pose was used
+        self._aligned: tuple[float, np.ndarray] | None = None   # stamp and turn of expect_poses
+        self.fixes = 1
+
+    @property
+    def newest(self) -> Node:
+        """State at the newest reading."""
+        return self.nodes[-1]
+
+    def at(self, stamp: float) -> Node:
+        """Last state not after ``stamp`` [s], or the oldest one."""
+        return self.nodes[max(0, bisect_right(self.nodes, stamp + SAME_INSTANT, key=_stamp) - 1)]
+
+    def predict(self, stamp: float, force: np.ndarray, rate: np.ndarray,
+                after_impact: bool) -> None:
+        """Append the state at the next reading."""
+        nodes = self.nodes
+        nodes.append(self._model.predict(nodes[-1], stamp, force, rate, after_impact))
+        while nodes[1].stamp < stamp - self._history:
+            del nodes[0]
+            self._model.covariance(nodes[0])    # otherwise it would keep its predecessors
+
+    def expect_poses(self, period: float) -> None:
+        """Prepare the newest state for dead reckoning if no pose was used for ``period`` [s]."""
+        if self._waits_since is None:
+            self._waits_since = self.newest.stamp
+        if self.newest.stamp - self._waits_since > period:
+            self._waits_since = np.inf      # once after each pose
+            self.nodes[-1], turn = self._model.without_marker_error(self.newest)
+            self._aligned = self.newest.stamp, turn
+
+    def correct(self, stamp: float, position: np.ndarray, quaternion: np.ndarray,
+                doubt_span: float = 0.0) -> bool:
+        """
+        Apply a pose at its capture time and replay the later readings.
+
+        Args:
+            stamp: capture time [s], not after the newest node; at least the oldest node's is used.
+            position: (3,) of the marker body in world [m].
+            quaternion: (4,) marker body to world.
+            doubt_span: duration for which the IMU may have been wrong [s], 0: not at all.
+
+        Returns:
+            False if the pose fails the gate; the track is then unchanged.
+
+        """
+        nodes = self.nodes
+        stamp = max(stamp, nodes[0].stamp)
+        index = bisect_right(nodes, stamp + SAME_INSTANT, key=_stamp) - 1
+        prior = nodes[index]
+        since, turn = self._aligned or (np.inf, None)
+        aligned = prior.stamp >= since
+        if stamp - prior.stamp > SAME_INSTANT:
+            after = nodes[index + 1]
+            prior = self._model.predict(prior, stamp, *interpolate(
+                stamp, (prior.stamp, prior.force, prior.rate),
+                (after.stamp, after.force, after.rate)), after.after_impact)
+        if turn is not None and aligned:    # poses refer to the markers
+            prior = self._model.turned(prior, turn)
+        if doubt_span:
+            prior = self._model.doubt(prior, doubt_span)
+        posterior = self._model.correct(prior, position, quaternion)
+        if posterior is None:
+            return False
+        self.fixes += 1
+        if self.fixes == VELOCITY_KNOWN:
+            self._model.add_time_uncertainty(posterior, self._time_deviation)
+        replayed = [posterior]
+        for node in nodes[index + 1:]:
+            replayed.append(self._model.predict(replayed[-1], node.stamp, node.force, node.rate,
+                                                node.after_impact))
+        self.nodes = replayed
+        self.last_fix = stamp
+        self._waits_since = self._aligned = None
+        return True
+
+
+def _stamp(node):
+    return node.stamp
 
 
 class ErrorStateEkf:
@@ -45,7 +163,6 @@ class ErrorStateEkf:
         """
         self._parameters = parameters
         self._model = ErrorStateModel(parameters, gravity)
-        self._mounting = Mounting(self._model)
         self.reset()
 
     def reset(self) -> None:
@@ -55,7 +172,6 @@ class ErrorStateEkf:
         self._noise_scale = self._noise.scale
         self._model.scale_noise(*self._noise_scale)
         self._readings: deque = deque()  # (stamp, force, rate, after_impact), base_link axes
-        self._alignment = MarkerAlignment(self._parameters, self._model.gravity)
         self._early: deque = deque()     # poses captured after the newest IMU sample
         self._track: Track | None = None
         self._candidate: Track | None = None
@@ -88,7 +204,7 @@ class ErrorStateEkf:
     def estimate(self) -> Estimate | None:
         """State at the newest IMU sample; None while uninitialised."""
         if self._estimate is None and self._track is not None:
-            self._estimate = self._mounting.estimate(self._track.newest, self._readings)
+            self._estimate = self._model.estimate(self._track.newest, self._readings)
         return self._estimate
 
     def imu(self, sample: ImuReading) -> bool:
@@ -103,7 +219,7 @@ class ErrorStateEkf:
         if checked is None:
             return False
         stamp = checked[0]
-        reading = (stamp, *self._mounting.aligned(*checked[1:3]), self._guard.after_impact)
+        reading = (stamp, *self._model.aligned(*checked[1:3]), self._guard.after_impact)
         self._estimate = None
         if self._guard.clock_jumped:
             self._restart(reading)
@@ -118,8 +234,7 @@ class ErrorStateEkf:
         while self._early and self._early[0][0] <= stamp + SAME_INSTANT:
             self._apply(*self._early.popleft())
         if self._track is not None:
-            self._track.expect_poses(self._parameters.status.dead_reckoning_after,
-                                     self._alignment)
+            self._track.expect_poses(self._parameters.status.dead_reckoning_after)
         return True
 
     def pose(self, sample: PoseReading) -> bool:
@@ -158,10 +273,8 @@ class ErrorStateEkf:
             self._model.scale_noise(*self._noise_scale)
         track = self._track if self._valid else None
         if track is not None:
-            interval = track.correct(stamp, position, quaternion)
-            if interval:
-                self._alignment.add(*interval, position, float(self._model.filter.R[0, 0]))
-            if interval or self._corrected_with_doubt(track, stamp, position, quaternion):
+            if track.correct(stamp, position, quaternion) \
+                    or self._corrected_with_doubt(track, stamp, position, quaternion):
                 self._candidate, self._contradictions = None, 0
                 self._good_pose = stamp, position, quaternion
                 return True
@@ -185,31 +298,31 @@ class ErrorStateEkf:
         self._contradictions = 0 if not smooth else self._contradictions + 1 if aligned else 1
         if not aligned:
             return False
-        needed = 1 if stamp < self._doubt_until else self._parameters.doubt.poses
+        needed = 1 if stamp < self._doubt_until else DOUBT_POSES
         if self._contradictions < needed:
             return False
-        self._doubt_until = stamp + self._parameters.doubt.time
+        self._doubt_until = stamp + DOUBT_TIME
         self.rejected['imu_contradicts'] += 1
         since = stamp - self._good_pose[0] if self._good_pose is not None else 0.0
-        return track.correct(stamp, position, quaternion, doubt_span=since) is not None
+        return track.correct(stamp, position, quaternion, doubt_span=since)
 
     def _continues_smoothly(self, track: Track, stamp, position, quaternion) -> bool:
         """Whether a pose continues smoothly from the last good one."""
         if self._good_pose is None:
             return False
         before, from_position, from_quaternion = self._good_pose
-        limits, dt = self._parameters.doubt, stamp - before
+        dt = stamp - before
         repeats = np.array_equal(position, from_position) \
             and np.array_equal(quaternion, from_quaternion)
-        if repeats or not 0 < dt <= self._parameters.imu.gap_limit:
+        if repeats or not 0 < dt <= GAP:
             return False
         node = track.at(stamp)
         step = position - from_position - dt * node.velocity
         was, now = (rotations.multiply(q, self._model.marker_to_base)
                     for q in (from_quaternion, quaternion))
         turned = rotations.multiply(was, rotations.exp(dt * (node.rate - node.gyroscope_bias)))
-        return float(np.linalg.norm(step)) < limits.distance + limits.speed * dt \
-            and geodesic_angle(turned, now) < limits.angle + limits.rate * dt
+        return float(np.linalg.norm(step)) < DISTANCE + SPEED * dt \
+            and geodesic_angle(turned, now) < ANGLE + RATE * dt
 
     def _update_candidate(self, valid: Track | None, stamp, position, quaternion) -> bool:
         """
@@ -228,11 +341,9 @@ class ErrorStateEkf:
         candidate = self._candidate
         agrees = candidate is None
         if candidate is not None:
-            agrees = candidate.correct(stamp, position, quaternion) is not None
+            agrees = candidate.correct(stamp, position, quaternion)
             if agrees:
-                limits = self._parameters.status
-                needed = limits.start_poses if valid is None else limits.jump_poses
-                if candidate.fixes >= needed:
+                if candidate.fixes >= (START_POSES if valid is None else JUMP_POSES):
                     if valid is not None and self._attitude_jumped(valid, candidate):
                         self.rejected['attitude_jump'] += 1
                         return True
@@ -247,7 +358,7 @@ class ErrorStateEkf:
         """Whether the gyroscope rules out the candidate's attitude."""
         deviation = sqrt(np.trace(self._model.covariance(track.newest)[ATTITUDE, ATTITUDE]))
         return geodesic_angle(track.newest.quaternion, candidate.newest.quaternion) \
-            > self._parameters.status.jump_attitude + SURE * deviation
+            > JUMP_ATTITUDE + SURE * deviation
 
     def _started(self, stamp, position, quaternion, known) -> Track:
         """Start a track at a pose, with the biases of ``known``, and predict it to now."""

@@ -3,9 +3,11 @@ The error-state model: inputs of filterpy's Kalman filter at each step.
 
 filterpy keeps the error state and computes its covariance and gain. This module adds the parts of
 a rigid body: propagation and residual on SO(3), and the injection of the estimated error into the
-state.
+state. The filter estimates the motion of the IMU at the IMU's stamps. The output is that of
+base_link now.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from math import sqrt
 
@@ -13,25 +15,39 @@ from filterpy.kalman import KalmanFilter
 import numpy as np
 from scipy.special import gammaincinv
 
+from beetle_omni_ros.estimation.inputs import IMPACT, PLACES
 from beetle_omni_ros.estimation.parameters import EkfParameters
-from beetle_omni_ros.estimation.propagation import (
-    identity,
+from beetle_omni_ros.estimation.state import (
+    ACCELEROMETER_BIAS,
+    ATTITUDE,
+    ERROR_STATES,
+    Estimate,
+    GYROSCOPE_BIAS,
     Node,
+    POSITION,
     propagate,
     STATES,
     TIME_OFFSET,
     transition,
-)
-from beetle_omni_ros.estimation.samples import (
-    ACCELEROMETER_BIAS,
-    ATTITUDE,
-    GYROSCOPE_BIAS,
-    POSITION,
     VELOCITY,
 )
 from beetle_omni_ros.robot import rotations
 
 MEASUREMENTS = 6  # position in world, rotation vector in base_link
+GATE = 0.99999          # share of good poses that passes the chi-square gate
+FIRST_SPEED = 5.0       # [m/s] standard deviation of the velocity before the second pose
+# The offset between the clocks: largest [s], random walk [s/sqrt(s)], and the speed [m/s] and rate
+# [rad/s] below which it is not estimated, because both are then mostly noise.
+LARGEST_OFFSET, OFFSET_WALK, LEAST_SPEED, LEAST_RATE = 0.05, 1e-5, 0.1, 0.2
+SIGNIFICANT = 4.0       # standard deviations of a significant time offset
+# Readings in the line that extrapolates a delayed body rate. With the IMU 25 ms late, a policy
+# that oscillated at 4 Hz had errors of 1.6, 2.0, 2.3 and 6.2 deg with 2, 3, 4 and 8; without
+# oscillation its commands changed least with 8.
+TREND = 3
+# Standard deviations that are added if the IMU contradicts poses: position [m], velocity [m/s],
+# attitude [rad], accelerometer bias [m/s^2], gyroscope bias [rad/s] (a dead axis hides a turn).
+DOUBT = 0.05, 0.5, 0.01, 1.0
+DOUBT_RATE = 3.0
 
 
 class ErrorStateModel:
@@ -57,21 +73,26 @@ class ErrorStateModel:
         self.parameters = parameters
         self.filter = KalmanFilter(dim_x=STATES, dim_z=MEASUREMENTS)
         self._no_error = np.zeros(STATES)
-        self._transition = identity()
-        self._process = _process_noise(parameters)
-        self._time_walk = float(self._process[TIME_OFFSET, TIME_OFFSET])
+        self._transition = np.eye(STATES)
+        density = np.zeros(STATES)      # of the process noise, per second
+        density[VELOCITY] = imu.accelerometer_noise ** 2 / imu.rate
+        density[ATTITUDE] = imu.gyroscope_noise ** 2 / imu.rate
+        density[ACCELEROMETER_BIAS] = imu.accelerometer_bias_walk ** 2
+        density[GYROSCOPE_BIAS] = imu.gyroscope_bias_walk ** 2
+        density[TIME_OFFSET] = OFFSET_WALK ** 2
+        self._process = np.diag(density)
         self._period = 1 / imu.rate
         # a missing reading was at the limit of the sensor's range or beyond, in any direction
         self._shock = np.zeros(STATES)
         self._shock[VELOCITY] = imu.specific_force_limit ** 2
         self._shock[ATTITUDE] = imu.angular_velocity_limit ** 2
-        self._impact = imu.impact_change ** 2
-        doubt, variance = parameters.doubt, np.zeros(STATES)
-        variance[POSITION] = doubt.position_std ** 2
-        variance[VELOCITY], variance[ATTITUDE] = doubt.velocity_std ** 2, doubt.attitude_std ** 2
-        variance[ACCELEROMETER_BIAS] = doubt.accelerometer_bias_std ** 2
-        self._doubt = np.diag(variance)
+        self._doubt = np.diag([*np.repeat(np.square(DOUBT), 3), *np.zeros(4)])
 
+        # mounting of the IMU, None where it is that of base_link
+        turned = np.any(imu.rotation)
+        self._axes = rotations.matrix(rotations.exp(imu.rotation)) if turned else None
+        self._arm = imu.position.copy() if np.any(imu.position) else None
+        self._biased = bool(np.any(imu.accelerometer_bias) or np.any(imu.gyroscope_bias))
         # vector from the navigated point (the IMU) to the marker body, in base_link axes
         self._lever = mocap.position - imu.position
         self._has_lever = bool(np.any(self._lever))
@@ -81,7 +102,7 @@ class ErrorStateModel:
         self._claimed_noise = (mocap.position_noise ** 2, mocap.orientation_noise ** 2)
         self.scale_noise(1.0, 1.0)
         # quantile of the chi-square distribution
-        self.gate = float(2 * gammaincinv(MEASUREMENTS / 2, mocap.gate_probability))
+        self.gate = float(2 * gammaincinv(MEASUREMENTS / 2, GATE))
 
     def scale_noise(self, position: float, orientation: float) -> None:
         """Set the MoCap's variances to these multiples of the parameters' values."""
@@ -111,7 +132,7 @@ class ErrorStateModel:
         covariance[POSITION, ATTITUDE] = arm @ noise[3:, 3:]
         covariance[ATTITUDE, POSITION] = covariance[POSITION, ATTITUDE].T
         covariance[ATTITUDE, ATTITUDE] = noise[3:, 3:]
-        covariance[VELOCITY, VELOCITY] = first.velocity_std ** 2 * np.eye(3)
+        covariance[VELOCITY, VELOCITY] = FIRST_SPEED ** 2 * np.eye(3)
         if biases is None:
             known = np.zeros(3), np.zeros(3), first.time_offset
             covariance[9:, 9:] = np.diag([first.accelerometer_bias_std ** 2] * 3
@@ -144,7 +165,7 @@ class ErrorStateModel:
 
     def doubt(self, node: Node, span: float) -> Node:
         """
-        Add the uncertainty of the parameters ``doubt`` to position, velocity, attitude and biases.
+        Add the uncertainty ``DOUBT`` to position, velocity, attitude and biases.
 
         A gyroscope bias that was wrong for ``span`` [s] has turned the attitude by ``span`` times
         its error. Both errors are therefore correlated, and a pose corrects the rate at once.
@@ -152,7 +173,7 @@ class ErrorStateModel:
         covariance = self.covariance(node) + self._doubt
         change = np.zeros((STATES, 3))
         change[GYROSCOPE_BIAS], change[ATTITUDE] = np.eye(3), -span * np.eye(3)
-        covariance += self.parameters.doubt.gyroscope_bias_std ** 2 * change @ change.T
+        covariance += DOUBT_RATE ** 2 * change @ change.T
         return replace(node, covariance=covariance)
 
     def turned(self, node: Node, turn: np.ndarray) -> Node:
@@ -170,14 +191,42 @@ class ErrorStateModel:
         return replace(node, quaternion=quaternion, rotation=rotations.matrix(quaternion),
                        accelerometer_bias=bias, covariance=self.covariance(node), before=None)
 
+    def without_marker_error(self, node: Node) -> tuple[Node, np.ndarray]:
+        """
+        Correct attitude and bias of a state, for the time after the last pose.
+
+        An attitude error of the markers appears as an accelerometer bias perpendicular to gravity,
+        which is wrong as soon as the robot turns. In one attitude only the sum of both errors is
+        known, and their priors divide it.
+
+        Returns:
+            the state, and the error of the markers (3,), a rotation vector in base_link [rad]; it
+            is zero if the bias is beyond three standard deviations of both: then it is another
+            error.
+
+        """
+        priors, up = self.parameters.dead_reckoning, node.rotation[2]
+        markers = (self.gravity * priors.marker_attitude_std) ** 2
+        both = priors.accelerometer_bias_std ** 2 + markers
+        share = markers / both
+        turn = share / self.gravity * rotations.cross(up, node.accelerometer_bias)
+        if turn.dot(turn) > (3 * share / self.gravity) ** 2 * both:
+            return node, np.zeros(3)
+        corrected = self.turned(node, -turn)
+        change = np.zeros((STATES, 3))
+        change[ATTITUDE] = np.eye(3)
+        change[ACCELEROMETER_BIAS] = -self.gravity * rotations.skew(up)
+        corrected.covariance = corrected.covariance \
+            + (1 - share) * priors.marker_attitude_std ** 2 * change @ change.T
+        return corrected, turn
+
     def after_clock_jump(self, node: Node, stamp: float, force: np.ndarray,
                          rate: np.ndarray) -> Node:
         """Move a state across an unknown time; only the biases remain known."""
-        limits = self.parameters
         covariance = self.covariance(node).copy()
         covariance[0:9, :] = covariance[:, 0:9] = 0.0
-        covariance[POSITION, POSITION] = limits.mocap.position_limit ** 2 * np.eye(3)
-        covariance[VELOCITY, VELOCITY] = limits.initial.velocity_std ** 2 * np.eye(3)
+        covariance[POSITION, POSITION] = PLACES ** 2 * np.eye(3)
+        covariance[VELOCITY, VELOCITY] = FIRST_SPEED ** 2 * np.eye(3)
         covariance[ATTITUDE, ATTITUDE] = np.pi ** 2 * np.eye(3)
         return Node(stamp, force, rate, node.position, np.zeros(3), node.quaternion, node.rotation,
                     node.accelerometer_bias, node.gyroscope_bias, node.time_offset,
@@ -196,33 +245,22 @@ class ErrorStateModel:
         return node.covariance
 
     def time_deviation(self, node: Node) -> float:
-        """
-        Standard deviation of a node's time offset [s].
-
-        A prediction adds only the random walk to its variance. No pending covariance is needed.
-        """
+        """Standard deviation of a node's time offset [s], without its walk while pending."""
         steps = node.pending()
         known = steps[0][0] if steps else node
-        variance, walk = known.covariance[TIME_OFFSET, TIME_OFFSET], self._time_walk
-        for before, after in steps:
-            variance += walk * self._noise_time(after.stamp - before.stamp)
-        return sqrt(variance)
-
-    def _noise_time(self, dt) -> float:
-        """Time [s] over which the process noise of a step acts."""
-        # Missing samples are interpolated, and the error grows with each of them.
-        return dt * max(1.0, dt / self._period) ** 3
+        return sqrt(known.covariance[TIME_OFFSET, TIME_OFFSET])
 
     def _predicted_covariance(self, before: Node, after: Node) -> np.ndarray:
         """Covariance (16, 16) after one step of :func:`propagate`."""
         dt, kalman = after.stamp - before.stamp, self.filter
         kalman.x = self._no_error
         kalman.P = before.covariance
+        # Missing samples are interpolated, and the error grows with each of them.
         kalman.predict(F=transition(before, after, self._transition),
-                       Q=self._process * self._noise_time(dt))
+                       Q=self._process * (dt * max(1.0, dt / self._period) ** 3))
         change = after.force - before.force
         squared_change = float(change.dot(change))
-        if not (after.after_impact or squared_change > self._impact):
+        if not (after.after_impact or squared_change > IMPACT ** 2):
             return kalman.P
         # an impulse, after missing readings also of the attitude
         density = self._shock.copy() if after.after_impact else np.zeros(STATES)
@@ -272,13 +310,13 @@ class ErrorStateModel:
         At rest they are zero. The estimated velocity and rate are then mostly noise, which is
         correlated with the residual and would bias the offset.
         """
-        least, jacobian = self.parameters.time_offset, self.filter.H
+        jacobian = self.filter.H
         rate = prior.rate - prior.gyroscope_bias
         velocity = prior.velocity
         if self._has_lever:
             velocity = velocity + prior.rotation @ rotations.cross(rate, self._lever)
-        jacobian[0:3, TIME_OFFSET] = velocity if velocity.dot(velocity) > least.speed ** 2 else 0.0
-        jacobian[3:6, TIME_OFFSET] = rate if rate.dot(rate) > least.rate ** 2 else 0.0
+        jacobian[0:3, TIME_OFFSET] = velocity if velocity.dot(velocity) > LEAST_SPEED ** 2 else 0.0
+        jacobian[3:6, TIME_OFFSET] = rate if rate.dot(rate) > LEAST_RATE ** 2 else 0.0
 
     def _inject(self, prior: Node, error: np.ndarray, covariance: np.ndarray) -> Node:
         """Add the estimated error to the state; the remaining error has mean zero."""
@@ -291,23 +329,98 @@ class ErrorStateModel:
         rows, columns = covariance[ATTITUDE, :], covariance[:, ATTITUDE]
         rows += shift.dot(rows)
         columns += columns.dot(shift.T)
-        limit = self.parameters.time_offset.limit
         return Node(prior.stamp, prior.force, prior.rate,
                     prior.position + error[POSITION], prior.velocity + error[VELOCITY],
                     quaternion, rotations.matrix(quaternion),
                     prior.accelerometer_bias + error[ACCELEROMETER_BIAS],
                     prior.gyroscope_bias + error[GYROSCOPE_BIAS],
-                    min(limit, max(-limit, prior.time_offset + float(error[TIME_OFFSET]))),
+                    min(LARGEST_OFFSET,
+                        max(-LARGEST_OFFSET, prior.time_offset + float(error[TIME_OFFSET]))),
                     prior.after_impact, 0.5 * (covariance + covariance.T))
 
+    def aligned(self, force: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Specific force and rate (3,) minus their known biases, in base_link axes."""
+        if self._biased:
+            imu = self.parameters.imu
+            force, rate = force - imu.accelerometer_bias, rate - imu.gyroscope_bias
+        return (force, rate) if self._axes is None else (self._axes @ force, self._axes @ rate)
 
-def _process_noise(parameters: EkfParameters) -> np.ndarray:
-    """Spectral density (16, 16) of the process noise, per second."""
-    imu = parameters.imu
-    density = np.zeros(STATES)
-    density[VELOCITY] = imu.accelerometer_noise ** 2 / imu.rate
-    density[ATTITUDE] = imu.gyroscope_noise ** 2 / imu.rate
-    density[ACCELEROMETER_BIAS] = imu.accelerometer_bias_walk ** 2
-    density[GYROSCOPE_BIAS] = imu.gyroscope_bias_walk ** 2
-    density[TIME_OFFSET] = parameters.time_offset.walk ** 2
-    return np.diag(density)
+    def estimate(self, node: Node, readings: Sequence = ()) -> Estimate:
+        """
+        Convert a node to the state of base_link at its stamp, with its covariance.
+
+        Args:
+            node: newest state of the filter.
+            readings: IMU readings (stamp, specific force, rate, after impact) up to the node's.
+
+        """
+        age = node.time_offset
+        late = age > SIGNIFICANT * self.time_deviation(node)
+        position, velocity, quaternion, measured_rate = (
+            self._extrapolated(node, age, self.trend(readings)) if late else
+            (node.position, node.velocity, node.quaternion, node.rate))
+        rate = measured_rate - node.gyroscope_bias
+        if self._arm is not None:
+            rotation = rotations.matrix(quaternion)
+            position = position - rotation @ self._arm
+            velocity = velocity - rotation @ rotations.cross(rate, self._arm)
+
+        def covariance():
+            # that at the stamp of the reading, which is up to 50 ms older than the estimate
+            found = self.covariance(node)[:ERROR_STATES, :ERROR_STATES]
+            return found if self._arm is None else \
+                self._covariance_at_base(rotations.matrix(quaternion), rate, found, self._arm)
+
+        return Estimate(node.stamp, position, velocity, quaternion, rate,
+                        node.accelerometer_bias, node.gyroscope_bias, covariance)
+
+    def trend(self, readings) -> np.ndarray:
+        """(3,) angular acceleration [rad/s^2], by least squares through the last readings."""
+        last = [readings[i] for i in range(max(0, len(readings) - TREND), len(readings))]
+        if len(last) < max(TREND, 2):
+            return np.zeros(3)
+        stamps, _, rates, after_impact = zip(*last)
+        if any(after_impact):
+            return np.zeros(3)
+        times = np.array(stamps)
+        times -= np.add.reduce(times) / len(last)
+        return times.dot(rates) / times.dot(times)
+
+    def _extrapolated(self, node, age, trend) -> tuple[np.ndarray, ...]:
+        """
+        Extrapolate position, velocity, quaternion and rate over the latency in the IMU's stamps.
+
+        A stamp on arrival can be late but not early. IMU stamps later than the MoCap's therefore
+        mean a delayed reading. In the opposite case the MoCap's stamps are late and the reading is
+        not delayed. The acceleration is constant over these few milliseconds, and the rate
+        continues its trend. Without the trend, 25 ms are a phase lag of 18 deg at 2 Hz.
+        """
+        velocity0, rate0, slopes = node.velocity.tolist(), node.rate.tolist(), trend.tolist()
+        turn = [age * (w - bias + 0.5 * age * slope)
+                for w, bias, slope in zip(rate0, node.gyroscope_bias.tolist(), slopes)]
+        quaternion = np.array(rotations.product(*node.quaternion.tolist(),
+                                                *rotations.exp_parts(*turn)))
+        acceleration = node.rotation.dot(node.force - node.accelerometer_bias).tolist()
+        acceleration[2] -= self.gravity
+        position = [p + age * v + 0.5 * age ** 2 * a
+                    for p, v, a in zip(node.position.tolist(), velocity0, acceleration)]
+        velocity = [v + age * a for v, a in zip(velocity0, acceleration)]
+        rate = [w + age * slope for w, slope in zip(rate0, slopes)]
+        return np.array(position), np.array(velocity), quaternion, np.array(rate)
+
+    def _covariance_at_base(self, rotation, rate, covariance, lever: np.ndarray) -> np.ndarray:
+        """
+        Transform a state's covariance (15, 15) from the IMU to base_link's origin.
+
+        With arm r and rate w, p = p_imu - R r and v = v_imu - R (w x r). The noise of the rate
+        sample affects the velocity through the arm.
+        """
+        swing = rotations.cross(rate, lever)
+        arm = rotation @ rotations.skew(lever)
+        jacobian = np.eye(ERROR_STATES)
+        jacobian[POSITION, ATTITUDE] = arm
+        jacobian[VELOCITY, ATTITUDE] = rotation @ rotations.skew(swing)
+        jacobian[VELOCITY, GYROSCOPE_BIAS] = -arm
+        covariance = jacobian @ covariance @ jacobian.T
+        covariance[VELOCITY, VELOCITY] += self.parameters.imu.gyroscope_noise ** 2 * arm @ arm.T
+        return covariance

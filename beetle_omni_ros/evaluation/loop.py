@@ -19,7 +19,7 @@ from beetle_omni_ros.control.host import ControllerError, ControllerHost
 from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.parameters import EkfParameters
-from beetle_omni_ros.estimation.samples import pose_covariance, twist_covariance
+from beetle_omni_ros.estimation.state import pose_covariance, twist_covariance
 from beetle_omni_ros.evaluation.compute import collector_off, ComputeTimer
 from beetle_omni_ros.evaluation.processes import Processes
 from beetle_omni_ros.messages.values import Odom, Wrench

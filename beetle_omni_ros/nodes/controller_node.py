@@ -48,7 +48,8 @@ class ControllerNode(FlightNode):
                          entry.parameters_file, entry.file_key, completed=entry.completed)
         self._entry = entry
         robot = RobotParameters.load(self.parameters.robot_file or None)
-        controller = entry.make(robot, parameters=self.parameters if entry.parameters else None)
+        controller = entry.make(
+            robot, parameters=self.parameters if entry.parameter_class else None)
         self._host = ControllerHost(entry.name, controller, self.timed, self._log)
         self._checks, self._sensors = TargetChecks(robot), robot.sensors
         self._joints = self._command = None

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.parameters import EkfParameters
-from beetle_omni_ros.estimation.samples import pose_covariance, twist_covariance
+from beetle_omni_ros.estimation.state import pose_covariance, twist_covariance
 from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes.node import ERROR, FlightNode, OK, WARN
 from beetle_omni_ros.robot.parameters import RobotParameters

@@ -291,7 +291,7 @@ def controller_nodes(active: str, *, robot_file: str = '', nmpc: str = '', polic
 def unfit(policy: str, robot_file: str = '', allow_other_robot: bool = False) -> str:
     """Return why a policy is unusable for a robot file ('': the shipped one), or ''."""
     try:
-        from beetle_omni_ros.control.policy_network import PolicyNetwork
+        from beetle_omni_ros.control.policy_file import PolicyNetwork
         PolicyNetwork(policy, RobotParameters.load(robot_file or None), allow_other_robot)
     except (ParameterError, ImportError) as error:
         return str(error)

@@ -2,8 +2,8 @@
 The batched training environment: thousands of robots that fly from target to target.
 
 The physics is the robot's own model (:mod:`train.model`). Observations are those of
-:mod:`control.observation`, delayed and noisy as on the robot. A step does not synchronise with
-the host, so that a whole rollout can be captured as one CUDA graph.
+:func:`control.policy.observed`, delayed and noisy as on the robot. A step does not synchronise
+with the host, so that a whole rollout can be captured as one CUDA graph.
 """
 
 import numpy as np
@@ -11,7 +11,7 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 import torch
 
-from beetle_omni_ros.control.guidance.trimming import TrimmingParameters
+from beetle_omni_ros.control import guidance
 from beetle_omni_ros.control.policy_file import PolicyContract
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -81,7 +81,6 @@ class TiltableQuadrotorEnv(VecEnv):
         self._axes = self._tensor(robot.tilt_axes)
         self._sideways = self._tensor(np.cross(robot.tilt_axes, [0.0, 0.0, 1.0]))
         self._nominal_mass = nominal_body(robot)[0]
-        self._trimming = TrimmingParameters()
         self.base_weights = self._tensor([getattr(parameters.reward, name)
                                           for name in rewards.TERMS]) * parameters.reward.scale
         self.weights = self.base_weights.clone()
@@ -225,18 +224,20 @@ class TiltableQuadrotorEnv(VecEnv):
         return new
 
     def _trim(self, s, x):
-        """(N, 6) shift of the target, as :class:`control.guidance.trimming.Trimming`."""
-        p, rate = self._trimming, self._trimming.rate * self.cfg.episode.period
+        """(N, 6) shift of the target, as :class:`control.guidance.Trimming`."""
+        rate = guidance.TRIM_RATE * self.cfg.episode.period
         way = s['target_position'] - x[:, model.POSITION] - s['bias'][:, 0:3]
         seen = batch.product(x[:, model.QUATERNION],
                              batch.from_rotation_vector(s['bias'][:, 3:6]))
         turn = batch.small_turn(batch.matrix(seen), batch.matrix(s['target_attitude']))
-        steady = (way.norm(dim=-1) <= p.near_distance) & (turn.norm(dim=-1) <= p.near_angle) \
-            & (x[:, model.VELOCITY].norm(dim=-1) <= p.speed) \
-            & (x[:, model.RATE].norm(dim=-1) <= p.turn_rate)
+        steady = (way.norm(dim=-1) <= guidance.NEAR_DISTANCE) \
+            & (turn.norm(dim=-1) <= guidance.NEAR_ANGLE) \
+            & (x[:, model.VELOCITY].norm(dim=-1) <= guidance.SLOW) \
+            & (x[:, model.RATE].norm(dim=-1) <= guidance.SLOW_TURN)
         made = s['trim'] + rate * s['trimmed'] * steady[:, None] * torch.cat((way, turn), -1)
         parts = [part * (limit / part.norm(dim=-1, keepdim=True).clamp(min=limit))
-                 for part, limit in zip(made.split(3, -1), (p.distance, p.angle))]
+                 for part, limit in zip(
+                     made.split(3, -1), (guidance.TRIM_DISTANCE, guidance.TRIM_ANGLE))]
         return torch.cat(parts, -1)
 
     def _disturbance_estimate(self, s, x, rotation):
@@ -282,8 +283,8 @@ class TiltableQuadrotorEnv(VecEnv):
         way = changed['target_position'] - new['target_position']
         turn = batch.geodesic(batch.matrix(changed['target_attitude']),
                               batch.matrix(new['target_attitude']))
-        near = (way.norm(dim=-1) <= self._trimming.near_distance) \
-            & (turn <= self._trimming.near_angle)
+        near = (way.norm(dim=-1) <= guidance.NEAR_DISTANCE) \
+            & (turn <= guidance.NEAR_ANGLE)
         changed['trim'] = new['trim'] * near[:, None]
         return changed
 

@@ -13,8 +13,13 @@ import numpy as np
 import torch
 
 from beetle_omni_ros import __version__
-from beetle_omni_ros.control import onnx_runtime, policy_checksum
-from beetle_omni_ros.control.policy_file import INPUT, OUTPUT, PolicyContract
+from beetle_omni_ros.control.policy_file import (
+    add_checksum,
+    INPUT,
+    OUTPUT,
+    PolicyContract,
+    session,
+)
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import RunError
 from beetle_omni_ros.train.network import ActorModel, ExportedPolicy
@@ -69,7 +74,7 @@ def export_policy(actor: ActorModel, path: Path, robot: RobotParameters,
     path = Path(path)
     part = path.with_suffix('.part')
     onnx.save(written, str(part))
-    policy_checksum.add(part)
+    add_checksum(part)
     difference = compare(actor.mean, part, size)
     if not difference <= AGREEMENT:
         part.unlink()
@@ -81,12 +86,12 @@ def export_policy(actor: ActorModel, path: Path, robot: RobotParameters,
 
 def compare(mean: Callable[[torch.Tensor], torch.Tensor], path: Path, size: int) -> float:
     """Largest relative difference of torch and onnxruntime on random observations."""
-    session = onnx_runtime.load().InferenceSession(str(path), providers=['CPUExecutionProvider'])
+    network = session(path.read_bytes())
     generator = torch.Generator().manual_seed(0)
     probes = torch.randn(PROBES, size, generator=generator)
     with torch.no_grad():
         expected = mean(probes).numpy()
-    found = np.concatenate([session.run([OUTPUT], {INPUT: row[None].numpy()})[0]
+    found = np.concatenate([network.run([OUTPUT], {INPUT: row[None].numpy()})[0]
                             for row in probes])
     return float(np.abs(found - expected).max() / max(np.abs(expected).max(), 1.0))
 

@@ -1,4 +1,4 @@
-"""Observations of actor and critic for a batch of robots, as :mod:`control.observation`."""
+"""Observations of actor and critic for a batch of robots, as :func:`control.policy.observed`."""
 
 import torch
 

@@ -103,8 +103,8 @@ def write_hover_policy(path, memory=False, blind_above=None):
     components = g('MatMul', wrench, Allocator(robot).inverse.T)
     tilt, thrust = targets(g, components, g.columns(seen, 21, 25), g.columns(seen, 25, 29),
                            contract, robot.joints.position_limit)
-    requested = g('Sub', g('Concat', tilt, thrust, axis=1), contract.action_offset[None])
-    action = g('Div', requested, contract.action_scale[None],
+    requested = g('Sub', g('Concat', tilt, thrust, axis=1), np.array([contract.action_offset]))
+    action = g('Div', requested, np.array([contract.action_scale]),
                result='t' if blind_above else 'action')
     if blind_above:
         height = g('Sub', g('MatMul', way, g('Transpose', up)), float(blind_above))
@@ -136,7 +136,7 @@ def targets(g, components, measured, previous, contract, limit):
         return (g('Add', g('Mul', along, cosine), g('Mul', across, sine)),
                 g('Sub', g('Mul', across, cosine), g('Mul', along, sine)))
 
-    before = g('Mul', previous, contract.action_scale[None, :4])
+    before = g('Mul', previous, np.array([contract.action_scale[:4]]))
     ahead, beside = seen_from(before)
     way = g.angle(beside, ahead)
     goal = g('Add', before, way)

@@ -4,15 +4,13 @@ import numpy as np
 import onnx
 from onnx import helper, numpy_helper, TensorProto
 
-from beetle_omni_ros.control import policy_checksum
-from beetle_omni_ros.control.policy_file import PolicyContract
+from beetle_omni_ros.control.policy_file import add_checksum, PolicyContract
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 
 def write(path, *, robot=None, memory=False, metadata=None, drop=(), weights=None, bias=None,
           hidden=None, seed=0, inputs=None, outputs=8, names=('observation', 'action'),
-          dtype=TensorProto.FLOAT, poison=False,
-          checksum=True):
+          dtype=TensorProto.FLOAT, poison=False, checksum=True):
     """
     Write one policy: affine, or a random network with ``hidden`` layers.
 
@@ -80,4 +78,4 @@ def save(path, nodes, constants, inputs, outputs, names, dtype, metadata, checks
     helper.set_model_props(model, metadata)
     onnx.save(model, str(path))
     if checksum:
-        policy_checksum.add(path)
+        add_checksum(path)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.control.base import Command, PoseTarget, State
-from beetle_omni_ros.control.call import FunctionCall
+from beetle_omni_ros.control.disturbance import FunctionCall
 from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.control.nmpc import NmpcController
 from beetle_omni_ros.robot import dynamics as model
@@ -31,7 +31,7 @@ class Body:
     """The CasADi model with broken actuators; a command acts 10 ms after its state."""
 
     def __init__(self):
-        self.advance = FunctionCall(model.integrator(ROBOT, 4), None)
+        self.advance = FunctionCall(model.integrator(ROBOT, 4))
         self.x = np.zeros(25)
         self.x[:3], self.x[9], self.x[21:] = PLACE, 1.0, ROBOT.hover_thrust
         self.time, self.broken = 0.0, ALL_HEALTHY
@@ -108,13 +108,3 @@ def test_the_disturbance_estimate_is_reset_after_an_actuator_loss(nmpc):
     assert np.linalg.norm(nmpc.disturbance[model.TORQUE]) > 0.1
     nmpc.set_health(LOST)
     assert np.linalg.norm(nmpc.disturbance[model.TORQUE]) < 0.01
-
-
-def test_the_plan_respects_the_bounds(nmpc):
-    nmpc.set_health(ALL_HEALTHY)
-    nmpc.reset()
-    body = Body().fly(nmpc, PoseTarget(PLACE, LEVEL), 0.3)
-    nmpc.set_health(LOST)
-    body.fly(nmpc, PoseTarget(PLACE, held(LOST)), 0.1)
-    assert np.abs(nmpc.predicted_states[:, 18]).max() < 0.01
-    assert nmpc.diagnostics()['unsolved'] == 0

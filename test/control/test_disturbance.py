@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.control.base import Command, PoseTarget, State
-from beetle_omni_ros.control.call import FunctionCall
-from beetle_omni_ros.control.disturbance import DisturbanceEstimator, RESOLUTION
+from beetle_omni_ros.control.disturbance import (
+    DisturbanceEstimator,
+    FunctionCall,
+    RESOLUTION,
+)
 from beetle_omni_ros.control.nmpc import NmpcController
 from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
 from beetle_omni_ros.evaluation.loop import FlightLoop
@@ -30,7 +33,7 @@ def command(k):
 def test_each_command_within_the_delay_acts_from_its_own_time(delay):
     p = NmpcParameters.load()
     p = replace(p, model=replace(p.model, command_delay=delay))
-    advance = FunctionCall(model.integrator(ROBOT), None)
+    advance = FunctionCall(model.integrator(ROBOT))
     estimator = DisturbanceEstimator(ROBOT, p.disturbance, p.model.command_delay, advance)
     now, rest = 12, State(0.0, np.zeros(3), np.zeros(3), np.array([0.0, 0, 0, 1]), np.zeros(3),
                           np.zeros(4), np.zeros(4), 0.0)
@@ -55,7 +58,7 @@ def driven(target, duration, band=0.0, sag=0.0):
     robot = replace(ROBOT, effects={'joint_friction': {
         'coulomb': friction, 'stiction': friction}} if band else {})
     estimator = DisturbanceEstimator(robot, p.disturbance, p.model.command_delay,
-                                     FunctionCall(model.integrator(ROBOT), None))
+                                     FunctionCall(model.integrator(ROBOT)))
     step = Step(NUMPY, Servo.of(ROBOT.joints, coulomb=friction, stiction=friction), FINE)
     tilt, rate, sent, hover = np.zeros(4), np.zeros(4), None, np.full(4, HOVER)
     for k in range(round(duration / PERIOD)):
@@ -81,14 +84,6 @@ def test_a_servo_held_by_friction_does_not_wind_up_the_offset():
     assert np.all(tilt == 0.0)      # it was held
     assert np.abs(estimator.disturbance[model.TILT_OFFSET]).max() < 0.1 * band
     assert np.abs(estimator._state[model.TILT]).max() < 0.1 * band
-
-
-def test_targets_overcome_the_friction_once_and_the_model_turns_by_the_plan():
-    estimator, _ = driven(lambda t: 0.1, 1.0, band=0.02)
-    resting = estimator._commands[-1].tilt
-    plan = resting + [0.01, -0.01, 0.03, 0.0]
-    assert np.allclose(estimator._moving(Command(1.0, estimator.sent(plan), np.zeros(4))).tilt,
-                       plan)
 
 
 def test_targets_reverse_by_more_than_noise_only():

@@ -1,99 +1,201 @@
-"""Guidance as a wrapper of any controller: targets, trim, reach, description."""
+"""Guidance: trimmed steady errors, raised targets in large turns, layers that are off."""
 
+from dataclasses import replace
+
+from hover_policy import write_hover_policy
+from hypothesis import given, settings
+from hypothesis import strategies as st
 import numpy as np
+from plant import Plant
 import pytest
 
-from beetle_omni_ros.control.base import Command, PoseTarget, State, TrajectoryTarget
-from beetle_omni_ros.control.guidance.guidance import Guidance, GuidanceParameters, Guided
+from beetle_omni_ros.control.base import Command, PoseTarget, State
+from beetle_omni_ros.control.guidance import (
+    Charge,
+    CLIMB,
+    Guidance,
+    LARGE,
+    Trimming,
+    TURN_DISTANCE,
+    TURN_HEIGHT,
+    Turning,
+)
+from beetle_omni_ros.control.policy import PolicyController, PolicyParameters
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 
-AXES = RobotParameters.load().tilt_axes
-LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
+ROBOT = RobotParameters.load()
+TARGET = PoseTarget(np.array([0.4, -0.3, 1.5]), rotations.from_rpy(0.8, -0.5, 2.0), stamp=3.0)
+SMALL = st.tuples(*[st.floats(-0.03, 0.03)] * 3).map(np.array)
 
 
-class TargetRecorder:
-    """A controller that stores its targets."""
-
-    period = 0.01
-
-    def __init__(self):
-        self.shown, self.health = [], None
-
-    def reset(self):
-        self.shown.clear()
-
-    def step(self, state, target):
-        self.shown.append(target)
-        return Command(state.stamp, np.zeros(4), np.full(4, 7.5))
-
-    def set_health(self, health):
-        self.health = health
+def state(stamp, way=(0, 0, 0), turn=(0, 0, 0), target=TARGET, **changed):
+    """State of a robot with an offset from a target, a vector in world and a rotation."""
+    values = {'position': target.position - np.array(way), 'velocity': np.zeros(3),
+              'quaternion': rotations.multiply(target.quaternion, rotations.conjugate(
+                  rotations.exp(np.array(turn, dtype=float)))),
+              'angular_velocity': np.zeros(3), **changed}
+    return State(stamp, **values, tilt=np.zeros(4), tilt_velocity=np.zeros(4), tilt_stamp=stamp)
 
 
-def state_at(stamp, position, command, quaternion=LEVEL):
-    return State(stamp, np.array(position, dtype=float), np.zeros(3), quaternion, np.zeros(3),
-                 np.zeros(4), np.zeros(4), stamp, command)
+def wait(trimming, seconds, begin=0.0, target=TARGET, **where):
+    for k in range(round(100 * seconds) + 1):
+        shown = trimming.target(state(begin + 0.01 * k, target=target, **where), target)
+    return shown
 
 
-def rest(guided, command_of, steps=200):
-    """Stand 2 cm beside a target; the command in force is ``command_of(the last given)``."""
-    target, given = PoseTarget(np.array([0.0, 0.0, 1.0]), LEVEL), None
-    for k in range(steps):
-        given = guided.step(state_at(0.01 * k, (0.02, 0, 1), command_of(given)), target)
+@settings(max_examples=20, deadline=None)
+@given(SMALL, SMALL)
+def test_a_constant_tracking_error_is_trimmed_to_zero(way, turn):
+    """The robot follows with a time constant of 0.3 s, much faster than the integral."""
+    trimming = Trimming()
+    position, lag = np.zeros(3), np.zeros(3)
+    for k in range(700):
+        shown = trimming.target(state(0.01 * k, way - position, turn - lag), TARGET)
+        asked = rotations.log(rotations.multiply(
+            rotations.conjugate(TARGET.quaternion), shown.quaternion))
+        position += 0.01 / 0.3 * (shown.position - TARGET.position - position)
+        lag += 0.01 / 0.3 * (asked - lag)
+    assert np.linalg.norm(way - position) < 0.03 * max(np.linalg.norm(way), 1e-3)
+    assert np.linalg.norm(turn - lag) < 0.03 * max(np.linalg.norm(turn), 1e-3)
+    assert shown.stamp == TARGET.stamp
 
 
-def test_guidance_removes_the_steady_error_of_any_controller():
-    keeper = TargetRecorder()
-    rest(Guided(keeper, Guidance(GuidanceParameters(), AXES)), lambda given: given)
-    assert keeper.shown[-1].position[0] < -0.01         # against the error, by its integral
+@pytest.mark.parametrize('where', [
+    {'way': (0.2, 0, 0)}, {'turn': (0, 0.5, 0)},
+    {'way': (0.01, 0, 0), 'velocity': np.array([0, 0.3, 0])},
+    {'turn': (0.01, 0, 0), 'angular_velocity': np.array([0, 0, 1.0])},
+    {'position': np.full(3, np.nan)}, {'quaternion': np.full(4, np.nan)},
+    {'velocity': np.full(3, np.inf)}, {'angular_velocity': np.full(3, np.nan)}])
+def test_the_trim_does_not_change_in_motion_or_for_nan_states(where):
+    trimming = Trimming()
+    shown = wait(trimming, 2.0, **where)
+    assert shown.position == pytest.approx(TARGET.position)
+    assert shown.quaternion == pytest.approx(TARGET.quaternion)
 
 
-def test_the_trim_does_not_change_while_another_controller_is_active():
-    keeper = TargetRecorder()
-    other = Command(0.0, np.full(4, 0.1), np.full(4, 7.0))
-    rest(Guided(keeper, Guidance(GuidanceParameters(), AXES)), lambda given: other)
-    assert np.array_equal(keeper.shown[-1].position, [0.0, 0.0, 1.0])
+def test_the_trim_is_kept_for_equal_and_nearby_targets_only():
+    trimming = Trimming()
+    wait(trimming, 3.0, way=(0.02, 0, 0))
+    found = list(trimming.position)
+    again = PoseTarget(TARGET.position.copy(), TARGET.quaternion.copy(), stamp=9.0)
+    near = replace(TARGET, position=TARGET.position + [0, 0.05, 0])
+    for target in (again, near):
+        shown = trimming.target(state(9.0, target=target), target)
+        assert shown.position - target.position == pytest.approx(found)
+    far = replace(TARGET, position=TARGET.position + [0, 0.5, 0])
+    assert trimming.target(state(9.0, target=far), far).position == pytest.approx(far.position)
 
 
-def test_a_low_target_is_raised_during_a_large_rotation():
-    keeper = TargetRecorder()
-    guided = Guided(keeper, Guidance(GuidanceParameters(), AXES))
-    target = PoseTarget(np.array([0.0, 0.0, 0.5]), rotations.exp(np.array([1.5, 0.0, 0.0])))
-    guided.step(state_at(0.0, (0, 0, 0.5), None), target)
-    assert keeper.shown[0].position[2] == GuidanceParameters().turning.height
+def test_a_policy_on_standby_does_not_trim_the_error_of_another_controller():
+    """Without its own command in force, an error must not change the trim."""
+    controller, targets = PolicyController(ROBOT), []
+    others = Command(0.0, np.zeros(4), np.full(4, ROBOT.hover_thrust))
+    for k in range(300):
+        at = replace(state(0.01 * k, way=(0.05, 0, 0)), command=others)
+        targets.append(controller.step(at, TARGET).tilt)
+    fresh = PolicyController(ROBOT)
+    same = replace(state(2.99, way=(0.05, 0, 0)), command=others)
+    assert targets[-1] == pytest.approx(fresh.step(same, TARGET).tilt, abs=1e-9)
 
 
-def test_trajectories_pass_unchanged_and_actuator_health_is_forwarded():
-    keeper = TargetRecorder()
-    guided = Guided(keeper, Guidance(GuidanceParameters(), AXES))
-    way = TrajectoryTarget(np.array([0.0, 1.0]), np.zeros((2, 3)), np.tile(LEVEL, (2, 1)),
-                           np.zeros((2, 3)), np.zeros((2, 3)))
-    guided.step(state_at(0.0, (0, 0, 1), None), way)
-    assert keeper.shown == [way]
-    guided.set_health('as it is')
-    assert keeper.health == 'as it is'
-    guided.reset()
-    assert not keeper.shown and guided.diagnostics() == {'unwound': 0, 'routed': 0}
+LEVEL = rotations.from_rpy(0.0, 0.0, 0.0)
+FAR, NEAR = rotations.from_rpy(2.0, 0.0, 0.0), rotations.from_rpy(0.3, 0.0, 0.0)
 
 
-def test_guidance_reports_the_reach_of_its_controller():
-    keeper = TargetRecorder()
-    assert Guided(keeper, Guidance(GuidanceParameters(), AXES)).reach == np.inf
-    keeper.reach = 3.0
-    assert Guided(keeper, Guidance(GuidanceParameters(), AXES)).reach == 3.0
+def turned(quaternion, height=1.0, sinking=0.0, place=(0.0, 0.0)):
+    return State(0.0, np.array([*place, height]), np.array([0.0, 0.0, -sinking]),
+                 np.asarray(quaternion, float), np.zeros(3), np.zeros(4), np.zeros(4),
+                 tilt_stamp=0.0)
+
+
+def pose(height=1.5, quaternion=LEVEL, place=(0.3, -0.4)):
+    return PoseTarget(np.array([*place, height]), quaternion)
+
+
+@given(st.floats(0.2, 2.5), st.floats(0.0, 3.1), st.floats(-3, 3))
+def test_only_low_targets_with_a_large_rotation_are_raised(height, angle, yaw):
+    target = pose(height, rotations.from_rpy(0.0, 0.0, yaw))
+    away = rotations.multiply(target.quaternion, rotations.exp(np.array([angle, 0.0, 0.0])))
+    shown = Turning().target(turned(away), target)
+    if height >= TURN_HEIGHT or angle < LARGE - 1e-6:
+        assert shown is target
+    elif angle > LARGE + 1e-6:
+        assert shown.position == pytest.approx([0.3, -0.4, TURN_HEIGHT])
+        assert shown.quaternion is target.quaternion and target.position[2] == height
+
+
+@given(st.floats(-5, 5), st.floats(-5, 5), st.floats(1.0, 4.0), st.floats(0.0, 3.1))
+def test_the_distance_of_an_inverted_target_is_limited_during_a_large_rotation(x, y, z, angle):
+    target, now = pose(z, place=(x, y)), turned(rotations.from_rpy(angle, 0.0, 0.0), 1.0)
+    shown, way = Turning().target(now, target), target.position - now.position
+    if angle < np.pi / 2 - 1e-6 or np.linalg.norm(way) <= TURN_DISTANCE:
+        assert shown is target
+    elif angle > np.pi / 2 + 1e-6:
+        step = shown.position - now.position
+        assert np.linalg.norm(step) == pytest.approx(TURN_DISTANCE)
+        assert np.cross(step, way) == pytest.approx(np.zeros(3), abs=1e-9) and step @ way > 0
+
+
+@pytest.mark.parametrize('attitude, height, sinking, begin, caught', [
+    (FAR, 1.25, 0.0, 1.3, False),        # above its start, less the depth
+    (FAR, 1.15, 0.0, 1.3, True),
+    (FAR, 1.3, 0.5, 1.3, True),          # it will be
+    (FAR, 1.3, 0.3, 1.3, False),
+    (FAR, 1.3, 0.5, 1.1, False),         # it began lower
+    (FAR, 1.45, 0.1, 2.0, False),        # the target is lower than where it began
+    (FAR, 1.35, 0.5, 2.0, True),
+    (NEAR, 1.15, 0.5, 1.3, False),       # a small rotation
+], ids=str)
+def test_a_predicted_descent_below_start_and_target_raises_the_target(attitude, height, sinking,
+                                                                      begin, caught):
+    turning, target = Turning(), pose(1.5)
+    turning.target(turned(attitude, begin), target)
+    shown = turning.target(turned(attitude, height, sinking), target)
+    assert shown.position[:2] == pytest.approx([0.3, -0.4])
+    assert shown.position[2] == pytest.approx(1.5 + CLIMB if caught else 1.5)
+
+
+@pytest.mark.parametrize('broken', ['quaternion', 'height'])
+def test_for_a_state_that_is_not_finite_the_target_passes_unchanged(broken):
+    target, turning = pose(0.4), Turning()
+    bad = turned(np.full(4, np.nan)) if broken == 'quaternion' else turned(LEVEL, np.nan)
+    assert turning.target(bad, target) is target
+    assert turning.target(turned(FAR, 0.2), target).position[2] == TURN_HEIGHT + CLIMB
+
+
+@pytest.mark.parametrize('without, most, least', [('', 0.003, 0.0), ('trimming', 1.0, 0.03)])
+def test_an_unknown_payload_costs_height_unless_it_is_trimmed(tmp_path, without, most, least):
+    path = write_hover_policy(tmp_path / 'hover.onnx')
+    controller = PolicyController(ROBOT, replace(PolicyParameters.load(), policy=str(path),
+                                                 without=without))
+    goal = PoseTarget(np.array([0.0, 0.0, 1.0]), LEVEL)
+    plant, command = Plant(ROBOT, goal.position, goal.quaternion, np.zeros(4), 1.015), None
+    for _ in range(800):
+        command = controller.step(plant.state(command), goal)
+        plant.advance(command, 0.01)
+    assert least <= np.linalg.norm(plant.position - goal.position) < most
+
+
+def test_only_its_latest_commands_put_a_controller_in_charge():
+    charge, at = Charge(), state(0.0)
+    own = Command(0.0, np.full(4, 0.1), np.full(4, 7.0))
+    charge.gave([0.1] * 4 + [7.0] * 4)
+    assert charge.holds(replace(at, command=own)) and not charge.holds(at)
+    assert not charge.holds(replace(at, command=replace(own, thrust=np.full(4, 7.1))))
+    for k in range(10):
+        charge.gave([0.2] * 4 + [float(k)] * 4)
+    assert not charge.holds(replace(at, command=own))
 
 
 def test_layers_that_are_off_do_not_act_and_are_not_in_the_description():
-    keeper = TargetRecorder()
-    assert Guidance(GuidanceParameters(), AXES).text == 'unwinding, routing, turning, trimming'
-    off = Guidance(GuidanceParameters(without='trimming, routing'), AXES)
-    assert off.text == 'unwinding, turning'
-    rest(Guided(keeper, off), lambda given: given)
-    assert np.array_equal(keeper.shown[-1].position, [0.0, 0.0, 1.0])
-    bare = Guidance(GuidanceParameters(without='all'), AXES)
+    assert Guidance(ROBOT.tilt_axes).text == 'unwinding, routing, turning, trimming'
+    assert Guidance(ROBOT.tilt_axes, 'trimming, routing').text == 'unwinding, turning'
     low = PoseTarget(np.array([0.0, 0.0, 0.5]), rotations.exp(np.array([1.5, 0.0, 0.0])))
-    assert bare.text == 'none' and bare.target(state_at(0.0, (0, 0, 0.5), None), low) is low
+    bare = Guidance(ROBOT.tilt_axes, 'all')
+    assert bare.text == 'none' and bare.target(turned(LEVEL, 0.5), low) is low
+    shown = Guidance(ROBOT.tilt_axes).target(turned(LEVEL, 0.5), low)
+    assert shown.position[2] == TURN_HEIGHT
     with pytest.raises(ParameterError, match=r"'without'.*trimming or all, found 'trim'"):
-        GuidanceParameters(without='trim')
+        Guidance(ROBOT.tilt_axes, 'trim')

@@ -1,13 +1,15 @@
-"""The host of a controller: target in force, motors that stop, exceptions."""
+"""The interface of a controller, and its host: target in force, stopped motors, exceptions."""
 
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.control.base import Command, PoseTarget, State, TrajectoryTarget
-from beetle_omni_ros.control.host import ControllerHost
+from beetle_omni_ros.control.host import checked, ControllerHost
 from beetle_omni_ros.robot.allocation import ActuatorHealth
+from beetle_omni_ros.robot.schema import ParameterError
 
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 
@@ -89,13 +91,6 @@ def test_a_target_beyond_the_reach_is_dropped_at_the_takeover_only():
     assert host.on_mode('flying:own', 0.0) == '' and flown(host, 10.0) == 17.0
 
 
-def test_the_controller_gets_true_tilts():
-    host, health = ControllerHost('own', Own()), ActuatorHealth(zeros=(0.1, 0.0, 0.0, -0.2))
-    host.on_health(health)
-    flown(host, 0.0)
-    assert np.array_equal(host.controller.states[0].tilt, health.true(np.zeros(4)))
-
-
 @pytest.mark.parametrize('method', ['step', 'reset', 'set_health'])
 def test_an_exception_of_any_method_is_counted_and_reported(method):
     reported = []
@@ -114,3 +109,27 @@ def test_an_exception_of_any_method_is_counted_and_reported(method):
     assert host.errors == len(reported) == 2
     assert host.error == reported[0] and host.error.startswith(
         f"controller 'own': {method} raised ValueError: bad (test_host.py:")
+
+
+def test_the_return_value_of_step_is_checked():
+    good = Command(0.0, np.zeros(4), np.ones(4))
+    assert checked(good) is good
+    for wrong, message in ((None, 'returned NoneType'), ((0, 1), 'returned tuple'),
+                           (Command(0.0, [0] * 4, np.ones(4)), 'tilt is no array'),
+                           (Command(0.0, np.zeros(4), np.ones(3)), r'thrust is of shape \(3,\)')):
+        with pytest.raises(ParameterError, match=message):
+            checked(wrong)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_a_trajectory_at_one_time_is_a_sample_of_length_one(seed):
+    rng = np.random.default_rng(seed)
+    times = np.sort(rng.uniform(0, 10, 200))
+    turns = Rotation.from_euler('xyz', np.cumsum(0.2 * rng.normal(size=(200, 3)), axis=0))
+    path = TrajectoryTarget(times, rng.normal(size=(200, 3)),
+                            turns.as_quat() * rng.choice([-1, 1], 200)[:, None],
+                            rng.normal(size=(200, 3)), rng.normal(size=(200, 3)))
+    for moment in (-1.0, *times[[0, 1, 100, -2, -1]], 11.0, *rng.uniform(0, 10, 50)):
+        one, many = path.at(moment), path.sample(np.array([moment]))
+        for name in ('position', 'quaternion', 'velocity', 'angular_velocity'):
+            assert np.allclose(getattr(one, name), getattr(many, name)[0], atol=1e-12), name

@@ -7,15 +7,19 @@ from plant import fly, Plant
 import pytest
 
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
-from beetle_omni_ros.control.hover import HoverController, HoverParameters
+from beetle_omni_ros.control.hover import (
+    HoverController,
+    STOP_OVERLAP,
+    THRUST_RATE,
+    TILT_RATE_SHARE,
+)
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 ROBOT = RobotParameters.load()
-PARAMETERS = HoverParameters.load()
-PERIOD = PARAMETERS.period
-TILT_RATE = PARAMETERS.tilt_rate_share * ROBOT.joints.velocity_limit
+PERIOD = HoverController.period
+TILT_RATE = TILT_RATE_SHARE * ROBOT.joints.velocity_limit
 HOME, LEVEL = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 0.0, 1.0])
 
 
@@ -53,15 +57,6 @@ def test_recovers_from_one_metre_and_sixty_degrees(seed, mass_scale):
     assert np.ptp([step[2].thrust for step in log[-50:]], axis=0).max() < 0.3   # no limit cycle
 
 
-def test_approach_is_well_damped():
-    plant, in_force = start(np.array([0, 0, 0, 1.0]), HOME - [0.4, 0.0, 0.0])
-    log = fly(plant, HoverController(ROBOT), PoseTarget(HOME, np.array([0, 0, 0, 1.0])), 4.0,
-              in_force)
-    error = np.array([step[0] for step in log])
-    assert error[200:].max() < 0.04                         # overshoot below a tenth
-    assert error[-1] < 0.01
-
-
 def test_hovers_with_thrust_along_an_arm_where_one_rotor_is_unloaded():
     """With gravity along arm 1, rotors 1 and 3 have no thrust and no defined direction."""
     arm = ROBOT.tilt_axes[0]
@@ -81,12 +76,6 @@ def test_hovers_with_thrust_along_an_arm_where_one_rotor_is_unloaded():
     assert np.linalg.norm(plant.position - HOME) < 0.02
     assert rotations.geodesic_angle(attitude, plant.quaternion) < 0.03
     assert np.abs(np.diff(tilts, axis=0)).max() <= TILT_RATE * PERIOD + 1e-9
-
-
-def test_the_observer_removes_the_steady_error_of_a_wrong_mass():
-    plant, in_force = start(LEVEL, mass_scale=1.1)
-    log = fly(plant, HoverController(ROBOT), PoseTarget(HOME, LEVEL), 3.0, in_force)
-    assert log[-1][0] < 0.01
 
 
 @pytest.mark.parametrize('rotor', range(4))
@@ -109,7 +98,7 @@ def test_takes_over_without_a_jump_from_any_command_in_force():
         command = controller.step(plant.state(in_force), PoseTarget(HOME, unit(rng, 4)))
         assert np.abs(command.tilt - in_force.tilt).max() <= TILT_RATE * PERIOD + 1e-9
         assert np.abs(command.thrust - in_force.thrust).max() \
-            <= PARAMETERS.thrust_rate * PERIOD + 1e-9
+            <= THRUST_RATE * PERIOD + 1e-9
 
 
 def test_the_disturbance_estimate_converges_while_another_controller_is_active():
@@ -191,7 +180,7 @@ def test_a_joint_waits_at_its_stop_for_the_end_of_a_transient(seed):
 def test_a_joint_leaves_its_stop_if_the_weight_needs_the_other_side():
     on_its_side = rotations.from_rpy(np.pi / 2, 0.0, 0.0)
     steady = Allocator(ROBOT).hover(on_its_side, np.zeros(4))
-    assert 2 * np.pi - np.abs(steady.tilt).max() > STOP + PARAMETERS.stop_overlap
+    assert 2 * np.pi - np.abs(steady.tilt).max() > STOP + STOP_OVERLAP
     command = Command(0.0, np.copysign(STOP, -steady.tilt), steady.thrust)
     plant = Plant(ROBOT, HOME, on_its_side, command.tilt)
     hover = HoverController(ROBOT)

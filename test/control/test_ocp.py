@@ -1,6 +1,5 @@
 """Stage functions: derivatives against finite differences, the interval against fine steps."""
 
-from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -101,11 +100,3 @@ def test_one_interval_agrees_with_fine_integration_of_the_lagged_model():
     # lags are exact; the body sees them at three points of the interval only
     assert np.allclose(coarse[13:], fine[13:], atol=1e-4)
     assert np.allclose(coarse[:13], fine[:13], atol=0.02)
-
-
-def test_an_effect_of_the_robot_file_reaches_the_prediction():
-    x, u, d, reference = random_point(2, 21)
-    weaker = replace(ROBOT, effects={'thrust_coefficient': {'scale': 0.8}})
-    plain = ocp.build(ROBOT, SERVO_LAG, True).stage(x, u, d, reference, WEIGHTS, 0.1)[0]
-    changed = ocp.build(weaker, SERVO_LAG, True).stage(x, u, d, reference, WEIGHTS, 0.1)[0]
-    assert np.abs(np.array(plain) - np.array(changed)).max() > 1e-2

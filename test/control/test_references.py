@@ -4,7 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
+from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.control.references import (
     ReferencePlanner,
     THRUST,
@@ -106,21 +106,6 @@ def test_joints_with_half_a_turn_to_go_turn_with_the_body_in_spite_of_noise(axis
     assert abs(np.sign(first) @ passed) == 4
 
 
-def test_a_joint_that_follows_a_moving_reference_does_not_jump_at_half_a_turn():
-    """Rolling over while hovering carries joints through pi."""
-    time = np.linspace(0, 4, 201)
-    quaternions = np.array([rotations.from_rpy(angle, 0, 0) for angle in np.pi * time / 4])
-    zeros = np.zeros((len(time), 3))
-    rates = zeros.copy()
-    rates[:, 0] = np.pi / 4
-    target = TrajectoryTarget(time, zeros, quaternions, zeros, rates)
-    tilt, plan = np.zeros(4), planner()
-    for start in np.arange(0.1, 3.5, 0.05):
-        reference = plan.plan(target, start, LEVEL, tilt, np.zeros(10))
-        assert np.abs(np.diff(reference[:, TILT], axis=0)).max() < 2.0
-        tilt = reference[0, TILT]
-
-
 def test_commands_lead_a_moving_reference_so_that_the_lag_arrives_on_time():
     target = lemniscate.target(0.0)
     reference = planner().plan(target, 20.0, LEVEL, np.zeros(4), np.zeros(10))
@@ -130,25 +115,3 @@ def test_commands_lead_a_moving_reference_so_that_the_lag_arrives_on_time():
             command = reference[k, values] + reference[k, lead]
             reached = command + (reference[k, values] - command) * np.exp(-length / lag)
             assert np.allclose(reached, reference[k + 1, values], atol=1e-12)
-
-
-def test_a_trajectory_samples_its_own_derivatives():
-    target = lemniscate.target(3.0)
-    times, step = np.linspace(12, 80, 50), 1e-3
-    before, now, after = (target.sample(times + s) for s in (-step, 0, step))
-    assert np.allclose((after.position - before.position) / (2 * step), now.velocity, atol=6e-3)
-    for k in range(len(times)):
-        turn = rotations.log(rotations.multiply(rotations.conjugate(before.quaternion[k]),
-                                                after.quaternion[k])) / (2 * step)
-        assert np.allclose(turn, now.angular_velocity[k], atol=2e-2)
-        single = target.at(times[k])
-        assert np.allclose(single.position, now.position[k])
-        assert np.allclose(single.quaternion, now.quaternion[k])
-
-
-def test_outside_its_time_a_trajectory_rests_at_its_ends():
-    target = lemniscate.target(3.0)
-    for time, end in ((0.0, 0), (1e4, -1)):
-        sample = target.at(time)
-        assert np.array_equal(sample.position, target.positions[end])
-        assert not sample.velocity.any() and not sample.angular_velocity.any()

@@ -1,4 +1,4 @@
-"""Leaving a joint stop: the condition, the intermediate targets, and the end."""
+"""Leaving a joint stop, and detours around it: condition, intermediate targets, end."""
 
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
@@ -7,18 +7,25 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.control.base import PoseTarget, State
-from beetle_omni_ros.control.guidance.turns import tilts_at_end, turning_cost
-from beetle_omni_ros.control.guidance.unwinding import (
+from beetle_omni_ros.control.unwinding import (
+    ATTEMPTS,
+    DURATION,
+    HEIGHT,
     level_between,
     levelled,
+    MISSED_ANGLE,
+    NEAR,
+    PATIENCE,
+    ROUTED,
+    Routing,
+    spread_attitudes,
+    tilts_along,
+    turned,
     Unwinding,
-    UnwindingParameters,
 )
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
 
-PARAMETERS = UnwindingParameters()
 ROBOT = RobotParameters.load()
 AXES = ROBOT.tilt_axes
 TARGET = PoseTarget(np.array([0.0, 0.0, 1.0]), rotations.from_rpy(1.2, 0.4, -2.0))
@@ -37,6 +44,11 @@ def fly(unwinding, seconds, begin=0.0, target=TARGET, **changed):
     """Targets of the guidance over a time, every 10 ms."""
     return [unwinding.target(stuck(begin + 0.01 * k, **changed), target)
             for k in range(round(seconds * 100))]
+
+
+def tilts_at_end(start, end):
+    """Tilts (n, 4) after the shortest turns from level attitudes with tilts of zero."""
+    return tilts_along(turned(start, end)[1], AXES)[:, -1]
 
 
 quaternions = st.tuples(*[st.floats(-1, 1)] * 4).filter(
@@ -62,16 +74,6 @@ def uses(start, end):
     return np.min(np.hypot(*np.moveaxis(arms, -1, 0)[:2]), axis=0)
 
 
-@settings(max_examples=30, deadline=None)
-@given(quaternions, quaternions)
-def test_the_cost_of_a_rotation_is_its_angle_weighted_by_arm_capacity(start, end):
-    angle = rotations.geodesic_angle(start, end)
-    weighted = angle * np.mean(np.maximum(uses(start, end), 0.2) ** -2)
-    cost = turning_cost(Rotation.from_quat(start), Rotation.from_quat(end), AXES)
-    assert cost.shape == (1,) and cost[0] >= angle - 1e-6
-    assert cost[0] == pytest.approx(weighted, rel=0.35)    # 16 points of a sharp peak
-
-
 @settings(max_examples=50, deadline=None)
 @given(st.floats(0.05, 0.5), st.floats(-np.pi, np.pi), st.floats(-np.pi, np.pi))
 def test_the_route_to_an_inverted_attitude_has_no_vertical_arm(off, direction, yaw):
@@ -92,23 +94,9 @@ def upward(attitude, tilts):
 @settings(max_examples=50, deadline=None)
 @given(quaternions, st.floats(-np.pi, np.pi))
 def test_after_a_rotation_each_thrust_points_upward_as_far_as_its_arm_permits(end, yaw):
-    tilts = tilts_at_end(Rotation.from_euler('z', yaw), Rotation.from_quat(end), AXES)[0]
+    tilts = tilts_at_end(Rotation.from_euler('z', yaw), Rotation.from_quat(end))[0]
     across = [np.linalg.norm(np.cross(rotations.matrix(end) @ axis, [0, 0, 1])) for axis in AXES]
     assert upward(end, tilts) == pytest.approx(across, abs=1e-6)
-
-
-@settings(max_examples=20, deadline=None)
-@given(quaternions, st.floats(-np.pi, np.pi))
-def test_predicted_final_tilts_equal_those_of_a_slow_rotation(end, yaw):
-    start = rotations.from_rpy(0.0, 0.0, yaw)
-    turn = rotations.log(rotations.multiply(rotations.conjugate(start), end))
-    assume(np.linalg.norm(turn) < 3.1 and min(uses(start, end)) > 0.4)  # else there are two ways
-    tilts, steps = np.zeros(4), np.linspace(-0.5, 0.5, 101)[:, None]
-    for part in np.linspace(0, 1, 50):
-        attitude = rotations.multiply(start, rotations.exp(part * turn))
-        tilts = tilts + steps[upward(attitude, tilts + steps).argmax(axis=0), 0]
-    found = tilts_at_end(Rotation.from_quat(start), Rotation.from_quat(end), AXES)[0]
-    assert found == pytest.approx(tilts, abs=0.1)
 
 
 @settings(max_examples=50, deadline=None)
@@ -119,31 +107,18 @@ def test_after_a_failed_attempt_another_winding_is_chosen(roll, pitch, yaw):
     failed = []
     for _ in range(2):
         level = level_between(target, target, AXES, failed)
-        tilts = tilts_at_end(Rotation.from_quat(level), Rotation.from_quat(target), AXES)[0]
+        tilts = tilts_at_end(Rotation.from_quat(level), Rotation.from_quat(target))[0]
         assert all(np.abs(tilts - other).max() > np.pi for other in failed)
         failed.append(tilts)
 
 
-def test_if_all_routes_wind_alike_the_best_is_repeated():
-    target, other = rotations.from_rpy(0.4, 0.2, 1.0), rotations.from_rpy(0.2, 0.4, 1.0)
-    best = level_between(other, target, AXES)
-    assert level_between(other, target, AXES, [np.zeros(4)]) == pytest.approx(best)
-
-
-@pytest.mark.parametrize('tilt', [WOUND, np.full(4, 3.9), np.full(4, -3.9)])
-def test_a_level_hover_needs_all_joints_at_zero_however_they_were_wound(tilt):
-    wanted = Allocator(ROBOT).hover(np.array([0.0, 0.0, 0.3, np.sqrt(0.91)]), tilt).tilt
-    assert np.abs(wanted).max() < 0.05
-    assert 2 * np.pi - 0.05 > ROBOT.joints.position_limit
-
-
 def test_a_robot_stuck_at_a_joint_stop_gets_a_level_target_above_its_place_after_the_timeout():
-    unwinding = Unwinding(PARAMETERS, AXES)
+    unwinding = Unwinding(AXES)
     shown = fly(unwinding, 1.0)
     first = next(k for k, t in enumerate(shown) if t is not TARGET)
-    assert 0.01 * first == pytest.approx(PARAMETERS.patience, abs=0.011)
+    assert 0.01 * first == pytest.approx(PATIENCE, abs=0.011)
     assert all(t is shown[-1] for t in shown[first:])
-    assert shown[-1].position == pytest.approx([0.0, 0.0, PARAMETERS.height])
+    assert shown[-1].position == pytest.approx([0.0, 0.0, HEIGHT])
     assert rotations.matrix(shown[-1].quaternion)[2, 2] == pytest.approx(1.0)
     assert unwinding.attempts == 1
 
@@ -152,26 +127,15 @@ def test_a_robot_stuck_at_a_joint_stop_gets_a_level_target_above_its_place_after
     {'tilt': np.array([1.5, 2.3, -1.5, -2.3])}, {'quaternion': TARGET.quaternion},
     {'tilt': np.full(4, np.nan)}, {'quaternion': np.full(4, np.nan)}])
 def test_without_a_stuck_joint_the_target_passes_unchanged(changed):
-    assert all(t is TARGET for t in fly(Unwinding(PARAMETERS, AXES), 3.0, **changed))
+    assert all(t is TARGET for t in fly(Unwinding(AXES), 3.0, **changed))
 
 
 @pytest.mark.parametrize('rate, goes_through_level', [(1.0, False), (0.05, True)])
 def test_while_the_error_falls_the_target_passes_unchanged(rate, goes_through_level):
-    unwinding = Unwinding(PARAMETERS, AXES)
+    unwinding = Unwinding(AXES)
     shown = []
     for k in range(200):
         angle = 1.5 * np.exp(-rate * 0.01 * k)
-        attitude = rotations.multiply(TARGET.quaternion, rotations.exp(np.array([0, angle, 0])))
-        shown.append(unwinding.target(stuck(0.01 * k, quaternion=attitude), TARGET))
-    assert any(t is not TARGET for t in shown) == goes_through_level
-
-
-@pytest.mark.parametrize('seconds_to_half, goes_through_level', [(1.3, True), (0.5, False)])
-def test_an_error_that_falls_too_slowly_counts_as_missed(seconds_to_half, goes_through_level):
-    unwinding = Unwinding(PARAMETERS, AXES)
-    shown = []
-    for k in range(150):
-        angle = 0.33 * 0.5 ** (0.01 * k / seconds_to_half)
         attitude = rotations.multiply(TARGET.quaternion, rotations.exp(np.array([0, angle, 0])))
         shown.append(unwinding.target(stuck(0.01 * k, quaternion=attitude), TARGET))
     assert any(t is not TARGET for t in shown) == goes_through_level
@@ -181,30 +145,18 @@ def test_an_error_that_falls_too_slowly_counts_as_missed(seconds_to_half, goes_t
     (0.8, 1.4, True), (0.3, 0.95, False), (0.4, 1.4, False)])
 def test_oscillation_about_the_limit_counts_as_missed_and_arrival_does_not(low, high,
                                                                           goes_through_level):
-    unwinding = Unwinding(PARAMETERS, AXES)
+    unwinding = Unwinding(AXES)
     shown = []
     for k in range(300):
         part = low + (high - low) * (0.5 + 0.5 * np.sin(2 * np.pi * 0.01 * k))
         attitude = rotations.multiply(TARGET.quaternion, rotations.exp(
-            np.array([0, part * PARAMETERS.angle, 0])))
+            np.array([0, part * MISSED_ANGLE, 0])))
         shown.append(unwinding.target(stuck(0.01 * k, quaternion=attitude), TARGET))
     assert any(t is not TARGET for t in shown) == goes_through_level
 
 
-def test_a_position_error_counts_as_an_attitude_error_does():
-    shown = fly(Unwinding(PARAMETERS, AXES), 1.0, quaternion=TARGET.quaternion,
-                position=TARGET.position + [0.0, 0.1, 0.0])
-    assert shown[-1] is not TARGET
-
-
-def test_a_position_that_is_high_enough_is_kept():
-    target = PoseTarget(np.array([0.5, 0.0, 1.7]), TARGET.quaternion)
-    shown = fly(Unwinding(PARAMETERS, AXES), 1.0, target=target, position=target.position)
-    assert shown[-1] is not target and np.array_equal(shown[-1].position, target.position)
-
-
 def test_the_target_returns_once_the_joints_are_unwound():
-    unwinding = Unwinding(PARAMETERS, AXES)
+    unwinding = Unwinding(AXES)
     level = fly(unwinding, 1.0)[-1]
     assert fly(unwinding, 0.1, 1.0, quaternion=level.quaternion)[-1] is level    # still wound
     assert fly(unwinding, 0.1, 1.1, quaternion=level.quaternion,
@@ -216,7 +168,7 @@ UPSIDE_DOWN = PoseTarget(np.array([0.0, 0.0, 1.5]), rotations.from_rpy(2.98, 0.0
 
 def missed(target, seconds=1.0):
     """An unwinding at the start of its route through level, the attitude, and its target."""
-    unwinding = Unwinding(PARAMETERS, AXES)
+    unwinding = Unwinding(AXES)
     off = rotations.multiply(target.quaternion, rotations.exp(np.array([0.0, 0.3, 0.0])))
     return unwinding, fly(unwinding, seconds, target=target, position=target.position,
                           quaternion=off)[-1]
@@ -234,41 +186,129 @@ def test_a_long_return_rotation_passes_an_attitude_halfway():
     assert fly(unwinding, 0.1, 1.2, quaternion=near, **there)[-1] is UPSIDE_DOWN
 
 
-def test_the_target_returns_if_the_halfway_attitude_is_not_reached():
-    unwinding, level = missed(UPSIDE_DOWN)
-    shown = fly(unwinding, 3.0, 1.0, UPSIDE_DOWN, position=UPSIDE_DOWN.position,
-                quaternion=level.quaternion, tilt=np.full(4, 0.5))
-    away = sum(t is not UPSIDE_DOWN for t in shown) * 0.01
-    assert away == pytest.approx(PARAMETERS.duration, abs=0.05)
-    assert shown[-1] is UPSIDE_DOWN
-
-
 def test_the_number_of_attempts_is_limited_and_the_target_returns():
-    unwinding = Unwinding(PARAMETERS, AXES)
+    unwinding = Unwinding(AXES)
     shown = fly(unwinding, 30.0)
     away = sum(t is not TARGET for t in shown) * 0.01
-    assert unwinding.attempts == PARAMETERS.attempts
-    assert away == pytest.approx(PARAMETERS.attempts * PARAMETERS.duration, abs=0.1)
+    assert unwinding.attempts == ATTEMPTS
+    assert away == pytest.approx(ATTEMPTS * DURATION, abs=0.1)
     assert shown[-1] is TARGET
 
 
 def test_a_new_target_is_followed_at_once_and_resets_the_attempts():
-    unwinding = Unwinding(PARAMETERS, AXES)
+    unwinding = Unwinding(AXES)
     fly(unwinding, 30.0)
     other = PoseTarget(TARGET.position + [0, 0, 0.2], TARGET.quaternion, 30.0)
     shown = fly(unwinding, 5.0, 30.0, other)
-    assert shown[0] is other and unwinding.attempts > PARAMETERS.attempts
-    unwinding = Unwinding(PARAMETERS, AXES)
+    assert shown[0] is other and unwinding.attempts > ATTEMPTS
+    unwinding = Unwinding(AXES)
     assert fly(unwinding, 1.0)[-1] is not TARGET     # on its route through level
     assert fly(unwinding, 0.1, 1.0, other)[0] is other
 
 
-def test_a_repeated_pose_does_not_reset_the_attempts():
-    unwinding = Unwinding(PARAMETERS, AXES)
-    shown = [unwinding.target(stuck(0.01 * k), PoseTarget(
-        TARGET.position.copy(), TARGET.quaternion.copy(), 0.01 * k)) for k in range(100)]
-    assert rotations.matrix(shown[-1].quaternion)[2, 2] == pytest.approx(1.0)
+STEPS = np.linspace(-0.5, 0.5, 101)[:, None]
+PLACE = np.array([0.5, -0.5, 1.5])
+# Inverted with two joints wound by half a turn; the target would wind them further.
+START, TILT = rotations.from_rpy(np.pi - 0.2, 0.3, 0.0), np.array([-3.0, -2.9, 3.0, 2.9])
+def winding(attitudes, tilt):
+    """
+    Largest tilts in a slow rotation through attitudes, and the least usable part of a thrust.
+
+    In each step each joint turns by at most half a radian to the most upward thrust direction.
+    """
+    largest, least = np.abs(tilt).max(), 1.0
+    for before, after in zip(attitudes, attitudes[1:]):
+        turn = rotations.log(rotations.multiply(rotations.conjugate(before), after))
+        count = max(2, round(np.linalg.norm(turn) / 0.05))
+        for part in np.arange(1, count + 1) / count:
+            attitude = rotations.multiply(before, rotations.exp(part * turn))
+            tried = tilt + STEPS
+            tilted = Rotation.from_rotvec((AXES * tried[..., None]).reshape(-1, 3))
+            up = (tilted.apply([0, 0, 1]) @ rotations.matrix(attitude)[2]).reshape(tried.shape)
+            tilt = tilt + STEPS[up.argmax(axis=0), 0]
+            largest, least = max(largest, np.abs(tilt).max()), min(least, up.max(axis=0).min())
+    return largest, least
 
 
-def test_without_attempts_targets_pass_unchanged():
-    assert all(t is TARGET for t in fly(Unwinding(UnwindingParameters(attempts=0), AXES), 5.0))
+def hovering(attitude):
+    """Tilts that keep the thrusts upward, each within half a turn."""
+    up = rotations.matrix(attitude)[2]
+    return np.arctan2(np.cross(AXES, [0, 0, 1]) @ up, up[2])
+
+
+@settings(max_examples=60, deadline=None)
+@given(quaternions, quaternions, st.integers(0, 4))
+def test_a_detour_is_taken_where_the_shortest_rotation_exceeds_the_travel(start, end,
+                                                                        wound):
+    tilt = hovering(start)
+    if wound < 4:      # a joint and the opposite one, where a whole turn fits into the travel
+        for joint in (wound, (wound + 2) % 4):
+            other = tilt[joint] - 2 * np.pi * np.sign(tilt[joint])
+            tilt[joint] = other if abs(other) < 3.9 else tilt[joint]
+    assume(np.allclose(tilt[:2], -tilt[2:], atol=1e-6))     # otherwise no route unwinds them
+    angle = rotations.geodesic_angle(start, end)
+    direct, use = winding([start, end], tilt)
+    assume(angle < 3.0 and use > 0.35)      # otherwise the direction of the joints is arbitrary
+    found = Routing(AXES).between(start, end, tilt)
+    if found is None:
+        assert direct < ROUTED + 1.5        # no route is better by much
+        return
+    assert direct > ROUTED - 0.15
+    by_way, use = winding([start, found, end], tilt)
+    longer = rotations.geodesic_angle(start, found) + rotations.geodesic_angle(found, end) - angle
+    assert -1e-9 < longer < 2 * np.pi
+    assume(use > 0.35)
+    assert by_way < direct and longer < 5.0 * (direct - by_way) + 1.0
+
+
+def inverted(attitude, **changed):
+    return PoseTarget(**{'position': PLACE, 'quaternion': attitude, **changed})
+
+
+def beyond():
+    """An attitude for which the joints at START would be wound further by more than a radian."""
+    for end in spread_attitudes(200):
+        largest, use = winding([START, end], TILT)
+        if 1.5 < rotations.geodesic_angle(START, end) < 2.5 and largest > 4.5 and use > 0.4:
+            return end
+    raise AssertionError('no such attitude')
+
+
+END = beyond()
+
+
+def wound_state(stamp=0.0, quaternion=START, tilt=TILT):
+    return State(stamp, PLACE, np.zeros(3), quaternion, np.zeros(3), tilt, np.zeros(4), stamp)
+
+
+def test_wound_joints_return_within_their_travel_on_the_chosen_route():
+    given = inverted(END)
+    shown = Routing(AXES).target(wound_state(), given)
+    assert shown is not given and shown.position is given.position
+    assert winding([START, END], TILT)[0] > 4.5
+    assert winding([START, shown.quaternion, END], TILT)[0] < 3.9
+
+
+def test_the_target_is_passed_on_near_the_intermediate_attitude():
+    routing, given = Routing(AXES), inverted(END)
+    between = routing.target(wound_state(), given).quaternion
+    for off, passed in ((NEAR + 0.05, False), (NEAR - 0.05, True)):
+        near = rotations.multiply(between, rotations.exp(np.array([0.0, off, 0.0])))
+        assert (routing.target(wound_state(0.1, near), given) is given) == passed
+    assert routing.target(wound_state(0.2), given) is given       # and does not come back
+    assert routing.routed == 1
+
+
+def test_a_route_is_searched_once_for_each_attitude_and_again_after_reset():
+    routing = Routing(AXES)
+    assert routing.target(wound_state(), inverted(END)).quaternion is not END
+    routing.target(wound_state(5.0), inverted(END))
+    little = rotations.multiply(END, rotations.exp(np.array([0.1, 0.0, 0.0])))
+    for same in (inverted(END), inverted(END, position=PLACE + 1), inverted(little)):
+        assert routing.target(wound_state(5.0), same) is same
+    assert routing.target(wound_state(6.0), inverted(START)).quaternion is START    # no turn
+    assert routing.target(wound_state(7.0), inverted(END)).quaternion is not END
+    assert routing.routed == 2
+    routing.reset()
+    assert routing.routed == 0
+    assert routing.target(wound_state(8.0), inverted(END)).quaternion is not END

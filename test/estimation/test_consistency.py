@@ -72,15 +72,6 @@ def test_covariance_does_not_depend_on_when_it_is_read():
     assert all(np.array_equal(early, late.covariance) for early, late in pairs)
 
 
-def test_after_reset_the_filter_equals_a_new_one():
-    flight = fly(7, 1.5)
-    ekf = run(ErrorStateEkf(EkfParameters.load(), GRAVITY), fly(8, 2.0))
-    ekf.reset()
-    assert ekf.status == 'uninitialised' and ekf.estimate is None and not ekf.rejected
-    fresh = run(ErrorStateEkf(EkfParameters.load(), GRAVITY), flight).estimate
-    assert np.array_equal(run(ekf, flight).estimate.covariance, fresh.covariance)
-
-
 def test_absolute_ros_time_does_not_change_the_estimate():
     """At 1.8e9 s a double resolves 0.2 us, which must not change the estimate."""
     flight, late = fly(9, 2.0), fly(9, 2.0)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from beetle_omni_ros.estimation.samples import Estimate, pose_covariance, twist_covariance
+from beetle_omni_ros.estimation.state import Estimate, pose_covariance, twist_covariance
 
 DRAWS, GYROSCOPE_NOISE = 200_000, 2e-3
 

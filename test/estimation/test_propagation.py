@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from beetle_omni_ros.estimation.propagation import identity, Node, propagate, transition
+from beetle_omni_ros.estimation.state import Node, propagate, STATES, transition
 from beetle_omni_ros.robot import rotations
 
 
@@ -44,7 +44,7 @@ def test_transition_matches_finite_differences(seed):
     reading = (node.stamp + dt, node.force + rng.standard_normal(3),
                node.rate + 0.1 * rng.standard_normal(3), GRAVITY)
     after = propagate(node, *reading)
-    exact = transition(node, after, identity())[:15, :15]
+    exact = transition(node, after, np.eye(STATES))[:15, :15]
     numeric = np.stack([
         (difference(propagate(moved(node, step * axis), *reading), after)
          - difference(propagate(moved(node, -step * axis), *reading), after)) / (2 * step)

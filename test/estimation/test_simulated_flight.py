@@ -100,13 +100,3 @@ def test_sensor_effects_of_the_robot_file_improve_the_estimate(name):
 
     uninformed, informed = error(None), error(true)
     assert informed < uninformed / better, f'{informed:.2f} against {uninformed:.2f}'
-
-
-@pytest.mark.parametrize('name, bias, found', [
-    ('imu_accelerometer_bias', (0.4, -0.3, 0.3), 'accelerometer_bias'),
-    ('imu_gyroscope_bias', (0.08, -0.06, 0.05), 'gyroscope_bias')])
-def test_a_bias_of_the_robot_file_is_the_initial_estimate(name, bias, found):
-    true = replace(RobotParameters.load(), effects={name: {'bias': bias}})
-    left = [np.linalg.norm(getattr(flown(true, nominal, 2.0)[1], found)) / np.linalg.norm(bias)
-            for nominal in (None, true)]
-    assert left[0] == pytest.approx(1.0, abs=0.1) and left[1] < 0.1

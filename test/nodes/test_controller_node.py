@@ -131,8 +131,8 @@ def test_the_newest_target_is_used_an_unset_stamp_means_now_and_a_landing_resets
 
 @pytest.mark.parametrize(('given', 'name', 'values'), [
     ((f'controller:={OWN}',), 'pose_controller', {'controller': OWN}),
-    (('controller:=rl_memory', 'unwinding.attempts:=0'), 'rl_memory',
-     {'policy': registry.find('rl_memory').policy_file, 'unwinding.attempts': 0})])
+    (('controller:=rl_memory', 'without:=all'), 'rl_memory',
+     {'policy': registry.find('rl_memory').policy_file, 'without': 'all'})])
 def test_a_parameter_selects_the_controller_of_a_node_with_its_parameters(make, given, name,
                                                                           values):
     node = make(ControllerNode, *given)

@@ -10,9 +10,7 @@ import pytest
 import torch
 
 import beetle_omni_ros
-from beetle_omni_ros.control import policy_checksum
-from beetle_omni_ros.control.policy_file import PolicyContract
-from beetle_omni_ros.control.policy_network import PolicyNetwork
+from beetle_omni_ros.control.policy_file import PolicyContract, PolicyNetwork, verify
 from beetle_omni_ros.robot.schema import RunError
 from beetle_omni_ros.train import export
 from beetle_omni_ros.train.export import export_policy
@@ -73,7 +71,7 @@ def test_the_file_is_complete_and_accepted_on_board(tmp_path, memory):
     export_policy(network, path, ROBOT, parameters, {'seconds': 12.5}, metrics)
     entries = {entry.key: entry.value for entry in onnx.load(path).metadata_props}
     assert set(entries) == {*PolicyContract.default(ROBOT).to_metadata(), 'checksum'}
-    assert policy_checksum.verify(path.read_bytes())
+    verify(path.read_bytes())
     contract = PolicyContract.from_metadata(entries)
     assert contract.check(ROBOT) == ''
     assert contract.memory == memory and contract.observation_size == (39 if memory else 33)

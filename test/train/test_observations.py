@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 import torch
 
 from beetle_omni_ros.control.base import PoseTarget, Reference, State
-from beetle_omni_ros.control.guidance.trimming import Trimming, TrimmingParameters
-from beetle_omni_ros.control.observation import observation
+from beetle_omni_ros.control.guidance import Trimming
+from beetle_omni_ros.control.policy import disturbed, observed
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.train import batch
 from beetle_omni_ros.train.observations import delayed, extrapolated, Signals
@@ -45,7 +45,8 @@ def on_board(env, k):
     zero = np.zeros(3)
     target = Reference(s['target_position'], s['target_attitude'], zero, zero)
     action = (s['previous'] - env.offset.double().numpy()) / env.scale.double().numpy()
-    return observation(state, target, action, s['estimate'] if env.cfg.memory else None)
+    return np.array(observed(state, target, action)
+                    + (disturbed(state, s['estimate']) if env.cfg.memory else []))
 
 
 @pytest.mark.parametrize('memory', [False, True])
@@ -216,7 +217,7 @@ def test_the_trimming_of_the_batch_is_that_of_the_controller():
         x = s['x'][k].double().numpy()
         given = PoseTarget(s['target_position'][k].double().numpy(),
                            s['target_attitude'][k].double().numpy(), 0.0)
-        trimming = Trimming(TrimmingParameters())
+        trimming = Trimming()
         for step in range(steps + 1):
             trimming.target(State(0.01 * step, x[:3], x[model.VELOCITY], x[model.QUATERNION],
                                   x[model.RATE], x[model.TILT], x[model.TILT_RATE], 0.0), given)

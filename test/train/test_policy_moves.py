@@ -10,7 +10,7 @@ pytest.importorskip('onnx')
 pytest.importorskip('torch')
 
 from beetle_omni_ros.control.policy import PolicyParameters
-from beetle_omni_ros.control.policy_network import find, PolicyNetwork
+from beetle_omni_ros.control.policy_file import find, PolicyNetwork
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 FILE = Path(__file__).resolve().parents[2] / 'benchmarks' / 'policy_moves.py'

@@ -9,7 +9,7 @@ import sys
 from learning import ROBOT, small
 import pytest
 
-from beetle_omni_ros.control.policy_network import PolicyNetwork
+from beetle_omni_ros.control.policy_file import PolicyNetwork
 from beetle_omni_ros.train import command
 from beetle_omni_ros.train.run_folder import read_parameters
 from beetle_omni_ros.train.runner import is_rank_zero, Runner

@@ -14,7 +14,7 @@ import torch
 from beetle_omni_ros import cli
 from beetle_omni_ros.control.base import PoseTarget, State
 from beetle_omni_ros.control.policy import PolicyController, PolicyParameters
-from beetle_omni_ros.control.policy_network import PolicyNetwork
+from beetle_omni_ros.control.policy_file import PolicyNetwork
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import flatten, ParameterError
 from beetle_omni_ros.train import command

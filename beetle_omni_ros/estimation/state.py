@@ -1,5 +1,5 @@
 """
-Strapdown propagation between two IMU samples, and its exact linearisation.
+State of the filter, its propagation between two IMU samples, and the output.
 
 The measured signals are linear between two samples. The attitude uses the mean rate and the first
 commutator (Magnus) term, so that coning motion does not drift. Velocity and position use the
@@ -7,21 +7,25 @@ trapezoidal rule in world, which needs no midpoint. The navigated point is the I
 accelerometer then needs no correction by the angular acceleration, which is not measured.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Optional
+from functools import cached_property
 
 import numpy as np
 
-from beetle_omni_ros.estimation.samples import (
-    ATTITUDE,
-    ERROR_STATES,
-    GYROSCOPE_BIAS,
-    POSITION,
-    VELOCITY,
-)
 from beetle_omni_ros.robot import rotations
 
-# The offset between the sensors' clocks follows the 15 error states of the estimate.
+# The 15 error states: position and velocity in world, attitude as rotation vector in base_link
+# (R_true = R exp(theta)), accelerometer and gyroscope bias. The offset between the sensors' clocks
+# follows them.
+POSITION = slice(0, 3)
+VELOCITY = slice(3, 6)
+ATTITUDE = slice(6, 9)
+ACCELEROMETER_BIAS = slice(9, 12)
+GYROSCOPE_BIAS = slice(12, 15)
+ERROR_STATES = 15
 TIME_OFFSET = ERROR_STATES
 STATES = ERROR_STATES + 1
 ACCELERATING = slice(ATTITUDE.start, GYROSCOPE_BIAS.stop)  # errors that change the acceleration
@@ -66,9 +70,9 @@ class Node:
     time_offset: float
     after_impact: bool = False
     covariance: np.ndarray = field(default_factory=lambda: UNKNOWN)
-    before: Optional['Node'] = None
+    before: Node | None = None
 
-    def pending(self) -> list[tuple['Node', 'Node']]:
+    def pending(self) -> list[tuple[Node, Node]]:
         """Steps (before, after) from the last node with a known covariance to this node."""
         steps, after = [], self
         while after.before is not None:
@@ -152,6 +156,65 @@ def transition(before: Node, after: Node, out: np.ndarray) -> np.ndarray:
     return out
 
 
-def identity() -> np.ndarray:
-    """Make a buffer for :func:`transition`."""
-    return np.eye(STATES)
+@dataclass(frozen=True)
+class Estimate:
+    """
+    State of base_link at the newest IMU sample.
+
+    Attributes:
+        stamp: time of that sample [s].
+        position: (3,) in world [m].
+        velocity: (3,) in world [m/s].
+        quaternion: (4,) body to world (x, y, z, w), unit.
+        angular_velocity: (3,) in base_link, bias removed [rad/s].
+        accelerometer_bias: (3,) in base_link axes [m/s^2].
+        gyroscope_bias: (3,) in base_link axes [rad/s].
+        covariance: (15, 15) of the error, in the order of this module's slices; computed on first
+            access.
+
+    """
+
+    stamp: float
+    position: np.ndarray
+    velocity: np.ndarray
+    quaternion: np.ndarray
+    angular_velocity: np.ndarray
+    accelerometer_bias: np.ndarray
+    gyroscope_bias: np.ndarray
+    compute_covariance: Callable[[], np.ndarray] = field(repr=False)
+
+    @cached_property
+    def covariance(self) -> np.ndarray:
+        """See the class."""
+        return self.compute_covariance()
+
+
+def pose_covariance(estimate: Estimate) -> np.ndarray:
+    """
+    Covariance (6, 6) of position [m] and rotation about world axes [rad].
+
+    The filter's rotation error is about body axes, that of nav_msgs/Odometry about world axes.
+    """
+    jacobian = np.zeros((6, ERROR_STATES))
+    jacobian[:3, POSITION] = np.eye(3)
+    jacobian[3:, ATTITUDE] = rotations.matrix(estimate.quaternion)
+    return jacobian @ estimate.covariance @ jacobian.T
+
+
+def twist_covariance(estimate: Estimate, gyroscope_noise: float) -> np.ndarray:
+    """
+    Covariance (6, 6) of linear [m/s] and angular [rad/s] velocity in base_link.
+
+    Args:
+        estimate: output of the filter.
+        gyroscope_noise: standard deviation of one angular-rate sample, each axis [rad/s].
+
+    """
+    to_body = rotations.matrix(estimate.quaternion).T
+    jacobian = np.zeros((6, ERROR_STATES))
+    jacobian[:3, VELOCITY] = to_body
+    jacobian[:3, ATTITUDE] = rotations.skew(to_body @ estimate.velocity)
+    jacobian[3:, GYROSCOPE_BIAS] = -np.eye(3)
+    covariance = jacobian @ estimate.covariance @ jacobian.T
+    covariance[3:, 3:] += gyroscope_noise ** 2 * np.eye(3)
+    return covariance

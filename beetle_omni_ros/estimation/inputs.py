@@ -1,14 +1,35 @@
-"""Checks of the filter's inputs: finite, plausible, new and in time."""
+"""Checks of the filter's inputs (finite, plausible, new, in time), and the MoCap's noise."""
 
-from collections import Counter
+from collections import Counter, deque
 from math import inf, isfinite, sqrt
 
 import numpy as np
 
-from beetle_omni_ros.estimation.parameters import EkfParameters
+from beetle_omni_ros.estimation.parameters import EkfParameters, MocapParameters
+from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.readings import SpikeFilter
 
 Checked = tuple[float, np.ndarray, np.ndarray]   # stamp and two vectors of a sample
+GAP = 0.1           # [s] longest bridged time between two IMU samples
+RESYNC = 20         # refused consistent stamps in a row after which the clock itself has jumped
+# Samples equal to the last digit while the other sensor moves come from a frozen driver; noise
+# never repeats exactly.
+FROZEN_READINGS, FROZEN_POSES = 10, 5
+# [m/s^2] change of the specific force between two samples that is an impact of unknown impulse
+IMPACT = 30.0
+# [rad/s] a larger change of the rate in one reading is a fault; full thrust turns the body by 0.5
+SPIKE = 3.0
+PLACES = 100.0      # [m] largest coordinate of a pose
+UNIT = 0.01         # largest deviation of a quaternion's norm from 1
+
+POSES = 4           # a third difference needs four
+GAIN = 20.0         # variance of the third difference of white noise: 1 + 9 + 9 + 1
+MEDIAN = 2.366      # of the chi-square distribution with 3 degrees of freedom
+WINDOW = 200        # differences in a median
+MIN_COUNT = 20      # differences before the first result
+SIGNIFICANT = 2.0   # excess of variance that is unlikely by chance
+EVEN = 0.1          # largest relative difference of equal intervals
+LARGEST_SCALE = 20.0    # of the measured noise to that of the parameters
 
 
 class InputGuard:
@@ -25,16 +46,14 @@ class InputGuard:
     def __init__(self, parameters: EkfParameters):
         self._imu, self._mocap = parameters.imu, parameters.mocap
         self.rejected: Counter = Counter()
-        self.clock_jumped = False
-        self.after_impact = False
-        self._out_of_range = False
+        self.clock_jumped = self.after_impact = self._out_of_range = False
         self._last_reading: float | None = None
         self._last_pose = -inf
         self._pose_values: tuple[float, ...] | None = None
         self._reading_values: tuple[float, ...] | None = None
         self._same_pose = self._same_reading = 0
         self._pose_moved = self._moved = False
-        self._spikes = SpikeFilter(self._imu.impact_change, self._imu.spike_change)
+        self._spikes = SpikeFilter(IMPACT, SPIKE)
         self._refused: list[float] = []  # consecutive refused stamps at regular distances
 
     def reading(self, sample) -> Checked | None:
@@ -58,14 +77,19 @@ class InputGuard:
         self.clock_jumped = False
         if self._last_reading is not None:
             step = stamp - self._last_reading
-            if not 0 < step <= self._imu.gap_limit:
+            if not 0 < step <= GAP:
                 if not self._starts_time_line(stamp):
                     return self._refuse('duplicate' if step == 0 else
                                         'backwards' if step < 0 else 'forward_gap')
                 self.clock_jumped = True
                 self._last_pose = -inf
                 self._spikes.reset()
-        if self._reading_frozen(values):
+        same = values == self._reading_values
+        self._moved |= self._reading_values is not None and not same
+        self._reading_values = values
+        self._same_reading = self._same_reading + 1 if same else 0
+        self._pose_moved &= same
+        if self._same_reading >= FROZEN_READINGS and self._pose_moved:
             return self._refuse('frozen')
         if not self._spikes.passes(force, rate):
             return self._refuse('spike')
@@ -74,22 +98,13 @@ class InputGuard:
         self.after_impact, self._out_of_range = self._out_of_range or self._spikes.lasted, False
         return stamp, force, rate
 
-    def _reading_frozen(self, values) -> bool:
-        """Whether readings have long been equal to the last digit while the MoCap moved."""
-        same = values == self._reading_values
-        self._moved |= self._reading_values is not None and not same
-        self._reading_values = values
-        self._same_reading = self._same_reading + 1 if same else 0
-        self._pose_moved &= same
-        return self._same_reading >= self._imu.frozen_samples and self._pose_moved
-
     def _starts_time_line(self, stamp) -> bool:
         """Whether enough consecutive refused stamps are consistent, after a jump of the clock."""
         refused = self._refused
-        if refused and not 0 < stamp - refused[-1] <= self._imu.gap_limit:
+        if refused and not 0 < stamp - refused[-1] <= GAP:
             refused.clear()
         refused.append(stamp)
-        return len(refused) >= self._imu.resync_samples
+        return len(refused) >= RESYNC
 
     def pose(self, sample, oldest: float) -> Checked | None:
         """
@@ -109,10 +124,10 @@ class InputGuard:
         values = (*position.tolist(), *quaternion.tolist())
         if not all(map(isfinite, (stamp, *values))):
             return self._refuse('not_finite')
-        if max(map(abs, values[:3])) > self._mocap.position_limit:
+        if max(map(abs, values[:3])) > PLACES:
             return self._refuse('out_of_range')
         norm = sqrt(_squared_norm(*values[3:]))
-        if not abs(norm - 1) <= self._mocap.quaternion_tolerance:
+        if not abs(norm - 1) <= UNIT:
             return self._refuse('quaternion_norm')
         if self._last_reading is None:
             return self._refuse('no_imu')
@@ -120,21 +135,17 @@ class InputGuard:
             return self._refuse('duplicate' if stamp == self._last_pose else 'backwards')
         if stamp < oldest or stamp < self._last_reading - self._mocap.delay_limit:
             return self._refuse('too_old')
-        if stamp > self._last_reading + self._imu.gap_limit:
+        if stamp > self._last_reading + GAP:
             return self._refuse('future')
         self._last_pose = stamp
-        if self._pose_frozen(values):
-            return self._refuse('frozen')
-        return stamp, position, quaternion / norm
-
-    def _pose_frozen(self, values) -> bool:
-        """Whether poses have long been equal to the last digit while the IMU moved."""
         same = values == self._pose_values
         self._pose_moved |= self._pose_values is not None and not same
         self._pose_values = values
         self._same_pose = self._same_pose + 1 if same and self._moved else 0
         self._moved = False
-        return self._same_pose >= self._mocap.frozen_poses
+        if self._same_pose >= FROZEN_POSES:
+            return self._refuse('frozen')
+        return stamp, position, quaternion / norm
 
     def _refuse(self, reason: str) -> Checked | None:
         """Count a refusal; return the result of the caller."""
@@ -145,3 +156,47 @@ class InputGuard:
 def _squared_norm(x, y, z, w=0.0) -> float:
     """Sum of squares in plain floats, which become infinite without a warning."""
     return x * x + y * y + z * z + w * w
+
+
+class NoiseMonitor:
+    """
+    Compares the noise of position and orientation with the parameters' values.
+
+    The third difference of evenly spaced poses removes smooth motion and keeps noise. It needs no
+    filter state. It is therefore available before the first fix and independent of the gate. Its
+    median over a window is robust against jumps and outliers, even one wrong pose in ten.
+
+    Attributes:
+        scale: factors >= 1 on the nominal variances of position and orientation.
+
+    """
+
+    def __init__(self, mocap: MocapParameters):
+        self._nominal = [MEDIAN * GAIN * mocap.position_noise ** 2,
+                         MEDIAN * GAIN * mocap.orientation_noise ** 2]
+        self.scale: tuple[float, ...] = (1.0, 1.0)
+        self._last: Checked | None = None
+        self._moves: deque = deque(maxlen=POSES - 1)  # (translation, rotation vector, interval)
+        self._excess: list[deque] = [deque(maxlen=WINDOW), deque(maxlen=WINDOW)]
+
+    def add(self, stamp: float, position: np.ndarray, quaternion: np.ndarray) -> None:
+        """Add one pose: stamp [s], (3,) [m], (4,) unit."""
+        last, self._last = self._last, (stamp, position, quaternion)
+        if last is None:
+            return
+        x, y, z, w = last[2].tolist()
+        turn = rotations.log(rotations.product(-x, -y, -z, w, *quaternion.tolist()))
+        self._moves.append((position - last[1], turn, stamp - last[0]))
+        if len(self._moves) < POSES - 1:
+            return
+        moves, turns, intervals = zip(*self._moves)
+        if max(intervals) - min(intervals) > EVEN * max(intervals):
+            return
+        for (first, second, third), window in zip((moves, turns), self._excess):
+            excess = third - 2 * second + first
+            window.append(float(excess.dot(excess)))
+        if len(window) >= MIN_COUNT:
+            ratios = [sorted(values)[len(values) // 2] / nominal
+                      for values, nominal in zip(self._excess, self._nominal)]
+            self.scale = tuple(min(ratio, LARGEST_SCALE ** 2) if ratio > SIGNIFICANT else 1.0
+                               for ratio in ratios)

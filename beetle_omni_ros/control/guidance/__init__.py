@@ -1,1 +1,0 @@
-"""Guidance: functions around a controller that modify its pose targets."""
