@@ -2,10 +2,12 @@
 
 from functools import partial
 from itertools import count
+import struct
 import time
 
 import numpy as np
 import pytest
+import reference_packets as reference
 from test_fuzz_inputs import mutate_bytes
 
 pytest.importorskip('rclpy')
@@ -14,7 +16,8 @@ pytest.importorskip('dynamixel_sdk')
 
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters
-from beetle_omni_ros.drivers.motor_board_state import BoardState, MavlinkReceiver
+from beetle_omni_ros.drivers.mavlink import MavlinkReceiver
+from beetle_omni_ros.drivers.motor_board_state import BoardState
 from beetle_omni_ros.drivers.servo_link import ServoLink
 from beetle_omni_ros.messages import conversions
 from beetle_omni_ros.messages.topics import ALL
@@ -23,8 +26,7 @@ from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import BatteryReading, ImuReading, JointReading, RotorReading
 from beetle_omni_ros.runs.targets import TargetChecks
-from beetle_omni_ros.sim.emulated import mavlink
-from beetle_omni_ros.sim.emulated.dynamixel import fast_status, packet, Receiver, status
+from beetle_omni_ros.sim.emulated.servo_bus import fast_status, packet, Receiver, status
 
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 NUMBERS = (np.nan, np.inf, -np.inf, 1e308, -1e308, 1e-320, 0.0, -5.0, 1e6)
@@ -39,29 +41,27 @@ def mutated(rng, data):
 
 
 class Board:
-    """Frames to the driver's receiver and watch, and to the emulated board's parser."""
+    """Frames to the receiver of driver and emulated board, and to the driver's state."""
 
     def __init__(self):
         self._receiver = MavlinkReceiver(1, 1)
-        self._parser = mavlink.Parser()
         self._state = BoardState(
             MotorBoardParameters.load(), RobotParameters.load().battery.cells, time.time)
         self._sequence, self._asked = count(), 0
 
     def __call__(self, rng):
         """Feed one frame."""
-        number = list(mavlink.MESSAGES)[rng.integers(len(mavlink.MESSAGES))]
-        _, layout = mavlink.MESSAGES[number]
+        number = list(reference.DEFINITIONS)[rng.integers(len(reference.DEFINITIONS))]
+        layout = struct.Struct(reference.payload_format(number))
         values = layout.unpack(rng.bytes(layout.size))      # nan and inf among them
-        if number == mavlink.TIMESYNC:      # an answer to a request, with any time
+        if number == 111:       # an answer to a request, with any time
             values = values[0], self._asked
-        frame = mavlink.pack(number, values, next(self._sequence) % 256, 1, 1)
+        frame = reference.pack(number, values, next(self._sequence) % 256)
         if rng.random() < 0.5:
             frame = mutated(rng, frame)
         now = time.monotonic()
         for message in self._receiver.feed(frame):
             self._state.message(message, now)
-        self._parser.feed(frame)
         self._state.tick(now, True)
         if rng.random() < 0.1:
             self._asked = self._state.timesync_request().ts1

@@ -11,11 +11,11 @@ import threading
 import time
 
 import numpy as np
-from pymavlink.dialects.v20 import common
 
 from beetle_omni_ros.drivers import motor_board_state as messages
 from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters
-from beetle_omni_ros.drivers.motor_board_state import BoardState, MavlinkReceiver, RotorStates
+from beetle_omni_ros.drivers.mavlink import common, MavlinkReceiver, restarted
+from beetle_omni_ros.drivers.motor_board_state import BoardState, RotorStates
 from beetle_omni_ros.drivers.serial_port import SerialPort, SerialPortError
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import BatteryReading
@@ -117,7 +117,8 @@ class MotorBoard:
         self._lock = threading.Lock()           # of state and command
         self._write_lock = threading.Lock()     # of port and packer
         self.state = BoardState(parameters, robot.battery.cells, clock)
-        self._receiver = MavlinkReceiver(parameters.board_system, parameters.board_component)
+        self._receiver = MavlinkReceiver(parameters.board_system, parameters.board_component,
+                                         restarted)
         self._packer = common.MAVLink(None, parameters.host_system, parameters.host_component)
         self._port: SerialPort | None = None
         self._thread: threading.Thread | None = None
@@ -312,7 +313,7 @@ class MotorBoard:
                 self.state.acknowledged(self._command.arm)
             return
         self.state.message(message, now)
-        if messages.restarted(message):
+        if restarted(message):
             self._next_heartbeat = self._next_timesync = now
 
     def _tick(self, now):

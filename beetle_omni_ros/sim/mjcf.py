@@ -100,10 +100,8 @@ def _module(robot, plant, parts, k):
 
 
 def _actuators(robot):
-    rotors, joints, effects = robot.rotors, robot.joints, robot.effects
-    ratio = effects.get('torque_coefficient', {}).get('torque_to_thrust_ratio',
-                                                      rotors.torque_to_thrust_ratio)
-    scale = thrust_scale(robot)
+    rotors, joints = robot.rotors, robot.joints
+    ratio, scale = torque_ratio(robot), thrust_scale(robot)
     rotor = ''.join(
         f'<general name="rotor{k + 1}" site="rotor{k + 1}" dyntype="filter" '
         f'dynprm="{rotors.time_constant!r}" gear="{_text(0, 0, scale[k], 0, 0)} '
@@ -114,6 +112,12 @@ def _actuators(robot):
         f'forcelimited="true" forcerange="{_text(-joints.effort_limit, joints.effort_limit)}"/>\n'
         for k in range(4))
     return rotor + servo
+
+
+def torque_ratio(robot: RobotParameters) -> float:
+    """Torque about a rotor's axis for each newton of its thrust [m]."""
+    return robot.effects.get('torque_coefficient', {}).get(
+        'torque_to_thrust_ratio', robot.rotors.torque_to_thrust_ratio)
 
 
 def thrust_scale(robot: RobotParameters) -> np.ndarray:

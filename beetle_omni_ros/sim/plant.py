@@ -5,14 +5,20 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from beetle_omni_ros.robot import dynamics, rotations
+from beetle_omni_ros.robot import dynamics, native, rotations
 from beetle_omni_ros.robot.allocation import clipped
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.mass_properties import Variation
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.servo import NUMPY
-from beetle_omni_ros.sim.effects import CatalogueForces, MotionForces
-from beetle_omni_ros.sim.mjcf import BASE, base_part, build_model, set_base_part, thrust_scale
+from beetle_omni_ros.sim.mjcf import (
+    BASE,
+    base_part,
+    build_model,
+    set_base_part,
+    thrust_scale,
+    torque_ratio,
+)
 from beetle_omni_ros.sim.parameters import PlantParameters
 
 # MuJoCo would write warnings into a file in the working directory; step() checks the state.
@@ -45,12 +51,17 @@ class Plant:
     def __init__(self, robot: RobotParameters, parameters: PlantParameters,
                  variation: Variation | None = None):
         self._robot, self._parameters, self._variation = robot, parameters, variation
-        self._forces, self._catalogue_forces = MotionForces(robot), CatalogueForces(robot)
+        # Effects that only change a number of the model are built into it.
+        forces = [name for name in robot.effects
+                  if CATALOGUE[name].apply and CATALOGUE[name].plant != 'model']
+        self._added_wrench = native.compiled(dynamics.added_wrench(robot, forces)) \
+            if forces else None
         play = robot.effects.get('joint_backlash', {'gap': 0.0, 'at_encoder': 0.0})
         self._half_gap = np.broadcast_to(play['gap'], 4) / 2
         self._has_play, self._at_encoder = bool(self._half_gap.any()), bool(play['at_encoder'])
-        self._has_motion_forces = bool(self._forces.depends_on_motion or self._has_play
-                                       or self._catalogue_forces.names)
+        self._has_motion_forces = bool(forces or self._has_play)
+        self._sideways = np.cross(robot.tilt_axes, [0.0, 0.0, 1.0])     # of a rotor at +90 deg
+        self._reaction = -robot.rotors.spin * torque_ratio(robot)
         self._has_servo_loads = any(CATALOGUE[name].servo for name in robot.effects
                                     if name != 'joint_friction')
         self._servo_terms = [dynamics.tilt_servo(robot, i, 0.0)[0] for i in range(4)]
@@ -253,36 +264,36 @@ class Plant:
         accurate to second order with a single evaluation.
         """
         data = self.data
-        applied = data.qfrc_applied
+        applied = data.qfrc_applied[:6]
+        applied[:] = self._wrench
         if not self._has_motion_forces:
-            applied[:6] = self._wrench
-            applied[:3] += self._forces.wind
             return
-        change = data.ctrl[:4] - data.act
-        thrust = data.act - np.expm1(-ahead / self._robot.rotors.time_constant) * change
-        turn = rotations.exp(ahead * self._qvel[3:6])
-        quaternion = rotations.multiply(self._qpos[XYZW], turn)
+        lag = self._robot.rotors.time_constant
+        thrust = data.act - np.expm1(-ahead / lag) * (data.ctrl[:4] - data.act)
+        quaternion = rotations.multiply(self._qpos[XYZW],
+                                        rotations.exp(ahead * self._qvel[3:6]))
         motion = self._qvel + ahead * data.qacc
-        driven = self._tilt + ahead * self._rate
-        tilt = clipped(self._shaft, driven - self._half_gap, driven + self._half_gap) \
-            if self._has_play else driven
-        force, torque = self._forces(
-            rotations.matrix(quaternion), motion[:3], motion[3:6], tilt, self._scale * thrust,
-            float(self._qpos[2]))
-        if self._catalogue_forces.names:
-            catalogue = self._catalogue_forces(
-                quaternion, motion[:3], motion[3:6], tilt, motion[6:], data.qacc[6:],
-                self._scale * thrust, self._scale * (data.ctrl[:4] - thrust)
-                / self._robot.rotors.time_constant, self._qpos[:3], self.voltage_ratio,
-                self.charge_drawn)
-            force, torque = force + catalogue[0], torque + catalogue[1]
+        driven = tilt = self._tilt + ahead * self._rate
         if self._has_play:
             # MuJoCo's thrust acts along the motor's angle, the true one along the shaft's.
-            moved = self._forces.turned(rotations.matrix(quaternion), driven, tilt,
-                                        self._scale * thrust)
-            force, torque = force + moved[0], torque + moved[1]
-        applied[:3] = self._wrench[:3] + force
-        applied[3:6] = self._wrench[3:] + torque
+            tilt = clipped(self._shaft, driven - self._half_gap, driven + self._half_gap)
+            force, torque = self._turned(driven, tilt, self._scale * thrust)
+            applied[:3] += rotations.matrix(quaternion) @ force
+            applied[3:] += torque
+        if self._added_wrench:
+            force, torque = self._added_wrench(
+                quaternion, motion[:3], motion[3:6], tilt, motion[6:], data.qacc[6:],
+                self._scale * thrust, self._scale * (data.ctrl[:4] - thrust) / lag,
+                self._qpos[:3], self.voltage_ratio, self.charge_drawn)
+            applied += np.concatenate([np.array(force), np.array(torque)]).ravel()
+
+    def _turned(self, before, after, thrust):
+        """Change of force and torque in base_link by rotors that turn between two tilts (4,)."""
+        change = thrust[:, None] * (
+            (np.cos(after) - np.cos(before))[:, None] * [0.0, 0.0, 1.0]
+            + (np.sin(after) - np.sin(before))[:, None] * self._sideways)
+        return change.sum(axis=0), \
+            np.cross(self._robot.rotors.positions, change).sum(axis=0) + self._reaction @ change
 
     def _load_servos(self):
         """Set servo targets and joint torques from the commands by the effects on servos."""

@@ -9,7 +9,7 @@ from servo_bench import arrived, bench, COUNT, PATIENT, running, tick, until
 
 from beetle_omni_ros.drivers.servo_guard import Guard
 from beetle_omni_ros.drivers.servo_link import ServoBusError
-from beetle_omni_ros.sim.emulated import servo_table as table
+from beetle_omni_ros.sim.emulated import servo_bus as table
 
 pytestmark = pytest.mark.real_time
 

@@ -7,7 +7,7 @@ import pytest
 from beetle_omni_ros.drivers.serial_port import SerialPortError
 from beetle_omni_ros.drivers.servo_link import NoAnswer, ServoBusError, ServoLink
 from beetle_omni_ros.drivers.servo_registers import GOAL_POSITION, HARDWARE_ERROR, TORQUE_ENABLE
-from beetle_omni_ros.sim.emulated.dynamixel import crc16, fast_status, packet, status
+from beetle_omni_ros.sim.emulated.servo_bus import crc16, fast_status, packet, status
 
 IDS = [1, 2, 3]
 DATA = {name: bytes(range(name, name + 10)) for name in IDS}

@@ -17,7 +17,7 @@ from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.graph import Graph, reserved_domain
 from beetle_omni_ros.nodes.operator import Operator
 from beetle_omni_ros.robot.parameters import JOINT_NAMES
-from beetle_omni_ros.sim.emulated.board_firmware import EmulatedBoardParameters
+from beetle_omni_ros.sim.emulated.motor_board import EmulatedBoardParameters
 
 JOINT, ROTOR = 'joint_bridge_node', 'rotor_bridge_node'
 WITHIN = 40     # [s] timeout of expected events on a busy machine

@@ -9,7 +9,7 @@ import pytest
 from beetle_omni_ros.messages import conversions
 from beetle_omni_ros.messages.values import MessageError
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters
-from beetle_omni_ros.sim.emulated.fault_switches import ServoFaults
+from beetle_omni_ros.sim.emulated import ServoFaults
 from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
 
 pytestmark = pytest.mark.real_time

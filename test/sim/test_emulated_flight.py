@@ -14,7 +14,7 @@ from servo_bench import PATIENT, SHIPPED
 from sim_robots import HIGH, ROBOT, WORLD
 
 from beetle_omni_ros.drivers.servo_bus import ServoBus
-from beetle_omni_ros.sim.emulated.fault_switches import BoardFaultSwitches, ServoFaultSwitches
+from beetle_omni_ros.sim.emulated import BoardFaults, ServoFaults
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
 from beetle_omni_ros.sim.emulated_actuators import EmulatedActuators
@@ -92,8 +92,8 @@ class Flight:
 
     def switch(self, servo=None, board=None):
         """Set faults."""
-        self.actuators.set_faults(ServoFaultSwitches(**servo or {}),
-                                  BoardFaultSwitches(**board or {}))
+        self.actuators.set_faults(ServoFaults(**servo or {}),
+                                  BoardFaults(**board or {}))
 
     @property
     def truth(self):

@@ -11,7 +11,7 @@ from sim_robots import HIGH, ROBOT, WORLD
 from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.sim.emulated.board_firmware import EmulatedBoardParameters
+from beetle_omni_ros.sim.emulated.motor_board import EmulatedBoardParameters
 from beetle_omni_ros.sim.fault_lists import FaultList, load_faults, parse_faults
 from beetle_omni_ros.sim.fault_lists import text as text_of
 from beetle_omni_ros.sim.faults import Fault, KINDS, OF_PROCESSES, READINGS

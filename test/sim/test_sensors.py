@@ -9,7 +9,7 @@ from sim_robots import HIGH, LEVEL, ROBOT, WORLD
 
 from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.sim.conditions import draw
+from beetle_omni_ros.sim.parameters import draw
 from beetle_omni_ros.sim.simulator import Simulator
 
 TICK = WORLD.plant.tick

@@ -117,18 +117,6 @@ def test_thrust_effect_scales_the_true_thrust():
     np.testing.assert_allclose(frame.truth.thrust, 0.9 * HOVER, rtol=1e-4)
 
 
-@pytest.mark.parametrize('call, text', [
-    (lambda s: s.set_wrench([np.nan, 0, 0], [0, 0, 0]), 'wrench force: expected 3 finite'),
-    (lambda s: s.set_wrench([0, 0, 0], [0, 0]), 'wrench torque: expected 3 finite'),
-    (lambda s: s.reset([0, 0, np.inf]), 'position: expected 3 finite'),
-    (lambda s: s.reset([0, 0, 1], [0, 0, 0, 0]), 'quaternion: expected a rotation'),
-    (lambda s: s.set_payload(-1.0), 'payload: expected a mass'),
-    (lambda s: s.set_payload(np.nan), 'payload: expected a mass')])
-def test_unusable_disturbance_or_start_is_refused(call, text):
-    with pytest.raises(ValueError, match=text):
-        call(Simulator(ROBOT, WORLD))
-
-
 def test_unknown_conditions_and_seeds_are_refused():
     with pytest.raises(ParameterError, match="'publish' is unknown; expected one of nominal"):
         Simulator(ROBOT, WORLD, 'publish')
