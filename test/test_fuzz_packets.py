@@ -26,7 +26,7 @@ from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import BatteryReading, ImuReading, JointReading, RotorReading
 from beetle_omni_ros.runs.targets import TargetChecks
-from beetle_omni_ros.sim.emulated.servo_bus import fast_status, packet, Receiver, status
+from beetle_omni_ros.sim.emulated.servo_bus import packet, Receiver, status
 
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 NUMBERS = (np.nan, np.inf, -np.inf, 1e308, -1e308, 1e-320, 0.0, -5.0, 1e6)
@@ -102,10 +102,8 @@ class Servos:
     def __call__(self, rng):
         """Feed the answers to one read, and one packet to the device."""
         link = self._link
-        link.fast = bool(rng.integers(2))
         parts = [(one, int(rng.integers(256)), rng.bytes(DATA)) for one in SERVOS]
-        answer = (fast_status(parts, (DATA + 4) * len(parts)) if link.fast
-                  else b''.join(status(*part) for part in parts))
+        answer = b''.join(status(*part) for part in parts)
         link.waiting = mutated(rng, answer) if rng.random() < 0.7 else answer
         for error, data in link.sync_read(132, DATA, SERVOS).values():
             if len(data) != DATA or not 0 <= error < 256:

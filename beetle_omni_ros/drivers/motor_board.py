@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import atexit
 from collections.abc import Callable
-from dataclasses import dataclass
 import math
 import select
 import threading
 import time
+from typing import NamedTuple
 
 import numpy as np
 
@@ -90,8 +90,7 @@ class ArmCommand:
         return self
 
 
-@dataclass(frozen=True, slots=True)
-class Sent:
+class Sent(NamedTuple):
     """Result of sending one thrust target: the reason why it was not sent, or arrays (4,)."""
 
     reason: str = ''
@@ -194,10 +193,7 @@ class MotorBoard:
         Zero and negative values stop the rotor. ``stamp`` is the time of the state estimate that
         they answer [s].
         """
-        thrust = np.asarray(thrust, dtype=float)
         age = self._clock() - stamp
-        if thrust.shape != (4,) or not (np.isfinite(thrust).all() and math.isfinite(age)):
-            return Sent('not four finite numbers')
         if abs(age) > self.parameters.stamp_age_limit:
             return Sent('stale stamp' if age > 0 else 'stamp in the future')
         if not self.state.clock.known:

@@ -10,7 +10,6 @@ pytest.importorskip('dynamixel_sdk')
 pytest.importorskip('pymavlink')
 
 from check_helpers import QUICK, repeated
-from servo_bench import JOINTS
 
 from beetle_omni_ros import cli
 from beetle_omni_ros.bringup.command import run_check
@@ -34,7 +33,7 @@ def robot(tmp_path):
     """Servo bus, motor board, and the arguments with their ports."""
     file = tmp_path / 'bus.yaml'
     file.write_text(PATIENT)
-    with EmulatedServoBus(motion=JOINTS) as bus, EmulatedMotorBoard(parameters=QUICK) as board:
+    with EmulatedServoBus() as bus, EmulatedMotorBoard(parameters=QUICK) as board:
         yield bus, board, ['check', '--servo-bus', str(file), '--servo-port', bus.port,
                            '--board-port', board.port, '--seconds', '1']
 

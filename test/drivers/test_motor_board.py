@@ -1,6 +1,5 @@
 """The driver against the emulated board, over a pseudo-terminal."""
 
-import math
 import os
 from pathlib import Path
 import pty
@@ -24,14 +23,10 @@ from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 pytestmark = pytest.mark.real_time
 
 
-def test_bad_thrusts_are_not_sent():
+def test_thrusts_with_bad_stamps_are_not_sent():
     with connected() as (emulated, board):
         board.start(True).wait()
         for thrust, age, reason in (
-                ([1, 2, 3], 0, 'not four finite numbers'),
-                ([1, 2, 3, math.nan], 0, 'not four finite numbers'),
-                ([1, 2, 3, math.inf], 0, 'not four finite numbers'),
-                ([1, 2, 3, 4], math.nan, 'not four finite numbers'),
                 ([1, 2, 3, 4], 0.2, 'stale stamp'), ([1, 2, 3, 4], -0.2, 'stamp in the future')):
             assert board.send(thrust, time.time() - age).reason == reason
         time.sleep(0.05)

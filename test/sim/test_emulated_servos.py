@@ -14,7 +14,6 @@ from beetle_omni_ros.sim.emulated.servo_bus import (
     EmulatedServo,
     EmulatedServoBus,
     Error,
-    fast_status,
     packet,
     Receiver,
     status,
@@ -33,7 +32,6 @@ INSTRUCTIONS = [
     (0xFE, 0x82, '84 00 04 00 01 02', 'FF FF FD 00 FE 09 00 82 84 00 04 00 01 02 CE FA'),
     (0xFE, 0x83, '74 00 04 00 01 96 00 00 00 02 AA 00 00 00',
      'FF FF FD 00 FE 11 00 83 74 00 04 00 01 96 00 00 00 02 AA 00 00 00 82 87'),
-    (0xFE, 0x8A, '84 00 04 00 03 07 04', 'FF FF FD 00 FE 0A 00 8A 84 00 04 00 03 07 04 20 F2'),
 ]
 payloads = st.tuples(
     st.integers(0, 0xFE).filter(lambda name: name != 0xFD), st.integers(0, 255),
@@ -51,11 +49,6 @@ def test_instructions_have_the_documented_bytes(name, instruction, parameters, e
 def test_answers_have_the_documented_bytes():
     assert status(1, 0, bytes.fromhex('A6 00 00 00')) == bytes.fromhex(
         'FF FF FD 00 01 08 00 55 00 A6 00 00 00 8C C0')
-    blocks = [(3, 0, bytes.fromhex('A6 00 00 00')), (7, 0, bytes.fromhex('1F 08 00 00')),
-              (4, 0, bytes.fromhex('FF 03 00 00'))]
-    assert fast_status(blocks, 3 * 8) == bytes.fromhex(
-        'FF FF FD 00 FE 19 00 55 00 03 A6 00 00 00 84 08 00 07 1F 08 00 00 16 CA '
-        '00 04 FF 03 00 00 D1 9E')
 
 
 @given(st.lists(payloads, min_size=1, max_size=6), st.binary(max_size=200), st.data())
@@ -238,12 +231,11 @@ def test_the_sdk_reads_writes_pings_and_receives_errors(bus, line):
 
 
 @pytest.mark.real_time
-@pytest.mark.parametrize('read', ['txRxPacket', 'fastSyncRead'])
-def test_group_reads_give_the_values_of_the_plant_or_the_fault(bus, line, read):
+def test_group_reads_give_the_values_of_the_plant_or_the_fault(bus, line):
     angles = np.array([0.5, -1.0, 3.6, -3.9])
     bus.set_state(angles, [1.0, -2.0, 0.0, 5.0], [0.1, 0.0, -0.2, 0.0])
     group = group_read(line, 126, 10)
-    assert getattr(group, read)() == sdk.COMM_SUCCESS
+    assert group.txRxPacket() == sdk.COMM_SUCCESS
     for name, angle in zip((1, 2, 3, 4), angles, strict=True):
         raw = group.getData(name, 132, 4)
         counts = raw - (1 << 32) if raw >> 31 else raw
@@ -251,9 +243,9 @@ def test_group_reads_give_the_values_of_the_plant_or_the_fault(bus, line, read):
     for fault, value in (('bad_crc', 1.0), ('dropped', 1.0), ('silent', {2})):
         usual = getattr(bus.faults, fault)
         setattr(bus.faults, fault, value)
-        assert getattr(group, read)() in (sdk.COMM_RX_CORRUPT, sdk.COMM_RX_TIMEOUT)
+        assert group.txRxPacket() in (sdk.COMM_RX_CORRUPT, sdk.COMM_RX_TIMEOUT)
         setattr(bus.faults, fault, usual)
-    assert getattr(group, read)() == sdk.COMM_SUCCESS
+    assert group.txRxPacket() == sdk.COMM_SUCCESS
 
 
 @pytest.mark.real_time
@@ -275,7 +267,7 @@ def test_the_emulator_tolerates_noise(bus, line):
     random = Random(3)
     for k in range(60):
         body = bytes((random.choice((1, 0xFE)), *random.randbytes(2), random.choice(
-            (1, 2, 3, 8, 0x55, 0x82, 0x83, 0x8A))))
+            (1, 2, 3, 8, 0x55, 0x82, 0x83))))
         port.writePort(random.randbytes(random.randrange(1, 300)))
         port.writePort(b'\xff\xff\xfd\x00' + body)
         port.writePort(packet(body[0], body[3], random.randbytes(random.randrange(9))))
@@ -285,7 +277,7 @@ def test_the_emulator_tolerates_noise(bus, line):
 
 
 @settings(max_examples=300, deadline=None)
-@given(st.lists(st.tuples(st.sampled_from((1, 2, 3, 8, 0x20, 0x55, 0x82, 0x83, 0x8A)),
+@given(st.lists(st.tuples(st.sampled_from((1, 2, 3, 8, 0x20, 0x55, 0x82, 0x83)),
                           st.sampled_from((0, 1, 2, 7, 0xFE)), st.binary(max_size=30)),
                 max_size=12))
 def test_arbitrary_sequences_of_packets_keep_all_registers_legal(sequence):

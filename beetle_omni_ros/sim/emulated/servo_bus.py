@@ -22,8 +22,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from beetle_omni_ros.robot.parameters import JointParameters
-from beetle_omni_ros.robot.servo import NUMPY, Servo, Step
 from beetle_omni_ros.sim.emulated import ServoFaults
 from beetle_omni_ros.sim.emulated.pseudo_terminal import PseudoTerminal
 
@@ -31,11 +29,11 @@ HEADER = b'\xff\xff\xfd\x00'
 BROADCAST = 0xFE
 HEAD_SIZE = 7       # [B] header, ID and length
 LENGTH_LIMIT = 1024 # [B] larger than any instruction of the SDK for 253 servos
-PING, READ, WRITE, REBOOT, STATUS, SYNC_READ, SYNC_WRITE, FAST_SYNC_READ = (
-    0x01, 0x02, 0x03, 0x08, 0x55, 0x82, 0x83, 0x8A)
+PING, READ, WRITE, REBOOT, STATUS, SYNC_READ, SYNC_WRITE = (
+    0x01, 0x02, 0x03, 0x08, 0x55, 0x82, 0x83)
 
 EEPROM_END = 64     # registers below it keep their value without power
-FIRST_FAST_FIRMWARE = 46    # first version with fast sync read
+STARTUP_FIRMWARE = 46   # first version with a startup configuration
 FIRMWARE = 52
 COUNTS_PER_TURN = 4096
 POSITION_UNIT = 2 * pi / COUNTS_PER_TURN    # [rad]
@@ -49,7 +47,6 @@ BAUD_RATES = (9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
 # Hardware Error Status (70) and Shutdown (63)
 VOLTAGE_ERROR, OVERHEATING, ENCODER_ERROR, SHOCK, OVERLOAD = 0x01, 0x04, 0x08, 0x10, 0x20
 
-STEP = 0.001        # [s] of the motion, small against the servo's natural frequency of 11 Hz
 CHECK_PERIOD = 0.01 # [s] between checks of watchdog, temperature and voltage
 PAUSE = 0.05        # [s] silence after which an incomplete packet is dropped
 
@@ -162,20 +159,6 @@ def status(identifier: int, error: int, data: bytes = b'') -> bytes:
     return packet(identifier, STATUS, bytes((error,)) + data)
 
 
-def fast_status(blocks: list[tuple[int, int, bytes]], length: int) -> bytes:
-    """
-    Build the common answer of several servos, without stuffing.
-
-    ``blocks`` are (ID, error, data) of the servos that answer, in order. ``length`` is the sum of
-    the bytes of data plus four (error, ID, CRC) over all addressed servos. The part of each servo
-    ends with the CRC of all bytes before.
-    """
-    sent = HEADER + bytes((BROADCAST,)) + (length + 1).to_bytes(2, 'little') + bytes((STATUS,))
-    for identifier, error, data in blocks:
-        sent = sealed(sent + bytes((error, identifier)) + data)
-    return sent
-
-
 class Packet(NamedTuple):
     """A received packet without stuffing."""
 
@@ -281,9 +264,10 @@ class EmulatedServo:
 
     def write(self, address: int, data: bytes) -> Error:
         """Write one register."""
-        if address not in NAMES:
+        name = NAMES.get(address)
+        if name is None or (name == 'Startup Configuration'
+                            and self['Firmware Version'] < STARTUP_FIRMWARE):
             return Error.ACCESS
-        name = NAMES[address]
         register = TABLE[name]
         if not register.legal or (address < EEPROM_END and self.torque):
             return Error.ACCESS
@@ -348,43 +332,23 @@ class EmulatedServo:
         self._turns = floor(self._counts() / COUNTS_PER_TURN)
 
 
-class SecondOrderMotion:
-    """Motion of the servos without load: position [rad], velocity [rad/s], effort [N m], (n,)."""
-
-    def __init__(self, joints: JointParameters, count: int):
-        self._servo = Servo.of(joints)
-        self._step = Step(NUMPY, self._servo, STEP)
-        self.position, self.velocity, self.effort = np.zeros((3, count))
-        self._time = time.monotonic()
-
-    def advance(self, now: float, goals: np.ndarray, powered: np.ndarray):
-        """Advance to ``now`` [s] with ``goals`` [rad]; a servo without power does not move."""
-        while self._time + STEP <= now:
-            self._time += STEP
-            moved = self._step(goals, self.position, np.where(powered, self.velocity, 0.0))
-            self.position, self.velocity = np.where(
-                powered, moved, [self.position, np.zeros_like(self.velocity)])
-            self.effort = np.where(powered, self._servo.motor(
-                NUMPY, goals - self.position, self.velocity), 0.0)
-
-
 # --- the line ---------------------------------------------------------------------------------
 
 class EmulatedServoBus:
     """
     XC330 servos on one serial port, as a context manager.
 
-    A plant reads :meth:`drive` and calls :meth:`set_state`. With ``motion`` the servos move
-    without a plant. ``refusals`` is the number of refused instructions.
+    A plant reads :meth:`drive` and calls :meth:`set_state`. ``refusals`` is the number of refused
+    instructions.
 
     Args:
         identifiers: IDs in the order of the joints.
         port: path of the created port; by default a temporary one.
-        firmware: firmware version of the servos; below 46 without fast sync read.
+        firmware: firmware version of the servos; below 46 without startup configuration.
         baud_rate: baud rate of the servos [bit/s].
         signs: +1 or -1 for each servo: counts rise or fall with the joint's angle.
         zeros: counts at which the angle of each joint is zero.
-        motion: parameters of the servo model, or None for servos moved by a plant.
+        speed: of servos with torque without a plant [rad/s]; by default they do not move.
         reboot_time: time without answers after a reboot [s].
         seed: seed of the faults.
 
@@ -393,18 +357,18 @@ class EmulatedServoBus:
     def __init__(self, identifiers: Sequence[int] = (1, 2, 3, 4), *, port: str | None = None,
                  firmware: int = FIRMWARE, baud_rate: int = 1_000_000,
                  signs: Sequence[int] = (1,) * 4, zeros: Sequence[int] = (ZERO,) * 4,
-                 motion: JointParameters | None = None, reboot_time: float = 0.3, seed: int = 0):
+                 speed: float = 0.0, reboot_time: float = 0.3, seed: int = 0):
         self.faults, self.refusals = ServoFaults(), 0
         self.servos = [EmulatedServo(name, firmware=firmware, baud_rate=baud_rate, sign=sign,
                                      zero=zero, reboot_time=reboot_time)
                        for name, sign, zero in zip(identifiers, signs, zeros, strict=True)]
-        self._motion = SecondOrderMotion(motion, len(self.servos)) if motion else None
+        self._speed = speed
         self._terminal = PseudoTerminal(port, 'servo_bus')
         self._receiver, self._random = Receiver(), Random(seed)
         self._late: list[tuple[float, int, bytes]] = []
         self._order = itertools.count()
         self._lock = Lock()
-        self._last_data = self._last_check = time.monotonic()
+        self._last_data = self._last_check = self._last_move = time.monotonic()
         self._running = True
         self._thread = Thread(target=self._run, name='emulated servo bus', daemon=True)
         self._thread.start()
@@ -447,14 +411,8 @@ class EmulatedServoBus:
     def set_state(self, position: np.ndarray, velocity: np.ndarray, effort: np.ndarray):
         """Set the joints' true angles [rad], rates [rad/s] and torques [N m], each (n,)."""
         with self._lock:
-            self._show(position, velocity, effort)
-            if self._motion:
-                self._motion.position = np.array(position, dtype=float)
-                self._motion.velocity = np.array(velocity, dtype=float)
-
-    def _show(self, *state):
-        for servo, angle, velocity, effort in zip(self.servos, *state, strict=True):
-            servo.angle, servo.velocity, servo.effort = map(float, (angle, velocity, effort))
+            for servo, *state in zip(self.servos, position, velocity, effort, strict=True):
+                servo.angle, servo.velocity, servo.effort = map(float, state)
 
     def reboot(self, index: int):
         """Restart servo ``index`` as a brown-out does: torque off, turn count lost."""
@@ -518,10 +476,10 @@ class EmulatedServoBus:
             self._terminal.write(heapq.heappop(self._late)[2])
 
     def _move(self, now):
-        if self._motion is not None:
-            self._motion.advance(now, np.array([servo.goal for servo in self.servos]),
-                                 np.array([servo.torque for servo in self.servos]))
-            self._show(self._motion.position, self._motion.velocity, self._motion.effort)
+        step, self._last_move = self._speed * (now - self._last_move), now
+        for servo in self.servos if step else ():
+            if servo.torque:
+                servo.angle += max(-step, min(step, servo.goal - servo.angle))
 
     def _send(self, data, now):
         faults, draw = self.faults, self._random.random
@@ -551,9 +509,12 @@ class EmulatedServoBus:
             for k in range(4, len(given), length + 1):
                 if given[k] in listening:
                     self._checked(listening[given[k]].write(address, given[k + 1:k + 1 + length]))
-        elif code in (SYNC_READ, FAST_SYNC_READ):
-            return self._read_all(listening, code, address, length, given[4:])
-        return []
+        answers = []
+        if code == SYNC_READ:       # each waits for the previous one, so a silent one ends it
+            for one in itertools.takewhile(listening.__contains__, given[4:]):
+                error, data = listening[one].read(address, length)
+                answers.append(status(one, self._checked(error) | listening[one].alert, data))
+        return answers
 
     def _single(self, servo, code, given, now):
         """Execute an instruction in one servo; return its answer."""
@@ -576,18 +537,3 @@ class EmulatedServoBus:
     def _checked(self, error):
         self.refusals += error is not Error.NONE
         return error
-
-    def _read_all(self, listening, code, address, length, names):
-        """Answers in sequence; each servo waits for the previous one, so a silent one ends it."""
-        blocks = []
-        for name in names:
-            servo = listening.get(name)
-            if servo is None or (code == FAST_SYNC_READ
-                                 and servo['Firmware Version'] < FIRST_FAST_FIRMWARE):
-                break
-            error, data = servo.read(address, length)
-            blocks.append((name, self._checked(error) | servo.alert, data))
-        if code == SYNC_READ:
-            return [status(*block) for block in blocks]
-        fast = [(name, error, data.ljust(length, b'\0')) for name, error, data in blocks]
-        return [fast_status(fast, len(names) * (4 + length))] if fast else []
