@@ -197,21 +197,6 @@ def test_an_ambiguous_turn_is_refused_until_the_operator_confirms_it():
 
 
 @pytest.mark.real_time
-def test_turning_the_joint_by_hand_resolves_the_turn():
-    with bench() as (bus, emulated):
-        place(emulated, [0.0, 0.0, 0.0, 3.5])
-        bus.configure()
-        with pytest.raises(ServoBusError):
-            bus.enable()
-        for angle in np.linspace(3.5, 1.0, 6):
-            emulated.set_state([0.0, 0.0, 0.0, angle], ZERO, ZERO)
-            bus.read()
-        bus.enable()
-        assert bus.read().position == pytest.approx([0, 0, 0, 1.0], abs=COUNT)
-        assert emulated.goals == pytest.approx([0, 0, 0, 1.0], abs=COUNT)
-
-
-@pytest.mark.real_time
 def test_turns_are_kept_over_disable_while_the_servo_has_power_and_lost_with_it():
     with running() as (bus, emulated):
         goal = np.array([3.9, -3.9, 0.0, 0.0])

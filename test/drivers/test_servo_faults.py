@@ -113,16 +113,6 @@ def test_an_overheated_servo_is_left_off():
         assert any('shut down (overheated)' in line for line in bus.take_events())
 
 
-def test_low_voltage_is_reported_and_tolerated():
-    with running() as (bus, emulated):
-        emulated.faults.supply_voltage = 5.0
-        until(lambda _, servos: all('voltage' in one.message and one.torque
-                                    and one.voltage == pytest.approx(5.0) for one in servos),
-              bus, GOAL)
-        assert emulated.torque_enabled.all()
-        until(arrived(GOAL), bus, GOAL)
-
-
 def test_expired_watchdogs_are_cleared_and_goals_are_followed_again():
     with running() as (bus, emulated):
         until(arrived(GOAL), bus, GOAL)
@@ -185,18 +175,6 @@ def test_enabling_fails_for_all_servos_if_one_refuses():
         with pytest.raises(ServoBusError, match='id 3: write 1 to Torque Enable'):
             bus.enable()
         assert not emulated.torque_enabled.any() and not bus.enabled
-
-
-def test_a_reboot_without_torque_leaves_it_configured_and_off():
-    with bench() as (bus, emulated):
-        bus.configure()
-        bus.reboot(2)
-        until(lambda *_: any('is back, without torque' in line for line in bus.take_events()),
-              bus, GOAL)
-        assert not emulated.torque_enabled.any()
-        assert emulated.servos[1]['Velocity I Gain'] == 1201
-        bus.enable()
-        assert emulated.torque_enabled.all()
 
 
 def test_the_guard_ends_when_torque_is_off():

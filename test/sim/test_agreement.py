@@ -114,15 +114,6 @@ def test_plant_without_module_inertia_agrees_with_newton_euler():
         assert difference(found[3:6], angular) < 1e-6
 
 
-def test_true_modules_shift_the_centre_of_gravity():
-    """With all modules at 90 deg, gravity acts on their eccentric centres of mass."""
-    made, rigid = plant(), plant(massless_modules())
-    tilt = np.array([1, 1, -1, -1]) * np.pi / 2
-    state = ([0, 0, 10], [0, 0, 0, 1], np.zeros(3), np.zeros(3), tilt, np.zeros(4),
-             np.full(4, ROBOT.hover_thrust))
-    assert np.abs(made.acceleration(*state)[3:6] - rigid.acceleration(*state)[3:6]).max() > 0.1
-
-
 @pytest.mark.parametrize('effects', [
     {'wind': {'force': [3.0, -4.0, 2.0]}},
     {'wind': {'force': [3.0, -4.0, 2.0]}, 'body_drag': {'coefficient': 0.3},

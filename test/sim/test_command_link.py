@@ -75,13 +75,3 @@ def test_rotors_stop_when_commands_cease_and_tilts_hold():
     made.push(command(0.2), 0.2)
     made.update(0.21)
     assert made.thrust[0] == 5
-
-
-def test_refused_commands_do_not_keep_the_rotors_turning():
-    made = link()
-    made.push(command(0.0), 0.0)
-    made.update(0.01)
-    for k in range(1, 21):
-        made.push(command(np.nan), 0.005 * k)
-        made.update(0.005 * k)
-    assert made.thrust[0] == 0
