@@ -7,6 +7,7 @@ import pytest
 
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.readings import JointReading
 from beetle_omni_ros.robot.servo import NUMPY, Servo, Step
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.plant import Plant
@@ -105,3 +106,12 @@ def test_readings_of_erring_encoders_are_corrected():
     read = robot.sensors.encoders(tilt)
     assert np.abs(read - tilt).max() > 0.02
     assert np.allclose(robot.sensors.tilts(read), tilt, atol=1e-5)
+
+
+def test_a_reading_is_corrected_where_it_enters_the_controllers():
+    robot = replace(ROBOT, effects={'joint_encoder_error': {
+        'gain': (0.02,) * 4, 'sine': (0.0,) * 4, 'cosine': (0.03, 0.0, 0.0, 0.0)}})
+    tilt = np.array([0.5, -1.0, 2.0, 0.0])
+    reading = JointReading(1.0, robot.sensors.encoders(tilt), np.zeros(4))
+    assert reading.corrected(robot.sensors).position == pytest.approx(tilt, abs=1e-5)
+    assert reading.corrected(ROBOT.sensors) is reading
