@@ -30,23 +30,21 @@ NONE, ASKED, HEARTBEAT_LOST, IDLE, WATCHDOG = range(5)      # reasons of the las
  SATURATED) = (1 << bit for bit in range(7))
 BLOCKS_ARMING = BOOTING | NO_HEARTBEAT | THROTTLE | BATTERY_LOW | ESC_FAILURE
 CONTRACT_VERSION = 1
+BOARD, HOST = (1, 1), (1, 191)    # MAVLink system and component of both sides
 ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED = range(4)
 STOP = (0.0, 0.0, 0.0, 0.0)
 UNKNOWN_CELL, UNKNOWN_CURRENT, UNKNOWN_TEMPERATURE = 65535, -1, 32767
 GENERIC_FAILURE = 64            # ESC_FAILURE_GENERIC
 MIN_HEARTBEAT_PERIOD = 0.02     # [s]
 TICK = 0.01                     # [s] longest sleep of the thread
+CLOCK_START, CLOCK_DRIFT = 4.0, 20e-6   # [s], [s/s] of the board's clock, as of a crystal
+IDLE_TEMPERATURE = 35.0         # [C] of the ESCs
 
 
 @dataclass(frozen=True, kw_only=True)
 class EmulatedBoardParameters(ParameterFile, file='emulated_board.yaml'):
     """Parameters of the firmware contract and of the emulated sensors."""
 
-    system: int = parameter(doc='MAVLink system ID', low=1, high=255)
-    component: int = parameter(doc='MAVLink component ID', low=1, high=255)
-    host_system: int = parameter(doc='system ID of the accepted sender', low=1, high=255)
-    host_component: int = parameter(doc='component ID of the accepted sender', low=1,
-                                    high=255)
     target_timeout: float = parameter(doc='time without a new target after which the rotors stop',
                                       unit='s', low=0.01, high=1)
     heartbeat_timeout: float = parameter(doc='time without a heartbeat after which it disarms',
@@ -69,13 +67,8 @@ class EmulatedBoardParameters(ParameterFile, file='emulated_board.yaml'):
     rotor_rate: float = parameter(doc='rate of ESC_STATUS', unit='Hz', low=1, high=500)
     rotor_info_rate: float = parameter(doc='rate of ESC_INFO', unit='Hz', low=0.1, high=50)
     reception_rate: float = parameter(doc='rate of SYS_STATUS', unit='Hz', low=0.1, high=50)
-    clock_start: float = parameter(doc='clock of the board at the start', unit='s', low=0,
-                                   high=1e6)
-    clock_drift: float = parameter(doc='drift of the clock of the board', unit='s/s', low=-0.01,
-                                   high=0.01)
     rpm_at_1_newton: float = parameter(doc='speed of a rotor at 1 N', unit='1/min', low=1,
                                        high=1e5)
-    idle_temperature: float = parameter(doc='temperature of the ESCs', unit='C', low=-40, high=150)
 
 
 class BoardFirmware:
@@ -97,11 +90,11 @@ class BoardFirmware:
 
     def __init__(self, parameters: EmulatedBoardParameters, cells: int, now: float):
         self._parameters = parameters
-        self._clock_zero = now - parameters.clock_start
+        self._clock_zero = now - CLOCK_START
         self._arm_voltage = cells * parameters.arm_cell_voltage
         self.voltage = self.current = math.nan
         self.rpm, self.rotor_current = [0.0] * 4, [0.0] * 4
-        self.temperature = [parameters.idle_temperature] * 4
+        self.temperature = [IDLE_TEMPERATURE] * 4
         self.failed: frozenset[int] = frozenset()
         self._start(now, NONE)
 
@@ -133,7 +126,7 @@ class BoardFirmware:
 
     def clock(self, now: float) -> float:
         """Clock of the board [s since its start]."""
-        return (now - self._clock_zero) * (1 + self._parameters.clock_drift)
+        return (now - self._clock_zero) * (1 + CLOCK_DRIFT)
 
     def runs(self, now: float) -> bool:
         """Whether the firmware is executed, neither booting nor hung."""
@@ -270,8 +263,7 @@ class BoardFirmware:
         self._target, self._target_at = STOP, -math.inf
 
     def _is_for_us(self, message):
-        return (message.target_system, message.target_component) == (
-            self._parameters.system, self._parameters.component)
+        return (message.target_system, message.target_component) == BOARD
 
     def _take_target(self, message, now):
         stamp, controls = message.time_usec / 1e6, message.controls
@@ -505,9 +497,7 @@ class EmulatedMotorBoard:
             self._terminal.plug()
 
     def _clear_stream(self):
-        given = self._parameters
-        self._receiver = MavlinkReceiver(given.host_system, given.host_component)
-        self._packer = common.MAVLink(None, given.system, given.component)
+        self._receiver, self._packer = MavlinkReceiver(*HOST), common.MAVLink(None, *BOARD)
 
     def _run(self):
         while not self._stop:

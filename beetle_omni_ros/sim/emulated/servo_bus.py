@@ -45,7 +45,7 @@ WATCHDOG_UNIT, WATCHDOG_EXPIRED = 0.02, 255     # [s]
 TORQUE_UNIT = 0.000670947
 BAUD_RATES = (9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
 # Hardware Error Status (70) and Shutdown (63)
-VOLTAGE_ERROR, OVERHEATING, ENCODER_ERROR, SHOCK, OVERLOAD = 0x01, 0x04, 0x08, 0x10, 0x20
+VOLTAGE_ERROR, OVERHEATING, OVERLOAD = 0x01, 0x04, 0x20
 
 CHECK_PERIOD = 0.01 # [s] between checks of watchdog, temperature and voltage
 PAUSE = 0.05        # [s] silence after which an incomplete packet is dropped
@@ -135,17 +135,12 @@ def _crc_table():
 CRC_TABLE = tuple(_crc_table())
 
 
-def crc16(data: bytes) -> int:
-    """CRC-16 (polynomial 0x8005, not reflected) of ``data``."""
+def sealed(data: bytes) -> bytes:
+    """Bytes with their CRC-16 (polynomial 0x8005, not reflected)."""
     crc = 0
     for byte in data:
         crc = ((crc << 8) & 0xFFFF) ^ CRC_TABLE[(crc >> 8) ^ byte]
-    return crc
-
-
-def sealed(data: bytes) -> bytes:
-    """Bytes with their CRC."""
-    return data + crc16(data).to_bytes(2, 'little')
+    return data + crc.to_bytes(2, 'little')
 
 
 def packet(identifier: int, instruction: int, parameters: bytes = b'') -> bytes:
