@@ -93,10 +93,8 @@ class Plant:
         """
         Place the robot at rest: tilts zero, rotors off, servos powered, no wrench, no payload.
 
-        Args:
-            position: (3,) of base_link in world [m]; by default standing at the origin.
-            quaternion: (4,) base_link to world, xyzw; by default level.
-
+        ``position`` (3,) is that of base_link in world [m], by default standing at the origin;
+        ``quaternion`` (4,) is base_link to world, xyzw, by default level.
         """
         self.set_payload(0.0)
         self.set_powered((True,) * 4)
@@ -120,12 +118,7 @@ class Plant:
         """
         Set pose and velocity of base_link; joints and rotors keep their states.
 
-        Args:
-            position: (3,) in world [m].
-            quaternion: (4,) xyzw.
-            velocity: (3,) in world [m/s].
-            angular_velocity: (3,) in base_link [rad/s].
-
+        Arguments as those of the same names in :class:`.readings.Truth`.
         """
         self._qpos[:3] = position
         self._qpos[3:7] = rotations.normalized(quaternion)[[3, 0, 1, 2]]
@@ -386,19 +379,9 @@ class Plant:
         """
         Accelerations in a given state away from the floor; the plant remains in it.
 
-        Args:
-            position: (3,) of base_link in world [m].
-            quaternion: (4,) xyzw.
-            velocity: (3,) in world [m/s].
-            angular_velocity: (3,) in base_link [rad/s].
-            tilt: (4,) [rad].
-            tilt_velocity: (4,) [rad/s].
-            thrust: (4,) thrusts before the effects' scales [N].
-            tilt_target: (4,) [rad]; by default the present tilt.
-
-        Returns:
-            (10,) linear in world [m/s^2], angular in base_link [rad/s^2], tilts [rad/s^2].
-
+        Arguments as those of the same names in :class:`.readings.Truth`, with the ``thrust``
+        before the effects' scales; ``tilt_target`` (4,) [rad] is by default the present tilt.
+        Returned are (10,) linear in world [m/s^2], angular in base_link and of tilts [rad/s^2].
         """
         data = self.data
         data.qpos[:] = np.concatenate([position, quaternion, tilt])[

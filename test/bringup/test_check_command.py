@@ -80,7 +80,7 @@ def test_a_port_in_use_by_the_bridge_is_not_opened(robot, tmp_path):
     graph = ObservedGraph(0, 1.0, {}, {'joint_bridge': 'ready'},
                   {'joint_bridge_node: gimbal2': Status(2, 'overload', {})})
     path, packets = tmp_path / 'result.json', []
-    bus.network.handle = lambda packet, *_: packets.append(packet) or []
+    bus.handle = lambda packet, *_: packets.append(packet) or []
     bridge = subprocess.Popen([sys.executable, '-c', 'import sys; f = open(sys.argv[1], "rb", 0); '
                                'print("open", flush=True); sys.stdin.read()', bus.port],
                               stdin=subprocess.PIPE, stdout=subprocess.PIPE)
