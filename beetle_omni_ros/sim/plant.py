@@ -54,8 +54,7 @@ class Plant:
         # Effects that only change a number of the model are built into it.
         forces = [name for name in robot.effects
                   if CATALOGUE[name].apply and CATALOGUE[name].plant != 'model']
-        self._added_wrench = native.compiled(dynamics.added_wrench(robot, forces)) \
-            if forces else None
+        self._added_wrench = AddedWrench(robot, forces) if forces else None
         play = robot.effects.get('joint_backlash', {'gap': 0.0, 'at_encoder': 0.0})
         self._half_gap = np.broadcast_to(play['gap'], 4) / 2
         self._has_play, self._at_encoder = bool(self._half_gap.any()), bool(play['at_encoder'])
@@ -274,11 +273,10 @@ class Plant:
             applied[:3] += rotations.matrix(quaternion) @ force
             applied[3:] += torque
         if self._added_wrench:
-            force, torque = self._added_wrench(
+            applied += self._added_wrench(
                 quaternion, motion[:3], motion[3:6], tilt, motion[6:], data.qacc[6:],
                 self._scale * thrust, self._scale * (data.ctrl[:4] - thrust) / lag,
                 self._qpos[:3], self.voltage_ratio, self.charge_drawn)
-            applied += np.concatenate([np.array(force), np.array(torque)]).ravel()
 
     def _turned(self, before, after, thrust):
         """Change of force and torque in base_link by rotors that turn between two tilts (4,)."""
@@ -393,6 +391,26 @@ class Plant:
         self._apply_forces()
         self._update()
         return data.qacc.copy()
+
+
+class AddedWrench:
+    """:func:`.dynamics.added_wrench` as (6,), through fixed buffers, which is tens of times as fast."""
+
+    def __init__(self, robot: RobotParameters, names: list[str]):
+        function = native.compiled(dynamics.added_wrench(robot, names))
+        self._inputs = [np.zeros(function.numel_in(k)) for k in range(function.n_in())]
+        self._result = np.zeros(6)
+        self._buffer, self._evaluate = function.buffer()
+        for k, values in enumerate(self._inputs):
+            self._buffer.set_arg(k, values.data)
+        for k in range(2):
+            self._buffer.set_res(k, self._result[3 * k:3 * k + 3].data)
+
+    def __call__(self, *values) -> np.ndarray:
+        for place, value in zip(self._inputs, values, strict=True):
+            place[:] = value
+        self._evaluate()
+        return self._result
 
 
 def _reach(model):
