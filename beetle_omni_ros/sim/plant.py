@@ -394,7 +394,7 @@ class Plant:
 
 
 class AddedWrench:
-    """:func:`.dynamics.added_wrench` as (6,), through fixed buffers, which is tens of times as fast."""
+    """:func:`.dynamics.added_wrench` through fixed buffers, tens of times as fast as without."""
 
     def __init__(self, robot: RobotParameters, names: list[str]):
         function = native.compiled(dynamics.added_wrench(robot, names))
@@ -407,6 +407,7 @@ class AddedWrench:
             self._buffer.set_res(k, self._result[3 * k:3 * k + 3].data)
 
     def __call__(self, *values) -> np.ndarray:
+        """Force and torque (6,), valid until the next call."""
         for place, value in zip(self._inputs, values, strict=True):
             place[:] = value
         self._evaluate()
