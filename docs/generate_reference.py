@@ -55,7 +55,7 @@ FILES = {
     'servo_bus.yaml': ('drivers.device_parameters:ServoBusParameters', 'The bus of tilt servos.'),
     'motor_board.yaml': ('drivers.device_parameters:MotorBoardParameters',
                          'The motor board.'),
-    'emulated_board.yaml': ('sim.emulated.board_firmware:EmulatedBoardParameters',
+    'emulated_board.yaml': ('sim.emulated.motor_board:EmulatedBoardParameters',
                             'The emulated motor board.'),
     'simulator.yaml': ('sim.parameters:SimulatorParameters', 'The simulated world.'),
     'check.yaml': ('bringup.limits:CheckLimits', 'Limits of `beetle_omni check`.'),

@@ -18,7 +18,7 @@ ALLOWED = {
     'control': ('robot',),
     'estimation': ('robot',),
     'drivers': ('robot',),
-    'sim': ('robot',),
+    'sim': ('robot', 'drivers.mavlink'),     # framing of the emulated board
     'safety': ('robot', 'control.base', 'control.registry'),
     'messages': ('robot', 'control.base', 'control.registry'),
     'runs': ('robot', 'control.base', 'control.registry', 'pages', 'messages'),

@@ -141,13 +141,8 @@ def _remedy_of_missing(identifier, parameters, misplaced):
 
 
 def _of_health(servo, limits: ServoLimits):
-    """Findings about firmware, supply, temperature and torque; empty without a problem."""
+    """Findings about supply, temperature and torque; empty without a problem."""
     name, findings = servo.name, []
-    if servo.firmware < registers.FIRST_FAST_FIRMWARE:
-        findings.append(Finding(
-            f'{name} firmware', WARN, f'{servo.firmware}, before '
-            f'{registers.FIRST_FAST_FIRMWARE}: no fast sync read, feedback of all servos takes '
-            'longer', 'update it with DYNAMIXEL Wizard', {'firmware': servo.firmware}))
     supply = {'supply_V': servo.voltage}
     if not limits.supply_fail_low <= servo.voltage <= limits.supply_high:
         findings.append(Finding(

@@ -27,10 +27,8 @@ class ServoTiming:
                              unit='s', low=0.0002, high=0.1)
     silent_after: int = parameter(10, doc='consecutive missing answers after which a servo is '
                                   'silent and only pinged', low=1, high=100)
-    probe_first: float = parameter(0.1, doc='time until a silent servo is pinged first', unit='s',
-                                   low=0.005, high=10)
-    probe_longest: float = parameter(2.0, doc='largest time between two pings of a silent servo, '
-                                     'to which the time doubles', unit='s', low=0.005, high=60)
+    probe: float = parameter(0.1, doc='time between two pings of a silent servo', unit='s',
+                             low=0.005, high=10)
     health: float = parameter(0.1, doc='period in which all health registers are read once',
                               unit='s', low=0.02, high=10)
     reconnect: float = parameter(0.2, doc='time between attempts to open a lost port',

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import atexit
 from collections.abc import Callable
-from dataclasses import dataclass
 import math
 import select
 import threading
 import time
+from typing import NamedTuple
 
 import numpy as np
-from pymavlink.dialects.v20 import common
 
 from beetle_omni_ros.drivers import motor_board_state as messages
 from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters
-from beetle_omni_ros.drivers.motor_board_state import BoardState, MavlinkReceiver, RotorStates
+from beetle_omni_ros.drivers.mavlink import common, MavlinkReceiver, restarted
+from beetle_omni_ros.drivers.motor_board_state import BoardState, RotorStates
 from beetle_omni_ros.drivers.serial_port import SerialPort, SerialPortError
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import BatteryReading
@@ -63,18 +63,18 @@ class ArmCommand:
             float(self.arm), 0, 0, 0, 0, 0, 0))
         self._attempts += 1
 
-    def acknowledge(self, message) -> bool:
-        """Handle a COMMAND_ACK; return whether it accepts this command."""
+    def acknowledge(self, message, state: BoardState) -> None:
+        """Handle a COMMAND_ACK; an accepted one changes the state before the result is set."""
         if message.command != common.MAV_CMD_COMPONENT_ARM_DISARM \
                 or bool(message.result_param2 & 1) != self.arm:
-            return False
+            return
         if message.result == common.MAV_RESULT_ACCEPTED:
+            state.acknowledged(self.arm)
             self.end(True)
-            return True
+            return
         text = RESULTS.get(message.result, f'result {message.result}')
         reason = ', '.join(messages.conditions_of(message.result_param2 >> 8 & 0xFF))
         self.end(False, f'{text} by the board: {reason or "no reason given"}')
-        return False
 
     def end(self, accepted: bool, reason: str = '') -> None:
         """Set the result, if it is pending."""
@@ -90,8 +90,7 @@ class ArmCommand:
         return self
 
 
-@dataclass(frozen=True, slots=True)
-class Sent:
+class Sent(NamedTuple):
     """Result of sending one thrust target: the reason why it was not sent, or arrays (4,)."""
 
     reason: str = ''
@@ -117,7 +116,8 @@ class MotorBoard:
         self._lock = threading.Lock()           # of state and command
         self._write_lock = threading.Lock()     # of port and packer
         self.state = BoardState(parameters, robot.battery.cells, clock)
-        self._receiver = MavlinkReceiver(parameters.board_system, parameters.board_component)
+        self._receiver = MavlinkReceiver(parameters.board_system, parameters.board_component,
+                                         restarted)
         self._packer = common.MAVLink(None, parameters.host_system, parameters.host_component)
         self._port: SerialPort | None = None
         self._thread: threading.Thread | None = None
@@ -193,10 +193,7 @@ class MotorBoard:
         Zero and negative values stop the rotor. ``stamp`` is the time of the state estimate that
         they answer [s].
         """
-        thrust = np.asarray(thrust, dtype=float)
         age = self._clock() - stamp
-        if thrust.shape != (4,) or not (np.isfinite(thrust).all() and math.isfinite(age)):
-            return Sent('not four finite numbers')
         if abs(age) > self.parameters.stamp_age_limit:
             return Sent('stale stamp' if age > 0 else 'stamp in the future')
         if not self.state.clock.known:
@@ -308,11 +305,11 @@ class MotorBoard:
 
     def _handle(self, message, now):
         if message.get_msgId() == common.MAVLINK_MSG_ID_COMMAND_ACK:
-            if self._command and self._command.acknowledge(message):
-                self.state.acknowledged(self._command.arm)
+            if self._command:
+                self._command.acknowledge(message, self.state)
             return
         self.state.message(message, now)
-        if messages.restarted(message):
+        if restarted(message):
             self._next_heartbeat = self._next_timesync = now
 
     def _tick(self, now):
@@ -366,20 +363,20 @@ class Arming:
             if before != state:
                 self._start_disarm()
         elif before == DISARMED and not self._inhibited:
-            self.phase, self._disarm, self._missing_for = ARMS, False, 0.0
+            self.phase, self._disarm = ARMS, False
             self._command = self._board.start(True)
-            self._check_answer(0.0)
+            self._check_answer()
         elif before in RESTING or not before:
             self._set_lost(self._inhibited or 'the supervisor was not disarmed before')
 
     def update(self, elapsed: float) -> None:
         """Check the board, ``elapsed`` [s] after the last call."""
-        status, elapsed = self._board.state.status, min(elapsed, STEP)
+        status = self._board.state.status
         if self.phase == ARMS:
-            self._check_answer(elapsed)
+            self._check_answer()
         elif self.phase == FLIES:
             missing = self._board.ready
-            self._missing_for = self._missing_for + elapsed if missing else 0.0
+            self._missing_for = self._missing_for + min(elapsed, STEP) if missing else 0.0
             if status is None or not status.armed:
                 self._set_lost(_disarm_cause(status))
             elif self._missing_for < PATIENCE:
@@ -419,18 +416,13 @@ class Arming:
                                 if text in messages.BLOCKS_ARMING)
         return missing or ('' if self._supervisor else 'no message from the supervisor')
 
-    def _check_answer(self, elapsed):
+    def _check_answer(self):
         command, status = self._command, self._board.state.status
-        if command.accepted is None:
-            return
-        if not command.accepted:
-            self._set_lost(f'not armed: {command.reason}')
-        elif status.armed:
+        if command.accepted and status.armed:
             self.phase, self._missing_for, self._silent = FLIES, 0.0, ''
-        else:
-            self._missing_for += elapsed       # the link's thread has not set the status yet
-            if self._missing_for >= PATIENCE:
-                self._set_lost(_disarm_cause(status))
+        elif command.accepted is not None:
+            self._set_lost(_disarm_cause(status) if command.accepted
+                           else f'not armed: {command.reason}')
 
     def _set_lost(self, reason):
         self.phase, self._lost = LOST, reason

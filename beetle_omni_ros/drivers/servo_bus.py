@@ -69,7 +69,6 @@ class Servo:
     misses: int = 0                     # consecutive missing answers
     silent: bool = False                # after several of them: it is only pinged
     next_probe: float = 0.0             # monotonic time of the next ping [s]
-    probe_wait: float = 0.0             # until the ping after it [s]
     wanted: bool = False                # whether it should have torque
     torque: bool | None = None          # whether it has
     error: int = 0                      # Hardware Error Status
@@ -210,7 +209,6 @@ class ServoBus:
         """
         with self._outside_the_loop():
             self.disable()
-            self.link.fast = False
             problems = []
             for servo in self.servos:
                 problem, remedy = examine(self.link, servo)
@@ -224,8 +222,6 @@ class ServoBus:
                     problems.append(f'{servo.name}: {error}')
             if problems:
                 raise ServoBusError(f'{self.link.path}: ' + ' | '.join(problems))
-            self.link.fast = all(servo.firmware >= registers.FIRST_FAST_FIRMWARE
-                                  for servo in self.servos)
             for servo in self.servos:
                 servo.silent, servo.kept_off, servo.misses, servo.recoveries = False, False, 0, 0
                 servo.torque, servo.error, servo.watchdog_expired = False, 0, False
@@ -297,11 +293,9 @@ class ServoBus:
         """
         Send tilt targets (4,) [rad], limited to the travel, to all servos with one packet.
 
-        Return whether it was sent; False without torque, port or four finite numbers.
+        Return whether it was sent; False without torque or port.
         """
-        tilt = np.asarray(tilt, dtype=float)
-        if tilt.shape != (4,) or not np.all(np.isfinite(tilt)) or not self.enabled \
-                or not self.link.is_open:
+        if not self.enabled or not self.link.is_open:
             return False
         legal = np.clip(tilt, -self.travel, self.travel)
         self.clipped += int(np.any(legal != tilt))
@@ -423,7 +417,7 @@ class ServoBus:
             (registers.OPERATING_MODE, registers.MODE_CODES[given.mode]),
             (registers.DRIVE_MODE, 0), (registers.HOMING_OFFSET, 0), (registers.RETURN_DELAY, 0),
             (registers.CURRENT_LIMIT, round(given.current_limit / registers.CURRENT_UNIT))]
-        if servo.firmware >= registers.FIRST_FAST_FIRMWARE:
+        if servo.firmware >= registers.STARTUP_FIRMWARE:
             permanent.append((registers.STARTUP, 0))    # nothing is restored after power-up
         link, volatile = self.link, self._volatile_settings()
         link.write(identifier, registers.WATCHDOG, 0)
@@ -514,8 +508,7 @@ class ServoBus:
         timing = self.parameters.timing
         if servo.misses >= timing.silent_after and not servo.silent:
             servo.silent, servo.torque = True, None
-            servo.probe_wait = timing.probe_first
-            servo.next_probe = time.monotonic() + servo.probe_wait
+            servo.next_probe = time.monotonic() + timing.probe
             self.log(f'{servo.where}: silent; check its cable and power')
 
     def _probe(self, now):
@@ -525,11 +518,8 @@ class ServoBus:
             self.link.ping(servo.identifier)
         except NoAnswer:
             self.link.late = False
-            if servo.restarting:
-                servo.next_probe = now + PING_PERIOD
-            else:
-                servo.probe_wait = min(2 * servo.probe_wait, self.parameters.timing.probe_longest)
-                servo.next_probe = now + servo.probe_wait
+            servo.next_probe = now + (
+                PING_PERIOD if servo.restarting else self.parameters.timing.probe)
             return
         except ServoBusError:
             pass
@@ -624,8 +614,7 @@ class ServoBus:
             link.reboot(identifier)
             now = time.monotonic()
             servo.silent = True     # so that reads of the others do not wait for it
-            servo.probe_wait, servo.next_probe = given.timing.probe_first, now + FIRST_PING
-            servo.boot_ends = now + given.timing.reboot
+            servo.next_probe, servo.boot_ends = now + FIRST_PING, now + given.timing.reboot
             return
         for register, value in self._volatile_settings():
             link.write(identifier, register, value, attempts=1)

@@ -9,37 +9,8 @@ import numpy as np
 
 from beetle_omni_ros.drivers.servo_bus import ServoBus, ServoReadings
 
-READ_AFTER = 0.001  # [s] start of a cycle after the arrival of goals, which find the bus free
-SLEW = 0.01         # largest relative change of a period by the phase control
-GAIN = 0.1          # of the phase control in each cycle, small against single late goals
-GOALS_KEPT = 0.1    # [s] older goals do not control the phase
 PERIOD = 0.005      # [s]
 STOP_TIMEOUT = 5.0  # [s] until the thread has ended; a cycle takes at most 0.02 s
-
-
-class ServoPace:
-    """
-    Times of the cycles on a monotonic clock [s].
-
-    A late cycle does not delay the next one, and a period without a cycle is missed. Goals arrive
-    once in one or several periods. The phase of the cycles is controlled so that goals do not
-    arrive during a transaction.
-
-    ``missed`` counts periods without a cycle, ``due`` is the time of the next one, ``goals`` that
-    of the last arrival.
-    """
-
-    def __init__(self, now: float):
-        self.missed, self.due, self.goals = 0, now, float('-inf')
-
-    def begin(self, now: float):
-        """Start a cycle at ``now`` and set the time of the next one."""
-        passed = int(max(0.0, now - self.due) / PERIOD)
-        self.missed += passed
-        self.due += (passed + 1) * PERIOD
-        if now - self.goals < GOALS_KEPT:
-            late = (self.due - self.goals - READ_AFTER + PERIOD / 2) % PERIOD - PERIOD / 2
-            self.due -= min(max(GAIN * late, -SLEW * PERIOD), SLEW * PERIOD)
 
 
 class ServoLoop:
@@ -58,6 +29,7 @@ class ServoLoop:
 
     Attributes:
         cycles, incomplete: number of cycles, and of those without a valid reading of each servo.
+        missed: number of periods without a cycle; a late cycle does not delay the next one.
         written, stale: number of packets with goals, and of goals that had expired before.
         failure: error that ended the thread, or ''; torque is off then.
 
@@ -66,10 +38,10 @@ class ServoLoop:
     def __init__(self, bus: ServoBus, on_readings: Callable[[ServoReadings, np.ndarray], None],
                  on_written: Callable[[float], None] = lambda published: None,
                  clock: Callable[[], float] = time.monotonic):
-        self.cycles = self.written = self.stale = self.incomplete = 0
+        self.cycles = self.missed = self.written = self.stale = self.incomplete = 0
         self.failure = ''
         self._bus, self._on_readings, self._on_written = bus, on_readings, on_written
-        self._clock, self.pace = clock, ServoPace(clock())
+        self._clock, self._due = clock, clock()
         self._lock = Lock()
         self._goal: tuple[np.ndarray, float, float] | None = None
         self._fresh = self._wrote = self._stopping = False
@@ -78,7 +50,7 @@ class ServoLoop:
 
     def start(self):
         """Start the thread."""
-        self.pace.due = self._clock()
+        self._due = self._clock()
         self._thread.start()
 
     def stop(self):
@@ -93,7 +65,6 @@ class ServoLoop:
 
         They were ``published`` [s] and are valid until ``expires`` on the monotonic clock [s].
         """
-        self.pace.goals = self._clock()
         self._goal = tilt, published, expires
         self._fresh = True
         self._write_pending()
@@ -105,7 +76,7 @@ class ServoLoop:
             try:
                 yield self._bus
             finally:
-                self.pace.due = now = self._clock()
+                self._due = now = self._clock()
                 self._last_obeying = np.full(4, now)
         self._write_pending()
 
@@ -122,7 +93,7 @@ class ServoLoop:
     def _run(self):
         try:
             while not self._stopping:
-                time.sleep(max(0.0, self.pace.due - self._clock()))
+                time.sleep(max(0.0, self._due - self._clock()))
                 with self._lock:
                     if not self._stopping:
                         self._cycle()
@@ -135,7 +106,9 @@ class ServoLoop:
 
     def _cycle(self):
         """Goals, feedback and upkeep, with the lock held."""
-        self.pace.begin(self._clock())
+        passed = int(max(0.0, self._clock() - self._due) / PERIOD)
+        self.missed += passed
+        self._due += (passed + 1) * PERIOD
         self.cycles += 1
         if self._fresh:
             self._write_fresh()

@@ -63,7 +63,7 @@ TEMPERATURE = Register('Present Temperature', 146, 1)
 ALL = tuple(value for value in list(globals().values()) if isinstance(value, Register))
 
 MODEL = 1210                # XC330-T181-T
-FIRST_FAST_FIRMWARE = 46    # fast sync read and startup configuration exist from here on
+STARTUP_FIRMWARE = 46       # the startup configuration exists from here on
 
 TURN = 2 * pi
 POSITION_UNIT = TURN / 4096         # [rad]

@@ -198,13 +198,13 @@ class JointBridgeNode(LifecycleFlightNode):
         if loop is not before:
             cycles = missed = 0
         values = {
-            'stage': self.stage, 'cycles': loop.cycles, 'missed_cycles': loop.pace.missed,
+            'stage': self.stage, 'cycles': loop.cycles, 'missed_cycles': loop.missed,
             'rate_hz': (loop.cycles - cycles) / max(now - then, 1e-3),
             'connected': bus.link.is_open, 'goals_written': loop.written,
             'goals_stale': loop.stale, 'goals_clipped': bus.clipped,
             'incomplete': loop.incomplete, **bus.link.counts}
-        missed = loop.pace.missed - missed
-        self._counted = (loop, loop.cycles, loop.pace.missed, now)
+        missed = loop.missed - missed
+        self._counted = (loop, loop.cycles, loop.missed, now)
         if text.startswith('lost'):
             return ERROR, text, values
         if not bus.link.is_open:

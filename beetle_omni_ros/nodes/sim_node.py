@@ -15,15 +15,13 @@ from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.node import CommandSource, Distribution, ERROR, FlightNode, OK, WARN
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import group, parameter, ParameterError
-from beetle_omni_ros.sim.emulated.fault_switches import (
+from beetle_omni_ros.sim.emulated import (
     BOARD_EVENTS,
-    BoardFaultSwitches,
+    BoardFaults,
     SERVO_EVENTS,
-    ServoFaultSwitches,
+    ServoFaults,
     switched_on,
 )
-from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
-from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
 from beetle_omni_ros.sim.emulated_actuators import EmulatedActuators
 from beetle_omni_ros.sim.fault_lists import DEVICES, parse_faults
 from beetle_omni_ros.sim.parameters import SimulatorParameters
@@ -202,8 +200,8 @@ class SimNodeParameters:
     payload: float = parameter(0.0, doc='mass attached below the body', unit='kg', low=0, high=2)
     faults: str = parameter('', doc='active faults, as "rotor_stops rotor=2; mocap_lost '
                             'duration=3"; docs/faults.md lists the kinds')
-    servo_faults: ServoFaultSwitches = group(ServoFaultSwitches, 'faults of the servo bus')
-    board_faults: BoardFaultSwitches = group(BoardFaultSwitches, 'faults of the motor board')
+    servo_faults: ServoFaults = group(ServoFaults, 'faults of the servo bus')
+    board_faults: BoardFaults = group(BoardFaults, 'faults of the motor board')
 
 
 class SimNode(FlightNode):
@@ -270,6 +268,8 @@ class SimNode(FlightNode):
 
     def _make_devices(self):
         """Connect emulated devices to the plant, for the drivers of the bridges."""
+        from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard  # has pymavlink
+        from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
         given = self.parameters
         servos = ServoBusParameters.load(given.servo_bus_file or None)
         bus = EmulatedServoBus(

@@ -4,22 +4,18 @@ from __future__ import annotations
 
 from collections import deque
 from math import ceil
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.sim.command_link import ROUNDING
-from beetle_omni_ros.sim.emulated.fault_switches import (
-    BoardFaultSwitches,
-    SERVO_EVENTS,
-    SERVO_LISTS,
-    ServoFaultSwitches,
-    switched_on,
-)
-from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
-from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
+from beetle_omni_ros.sim.emulated import BoardFaults, SERVO_EVENTS, ServoFaults, switched_on
 from beetle_omni_ros.sim.readings import Drive, Frame
-from beetle_omni_ros.sim.simulator import Simulator
+from beetle_omni_ros.sim.simulator import ROUNDING, Simulator
+
+if TYPE_CHECKING:       # pymavlink is needed by an emulated board only
+    from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
+    from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
 
 
 class EmulatedActuators:
@@ -39,7 +35,7 @@ class EmulatedActuators:
         self._tilts = _line(tilt, simulator.tick, lambda: (np.zeros(4), [False] * 4))
         self._thrusts = _line(thrust, simulator.tick, lambda: np.zeros(4))
         self._held: dict[int, float] = {}
-        self._servo_faults, self._board_faults = ServoFaultSwitches(), BoardFaultSwitches()
+        self._faults = ServoFaults(), BoardFaults()
         truth = simulator.truth
         bus.set_state(truth.tilt, truth.tilt_velocity, np.zeros(4))
         board.set_rotors(truth.thrust)
@@ -65,7 +61,13 @@ class EmulatedActuators:
         self._thrusts.append(self.board.thrust_targets)
         tilt, powered = self._tilts[0]
         frame = self._simulator.step(Drive(tilt, powered, self._thrusts[0]))
-        self._update_devices(frame, powered)
+        joints, pack, battery = frame.joints, frame.battery, self._simulator.battery
+        # The current of a servo without torque is zero.
+        self.bus.set_state(joints.position, joints.velocity, joints.effort * powered)
+        voltage, current = battery.voltage, battery.current
+        self.board.set_battery(voltage, current,
+                               (pack.voltage - voltage, -pack.current - current))
+        self.board.set_rotors(frame.truth.thrust)
         return frame
 
     def _hold(self, goals, stopped):
@@ -84,16 +86,7 @@ class EmulatedActuators:
                     tilt[joint] = held
             goals[joint] = self._held[joint]
 
-    def _update_devices(self, frame, powered):
-        """Set the sensors of the devices; the current of a servo without torque is zero."""
-        joints, pack, battery = frame.joints, frame.battery, self._simulator.battery
-        self.bus.set_state(joints.position, joints.velocity, joints.effort * powered)
-        voltage, current = battery.voltage, battery.current
-        self.board.set_battery(voltage, current,
-                               (pack.voltage - voltage, -pack.current - current))
-        self.board.set_rotors(frame.truth.thrust)
-
-    def set_faults(self, servo: ServoFaultSwitches, board: BoardFaultSwitches) -> None:
+    def set_faults(self, servo: ServoFaults, board: BoardFaults) -> None:
         """
         Switch faults on and off, and trigger the events that are set.
 
@@ -102,60 +95,43 @@ class EmulatedActuators:
                 use when it is plugged in.
 
         """
-        _check_faults(servo, board, [one['ID'] for one in self.bus.servos])
+        places = {one['ID']: place for place, one in enumerate(self.bus.servos)}
+        for name in ('silent', 'overload', 'overheated', *SERVO_EVENTS):
+            for wanted in np.ravel(getattr(servo, name)):
+                if wanted not in places and not (name in SERVO_EVENTS and wanted == 0):
+                    raise ParameterError(f'servo_faults.{name}: no servo has the id {wanted:g}; '
+                                         f'ids are {list(places)}')
+        if np.any(board.failed_escs != np.round(board.failed_escs)):
+            raise ParameterError('board_faults.failed_escs: expected rotors 1 to 4, found '
+                                 f'{board.failed_escs}')
+        self._faults = self.bus.faults, self.board.faults = servo, board
         try:
-            self._set_servo_faults(servo)
-            self._set_board_faults(board)
+            (self.bus.unplug if servo.unplugged else self.bus.replug)()
+            (self.board.unplug if board.unplugged else self.board.plug)()
         except OSError as error:
             raise ParameterError(str(error)) from None
-        self._servo_faults, self._board_faults = servo, board
-
-    def _set_servo_faults(self, faults):
-        bus = self.bus
-        bus.faults = faults
-        (bus.unplug if faults.unplugged else bus.replug)()
-        places = {servo['ID']: place for place, servo in enumerate(bus.servos)}
-        if faults.reboot:
-            bus.reboot(places[faults.reboot])
-        if faults.expire_watchdog:
-            bus.expire_watchdog(places[faults.expire_watchdog])
-
-    def _set_board_faults(self, faults):
-        board = self.board
-        board.faults = faults
-        (board.unplug if faults.unplugged else board.plug)()
-        if faults.hang:
-            board.hang()
-        if faults.reboot:
-            board.reboot()
+        if servo.reboot:
+            self.bus.reboot(places[servo.reboot])
+        if servo.expire_watchdog:
+            self.bus.expire_watchdog(places[servo.expire_watchdog])
+        if board.hang:
+            self.board.hang()
+        if board.reboot:
+            self.board.reboot()
 
     @property
     def faults(self) -> list[str]:
         """Active faults as texts such as 'servo silent [2]'."""
-        return [f'{device} {text}' for device, faults in
-                (('servo', self._servo_faults), ('board', self._board_faults))
+        return [f'{device} {text}' for device, faults in zip(('servo', 'board'), self._faults)
                 for text in switched_on(faults)]
 
     def status(self) -> dict[str, object]:
         """States and refusals of the devices, for diagnostics."""
         bus, board = self.bus, self.board
+        _, torque, stopped = bus.drive()
         return {'servo_port': bus.port, 'board_port': board.port, 'armed': board.armed,
-                'torque': [bool(on) for on in bus.torque_enabled],
-                'stopped': [bool(on) for on in bus.stopped],
-                'servo refused': bus.network.refusals,
+                'torque': torque, 'stopped': stopped, 'servo refused': bus.refusals,
                 **{f'board refused: {reason}': count for reason, count in board.refused.items()}}
-
-
-def _check_faults(servo, board, known):
-    """Refuse unknown IDs, and numbers of rotors that are not whole."""
-    for name in SERVO_LISTS + SERVO_EVENTS:
-        for wanted in np.ravel(getattr(servo, name)):
-            if wanted not in known and not (name in SERVO_EVENTS and wanted == 0):
-                raise ParameterError(f'servo_faults.{name}: no servo has the id {wanted:g}; '
-                                     f'ids are {known}')
-    if np.any(board.failed_escs != np.round(board.failed_escs)):
-        raise ParameterError('board_faults.failed_escs: expected rotors 1 to 4, found '
-                             f'{board.failed_escs}')
 
 
 def _line(delay, tick, make):

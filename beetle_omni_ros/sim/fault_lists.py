@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from math import inf
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.resources import share_path
@@ -15,7 +15,6 @@ from beetle_omni_ros.sim.faults import Fault, KINDS
 
 # Signals without effect if the devices are emulated.
 DEVICES = 'joints', 'rotors', 'battery', 'command'
-GROUPS = ('limits', 'flight', 'healthy')
 OUTCOMES = ('flies_on', 'lands', 'stops', 'refused')
 
 
@@ -81,23 +80,13 @@ class HealthyFlights:
     effects: dict = parameter(doc='effects of the plant, as in a robot file')
 
 
-@dataclass(frozen=True)
-class Case:
-    """
-    One named fault of the campaign.
-
-    Attributes:
-        name: name in the file.
-        expected: expected outcome, one of OUTCOMES.
-        what: description.
-        strike: its faults; ``at`` counts from the onset.
-
-    """
+class Case(NamedTuple):
+    """One named fault of the campaign."""
 
     name: str
-    expected: str
-    what: str
-    strike: tuple[Fault, ...]
+    expected: str                   # outcome, one of OUTCOMES
+    what: str                       # description
+    strike: tuple[Fault, ...]       # its faults; ``at`` counts from the onset
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,7 +99,9 @@ class FaultList:
     faults: dict = parameter(doc='name -> expected, what, strike')
 
     def __post_init__(self):
-        object.__setattr__(self, 'cases', _cases(self.faults))
+        object.__setattr__(self, 'cases', {
+            name: _case(name, entry, f"key 'faults.{shortened(str(name))}'")
+            for name, entry in self.faults.items()})
 
     @classmethod
     def load(cls, path: str | Path | None = None) -> FaultList:
@@ -125,11 +116,10 @@ class FaultList:
         path = path or shipped
         given = schema.load_yaml(path)
         if not isinstance(given.get('faults'), dict):
-            raise ParameterError(f"{path}: key 'faults': expected a mapping of names, "
-                                 f"found {type(given.get('faults')).__name__}")
+            raise ParameterError(f"{path}: key 'faults': expected a mapping of names")
         defaults = schema.load_yaml(shipped)
-        return schema.bind(cls, {**{key: defaults[key] for key in GROUPS}, **given},
-                           str(path))
+        return schema.bind(cls, {**{key: defaults[key] for key in ('limits', 'flight', 'healthy')},
+                                 **given}, str(path))
 
     def chosen(self, names: list[str] | None) -> list[Case]:
         """
@@ -146,32 +136,25 @@ class FaultList:
         return [self.cases[name] for name in names or self.cases]
 
 
-def _cases(faults) -> dict[str, Case]:
-    cases = {}
-    for name, entry in faults.items():
-        at = f"key 'faults.{shortened(name) if isinstance(name, str) else quoted(name)}'"
-        if not isinstance(name, str) or not isinstance(entry, dict) \
-                or set(entry) != {'expected', 'what', 'strike'}:
-            raise ParameterError(f'{at}: expected the keys expected, what and strike')
-        if entry['expected'] not in OUTCOMES:
-            raise ParameterError(f"{at}: expected: one of {', '.join(OUTCOMES)}, "
-                                 f"found {quoted(entry['expected'])}")
-        if not isinstance(entry['what'], str):
-            raise ParameterError(f'{at}: what: expected text')
-        if not isinstance(entry['strike'], list) or not entry['strike']:
-            raise ParameterError(f'{at}: strike: expected a list of faults')
-        cases[name] = Case(name, entry['expected'], entry['what'], tuple(
-            _fault(strike, f'{at}: strike {k}') for k, strike in enumerate(entry['strike'], 1)))
-    return cases
+def _case(name, entry, at):
+    if not isinstance(entry, dict) or set(entry) != {'expected', 'what', 'strike'} \
+            or not isinstance(entry['strike'], list) or not entry['strike']:
+        raise ParameterError(f'{at}: expected the keys expected, what and strike, a list of '
+                             'faults')
+    if entry['expected'] not in OUTCOMES:
+        raise ParameterError(f"{at}: expected: one of {', '.join(OUTCOMES)}, "
+                             f"found {quoted(entry['expected'])}")
+    return Case(str(name), entry['expected'], str(entry['what']), tuple(
+        _fault(one, f'{at}: strike {k}') for k, one in enumerate(entry['strike'], 1)))
 
 
-def _fault(entry: Any, at: str) -> Fault:
-    if not isinstance(entry, dict) or not isinstance(entry.get('kind'), str) \
-            or not all(isinstance(key, str) for key in entry):
-        raise ParameterError(f"{at}: expected a mapping with the key 'kind'")
+def _fault(entry, at, key='kind'):
+    """Fault of a mapping whose ``key`` is the kind."""
+    if not isinstance(entry, dict) or not isinstance(entry.get(key), str):
+        raise ParameterError(f"{at}: expected a mapping with the key '{key}'")
     try:
-        return Fault(entry['kind'], **{key: value for key, value in entry.items()
-                                       if key not in ('kind', 'self')})
+        return Fault(entry[key], **{str(name): value for name, value in entry.items()
+                                    if name != key})
     except ParameterError as error:
         raise ParameterError(f'{at}: {error}') from None
 
@@ -187,9 +170,9 @@ def load_faults(path: str | Path) -> list[Fault]:
 
     """
     given = schema.load_yaml(path)
-    unknown = set(map(str, given)) - {'faults'}
-    if unknown:
-        raise ParameterError(f'{path}: key {quoted(min(unknown))}: unknown key; known: faults')
+    for key in given:
+        if key != 'faults':
+            raise ParameterError(f'{path}: key {quoted(key)}: unknown key; known: faults')
     if not isinstance(given.get('faults'), list):
         raise ParameterError(f"{path}: key 'faults': expected a list")
     named = FaultList.load().cases
@@ -198,23 +181,20 @@ def load_faults(path: str | Path) -> list[Fault]:
 
 
 def _placed(entry, at, named):
-    if not isinstance(entry, dict) or not isinstance(entry.get('what'), str):
-        raise ParameterError(f"{at}: expected a mapping with the key 'what'")
-    numbers = dict(entry)
-    what = numbers.pop('what')
-    if what in KINDS and not (what in named and set(numbers) <= {'at', 'duration'}):
-        if 'kind' in numbers:
-            raise ParameterError(f"{at}: key 'kind': give the kind as 'what'")
-        return [_fault({'kind': what, **numbers}, at)]
+    what = entry.get('what') if isinstance(entry, dict) else None
+    times = {key: value for key, value in entry.items() if key != 'what'} if what else {}
+    if not isinstance(what, str) or what in KINDS and not (
+            what in named and set(times) <= {'at', 'duration'}):
+        return [_fault(entry, at, 'what')]
     if what not in named:
         raise ParameterError(f"{at}: key 'what': {quoted(what)} is unknown, a kind or a name of "
                              f'params/faults.yaml is expected{_near(what, [*KINDS, *named])}')
-    for key in numbers:
+    for key in times:
         if key not in ('at', 'duration'):
             raise ParameterError(f'{at}: key {quoted(key)}: a fault of the list takes at and '
                                  'duration')
-    return [_fault({'kind': fault.kind, **fault.numbers, 'duration': fault.duration, **numbers},
-                   at) for fault in named[what].strike]
+    return [_fault({'kind': fault.kind, **fault.numbers, 'duration': fault.duration, **times}, at)
+            for fault in named[what].strike]
 
 
 def _near(name, known):

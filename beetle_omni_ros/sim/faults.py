@@ -4,8 +4,8 @@ Faults of the simulated robot, its devices and the flight stack, as one table KI
 An example is ``Fault('rotor_weak', at=3.0, duration=1.0, rotor=2, share=0.5)``. Faults of robot
 and devices go to ``Simulator.set_faults``, those of processes to the in-process loop.
 
-A function of the table gets an active fault, whose attributes are the numbers of its kind, and
-those that :meth:`Schedule.update` sets. What else it gets and returns depends on its signal:
+A function of the table gets an active fault with the numbers of its kind and the attributes that
+:meth:`Schedule.update` sets. What else it gets and returns depends on its signal:
 
 - ``imu``, ``mocap``, ``joints``, ``rotors``, ``battery``: the reading that arrives; returns the
   changed one, or None. ``command`` and ``request`` do the same for the commands to the actuators
@@ -47,21 +47,20 @@ class Number:
     doc: str
     unit: str = ''
     default: float | None = None
-    low: float = -inf
-    high: float = inf
+    low: float = -LARGEST
+    high: float = LARGEST
     whole: bool = False
 
     def checked(self, value: Any, at: str) -> float:
         """Return a legal value as a float, else raise a ParameterError that starts with ``at``."""
-        unit = f' {self.unit}' if self.unit else ''
         if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) \
                 or not -inf < value < inf or (self.whole and value != int(value)):
             kind = 'a whole number' if self.whole else 'a number'
-            raise ParameterError(f"{at}: expected {kind}{f' [{self.unit}]' if unit else ''}, "
+            raise ParameterError(f"{at}: expected {kind}{f' [{self.unit}]' if self.unit else ''}, "
                                  f'found {quoted(value)}')
-        if not max(self.low, -LARGEST) <= value <= min(self.high, LARGEST):
+        if not self.low <= value <= self.high:
             raise ParameterError(f'{at}: {quoted(value)} is outside {self.low:g} to '
-                                 f'{self.high:g}{unit}')
+                                 f'{self.high:g} {self.unit}'.rstrip())
         return float(value)
 
 
@@ -75,23 +74,13 @@ class Kind:
 
 @dataclass
 class Actuation:
-    """
-    Inputs of the actuators in one tick; faults change them in place.
+    """Inputs of the actuators in one tick; faults change them in place."""
 
-    Attributes:
-        tilt: (4,) targets of the servos [rad].
-        thrust: (4,) targets of the rotors [N].
-        powered: (4,) whether a servo has torque.
-        jammed: (4,) whether a joint is jammed at its target.
-        wear: (4,) thrust relative to that of an intact propeller at the same speed.
-
-    """
-
-    tilt: np.ndarray
-    thrust: np.ndarray
-    powered: np.ndarray
-    jammed: np.ndarray
-    wear: np.ndarray
+    tilt: np.ndarray        # (4,) targets of the servos [rad]
+    thrust: np.ndarray      # (4,) targets of the rotors [N]
+    powered: np.ndarray     # (4,) whether a servo has torque
+    jammed: np.ndarray      # (4,) whether a joint is jammed at its target
+    wear: np.ndarray        # (4,) thrust relative to an intact propeller at the same speed
 
 
 # Functions of several kinds ---------------------------------------------------------------------
@@ -123,13 +112,32 @@ def delayed(fault, item, most=inf):
     return due
 
 
+def added(field, amount):
+    """Function that adds ``amount(fault)`` to a field of a reading."""
+    return lambda fault, item: replace(item, **{field: getattr(item, field) + amount(fault)})
+
+
+def of_motion(change):
+    """Function that applies ``change(fault, (6,) specific force and rate)`` to an IMU reading."""
+    def changed(fault, reading):
+        motion = change(fault, np.concatenate([reading.specific_force, reading.angular_velocity]))
+        return replace(reading, specific_force=motion[:3], angular_velocity=motion[3:])
+    return changed
+
+
+def _axes(fault):
+    return np.array([fault.x, fault.y, fault.z])
+
+
+def _turn(fault):
+    return rotations.from_rpy(fault.roll, fault.pitch, fault.yaw)
+
+
+def _both(fault):
+    return np.repeat([fault.specific_force, fault.rate], 3)
+
+
 # Rotors and servos -----------------------------------------------------------------------------
-
-def _start(fault, value):
-    """Set the memory at the first call."""
-    if fault.memory is None:
-        fault.memory = float(value)
-
 
 def rotor_weak(fault, drive):
     drive.thrust[fault.k] *= fault.share
@@ -149,7 +157,8 @@ def rotor_sticks(fault, drive):
 
 
 def rotor_slow(fault, drive):
-    _start(fault, fault.truth.thrust[fault.k])
+    if fault.memory is None:
+        fault.memory = float(fault.truth.thrust[fault.k])
     gain = 1 - exp(-fault.tick / fault.time_constant)
     fault.memory += gain * (drive.thrust[fault.k] - fault.memory)
     drive.thrust[fault.k] = fault.memory
@@ -168,7 +177,8 @@ def servo_limp(fault, drive):
 
 
 def servo_slow(fault, drive):
-    _start(fault, fault.truth.tilt[fault.k])
+    if fault.memory is None:
+        fault.memory = float(fault.truth.tilt[fault.k])
     step = fault.rate * fault.tick
     fault.memory += float(np.clip(drive.tilt[fault.k] - fault.memory, -step, step))
     drive.tilt[fault.k] = fault.memory
@@ -182,32 +192,15 @@ def servo_misled(fault, drive):
     drive.tilt[fault.k] -= fault.angle
 
 
-def encoder_shifted(fault, reading):
-    position = reading.position.copy()
-    position[fault.k] += fault.angle
-    return replace(reading, position=position)
-
-
 def encoder_frozen(fault, reading):
-    _start(fault, reading.position[fault.k])
+    if fault.memory is None:
+        fault.memory = float(reading.position[fault.k])
     position, velocity = reading.position.copy(), reading.velocity.copy()
     position[fault.k], velocity[fault.k] = fault.memory, 0.0
     return replace(reading, position=position, velocity=velocity)
 
 
-# Motion capture and IMU ------------------------------------------------------------------------
-
-def _turn(fault):
-    return rotations.from_rpy(fault.roll, fault.pitch, fault.yaw)
-
-
-def _axes(fault):
-    return np.array([fault.x, fault.y, fault.z])
-
-
-def mocap_jumps(fault, pose):
-    return replace(pose, position=pose.position + _axes(fault))
-
+# Sensors, battery and processes ----------------------------------------------------------------
 
 def mocap_turned(fault, pose):
     return replace(pose, quaternion=rotations.multiply(pose.quaternion, _turn(fault)))
@@ -218,10 +211,6 @@ def mocap_noisy(fault, pose):
     turn = rotations.exp(fault.orientation * noise[3:])
     return replace(pose, position=pose.position + fault.position * noise[:3],
                    quaternion=rotations.multiply(pose.quaternion, turn))
-
-
-def mocap_delayed(fault, pose):
-    return delayed(fault, pose, 1)
 
 
 def mocap_lags(fault, pose):
@@ -235,48 +224,16 @@ def mocap_slow(fault, pose):
     return pose
 
 
-def _moved(reading, motion):
-    return replace(reading, specific_force=motion[:3], angular_velocity=motion[3:])
-
-
-def _motion(reading):
-    return np.concatenate([reading.specific_force, reading.angular_velocity])
-
-
-def _both(fault):
-    return np.repeat([fault.specific_force, fault.rate], 3)
-
-
-def gyroscope_bias(fault, reading):
-    return replace(reading, angular_velocity=reading.angular_velocity + _axes(fault))
-
-
-def accelerometer_bias(fault, reading):
-    return replace(reading, specific_force=reading.specific_force + _axes(fault))
-
-
-def imu_saturated(fault, reading):
-    return _moved(reading, np.clip(_motion(reading), -_both(fault), _both(fault)))
-
-
-def imu_nan(fault, reading):
-    return _moved(reading, np.full(6, np.nan))
-
-
-def imu_spikes(fault, reading):
+def imu_spikes(fault, motion):
     hit, *direction = fault.random.uniform(-1, 1, 7)
-    if abs(hit) >= fault.tick / fault.period:
-        return reading
-    return _moved(reading, _motion(reading) + _both(fault) * np.sign(direction))
+    hits = abs(hit) < fault.tick / fault.period
+    return motion + _both(fault) * np.sign(direction) if hits else motion
 
 
-def imu_axis_dead(fault, reading):
-    motion = _motion(reading)
+def imu_axis_dead(fault, motion):
     motion[int(fault.axis) - 1] = 0.0
-    return _moved(reading, motion)
+    return motion
 
-
-# Battery and processes -------------------------------------------------------------------------
 
 def battery_charge(fault, battery, begins):
     if begins:
@@ -287,10 +244,6 @@ def battery_resistance(fault, battery, begins):
     battery.extra_resistance += fault.resistance if begins else -fault.resistance
 
 
-def push(fault):
-    return np.array([fault.x, fault.y, fault.z, fault.roll, fault.pitch, fault.yaw])
-
-
 def estimator_diverges(fault, state):
     time = fault.memory = (fault.memory or 0.0) + fault.tick
     away = np.array([1.0, 0.0, 0.0])
@@ -298,18 +251,10 @@ def estimator_diverges(fault, state):
                    velocity=state.velocity + fault.acceleration * time * away)
 
 
-def estimator_nan(fault, state):
-    return replace(state, position=np.full(3, np.nan))
-
-
 def estimator_rubbish(fault, state):
     row = fault.random.standard_normal(13)
     return replace(state, position=3 * row[:3], velocity=3 * row[3:6],
                    quaternion=rotations.normalized(row[6:10]), angular_velocity=3 * row[10:])
-
-
-def controller_nan(fault, command):
-    return replace(command, thrust=np.full(4, np.nan))
 
 
 def controller_rubbish(fault, command):
@@ -369,7 +314,8 @@ KINDS = {
     'encoder_shifted': Kind(
         'an encoder reads too much by an angle, and its servo uses this reading', SERVO | {
             'angle': Number('reading minus true tilt', 'rad', low=-8, high=8)},
-        drive=servo_misled, joints=encoder_shifted),
+        drive=servo_misled,
+        joints=added('position', lambda fault: fault.angle * np.eye(4)[fault.k])),
     'encoder_frozen': Kind('the reported angle of a servo is frozen, the servo works', SERVO,
                            joints=encoder_frozen),
     'joints_lost': Kind('no joint feedback arrives', joints=lost),
@@ -382,12 +328,14 @@ KINDS = {
     'estimator_diverges': Kind('the estimated position and velocity run away along world x', {
         'acceleration': Number('acceleration of the error', 'm/s^2', 1.0, 0, 1000)},
         estimate=estimator_diverges),
-    'estimator_nan': Kind('the estimates are NaN', estimate=estimator_nan),
+    'estimator_nan': Kind('the estimates are NaN', estimate=lambda fault, state: replace(
+        state, position=np.full(3, np.nan))),
     'estimator_rubbish': Kind('the estimates are random states', estimate=estimator_rubbish),
     'estimator_frozen': Kind('the estimator repeats a state with new stamps', estimate=frozen),
     'controller_silent': Kind('the active controller publishes nothing', request=lost),
     'controller_nan': Kind('the commands of the active controller are NaN',
-                           request=controller_nan),
+                           request=lambda fault, command: replace(
+                               command, thrust=np.full(4, np.nan))),
     'controller_rubbish': Kind(
         'its commands are random tilts within 3 rad and thrusts within 20 N',
         request=controller_rubbish),
@@ -413,14 +361,15 @@ KINDS = {
                         mocap=dropped),
     'mocap_frozen': Kind('the same pose arrives with new stamps', mocap=frozen),
     'mocap_jumps': Kind('the position jumps by a permanent offset',
-                        _vector('m', 'of the jump in world', **XYZ), mocap=mocap_jumps),
+                        _vector('m', 'of the jump in world', **XYZ),
+                        mocap=added('position', _axes)),
     'mocap_turned': Kind('the orientation jumps by a permanent turn about base_link axes',
                          _vector('rad', 'of the rotation', **RPY), mocap=mocap_turned),
     'mocap_noisy': Kind('additional noise of the pose; standard deviations of an axis', {
         'position': Number('standard deviation', 'm', 0.0, 0, 10),
         'orientation': Number('standard deviation', 'rad', 0.0, 0, 3)}, mocap=mocap_noisy),
     'mocap_delayed': Kind('poses arrive late with the stamps of their capture', DELAY, late=True,
-                          mocap=mocap_delayed),
+                          mocap=lambda fault, pose: delayed(fault, pose, 1)),
     'mocap_lags': Kind('poses arrive late with late stamps', DELAY, late=True, mocap=mocap_lags),
     'mocap_slow': Kind('poses arrive at a lower rate', {
         'period': Number('time between two poses', 's', low=0.01, high=5)}, mocap=mocap_slow),
@@ -431,17 +380,20 @@ KINDS = {
     'imu_clock': Kind('the stamps of the IMU jump by a permanent offset', STEP,
                       imu=stamped_wrongly),
     'gyroscope_bias': Kind('the gyroscope bias steps', _vector('rad/s', 'of the step', **XYZ),
-                           imu=gyroscope_bias),
+                           imu=added('angular_velocity', _axes)),
     'accelerometer_bias': Kind('the accelerometer bias steps',
-                               _vector('m/s^2', 'of the step', **XYZ), imu=accelerometer_bias),
+                               _vector('m/s^2', 'of the step', **XYZ),
+                               imu=added('specific_force', _axes)),
     'imu_saturated': Kind('the IMU saturates', _imu_sizes('largest value', 1000.0),
-                          imu=imu_saturated),
-    'imu_nan': Kind('the IMU gives NaN', imu=imu_nan),
+                          imu=of_motion(lambda fault, motion: np.clip(
+                              motion, -_both(fault), _both(fault)))),
+    'imu_nan': Kind('the IMU gives NaN', imu=of_motion(lambda fault, motion: np.full(6, np.nan))),
     'imu_spikes': Kind('single IMU samples have errors in random directions', {
         'period': Number('mean time between two spikes', 's', 0.1, 0.005, 100),
-        **_imu_sizes('error of an axis', 0.0)}, imu=imu_spikes),
+        **_imu_sizes('error of an axis', 0.0)}, imu=of_motion(imu_spikes)),
     'imu_axis_dead': Kind('one axis of the IMU reads zero: 1 to 3 specific force, 4 to 6 rate', {
-        'axis': Number('number of the axis', '', None, 1, 6, whole=True)}, imu=imu_axis_dead),
+        'axis': Number('number of the axis', '', None, 1, 6, whole=True)},
+        imu=of_motion(imu_axis_dead)),
 
     'commands_lost': Kind('no command reaches the actuators', command=lost),
     'commands_drop': Kind('a share of the commands is lost', _share('share of lost commands'),
@@ -458,30 +410,23 @@ KINDS = {
     'payload': Kind('a mass is attached below the body', {
         'mass': Number('attached mass', 'kg', low=0, high=10)}, payload=lambda fault: fault.mass),
     'push': Kind('a force in world and a torque in base_link act',
-                 _vector('N', 'force', **XYZ) | _vector('N m', 'torque', **RPY), wrench=push),
+                 _vector('N', 'force', **XYZ) | _vector('N m', 'torque', **RPY),
+                 wrench=lambda fault: np.array([fault.x, fault.y, fault.z,
+                                                fault.roll, fault.pitch, fault.yaw])),
 }
 TIME = Number('', 's', low=0.0)
 
 
 @dataclass(frozen=True, init=False)
 class Fault:
-    """
-    One fault.
+    """One fault."""
 
-    Attributes:
-        kind: a name in KINDS.
-        at: time from the start of the schedule to the onset [s].
-        duration: [s]; inf: permanent.
-        numbers: all numbers of the kind, by name.
+    kind: str                       # a name in KINDS
+    at: float                       # time from the start of the schedule to the onset [s]
+    duration: float                 # [s]; inf: permanent
+    numbers: Mapping[str, float]    # all numbers of the kind, by name
 
-    """
-
-    kind: str
-    at: float
-    duration: float
-    numbers: Mapping[str, float]
-
-    def __init__(self, kind: str, at: float = 0.0, duration: float = inf, **numbers: float):
+    def __init__(self, kind: str, /, at: float = 0.0, duration: float = inf, **numbers: float):
         """
         Check all arguments; missing numbers have the defaults of the kind.
 
@@ -512,7 +457,7 @@ class Fault:
     @property
     def is_process(self) -> bool:
         """Whether it affects a process of the flight stack, not the robot or its devices."""
-        return not OF_PROCESSES.isdisjoint(KINDS[self.kind].functions)
+        return self.changes(*OF_PROCESSES)
 
     def changes(self, *signals: str) -> bool:
         """Whether its kind has a function of one of these signals."""
@@ -525,34 +470,41 @@ class Fault:
         return f"{self.kind}{f'({numbers})' if numbers else ''} at {self.at:g} s{duration}"
 
 
+@dataclass(eq=False)
+class _Entry:
+    """A fault of a schedule, its start [s], its state since the onset, and whether it is over."""
+
+    fault: Fault
+    start: float
+    state: Any = None
+    over: bool = False
+
+
 class Schedule:
     """
     Starts and ends faults by their times, updated once in each ``tick`` [s].
 
     Equal faults, seeds and calls give equal results. A fault that is in the list before and after
-    a change continues unchanged.
-
-    Attributes:
-        active: kind and state of the active faults, in the order of the list.
-
+    a change continues unchanged. ``active`` are kind and state of the active faults, ``names``
+    their kinds, in the order of the list.
     """
 
     def __init__(self, tick: float, seed: np.random.SeedSequence, battery=None):
         self._tick, self._seed, self._battery = tick, seed, battery
-        self._entries: list[list] = []      # fault, start time, state or None, whether over
+        self._entries: list[_Entry] = []
         self.active: list[tuple[Kind, Any]] = []
+        self.names: list[str] = []
 
     def set(self, faults: Sequence[Fault], now: float) -> None:
         """Replace the faults; their ``at`` counts from ``now`` [s]."""
-        before = list(self._entries)
-        self._entries = []
+        before, self._entries = self._entries, []
         for fault in faults:
-            same = next((entry for entry in before if entry[0] == fault), None)
+            same = next((entry for entry in before if entry.fault == fault), None)
             if same is not None:
                 before.remove(same)
-            self._entries.append(same or [fault, now, None, False])
+            self._entries.append(same or _Entry(fault, now))
         for entry in before:
-            if entry[2] is not None and not entry[3]:
+            if entry.state is not None and not entry.over:
                 self._switch(entry, False)
         self._collect()
 
@@ -566,30 +518,31 @@ class Schedule:
         """
         changed = False
         for entry in self._entries:
-            fault, start, state, over = entry
-            begin = start + fault.at
-            if state is None and now >= begin - ROUNDING:
+            fault = entry.fault
+            begin = entry.start + fault.at
+            if entry.state is None and now >= begin - ROUNDING:
                 numbers = fault.numbers
-                entry[2] = state = SimpleNamespace(
+                entry.state = SimpleNamespace(
                     **numbers, k=int(numbers.get('rotor', numbers.get('servo', 1))) - 1,
                     tick=self._tick, now=now, memory=None, truth=truth, held=held,
                     random=np.random.default_rng(self._seed.spawn(1)[0]))
                 self._switch(entry, True)
                 changed = True
-            if state is not None and not over and now >= begin + fault.duration - ROUNDING:
+            if entry.state is not None and not entry.over \
+                    and now >= begin + fault.duration - ROUNDING:
                 self._switch(entry, False)
-                entry[3] = changed = True
+                entry.over = changed = True
         if changed:
             self._collect()
 
     def _switch(self, entry, begins):
-        switch = KINDS[entry[0].kind].functions.get('switch')
-        if switch:
-            switch(entry[2], self._battery, begins)
+        if switch := KINDS[entry.fault.kind].functions.get('switch'):
+            switch(entry.state, self._battery, begins)
 
     def _collect(self):
-        self.active = [(KINDS[fault.kind], state) for fault, _, state, over in self._entries
-                       if state is not None and not over]
+        running = [entry for entry in self._entries if entry.state is not None and not entry.over]
+        self.active = [(KINDS[entry.fault.kind], entry.state) for entry in running]
+        self.names = [entry.fault.kind for entry in running]
 
     def through(self, signal: str, item: Any, now: float) -> list:
         """Items that arrive ``now`` [s] if ``item``, or None, is sent through the faults."""
@@ -614,9 +567,3 @@ class Schedule:
     def empty(self) -> bool:
         """Whether the list is empty."""
         return not self._entries
-
-    @property
-    def names(self) -> list[str]:
-        """Kinds of the active faults."""
-        return [fault.kind for fault, _, state, over in self._entries
-                if state is not None and not over]

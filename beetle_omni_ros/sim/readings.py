@@ -16,71 +16,38 @@ from beetle_omni_ros.robot.readings import (
 
 @dataclass(frozen=True, slots=True)
 class Impact:
-    """
-    Motion at a touchdown, the first contact with the floor after flight.
-
-    Attributes:
-        stamp: [s].
-        speed: speed of base_link [m/s].
-        vertical_speed: downward component of the velocity [m/s].
-        inclination: angle between base_link's z axis and the vertical [rad].
-
-    """
+    """Motion at a touchdown, the first contact with the floor after flight."""
 
     stamp: float
-    speed: float
-    vertical_speed: float
-    inclination: float
+    speed: float                    # of base_link [m/s]
+    vertical_speed: float           # downward [m/s]
+    inclination: float              # angle between base_link's z axis and the vertical [rad]
 
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """
-    The true state.
-
-    Attributes:
-        stamp: [s].
-        position: (3,) of base_link in world [m].
-        velocity: (3,) of base_link's origin in world [m/s].
-        quaternion: (4,) base_link to world, xyzw.
-        angular_velocity: (3,) in base_link [rad/s].
-        tilt: (4,) [rad].
-        tilt_velocity: (4,) [rad/s].
-        thrust: (4,) present thrusts [N].
-        contact: whether any part touches the floor.
-        impact: last touchdown, None before the first.
-        broken: whether the robot is broken; then rotors and servos do not work until reset.
-
-    """
+    """The true state."""
 
     stamp: float
-    position: np.ndarray
-    velocity: np.ndarray
-    quaternion: np.ndarray
-    angular_velocity: np.ndarray
-    tilt: np.ndarray
-    tilt_velocity: np.ndarray
-    thrust: np.ndarray
-    contact: bool
-    impact: Impact | None = None
-    broken: bool = False
+    position: np.ndarray            # (3,) of base_link in world [m]
+    velocity: np.ndarray            # (3,) of base_link's origin in world [m/s]
+    quaternion: np.ndarray          # (4,) base_link to world, xyzw
+    angular_velocity: np.ndarray    # (3,) in base_link [rad/s]
+    tilt: np.ndarray                # (4,) [rad]
+    tilt_velocity: np.ndarray       # (4,) [rad/s]
+    thrust: np.ndarray              # (4,) present thrusts [N]
+    contact: bool                   # whether any part touches the floor
+    impact: Impact | None = None    # last touchdown
+    broken: bool = False            # then rotors and servos do not work until reset
 
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """
-    Inputs from actuators outside the simulator in one tick.
+    """Inputs from actuators outside the simulator in one tick."""
 
-    Attributes:
-        tilt: (4,) targets of the servos [rad].
-        powered: (4,) whether a servo has torque.
-        thrust: (4,) targets of the rotors, within the limit of the battery [N].
-
-    """
-
-    tilt: np.ndarray
-    powered: Sequence[bool]
-    thrust: np.ndarray
+    tilt: np.ndarray                # (4,) targets of the servos [rad]
+    powered: Sequence[bool]         # (4,) whether a servo has torque
+    thrust: np.ndarray              # (4,) targets of the rotors, within the battery's limit [N]
 
 
 @dataclass(frozen=True, slots=True)

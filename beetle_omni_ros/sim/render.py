@@ -30,38 +30,21 @@ HAZE, FLOOR = (0.93, 0.95, 0.97), (0.73, 0.77, 0.82)
 
 @dataclass(frozen=True)
 class Look:
-    """
-    Appearance of a robot.
+    """Appearance of a robot."""
 
-    Attributes:
-        opacity: 1 for a solid robot, less for a ghost.
-        tint: (3,) colour of the whole robot, or None for the colours of its parts.
-
-    """
-
-    opacity: float = 1.0
-    tint: tuple[float, float, float] | None = None
+    opacity: float = 1.0                                # less than 1 for a ghost
+    tint: tuple[float, float, float] | None = None      # by default the colours of its parts
 
 
 @dataclass(frozen=True)
 class Pose:
-    """
-    One robot in a picture.
+    """One robot in a picture."""
 
-    Attributes:
-        position: (3,) of base_link in world [m].
-        quaternion: (4,) base_link to world, xyzw.
-        tilt: (4,) [rad].
-        thrust: (4,) thrusts drawn as arrows [N], or None.
-        time: time that determines the angles of the propellers [s].
-
-    """
-
-    position: np.ndarray
-    quaternion: np.ndarray
-    tilt: np.ndarray
-    thrust: np.ndarray | None = None
-    time: float = 0.0
+    position: np.ndarray                # (3,) of base_link in world [m]
+    quaternion: np.ndarray              # (4,) base_link to world, xyzw
+    tilt: np.ndarray                    # (4,) [rad]
+    thrust: np.ndarray | None = None    # (4,) drawn as arrows [N]
+    time: float = 0.0                   # of the angles of the propellers [s]
 
 
 @dataclass(frozen=True)

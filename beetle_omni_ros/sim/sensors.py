@@ -14,9 +14,7 @@ from beetle_omni_ros.robot.readings import (
     RotorReading,
 )
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.sim.battery import Battery
-from beetle_omni_ros.sim.conditions import Conditions
-from beetle_omni_ros.sim.parameters import SimulatorParameters
+from beetle_omni_ros.sim.parameters import Conditions, SimulatorParameters
 from beetle_omni_ros.sim.plant import Plant
 from beetle_omni_ros.sim.readings import Truth
 
@@ -65,48 +63,42 @@ class Sensors:
         self._to_imu = rotations.matrix(rotations.exp(errors.imu_rotation)) \
             if any(errors.imu_rotation) else None
         self._lever_arm = np.array(errors.imu_position) if any(errors.imu_position) else None
-        generators = [np.random.Generator(np.random.PCG64(seed)) for seed in seeds]
         imu, mocap, pack = parameters.imu, parameters.mocap, parameters.battery
+        rotors, encoders = parameters.rotor_speed, parameters.encoders
+        generators = (np.random.Generator(np.random.PCG64(seed)) for seed in seeds)
         self._imu_noise = Noise(
-            generators[0],
+            next(generators),
             conditions.imu_bias + np.array([*errors.accelerometer_bias, *errors.gyroscope_bias]),
             np.repeat([imu.specific_force_noise, imu.angular_velocity_noise], 3),
             conditions.imu_uniform_noise)
         self._mocap_noise = Noise(
-            generators[1], np.concatenate([
+            next(generators), np.concatenate([
                 conditions.position_bias,
                 conditions.orientation_bias + np.array(errors.mocap_rotation)]),
             np.repeat([mocap.position_noise, mocap.orientation_noise], 3),
             conditions.mocap_uniform_noise)
-        self._tilt_noise = Noise(generators[2], conditions.tilt_bias, np.zeros(4),
+        self._tilt_noise = Noise(next(generators), conditions.tilt_bias, np.zeros(4),
                                  conditions.tilt_uniform_noise)
-        self._battery_noise = Noise(generators[3], np.zeros(2),
+        self._battery_noise = Noise(next(generators), np.zeros(2),
                                     np.array([pack.voltage_noise, pack.current_noise]), 0.0)
-        rotors = parameters.rotor_speed
-        self._rotor_noise = Noise(generators[4], np.ones(4), np.full(4, rotors.noise), 0.0)
-        self._rotor_period = self._ticks('rotor_speed.period', rotors.period, least=1)
-        self._rotors = _delay_line(self._ticks('rotor_speed.latency', rotors.latency))
+        self._rotor_noise = Noise(next(generators), np.ones(4), np.full(4, rotors.noise), 0.0)
         self._speed_at_1_newton = rotors.rpm_at_1_newton * np.pi / 30
+        self._resolution = 2 * np.pi / encoders.counts_per_turn
+        self._velocity_step = encoders.velocity_step
+        self._rotor_period = self._ticks('rotor_speed.period', rotors.period, least=1)
         self._mocap_period = self._ticks('mocap.period', mocap.period, least=1)
         self._battery_period = self._ticks('battery.period', pack.period, least=1)
-        self._resolution = 2 * np.pi / parameters.encoders.counts_per_turn
-        self._velocity_step = parameters.encoders.velocity_step
-        self._imu = _delay_line(self._ticks('imu latency', conditions.imu_latency)
-                                + self._hidden_ticks(errors.imu_delay))
-        self._joints = _delay_line(self._ticks('encoder latency', conditions.tilt_latency)
-                                   + self._hidden_ticks(errors.encoder_delay))
-        self._mocap = _delay_line(self._ticks('mocap.latency', mocap.latency)
-                                  + self._hidden_ticks(errors.mocap_delay))
+        self._rotors = self._line('rotor_speed.latency', rotors.latency)
+        self._imu = self._line('imu latency', conditions.imu_latency, errors.imu_delay)
+        self._joints = self._line('encoder latency', conditions.tilt_latency,
+                                  errors.encoder_delay)
+        self._mocap = self._line('mocap.latency', mocap.latency, errors.mocap_delay)
         # The delay of the IMU is realised in whole ticks and corrected by the stamps.
         self._imu_shift = errors.imu_delay - self._tick * self._hidden_ticks(errors.imu_delay)
-        at_rest = np.zeros(6)
-        for _ in range(self._imu.maxlen):
-            self._imu.append(at_rest)
         for k in range(self._joints.maxlen):
             stamp = first.stamp - self._tick * (self._joints.maxlen - 1 - k)
             self._joints.append((stamp, first.tilt, first.tilt_velocity, effort))
-        for _ in range(self._mocap.maxlen - 1):
-            self._mocap.append(None)
+        self._mocap.extend([None] * (self._mocap.maxlen - 1))
         self._mocap.append(self._capture(first))
 
     def _ticks(self, name, seconds, least=0):
@@ -115,6 +107,10 @@ class Sensors:
             raise ParameterError(f'{name}: {seconds:g} s must be a multiple of the simulator tick '
                                  f'{self._tick:g} s' + (', one or more' if least else ''))
         return ticks
+
+    def _line(self, name, latency, hidden=0.0):
+        """Queue whose first element is older than its last by both times, once it is full."""
+        return deque(maxlen=1 + self._ticks(name, latency) + self._hidden_ticks(hidden))
 
     def _hidden_ticks(self, delay):
         """Additional latency in ticks of a reading whose stamp does not contain a delay [s]."""
@@ -141,22 +137,13 @@ class Sensors:
         for _ in range(self._imu.maxlen):
             self._imu.append(motion)
 
-    def read(self, tick: int, truth: Truth, plant: Plant, battery: Battery,
+    def read(self, tick: int, truth: Truth, plant: Plant, battery,
              devices: bool = False) -> tuple:
         """
-        Readings that arrive at ``truth.stamp``, the end of tick number ``tick``.
+        IMU, MoCap, joint and battery readings, or None, that arrive at ``truth.stamp``.
 
-        Args:
-            tick: number of the tick.
-            truth: state at the end of the tick.
-            plant: plant, for the torques of the servos.
-            battery: battery at the end of the tick.
-            devices: whether joints and battery are inputs of emulated devices, see
-                :class:`.readings.Frame`.
-
-        Returns:
-            (imu, mocap, joints, battery), None for a reading that does not arrive.
-
+        ``tick`` is the number of the tick that ends then. With ``devices``, joints and battery
+        are inputs of emulated devices, see :class:`.readings.Frame`.
         """
         self._imu.append(self._motion(self._before, truth, plant.gravity))
         self._before = truth
@@ -180,11 +167,7 @@ class Sensors:
         """
         Rotor speeds that arrive at the end of tick number ``tick``.
 
-        Args:
-            tick: number of the tick.
-            truth: state at the end of the tick.
-            wear: (4,) thrust relative to that of an intact propeller at the same speed.
-
+        ``wear`` (4,) is the thrust relative to that of an intact propeller at the same speed.
         """
         reading = None
         if tick % self._rotor_period == 0:
@@ -228,8 +211,3 @@ def mean_motion(before: Truth, after: Truth, gravity: float) -> np.ndarray:
     motion[:3] = acceleration.dot(rotations.matrix(middle))
     motion[3:] = turn / dt
     return motion
-
-
-def _delay_line(ticks):
-    """Queue whose first element is ``ticks`` older than its last, once it is full."""
-    return deque(maxlen=ticks + 1)

@@ -1,25 +1,206 @@
 """The simulated robot with the interface of a real one: commands in, sensor readings out."""
 
-from collections import Counter
+from bisect import bisect_right
+from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import replace
+from math import isfinite, sqrt
 
 import numpy as np
 
+from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import clipped
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.sim.battery import Battery
-from beetle_omni_ros.sim.command_link import CommandLink
-from beetle_omni_ros.sim.conditions import draw
-from beetle_omni_ros.sim.crash import CrashWatch
 from beetle_omni_ros.sim.faults import Actuation, Fault, READINGS, Schedule
-from beetle_omni_ros.sim.parameters import SimulatorParameters
+from beetle_omni_ros.sim.parameters import (
+    ActuatorTimingParameters,
+    Conditions,
+    CrashParameters,
+    draw,
+    PackParameters,
+    SimulatorParameters,
+)
 from beetle_omni_ros.sim.plant import Plant, XYZW
-from beetle_omni_ros.sim.readings import Drive, Frame, Truth
+from beetle_omni_ros.sim.readings import Drive, Frame, Impact, Truth
 from beetle_omni_ros.sim.sensors import Sensors
 
+ROUNDING = 1e-9     # [s] bound of the rounding error of sums of ticks
 POWERED, INTACT = (True,) * 4, np.ones(4)
+
+
+class Battery:
+    """
+    Charge, voltage and current of one battery.
+
+    Attributes:
+        charge: charge as a fraction of a full battery.
+        voltage: voltage under the present load [V].
+        extra_resistance: additional resistance of a bad contact or cell [ohm].
+        current: drawn current [A], positive.
+        drawn: charge drawn since the reset [A h].
+
+    """
+
+    def __init__(self, robot: RobotParameters, pack: PackParameters):
+        self._pack = pack
+        self._resistance = robot.battery.resistance
+        self._curve = pack.charge_levels.tolist(), \
+            (robot.battery.full_voltage * pack.relative_voltages).tolist()
+        rows = sorted(robot.rotors.map, key=lambda row: row.voltage)
+        self._limits = [row.voltage for row in rows], [row.thrust_max for row in rows]
+        self._thrust_max = robot.rotors.thrust_max
+        self.reset()
+
+    def reset(self) -> None:
+        """Set the initial charge and no load."""
+        self.charge = self._pack.initial_charge
+        self.extra_resistance = self.current = self.drawn = 0.0
+        self.voltage = self.rest_voltage
+
+    @property
+    def rest_voltage(self) -> float:
+        """Open-circuit voltage [V]."""
+        return _interpolate(*self._curve, self.charge)
+
+    def step(self, thrust: np.ndarray, duration: float) -> None:
+        """Supply the power for ``thrust`` (4,) [N] during ``duration`` [s]."""
+        pack = self._pack
+        power = pack.idle_power + pack.rotor_power * sum(
+            f * sqrt(f) for f in thrust.tolist() if f > 0)
+        rest = self.rest_voltage
+        # power = V (rest - V) / R, limited to the largest power, which is at V = rest / 2
+        resistance = self._resistance + self.extra_resistance
+        self.voltage = 0.5 * (rest + sqrt(max(0.0, rest * rest - 4 * resistance * power)))
+        self.current = power / self.voltage
+        if resistance:
+            self.current = min(self.current, (rest - self.voltage) / resistance)
+        self.drawn += self.current * duration / 3600
+        self.charge = max(0.0, self.charge - self.current * duration / (3600 * pack.capacity))
+
+    @property
+    def thrust_limit(self) -> float:
+        """
+        Largest thrust of a rotor at the present voltage [N].
+
+        It is interpolated between the voltages of the rotor map, and extrapolated below the
+        lowest. Without a map it is the limit of the robot.
+        """
+        voltages, thrusts = self._limits
+        if not voltages:
+            return self._thrust_max
+        limit = thrusts[0] if len(thrusts) == 1 else \
+            _interpolate(voltages, thrusts, min(self.voltage, voltages[-1]))
+        return min(self._thrust_max, max(0.0, limit))
+
+
+def _interpolate(xs, ys, x):
+    """Piecewise linear interpolation with linear extrapolation."""
+    k = min(max(bisect_right(xs, x) - 1, 0), len(xs) - 2)
+    return ys[k] + (ys[k + 1] - ys[k]) * (x - xs[k]) / (xs[k + 1] - xs[k])
+
+
+class CommandLink:
+    """
+    Checks and delays commands, and stops the rotors if none arrives.
+
+    ``tilt`` (4,) [rad] and ``thrust`` (4,) [N] are the present targets, ``rejected`` the numbers
+    of refused commands by reason.
+    """
+
+    def __init__(self, robot: RobotParameters, timing: ActuatorTimingParameters,
+                 conditions: Conditions):
+        self._limit = robot.joints.position_limit
+        self._thrust_range = robot.rotors.thrust_min, robot.rotors.thrust_max
+        self._timing = timing
+        self._delays = conditions.command_delays(robot)
+        self._pending: tuple[deque, deque] = (deque(), deque())
+        self._last_stamp = self._last_arrival = -np.inf
+        self.tilt, self.thrust = np.zeros((2, 4))
+        self.rejected: Counter = Counter()
+
+    def push(self, command, now: float) -> bool:
+        """
+        Accept or refuse a command. A command with the stamp of the last one replaces it.
+
+        Args:
+            command: has ``stamp`` [s], ``tilt`` (4,) [rad], ``thrust`` (4,) [N].
+            now: [s]; the command acts at its stamp plus the delay, or now if that has passed.
+
+        Returns:
+            whether it was accepted.
+
+        """
+        reason = self._refusal(command, now)
+        if reason:
+            self.rejected[reason] += 1
+            return False
+        self._last_stamp, self._last_arrival = command.stamp, now
+        tilt = clipped(np.asarray(command.tilt), -self._limit, self._limit)
+        thrust = clipped(np.asarray(command.thrust), *self._thrust_range)
+        for queue, delay, value in zip(self._pending, self._delays, (tilt, thrust)):
+            queue.append((max(command.stamp + delay, now), value))
+        return True
+
+    def _refusal(self, command, now):
+        if not all(map(isfinite, (command.stamp, *command.tilt, *command.thrust))):
+            return 'not finite'
+        if command.stamp < self._last_stamp:
+            return 'older than the last'
+        if command.stamp > now + self._timing.command_future_limit:
+            return 'from the future'
+        return None
+
+    def update(self, now: float) -> None:
+        """Set the targets that are due at ``now``; stop the rotors after the timeout."""
+        due = now + ROUNDING
+        tilts, thrusts = self._pending
+        while tilts and tilts[0][0] <= due:
+            self.tilt = tilts.popleft()[1]
+        while thrusts and thrusts[0][0] <= due:
+            self.thrust = thrusts.popleft()[1]
+        if now - self._last_arrival >= self._timing.command_timeout - ROUNDING:
+            self.thrust = np.zeros(4)
+
+
+class CrashWatch:
+    """
+    Checks the true state once in each ``tick`` [s].
+
+    A robot that has flown breaks if its first contact is too fast, or a contact too inclined. A
+    robot that has not flown does not break, so it may be placed on its side. ``impact`` is the
+    last touchdown, ``broken`` whether the robot is broken.
+    """
+
+    def __init__(self, parameters: CrashParameters, tick: float):
+        self._limits, self._tick = parameters, tick
+        self.impact: Impact | None = None
+        self.broken = False
+        self._airborne, self._flown = 0.0, False
+
+    def step(self, before: Truth, contact: bool) -> None:
+        """
+        Update after a tick.
+
+        Args:
+            before: state before the tick, in which the floor has not slowed the robot yet.
+            contact: whether any part touches the floor after the tick.
+
+        """
+        if not contact:
+            self._airborne += self._tick
+            self._flown = self._flown or self._airborne >= self._limits.airborne_time
+            return
+        vertical = rotations.up(before.quaternion)[2]   # cosine of the inclination
+        breaks = vertical < np.cos(self._limits.inclination)
+        if self._airborne > 0:
+            speed = float(np.linalg.norm(before.velocity))
+            breaks = breaks or speed > self._limits.speed
+            if self._airborne >= self._limits.airborne_time:
+                self.impact = Impact(before.stamp, speed, max(0.0, -float(before.velocity[2])),
+                                     float(np.arccos(np.clip(vertical, -1.0, 1.0))))
+        self.broken = self.broken or bool(self._flown and breaks)
+        self._airborne = 0.0
 
 
 class Simulator:
@@ -57,8 +238,6 @@ class Simulator:
                                np.random.default_rng(np.random.SeedSequence(seed).spawn(1)[0]))
         self._plant = Plant(robot, self._parameters.plant, self.conditions.variation)
         self.battery = Battery(robot, self._parameters.battery)
-        self._crash = CrashWatch(self._parameters.crash, self.tick)
-        self._wrench, self._payload = np.zeros(6), 0.0
         self.reset()
 
     def reset(self, position: np.ndarray | None = None,
@@ -66,25 +245,14 @@ class Simulator:
         """
         Restart at rest: intact robot, rotors off, initial charge, first noise values, no faults.
 
-        Args:
-            position: (3,) of base_link in world [m]; by default standing on the floor.
-            quaternion: (4,) base_link to world, xyzw; by default level.
-
-        Raises:
-            ValueError: not finite, of another shape, or a zero quaternion.
-
+        ``position`` (3,) is that of base_link in world [m], by default standing on the floor;
+        ``quaternion`` (4,) is base_link to world, xyzw, by default level.
         """
-        if position is not None:
-            position = _vector('position', position, 3)
-        if quaternion is not None:
-            quaternion = _vector('quaternion', quaternion, 4)
-            if not quaternion.any():
-                raise ValueError('quaternion: expected a rotation, found zeros')
         self._ticks = 0
         self.time = 0.0
         self._plant.reset(position, quaternion)
         self.battery.reset()
-        self._crash.reset()
+        self._crash = CrashWatch(self._parameters.crash, self.tick)
         self._wrench, self._payload = np.zeros(6), 0.0
         self._wear = INTACT
         self._link = CommandLink(self._robot, self._parameters.actuators, self.conditions)
@@ -99,16 +267,14 @@ class Simulator:
                  angular_velocity: np.ndarray) -> None:
         """Repair the robot and set its motion, see :meth:`.plant.Plant.set_body`."""
         self._plant.set_body(position, quaternion, velocity, angular_velocity)
-        self._crash.reset()
+        self._crash = CrashWatch(self._parameters.crash, self.tick)
         self.truth = self._truth()
 
     def command(self, command) -> bool:
         """
         Send a command (stamp, tilt (4,), thrust (4,)), which acts at its stamp plus the delay.
 
-        Returns:
-            whether it was accepted; :attr:`rejected` counts refusals.
-
+        Return whether it was accepted; :attr:`rejected` counts refusals.
         """
         accepted = True
         for one in self._schedule.through('command', command, self.time):
@@ -160,42 +326,21 @@ class Simulator:
         return self._link.rejected
 
     def set_wrench(self, force_world: np.ndarray, torque_body: np.ndarray) -> None:
-        """
-        Apply an external wrench at base_link.
-
-        Args:
-            force_world: (3,) [N].
-            torque_body: (3,) in base_link [N m].
-
-        Raises:
-            ValueError: not three finite numbers each.
-
-        """
-        self._wrench = np.concatenate([_vector('wrench force', force_world, 3),
-                                       _vector('wrench torque', torque_body, 3)])
+        """Apply an external force (3,) in world [N] and torque (3,) in base_link [N m] there."""
+        self._wrench = np.concatenate([force_world, torque_body])
         self._apply_wrench()
 
     def set_payload(self, mass: float) -> None:
-        """
-        Set the mass [kg] of the payload, a ball that is fixed below the body.
-
-        Raises:
-            ValueError: negative or not finite.
-
-        """
-        if not (np.isfinite(mass) and mass >= 0):
-            raise ValueError(f'payload: expected a mass of 0 kg or more, found {mass!r}')
-        self._payload = float(mass)
+        """Set the mass [kg] of the payload, a ball that is fixed below the body."""
+        self._payload = mass
         self._apply_wrench()
 
     def step(self, drive: Drive | None = None) -> Frame:
         """
         Advance one tick; return the readings that arrive in it.
 
-        Args:
-            drive: inputs from external actuators, applied without delay or timeout; by default
-                servos and rotors follow :meth:`command`.
-
+        Servos and rotors follow :meth:`command`, or ``drive`` of external actuators, without
+        delay or timeout.
         """
         plant, link, battery = self._plant, self._link, self.battery
         if not self._schedule.empty:
@@ -256,16 +401,5 @@ class Simulator:
     def _truth(self):
         qpos, qvel = self._plant.state
         return Truth(self.time, qpos[:3], qvel[:3], qpos[XYZW], qvel[3:6], self._plant.tilt,
-                     qvel[6:],
-                     self._plant.thrust, self._plant.contact, self._crash.impact,
+                     qvel[6:], self._plant.thrust, self._plant.contact, self._crash.impact,
                      self._crash.broken)
-
-
-def _vector(name, value, length):
-    try:
-        vector = np.asarray(value, dtype=float)
-    except (TypeError, ValueError):
-        vector = np.empty(0)
-    if vector.shape != (length,) or not np.isfinite(vector).all():
-        raise ValueError(f'{name}: expected {length} finite numbers, found {value!r}')
-    return vector

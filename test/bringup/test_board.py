@@ -44,7 +44,7 @@ def test_a_good_board_passes_and_stays_disarmed(emulated):
 def test_an_old_start_of_another_program_is_not_counted_as_loss(emulated):
     for _ in range(2):      # each leaves the board with a gap in the sequence
         board(emulated.port, seconds=0.3)
-    assert emulated._parser.lost > 10
+    assert emulated._receiver.counts['lost'] > 10
     board_with(emulated, {})
 
 
@@ -93,7 +93,7 @@ def test_a_silent_or_foreign_board_ends_the_checks(emulated):
 
 
 def test_without_pymavlink_the_extra_is_named(emulated, monkeypatch):
-    for name in ('motor_board', 'motor_board_state'):
+    for name in ('motor_board', 'motor_board_state', 'mavlink'):
         monkeypatch.delitem(sys.modules, f'beetle_omni_ros.drivers.{name}')
     monkeypatch.setitem(sys.modules, 'pymavlink', None)
     monkeypatch.setitem(sys.modules, 'pymavlink.dialects.v20', None)

@@ -10,7 +10,6 @@ pytest.importorskip('dynamixel_sdk')
 pytest.importorskip('pymavlink')
 
 from check_helpers import QUICK, repeated
-from servo_bench import JOINTS
 
 from beetle_omni_ros import cli
 from beetle_omni_ros.bringup.command import run_check
@@ -34,7 +33,7 @@ def robot(tmp_path):
     """Servo bus, motor board, and the arguments with their ports."""
     file = tmp_path / 'bus.yaml'
     file.write_text(PATIENT)
-    with EmulatedServoBus(motion=JOINTS) as bus, EmulatedMotorBoard(parameters=QUICK) as board:
+    with EmulatedServoBus() as bus, EmulatedMotorBoard(parameters=QUICK) as board:
         yield bus, board, ['check', '--servo-bus', str(file), '--servo-port', bus.port,
                            '--board-port', board.port, '--seconds', '1']
 
@@ -81,7 +80,7 @@ def test_a_port_in_use_by_the_bridge_is_not_opened(robot, tmp_path):
     graph = ObservedGraph(0, 1.0, {}, {'joint_bridge': 'ready'},
                   {'joint_bridge_node: gimbal2': Status(2, 'overload', {})})
     path, packets = tmp_path / 'result.json', []
-    bus.network.handle = lambda packet, *_: packets.append(packet) or []
+    bus.handle = lambda packet, *_: packets.append(packet) or []
     bridge = subprocess.Popen([sys.executable, '-c', 'import sys; f = open(sys.argv[1], "rb", 0); '
                                'print("open", flush=True); sys.stdin.read()', bus.port],
                               stdin=subprocess.PIPE, stdout=subprocess.PIPE)

@@ -10,8 +10,7 @@ import numpy as np
 from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters
 from beetle_omni_ros.drivers.motor_board import MotorBoard
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.sim.emulated.board_firmware import EmulatedBoardParameters
-from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
+from beetle_omni_ros.sim.emulated.motor_board import EmulatedBoardParameters, EmulatedMotorBoard
 
 QUICK = replace(EmulatedBoardParameters.load(), boot_time=0.05, heartbeat_timeout=0.5,
                 idle_timeout=1.0, throttle_low_time=0.3, reception_rate=10.0)

@@ -10,6 +10,8 @@ from pathlib import Path
 import re
 import struct
 
+from hypothesis import strategies
+
 # Message id -> name and fields (type, name, array length) in the order of the definition.
 DEFINITIONS = {
     0: ('HEARTBEAT', 'uint8_t type,uint8_t autopilot,uint8_t base_mode,uint32_t custom_mode,'
@@ -39,7 +41,6 @@ DEFINITIONS = {
 CODES = {'uint8_t': 'B', 'int8_t': 'b', 'int16_t': 'h', 'uint16_t': 'H', 'int32_t': 'i',
          'uint32_t': 'I', 'int64_t': 'q', 'uint64_t': 'Q', 'float': 'f'}
 EXTENSIONS = {77: 'BiBB'}
-
 
 DOCUMENT = (Path(__file__).resolve().parents[2] / 'docs' / 'reference' / 'firmware.md').read_text()
 (HOST_HEARTBEAT, ARM, DISARM, TARGET, TIME_REQUEST,     # from the computer (1, 191)
@@ -102,6 +103,21 @@ def parse(frame):
     form = payload_format(number)
     payload = frame[10:-2].ljust(struct.calcsize(form), b'\0')
     return number, frame[4], (frame[5], frame[6]), struct.unpack(form, payload)
+
+
+def pack(number, values, sequence=0, sender=(1, 1)):
+    """Frame of a message with ``values`` in wire order."""
+    payload = struct.pack(payload_format(number), *values).rstrip(b'\0') or b'\0'
+    body = bytes([len(payload), 0, 0, sequence, *sender]) + number.to_bytes(3, 'little') + payload
+    return b'\xfd' + body + crc(body + bytes([crc_extra(number)])).to_bytes(2, 'little')
+
+
+# Valid frames of the board with any content.
+ANY_FRAME = strategies.sampled_from(sorted(DEFINITIONS)).flatmap(
+    lambda number: strategies.binary(
+        min_size=struct.calcsize(payload_format(number)),
+        max_size=struct.calcsize(payload_format(number))).map(
+            lambda payload: pack(number, struct.unpack(payload_format(number), payload))))
 
 
 def split(data):

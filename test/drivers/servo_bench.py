@@ -14,15 +14,15 @@ from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
 JOINTS = RobotParameters.load().joints
 SHIPPED = ServoBusParameters.load()
 # Driver and servos share this process and a busy machine: wait longer than on a robot.
-PATIENT = replace(SHIPPED.timing, reply=0.03, probe_first=0.02, probe_longest=0.1, health=0.04,
+PATIENT = replace(SHIPPED.timing, reply=0.03, probe=0.05, health=0.04,
                   reconnect=0.02)
 COUNT = 2 * np.pi / 4096  # [rad]
 
 
 @contextmanager
 def bench(guard=False, timing=PATIENT, servos=None, **parameters):
-    """Open a bus of emulated servos with a motion model, not configured."""
-    with EmulatedServoBus(**{'motion': JOINTS, 'reboot_time': 0.05, **(servos or {})}) as emulated:
+    """Open a bus of emulated servos with their own motion, not configured."""
+    with EmulatedServoBus(**{'speed': 10.0, 'reboot_time': 0.05, **(servos or {})}) as emulated:
         bus = ServoBus(replace(SHIPPED, port=emulated.port, guard=guard, timing=timing,
                                **parameters), JOINTS)
         bus.open()

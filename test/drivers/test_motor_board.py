@@ -1,6 +1,5 @@
 """The driver against the emulated board, over a pseudo-terminal."""
 
-import math
 import os
 from pathlib import Path
 import pty
@@ -18,19 +17,16 @@ pytest.importorskip('serial')
 
 from board_bench import connected, driver, HOVER, opened, QUICK, until
 
+from beetle_omni_ros.drivers.mavlink import common
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 
 pytestmark = pytest.mark.real_time
 
 
-def test_bad_thrusts_are_not_sent():
+def test_thrusts_with_bad_stamps_are_not_sent():
     with connected() as (emulated, board):
         board.start(True).wait()
         for thrust, age, reason in (
-                ([1, 2, 3], 0, 'not four finite numbers'),
-                ([1, 2, 3, math.nan], 0, 'not four finite numbers'),
-                ([1, 2, 3, math.inf], 0, 'not four finite numbers'),
-                ([1, 2, 3, 4], math.nan, 'not four finite numbers'),
                 ([1, 2, 3, 4], 0.2, 'stale stamp'), ([1, 2, 3, 4], -0.2, 'stamp in the future')):
             assert board.send(thrust, time.time() - age).reason == reason
         time.sleep(0.05)
@@ -50,7 +46,8 @@ def test_refused_arming_is_reported_with_the_reason():
         assert not result.accepted and result.reason.endswith('throttle not low')
         time.sleep(QUICK.throttle_low_time)
         assert board.start(True).wait().accepted and emulated.armed
-        emulated._firmware._heartbeat = lambda state, now: (0, (1 | 9 << 24, 2, 0, 1, 3, 3))
+        emulated._firmware._heartbeat = lambda state, now: common.MAVLink_heartbeat_message(
+            2, 0, 1, 1 | 9 << 24, 3, 3)
         assert until(lambda: board.state.status.contract == 9)
         assert board.start(True).wait().reason == 'firmware follows contract 9, this driver 1'
 
@@ -140,7 +137,7 @@ def test_a_step_of_the_computers_clock_does_not_stop_the_rotors():
 def test_stamps_stay_monotonic_when_the_offset_is_corrected():
     with connected() as (emulated, board):
         stamps = []
-        emulated.on_target = lambda now, values: stamps.append(values[0])
+        emulated.on_target = lambda now, stamp: stamps.append(stamp)
         assert board.start(True).wait().accepted
         clock, begin = board.state.clock, time.time()
         for k, correction in enumerate((0.0, -0.003, 0.002, -0.003)):
@@ -175,7 +172,7 @@ if sys.argv[3]:
 def test_a_process_disarms_at_exit_and_after_an_exception(end):
     with EmulatedMotorBoard(parameters=QUICK) as emulated:
         arrivals, folder = [], Path(__file__).parent
-        emulated.on_target = lambda now, values: arrivals.append(now)
+        emulated.on_target = lambda now, stamp: arrivals.append(now)
         subprocess.run(
             [sys.executable, '-c', CHILD, emulated.port, str(folder), end], timeout=20,
             stderr=subprocess.DEVNULL, env={**os.environ, 'PYTHONPATH': os.pathsep.join(

@@ -195,7 +195,5 @@ def test_an_acknowledgement_contradicted_by_the_heartbeat_does_not_start_a_fligh
     arming.follow('takeoff')
     board.answer()
     board.state.status = BoardStatus(0.0, 'disarmed', 'heartbeat of the host lost', (), 1)
-    for _ in range(round(PATIENCE / CYCLE) + 1):
-        assert arming.phase != 'flies'
-        arming.update(CYCLE)
+    arming.update(CYCLE)
     assert arming.text == 'lost: disarmed (heartbeat of the host lost)'

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from beetle_omni_ros.drivers.servo_loop import PERIOD, READ_AFTER, ServoLoop, ServoPace
+from beetle_omni_ros.drivers.servo_loop import PERIOD, ServoLoop
 
 FOREVER = float('inf')
 VALID = np.ones(4, bool)
@@ -158,33 +158,12 @@ def test_an_exception_in_the_thread_closes_the_bus_and_is_reported():
     loop.stop()
 
 
-# --- the pace ---------------------------------------------------------------------------------
-
-def run(pace, cycles, goals=(), late=lambda k: 0.0):
-    """Run cycles on a simulated clock; return their start times."""
-    began, goals = [], list(goals)
-    for k in range(cycles):
-        while goals and goals[0] <= pace.due:
-            pace.goals = goals.pop(0)
-        began.append(pace.due + late(k))
-        pace.begin(began[-1])
-    return np.array(began)
-
-
 def test_late_cycles_are_caught_up_and_missed_periods_counted_and_not_repeated():
-    pace = ServoPace(10.0)
-    began = run(pace, 101, late=lambda k: 0.004 if k % 10 == 5 else 0.0)
-    assert pace.missed == 0
-    assert began[-1] - began[0] == pytest.approx(100 * PERIOD)
-    run(pace, 20, late=lambda k: 2.5 * PERIOD if k == 10 else 0.0)
-    assert pace.missed == 2
-
-
-@pytest.mark.parametrize('every', [PERIOD, 2 * PERIOD])
-@pytest.mark.parametrize('phase', [0.0, 0.0024, 0.0049])
-def test_the_phase_converges_to_times_when_goals_find_the_bus_free(every, phase):
-    pace = ServoPace(10.0)
-    began = run(pace, 800, goals=10.0 + phase + np.arange(0, 5, every))
-    assert pace.missed == 0
-    assert np.abs(np.diff(began) - PERIOD).max() <= 0.0101 * PERIOD
-    assert ((began[-1] - phase - 10.0) % PERIOD) == pytest.approx(READ_AFTER, abs=2e-4)
+    loop, _, clock, _ = make()
+    for k in range(101):
+        clock.now = 100.0 + k * PERIOD + (0.004 if k % 10 == 5 else 0.0)
+        loop._cycle()
+    assert loop.missed == 0 and loop._due == pytest.approx(100.0 + 101 * PERIOD)
+    clock.now += 3.5 * PERIOD
+    loop._cycle()
+    assert loop.missed == 2

@@ -17,10 +17,8 @@ from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.effects import CATALOGUE, LimitStarts
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.sim.command_link import CommandLink
-from beetle_omni_ros.sim.conditions import draw
-from beetle_omni_ros.sim.parameters import SimulatorParameters
-from beetle_omni_ros.sim.simulator import Simulator
+from beetle_omni_ros.sim.parameters import draw, SimulatorParameters
+from beetle_omni_ros.sim.simulator import CommandLink, Simulator
 
 ROBOT, WORLD = RobotParameters.load(), SimulatorParameters.load()
 

@@ -17,12 +17,12 @@ from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.graph import Graph, reserved_domain
 from beetle_omni_ros.nodes.operator import Operator
 from beetle_omni_ros.robot.parameters import JOINT_NAMES
-from beetle_omni_ros.sim.emulated.board_firmware import EmulatedBoardParameters
+from beetle_omni_ros.sim.emulated.motor_board import EmulatedBoardParameters
 
 JOINT, ROTOR = 'joint_bridge_node', 'rotor_bridge_node'
 WITHIN = 40     # [s] timeout of expected events on a busy machine
 # Answers come from a thread of the test: wait longer for them than on a robot.
-PATIENT = {JOINT: {'timing': {'reply': 0.03, 'probe_first': 0.02, 'probe_longest': 0.1,
+PATIENT = {JOINT: {'timing': {'reply': 0.03, 'probe': 0.05,
                               'health': 0.04, 'reconnect': 0.02}},
            ROTOR: {'reconnect_period': 0.1, 'silence': 1.0}}
 QUICK = replace(EmulatedBoardParameters.load(), boot_time=0.05, throttle_low_time=0.2,

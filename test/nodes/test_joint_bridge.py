@@ -8,8 +8,8 @@ import pytest
 
 from beetle_omni_ros.messages import conversions
 from beetle_omni_ros.messages.values import MessageError
-from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters
-from beetle_omni_ros.sim.emulated.fault_switches import ServoFaults
+from beetle_omni_ros.robot.parameters import JOINT_NAMES
+from beetle_omni_ros.sim.emulated import ServoFaults
 from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
 
 pytestmark = pytest.mark.real_time
@@ -21,7 +21,7 @@ GOAL, HOME, ERROR = [0.5, -1.0, 3.5, -3.5], [0.0] * 4, 2
 def shared(tmp_path_factory):
     """One process and one bus for all tests that do not break them."""
     folder = tmp_path_factory.mktemp('joint_bridge')
-    with EmulatedServoBus(motion=RobotParameters.load().joints, reboot_time=0.05) as emulated, \
+    with EmulatedServoBus(speed=10.0, reboot_time=0.05) as emulated, \
             running_bridge(folder, JOINT, port=emulated.port) as (graph, operator):
         yield emulated, operator
         assert not graph.dead()

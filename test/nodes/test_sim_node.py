@@ -129,7 +129,7 @@ def test_the_emulated_servos_are_those_of_the_bus_file(sim, tmp_path):
     assert [servo['ID'] for servo in servos] == [11, 12, 13, 14]
     assert [servo.sign for servo in servos] == [1, -1, 1, -1]
     assert [servo.zero for servo in servos] == [2000, 2100, 2048, 1900]
-    assert {servo.baud_rate for servo in servos} == {3_000_000}
+    assert {servo['Baud Rate'] for servo in servos} == {5}      # 3 Mbit/s
 
 
 def test_a_payload_changes_in_flight_within_its_range(sim):

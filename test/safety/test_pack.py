@@ -8,8 +8,8 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.thrust_map import ThrustMap
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.watch.pack import PackWatch
-from beetle_omni_ros.sim.battery import Battery
 from beetle_omni_ros.sim.parameters import SimulatorParameters
+from beetle_omni_ros.sim.simulator import Battery
 
 ROBOT = RobotParameters.load()
 PACK = SimulatorParameters.load().battery

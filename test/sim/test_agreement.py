@@ -7,10 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from sim_robots import massless_modules, plant, ROBOT
 
-from beetle_omni_ros.robot import dynamics
 from beetle_omni_ros.robot.dynamics import body_acceleration
 from beetle_omni_ros.robot.rotations import normalized
-from beetle_omni_ros.sim import effects as plant_effects
 
 EFFECTS = {
     'none': {},
@@ -116,15 +114,6 @@ def test_plant_without_module_inertia_agrees_with_newton_euler():
         assert difference(found[3:6], angular) < 1e-6
 
 
-def test_true_modules_shift_the_centre_of_gravity():
-    """With all modules at 90 deg, gravity acts on their eccentric centres of mass."""
-    made, rigid = plant(), plant(massless_modules())
-    tilt = np.array([1, 1, -1, -1]) * np.pi / 2
-    state = ([0, 0, 10], [0, 0, 0, 1], np.zeros(3), np.zeros(3), tilt, np.zeros(4),
-             np.full(4, ROBOT.hover_thrust))
-    assert np.abs(made.acceleration(*state)[3:6] - rigid.acceleration(*state)[3:6]).max() > 0.1
-
-
 @pytest.mark.parametrize('effects', [
     {'wind': {'force': [3.0, -4.0, 2.0]}},
     {'wind': {'force': [3.0, -4.0, 2.0]}, 'body_drag': {'coefficient': 0.3},
@@ -149,24 +138,3 @@ def test_terminal_speed_is_where_drag_carries_the_weight():
         made.step()
     speed = np.sqrt(ROBOT.mass * ROBOT.gravity / 2.0)
     assert made.state[1][2] == pytest.approx(-speed, rel=1e-5)
-
-
-@pytest.mark.parametrize('name, values', [
-    ('wind', {'force': (1.0, -2.0, 0.5)}), ('rotor_drag', {'coefficient': 0.4}),
-    ('body_drag', {'coefficient': 0.5}), ('axial_inflow', {'per_rotor': 0.3}),
-    ('tilt_thrust_loss', {'loss_at_60deg': 0.1, 'cosine_share': 0.3}),
-    ('ground_effect', {'gain_at_0.25m': 0.1, 'exponential_share': 0.4})])
-def test_forces_of_the_plant_equal_those_of_the_catalogue(name, values):
-    robot = replace(ROBOT, effects={name: values})
-    rng = np.random.default_rng(4)
-    function = dynamics.added_wrench(robot, [name])
-    for _ in range(20):
-        quaternion, tilt = Rotation.random(random_state=rng).as_quat(), rng.uniform(-2, 2, 4)
-        velocity, rate = rng.normal(size=(2, 3)) * 2
-        thrust, height = rng.uniform(2, 15, 4), rng.uniform(0.5, 1.5)
-        own = plant_effects.MotionForces(robot)(
-            Rotation.from_quat(quaternion).as_matrix(), velocity, rate, tilt, thrust, height)
-        found = function(quaternion, velocity, rate, tilt, np.zeros(4), np.zeros(4), thrust,
-                         np.zeros(4), [0, 0, height], 1.0, 0.0)
-        for a, b in zip(own, found, strict=True):
-            np.testing.assert_allclose(a, np.array(b).ravel(), atol=2e-4)

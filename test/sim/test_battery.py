@@ -7,7 +7,7 @@ import pytest
 from sim_robots import ROBOT, WORLD
 
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.sim.battery import Battery
+from beetle_omni_ros.sim.simulator import Battery
 
 HOVER = np.full(4, ROBOT.hover_thrust)
 

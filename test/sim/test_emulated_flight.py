@@ -14,7 +14,7 @@ from servo_bench import PATIENT, SHIPPED
 from sim_robots import HIGH, ROBOT, WORLD
 
 from beetle_omni_ros.drivers.servo_bus import ServoBus
-from beetle_omni_ros.sim.emulated.fault_switches import BoardFaultSwitches, ServoFaultSwitches
+from beetle_omni_ros.sim.emulated import BoardFaults, ServoFaults
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
 from beetle_omni_ros.sim.emulated_actuators import EmulatedActuators
@@ -92,8 +92,8 @@ class Flight:
 
     def switch(self, servo=None, board=None):
         """Set faults."""
-        self.actuators.set_faults(ServoFaultSwitches(**servo or {}),
-                                  BoardFaultSwitches(**board or {}))
+        self.actuators.set_faults(ServoFaults(**servo or {}),
+                                  BoardFaults(**board or {}))
 
     @property
     def truth(self):
@@ -121,14 +121,6 @@ def test_thrusts_and_tilts_act_and_are_measured(flight):
     np.testing.assert_allclose(flight.latest['rotors'].rpm, rpm, rtol=0.02)
 
 
-def test_rotors_stop_when_targets_cease_and_come_back_with_them(flight):
-    flight.thrust = None
-    flight.until(lambda: flight.truth.thrust.max() < 0.2 * HOVER[0], 1.0)
-    assert flight.actuators.board.armed
-    flight.thrust = HOVER
-    flight.until(lambda: flight.truth.thrust.min() > 0.9 * HOVER[0], 1.0)
-
-
 def test_torque_off_frees_the_joints_and_torque_on_holds_them_where_they_are(flight):
     flight.tilt = np.full(4, 0.4)
     flight.until(lambda: np.all(flight.truth.tilt > 0.35))
@@ -142,48 +134,10 @@ def test_torque_off_frees_the_joints_and_torque_on_holds_them_where_they_are(fli
     np.testing.assert_allclose(flight.truth.tilt, flight.tilt, atol=0.15)
 
 
-def test_an_overloaded_servo_goes_limp_and_the_others_keep_their_angles(flight):
-    flight.switch({'overload': np.array([2.0])})
-    flight.until(lambda: 'overload' in flight.reports[1].message)
-    flight.tilt = np.full(4, 0.8 * -np.sign(flight.truth.tilt[1]))
-    flight.until(lambda: np.all(np.abs(flight.truth.tilt - flight.tilt)[[0, 2, 3]] < 0.15))
-    assert abs(flight.truth.tilt[1] - flight.tilt[1]) > 0.4
-    assert flight.actuators.bus.torque_enabled.tolist() == [True, False, True, True]
-
-
-def test_an_expired_watchdog_is_cleared_and_the_flight_goes_on(flight):
-    flight.switch({'expire_watchdog': 3})
-    assert flight.actuators.bus.stopped.tolist() == [False, False, True, False]
-    flight.tilt = np.full(4, 0.4)
-    flight.until(lambda: np.all(flight.truth.tilt > 0.3))
-    assert not flight.actuators.bus.stopped.any()
-
-
 def test_a_failed_esc_stops_its_rotor_alone(flight):
     flight.switch(board={'failed_escs': np.array([4.0])})
     flight.until(lambda: flight.truth.thrust[3] < 0.1)
     np.testing.assert_allclose(flight.truth.thrust[:3], HOVER[:3], rtol=0.02)
-
-
-def test_a_sagging_pack_is_reported_and_thrust_is_kept(flight):
-    before = flight.latest['battery'].voltage
-    flight.switch(board={'voltage_sag': 2.0})
-    flight.run(0.6)
-    assert flight.latest['battery'].voltage == pytest.approx(before - 2.0, abs=0.2)
-    np.testing.assert_allclose(flight.truth.thrust, HOVER, rtol=0.02)
-
-
-@pytest.mark.parametrize('event', ['reboot', 'hang'])
-def test_a_board_that_restarts_stops_the_rotors_and_stays_disarmed(flight, event):
-    flight.switch(board={event: True})
-    flight.until(lambda: flight.truth.thrust.max() < 0.2 * HOVER[0])
-    flight.run(0.3)
-    assert not flight.actuators.board.armed and flight.truth.thrust.max() < 0.2
-
-
-def test_without_the_boards_cable_the_rotors_stop(flight):
-    flight.switch(board={'unplugged': True})
-    flight.until(lambda: flight.truth.thrust.max() < 0.2 * HOVER[0])
 
 
 def test_without_the_servos_cable_the_joints_hold(flight):

@@ -11,7 +11,7 @@ from sim_robots import HIGH, ROBOT, WORLD
 from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.sim.emulated.board_firmware import EmulatedBoardParameters
+from beetle_omni_ros.sim.emulated.motor_board import EmulatedBoardParameters
 from beetle_omni_ros.sim.fault_lists import FaultList, load_faults, parse_faults
 from beetle_omni_ros.sim.fault_lists import text as text_of
 from beetle_omni_ros.sim.faults import Fault, KINDS, OF_PROCESSES, READINGS
@@ -96,8 +96,8 @@ def test_a_fault_kind_changes_its_quantity_from_its_start_only(kind, healthy):
         assert changed == SENSING[kind]
 
 
-@pytest.mark.parametrize('kind', ROBOT_KINDS)
-def test_a_kind_is_deterministic(kind):
+@pytest.mark.parametrize('kind', ['imu_spikes', 'mocap_noisy', 'mocap_drops', 'commands_drop'])
+def test_a_random_kind_is_deterministic(kind):
     fault = some(kind, at=0.1)
     assert differing(flight(fault, ticks=80)[0], flight(fault, ticks=80)[0]) == set()
 
@@ -108,10 +108,6 @@ def test_after_a_sensor_fault_the_readings_are_unchanged(kind, healthy):
     frames, simulator = flight(some(kind, at=0.1, duration=0.2))
     assert differing(frames, healthy, 110) == set()
     assert simulator.faults == []
-
-
-def test_an_empty_list_changes_nothing(healthy):
-    assert differing(flight()[0], healthy) == set()
 
 
 def test_a_stopped_rotor_fades_with_its_lag_and_shows_in_its_speed():
@@ -140,15 +136,6 @@ def test_rotor_speeds_come_at_50_hz_and_are_those_of_the_thrust():
 
 def test_the_rotor_speed_is_that_of_the_emulated_board():
     assert WORLD.rotor_speed.rpm_at_1_newton == EmulatedBoardParameters.load().rpm_at_1_newton
-
-
-def test_a_broken_propeller_turns_as_fast_as_a_whole_one():
-    whole, _ = flight(ticks=300)
-    broken, _ = flight(Fault('propeller_broken', rotor=1, share=0.5), ticks=300)
-    (a, b), thrust = ([frame.rotors.speed[0] for frame in frames if frame.rotors is not None][-1]
-                      for frames in (whole, broken)), broken[-1].truth.thrust
-    assert np.isclose(a, b, rtol=0.01)
-    assert thrust[0] < 0.6 * whole[-1].truth.thrust[0]
 
 
 @pytest.mark.parametrize('share', [0.8, 0.5])
@@ -336,7 +323,7 @@ def test_a_fault_file_of_one_flight_is_read(tmp_path):
     ('faults: [{what: rotor_weak, rotor: 1}]', "'share' is missing"),
     ('faults: [{what: rotor_blinks, share: 1}]', "key 'share'"),
     ('faults: [{what: mocap_lost, at: .nan}]', "key 'at'"),
-    ('faults: [{what: mocap_lost, self: 1, at: x}]', "key 'at'"),
+    ('faults: [{what: mocap_lost, self: 1}]', "key 'self'"),
     ('faults: [{what: [1]}]', "key 'what'")])
 def test_unusable_files_name_the_key_in_one_line(tmp_path, text, named):
     path = tmp_path / 'faults.yaml'
@@ -355,15 +342,6 @@ def test_short_texts_describe_a_fault():
     for text in ('rotor_stops 2', 'rotor_stops rotor=x', 'nothing'):
         with pytest.raises(ParameterError, match='faults'):
             parse_faults(text)
-
-
-def test_break_limits_of_a_simulator_file_are_used():
-    tough = replace(WORLD, crash=replace(WORLD.crash, speed=50.0))
-    simulator = Simulator(ROBOT, tough)
-    simulator.reset([0, 0, 2.0])
-    for _ in range(300):
-        simulator.step()
-    assert simulator.truth.impact.speed > 5 and not simulator.truth.broken
 
 
 def test_the_docs_name_every_kind():

@@ -18,13 +18,6 @@ def whole(properties):
     return combined([properties.main_body, *properties.modules, properties.end_effector])
 
 
-def test_parts_add_up_to_the_totals():
-    total = whole(mass_properties(ROBOT))
-    assert total.mass == pytest.approx(ROBOT.mass, rel=1e-12)
-    np.testing.assert_allclose(total.centre, 0, atol=1e-15)
-    np.testing.assert_allclose(total.inertia, np.diag(ROBOT.inertia), atol=1e-15)
-
-
 def test_variation_moves_the_totals():
     variation = Variation(1.04, np.array([0.96, 1.03, 1.05]), np.array([0.01, -0.007, 0.004]))
     total = whole(mass_properties(ROBOT, variation))

@@ -1,9 +1,8 @@
 """Servos and rotors of the plant have the response of their parameters."""
 
-from dataclasses import replace
 
 import numpy as np
-from sim_robots import HIGH, immovable, plant, ROBOT
+from sim_robots import immovable, plant, ROBOT
 
 JOINT = ROBOT.joints
 TICK = 0.005
@@ -104,48 +103,3 @@ def test_a_joint_without_torque_ignores_its_target_and_only_its_damping_slows_it
         np.testing.assert_allclose(rate[1:3], left, rtol=1e-2, atol=1e-3)
         expected, _ = second_order(k * TICK, 0.1)
         np.testing.assert_allclose(tilt[[0, 3]], expected, atol=1e-4)
-
-
-def test_limits_of_a_weak_motor_do_not_stiffen_a_joint_without_torque():
-    weak = replace(immovable(), joints=replace(JOINT, effort_limit=0.01, velocity_limit=1.0))
-    made = plant(weak)
-    made.set_powered([False] * 4)
-    made.data.qvel[6:] = 5.0
-    made.step()
-    np.testing.assert_allclose(made.state[1][6:], damped(TICK, 5.0)[1], rtol=1e-3)
-
-
-def test_when_torque_returns_the_joint_follows_its_target():
-    made = plant(immovable())
-    made.set_powered([False] * 4)
-    made.set_targets(np.full(4, 0.3), np.zeros(4))
-    for _ in range(20):
-        made.step()
-    np.testing.assert_array_equal(made.state[0][7:], 0)
-    made.set_powered([True] * 4)
-    for _ in range(100):
-        made.step()
-    np.testing.assert_allclose(made.state[0][7:], 0.3, atol=1e-3)
-
-
-def test_a_joint_without_torque_lets_its_module_hang():
-    """With upward acceleration, as with gravity, the module swings below its axis."""
-    made = plant(immovable())
-    made.set_targets(np.ones(4), np.zeros(4))
-    for k in range(800):
-        made.set_powered([k < 100, True, True, True])
-        made.set_wrench([0, 0, 190 * 9.8], np.zeros(3))
-        made.step()
-    tilt = made.state[0][7:]
-    assert abs(tilt[0]) < 1e-3
-    assert np.all(np.abs(tilt[1:] - 1.0) < 0.06)
-
-
-def test_a_reset_restores_the_torque():
-    made = plant(immovable())
-    made.set_powered([False] * 4)
-    made.reset(HIGH)
-    made.set_targets(np.full(4, 0.2), np.zeros(4))
-    for _ in range(100):
-        made.step()
-    np.testing.assert_allclose(made.state[0][7:], 0.2, atol=1e-3)

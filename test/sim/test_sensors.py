@@ -9,7 +9,7 @@ from sim_robots import HIGH, LEVEL, ROBOT, WORLD
 
 from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.sim.conditions import draw
+from beetle_omni_ros.sim.parameters import draw
 from beetle_omni_ros.sim.simulator import Simulator
 
 TICK = WORLD.plant.tick
@@ -109,22 +109,6 @@ def test_imu_readings_sum_to_the_motion_even_through_jolts():
         attitude = attitude * turn * turn
     np.testing.assert_allclose(velocity, frame.truth.velocity, atol=1e-6)
     assert (attitude.inv() * Rotation.from_quat(frame.truth.quaternion)).magnitude() < 1e-6
-
-
-def test_imu_measures_acceleration_less_gravity():
-    """Against differences of the true velocity over the tick, turned to its middle."""
-    quiet = replace(WORLD, imu=replace(WORLD.imu, specific_force_noise=0.0))
-    simulator = Simulator(ROBOT, quiet)
-    simulator.reset(HIGH, Rotation.from_euler('ZYX', [0.3, 0.2, 0.1]).as_quat())
-    frames = []
-    for _ in range(60):
-        simulator.command(Command(simulator.time, np.zeros(4), np.full(4, 9.0)))
-        frames.append(simulator.step())
-    for before, now in zip(frames[10:], frames[11:]):
-        acceleration = (now.truth.velocity - before.truth.velocity) / TICK
-        expected = Rotation.from_quat(now.truth.quaternion).inv().apply(
-            acceleration + [0, 0, ROBOT.gravity])
-        np.testing.assert_allclose(now.imu.specific_force, expected, atol=0.05)
 
 
 def test_joints_at_their_rate_limit_have_constant_velocity():

@@ -53,26 +53,6 @@ def test_command_moves_rotors_and_joints_two_ticks_after_its_stamp():
     assert simulator.truth.tilt[0] > 0.01
 
 
-def test_rotors_stop_100_ms_after_the_last_command():
-    simulator = Simulator(ROBOT, WORLD)
-    simulator.reset(HIGH)
-    simulator.command(Command(0.0, np.zeros(4), HOVER))
-    thrusts = np.array([simulator.step().truth.thrust[0] for _ in range(40)])
-    assert np.argmax(thrusts) == 19         # rises through the tick that ends at 100 ms
-    assert np.all(np.diff(thrusts[19:]) < 0)
-
-
-def test_a_nan_command_is_refused_and_counted_without_effect():
-    simulator = Simulator(ROBOT, WORLD)
-    simulator.reset(HIGH)
-    simulator.command(Command(0.0, np.zeros(4), HOVER))
-    assert not simulator.command(Command(0.005, np.full(4, np.nan), HOVER))
-    assert simulator.rejected['not finite'] == 1
-    for _ in range(10):
-        frame = simulator.step()
-    assert np.isfinite(frame.truth.position).all() and frame.truth.thrust[0] > 1
-
-
 def test_payload_needs_more_thrust_to_stay():
     def fall(payload, thrust):
         simulator = Simulator(ROBOT, WORLD)
@@ -106,27 +86,6 @@ def test_weak_battery_caps_the_thrust():
     assert reached[1] < 13.0
     assert voltages[1] < voltages[0] - 2
     assert current < 0
-
-
-def test_thrust_effect_scales_the_true_thrust():
-    simulator = Simulator(replace(ROBOT, effects={'thrust_coefficient': {'scale': 0.9}}), WORLD)
-    simulator.reset(HIGH)
-    for _ in range(200):
-        simulator.command(Command(simulator.time, np.zeros(4), HOVER))
-        frame = simulator.step()
-    np.testing.assert_allclose(frame.truth.thrust, 0.9 * HOVER, rtol=1e-4)
-
-
-@pytest.mark.parametrize('call, text', [
-    (lambda s: s.set_wrench([np.nan, 0, 0], [0, 0, 0]), 'wrench force: expected 3 finite'),
-    (lambda s: s.set_wrench([0, 0, 0], [0, 0]), 'wrench torque: expected 3 finite'),
-    (lambda s: s.reset([0, 0, np.inf]), 'position: expected 3 finite'),
-    (lambda s: s.reset([0, 0, 1], [0, 0, 0, 0]), 'quaternion: expected a rotation'),
-    (lambda s: s.set_payload(-1.0), 'payload: expected a mass'),
-    (lambda s: s.set_payload(np.nan), 'payload: expected a mass')])
-def test_unusable_disturbance_or_start_is_refused(call, text):
-    with pytest.raises(ValueError, match=text):
-        call(Simulator(ROBOT, WORLD))
 
 
 def test_unknown_conditions_and_seeds_are_refused():

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 import torch
 
 from beetle_omni_ros.robot import dynamics as model
-from beetle_omni_ros.sim.battery import Battery
 from beetle_omni_ros.sim.parameters import SimulatorParameters
+from beetle_omni_ros.sim.simulator import Battery
 from beetle_omni_ros.train import rewards
 from beetle_omni_ros.train.parameters import TrainParameters
 from beetle_omni_ros.train.physics import Physics

@@ -1,8 +1,13 @@
-"""The emulated motor board: firmware, sensors and faults on a pseudo-terminal."""
+"""
+The emulated motor board: the firmware of docs/reference/firmware.md on a pseudo-terminal.
+
+The framing is that of the driver. ``test/drivers/reference_packets.py`` checks it independently.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 import heapq
 import math
 from pathlib import Path
@@ -12,14 +17,310 @@ import time
 
 import numpy as np
 
+from beetle_omni_ros.drivers.mavlink import common, EscInfo, EscStatus, MavlinkReceiver
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import parameter, ParameterFile
 from beetle_omni_ros.robot.thrust_map import duty_of_command, ThrustMap
-from beetle_omni_ros.sim.emulated import mavlink
-from beetle_omni_ros.sim.emulated.board_firmware import BoardFirmware, EmulatedBoardParameters
-from beetle_omni_ros.sim.emulated.fault_switches import BoardFaults
+from beetle_omni_ros.sim.emulated import BoardFaults
 from beetle_omni_ros.sim.emulated.pseudo_terminal import PseudoTerminal
 
-TICK = 0.01             # [s] longest sleep of the thread
+BOOT, DISARMED, ARMED, RUNNING = range(4)
+NONE, ASKED, HEARTBEAT_LOST, IDLE, WATCHDOG = range(5)      # reasons of the last disarming
+(BOOTING, NO_HEARTBEAT, THROTTLE, BATTERY_LOW, ESC_FAILURE, TIMED_OUT,
+ SATURATED) = (1 << bit for bit in range(7))
+BLOCKS_ARMING = BOOTING | NO_HEARTBEAT | THROTTLE | BATTERY_LOW | ESC_FAILURE
+CONTRACT_VERSION = 1
+BOARD, HOST = (1, 1), (1, 191)    # MAVLink system and component of both sides
+ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED = range(4)
+STOP = (0.0, 0.0, 0.0, 0.0)
+UNKNOWN_CELL, UNKNOWN_CURRENT, UNKNOWN_TEMPERATURE = 65535, -1, 32767
+GENERIC_FAILURE = 64            # ESC_FAILURE_GENERIC
+MIN_HEARTBEAT_PERIOD = 0.02     # [s]
+TICK = 0.01                     # [s] longest sleep of the thread
+CLOCK_START, CLOCK_DRIFT = 4.0, 20e-6   # [s], [s/s] of the board's clock, as of a crystal
+IDLE_TEMPERATURE = 35.0         # [C] of the ESCs
+
+
+@dataclass(frozen=True, kw_only=True)
+class EmulatedBoardParameters(ParameterFile, file='emulated_board.yaml'):
+    """Parameters of the firmware contract and of the emulated sensors."""
+
+    target_timeout: float = parameter(
+        0.1, doc='time without a new target after which the rotors stop', unit='s', low=0.01,
+        high=1)
+    heartbeat_timeout: float = parameter(
+        1.0, doc='time without a heartbeat after which it disarms', unit='s', low=0.1, high=10)
+    idle_timeout: float = parameter(
+        2.0, doc='time armed without a target after which it disarms', unit='s', low=0.1, high=60)
+    throttle_low_time: float = parameter(
+        1.0, doc='time without a nonzero target before arming', unit='s', low=0, high=10)
+    target_age_limit: float = parameter(
+        0.1, doc='largest age of a target', unit='s', low=0.01, high=10)
+    target_future_limit: float = parameter(
+        0.05, doc='largest lead of a stamp over the clock', unit='s', low=0, high=10)
+    watchdog_time: float = parameter(
+        0.1, doc='time from a hang to the reset', unit='s', low=0.001, high=1)
+    boot_time: float = parameter(
+        0.3, doc='time from a reset to the first heartbeat', unit='s', low=0, high=10)
+    arm_cell_voltage: float = parameter(
+        3.5, doc='smallest cell voltage for arming', unit='V', low=0, high=5)
+    heartbeat_rate: float = parameter(5.0, doc='rate of HEARTBEAT', unit='Hz', low=1, high=50)
+    battery_rate: float = parameter(50.0, doc='rate of BATTERY_STATUS', unit='Hz', low=1, high=200)
+    rotor_rate: float = parameter(100.0, doc='rate of ESC_STATUS', unit='Hz', low=1, high=500)
+    rotor_info_rate: float = parameter(2.0, doc='rate of ESC_INFO', unit='Hz', low=0.1, high=50)
+    reception_rate: float = parameter(1.0, doc='rate of SYS_STATUS', unit='Hz', low=0.1, high=50)
+    rpm_at_1_newton: float = parameter(
+        2700.0, doc='speed of a rotor at 1 N', unit='1/min', low=1, high=1e5)
+
+
+class BoardFirmware:
+    """
+    State machine of the board, powered at ``now`` [s] by a battery of ``cells``, without port.
+
+    All times are arguments on a clock without steps. Each call first advances the state to its
+    time, so that the results do not depend on the frequency of calls.
+
+    Attributes:
+        voltage, current: of the battery [V, A], NaN without a measurement; set from outside, as
+            the next two.
+        rpm, rotor_current, temperature: of the four rotors [1/min, A, C].
+        failed: rotors (0 to 3) whose ESC has failed.
+        refused: reason -> number of refused targets since the start.
+        timeouts: number of target timeouts with turning rotors.
+
+    """
+
+    def __init__(self, parameters: EmulatedBoardParameters, cells: int, now: float):
+        self._parameters = parameters
+        self._clock_zero = now - CLOCK_START
+        self._arm_voltage = cells * parameters.arm_cell_voltage
+        self.voltage = self.current = math.nan
+        self.rpm, self.rotor_current = [0.0] * 4, [0.0] * 4
+        self.temperature = [IDLE_TEMPERATURE] * 4
+        self.failed: frozenset[int] = frozenset()
+        self._start(now, NONE)
+
+    def _start(self, now, reason):
+        self._hung_at = math.inf
+        self._booted_at = now + self._parameters.boot_time
+        self._announced = False
+        self._armed_at = -math.inf              # finite while armed
+        self._stop_reason = reason
+        self._heartbeat_at = self._nonzero_target_at = self._target_at = -math.inf
+        self._target, self._target_stamp, self._saturated = STOP, -math.inf, False
+        self.refused: dict[str, int] = {}
+        self.timeouts = 0
+        self._next = dict.fromkeys(('heartbeat_rate', 'rotor_info_rate', 'rotor_rate',
+                                    'battery_rate', 'reception_rate'), self._booted_at)
+        self._sent_mode, self._sent_at = None, -math.inf
+        self._sent_failed: frozenset[int] | None = None
+        self._errors, self._packets = [0] * 4, 0
+
+    def reboot(self, now: float, reason: int = NONE) -> None:
+        """Reset the board: outputs off, initial state, clock at zero."""
+        self._clock_zero = now
+        self._start(now, reason)
+
+    def hang(self, now: float) -> None:
+        """Stop the execution; the outputs are constant until the watchdog resets the board."""
+        self._advance(now)
+        self._hung_at = min(self._hung_at, now)
+
+    def clock(self, now: float) -> float:
+        """Clock of the board [s since its start]."""
+        return (now - self._clock_zero) * (1 + CLOCK_DRIFT)
+
+    def runs(self, now: float) -> bool:
+        """Whether the firmware is executed, neither booting nor hung."""
+        self._advance(now)
+        return now >= self._booted_at and self._hung_at == math.inf
+
+    def state(self, now: float) -> int:
+        """BOOT, DISARMED, ARMED (rotors stopped) or RUNNING (following targets)."""
+        self._advance(now)
+        if now < self._booted_at:
+            return BOOT
+        if self._armed_at == -math.inf:
+            return DISARMED
+        return RUNNING if self._fresh(min(now, self._hung_at)) else ARMED
+
+    def outputs(self, now: float) -> tuple[float, ...]:
+        """Normalised commands of the four PWM outputs, 0 to 1."""
+        return self._target if self.state(now) == RUNNING else STOP
+
+    def conditions(self, now: float) -> int:
+        """Bits of the conditions that prevent arming, and of timed-out and saturated targets."""
+        parameters, armed = self._parameters, self._armed_at > -math.inf
+        return BOOTING * (now < self._booted_at) \
+            | NO_HEARTBEAT * (now - self._heartbeat_at >= parameters.heartbeat_timeout) \
+            | THROTTLE * (not armed and
+                          now - self._nonzero_target_at < parameters.throttle_low_time) \
+            | BATTERY_LOW * (not self.voltage >= self._arm_voltage) \
+            | ESC_FAILURE * bool(self.failed) \
+            | TIMED_OUT * (armed and self._target_at > -math.inf and not self._fresh(now)) \
+            | SATURATED * (self._saturated and self._fresh(now))
+
+    def receive(self, message, now: float) -> list:
+        """Handle a message of the computer; return the answers."""
+        if not self.runs(now):
+            return []
+        kind = message.get_type()
+        if kind == 'HEARTBEAT':
+            self._heartbeat_at = now
+        elif kind == 'TIMESYNC' and message.tc1 == 0:
+            return [common.MAVLink_timesync_message(round(1e9 * self.clock(now)), message.ts1)]
+        elif kind == 'SET_ACTUATOR_CONTROL_TARGET':
+            self._take_target(message, now)
+        elif kind == 'COMMAND_LONG' and self._is_for_us(message):
+            return [self._command(message, now)]
+        return []
+
+    def next_due(self) -> float:
+        """Time of the next periodic message [s]."""
+        return min(self._next.values())
+
+    def due(self, now: float, received: dict[str, int]) -> list:
+        """Periodic messages due at ``now``; ``received`` has the counts of the receiver."""
+        if not self.runs(now):
+            return []
+        if not self._announced:
+            self._announced = True
+            return [self._heartbeat(BOOT, now)]
+        messages, beat = [], self._heartbeat(self.state(now), now)
+        changed = beat.custom_mode != self._sent_mode \
+            and now - self._sent_at >= MIN_HEARTBEAT_PERIOD
+        if self._is_due('heartbeat_rate', now) or changed:
+            self._sent_mode, self._sent_at = beat.custom_mode, now
+            messages.append(beat)
+        stamp = round(1e6 * self.clock(now))
+        if self._is_due('rotor_info_rate', now) or self.failed != self._sent_failed:
+            self._sent_failed = self.failed
+            messages.append(self._esc_info(stamp))
+        if self._is_due('rotor_rate', now):
+            messages.append(self._esc_status(stamp))
+        total, current = _integer(1000 * self.voltage, 0, UNKNOWN_CELL - 1, UNKNOWN_CELL), \
+            _integer(100 * self.current, -32768, 32767, UNKNOWN_CURRENT)
+        if self._is_due('battery_rate', now):
+            messages.append(common.MAVLink_battery_status_message(
+                0, 0, 1, UNKNOWN_TEMPERATURE, [total, *[UNKNOWN_CELL] * 9], current, -1, -1, -1))
+        if self._is_due('reception_rate', now):
+            counts = (received['lost'], received['bad_crc'], sum(self.refused.values()),
+                      self.timeouts)
+            messages.append(common.MAVLink_sys_status_message(
+                0, 0, 0, 0, total, current, -1, 0, *(min(count, 65535) for count in (
+                    received['lost'] + received['bad_crc'], *counts))))
+        return messages
+
+    def _is_due(self, rate, now):
+        """Whether a message with this rate is due: without drift, and once after a pause."""
+        if now < self._next[rate]:
+            return False
+        period = 1 / getattr(self._parameters, rate)
+        self._next[rate] += period * (1 + math.floor((now - self._next[rate]) / period))
+        return True
+
+    def _heartbeat(self, state, now):
+        mode = state | self._stop_reason << 8 | self.conditions(now) << 16 | CONTRACT_VERSION << 24
+        armed = state in (ARMED, RUNNING)
+        status = 1 if state == BOOT else 5 if self.failed else 4 if armed else 3
+        return common.MAVLink_heartbeat_message(2, 0, 1 | 128 * armed, mode, status, 3)
+
+    def _esc_status(self, stamp):
+        self._packets += 1
+        works = [k not in self.failed for k in range(4)]
+        volts = 0.0 if math.isnan(self.voltage) else self.voltage
+        return EscStatus(0, stamp, [round(rpm) * on for rpm, on in zip(self.rpm, works)],
+                         [volts * on for on in works],
+                         [current * on for current, on in zip(self.rotor_current, works)])
+
+    def _esc_info(self, stamp):
+        failed = [k in self.failed for k in range(4)]
+        self._errors = [count + bad for count, bad in zip(self._errors, failed)]
+        return EscInfo(
+            0, stamp, self._packets % 65536, 4, 0, sum(1 << k for k in range(4) if not failed[k]),
+            [GENERIC_FAILURE * bad for bad in failed], self._errors,
+            [UNKNOWN_TEMPERATURE if bad else round(100 * value)
+             for value, bad in zip(self.temperature, failed)])
+
+    def _fresh(self, now):
+        return now - self._target_at < self._parameters.target_timeout
+
+    def _advance(self, now):
+        """Advance the state to ``now``."""
+        parameters = self._parameters
+        if now >= self._hung_at + parameters.watchdog_time:
+            self.reboot(self._hung_at + parameters.watchdog_time, WATCHDOG)
+        if self._hung_at < math.inf or self._armed_at == -math.inf:
+            return
+        if now - self._heartbeat_at >= parameters.heartbeat_timeout:
+            self._disarm(HEARTBEAT_LOST)
+        elif now - max(self._target_at, self._armed_at) >= parameters.idle_timeout:
+            self._disarm(IDLE)
+        elif self._target is not STOP and not self._fresh(now):
+            self._target = STOP
+            self.timeouts += 1
+
+    def _disarm(self, reason):
+        self._armed_at, self._stop_reason = -math.inf, reason
+        self._target, self._target_at = STOP, -math.inf
+
+    def _is_for_us(self, message):
+        return (message.target_system, message.target_component) == BOARD
+
+    def _take_target(self, message, now):
+        stamp, controls = message.time_usec / 1e6, message.controls
+        reason = self._refusal(message, stamp, controls, now)
+        if not reason:
+            newer, self._target_stamp = stamp > self._target_stamp, stamp
+            if max(controls) > 0:
+                self._nonzero_target_at = now
+            reason = 'not armed' if self._armed_at == -math.inf else ''
+        if reason:
+            self.refused[reason] = self.refused.get(reason, 0) + 1
+            return
+        self._saturated = min(controls) < 0 or max(controls) > 1
+        self._target = tuple(min(1.0, max(0.0, control)) for control in controls[:4])
+        if newer:       # a repeated target does not prevent the timeout
+            self._target_at = now
+
+    def _refusal(self, message, stamp, controls, now):
+        age = self.clock(now) - stamp
+        if not self._is_for_us(message):
+            return 'other addressee'
+        if message.group_mlx:
+            return 'other group'
+        if not all(map(math.isfinite, controls)):
+            return 'not finite'
+        if any(controls[4:]):
+            return 'more than four rotors'
+        if age > self._parameters.target_age_limit:
+            return 'stale stamp'
+        if age < -self._parameters.target_future_limit:
+            return 'stamp in the future'
+        return 'older than the last' if stamp < self._target_stamp else ''
+
+    def _command(self, message, now):
+        arm, detail, armed = message.param1, 0, self._armed_at > -math.inf
+        if message.command != common.MAV_CMD_COMPONENT_ARM_DISARM:
+            result = UNSUPPORTED
+        elif arm not in (0.0, 1.0) or arm and message.param2:
+            result, detail = DENIED, int(arm == 1.0)    # nothing overrides the conditions
+        elif arm:
+            blocking = 0 if armed else self.conditions(now) & BLOCKS_ARMING
+            result, detail = TEMPORARILY_REJECTED if blocking else ACCEPTED, 1 | blocking << 8
+            if not blocking and not armed:
+                self._armed_at = now
+        else:
+            result = ACCEPTED
+            if armed:
+                self._disarm(ASKED)
+        return common.MAVLink_command_ack_message(message.command, result, 0, detail,
+                                                  message.get_srcSystem(),
+                                                  message.get_srcComponent())
+
+
+def _integer(value, low, high, unknown):
+    return unknown if math.isnan(value) else max(low, min(high, round(value)))
 
 
 class Line:
@@ -44,13 +345,13 @@ class Line:
     def take(self, now: float) -> bytes:
         """Receive everything that has arrived by ``now`` [s]."""
         pieces = []
-        while self._waiting and self._waiting[0][0] <= now:
+        while self.next() <= now:
             pieces.append(heapq.heappop(self._waiting)[2])
         return b''.join(pieces)
 
     def next(self) -> float:
         """Arrival of the next frame [s], inf without one."""
-        return self._waiting[0][0] if self._waiting else float('inf')
+        return self._waiting[0][0] if self._waiting else math.inf
 
     def clear(self) -> None:
         """Lose all frames that have not arrived."""
@@ -83,7 +384,7 @@ class EmulatedMotorBoard:
     Attributes:
         faults: present faults; their attributes may be set at any time.
         on_target: called in the board's thread after each target with its arrival
-            [s, monotonic] and its wire values, for measurements.
+            [s, monotonic] and its stamp [us], for measurements.
 
     Raises:
         OSError: the port cannot be created.
@@ -97,15 +398,15 @@ class EmulatedMotorBoard:
         self._parameters = parameters or EmulatedBoardParameters.load()
         self._map = ThrustMap(robot.rotors)
         self.faults = BoardFaults()
-        self.on_target: Callable[[float, tuple], None] | None = None
+        self.on_target: Callable[[float, int], None] | None = None
         self._lock = threading.RLock()
         self._firmware = BoardFirmware(self._parameters, robot.battery.cells, time.monotonic())
         self._voltage, self._current = robot.battery.full_voltage, 0.0
         self._error = 0.0, 0.0
         self._thrust: np.ndarray | None = None
-        self._parser = mavlink.Parser()
         self._incoming, self._outgoing = Line(seed), Line(seed + 1)
-        self._sequence, self._executes = 0, True
+        self._clear_stream()
+        self._executes = True
         self._terminal = PseudoTerminal(port, 'motor_board')
         self._stop = False
         self._thread = threading.Thread(target=self._run, name='emulated_motor_board', daemon=True)
@@ -118,12 +419,11 @@ class EmulatedMotorBoard:
 
     def close(self) -> None:
         """Stop the thread and remove the port."""
-        if self._stop:
-            return
-        self._stop = True
-        self._terminal.interrupt()
-        self._thread.join(2.0)
-        self._terminal.close()
+        if not self._stop:
+            self._stop = True
+            self._terminal.interrupt()
+            self._thread.join(2.0)
+            self._terminal.close()
 
     def __enter__(self) -> EmulatedMotorBoard:
         return self
@@ -135,7 +435,7 @@ class EmulatedMotorBoard:
     def armed(self) -> bool:
         """Whether the board is armed."""
         with self._lock:
-            return self._firmware.state(time.monotonic()) >= 2
+            return self._firmware.state(time.monotonic()) >= ARMED
 
     @property
     def commands(self) -> np.ndarray:
@@ -153,15 +453,11 @@ class EmulatedMotorBoard:
             return self._thrusts(self.commands)
 
     def _thrusts(self, commands):
-        thrust = self._map.thrust(duty_of_command(commands), self.voltage)
+        thrust = self._map.thrust(duty_of_command(commands),
+                                  self._voltage - self.faults.voltage_sag)
         for rotor in self.faults.failed_escs:
             thrust[int(rotor) - 1] = 0.0
         return thrust
-
-    @property
-    def voltage(self) -> float:
-        """True battery voltage with the sag fault [V]."""
-        return self._voltage - self.faults.voltage_sag
 
     @property
     def refused(self) -> dict[str, int]:
@@ -170,22 +466,14 @@ class EmulatedMotorBoard:
 
     def set_battery(self, voltage: float, current: float,
                     error: tuple[float, float] = (0.0, 0.0)) -> None:
-        """
-        Set the state of the battery.
-
-        Args:
-            voltage: true voltage under load [V].
-            current: true drawn current [A, positive].
-            error: errors of the measured voltage and current [V, A].
-
-        """
+        """Set true voltage [V], drawn current [A] and errors of both measurements [V, A]."""
         self._voltage, self._current, self._error = float(voltage), float(current), error
 
     def set_rotors(self, thrust: np.ndarray, temperature: np.ndarray | None = None) -> None:
         """Set present thrusts (4,) [N] and ESC temperatures (4,) [C] of the rotors."""
         self._thrust = np.array(thrust, dtype=float)
         if temperature is not None:
-            self._firmware.telemetry.temperature = [float(value) for value in temperature]
+            self._firmware.temperature = [float(value) for value in temperature]
 
     def reboot(self) -> None:
         """Reset the board, as a brown-out does."""
@@ -211,20 +499,17 @@ class EmulatedMotorBoard:
             self._terminal.plug()
 
     def _clear_stream(self):
-        self._parser, self._sequence = mavlink.Parser(), 0
+        self._receiver, self._packer = MavlinkReceiver(*HOST), common.MAVLink(None, *BOARD)
 
     def _run(self):
         while not self._stop:
-            self._terminal.wait(self._wait_time())
+            now = time.monotonic()
+            telemetry = self._firmware.next_due()
+            self._terminal.wait(min(telemetry if telemetry > now else now + TICK,
+                                    self._incoming.next(), self._outgoing.next(),
+                                    now + TICK) - now)
             with self._lock:
                 self._step(time.monotonic())
-
-    def _wait_time(self):
-        """Time until something is due [s]."""
-        now = time.monotonic()
-        telemetry = self._firmware.telemetry.next()
-        return min(telemetry if telemetry > now else now + TICK, self._incoming.next(),
-                   self._outgoing.next(), now + TICK) - now
 
     def _step(self, now):
         """Receive, execute and send."""
@@ -240,37 +525,32 @@ class EmulatedMotorBoard:
         data = self._incoming.take(now)
         if executes:
             self._measure(now)
-            for message in self._parser.feed(data):
+            for message in self._receiver.feed(data):
                 self._send(self._firmware.receive(message, now), now)
-                if self.on_target and message.number == mavlink.ACTUATOR_TARGET:
-                    self.on_target(now, message.values)
-            self._send(self._firmware.due(now, self._parser), now)
-        out = self._outgoing.take(now)
-        if out:
+                if self.on_target and message.get_type() == 'SET_ACTUATOR_CONTROL_TARGET':
+                    self.on_target(now, message.time_usec)
+            self._send(self._firmware.due(now, self._receiver.counts), now)
+        if out := self._outgoing.take(now):
             self._terminal.write(out)
 
     def _send(self, messages, now):
         faults = self.faults
-        for number, values in messages:
-            frame = mavlink.pack(number, values, self._sequence, self._parameters.system,
-                                 self._parameters.component)
-            self._sequence = (self._sequence + 1) % 256
+        for message in messages:
+            frame = message.pack(self._packer)
+            self._packer.seq = (self._packer.seq + 1) % 256
             self._outgoing.put(frame, now, faults.corrupt_out, 1.0 if faults.mute
                                else faults.drop_out, faults.delay_out)
 
     def _measure(self, now):
-        """Set the measurements of the telemetry."""
-        telemetry = self._firmware.telemetry
-        telemetry.voltage = self.voltage + self._error[0]
-        telemetry.current = self._current + self._error[1]
-        telemetry.failed = frozenset(int(rotor) - 1 for rotor in self.faults.failed_escs)
-        thrust = self._thrust
-        if thrust is None:
-            thrust = self._thrusts(np.array(self._firmware.outputs(now)))
-        powers = [max(0.0, f) ** 1.5 for f in thrust.tolist()]
-        total = sum(powers)
-        telemetry.rpm = [self._parameters.rpm_at_1_newton * math.sqrt(max(0.0, f))
-                         for f in thrust.tolist()]
+        """Set the measurements of the firmware."""
+        firmware = self._firmware
+        firmware.voltage = self._voltage - self.faults.voltage_sag + self._error[0]
+        firmware.current = self._current + self._error[1]
+        firmware.failed = frozenset(int(rotor) - 1 for rotor in self.faults.failed_escs)
+        thrust = self._thrusts(np.array(firmware.outputs(now))) if self._thrust is None \
+            else self._thrust
+        thrust = np.maximum(thrust, 0.0)
+        firmware.rpm = (self._parameters.rpm_at_1_newton * np.sqrt(thrust)).tolist()
         # The battery current is divided among the rotors by aerodynamic power.
-        telemetry.rotor_current = [self._current * power / total if total else 0.0
-                                   for power in powers]
+        powers = thrust ** 1.5
+        firmware.rotor_current = (self._current * powers / (powers.sum() or 1.0)).tolist()

@@ -1,5 +1,6 @@
 """A serial port without hardware: a pseudo-terminal with a fixed path, which can be unplugged."""
 
+from contextlib import suppress
 import os
 from pathlib import Path
 import select
@@ -18,14 +19,8 @@ class PseudoTerminal:
     The device's end of a serial cable.
 
     One thread calls :meth:`wait`. Any thread may call the other methods, under a lock of the
-    owner.
-
-    Args:
-        port: path of the created link; an existing link is replaced.
-        name: name of the link in a temporary folder, used without ``port``.
-
-    Attributes:
-        port: path for the driver, a link to the present terminal; it exists only while plugged in.
+    owner. ``port`` is the path for the driver, a link to the present terminal; it exists only
+    while plugged in. Without a given path it is ``name`` in a temporary folder.
 
     Raises:
         OSError: the path cannot be created; the message has the path.
@@ -38,7 +33,6 @@ class PseudoTerminal:
         self._device = self._line = -1
         self._waker, self._wake = os.pipe()
         os.set_blocking(self._wake, False)
-        os.set_blocking(self._waker, False)
         try:
             self.plug()
         except OSError:
@@ -46,14 +40,9 @@ class PseudoTerminal:
             raise
 
     @property
-    def plugged(self) -> bool:
-        """Whether the port exists."""
-        return self._device >= 0
-
-    @property
     def baud_rate(self) -> int:
-        """Baud rate set by the driver [bit/s]; 0 while unplugged."""
-        return SPEEDS.get(termios.tcgetattr(self._line)[5], 0) if self.plugged else 0
+        """Baud rate set by the driver [bit/s]."""
+        return SPEEDS.get(termios.tcgetattr(self._line)[5], 0)
 
     def plug(self) -> None:
         """
@@ -63,7 +52,7 @@ class PseudoTerminal:
             OSError: the path exists and is not a link, or cannot be created.
 
         """
-        if self.plugged:
+        if self._device >= 0:
             return
         link = Path(self.port)
         if os.path.lexists(link) and not link.is_symlink():
@@ -86,7 +75,7 @@ class PseudoTerminal:
 
     def unplug(self) -> None:
         """Remove the port; a driver that has it open gets an error or an end of file."""
-        if not self.plugged:
+        if self._device < 0:
             return
         device, line, self._device, self._line = self._device, self._line, -1, -1
         link = Path(self.port)
@@ -100,11 +89,9 @@ class PseudoTerminal:
         """Return when bytes arrive, after ``timeout`` [s], or on :meth:`interrupt`."""
         device = self._device
         watched = [self._waker, device] if device >= 0 else [self._waker]
-        try:
+        with suppress(OSError):     # the port was unplugged during the call
             if self._waker in select.select(watched, [], [], max(0.0, timeout))[0]:
                 os.read(self._waker, CHUNK)
-        except OSError:
-            pass        # the port was unplugged during the call
 
     def read(self) -> bytes:
         """Received bytes; empty without any, or if unplugged."""
@@ -115,17 +102,13 @@ class PseudoTerminal:
 
     def write(self, data: bytes) -> None:
         """Send bytes; they are lost if the buffer is full or the port unplugged."""
-        try:
+        with suppress(OSError):
             os.write(self._device, data)
-        except OSError:
-            pass
 
     def interrupt(self) -> None:
         """Let :meth:`wait` return."""
-        try:
+        with suppress(BlockingIOError):
             os.write(self._wake, b'\0')
-        except OSError:
-            pass
 
     def close(self) -> None:
         """Remove port and folder."""

@@ -1,101 +1,369 @@
-"""The emulated servo bus: servos and faults on a pseudo-terminal."""
+"""
+Emulated XC330-T181-T servos on a pseudo-terminal, as far as a driver of their positions uses them.
 
-from collections.abc import Sequence
+Sources: emanual.robotis.com/docs/en/dxl/protocol2 and .../dxl/x/xc330-t181. The maker's SDK is not
+used, so that tests can compare both. If the manual does not define a behaviour, the servos have
+the one that is worse for a driver, and a comment states it.
+
+A packet is ``FF FF FD 00 | ID | length (2 B) | instruction | parameters | CRC (2 B)``. The length
+is that of the rest of the packet. In instruction and parameters an ``FD`` is stuffed after each
+``FF FF FD``, so that the header is unique.
+"""
+
+from collections.abc import Container, Iterator, Sequence
+from enum import IntEnum
 import heapq
 import itertools
+from math import floor, inf, pi
 from random import Random
 from threading import Lock, Thread
 import time
+from typing import NamedTuple
 
 import numpy as np
 
-from beetle_omni_ros.robot.parameters import JointParameters
-from beetle_omni_ros.robot.servo import NUMPY, Servo, Step
-from beetle_omni_ros.sim.emulated import servo_table as table
-from beetle_omni_ros.sim.emulated.dynamixel import Receiver
-from beetle_omni_ros.sim.emulated.fault_switches import ServoFaults
+from beetle_omni_ros.sim.emulated import ServoFaults
 from beetle_omni_ros.sim.emulated.pseudo_terminal import PseudoTerminal
-from beetle_omni_ros.sim.emulated.servo import EmulatedServo
-from beetle_omni_ros.sim.emulated.servo_network import ServoNetwork
 
-STEP = 0.001        # [s] of the motion, small against the servo's natural frequency of 11 Hz
+HEADER = b'\xff\xff\xfd\x00'
+BROADCAST = 0xFE
+HEAD_SIZE = 7       # [B] header, ID and length
+LENGTH_LIMIT = 1024 # [B] larger than any instruction of the SDK for 253 servos
+PING, READ, WRITE, REBOOT, STATUS, SYNC_READ, SYNC_WRITE = (
+    0x01, 0x02, 0x03, 0x08, 0x55, 0x82, 0x83)
+
+EEPROM_END = 64     # registers below it keep their value without power
+STARTUP_FIRMWARE = 46   # first version with a startup configuration
+FIRMWARE = 52
+COUNTS_PER_TURN = 4096
+POSITION_UNIT = 2 * pi / COUNTS_PER_TURN    # [rad]
+ZERO = 2048         # position reading in the middle of the turn
+VELOCITY_UNIT = 0.229 * 2 * pi / 60         # [rad/s] 0.229 rev/min
+VOLTAGE_UNIT = 0.1  # [V]
+WATCHDOG_UNIT, WATCHDOG_EXPIRED = 0.02, 255     # [s]
+# [N m] for one count (about 1 mA) of current: the maker's model file xc330_t181_fw52.model
+TORQUE_UNIT = 0.000670947
+BAUD_RATES = (9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
+# Hardware Error Status (70) and Shutdown (63)
+VOLTAGE_ERROR, OVERHEATING, OVERLOAD = 0x01, 0x04, 0x20
+
 CHECK_PERIOD = 0.01 # [s] between checks of watchdog, temperature and voltage
 PAUSE = 0.05        # [s] silence after which an incomplete packet is dropped
-BITS_PER_BYTE = 10  # start, eight data, stop
 
 
-class SecondOrderMotion:
+class Error(IntEnum):
+    """Lower seven bits of the error byte in a status packet; ALERT is the eighth."""
+
+    NONE = 0
+    RESULT_FAIL = 1
+    INSTRUCTION = 2
+    DATA_RANGE = 4
+    DATA_LENGTH = 5
+    DATA_LIMIT = 6
+    ACCESS = 7
+    ALERT = 0x80
+
+
+class Register(NamedTuple):
+    """A register: address, size [B], value after power-up, values that may be written, sign."""
+
+    address: int
+    size: int
+    initial: int = 0
+    legal: Container[int] = ()
+    signed: bool = False
+
+
+GAIN = range(16384)
+TABLE = {
+    'Model Number': Register(0, 2, 1210),
+    'Firmware Version': Register(6, 1, FIRMWARE),
+    'ID': Register(7, 1, 1, range(253)),
+    'Baud Rate': Register(8, 1, 1, range(7)),
+    'Return Delay Time': Register(9, 1, 250, range(255)),
+    'Drive Mode': Register(10, 1, 0, (0, 1, 4, 5, 8, 9, 12, 13)),
+    'Operating Mode': Register(11, 1, 3, (0, 1, 3, 4, 5, 16)),
+    'Secondary(Shadow) ID': Register(12, 1, 255, (*range(253), 255)),
+    'Homing Offset': Register(20, 4, 0, range(-1_044_479, 1_044_480), True),
+    'Temperature Limit': Register(31, 1, 70, range(101)),
+    'Max Voltage Limit': Register(32, 2, 140, range(55, 141)),
+    'Min Voltage Limit': Register(34, 2, 55, range(55, 141)),
+    'Current Limit': Register(38, 2, 910, range(911)),
+    'Startup Configuration': Register(60, 1, 0, range(4)),
+    'Shutdown': Register(63, 1, 52, range(0x3E)),
+    'Torque Enable': Register(64, 1, 0, range(2)),
+    'LED': Register(65, 1, 0, range(2)),
+    'Status Return Level': Register(68, 1, 2, range(3)),
+    'Registered Instruction': Register(69, 1),
+    'Hardware Error Status': Register(70, 1),
+    'Velocity I Gain': Register(76, 2, 1200, GAIN),
+    'Position D Gain': Register(80, 2, 0, GAIN),
+    'Position I Gain': Register(82, 2, 0, GAIN),
+    'Position P Gain': Register(84, 2, 900, GAIN),
+    'Feedforward 2nd Gain': Register(88, 2, 0, GAIN),
+    'Feedforward 1st Gain': Register(90, 2, 0, GAIN),
+    'Bus Watchdog': Register(98, 1, 0, range(128)),
+    'Goal Current': Register(102, 2, 910, range(-910, 911), True),
+    'Profile Acceleration': Register(108, 4, 0, range(32768)),
+    'Profile Velocity': Register(112, 4, 0, range(32768)),
+    'Goal Position': Register(116, 4, 0, range(-1_048_575, 1_048_576), True),
+    'Present Current': Register(126, 2, signed=True),
+    'Present Velocity': Register(128, 4, signed=True),
+    'Present Position': Register(132, 4, signed=True),
+    'Present Input Voltage': Register(144, 2, 120),
+    'Present Temperature': Register(146, 1, 35),
+    'Backup Ready': Register(147, 1),
+}
+NAMES = {register.address: name for name, register in TABLE.items()}
+DEFINED = frozenset(address for register in TABLE.values()
+                    for address in range(register.address, register.address + register.size))
+# Registers that a change of the operating mode resets.
+RESET_BY_MODE = tuple(name for name in TABLE if 'Gain' in name or 'Profile' in name)
+
+
+# --- packets ----------------------------------------------------------------------------------
+
+def _crc_table():
+    """Remainders of the polynomial x^16 + x^15 + x^2 + 1 for each leading byte."""
+    for byte in range(256):
+        remainder = byte << 8
+        for _ in range(8):
+            remainder = (remainder << 1) ^ (0x8005 if remainder & 0x8000 else 0)
+        yield remainder & 0xFFFF
+
+
+CRC_TABLE = tuple(_crc_table())
+
+
+def sealed(data: bytes) -> bytes:
+    """Bytes with their CRC-16 (polynomial 0x8005, not reflected)."""
+    crc = 0
+    for byte in data:
+        crc = ((crc << 8) & 0xFFFF) ^ CRC_TABLE[(crc >> 8) ^ byte]
+    return data + crc.to_bytes(2, 'little')
+
+
+def packet(identifier: int, instruction: int, parameters: bytes = b'') -> bytes:
+    """Build a packet."""
+    body = (bytes((instruction,)) + parameters).replace(b'\xff\xff\xfd', b'\xff\xff\xfd\xfd')
+    return sealed(HEADER + bytes((identifier,)) + (len(body) + 2).to_bytes(2, 'little') + body)
+
+
+def status(identifier: int, error: int, data: bytes = b'') -> bytes:
+    """Build the answer of one servo."""
+    return packet(identifier, STATUS, bytes((error,)) + data)
+
+
+class Packet(NamedTuple):
+    """A received packet without stuffing."""
+
+    identifier: int
+    instruction: int
+    parameters: bytes
+
+
+class Receiver:
+    """Finds packets with a correct CRC in a stream of bytes."""
+
+    def __init__(self):
+        self._buffer = bytearray()
+
+    def forget(self):
+        """Drop an incomplete packet, as a servo does after a pause on the line."""
+        self._buffer.clear()
+
+    def feed(self, data: bytes) -> Iterator[Packet]:
+        """Parse further bytes; yield each packet that they complete."""
+        self._buffer += data
+        while (start := self._buffer.find(HEADER)) >= 0:
+            del self._buffer[:start]
+            if len(self._buffer) < HEAD_SIZE:
+                return
+            length = int.from_bytes(self._buffer[5:7], 'little')
+            end = HEAD_SIZE + length
+            if 3 <= length <= LENGTH_LIMIT and len(self._buffer) < end:
+                return
+            raw = bytes(self._buffer[:end])
+            if not 3 <= length <= LENGTH_LIMIT or sealed(raw[:-2]) != raw:
+                del self._buffer[:len(HEADER)]      # its rest may have the start of the next one
+                continue
+            del self._buffer[:end]
+            body = raw[HEAD_SIZE:-2].replace(b'\xff\xff\xfd\xfd', b'\xff\xff\xfd')
+            yield Packet(raw[4], body[0], body[1:])
+
+
+# --- servos -----------------------------------------------------------------------------------
+
+class EmulatedServo:
     """
-    Motion of ``count`` servos without load.
+    Registers, watchdog, shutdown and turn count of one servo.
 
-    Attributes:
-        position: (n,) [rad].
-        velocity: (n,) [rad/s].
-        effort: (n,) [N m].
-
+    Angles are those of the robot's joint [rad]; ``sign`` and ``zero`` convert them to counts. The
+    owner sets ``angle``, ``velocity`` [rad/s] and ``effort`` [N m] of the shaft.
     """
 
-    def __init__(self, joints: JointParameters, count: int):
-        self._servo = Servo.of(joints)
-        self._step = Step(NUMPY, self._servo, STEP)
-        self.position, self.velocity, self.effort = np.zeros((3, count))
-        self._time = None
+    def __init__(self, identifier: int, *, firmware: int = FIRMWARE, baud_rate: int = 1_000_000,
+                 sign: int = 1, zero: int = ZERO, reboot_time: float = 0.3):
+        self.sign, self.zero, self.reboot_time = sign, zero, reboot_time
+        self.angle = self.velocity = self.effort = 0.0
+        self.last_packet, self.boots_at = 0.0, -inf
+        self._memory = bytearray(max(DEFINED) + 1)
+        for name, register in TABLE.items():
+            self[name] = register.initial
+        self['ID'], self['Firmware Version'] = identifier, firmware
+        self['Baud Rate'] = BAUD_RATES.index(baud_rate)
+        self._to_one_turn()
 
-    def advance(self, now: float, goals: np.ndarray, powered: np.ndarray):
-        """Advance to ``now`` [s] with ``goals`` [rad]; a servo without power does not move."""
-        if self._time is None or now - self._time > 1.0:
-            self._time = now
-        while self._time + STEP <= now:
-            self._time += STEP
-            moved = self._step(goals, self.position, np.where(powered, self.velocity, 0.0))
-            self.position, self.velocity = np.where(
-                powered, moved, [self.position, np.zeros_like(self.velocity)])
-            self.effort = np.where(powered, self._servo.motor(
-                NUMPY, goals - self.position, self.velocity), 0.0)
+    def __getitem__(self, name: str) -> int:
+        """Value of a register."""
+        register = TABLE[name]
+        raw = self._memory[register.address:register.address + register.size]
+        return int.from_bytes(raw, 'little', signed=register.signed)
 
+    def __setitem__(self, name: str, value: int):
+        """Set a register without checks."""
+        register = TABLE[name]
+        self._memory[register.address:register.address + register.size] = \
+            value.to_bytes(register.size, 'little', signed=register.signed)
+
+    @property
+    def torque(self) -> bool:
+        """Whether the motor is powered."""
+        return bool(self['Torque Enable'])
+
+    @property
+    def expired(self) -> bool:
+        """Whether the bus watchdog has stopped it."""
+        return self['Bus Watchdog'] == WATCHDOG_EXPIRED
+
+    @property
+    def goal(self) -> float:
+        """Goal angle of the joint [rad]."""
+        counts = self['Goal Position'] + COUNTS_PER_TURN * self._turns
+        return self.sign * (counts - self.zero) * POSITION_UNIT
+
+    @property
+    def alert(self) -> int:
+        """Alert bit of its error bytes."""
+        return Error.ALERT if self['Hardware Error Status'] else 0
+
+    def read(self, address: int, length: int) -> tuple[Error, bytes]:
+        """Read bytes of the control table; error ACCESS for undefined addresses."""
+        end = address + length
+        if not length or not all(place in DEFINED for place in range(address, end)):
+            return Error.ACCESS, b''
+        self['Present Current'] = round(self.sign * self.effort / TORQUE_UNIT)
+        self['Present Velocity'] = round(self.sign * self.velocity / VELOCITY_UNIT)
+        self['Present Position'] = self._present()
+        return Error.NONE, bytes(self._memory[address:end])
+
+    def write(self, address: int, data: bytes) -> Error:
+        """Write one register."""
+        name = NAMES.get(address)
+        if name is None or (name == 'Startup Configuration'
+                            and self['Firmware Version'] < STARTUP_FIRMWARE):
+            return Error.ACCESS
+        register = TABLE[name]
+        if not register.legal or (address < EEPROM_END and self.torque):
+            return Error.ACCESS
+        if len(data) != register.size:
+            return Error.DATA_LENGTH
+        value = int.from_bytes(data, 'little', signed=register.signed)
+        if value not in register.legal or (self.expired and (
+                name in ('Goal Position', 'Goal Current') or name == 'Bus Watchdog' and value)):
+            return Error.DATA_RANGE
+        # The manual defines the refusal, but not its error.
+        if name == 'Torque Enable' and value and self['Hardware Error Status'] & self['Shutdown']:
+            return Error.RESULT_FAIL
+        if name == 'Goal Current' and abs(value) > self['Current Limit']:
+            return Error.DATA_LIMIT
+        self._apply(name, value)
+        return Error.NONE
+
+    def _apply(self, name, value):
+        if name == 'Operating Mode' and self[name] != value:
+            for other in RESET_BY_MODE:
+                self[other] = TABLE[other].initial
+            self['Goal Current'] = self['Current Limit']
+        self[name] = value      # a goal remains, so torque without a new one causes a jump
+
+    def reboot(self, now: float):
+        """Restart with initial RAM, torque off, position within one turn; silent until booted."""
+        for name, register in TABLE.items():
+            if register.address >= EEPROM_END:
+                self[name] = register.initial
+        self.boots_at = now + self.reboot_time
+        self._to_one_turn()
+
+    def advance(self, now: float, temperature: int, voltage: float):
+        """Check watchdog, temperature [deg C] and supply voltage [V]."""
+        limit, silence = self['Bus Watchdog'], now - self.last_packet
+        if self.torque and 0 < limit < WATCHDOG_EXPIRED and silence > limit * WATCHDOG_UNIT:
+            self.expire()
+        self['Present Temperature'] = temperature
+        if temperature > self['Temperature Limit']:
+            self.trip(OVERHEATING)
+        self['Present Input Voltage'] = counts = round(voltage / VOLTAGE_UNIT)
+        if not self['Min Voltage Limit'] <= counts <= self['Max Voltage Limit']:
+            self.trip(VOLTAGE_ERROR)
+
+    def expire(self):
+        """Expire the watchdog: hold the present position (the manual has only "stop")."""
+        self['Bus Watchdog'], self['Goal Position'] = WATCHDOG_EXPIRED, self._present()
+
+    def trip(self, error: int):
+        """Set a hardware error; the errors in Shutdown (63) switch the torque off."""
+        self['Hardware Error Status'] |= error
+        if error & self['Shutdown']:
+            self['Torque Enable'] = 0
+
+    def _counts(self):
+        return round(self.zero + self.sign * self.angle / POSITION_UNIT)
+
+    def _present(self):
+        return self._counts() - COUNTS_PER_TURN * self._turns
+
+    def _to_one_turn(self):
+        self._turns = floor(self._counts() / COUNTS_PER_TURN)
+
+
+# --- the line ---------------------------------------------------------------------------------
 
 class EmulatedServoBus:
     """
     XC330 servos on one serial port, as a context manager.
 
-    A plant reads :meth:`drive` and calls :meth:`set_state`. With ``motion`` the servos move
-    without a plant.
+    A plant reads :meth:`drive` and calls :meth:`set_state`. ``refusals`` is the number of refused
+    instructions.
 
     Args:
         identifiers: IDs in the order of the joints.
         port: path of the created port; by default a temporary one.
-        firmware: firmware version of the servos; below 46 without fast sync read.
+        firmware: firmware version of the servos; below 46 without startup configuration.
         baud_rate: baud rate of the servos [bit/s].
         signs: +1 or -1 for each servo: counts rise or fall with the joint's angle.
         zeros: counts at which the angle of each joint is zero.
-        motion: parameters of the servo model, or None for servos moved by a plant.
-        timing: whether answers take the time on the wire and the return delay.
+        speed: of servos with torque without a plant [rad/s]; by default they do not move.
         reboot_time: time without answers after a reboot [s].
         seed: seed of the faults.
 
     """
 
     def __init__(self, identifiers: Sequence[int] = (1, 2, 3, 4), *, port: str | None = None,
-                 firmware: int = table.FIRMWARE, baud_rate: int = 1_000_000,
-                 signs: Sequence[int] | None = None, zeros: Sequence[int] | None = None,
-                 motion: JointParameters | None = None, timing: bool = False,
-                 reboot_time: float = 0.3, seed: int = 0):
-        count = len(identifiers)
-        self.faults = ServoFaults()
-        self.network = ServoNetwork([
-            EmulatedServo(name, firmware=firmware, baud_rate=baud_rate, sign=int(sign),
-                          zero=int(zero), reboot_time=reboot_time)
-            for name, sign, zero in zip(identifiers, signs or [1] * count,
-                                        zeros or [table.ZERO] * count, strict=True)])
-        self.timing = timing
-        self._motion = SecondOrderMotion(motion, count) if motion else None
+                 firmware: int = FIRMWARE, baud_rate: int = 1_000_000,
+                 signs: Sequence[int] = (1,) * 4, zeros: Sequence[int] = (ZERO,) * 4,
+                 speed: float = 0.0, reboot_time: float = 0.3, seed: int = 0):
+        self.faults, self.refusals = ServoFaults(), 0
+        self.servos = [EmulatedServo(name, firmware=firmware, baud_rate=baud_rate, sign=sign,
+                                     zero=zero, reboot_time=reboot_time)
+                       for name, sign, zero in zip(identifiers, signs, zeros, strict=True)]
+        self._speed = speed
         self._terminal = PseudoTerminal(port, 'servo_bus')
-        self._receiver = Receiver()
-        self._random = Random(seed)
+        self._receiver, self._random = Receiver(), Random(seed)
         self._late: list[tuple[float, int, bytes]] = []
         self._order = itertools.count()
         self._lock = Lock()
-        self._last_data = self._last_check = time.monotonic()
+        self._last_data = self._last_check = self._last_move = time.monotonic()
         self._running = True
         self._thread = Thread(target=self._run, name='emulated servo bus', daemon=True)
         self._thread.start()
@@ -111,56 +379,35 @@ class EmulatedServoBus:
         """Path of the serial port."""
         return self._terminal.port
 
-    @property
-    def servos(self) -> list[EmulatedServo]:
-        """The servos, in the order of the joints."""
-        return self.network.servos
-
-    # --- the plant's side ---------------------------------------------------------------------
-
     def drive(self) -> tuple[list[float], list[bool], list[bool]]:
-        """
-        Inputs of a plant at one time.
-
-        Returns:
-            values of :attr:`goals`, :attr:`torque_enabled` and :attr:`stopped`.
-
-        """
+        """Goals [rad], whether motors are powered, whether watchdogs stopped them, at one time."""
         with self._lock:
             # Handle received bytes, because the thread may not have been scheduled.
             self._serve(time.monotonic())
-            servos = self.servos
-            return ([servo.goal for servo in servos], [servo.torque for servo in servos],
-                    [servo.expired for servo in servos])
+            return ([servo.goal for servo in self.servos],
+                    [servo.torque for servo in self.servos],
+                    [servo.expired for servo in self.servos])
 
     @property
     def goals(self) -> np.ndarray:
         """(n,) goal angles of the joints [rad]."""
-        with self._lock:
-            return np.array([servo.goal for servo in self.servos])
+        return np.array(self.drive()[0])
 
     @property
     def torque_enabled(self) -> np.ndarray:
         """(n,) bool: whether a motor is powered; without power the joint is free."""
-        with self._lock:
-            return np.array([servo.torque for servo in self.servos])
+        return np.array(self.drive()[1])
 
     @property
     def stopped(self) -> np.ndarray:
         """(n,) bool: whether the bus watchdog has stopped a servo, which then refuses goals."""
-        with self._lock:
-            return np.array([servo.expired for servo in self.servos])
+        return np.array(self.drive()[2])
 
     def set_state(self, position: np.ndarray, velocity: np.ndarray, effort: np.ndarray):
         """Set the joints' true angles [rad], rates [rad/s] and torques [N m], each (n,)."""
         with self._lock:
             for servo, *state in zip(self.servos, position, velocity, effort, strict=True):
-                servo.move(*state)
-            if self._motion:
-                self._motion.position = np.array(position, dtype=float)
-                self._motion.velocity = np.array(velocity, dtype=float)
-
-    # --- events -------------------------------------------------------------------------------
+                servo.angle, servo.velocity, servo.effort = map(float, state)
 
     def reboot(self, index: int):
         """Restart servo ``index`` as a brown-out does: torque off, turn count lost."""
@@ -177,18 +424,13 @@ class EmulatedServoBus:
         """Unplug the adapter; the servos keep their power."""
         with self._lock:
             self._terminal.unplug()
-            self._forget()
+            self._receiver.forget()
+            self._late.clear()
 
     def replug(self):
         """Plug the adapter in."""
         with self._lock:
-            if not self._terminal.plugged:
-                self._terminal.plug()
-                self._forget()
-
-    def _forget(self):
-        self._receiver.forget()
-        self._late.clear()
+            self._terminal.plug()
 
     def close(self):
         """Stop the thread and remove the port."""
@@ -198,68 +440,43 @@ class EmulatedServoBus:
             self._thread.join(2.0)
             self._terminal.close()
 
-    # --- the thread ---------------------------------------------------------------------------
-
     def _run(self):
         while self._running:
-            self._terminal.wait(self._wait_time())
+            due = self._late[0][0] - time.monotonic() if self._late else inf
+            self._terminal.wait(min(CHECK_PERIOD, due))
             with self._lock:
                 self._serve(time.monotonic())
 
     def _serve(self, now):
         """Handle received packets, check the servos, send due answers."""
-        data = self._terminal.read()
-        if data:
+        if data := self._terminal.read():
             if now - self._last_data > PAUSE:
                 self._receiver.forget()
             self._last_data = now
-            self._take(data, now)
+            for received in self._receiver.feed(data):
+                self._move(now)
+                for answer in self.handle(received, self._terminal.baud_rate, now):
+                    self._send(answer, now)
         # After the data, so that waiting packets restart the watchdogs of a late thread.
         if now - self._last_check >= CHECK_PERIOD:
             self._last_check = now
-            self._check_servos(now)
+            for servo in self.servos:
+                hot = servo['ID'] in self.faults.overheated
+                servo.advance(now, servo['Temperature Limit'] + 10 if hot else 35,
+                              self.faults.supply_voltage)
+                if servo['ID'] in self.faults.overload and servo.torque:
+                    servo.trip(OVERLOAD)
+            self._move(now)
         while self._late and self._late[0][0] <= now:
             self._terminal.write(heapq.heappop(self._late)[2])
 
-    def _wait_time(self):
-        if not self._late:
-            return CHECK_PERIOD
-        return min(CHECK_PERIOD, max(0.0, self._late[0][0] - time.monotonic()))
-
-    def _check_servos(self, now):
-        faults = self.faults
-        self.network.silent = set(faults.silent)
-        for servo in self.servos:
-            name = servo['ID']
-            servo.temperature = servo['Temperature Limit'] + 10 if name in faults.overheated \
-                else None
-            servo.voltage = faults.supply_voltage
-            servo.advance(now)
-            if name in faults.overload and servo.torque:
-                servo.trip(table.OVERLOAD)
-        self._move(now)
-
     def _move(self, now):
-        if self._motion is None:
-            return
-        goals = np.array([servo.goal for servo in self.servos])
-        powered = np.array([servo.torque for servo in self.servos])
-        self._motion.advance(now, goals, powered)
-        for servo, *state in zip(self.servos, self._motion.position, self._motion.velocity,
-                                 self._motion.effort, strict=True):
-            servo.move(*state)
+        step, self._last_move = self._speed * (now - self._last_move), now
+        for servo in self.servos if step else ():
+            if servo.torque:
+                servo.angle += max(-step, min(step, servo.goal - servo.angle))
 
-    def _take(self, data, now):
-        baud_rate = self._terminal.baud_rate
-        for packet in self._receiver.feed(data):
-            self.network.silent = set(self.faults.silent)
-            self._move(now)
-            arrived = now + (len(packet.parameters) + 10) * BITS_PER_BYTE / max(baud_rate, 1)
-            for reply in self.network.handle(packet, baud_rate, now):
-                arrived += reply.delay + len(reply.data) * BITS_PER_BYTE / max(baud_rate, 1)
-                self._answer(reply.data, arrived if self.timing else 0.0)
-
-    def _answer(self, data, due):
+    def _send(self, data, now):
         faults, draw = self.faults, self._random.random
         if draw() < faults.dropped:
             return
@@ -268,8 +485,50 @@ class EmulatedServoBus:
             data = data[:place] + bytes((data[place] ^ 1 << self._random.randrange(8),)) \
                 + data[place + 1:]
         if draw() < faults.delayed:
-            due = max(due, time.monotonic()) + faults.delay
-        if due:
-            heapq.heappush(self._late, (due, next(self._order), data))
+            heapq.heappush(self._late, (now + faults.delay, next(self._order), data))
         else:
             self._terminal.write(data)
+
+    def handle(self, received: Packet, baud_rate: int, now: float) -> list[bytes]:
+        """Execute a packet in every servo that receives it; return the answers in order."""
+        listening = {servo['ID']: servo for servo in self.servos
+                     if servo['ID'] not in self.faults.silent and now >= servo.boots_at
+                     and BAUD_RATES[servo['Baud Rate']] == baud_rate}
+        for servo in listening.values():
+            servo.last_packet = now
+        name, code, given = received
+        if name != BROADCAST:
+            return [self._single(listening[name], code, given, now)] if name in listening else []
+        address, length = (int.from_bytes(given[k:k + 2], 'little') for k in (0, 2))
+        if code == SYNC_WRITE:
+            for k in range(4, len(given), length + 1):
+                if given[k] in listening:
+                    self._checked(listening[given[k]].write(address, given[k + 1:k + 1 + length]))
+        answers = []
+        if code == SYNC_READ:       # each waits for the previous one, so a silent one ends it
+            for one in itertools.takewhile(listening.__contains__, given[4:]):
+                error, data = listening[one].read(address, length)
+                answers.append(status(one, self._checked(error) | listening[one].alert, data))
+        return answers
+
+    def _single(self, servo, code, given, now):
+        """Execute an instruction in one servo; return its answer."""
+        name, data = servo['ID'], b''   # with a new ID it still answers with the old one
+        address = int.from_bytes(given[:2], 'little')
+        if code == PING:
+            error, data = servo.read(0, 2)
+            data += bytes((servo['Firmware Version'],))
+        elif code == READ:
+            error, data = servo.read(address, int.from_bytes(given[2:4], 'little'))
+        elif code == WRITE:
+            error = servo.write(address, given[2:])
+        elif code == REBOOT:
+            error = Error.NONE
+            servo.reboot(now)
+        else:
+            error = Error.INSTRUCTION
+        return status(name, self._checked(error) | servo.alert, data)
+
+    def _checked(self, error):
+        self.refusals += error is not Error.NONE
+        return error

@@ -1,0 +1,295 @@
+"""Emulated servos against the manual's examples and limits, and against the maker's SDK."""
+
+from pathlib import Path
+from random import Random
+import time
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
+from beetle_omni_ros.sim.emulated import servo_bus as emulated
+from beetle_omni_ros.sim.emulated.servo_bus import (
+    EmulatedServo,
+    EmulatedServoBus,
+    Error,
+    packet,
+    Receiver,
+    status,
+    TABLE,
+)
+
+sdk = pytest.importorskip('dynamixel_sdk')
+
+# Examples of emanual.robotis.com/docs/en/dxl/protocol2, typed in by hand: (ID, instruction,
+# parameters) and the whole packet.
+INSTRUCTIONS = [
+    (0x01, 0x01, '', 'FF FF FD 00 01 03 00 01 19 4E'),
+    (0x01, 0x02, '84 00 04 00', 'FF FF FD 00 01 07 00 02 84 00 04 00 1D 15'),
+    (0x01, 0x03, '74 00 00 02 00 00', 'FF FF FD 00 01 09 00 03 74 00 00 02 00 00 CA 89'),
+    (0x01, 0x08, '', 'FF FF FD 00 01 03 00 08 2F 4E'),
+    (0xFE, 0x82, '84 00 04 00 01 02', 'FF FF FD 00 FE 09 00 82 84 00 04 00 01 02 CE FA'),
+    (0xFE, 0x83, '74 00 04 00 01 96 00 00 00 02 AA 00 00 00',
+     'FF FF FD 00 FE 11 00 83 74 00 04 00 01 96 00 00 00 02 AA 00 00 00 82 87'),
+]
+payloads = st.tuples(
+    st.integers(0, 0xFE).filter(lambda name: name != 0xFD), st.integers(0, 255),
+    st.lists(st.sampled_from((0, 1, 0xFD, 0xFE, 0xFF, 0x55)) | st.integers(0, 255),
+             max_size=40).map(bytes))
+
+
+@pytest.mark.parametrize(('name', 'instruction', 'parameters', 'expected'), INSTRUCTIONS)
+def test_instructions_have_the_documented_bytes(name, instruction, parameters, expected):
+    made = packet(name, instruction, bytes.fromhex(parameters))
+    assert made == bytes.fromhex(expected)
+    assert list(Receiver().feed(made)) == [(name, instruction, bytes.fromhex(parameters))]
+
+
+def test_answers_have_the_documented_bytes():
+    assert status(1, 0, bytes.fromhex('A6 00 00 00')) == bytes.fromhex(
+        'FF FF FD 00 01 08 00 55 00 A6 00 00 00 8C C0')
+
+
+@given(st.lists(payloads, min_size=1, max_size=6), st.binary(max_size=200), st.data())
+def test_packets_are_found_for_any_split_of_the_stream_and_after_noise(sent, noise, data):
+    stream = b''.join(packet(*payload) for payload in sent)
+    cuts = sorted(data.draw(st.lists(st.integers(0, len(stream)), max_size=12)))
+    receiver, found = Receiver(), []
+    list(receiver.feed(noise))
+    receiver.forget()
+    for start, end in zip([0, *cuts], [*cuts, len(stream)], strict=True):
+        found += receiver.feed(stream[start:end])
+    assert found == sent
+
+
+@given(payloads, st.integers(0, 10_000), st.integers(0, 7))
+def test_a_packet_with_a_flipped_bit_is_ignored(payload, place, bit):
+    raw = bytearray(packet(*payload))
+    raw[place % len(raw)] ^= 1 << bit
+    assert payload not in list(Receiver().feed(bytes(raw)))
+
+
+# --- one servo --------------------------------------------------------------------------------
+
+@pytest.fixture
+def servo():
+    return EmulatedServo(1, reboot_time=0.0)
+
+
+def write(servo, name, value):
+    register = TABLE[name]
+    return servo.write(register.address, value.to_bytes(register.size, 'little', signed=value < 0))
+
+
+def position(servo):
+    servo.read(132, 4)
+    return servo['Present Position']
+
+
+@pytest.mark.parametrize(('name', 'value', 'error'), [
+    ('Operating Mode', 2, Error.DATA_RANGE), ('Baud Rate', 7, Error.DATA_RANGE),
+    ('ID', 253, Error.DATA_RANGE), ('Torque Enable', 2, Error.DATA_RANGE),
+    ('Position P Gain', 16384, Error.DATA_RANGE), ('Bus Watchdog', 128, Error.DATA_RANGE),
+    ('Model Number', 5, Error.ACCESS), ('Present Position', 5, Error.ACCESS),
+    ('Goal Position', 1_048_576, Error.DATA_RANGE), ('Goal Position', -534, Error.NONE)])
+def test_a_value_outside_its_range_is_refused_and_changes_nothing(servo, name, value, error):
+    before = servo[name]
+    assert write(servo, name, value) == error
+    assert servo[name] == (value if error is Error.NONE else before)
+
+
+def test_only_whole_known_registers_are_accessible(servo):
+    for address, data, error in ((116, b'\0\0', Error.DATA_LENGTH), (117, b'\0', Error.ACCESS),
+                                 (14, b'\0', Error.ACCESS), (64, b'', Error.DATA_LENGTH)):
+        assert servo.write(address, data) == error
+    for address, length in ((66, 1), (60, 3), (147, 2), (0, 0), (600, 1)):
+        assert servo.read(address, length) == (Error.ACCESS, b'')
+
+
+def test_eeprom_is_locked_while_torque_is_on_and_a_change_of_mode_resets_gains(servo):
+    write(servo, 'Position P Gain', 700)
+    assert write(servo, 'Torque Enable', 1) == Error.NONE
+    for name in ('ID', 'Baud Rate', 'Operating Mode', 'Homing Offset'):
+        assert write(servo, name, servo[name]) == Error.ACCESS, name
+    write(servo, 'Torque Enable', 0)
+    write(servo, 'Current Limit', 300)
+    assert write(servo, 'Goal Current', 301) == Error.DATA_LIMIT
+    assert write(servo, 'Operating Mode', 4) == Error.NONE
+    assert (servo['Position P Gain'], servo['Goal Current']) == (900, 300)
+
+
+def test_the_watchdog_stops_the_servo_and_locks_its_goals_until_cleared(servo):
+    write(servo, 'Bus Watchdog', 5)
+    servo.advance(10.0, 35, 12.0)
+    assert not servo.expired, 'it counts only while torque is on'
+    servo.last_packet = 20.0
+    write(servo, 'Torque Enable', 1)
+    write(servo, 'Goal Position', 4000)
+    servo.angle = 0.5
+    servo.advance(20.09, 35, 12.0)
+    assert not servo.expired and servo.goal > 2
+    servo.advance(20.11, 35, 12.0)
+    assert servo.expired and servo['Bus Watchdog'] == 255
+    assert servo.goal == pytest.approx(0.5, abs=emulated.POSITION_UNIT)
+    for name, value in (('Goal Position', 0), ('Bus Watchdog', 5)):
+        assert write(servo, name, value) == Error.DATA_RANGE
+    assert write(servo, 'Bus Watchdog', 0) == write(servo, 'Goal Position', 4000) == Error.NONE
+
+
+@pytest.mark.parametrize(('fault', 'shuts_down'), [
+    (emulated.OVERLOAD, True), (emulated.OVERHEATING, True), (emulated.VOLTAGE_ERROR, False)])
+def test_hardware_errors_raise_the_alert_and_those_of_shutdown_take_torque(servo, fault,
+                                                                           shuts_down):
+    write(servo, 'Torque Enable', 1)
+    servo.trip(fault)
+    assert servo.alert == 0x80 and servo.torque is not shuts_down
+    assert write(servo, 'Torque Enable', 1) == (Error.RESULT_FAIL if shuts_down else Error.NONE)
+    servo.reboot(0.0)
+    assert servo.alert == 0 and write(servo, 'Torque Enable', 1) == Error.NONE
+
+
+def test_a_reboot_keeps_eeprom_forgets_ram_and_the_turns(servo):
+    write(servo, 'Operating Mode', 4)
+    write(servo, 'Position P Gain', 700)
+    servo.angle = 3.6
+    whole = position(servo)
+    write(servo, 'Torque Enable', 1)
+    servo.reboot(0.0)
+    assert not servo.torque and (servo['Operating Mode'], servo['Position P Gain']) == (4, 900)
+    assert whole > 4095 and position(servo) == whole - 4096
+
+
+@given(st.floats(-3.9, 3.9), st.sampled_from((-1, 1)), st.integers(0, 4095),
+       st.integers(-2, 2))
+def test_goals_mean_the_same_angle_as_positions(angle, sign, zero, turns):
+    servo = EmulatedServo(1, sign=sign, zero=zero)
+    servo.angle = angle + turns * 2 * np.pi
+    servo.reboot(-1.0)
+    servo.angle = angle
+    assert write(servo, 'Goal Position', position(servo)) == Error.NONE
+    assert servo.goal == pytest.approx(angle, abs=0.51 * emulated.POSITION_UNIT)
+
+
+# --- the line, through the SDK ----------------------------------------------------------------
+
+@pytest.fixture
+def bus():
+    with EmulatedServoBus(reboot_time=0.05) as made:
+        yield made
+
+
+@pytest.fixture
+def line(bus):
+    """(port, packet handler), opened as the SDK's examples do."""
+    port = sdk.PortHandler(bus.port)
+    assert port.setBaudRate(1_000_000)
+    yield port, sdk.PacketHandler(2.0)
+    port.closePort()
+
+
+def group_read(line, address, length):
+    group = sdk.GroupSyncRead(*line, address, length)
+    for name in (1, 2, 3, 4):
+        group.addParam(name)
+    return group
+
+
+def test_the_table_agrees_with_the_makers_model_file():
+    folder = Path(sdk.__file__).parents[1] / 'dynamixel_easy_sdk' / 'control_table'
+    path = folder / 'xc330_t181_fw52.model'
+    if not path.is_file():
+        pytest.skip('this SDK has no model files')
+    rows = [line.split('\t') for line in path.read_text().splitlines()]
+    rows = {row[2]: (int(row[0]), int(row[1])) for row in rows
+            if len(row) == 3 and row[0].isdigit()}
+    known = set(TABLE) & set(rows)
+    assert len(known) > 30
+    for name in known:
+        assert rows[name] == TABLE[name][:2], name
+
+
+@pytest.mark.real_time
+def test_the_sdk_reads_writes_pings_and_receives_errors(bus, line):
+    port, handler = line
+    assert handler.ping(port, 2) == (1210, sdk.COMM_SUCCESS, 0)
+    assert handler.ping(port, 9)[1] == sdk.COMM_RX_TIMEOUT
+    assert handler.write1ByteTxRx(port, 1, 11, 4) == (sdk.COMM_SUCCESS, 0)
+    for value in (-534 & 0xFFFFFFFF, 0xFFFDFFFF, 0xFFFFFFFD):   # with a header, all legal
+        assert handler.write4ByteTxRx(port, 1, 116, value) == (sdk.COMM_SUCCESS, 0)
+        assert handler.read4ByteTxRx(port, 1, 116) == (value, 0, 0)
+    assert handler.write1ByteTxRx(port, 1, 64, 1) == (sdk.COMM_SUCCESS, 0)
+    assert handler.write1ByteTxRx(port, 1, 11, 3) == (sdk.COMM_SUCCESS, 7)
+    assert handler.write2ByteTxRx(port, 1, 116, 5) == (sdk.COMM_SUCCESS, 5)
+    assert bus.torque_enabled.tolist() == [True, False, False, False]
+    assert bus.goals[0] == pytest.approx((-3 - 2048) * 2 * np.pi / 4096)
+    assert handler.reboot(port, 1) == (0, 0)
+    assert handler.ping(port, 1)[1] == sdk.COMM_RX_TIMEOUT
+    time.sleep(0.06)
+    assert handler.read1ByteTxRx(port, 1, 64) == (0, 0, 0)
+    assert bus.refusals == 2
+
+
+@pytest.mark.real_time
+def test_group_reads_give_the_values_of_the_plant_or_the_fault(bus, line):
+    angles = np.array([0.5, -1.0, 3.6, -3.9])
+    bus.set_state(angles, [1.0, -2.0, 0.0, 5.0], [0.1, 0.0, -0.2, 0.0])
+    group = group_read(line, 126, 10)
+    assert group.txRxPacket() == sdk.COMM_SUCCESS
+    for name, angle in zip((1, 2, 3, 4), angles, strict=True):
+        raw = group.getData(name, 132, 4)
+        counts = raw - (1 << 32) if raw >> 31 else raw
+        assert (counts - 2048) * 2 * np.pi / 4096 == pytest.approx(angle, abs=0.0008)
+    for fault, value in (('bad_crc', 1.0), ('dropped', 1.0), ('silent', {2})):
+        usual = getattr(bus.faults, fault)
+        setattr(bus.faults, fault, value)
+        assert group.txRxPacket() in (sdk.COMM_RX_CORRUPT, sdk.COMM_RX_TIMEOUT)
+        setattr(bus.faults, fault, usual)
+    assert group.txRxPacket() == sdk.COMM_SUCCESS
+
+
+@pytest.mark.real_time
+def test_group_writes_reach_all_at_their_baud_rate_only(bus, line):
+    port, handler = line
+    group = sdk.GroupSyncWrite(port, handler, 116, 4)
+    for name in (1, 2, 3, 4):
+        group.addParam(name, [name, 4, 0, 0])
+    assert group.txPacket() == sdk.COMM_SUCCESS
+    handler.ping(port, 1)  # answered after what came before
+    assert [servo['Goal Position'] for servo in bus.servos] == [1025, 1026, 1027, 1028]
+    port.setBaudRate(57600)
+    assert handler.ping(port, 1)[1] == sdk.COMM_RX_TIMEOUT
+
+
+@pytest.mark.real_time
+def test_the_emulator_tolerates_noise(bus, line):
+    port, handler = line
+    random = Random(3)
+    for k in range(60):
+        body = bytes((random.choice((1, 0xFE)), *random.randbytes(2), random.choice(
+            (1, 2, 3, 8, 0x55, 0x82, 0x83))))
+        port.writePort(random.randbytes(random.randrange(1, 300)))
+        port.writePort(b'\xff\xff\xfd\x00' + body)
+        port.writePort(packet(body[0], body[3], random.randbytes(random.randrange(9))))
+    time.sleep(0.15)  # a pause on the line ends an unfinished packet
+    bus.set_state(*np.zeros((3, 4)))
+    assert handler.ping(port, bus.servos[1]['ID'])[:2] == (1210, sdk.COMM_SUCCESS)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.lists(st.tuples(st.sampled_from((1, 2, 3, 8, 0x20, 0x55, 0x82, 0x83)),
+                          st.sampled_from((0, 1, 2, 7, 0xFE)), st.binary(max_size=30)),
+                max_size=12))
+def test_arbitrary_sequences_of_packets_keep_all_registers_legal(sequence):
+    line = EmulatedServoBus.__new__(EmulatedServoBus)
+    line.servos = [EmulatedServo(name, reboot_time=0.01) for name in (1, 2)]
+    line.faults, line.refusals = emulated.ServoFaults(), 0
+    for count, (instruction, name, parameters) in enumerate(sequence):
+        for answer in line.handle(emulated.Packet(name, instruction, parameters), 1_000_000,
+                                  count * 0.1):
+            assert answer.startswith(b'\xff\xff\xfd\0')
+        for servo in line.servos:
+            servo.advance(count * 0.1, 35, 12.0)
+            for register, entry in TABLE.items():
+                if entry.legal and not (register == 'Bus Watchdog' and servo.expired):
+                    assert servo[register] in entry.legal
