@@ -134,7 +134,7 @@ class Messages:
         self._kinds = [
             (lambda: wire.message('target_pose', PoseTarget(zero + 1, LEVEL, 1.0)), self._target),
             (lambda: track, self._track),
-            (lambda: wire.message('joint_states', joints), conversions.take_known_joints),
+            (lambda: wire.message('joint_states', joints), conversions.take_joints),
             *((partial(wire.message, topic, value), ALL[topic].take)
               for topic, value in values.items())]
 

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
-from beetle_omni_ros.messages import columns
-from beetle_omni_ros.messages.bag_types import BAG, from_bytes, to_bytes
-from beetle_omni_ros.messages.columns import read_all
+from beetle_omni_ros.messages import bag_types
+from beetle_omni_ros.messages.bag_types import BAG, from_bytes, read_all, to_bytes
 from beetle_omni_ros.messages.topics import ALL, TABLE, topic_of
 from beetle_omni_ros.messages.values import (
     Diagnostic,
@@ -95,7 +94,7 @@ def test_a_value_comes_back_from_its_message(topic):
 @pytest.mark.parametrize('one_by_one', [False, True])
 def test_messages_read_together_equal_those_read_one_by_one(topic, one_by_one, monkeypatch):
     if one_by_one:
-        monkeypatch.setattr(columns, 'LAYOUTS', 0)
+        monkeypatch.setattr(bag_types, 'LAYOUTS', 0)
     entry = ALL[topic]
     data = [cdr(topic, value(topic, seed, STAMP + 0.01 * seed)) for seed in range(40)]
     rows, at_once, refused = read_all(entry, data)

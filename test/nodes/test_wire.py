@@ -31,7 +31,7 @@ def test_stamps_round_trip_to_the_nanosecond():
 def test_scalars_of_any_number_type_arrive_as_sent(kind):
     values = [kind(1), kind(2), kind(3)]
     message = over_the_wire(wire.message('imu/data_raw', ImuReading(4.0, values, values)))
-    sample = conversions.take_imu(message)
+    sample = conversions.IMU.take(message)
     assert sample.specific_force.tolist() == sample.angular_velocity.tolist() == [1, 2, 3]
     assert message.orientation_covariance[0] == -1
 
