@@ -33,7 +33,7 @@ ALLOWED = {
     'drive': ('robot',),
     'view': ('robot', 'control.base', 'runs', 'messages'),
     'nodes': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs', 'drivers', 'drive',
-              'messages', 'view', 'bringup.graph'),
+              'messages', 'view', 'bringup.findings'),
     'train': ('robot', 'control.observation', 'control.onnx_runtime', 'control.policy_file',
               'control.policy_checksum', 'runs.files'),
     'cli': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs', 'evaluation', 'comparison',

@@ -137,15 +137,15 @@ class Vectors:
 
     Args:
         value: class of the value, with a ``stamp``.
-        type: ROS message type.
+        message: ROS message type.
         frame: frame_id.
         places: attribute of the value -> path of its vector in the message, followed by the names
             of its parts, 'pose.position xyz'; without parts it is a number.
 
     """
 
-    def __init__(self, value: type, type: str, frame: str, **places: str):
-        self.value, self.type, self._frame = value, type, frame
+    def __init__(self, value: type, message: str, frame: str, **places: str):
+        self.value, self.type, self._frame = value, message, frame
         self._places = []       # attribute, path, getter of the vector, getter of its parts
         for attribute, place in places.items():
             path, _, parts = place.partition(' ')
@@ -279,7 +279,7 @@ def read_joints(message: Any) -> JointReading:
 
 
 def take_joints(message: Any) -> JointReading:
-    """Read the tilt joints for flight: NaN for a joint without a name, rates of 0 without rates."""
+    """Read the tilt joints for flight: NaN for a joint that is not named, 0 for missing rates."""
     known = [name in message.name for name in JOINTS]
     names = [name for name in JOINTS if name in message.name]
     position, velocity = np.full((2, 4), np.nan)

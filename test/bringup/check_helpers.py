@@ -5,9 +5,8 @@ from dataclasses import replace
 from board_bench import QUICK
 from servo_bench import PATIENT
 
-from beetle_omni_ros.bringup.board import check_board
-from beetle_omni_ros.bringup.limits import CheckLimits
-from beetle_omni_ros.bringup.servos import check_servos
+from beetle_omni_ros.bringup.devices import check_board, check_servos
+from beetle_omni_ros.bringup.findings import CheckLimits
 from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters, ServoBusParameters
 from beetle_omni_ros.robot.parameters import RobotParameters
 

@@ -11,7 +11,7 @@ pytest.importorskip('pymavlink')
 from check_helpers import levels, repeated, servos
 from servo_bench import JOINTS, running
 
-from beetle_omni_ros.bringup import servos as room
+from beetle_omni_ros.bringup import devices as room
 from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
 
 pytestmark = pytest.mark.real_time

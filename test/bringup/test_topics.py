@@ -4,9 +4,13 @@ from check_helpers import by_item, levels, LIMITS, ROBOT
 import numpy as np
 import pytest
 
-from beetle_omni_ros.bringup.finding import bridge_findings, Finding
-from beetle_omni_ros.bringup.graph import ObservedGraph, Status, Stream
-from beetle_omni_ros.bringup.topics import check_topics
+from beetle_omni_ros.bringup.findings import (
+    check_topics,
+    closed_port,
+    ObservedGraph,
+    Status,
+    Stream,
+)
 
 
 def stream(rate, age, jitter=0.001, size=9.81, seconds=3.0, seed=0):
@@ -119,14 +123,14 @@ def test_a_running_bridge_is_judged_by_its_reports():
         assert found['joint_bridge state'].found == state
 
 
-def test_a_port_in_use_by_a_bridge_is_not_opened():
-    busy = Finding('servo port', 'fail', 'p: used by process 5 (x)', 'stop it', {'holders': 1})
-    port, state, gimbal = bridge_findings(busy, 'joint_bridge', running())
+def test_a_port_in_use_by_a_bridge_is_judged_by_its_reports():
+    busy = 'servo port', 'p: in use by another process', 'stop it', 'joint_bridge'
+    port, state, gimbal = closed_port(*busy, running())
     assert [port.level, state.level, gimbal.level] == ['ok'] * 3
     assert 'joint_bridge_node reports' in port.found
     rows = by_item(check_topics(running(), LIMITS, ROBOT.gravity, frozenset({'joint_bridge'})))
     assert 'joint_bridge state' not in rows
-    for observed in (None, graph()):
-        assert bridge_findings(busy, 'joint_bridge', observed) == [busy]
-    absent = Finding('servo port', 'fail', 'p: no such port', 'plug it in')
-    assert bridge_findings(absent, 'joint_bridge', running()) == [absent]
+    absent = 'servo port', 'p: no such port', 'plug it in', 'joint_bridge'
+    for given, observed in ((busy, None), (busy, graph()), (absent, running())):
+        finding, = closed_port(*given, observed)
+        assert (finding.level, finding.remedy) == ('fail', given[2])
