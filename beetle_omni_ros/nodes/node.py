@@ -242,6 +242,7 @@ class Input:
     seen: float | None = None           # elapsed() at the last good message
     rejected: Counter = field(default_factory=Counter)
     rejected_reported: int = 0
+    last_refusal: str = ''
 
 
 class Health:
@@ -280,6 +281,7 @@ class Health:
         if kind not in entry.rejected and (entry.received or 'stamp' not in kind):
             self._node.get_logger().warning(f'{topic}: message refused, {reason}')
         entry.rejected[kind] += 1
+        entry.last_refusal = reason
 
     def track_compute(self, deadline: float) -> None:
         """Report compute times against a ``deadline`` [s] under '<node>: compute'."""
@@ -320,7 +322,8 @@ class Health:
                 faults.append(f'{topic} silent for {now - entry.seen:.1f} s')
             if count > entry.rejected_reported:
                 level = max(level, WARN)
-                faults.append(f'{topic}: {count - entry.rejected_reported} rejected')
+                faults.append(f'{topic}: {count - entry.rejected_reported} rejected, '
+                              f'{entry.last_refusal}')
             elif entry.seen is None and entry.stale_after is not None:
                 faults.append(f'waiting for {topic}')
             entry.reported, entry.rejected_reported = entry.received, count

@@ -258,8 +258,10 @@ def _observe(node, topic, stream, message):
     stream.arrivals.append(time.monotonic())
     stream.ages.append(now - seconds_of(message.header.stamp))
     try:
-        stream.norms.append(float(np.linalg.norm(getattr(TOPICS[topic].take(message),
-                                                         SENSORS[topic]))))
+        norm = float(np.linalg.norm(getattr(TOPICS[topic].take(message), SENSORS[topic])))
+        if np.isnan(norm):
+            raise MessageError('not all joints are named')
+        stream.norms.append(norm)
     except MessageError as error:
         stream.refused[str(error)] += 1
 

@@ -17,8 +17,7 @@ from beetle_omni_ros.control.registry import ControllerEntry
 from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes import graph
 from beetle_omni_ros.nodes import node as base
-from beetle_omni_ros.nodes.controller_node import ControllerNode
-from beetle_omni_ros.nodes.supervisor_node import SupervisorNode
+from beetle_omni_ros.nodes.control_nodes import ControllerNode, SupervisorNode
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth
 from beetle_omni_ros.robot.readings import JointReading
 from beetle_omni_ros.robot.schema import ParameterError

@@ -12,8 +12,7 @@ from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import String
 
-from beetle_omni_ros.bringup.limits import CheckLimits
-from beetle_omni_ros.bringup.topics import check_topics
+from beetle_omni_ros.bringup.findings import check_topics, CheckLimits
 from beetle_omni_ros.messages.topics import EVENT, LATCHED, SENSOR
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.operator import listen
@@ -91,12 +90,12 @@ def test_messages_of_real_publishers_are_recorded_and_checked(ros_domain):
     with Drivers(ros_domain):
         for _ in range(5):      # discovery is slow on a busy machine
             graph = listen(3.0)
-            if graph.streams['imu/data_raw'].rate and graph.of_bridge('joint_bridge'):
+            if graph.streams['imu/data_raw'].arrivals and graph.of_bridge('joint_bridge'):
                 break
     assert graph.domain == ros_domain
     imu, mocap = graph.streams['imu/data_raw'], graph.streams['mocap/pose']
-    assert imu.rate == pytest.approx(2 * mocap.rate, rel=0.1)
-    assert -0.05 <= imu.freshest < 0 <= 0.008 <= mocap.freshest
+    assert len(imu.arrivals) == pytest.approx(2 * len(mocap.arrivals), rel=0.1)
+    assert -0.05 <= min(imu.ages) < 0 <= 0.008 <= min(mocap.ages)
     assert np.mean(imu.norms) == pytest.approx(9.81, abs=0.05)
     assert sorted(mocap.publishers) == ['sim_node', 'vrpn'] and imu.publishers == ['vrpn']
     assert graph.streams['battery_state'].other_types == ['std_msgs/msg/String']

@@ -7,7 +7,7 @@ from rcl_interfaces.msg import SetParametersResult
 from beetle_omni_ros.control.base import Command, PoseTarget
 from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes import wire
-from beetle_omni_ros.nodes.live_view import LiveGraph
+from beetle_omni_ros.nodes.operator import LiveGraph
 from beetle_omni_ros.view.frames import COLUMNS, pose, Sampler
 
 pytestmark = pytest.mark.real_time
