@@ -22,7 +22,6 @@ from beetle_omni_ros.robot.parameters import JointParameters, RobotParameters
 SYS = Path('/sys')
 BUS, BOARD = 'servo bus', 'motor board'
 ROUNDS = 50             # reads of each servo to measure answer time and loss
-OTHER_IDS = range(21)   # searched at every baud rate if a servo is missing
 POLL_PERIOD = 0.02      # [s] between polls of the board
 SETTLING = 0.3          # [s] until the board has received several of our packets
 
@@ -121,20 +120,16 @@ def _check_bus(findings, link, parameters, joints, limits):
                 servo.torque = None
     if present:
         _check_answers(findings, link, present, limits)
-    misplaced = []
-    if len(present) < len(servos):
-        link.close()
-        misplaced = _misplaced(parameters)
-        if not present and not misplaced:
-            findings.add(BUS, 'no servo answers at any baud rate',
-                         fail="check the servos' supply (their LEDs blink once at power-up) "
-                         'and the data cable')
-            return
+    else:
+        findings.add(BUS, f'no servo answers at {link.baud_rate} bit/s', fail="check the servos' "
+                     'supply (their LEDs blink once at power-up), the data cable, and with '
+                     'DYNAMIXEL Wizard their baud rates')
+        return
     for k, (servo, (problem, remedy)) in enumerate(zip(servos, problems, strict=True)):
         if servo.model is None:
             findings.add(servo.name, f'id {servo.identifier} {problem}',
-                         fail=_remedy_of_missing(servo.identifier, parameters, misplaced),
-                         id=servo.identifier)
+                         fail='check its connector, and those before it in the chain; search '
+                         'for its id and baud rate with DYNAMIXEL Wizard', id=servo.identifier)
             continue
         read = servo.firmware is not None
         facts = f'id {servo.identifier}, model {servo.model}, firmware {servo.firmware}, ' \
@@ -148,44 +143,6 @@ def _check_bus(findings, link, parameters, joints, limits):
         if read:
             _check_health(findings, servo, limits)
             _check_turn(findings, servo, parameters, joints, k)
-
-
-def _misplaced(parameters):
-    """Find (baud rate, ID) of servos with an unexpected ID or baud rate."""
-    from beetle_omni_ros.drivers.serial_port import SerialPortError
-    from beetle_omni_ros.drivers.servo_link import ServoBusError, ServoLink
-    found, ids = [], {int(name) for name in parameters.ids}
-    for baud_rate in registers.BAUD_CODES:
-        link = ServoLink(parameters.port, baud_rate, max(parameters.timing.reply, 0.005))
-        try:
-            link.open()
-            for identifier in sorted(ids.union(OTHER_IDS)):
-                if baud_rate == parameters.baud_rate and identifier in ids:
-                    continue
-                try:
-                    link.ping(identifier)
-                    found.append((baud_rate, identifier))
-                except ServoBusError:
-                    continue
-        except SerialPortError:
-            continue    # some adapters lack some baud rates
-        finally:
-            link.close()
-    return found
-
-
-def _remedy_of_missing(identifier, parameters, misplaced):
-    for baud_rate, other in misplaced:
-        if other == identifier:
-            return (f'id {other} answers at {baud_rate} bit/s: set Baud Rate(8) to code '
-                    f'{registers.BAUD_CODES[parameters.baud_rate]}, '
-                    f'{parameters.baud_rate} bit/s, with DYNAMIXEL Wizard')
-    others = [f'id {other} at {baud_rate} bit/s' for baud_rate, other in misplaced]
-    if others:
-        return (f"unexpected answer of {', '.join(others)}; if this is the servo, set id "
-                f'{identifier} and {parameters.baud_rate} bit/s with DYNAMIXEL Wizard, with '
-                'that servo alone on the bus')
-    return 'check its connector, and those before it in the chain'
 
 
 def _check_health(findings, servo, limits):

@@ -18,6 +18,7 @@ from beetle_omni_ros.drivers.servo_link import ServoBusError
 from beetle_omni_ros.drivers.servo_loop import ServoLoop
 from beetle_omni_ros.nodes.graph import AUTOSTART
 from beetle_omni_ros.nodes.node import CommandSource, Distribution, ERROR, FlightNode, OK, WARN
+from beetle_omni_ros.nodes.parameters import file_parameter
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters
 from beetle_omni_ros.robot.readings import JointReading, RotorReading
 from beetle_omni_ros.robot.schema import parameter
@@ -143,10 +144,8 @@ class BridgeNode(LifecycleNodeMixin, FlightNode):
 class JointBridgeNodeParameters(ServoBusParameters):
     """Parameters of joint_bridge_node: the bus's parameters, the files, and autostart."""
 
-    robot_file: str = parameter('', doc='robot file; empty: the shipped one', read_only=True)
-    servo_bus_file: str = parameter(
-        '', doc='servo file to start from; empty: the shipped params/servo_bus.yaml',
-        read_only=True)
+    robot_file: str = file_parameter()
+    servo_bus_file: str = file_parameter('servo file to start from')
     autostart: str = parameter('none', choices=tuple(AUTOSTART), read_only=True,
                                doc='transition at the start, repeated until it succeeds')
 
@@ -334,10 +333,8 @@ class JointBridgeNode(BridgeNode):
 class RotorBridgeNodeParameters(MotorBoardParameters):
     """Parameters of rotor_bridge_node: the driver's parameters, the files, and autostart."""
 
-    robot_file: str = parameter(
-        '', doc='robot file with the rotor map; empty: the shipped one', read_only=True)
-    motor_board_file: str = parameter(
-        '', doc='motor board file; empty: the shipped params/motor_board.yaml', read_only=True)
+    robot_file: str = file_parameter('robot file with the rotor map')
+    motor_board_file: str = file_parameter('motor board file')
     autostart: str = parameter('activate', choices=tuple(AUTOSTART), read_only=True,
                                doc='transition at the start')
 

@@ -19,6 +19,7 @@ from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.estimation.samples import pose_covariance, twist_covariance
 from beetle_omni_ros.messages.values import HealthReport, MessageError, Odom, TargetOverride
 from beetle_omni_ros.nodes.node import CommandSource, ERROR, FlightNode, IDENTITY, OK, WARN
+from beetle_omni_ros.nodes.parameters import file_parameter
 from beetle_omni_ros.robot.actuator_health import ALL_HEALTHY
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import NAMES, parameter, ParameterError
@@ -43,10 +44,8 @@ NAME = 'controller_node'    # of the executable, before its controller is known
 class EkfNodeParameters(EkfParameters):
     """Parameters of ekf_node: the estimator's parameters and the files."""
 
-    robot_file: str = parameter('', doc='robot file; empty: the shipped one', read_only=True)
-    ekf_file: str = parameter(
-        '', doc='estimator file to start from; empty: the shipped params/ekf.yaml',
-        read_only=True)
+    robot_file: str = file_parameter()
+    ekf_file: str = file_parameter('estimator file to start from')
 
 
 class EkfNode(FlightNode):
@@ -274,9 +273,8 @@ class SupervisorNodeParameters(SupervisorParameters):
     controllers: NAMES = parameter(
         tuple(registry.standing_by()), read_only=True,
         doc='controllers that may be active: registered names, or FILE.py:Class')
-    robot_file: str = parameter('', doc='robot file; empty: the shipped one', read_only=True)
-    supervisor_file: str = parameter(
-        '', doc='supervisor file; empty: the shipped params/supervisor.yaml', read_only=True)
+    robot_file: str = file_parameter()
+    supervisor_file: str = file_parameter('supervisor file')
 
 
 class SupervisorNode(FlightNode):

@@ -23,6 +23,11 @@ ROS_OWN = (CLOCK, 'start_type_description_service')
 ROS_OWN_PREFIX = 'qos_overrides.'
 
 
+def file_parameter(what: str = 'robot file'):
+    """Make the parameter of a node that names a file."""
+    return schema.parameter('', doc=f'{what}; empty: the shipped one', read_only=True)
+
+
 def declare(node: Node, cls: type, file: str | None = None, file_key: str | None = None,
             on_change: Callable | None = None, changeable: tuple[str, ...] | None = None,
             completed: Callable[[dict, bool], dict] | None = None):

@@ -18,6 +18,7 @@ from beetle_omni_ros.messages.topics import ALL, EVENT, LATCHED_LOG, LOG, SENSOR
 from beetle_omni_ros.messages.values import Wrench
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.node import ERROR, FlightNode, OK, WARN
+from beetle_omni_ros.nodes.parameters import file_parameter
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import NAMES, parameter, ParameterError
@@ -147,8 +148,7 @@ class RecorderNodeParameters:
     controllers: NAMES = parameter(
         tuple(registry.standing_by()), read_only=True,
         doc='registered controllers whose commands are recorded')
-    urdf_file: str = parameter('', doc='robot description for the recorded frames; empty: the '
-                                       'shipped one', read_only=True)
+    urdf_file: str = file_parameter('robot description for the recorded frames')
     compression: str = parameter('none', choices=COMPRESSIONS, read_only=True,
                                  doc='compression of the chunks in the MCAP file')
 
@@ -235,7 +235,7 @@ class RecorderNode(FlightNode):
 class ViewerNodeParameters:
     """Parameters of viewer_node."""
 
-    robot_file: str = parameter('', doc='robot file; empty: the shipped one', read_only=True)
+    robot_file: str = file_parameter()
     frame_rate: float = parameter(50.0, doc='rate of the frame', unit='Hz', low=0.5, high=200,
                                   read_only=True)
     rate: float = parameter(20.0, doc='rate of the markers', unit='Hz', low=0.5, high=100,

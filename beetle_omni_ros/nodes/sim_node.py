@@ -14,6 +14,7 @@ from beetle_omni_ros.messages.topics import SENSOR
 from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.node import CommandSource, Distribution, ERROR, FlightNode, OK, WARN
+from beetle_omni_ros.nodes.parameters import file_parameter
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import group, parameter, ParameterError
 from beetle_omni_ros.sim.emulated.fault_switches import (
@@ -150,10 +151,8 @@ class SimulatedTimePacing:
 class SimNodeParameters:
     """Parameters of sim_node."""
 
-    robot_file: str = parameter(
-        '', doc='robot file of the simulated robot; empty: the shipped one', read_only=True)
-    simulator_file: str = parameter(
-        '', doc='simulator file; empty: the shipped one', read_only=True)
+    robot_file: str = file_parameter('robot file of the simulated robot')
+    simulator_file: str = file_parameter('simulator file')
     conditions: str = parameter('nominal', choices=('nominal', 'published'), read_only=True,
                                 doc='randomisation of plant and sensors')
     seed: int = parameter(0, doc='seed of all random numbers', low=0, high=2**31 - 1,
@@ -165,9 +164,7 @@ class SimNodeParameters:
                                 'one', read_only=True)
     board_port: str = parameter('', doc="path of the emulated motor board's port; empty: a "
                                 'temporary one', read_only=True)
-    servo_bus_file: str = parameter(
-        '', doc='ids, signs, zeros and baud rate of the emulated servos; empty: the shipped file',
-        read_only=True)
+    servo_bus_file: str = file_parameter('ids, signs, zeros and baud rate of the emulated servos')
     clock: str = parameter('system', choices=('system', 'simulated'), read_only=True,
                            doc='real time, or simulated time on /clock, which waits for late '
                            'nodes; all other nodes then need use_sim_time')

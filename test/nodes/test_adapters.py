@@ -23,9 +23,9 @@ def test_the_supervisor_refuses_to_arm_with_the_reason_of_bridges_or_estimator(m
         return answer.message
 
     assert 'ekf_node' in refusal()
-    node._on_bridge('rotor')('waiting: battery low')
+    node._on_bridge('rotor', 'waiting: battery low')
     assert refusal() == 'arm refused: rotor_bridge_node waiting: battery low'
-    node._on_bridge('joint')('lost: gimbal3 silent')
+    node._on_bridge('joint', 'lost: gimbal3 silent')
     assert refusal() == 'arm refused: joint_bridge_node lost: gimbal3 silent; rotor_bridge_node ' \
                         'waiting: battery low'
     for name in ('joint', 'rotor'):
