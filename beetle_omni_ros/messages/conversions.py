@@ -98,13 +98,14 @@ def xyzw(q: Any) -> np.ndarray:
 
 def set_parts(v: Any, values: Sequence[float] | np.ndarray) -> None:
     """Fill the fields x, y, z of a vector, or x, y, z, w of a quaternion."""
-    for name, value in zip('xyzw', values):
-        setattr(v, name, float(value))
+    v.x, v.y, v.z = float(values[0]), float(values[1]), float(values[2])
+    if len(values) == 4:
+        v.w = float(values[3])
 
 
-def finite(values: np.ndarray, what: str) -> None:
-    """Raise MessageError if a value is not finite."""
-    if not np.isfinite(values).all():
+def finite(values: np.ndarray | float, what: str) -> None:
+    """Raise MessageError if a value is not finite, or its square is not."""
+    if not isfinite(np.vdot(values, values)):
         raise MessageError(f'{what} is not finite')
 
 
@@ -152,18 +153,22 @@ class Vectors:
             self._places.append((attribute, path, attrgetter(path), attrgetter(
                 *(f'{path}.{part}' for part in parts)) if parts else None))
 
+    def fields(self, message: Any, check: bool = False) -> dict[str, Any]:
+        """Read the fields of the value; with ``check``, MessageError if one is not finite."""
+        found = {'stamp': seconds(message.header.stamp)}
+        for attribute, path, whole, parts in self._places:
+            found[attribute] = np.array(parts(message)).T if parts else whole(message)
+            if check:
+                finite(found[attribute], path)
+        return found
+
     def read(self, message: Any) -> Any:
         """Read the value of one message, or of a message with columns."""
-        return self.value(stamp=seconds(message.header.stamp), **{
-            attribute: np.array(parts(message)).T if parts else whole(message)
-            for attribute, _, whole, parts in self._places})
+        return self.value(**self.fields(message))
 
     def take(self, message: Any) -> Any:
         """Read a value for flight; MessageError if one of its numbers is not finite."""
-        value = self.read(message)
-        for attribute, path, _, _ in self._places:
-            finite(getattr(value, attribute), path)
-        return value
+        return self.value(**self.fields(message, True))
 
     def write(self, factory: MessageFactory, value: Any) -> Any:
         """Write a value."""
@@ -220,20 +225,20 @@ def write_battery(factory: MessageFactory, value: BatteryReading) -> Any:
 
 def read_odom(message: Any) -> Odom:
     """Read pose and velocity; the velocity is rotated from base_link to world."""
-    return _in_world(ODOM.read(message))
+    return _in_world(ODOM.fields(message))
 
 
 def take_odom(message: Any) -> Odom:
     """Read pose and velocity for flight."""
-    odom = ODOM.take(message)
-    return _in_world(odom, unit(odom.quaternion))
+    fields = ODOM.fields(message, True)
+    return _in_world({**fields, 'quaternion': unit(fields['quaternion'])})
 
 
-def _in_world(odom, quaternion=None):
-    q, velocity = odom.quaternion if quaternion is None else quaternion, odom.velocity
-    velocity = rotations.matrix(q) @ velocity if velocity.ndim == 1 else \
+def _in_world(fields):
+    q, velocity = fields['quaternion'], fields['velocity']
+    fields['velocity'] = rotations.matrix(q) @ velocity if velocity.ndim == 1 else \
         np.einsum('ijn,nj->ni', rotations.matrix(tuple(q.T)), velocity)
-    return Odom(odom.stamp, odom.position, velocity, q, odom.angular_velocity)
+    return Odom(**fields)
 
 
 def write_odom(factory: MessageFactory, value: Odom) -> Any:
@@ -250,9 +255,9 @@ def write_odom(factory: MessageFactory, value: Odom) -> Any:
 
 def take_pose_target(message: Any) -> PoseTarget:
     """Read a pose target; MessageError for another frame than world."""
-    target = POSE_TARGET.take(message)
+    fields = POSE_TARGET.fields(message, True)
     _check_frame(message)
-    return PoseTarget(target.position, unit(target.quaternion), target.stamp)
+    return PoseTarget(**{**fields, 'quaternion': unit(fields['quaternion'])})
 
 
 # --- messages of joints -------------------------------------------------------------------------
@@ -280,13 +285,15 @@ def read_joints(message: Any) -> JointReading:
 
 def take_joints(message: Any) -> JointReading:
     """Read the tilt joints for flight: NaN for a joint that is not named, 0 for missing rates."""
-    known = [name in message.name for name in JOINTS]
     names = [name for name in JOINTS if name in message.name]
-    position, velocity = np.full((2, 4), np.nan)
-    position[known] = _of(message, 'position', names)
-    velocity[known] = _of(message, 'velocity', names) if len(message.velocity) else 0.0
-    finite(position[known], 'position')
-    finite(velocity[known], 'velocity')
+    position = _of(message, 'position', names)
+    velocity = _of(message, 'velocity', names) if len(message.velocity) else np.zeros(len(names))
+    finite(position, 'position')
+    finite(velocity, 'velocity')
+    if len(names) < len(JOINTS):
+        known, measured = np.isin(JOINTS, names), (position, velocity)
+        position, velocity = np.full((2, 4), np.nan)
+        position[known], velocity[known] = measured
     return JointReading(seconds(message.header.stamp), position, velocity)
 
 

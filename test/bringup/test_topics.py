@@ -46,12 +46,6 @@ def test_a_sensor_without_publisher_fails_and_names_the_domain():
     assert 'ROS domain 5' in found['mocap/pose'].found
 
 
-def test_silence_and_another_message_type_are_distinguished():
-    found = judged(mocap=Stream(publishers=['vrpn']), imu=Stream(other_types=['a/msg/Imu']))
-    assert 'although vrpn publishes it' in found['mocap/pose'].found
-    assert 'published as a/msg/Imu' in found['imu/data_raw'].found
-
-
 def paused():
     made = stream(100, 0.01)
     made.arrivals[200:] = [t + 0.15 for t in made.arrivals[200:]]

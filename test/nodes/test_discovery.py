@@ -74,18 +74,6 @@ def test_an_argument_of_fly_reaches_every_node_of_the_plan(tmp_path, unset, monk
     assert ranges == [holds] * (2 if composed else len(nodes))
 
 
-def test_a_name_is_free_again_when_its_process_ends():
-    name = f'test/{os.getpid()}'
-    with graph.claim(name):
-        assert graph.claim(name) is None
-    code = f'from beetle_omni_ros.nodes import graph; print(graph.claim({name!r}))'
-    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
-                          check=True, timeout=60)
-    assert 'socket' in done.stdout
-    with graph.claim(name):
-        pass
-
-
 def test_two_reserved_domains_differ(monkeypatch):
     with graph.reserved_domain() as first:
         monkeypatch.setattr(graph, '_starts', iter([graph.DOMAINS.index(first)]))

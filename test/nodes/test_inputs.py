@@ -17,9 +17,8 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import String
-from trajectory_msgs.msg import MultiDOFJointTrajectory
 
-from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
+from beetle_omni_ros.control.base import Command, PoseTarget
 from beetle_omni_ros.control.registry import ControllerEntry
 from beetle_omni_ros.messages import conversions
 from beetle_omni_ros.messages.topics import COMMAND, EVENT, LATCHED, SENSOR
@@ -94,25 +93,6 @@ def test_a_stamp_of_1970_is_refused_in_simulated_time_too(bench, monkeypatch):
         else:
             with pytest.raises(MessageError, match='the stamp is .* expected at most'):
                 node._check_target(target, now)
-
-
-def trajectory(heights, stamp):
-    count = len(heights)
-    positions = np.column_stack([np.zeros((count, 2)), heights])
-    return wire.message('target_trajectory', TrajectoryTarget(
-        stamp + np.arange(count), positions, np.tile(LEVEL, (count, 1)), np.zeros((count, 3)),
-        np.zeros((count, 3)), stamp=stamp))
-
-
-def test_every_point_of_a_target_trajectory_is_checked(bench):
-    node = bench.add(StillNode())
-    paths = bench.publisher(MultiDOFJointTrajectory, 'target_trajectory')
-    paths.publish(trajectory([1.0, 1.1, -5.0], time.time()))
-    assert bench.wait(lambda: node.refusals)
-    assert node.refusals[0].startswith('target_trajectory: point 3: z = -5 m, expected')
-    assert node._host.target is None
-    paths.publish(trajectory([1.0, 1.1, 1.2], time.time()))
-    assert bench.wait(lambda: node._host.target is not None)
 
 
 def test_bad_and_stale_samples_are_refused_and_counted_by_reason(bench):

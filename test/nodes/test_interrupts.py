@@ -25,20 +25,6 @@ def test_a_signal_is_an_interrupt_even_if_a_library_converts_it(number):
     assert signal.getsignal(number) is before
 
 
-def test_a_second_signal_does_not_interrupt_the_clean_up():
-    cleaned = []
-    with pytest.raises(KeyboardInterrupt), sigterm_as_interrupt():
-        try:
-            os.kill(os.getpid(), signal.SIGTERM)
-            time.sleep(1)
-        finally:
-            os.kill(os.getpid(), signal.SIGTERM)
-            os.kill(os.getpid(), signal.SIGINT)
-            time.sleep(0.01)
-            cleaned.append(True)
-    assert cleaned
-
-
 @pytest.mark.parametrize(('moment', 'options'), [
     ('start', ('--separate', '--actuators', 'direct')), ('flight', ())])
 def test_sigterm_ends_a_flight_cleanly_and_the_bag_is_complete(tmp_path, moment, options):

@@ -145,30 +145,6 @@ def test_a_silent_servo_leaves_joint_states_incomplete_and_is_named(active):
     is_back(emulated, operator)
 
 
-def test_an_unplugged_cable_is_reported_lost_until_it_is_back(active):
-    emulated, operator = active
-    emulated.unplug()
-    operator.reaches(f'lost: {emulated.port}: no connection')
-    operator.joints.clear()
-    operator.spin(0.2)
-    assert not operator.joints, 'nothing is made up'
-    emulated.replug()
-    is_back(emulated, operator)
-
-
-def test_an_overheated_servo_is_lost_until_it_is_rebooted(active):
-    emulated, operator = active
-    emulated.faults.overheated = {4}
-    operator.until(lambda: 'lost: gimbal4' in operator.now
-                   and 'shut down (overheated)' in operator.now, 'not noticed')
-    assert emulated.torque_enabled.tolist() == [True, True, True, False]
-    emulated.faults.overheated = set()
-    operator.spin(0.3)
-    assert not emulated.torque_enabled[3], 'no torque was requested'
-    assert operator.ask('reboot_gimbal4').message == 'restarting gimbal4'
-    is_back(emulated, operator)
-
-
 def test_a_composed_bridge_waits_for_its_port_and_reports_why(tmp_path):
     port = tmp_path / 'servo_bus'
     with running_bridge(tmp_path, JOINT, ['ekf_node'], port=str(port), autostart='activate') \

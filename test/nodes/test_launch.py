@@ -73,24 +73,6 @@ def test_composed_is_one_process_and_one_for_the_bridges(bringup):
     assert command[-2:] == ['-r', '__ns:=/robot1']
 
 
-def test_separate_nodes_and_no_simulator_for_another_backend(bringup):
-    _, *nodes = bringup.start(composed='false', backend='none', task='waypoints',
-                              viewer='true', namespace='robot1')
-    assert [n.kwargs['executable'] for n in nodes] == [
-        'ekf_node', 'nmpc_node', 'rl_node', 'supervisor_node', 'reference_node', 'viewer_node']
-    assert all(n.kwargs['namespace'] == 'robot1' for n in nodes)
-
-
-def test_robot_state_publisher_has_the_links(bringup):
-    state_publisher, *_ = bringup.start(viewer='true', namespace='robot1', composed='false')
-    given = state_publisher.kwargs
-    assert (given['package'], given['namespace']) == ('robot_state_publisher', 'robot1')
-    text = given['parameters'][0]['robot_description']
-    assert text.args[0].startswith('<?xml') and text.kwargs == {'value_type': str}
-    assert all(n.kwargs['package'] != 'robot_state_publisher'
-               for n in bringup.start(composed='false'))
-
-
 def given_to(nodes):
     """Name -> parameters of separate nodes."""
     return {node.kwargs['name']: node.kwargs['parameters'][0] for node in nodes}

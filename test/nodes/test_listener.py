@@ -18,7 +18,6 @@ from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.operator import listen
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import PoseReading
-from beetle_omni_ros.robot.schema import ParameterError
 
 pytestmark = pytest.mark.real_time
 UPRIGHT = np.array([0, 0, 0, 1.0])
@@ -107,11 +106,3 @@ def test_messages_of_real_publishers_are_recorded_and_checked(ros_domain):
         'imu/data_raw age', 'mocap/pose publishers', 'joint_states content',
         'joint_bridge gimbal2'}
     assert found['joint_bridge gimbal2'].values == {'voltage': '11.9'}
-
-
-def test_another_namespace_is_empty_and_an_impossible_one_is_refused(ros_domain):
-    with Drivers(ros_domain):
-        graph = listen(1.0, 'robot1')
-    assert not graph.runs('joint_bridge') and not graph.streams['imu/data_raw'].arrivals
-    with pytest.raises(ParameterError, match="namespace 'a b'"):
-        listen(0.1, 'a b')

@@ -11,7 +11,7 @@ from beetle_omni_ros.messages import conversions
 from beetle_omni_ros.messages.values import MessageError, Odom
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.readings import ImuReading, JointReading
+from beetle_omni_ros.robot.readings import ImuReading
 
 
 def over_the_wire(message):
@@ -34,15 +34,6 @@ def test_scalars_of_any_number_type_arrive_as_sent(kind):
     sample = conversions.IMU.take(message)
     assert sample.specific_force.tolist() == sample.angular_velocity.tolist() == [1, 2, 3]
     assert message.orientation_covariance[0] == -1
-
-
-def test_joints_are_found_by_name_not_by_position():
-    position = np.random.default_rng(3).normal(size=4)
-    message = wire.message('joint_states', JointReading(1.0, position, -position))
-    shuffled = JointState(**{name: [getattr(message, name)[k] for k in (2, 0, 3, 1)]
-                             for name in ('name', 'position', 'velocity')})
-    assert np.array_equal(conversions.take_joints(shuffled).position, position)
-    assert np.array_equal(conversions.take_joints(shuffled).velocity, -position)
 
 
 def test_odometry_carries_the_twist_in_base_link():
