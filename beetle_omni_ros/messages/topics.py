@@ -48,7 +48,7 @@ class Topic:
         qos: quality of service that its publisher offers.
         value: class of its values.
         read: message -> value; MessageError for another layout.
-        write: (message factory, value) -> message.
+        write: value -> message.
         meaning: description for the reference page.
         take: message -> value for use in flight; MessageError for unusable values. Default: read.
         required: whether a bag without it gets a warning.
@@ -61,7 +61,7 @@ class Topic:
     qos: Qos
     value: type
     read: Callable[[Any], Any]
-    write: Callable[[c.MessageFactory, Any], Any]
+    write: Callable[[Any], Any]
     meaning: str
     take: Callable[[Any], Any] | None = None
     required: bool = False

@@ -123,9 +123,9 @@ class FlightNode(Node):
         read = read or entry.take
         self.health.inputs[topic] = counts
 
-        def callback(message, *publication):
+        def callback(data, *publication):
             try:
-                value = read(message)
+                value = read(wire.message(entry, data))
                 age = self.now() - value.stamp
                 if max_age is not None and not -FUTURE <= age <= max_age:
                     raise MessageError('stale stamp' if age > 0 else 'stamp in the future')
@@ -140,11 +140,11 @@ class FlightNode(Node):
 
         if any_qos:
             wire.subscribe_any(self, topic, callback if published else
-                               lambda message, _: callback(message))
+                               lambda data, _: callback(data))
             return
         self.create_subscription(
             wire.message_class(entry.type), topic, wire.with_publication(callback)
-            if published else callback, wire.profile(qos or entry.qos))
+            if published else callback, wire.profile(qos or entry.qos), raw=True)
 
     def timed(self, function: Callable, *args):
         """Call ``function`` and count its CPU and wall time."""

@@ -233,7 +233,8 @@ def listen(seconds: float, namespace: str = '', discovery: str | None = None
         for topic in SENSORS:
             node.create_subscription(
                 wire.message_class(TOPICS[topic].type), topic,
-                partial(_observe, node, topic, graph.streams[topic]), wire.profile(LOG))
+                partial(_observe, node, TOPICS[topic], graph.streams[topic]), wire.profile(LOG),
+                raw=True)
         for bridge in findings.BRIDGES:
             wire.subscribe(node, f'{bridge}/state', partial(graph.states.__setitem__, bridge))
         wire.subscribe(node, 'diagnostics', lambda statuses: graph.diagnostics.update(
@@ -253,12 +254,13 @@ def listen(seconds: float, namespace: str = '', discovery: str | None = None
     return graph
 
 
-def _observe(node, topic, stream, message):
+def _observe(node, topic, stream, data):
     now = node.get_clock().now().nanoseconds * 1e-9
-    stream.arrivals.append(time.monotonic())
-    stream.ages.append(now - seconds_of(message.header.stamp))
     try:
-        norm = float(np.linalg.norm(getattr(TOPICS[topic].take(message), SENSORS[topic])))
+        message = wire.message(topic, data)
+        stream.arrivals.append(time.monotonic())
+        stream.ages.append(now - seconds_of(message.header.stamp))
+        norm = float(np.linalg.norm(getattr(topic.take(message), SENSORS[topic.name])))
         if np.isnan(norm):
             raise MessageError('not all joints are named')
         stream.norms.append(norm)
@@ -291,7 +293,7 @@ class LiveGraph:
         for topic in EVENTS:
             self._subscribe(topic, partial(self._queue, topic))
         for topic in TARGETS:
-            wire.subscribe_any(node, topic, partial(self._queue, topic), raw=True)
+            wire.subscribe_any(node, topic, partial(self._queue, topic))
         self._targets = wire.Publisher(node, 'target_pose') if writable else None
         self._setting = node.create_client(SetParameters, f'{SUPERVISOR}/set_parameters') \
             if writable else None

@@ -176,7 +176,7 @@ class RecorderNode(FlightNode):
         for name, topic in {**ALL, **topics}.items():
             keep = partial(self._keep, prefix + name, topic.type)
             if name in ANY_QOS:
-                wire.subscribe_any(self, name, keep, depth=50, raw=True, on_lost=self._on_lost)
+                wire.subscribe_any(self, name, keep, depth=50, on_lost=self._on_lost)
                 continue
             self.create_subscription(
                 wire.message_class(topic.type), name, lambda data, keep=keep: keep(data),

@@ -1,8 +1,7 @@
 """rclpy side of the table of topics: message classes, quality of service, both ends."""
 
-from array import array
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cache
 from importlib import import_module
 import inspect
@@ -15,7 +14,9 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from beetle_omni_ros.messages.topics import Qos, topic_of
+from beetle_omni_ros.messages.bag_types import from_bytes, to_bytes
+from beetle_omni_ros.messages.topics import Qos, Topic, topic_of
+from beetle_omni_ros.messages.values import MessageError
 
 COPIES = 64             # newest messages that are compared to detect a copy
 TWO_ARGUMENTS = inspect.Signature([
@@ -29,29 +30,6 @@ def message_class(name: str) -> type:
     return getattr(import_module(f'{package}.msg'), message)
 
 
-class RclpyFactory:
-    """See :class:`~beetle_omni_ros.messages.conversions.MessageFactory`."""
-
-    def new(self, name: str) -> Any:
-        """Make a message with default values, by its ROS type."""
-        return message_class(name)()
-
-    def doubles(self, values: Sequence[float]) -> array:
-        """Return an array of doubles."""
-        return array('d', values)
-
-    def singles(self, values: Sequence[float]) -> array:
-        """Return an array of floats."""
-        return array('f', values)
-
-    def byte(self, value: int) -> bytes:
-        """Return one byte."""
-        return bytes((value,))
-
-
-RCLPY = RclpyFactory()
-
-
 def profile(qos: Qos) -> QoSProfile:
     """Return the quality of service for rclpy."""
     return QoSProfile(
@@ -60,12 +38,21 @@ def profile(qos: Qos) -> QoSProfile:
         durability=DurabilityPolicy.TRANSIENT_LOCAL if qos.latched else DurabilityPolicy.VOLATILE)
 
 
-def message(topic: str, value: Any, frame: str | None = None) -> Any:
-    """Make the message of a topic's value; ``frame`` replaces the topic's frame_id."""
-    made = topic_of(topic).write(RCLPY, value)
+def serialized(topic: str, value: Any, frame: str | None = None) -> bytes:
+    """Make the CDR message of a topic's value; ``frame`` replaces the topic's frame_id."""
+    entry = topic_of(topic)
+    made = entry.write(value)
     if frame is not None:
         made.header.frame_id = frame
-    return made
+    return bytes(to_bytes(made, entry.type))
+
+
+def message(topic: Topic, data: bytes) -> Any:
+    """Decode the message of a topic; MessageError for broken bytes."""
+    try:
+        return from_bytes(data, topic.type)
+    except Exception:       # broken bytes raise anything
+        raise MessageError('not readable') from None
 
 
 def parameter_request(name: str, value: Any) -> SetParameters.Request:
@@ -82,8 +69,8 @@ class Publisher:
                                                 profile(entry.qos))
 
     def publish(self, value: Any, frame: str | None = None) -> None:
-        """Publish one value, see :func:`message`."""
-        self._publisher.publish(message(self._topic, value, frame))
+        """Publish one value, see :func:`serialized`."""
+        self._publisher.publish(serialized(self._topic, value, frame))
 
 
 def subscribe(node: Node, topic: str, handle: Callable[[Any], None],
@@ -91,8 +78,8 @@ def subscribe(node: Node, topic: str, handle: Callable[[Any], None],
     """Subscribe a topic without checks of age; ``qos`` replaces that of the table."""
     entry = topic_of(topic)
     node.create_subscription(message_class(entry.type), topic,
-                             lambda received: handle(entry.take(received)),
-                             profile(qos or entry.qos))
+                             lambda data: handle(entry.take(message(entry, data))),
+                             profile(qos or entry.qos), raw=True)
 
 
 def with_publication(callback: Callable) -> Callable:
@@ -117,7 +104,7 @@ def with_publication(callback: Callable) -> Callable:
 
 
 def subscribe_any(node: Node, topic: str, callback: Callable, *, depth: int = 10,
-                  raw: bool = False, on_lost: Callable | None = None) -> None:
+                  on_lost: Callable | None = None) -> None:
     """
     Receive the messages of publishers with any quality of service, each message once.
 
@@ -128,22 +115,21 @@ def subscribe_any(node: Node, topic: str, callback: Callable, *, depth: int = 10
     Args:
         node: subscribing node.
         topic: name.
-        callback: called with (message, time of publication [s, system time, or nan]).
+        callback: called with (CDR, time of publication [s, system time, or nan]).
         depth: depth of the queues.
-        raw: whether the callback gets serialized messages.
         on_lost: called with rclpy's event of lost messages.
 
     """
     seen: deque[float] = deque(maxlen=COPIES)
 
-    def take(message, publication):
+    def take(data, publication):
         if publication not in seen:     # nan never is
             seen.append(publication)
-            callback(message, publication)
+            callback(data, publication)
 
     for is_latched in (False, True):
         node.create_subscription(
             message_class(topic_of(topic).type), topic, with_publication(take),
-            profile(Qos(depth, reliable=is_latched, latched=is_latched)), raw=raw,
+            profile(Qos(depth, reliable=is_latched, latched=is_latched)), raw=True,
             event_callbacks=SubscriptionEventCallbacks(
                 incompatible_qos=lambda event: None, message_lost=on_lost))

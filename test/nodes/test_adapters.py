@@ -29,7 +29,7 @@ def test_the_supervisor_refuses_to_arm_with_the_reason_of_bridges_or_estimator(m
     assert refusal() == 'arm refused: joint_bridge_node lost: gimbal3 silent; rotor_bridge_node ' \
                         'waiting: battery low'
     for name in ('joint', 'rotor'):
-        node._on_bridge(name)('ready')
+        node._on_bridge(name, 'ready')
     assert 'no fresh state estimate' in refusal()
 
 

@@ -21,7 +21,7 @@ from std_msgs.msg import String
 from beetle_omni_ros.control.base import Command, PoseTarget
 from beetle_omni_ros.control.registry import ControllerEntry
 from beetle_omni_ros.messages import conversions
-from beetle_omni_ros.messages.topics import COMMAND, EVENT, LATCHED, SENSOR
+from beetle_omni_ros.messages.topics import ALL, COMMAND, EVENT, LATCHED, SENSOR
 from beetle_omni_ros.messages.values import MessageError
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.bridge_nodes import JointBridgeNode, RotorBridgeNode
@@ -47,9 +47,7 @@ class StillNode(ControllerNode):
 
 
 def pose(height=1.0, stamp=0.0, frame='world', x=0.0):
-    message = wire.message('target_pose', PoseTarget([x, 0, height], LEVEL, stamp))
-    message.header.frame_id = frame
-    return message
+    return wire.serialized('target_pose', PoseTarget([x, 0, height], LEVEL, stamp), frame)
 
 
 def test_a_bad_target_pose_is_refused_with_its_reason_and_the_old_one_stays(bench):
@@ -87,7 +85,8 @@ def test_a_stamp_of_1970_is_refused_in_simulated_time_too(bench, monkeypatch):
             (now, 1.5, False), (now, now + 1e5, False), (now, now - 60, True),
             (100.0, 1.5, True), (0.0, now, True), (100.0, now, False)):
         monkeypatch.setattr(node, 'now', lambda t=time_now: t)
-        target = conversions.take_pose_target(pose(stamp=stamp))
+        target = conversions.take_pose_target(
+            wire.message(ALL['target_pose'], pose(stamp=stamp)))
         if good:
             node._check_target(target, now)
         else:
@@ -101,7 +100,7 @@ def test_bad_and_stale_samples_are_refused_and_counted_by_reason(bench):
     rejected = node.health.inputs['imu/data_raw'].rejected
     for specific_force, age in (([np.nan, 0, 9.8], 0.0), ([0, 0, 9.8], 30.0)):
         before = rejected.total()
-        samples.publish(wire.message('imu/data_raw', ImuReading(
+        samples.publish(wire.serialized('imu/data_raw', ImuReading(
             time.time() - age, specific_force, [0, 0, 0])))
         assert bench.wait(lambda before=before: rejected.total() > before)
     assert rejected == {'linear_acceleration is not finite': 1, 'stale stamp': 1}
@@ -125,7 +124,7 @@ def test_only_the_supervisors_commands_are_executed_and_others_are_named(make_be
         end = time.monotonic() + SOON
         # A message older than 0.1 s is refused as late, and is sent again.
         while (entry.received, entry.rejected.total()) == before and time.monotonic() < end:
-            commands.publish(wire.message(
+            commands.publish(wire.serialized(
                 'command', Command(time.time(), np.zeros(4), np.full(4, 7.0)), source))
             bench.wait(lambda: (entry.received, entry.rejected.total()) != before, 0.5)
         return 'taken' if entry.received > before[0] else 'refused'
@@ -152,7 +151,7 @@ def test_the_supervisor_signs_its_commands_and_publishes_its_identity(bench):
     node._publisher._publisher = SimpleNamespace(publish=sent.append)
     node._supervisor.update = lambda now: Command(now, np.zeros(4), np.zeros(4))
     node._update()
-    assert sent[0].header.frame_id == received[0]
+    assert wire.message(ALL['command'], sent[0]).header.frame_id == received[0]
     assert re.fullmatch('supervisor_node:[0-9a-f]{8}', received[0])
 
 

@@ -59,9 +59,9 @@ class Drivers:
             if self.stop.is_set():
                 return
             now = time.time()
-            self.imu.publish(wire.message('imu/data_raw', Reading(now + 0.05, rng)))
+            self.imu.publish(wire.serialized('imu/data_raw', Reading(now + 0.05, rng)))
             if k % 2 == 0:
-                self.mocap.publish(wire.message('mocap/pose', PoseReading(
+                self.mocap.publish(wire.serialized('mocap/pose', PoseReading(
                     now - 0.008, rng.normal(size=3), UPRIGHT)))
                 self.joints.publish(JointState(name=['gimbal1'], position=[0.0]))
             if k % 100 == 0:
