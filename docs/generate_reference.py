@@ -58,7 +58,6 @@ FILES = {
     'emulated_board.yaml': ('sim.emulated.board_firmware:EmulatedBoardParameters',
                             'The emulated motor board.'),
     'simulator.yaml': ('sim.parameters:SimulatorParameters', 'The simulated world.'),
-    'check.yaml': ('bringup.findings:CheckLimits', 'Limits of `beetle_omni check`.'),
     'recording.yaml': ('identify.recording.limits:RecordingLimits',
                        'Limits of the checks of a recording against itself.'),
     'train.yaml': ('train.parameters:TrainParameters', 'The training of a policy.'),

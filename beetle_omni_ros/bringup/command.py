@@ -13,7 +13,6 @@ from beetle_omni_ros.bringup.devices import check_board, check_servos
 from beetle_omni_ros.bringup.findings import (
     BRIDGES,
     check_topics,
-    CheckLimits,
     FAIL,
     Findings,
     ObservedGraph,
@@ -51,7 +50,7 @@ def run_check(*, listen: Callable[[float], ObservedGraph], servo_port: str | Non
         if part not in PARTS:
             raise ParameterError(f"--skip '{part}': expected {', '.join(PARTS)}")
     check_writable(json_path)
-    console, limits = console or Console(), CheckLimits.load()
+    console = console or Console()
     bus, link = ServoBusParameters.load(servo_bus), MotorBoardParameters.load(motor_board)
     robot_parameters = RobotParameters.load(robot)
     bus = replace(bus, port=servo_port or bus.port)
@@ -62,9 +61,9 @@ def run_check(*, listen: Callable[[float], ObservedGraph], servo_port: str | Non
             graph = _observed(listen, seconds, of_ros)
     checks = {
         'servos': (f'checking the servos on {bus.port}',
-                   lambda: check_servos(bus, robot_parameters.joints, limits, graph)),
+                   lambda: check_servos(bus, robot_parameters.joints, graph)),
         'board': (f'listening to the motor board on {link.port}',
-                  lambda: check_board(link, robot_parameters, limits, seconds, graph))}
+                  lambda: check_board(link, robot_parameters, seconds, graph))}
     found: dict[str, Findings] = {}
     for part, (doing, check) in checks.items():
         if part not in skip:
@@ -73,7 +72,7 @@ def run_check(*, listen: Callable[[float], ObservedGraph], servo_port: str | Non
     if 'ros' not in skip:
         items = [finding.item for rows in found.values() for finding in rows]
         found['ros'] = of_ros if graph is None else check_topics(
-            graph, limits, robot_parameters.gravity,
+            graph, robot_parameters.gravity,
             frozenset(bridge for bridge in BRIDGES if f'{bridge} state' in items))
     _print(console, found, skip)
     is_ok = all(finding.level != FAIL for rows in found.values() for finding in rows)

@@ -14,7 +14,7 @@ import time
 
 import numpy as np
 
-from beetle_omni_ros.bringup.findings import CheckLimits, closed_port, Findings, ObservedGraph
+from beetle_omni_ros.bringup.findings import closed_port, Findings, ObservedGraph
 from beetle_omni_ros.drivers import servo_registers as registers
 from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters, ServoBusParameters
 from beetle_omni_ros.robot.parameters import JointParameters, RobotParameters
@@ -24,6 +24,15 @@ BUS, BOARD = 'servo bus', 'motor board'
 ROUNDS = 50             # reads of each servo to measure answer time and loss
 POLL_PERIOD = 0.02      # [s] between polls of the board
 SETTLING = 0.3          # [s] until the board has received several of our packets
+LATENCY_TIMER = 1       # [ms] of FTDI adapters, docs/how-to/hardware.md
+LOSS, LOSS_FAIL = 0.01, 0.1     # [-] share of lost answers or packets; at 0.1 the joints jerk
+# [V] supply of a servo: the smallest of the XC330-T181-T by its manual; half a volt below the
+# recommended 11.1 V, it is weaker and slower; 5 % above the largest.
+SUPPLY_FAIL_LOW, SUPPLY_LOW, SUPPLY_HIGH = 6.5, 10.5, 12.6
+TEMPERATURE_HIGH = 55.0     # [C] the servo shuts down at 70; at rest it has nearly room temperature
+# [V] cell at rest: smallest for arming (supervisor.yaml); about half empty; above a full LiPo
+# cell, 4.2 V, the calibration or the number of cells is wrong.
+CELL_FAIL_LOW, CELL_LOW, CELL_HIGH = 3.5, 3.7, 4.25
 
 
 # --- ports --------------------------------------------------------------------------------------
@@ -54,7 +63,7 @@ def unusable_port(path: str) -> tuple[str, str]:
     return '', ''
 
 
-def _opened_port(findings, device, path, limit):
+def _opened_port(findings, device, path):
     """Add findings about an open port: its name, and the latency timer of a USB adapter."""
     from beetle_omni_ros.drivers.serial_port import usb_ports
     real = os.path.realpath(path)
@@ -67,13 +76,14 @@ def _opened_port(findings, device, path, limit):
         findings.add(f'{device} port latency timer', 'none: no FTDI adapter')
         return
     findings.add(f'{device} port latency timer', f'{timer} ms', latency_timer_ms=timer,
-                 fail=f'each answer waits for it: echo {limit} | sudo tee {file}; permanently: '
-                 'the udev rule of docs/how-to/hardware.md' if timer > limit else '')
+                 fail=f'each answer waits for it: echo {LATENCY_TIMER} | sudo tee {file}; '
+                 'permanently: the udev rule of docs/how-to/hardware.md'
+                 if timer > LATENCY_TIMER else '')
 
 
 # --- servos -------------------------------------------------------------------------------------
 
-def check_servos(parameters: ServoBusParameters, joints: JointParameters, limits: CheckLimits,
+def check_servos(parameters: ServoBusParameters, joints: JointParameters,
                  graph: ObservedGraph | None = None) -> Findings:
     """
     Check the bus and its servos. A failure may end the list of findings.
@@ -97,8 +107,8 @@ def check_servos(parameters: ServoBusParameters, joints: JointParameters, limits
         return closed_port('servo port', str(error), 'docs/how-to/hardware.md', 'joint_bridge',
                            graph)
     try:
-        _opened_port(findings, 'servo', parameters.port, limits.link.latency_timer)
-        _check_bus(findings, link, parameters, joints, limits.servos)
+        _opened_port(findings, 'servo', parameters.port)
+        _check_bus(findings, link, parameters, joints)
     except SerialPortError as error:
         findings.add(BUS, str(error), fail='check cable and adapter: docs/how-to/hardware.md')
     finally:
@@ -106,7 +116,7 @@ def check_servos(parameters: ServoBusParameters, joints: JointParameters, limits
     return findings
 
 
-def _check_bus(findings, link, parameters, joints, limits):
+def _check_bus(findings, link, parameters, joints):
     from beetle_omni_ros.drivers.servo_bus import examine, make_servos
     from beetle_omni_ros.drivers.servo_link import ServoBusError
     servos = make_servos(parameters)
@@ -119,7 +129,7 @@ def _check_bus(findings, link, parameters, joints, limits):
             except ServoBusError:
                 servo.torque = None
     if present:
-        _check_answers(findings, link, present, limits)
+        _check_answers(findings, link, present)
     else:
         findings.add(BUS, f'no servo answers at {link.baud_rate} bit/s', fail="check the servos' "
                      'supply (their LEDs blink once at power-up), the data cable, and with '
@@ -141,11 +151,11 @@ def _check_bus(findings, link, parameters, joints, limits):
                          'supply_V': servo.voltage, 'temperature_C': servo.temperature,
                          'position_rad': servo.position} if read else {}))
         if read:
-            _check_health(findings, servo, limits)
+            _check_health(findings, servo)
             _check_turn(findings, servo, parameters, joints, k)
 
 
-def _check_health(findings, servo, limits):
+def _check_health(findings, servo):
     """Add findings about firmware, supply, temperature and torque; none without a problem."""
     name = servo.name
     if servo.firmware < registers.FIRST_FAST_FIRMWARE:
@@ -153,15 +163,15 @@ def _check_health(findings, servo, limits):
                      f'{registers.FIRST_FAST_FIRMWARE}: no fast sync read, feedback of all servos '
                      'takes longer', warn='update it with DYNAMIXEL Wizard',
                      firmware=servo.firmware)
-    if not limits.supply_fail_low <= servo.voltage <= limits.supply_high:
+    if not SUPPLY_FAIL_LOW <= servo.voltage <= SUPPLY_HIGH:
         findings.add(f'{name} supply', f'{servo.voltage:.1f} V, allowed are '
-                     f'{limits.supply_fail_low:g} to {limits.supply_high:g} V',
+                     f'{SUPPLY_FAIL_LOW:g} to {SUPPLY_HIGH:g} V',
                      fail='set the regulator to 11.1 to 12 V', supply_V=servo.voltage)
-    elif servo.voltage < limits.supply_low:
+    elif servo.voltage < SUPPLY_LOW:
         findings.add(f'{name} supply', f'{servo.voltage:.1f} V: slower and weaker than identified',
                      warn='set the regulator to 11.1 to 12 V; check the drop over thin cables',
                      supply_V=servo.voltage)
-    if servo.temperature > limits.temperature_high:
+    if servo.temperature > TEMPERATURE_HIGH:
         findings.add(f'{name} temperature', f'{servo.temperature:.0f} C', warn='let it cool; '
                      'check what blocks the joint', temperature_C=servo.temperature)
     if servo.torque:
@@ -185,7 +195,7 @@ def _check_turn(findings, servo, parameters, joints, k):
                      position_rad=servo.position)
 
 
-def _check_answers(findings, link, servos, limits):
+def _check_answers(findings, link, servos):
     """Add a finding about the loss and the duration of answers to single reads."""
     from beetle_omni_ros.drivers.servo_link import ServoBusError
     asked, times = ROUNDS * len(servos), []
@@ -202,15 +212,15 @@ def _check_answers(findings, link, servos, limits):
         BUS, f'{len(times)} of {asked} reads answered, {median:.1f} ms each (median), '
         f'longest {slowest:.1f} ms, at {link.baud_rate} bit/s', missing / asked,
         'check latency timer, connectors, ground, ends of the chain, two servos with one id, the '
-        'load of the computer', warn=limits.answer_loss, fail=limits.answer_loss_fail,
+        'load of the computer', warn=LOSS, fail=LOSS_FAIL,
         asked=asked, missing=missing, median_ms=float(median), longest_ms=float(slowest),
         baud_rate=link.baud_rate)
 
 
 # --- motor board --------------------------------------------------------------------------------
 
-def check_board(parameters: MotorBoardParameters, robot: RobotParameters, limits: CheckLimits,
-                seconds: float, graph: ObservedGraph | None = None) -> Findings:
+def check_board(parameters: MotorBoardParameters, robot: RobotParameters, seconds: float,
+                graph: ObservedGraph | None = None) -> Findings:
     """
     Check the motor board, listening for ``seconds``. A failure may end the list of findings.
 
@@ -234,7 +244,7 @@ def check_board(parameters: MotorBoardParameters, robot: RobotParameters, limits
                            graph)
     try:
         battery, rotors, receptions = _listen(board, seconds)
-        _opened_port(findings, 'board', parameters.port, limits.link.latency_timer)
+        _opened_port(findings, 'board', parameters.port)
         status, link = board.state.status, board.link()
     finally:
         board.close()
@@ -244,10 +254,10 @@ def check_board(parameters: MotorBoardParameters, robot: RobotParameters, limits
                      fail=_remedy_of_silence(link, parameters))
         return findings
     _check_status(findings, status)
-    _check_battery(findings, battery, robot.battery.cells, limits.battery)
+    _check_battery(findings, battery, robot.battery.cells)
     _check_escs(findings, rotors)
     _check_clock(findings, link, parameters)
-    _check_link(findings, link, receptions, limits.link)
+    _check_link(findings, link, receptions)
     return findings
 
 
@@ -307,7 +317,7 @@ def _check_status(findings, status):
                  if blocking else '')
 
 
-def _check_battery(findings, battery, cells, limits):
+def _check_battery(findings, battery, cells):
     if battery is None:
         findings.add('battery', 'no plausible voltage',
                      fail="check the board's voltage divider and its calibration")
@@ -317,8 +327,8 @@ def _check_battery(findings, battery, cells, limits):
     findings.add(
         'battery', f'{battery.voltage:.2f} V, {cell:.2f} V a cell of {cells}{current}',
         fail='calibrate the voltage, or correct battery.cells in the robot file'
-        if cell > limits.cell_high else 'charge it' if cell < limits.cell_fail_low else '',
-        warn='charge it' if cell < limits.cell_low else '',
+        if cell > CELL_HIGH else 'charge it' if cell < CELL_FAIL_LOW else '',
+        warn='charge it' if cell < CELL_LOW else '',
         voltage_V=battery.voltage, cell_V=cell, current_A=battery.current)
 
 
@@ -350,7 +360,7 @@ def _check_clock(findings, link, parameters):
         offset_s=offset, uncertainty_s=uncertainty)
 
 
-def _check_link(findings, link, receptions, limits):
+def _check_link(findings, link, receptions):
     counts = [('link from the board', link['lost'], link['bad_crc'], link['received'])]
     if len(receptions) > 1:
         (before, first), (after, last) = receptions[0], receptions[-1]
@@ -360,8 +370,8 @@ def _check_link(findings, link, receptions, limits):
         bad = max(lost, bad_crc)    # a corrupt packet also leaves a gap in the sequence numbers
         findings.grade(
             item, f'{bad} of {good + bad} packets lost or corrupt', bad / max(1, good + bad),
-            'check cable, ground, distance to the motor wires, baud rate', warn=limits.loss,
-            fail=limits.loss_fail, lost=lost, bad_crc=bad_crc, good=good)
+            'check cable, ground, distance to the motor wires, baud rate', warn=LOSS,
+            fail=LOSS_FAIL, lost=lost, bad_crc=bad_crc, good=good)
     if len(receptions) < 2:
         findings.add('link to the board', f"{len(receptions)} reports of the board's reception, "
                      'two are needed', warn='increase the time: --seconds 4')

@@ -1,12 +1,10 @@
-"""Findings of `beetle_omni check`, its limits, and what was observed in the ROS graph."""
+"""Findings of `beetle_omni check`, and those about the observed ROS graph."""
 
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from statistics import fmean, median
-
-from beetle_omni_ros.robot.schema import parameter, ParameterFile
+from typing import NamedTuple
 
 OK, WARN, FAIL = 'ok', 'warn', 'fail'
 # Bridge -> device whose port it opens, page about its faults.
@@ -15,12 +13,32 @@ FAULT_PAGES = {'joint_bridge': 'docs/reference/hardware_faults.md: what happens 
                'rotor_bridge': 'docs/reference/firmware.md: outcome of faults'}
 UNUSED = ('node', 'inputs', 'compute')      # statuses of every node; the topics cover them
 MOCAP, IMU, JOINTS, BATTERY = 'mocap/pose', 'imu/data_raw', 'joint_states', 'battery_state'
-# Topic -> name in the limits, publisher in words, bridge that publishes it.
-TOPICS = {MOCAP: ('mocap', 'the MoCap driver', None), IMU: ('imu', 'the IMU driver', None),
-          JOINTS: ('joint', 'joint_bridge_node', 'joint_bridge'),
-          BATTERY: ('battery', 'rotor_bridge_node', 'rotor_bridge')}
 MISSED = 3              # missing messages in a row that count as a pause
 CLOCK_SPREAD = 0.2      # relative spread of large ages below which clocks are the cause
+RATE_LOW, RATE_FAIL = 0.95, 0.8     # [-] of the nominal rate; below a warning, a failure
+RATE_HIGH = 1.2         # [-] of MoCap and IMU; above it the estimator is tuned for another rate
+AHEAD = 0.001           # [s] stamps farther ahead of this clock: clocks not synchronised
+GAP = 0.1               # [s] longest pause between two messages without a warning
+GRAVITY_TOLERANCE = 1.0     # [m/s^2] mean specific force at rest minus gravity
+
+
+class Expected(NamedTuple):
+    """What is expected of a topic."""
+
+    source: str             # publisher in words
+    bridge: str             # that publishes it, or ''
+    rate: float             # [Hz]
+    age_warn: float         # [s] of the freshest message
+    age_fail: float         # [s]
+
+
+# A MoCap needs about 10 ms, and the network; at 0.1 s the estimator is dead reckoning. The other
+# ages that fail are those after which the supervisor acts. The board reports its battery at 50 Hz,
+# the simulator at 10 Hz.
+TOPICS = {MOCAP: Expected('the MoCap driver', '', 100.0, 0.03, 0.1),
+          IMU: Expected('the IMU driver', '', 200.0, 0.01, 0.05),
+          JOINTS: Expected('joint_bridge_node', 'joint_bridge', 200.0, 0.02, 0.2),
+          BATTERY: Expected('rotor_bridge_node', 'rotor_bridge', 10.0, 0.1, 2.0)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,92 +82,6 @@ class Findings(list[Finding]):
         module = (error.name or '').partition('.')[0]
         self.add(item, f"not checked: the module '{module}' is not installed",
                  fail=f"{remedy}pip install 'beetle_omni_ros[{extra}]'")
-
-
-# --- limits -------------------------------------------------------------------------------------
-
-_share = partial(parameter, low=0, high=1)
-_supply = partial(parameter, unit='V', low=0, high=60)
-
-
-def _rate(topic, low, high):
-    return parameter(doc=f'nominal rate of {topic}', unit='Hz', low=low, high=high)
-
-
-def _age(topic, result):
-    return parameter(doc=f'age of the freshest message of {topic}; {result} above', unit='s',
-                     low=0, high=10)
-
-
-@dataclass(frozen=True, kw_only=True)
-class ServoLimits:
-    """Limits for each servo and for the bus."""
-
-    supply_fail_low: float = _supply(doc='supply voltage of a servo; failure below')
-    supply_low: float = _supply(doc='supply voltage of a servo; warning below')
-    supply_high: float = _supply(doc='supply voltage of a servo; failure above')
-    temperature_high: float = parameter(doc='temperature of a servo; warning above', unit='C',
-                                        low=0, high=150)
-    answer_loss: float = _share(doc='share of missing answers; warning above')
-    answer_loss_fail: float = _share(doc='share of missing answers; failure above')
-
-
-@dataclass(frozen=True, kw_only=True)
-class BatteryLimits:
-    """Voltage limits of a cell at rest."""
-
-    cell_fail_low: float = parameter(doc='cell voltage; failure below', unit='V', low=0, high=5)
-    cell_low: float = parameter(doc='cell voltage; warning below', unit='V', low=0, high=5)
-    cell_high: float = parameter(doc='cell voltage; failure above', unit='V', low=0, high=6)
-
-
-@dataclass(frozen=True, kw_only=True)
-class LinkLimits:
-    """Limits for serial ports."""
-
-    loss: float = _share(doc='share of lost or corrupt packets; warning above')
-    loss_fail: float = _share(doc='share of lost or corrupt packets; failure above')
-    latency_timer: int = parameter(doc='latency timer of an FTDI adapter; failure above',
-                                   unit='ms', low=1, high=255)
-
-
-@dataclass(frozen=True, kw_only=True)
-class TopicLimits:
-    """Limits for the rates and ages of ROS topics."""
-
-    mocap_rate: float = _rate(MOCAP, 1, 2000)
-    imu_rate: float = _rate(IMU, 1, 8000)
-    joint_rate: float = _rate(JOINTS, 1, 2000)
-    battery_rate: float = _rate(BATTERY, 0.1, 1000)
-    rate_low: float = _share(doc='share of the nominal rate; warning below')
-    rate_fail: float = _share(doc='share of the nominal rate; failure below')
-    rate_high: float = parameter(doc='multiple of the nominal rate; warning above', low=1,
-                                 high=100)
-    ahead: float = parameter(doc='lead of a stamp over the clock of this computer; failure above',
-                             unit='s', low=0, high=10)
-    mocap_age: float = _age(MOCAP, 'warning')
-    mocap_age_fail: float = _age(MOCAP, 'failure')
-    imu_age: float = _age(IMU, 'warning')
-    imu_age_fail: float = _age(IMU, 'failure')
-    joint_age: float = _age(JOINTS, 'warning')
-    joint_age_fail: float = _age(JOINTS, 'failure')
-    battery_age: float = _age(BATTERY, 'warning')
-    battery_age_fail: float = _age(BATTERY, 'failure')
-    gap: float = parameter(doc='pause between two messages; warning above', unit='s', low=0,
-                           high=10)
-    gravity_tolerance: float = parameter(
-        doc='difference between mean specific force at rest and gravity; warning above',
-        unit='m/s^2', low=0, high=10)
-
-
-@dataclass(frozen=True, kw_only=True)
-class CheckLimits(ParameterFile, file='check.yaml'):
-    """All limits of params/check.yaml."""
-
-    servos: ServoLimits = parameter(doc='servos')
-    battery: BatteryLimits = parameter(doc='battery')
-    link: LinkLimits = parameter(doc='serial ports')
-    topics: TopicLimits = parameter(doc='topics')
 
 
 # --- the observed graph -------------------------------------------------------------------------
@@ -254,7 +186,7 @@ def reported(bridge: str, graph: ObservedGraph) -> Findings:
     return findings
 
 
-def check_topics(graph: ObservedGraph, limits: CheckLimits, gravity: float,
+def check_topics(graph: ObservedGraph, gravity: float,
                  reported_bridges: frozenset[str] = frozenset()) -> Findings:
     """
     Check rates, ages and contents of the sensor topics; ``gravity`` in m/s^2.
@@ -262,21 +194,19 @@ def check_topics(graph: ObservedGraph, limits: CheckLimits, gravity: float,
     Reports of a running bridge are added unless it is in ``reported_bridges``.
     """
     findings = Findings()
-    for topic, (name, source, bridge) in TOPICS.items():
-        stream = graph.streams.get(topic, Stream())
-        runs = bridge is not None and graph.runs(bridge)
+    for topic, expected in TOPICS.items():
+        stream, bridge = graph.streams.get(topic, Stream()), expected.bridge
+        runs = bool(bridge) and graph.runs(bridge)
         if bridge and not runs and not stream.publishers and not stream.arrivals:
-            findings.add(topic, f'not published: {source} does not run')
+            findings.add(topic, f'not published: {expected.source} does not run')
         elif not stream.arrivals:
-            _absent(findings, topic, source, stream, graph)
+            _absent(findings, topic, expected.source, stream, graph)
         else:
-            _rate_of(findings, topic, stream, getattr(limits.topics, f'{name}_rate'),
-                     limits.topics)
-            _age_of(findings, topic, stream, getattr(limits.topics, f'{name}_age'),
-                    getattr(limits.topics, f'{name}_age_fail'), limits.topics)
-            _content_of(findings, topic, source, stream)
+            _rate_of(findings, topic, stream, expected.rate)
+            _age_of(findings, topic, stream, expected)
+            _content_of(findings, topic, expected.source, stream)
         if topic == IMU:
-            _gravity_of(findings, stream, gravity, limits.topics)
+            _gravity_of(findings, stream, gravity)
         if runs and bridge not in reported_bridges:
             findings += reported(bridge, graph)
     return findings
@@ -297,27 +227,27 @@ def _absent(findings, topic, source, stream, graph):
                      'computers, and BEETLE_OMNI_DISCOVERY=SUBNET if it runs on another one')
 
 
-def _rate_of(findings, topic, stream, nominal, limits):
+def _rate_of(findings, topic, stream, nominal):
     pauses = [b - a for a, b in zip(stream.arrivals, stream.arrivals[1:])]
     rate, gap = 1 / fmean(pauses) if sum(pauses) else 0.0, max(pauses, default=0.0)
-    low = rate < limits.rate_low * nominal
+    low = rate < RATE_LOW * nominal
     slow = f'expected are {nominal:g} Hz: check settings of its driver, network, load'
     fast = f'expected are {nominal:g} Hz: set its driver'
     findings.add(
         f'{topic} rate', f'{rate:.1f} Hz, longest pause {1e3 * gap:.0f} ms',
-        fail=slow if rate < limits.rate_fail * nominal else '',
-        warn=slow if low else fast if rate > limits.rate_high * nominal and topic in (MOCAP, IMU)
+        fail=slow if rate < RATE_FAIL * nominal else '',
+        warn=slow if low else fast if rate > RATE_HIGH * nominal and topic in (MOCAP, IMU)
         else 'check network (cable instead of Wi-Fi), load of the computers'
-        if gap > max(limits.gap, MISSED / nominal) else '',
+        if gap > max(GAP, MISSED / nominal) else '',
         rate_Hz=rate, gap_s=gap, messages=len(stream.arrivals))
 
 
-def _age_of(findings, topic, stream, warn, fail, limits):
+def _age_of(findings, topic, stream, expected):
     freshest, middle, oldest = min(stream.ages), median(stream.ages), max(stream.ages)
     found = (f'{1e3 * freshest:.1f} ms at least, {1e3 * middle:.1f} ms (median), '
              f'{1e3 * oldest:.1f} ms at most')
     values = {'freshest_s': freshest, 'median_s': middle, 'oldest_s': oldest}
-    if freshest < -limits.ahead:
+    if freshest < -AHEAD:
         findings.add(f'{topic} age', f'{found}: stamped in the future', fail='clocks are not '
                      'synchronised: run chrony or PTP on the computers; the driver must '
                      'stamp with the system clock', **values)
@@ -326,7 +256,8 @@ def _age_of(findings, topic, stream, warn, fail, limits):
         'computers), or the stamps are of another clock' \
         if oldest - freshest < CLOCK_SPREAD * freshest else \
         'check buffers or filters of its driver, network, load'
-    findings.grade(f'{topic} age', found, freshest, remedy, warn=warn, fail=fail, **values)
+    findings.grade(f'{topic} age', found, freshest, remedy,
+                   warn=expected.age_warn, fail=expected.age_fail, **values)
 
 
 def _content_of(findings, topic, source, stream):
@@ -343,14 +274,14 @@ def _content_of(findings, topic, source, stream):
                      'or lost the robot, and its driver repeats the last value')
 
 
-def _gravity_of(findings, stream, gravity, limits):
+def _gravity_of(findings, stream, gravity):
     """Check the unit of the specific force, which equals gravity at rest."""
     if len(stream.norms) < 2 or stream.refused:
         return
     mean = fmean(stream.norms)
-    if abs(mean - gravity) > limits.gravity_tolerance:
+    if abs(mean - gravity) > GRAVITY_TOLERANCE:
         findings.add(f'{IMU} specific force', f'{mean:.2f} m/s^2 on average; at rest it must be '
                      f'{gravity:.2f}', warn='its unit is g: the driver must convert to m/s^2'
-                     if abs(mean * gravity - gravity) <= limits.gravity_tolerance else
+                     if abs(mean * gravity - gravity) <= GRAVITY_TOLERANCE else
                      'must be specific force in m/s^2 with gravity (REP-145); keep the robot at '
                      'rest', mean_m_s2=mean)

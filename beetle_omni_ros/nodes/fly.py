@@ -347,28 +347,27 @@ class Flight:
         raise RunError(f'no take-off in {TAKEOFF_ATTEMPTS} attempts; see the warnings below')
 
     def _fly_task(self):
-        operator, graph, first = self._operator, self._graph, self._cycles()
-        cpu, bridges_cpu = graph.cpu_seconds(), graph.cpu_seconds(bridges=True)
-        start, steady = operator.time(), time.monotonic()
+        operator, graph = self._operator, self._graph
+        before, start, steady = self._counts(), operator.time(), time.monotonic()
         if self._faults:
             self._inject_faults()
         left = operator.countdown(self._task.duration + SPARE_TIME)
         while not operator.progress.startswith('done'):
             self._spin()
-            flown, passed = operator.time() - start, time.monotonic() - steady
-            self._show(f'{self._task.name} ({operator.state})', operator.progress, flown)
-            self.measured['cpu_percent'] = 100 * (graph.cpu_seconds() - cpu) / passed
-            if self._bridges:
-                self.measured['bridges_cpu_percent'] = \
-                    100 * (graph.cpu_seconds(bridges=True) - bridges_cpu) / passed
-            if graph.simulated:
-                self.measured['real_time_factor'] = flown / passed
+            self._show(f'{self._task.name} ({operator.state})', operator.progress,
+                       operator.time() - start)
             if operator.state in ON_GROUND:
                 raise RunError(f"the flight ended early, supervisor in '{operator.state}'")
             if next(left, None) is None:
                 raise RunError(f"the task does not continue at '{operator.progress}'")
-        if not graph.simulated:
-            self._take_latencies(first)
+        passed = time.monotonic() - steady
+        counts = {key: value - before.get(key, 0) for key, value in self._counts().items()}
+        self.measured = {key: 100 * value / passed if key.endswith('percent') else value
+                         for key, value in counts.items()}
+        if graph.simulated:
+            self.measured['real_time_factor'] = (operator.time() - start) / passed
+        else:
+            self._take_latencies()
 
     def _inject_faults(self):
         """Set the faults as the task begins, so that their times count from there."""
@@ -379,23 +378,25 @@ class Flight:
         if not accepted:
             raise RunError(f'sim_node refuses the faults: {answer}')
 
-    def _cycles(self):
-        """Counts of the bridges' cycles, from their diagnostics."""
-        return {f'{name}_{key}': int(value) for node, (status, name) in MEASURED.items()
-                for key, value in self._operator.values(f'{node}: {status}').items()
-                if key in ('cycles', 'missed_cycles')}
+    def _counts(self):
+        """CPU seconds so far, and counts of the bridges' cycles from their diagnostics."""
+        found = {'cpu_percent': self._graph.cpu_seconds()}
+        if self._bridges:
+            found['bridges_cpu_percent'] = self._graph.cpu_seconds(bridges=True)
+        for node, (status, name) in MEASURED.items():
+            values = self._operator.values(f'{node}: {status}')
+            found |= {f'{name}_{key}': int(values[key])
+                      for key in ('cycles', 'missed_cycles') if key in values}
+        return found
 
-    def _take_latencies(self, first):
-        """Add latencies, and cycles since ``first``; a bridge's begins with `command`."""
+    def _take_latencies(self):
+        """Add the latencies of the loop, and of each bridge from `command` on."""
         status, prefix = ('rotor_bridge_node', 'age_') if self._bridges else ('sim_node', '')
-        sources = [('latency', status, prefix), *(
-            (f'{name}_latency', node, '') for node, (_, name) in MEASURED.items())]
-        for name, node, prefix in sources:
+        for name, node, prefix in (('latency', status, prefix), *(
+                (f'{name}_latency', node, '') for node, (_, name) in MEASURED.items())):
             values = self._operator.values(f'{node}: latency')
             self.measured.update({f'{name}_{key}': float(values[prefix + key])
                                   for key in QUANTILES if prefix + key in values})
-        self.measured.update({key: cycles - first.get(key, 0)
-                              for key, cycles in self._cycles().items()})
 
     def land(self) -> None:
         """Land if the robot flies, and wait for the motors to stop."""

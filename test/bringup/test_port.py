@@ -58,6 +58,6 @@ def test_a_port_without_permission_is_reported_with_the_remedy(monkeypatch):
 def test_product_and_latency_timer_of_an_open_port_are_reported(adapter, timer, level):
     adapter.write_text(timer)
     findings = Findings()
-    devices._opened_port(findings, 'servo', '/dev/ttyUSB0', 1)
+    devices._opened_port(findings, 'servo', '/dev/ttyUSB0')
     assert [finding.level for finding in findings] == ['ok', level]
     assert 'FTDI USB' in findings[0].found

@@ -1,6 +1,6 @@
 """Check of the topics: rates, ages, clocks, units, several publishers, bridges."""
 
-from check_helpers import by_item, levels, LIMITS, ROBOT
+from check_helpers import by_item, levels, ROBOT
 import numpy as np
 import pytest
 
@@ -30,7 +30,7 @@ def graph(**streams):
 
 
 def judged(**streams):
-    return by_item(check_topics(graph(**streams), LIMITS, ROBOT.gravity))
+    return by_item(check_topics(graph(**streams), ROBOT.gravity))
 
 
 def test_good_sensors_without_bridges_pass():
@@ -107,12 +107,12 @@ def running(state='ready', level=0):
 
 
 def test_a_running_bridge_is_judged_by_its_reports():
-    found = by_item(check_topics(running(level=2), LIMITS, ROBOT.gravity))
+    found = by_item(check_topics(running(level=2), ROBOT.gravity))
     assert levels(found) == {'joint_bridge gimbal1': 'fail'}
     assert found['joint_bridge gimbal1'].values == {'voltage': '11.9'}
     assert found['joint_states rate'].level == 'ok'
     for state, level in (('waiting: turn lost', 'warn'), ('lost: port away', 'fail')):
-        found = by_item(check_topics(running(state), LIMITS, ROBOT.gravity))
+        found = by_item(check_topics(running(state), ROBOT.gravity))
         assert levels(found) == {'joint_bridge state': level}
         assert found['joint_bridge state'].found == state
 
@@ -122,7 +122,7 @@ def test_a_port_in_use_by_a_bridge_is_judged_by_its_reports():
     port, state, gimbal = closed_port(*busy, running())
     assert [port.level, state.level, gimbal.level] == ['ok'] * 3
     assert 'joint_bridge_node reports' in port.found
-    rows = by_item(check_topics(running(), LIMITS, ROBOT.gravity, frozenset({'joint_bridge'})))
+    rows = by_item(check_topics(running(), ROBOT.gravity, frozenset({'joint_bridge'})))
     assert 'joint_bridge state' not in rows
     absent = 'servo port', 'p: no such port', 'plug it in', 'joint_bridge'
     for given, observed in ((busy, None), (busy, graph()), (absent, running())):

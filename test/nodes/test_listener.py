@@ -12,7 +12,7 @@ from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import String
 
-from beetle_omni_ros.bringup.findings import check_topics, CheckLimits
+from beetle_omni_ros.bringup.findings import check_topics
 from beetle_omni_ros.messages.topics import EVENT, LATCHED, SENSOR
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.operator import listen
@@ -101,7 +101,7 @@ def test_messages_of_real_publishers_are_recorded_and_checked(ros_domain):
     assert graph.streams['joint_states'].refused.total() > 1
     assert graph.states == {'joint_bridge': 'ready'}
     found = {finding.item: finding for finding in check_topics(
-        graph, CheckLimits.load(), RobotParameters.load().gravity)}
+        graph, RobotParameters.load().gravity)}
     assert {item for item, finding in found.items() if finding.level == 'fail'} >= {
         'imu/data_raw age', 'mocap/pose publishers', 'joint_states content',
         'joint_bridge gimbal2'}
