@@ -29,7 +29,7 @@ LOSS, LOSS_FAIL = 0.01, 0.1     # [-] share of lost answers or packets; at 0.1 t
 # [V] supply of a servo: the smallest of the XC330-T181-T by its manual; half a volt below the
 # recommended 11.1 V, it is weaker and slower; 5 % above the largest.
 SUPPLY_FAIL_LOW, SUPPLY_LOW, SUPPLY_HIGH = 6.5, 10.5, 12.6
-TEMPERATURE_HIGH = 55.0     # [C] the servo shuts down at 70; at rest it has nearly room temperature
+TEMPERATURE_HIGH = 55.0     # [C] at rest a servo has nearly room temperature; at 70 it shuts down
 # [V] cell at rest: smallest for arming (supervisor.yaml); about half empty; above a full LiPo
 # cell, 4.2 V, the calibration or the number of cells is wrong.
 CELL_FAIL_LOW, CELL_LOW, CELL_HIGH = 3.5, 3.7, 4.25
