@@ -22,8 +22,7 @@ def load(name: str):
     if name in PROGRAMS:
         module, _, function = PROGRAMS[name].partition(':')
         return getattr(import_module(module), function)
-    runner = import_module(f'{PACKAGE}.nodes.runner')
-    return partial(runner.main, runner.node_class(name))
+    return partial(import_module(f'{PACKAGE}.nodes.runner').main, name)
 
 
 def run(name: str) -> int | None:

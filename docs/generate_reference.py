@@ -58,7 +58,6 @@ FILES = {
     'emulated_board.yaml': ('sim.emulated.motor_board:EmulatedBoardParameters',
                             'The emulated motor board.'),
     'simulator.yaml': ('sim.parameters:SimulatorParameters', 'The simulated world.'),
-    'check.yaml': ('bringup.limits:CheckLimits', 'Limits of `beetle_omni check`.'),
     'recording.yaml': ('identify.recording.limits:RecordingLimits',
                        'Limits of the checks of a recording against itself.'),
     'train.yaml': ('train.parameters:TrainParameters', 'The training of a policy.'),
@@ -82,9 +81,9 @@ A file that extends another moves what depends on its numbers:
 
 """
 
-# Nodes whose code is not in a file of their own name; '' is no node of its own.
-SHARED = {'controller_node': 'nmpc_node, rl_node', 'node': 'every node', 'operator': '',
-          'driver': '', 'recorder_node': '', 'wire': ''}
+# Classes of nodes/ whose calls count for other nodes; '' for none.
+SHARED = {'ControllerNode': 'nmpc_node, rl_node', 'Health': 'every node',
+          'RecorderNode': ''}
 
 # Topics that viewers and clocks need, which no other part of the package reads.
 OTHERS = {
@@ -222,18 +221,21 @@ def _ends() -> dict[str, dict[str, list[str]]]:
     shared = _constants(ast.parse((nodes / 'node.py').read_text(encoding='utf-8')))
     ways = {'publisher': ('from', 0), 'Publisher': ('from', 1), 'create_publisher': ('from', 1),
             'listen': ('to', 0), 'follow': ('to', 0)}
-    for path in sorted(nodes.glob('*.py')):
-        node = SHARED.get(path.stem, path.stem)
+    for path in sorted((*nodes.glob('*_node.py'), *nodes.glob('*_nodes.py'), nodes / 'node.py')):
         tree = ast.parse(path.read_text(encoding='utf-8'))
-        for call in ast.walk(tree):
-            if not node or not isinstance(call, ast.Call) \
-                    or not isinstance(call.func, ast.Attribute) or call.func.attr not in ways:
-                continue
-            way, place = ways[call.func.attr]
-            given = call.args[place] if len(call.args) > place else None
-            for topic in _topic(given, {**shared, **_constants(tree)}):
-                entry = found.setdefault(topic, {'from': [], 'to': []})
-                entry[way] += [one for one in node.split(', ') if one not in entry[way]]
+        constants = {**shared, **_constants(tree)}
+        for kind in (item for item in tree.body if isinstance(item, ast.ClassDef)):
+            name = re.sub(r'(?<=[a-z])(?=[A-Z])', '_', kind.name).lower()
+            node = SHARED.get(kind.name, name if name.endswith('_node') else '')
+            for call in ast.walk(kind):
+                if not node or not isinstance(call, ast.Call) \
+                        or not isinstance(call.func, ast.Attribute) or call.func.attr not in ways:
+                    continue
+                way, place = ways[call.func.attr]
+                given = call.args[place] if len(call.args) > place else None
+                for topic in _topic(given, constants):
+                    entry = found.setdefault(topic, {'from': [], 'to': []})
+                    entry[way] += [one for one in node.split(', ') if one not in entry[way]]
     # Read through the class that checks the publisher.
     found['supervisor/identity']['to'] = list(found['command']['to'])
     found['/tf']['from'].append('robot_state_publisher')

@@ -9,7 +9,7 @@ import subprocess
 import pytest
 
 from beetle_omni_ros.nodes import graph
-from beetle_omni_ros.nodes.lifecycle_node import AUTOSTART, INACTIVE
+from beetle_omni_ros.nodes.graph import AUTOSTART
 
 ROOT = Path(__file__).resolve().parents[1]
 DEPLOY = ROOT / 'deploy'
@@ -75,7 +75,7 @@ def test_the_service_starts_the_bridges_without_arming(tmp_path):
     assert done.returncode == 0, done.stderr
     unit = (tmp_path / UNIT).read_text()
     start = re.search(r'^ExecStart=(.*)$', unit, re.M)[1]
-    assert AUTOSTART['configure'] == INACTIVE
+    assert AUTOSTART['configure'] == 'inactive'
     for node in ('joint_bridge_node', 'rotor_bridge_node'):
         assert node in graph.NODES
         assert re.findall(rf'-p {node}:autostart:=(\w+)', start) == ['configure']

@@ -32,7 +32,7 @@ ALLOWED = {
     'drive': ('robot',),
     'view': ('robot', 'control.base', 'runs', 'messages'),
     'nodes': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs', 'drivers', 'drive',
-              'messages', 'view', 'bringup.graph'),
+              'messages', 'view', 'bringup.findings'),
     'train': ('robot', 'control.policy_file', 'runs.files'),
     'cli': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs', 'evaluation', 'comparison',
             'faults', 'film', 'nodes', 'train', 'identify', 'bringup', 'view'),

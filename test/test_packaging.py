@@ -13,6 +13,7 @@ import pytest
 
 import beetle_omni_ros
 from beetle_omni_ros import start
+from beetle_omni_ros.nodes.graph import NODES
 from beetle_omni_ros.robot.resources import PACKAGE, share_path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -83,19 +84,16 @@ def test_every_executable_has_its_function(setup_arguments):
         _, target = (part.strip() for part in script.split('='))
         module, function = target.split(':')
         program, = getattr(import_module(module), function).args
-        if program in start.PROGRAMS or HAS_ROS:
+        if program in start.PROGRAMS:
             assert callable(start.load(program)), script
-            continue
-        file = 'controller_node' if program in ('nmpc_node', 'rl_node') else program
-        assert importlib.util.find_spec(f'{PACKAGE}.nodes.{file}'), f'{script}: no such module'
+        elif HAS_ROS:
+            assert isinstance(import_module(f'{PACKAGE}.nodes.runner').node_class(program), type)
 
 
-def test_every_node_file_is_an_executable(setup_arguments):
-    scripts = [script.split(' ')[0] for script in setup_arguments['entry_points'][
-        'console_scripts']]
-    for path in (ROOT / PACKAGE / 'nodes').glob('*_node.py'):
-        if re.search(r'^def main\(', path.read_text(encoding='utf-8'), re.MULTILINE):
-            assert path.stem in scripts, f'{path.name}: not in setup.py'
+def test_every_node_is_an_executable(setup_arguments):
+    scripts = {script.split(' ')[0] for script in setup_arguments['entry_points'][
+        'console_scripts']}
+    assert scripts == {*NODES, 'beetle_omni'}
 
 
 def test_every_folder_of_code_is_installed(setup_arguments):

@@ -123,6 +123,6 @@ def view(runs: Annotated[Optional[list[Path]], typer.Argument(
         return
     if at or paused:
         raise ParameterError(f"{'--at' if at else '--paused'}: expected with RUN")
-    from beetle_omni_ros.nodes.live_view import run_live
+    from beetle_omni_ros.nodes.operator import run_live
     run_live(namespace=namespace, domain_id=domain_id, discovery=discovery,
              allow_targets=allow_targets, **shared)

@@ -11,6 +11,7 @@ import select
 import termios
 
 import serial
+from serial.tools import list_ports
 
 
 class SerialPortError(OSError):
@@ -105,3 +106,10 @@ def _cause(error):
     """Cause and remedy of an error of the port; pyserial has the number in ``args`` at times."""
     number = getattr(error, 'errno', None) or (error.args or [None])[0]
     return CAUSES.get(number) or (str(error).splitlines() or ['unplugged'])[0]
+
+
+def usb_ports() -> dict[str, str]:
+    """USB serial ports of this computer: device -> maker, product, IDs and serial number."""
+    return {port.device: ' '.join(filter(None, (
+        port.manufacturer, port.product, f'({port.usb_info()})')))
+        for port in list_ports.comports() if port.vid is not None}

@@ -1,20 +1,20 @@
 """
 Conversion between messages and values, by attribute access only.
 
-``read_*`` converts a message of rclpy, of a bag, or of :mod:`~beetle_omni_ros.messages.columns`.
-The numbers of the latter are arrays over N messages, so vectors have the shape (N, 3).
-``take_*`` converts one message for use in flight and raises MessageError for unusable values.
-``write_*`` makes a message by a :class:`MessageFactory`. Scalars are converted to ``float``,
-because ROS serialises another Python type in a float field as garbage without an error.
+``read_*`` converts a message of :mod:`~.bag_types`, also one of ``read_all``, whose numbers are
+arrays over N messages, so vectors have the shape (N, 3). ``take_*`` converts one message for use
+in flight and raises MessageError for unusable values. ``write_*`` makes a message.
 """
 
 from collections.abc import Callable, Sequence
 from math import floor, isfinite, isnan
-from typing import Any, Protocol, TypeVar
+from operator import attrgetter
+from typing import Any
 
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
+from beetle_omni_ros.messages.bag_types import new
 from beetle_omni_ros.messages.values import (
     Diagnostic,
     HealthReport,
@@ -41,28 +41,11 @@ HEALTH_NAMES = [*COMMAND_NAMES, *(f'{name}_zero' for name in JOINT_NAMES)]
 NO_VALUE = [float('nan')] * 4
 UNIT_TOLERANCE = 0.01   # of a quaternion's length; above the rounding of any publisher
 POINTS = 10_000     # of a trajectory: 100 s at 100 Hz; more would block the reading node
+JOINT_STATE = 'sensor_msgs/msg/JointState'
+TRAJECTORY = 'trajectory_msgs/msg/MultiDOFJointTrajectory'
 
 
-Value = TypeVar('Value')
-
-
-class MessageFactory(Protocol):
-    """Constructors of messages, for the message classes of rclpy or of bags."""
-
-    def new(self, name: str) -> Any:
-        """Make a message with default values from its ROS type."""
-
-    def doubles(self, values: Sequence[float] | np.ndarray) -> Any:
-        """Return the value of a field ``float64[]``."""
-
-    def singles(self, values: Sequence[float]) -> Any:
-        """Return the value of a field ``float32[]``."""
-
-    def byte(self, value: int) -> Any:
-        """Return the value of a field ``byte``."""
-
-
-# --- times, vectors, names ----------------------------------------------------------------------
+# --- times, vectors, checks ---------------------------------------------------------------------
 
 def nanoseconds(t: float) -> int:
     """Convert seconds to integer nanoseconds; whole seconds separately, to keep every bit."""
@@ -96,250 +79,250 @@ def xyzw(q: Any) -> np.ndarray:
     return np.array([q.x, q.y, q.z, q.w]).T
 
 
-def set_xyz(v: Any, values: Sequence[float] | np.ndarray) -> None:
-    """Fill three fields."""
+def set_parts(v: Any, values: Sequence[float] | np.ndarray) -> None:
+    """Fill the fields x, y, z of a vector, or x, y, z, w of a quaternion."""
     v.x, v.y, v.z = float(values[0]), float(values[1]), float(values[2])
+    if len(values) == 4:
+        v.w = float(values[3])
 
 
-def set_xyzw(q: Any, values: Sequence[float] | np.ndarray) -> None:
-    """Fill four fields."""
-    q.x, q.y, q.z, q.w = float(values[0]), float(values[1]), float(values[2]), float(values[3])
-
-
-def finite(values: np.ndarray, what: str) -> np.ndarray:
-    """Return the values; MessageError if one is not finite."""
-    if not np.isfinite(values).all():
+def finite(values: np.ndarray | float, what: str) -> None:
+    """Raise MessageError if a value is not finite, or its square is not."""
+    if not isfinite(np.vdot(values, values)):
         raise MessageError(f'{what} is not finite')
-    return values
 
 
-def unit(q: np.ndarray, low: float = 1 - UNIT_TOLERANCE,
-         high: float = 1 + UNIT_TOLERANCE) -> np.ndarray:
-    """Normalise a quaternion; MessageError if its length is outside (low, high)."""
+def unit(q: np.ndarray) -> np.ndarray:
+    """Normalise a quaternion; MessageError if it is none."""
     norm = float(q @ q) ** 0.5
-    if not low < norm < high:      # catches NaN as well
+    if not abs(norm - 1) < UNIT_TOLERANCE:      # catches NaN as well
         raise MessageError('orientation is not a unit quaternion')
     return q / norm
 
 
-def _begin(factory, name, stamp, frame=''):
-    message = factory.new(name)
+def _begin(name, stamp, frame=''):
+    message = new(name)
     set_time(message.header.stamp, stamp)
     message.header.frame_id = frame
     return message
 
 
-def _set_pose(pose, position, quaternion):
-    set_xyz(pose.position, position)
-    set_xyzw(pose.orientation, quaternion)
+def _check_frame(message):
+    if message.header.frame_id not in ('', WORLD):
+        raise MessageError(f"frame_id '{message.header.frame_id[:40]}' is not '{WORLD}'",
+                           'wrong frame')
 
 
-def _order(names, wanted):
-    if names == wanted:
-        return range(len(wanted))
-    try:
-        return [names.index(name) for name in wanted]
-    except ValueError:
-        raise MessageError(f"names are not {', '.join(wanted)}") from None
+# --- messages of vectors ------------------------------------------------------------------------
+
+class Vectors:
+    """
+    A stamped message whose value has vectors at fixed places of the message.
+
+    Args:
+        value: class of the value, with a ``stamp``.
+        message: ROS message type.
+        frame: frame_id.
+        places: attribute of the value -> path of its vector in the message, followed by the names
+            of its parts, 'pose.position xyz'; without parts it is a number.
+
+    """
+
+    def __init__(self, value: type, message: str, frame: str, **places: str):
+        self.value, self.type, self._frame = value, message, frame
+        self._places = []       # attribute, path, getter of the vector, getter of its parts
+        for attribute, place in places.items():
+            path, _, parts = place.partition(' ')
+            self._places.append((attribute, path, attrgetter(path), attrgetter(
+                *(f'{path}.{part}' for part in parts)) if parts else None))
+
+    def fields(self, message: Any, check: bool = False) -> dict[str, Any]:
+        """Read the fields of the value; with ``check``, MessageError if one is not finite."""
+        found = {'stamp': seconds(message.header.stamp)}
+        for attribute, path, whole, parts in self._places:
+            found[attribute] = np.array(parts(message)).T if parts else whole(message)
+            if check:
+                finite(found[attribute], path)
+        return found
+
+    def read(self, message: Any) -> Any:
+        """Read the value of one message, or of a message with columns."""
+        return self.value(**self.fields(message))
+
+    def take(self, message: Any) -> Any:
+        """Read a value for flight; MessageError if one of its numbers is not finite."""
+        return self.value(**self.fields(message, True))
+
+    def write(self, value: Any) -> Any:
+        """Write a value."""
+        message = _begin(self.type, value.stamp, self._frame)
+        for attribute, path, whole, parts in self._places:
+            if parts:
+                set_parts(whole(message), getattr(value, attribute))
+            else:
+                setattr(message, path, float(getattr(value, attribute)))
+        return message
 
 
-def _values(values, order, what):
-    try:
-        return np.array([values[k] for k in order], dtype=float).T
-    except IndexError:
-        raise MessageError(f'{what} has {len(values)} values, too few for the names') from None
+POSE = Vectors(PoseReading, 'geometry_msgs/msg/PoseStamped', WORLD,
+               position='pose.position xyz', quaternion='pose.orientation xyzw')
+POSE_TARGET = Vectors(PoseTarget, 'geometry_msgs/msg/PoseStamped', WORLD,
+                      position='pose.position xyz', quaternion='pose.orientation xyzw')
+IMU = Vectors(ImuReading, 'sensor_msgs/msg/Imu', BODY, specific_force='linear_acceleration xyz',
+              angular_velocity='angular_velocity xyz')
+WRENCH = Vectors(Wrench, 'geometry_msgs/msg/WrenchStamped', WORLD,
+                 force='wrench.force xyz', torque='wrench.torque xyz')
+BATTERY = Vectors(BatteryReading, 'sensor_msgs/msg/BatteryState', '',
+                  voltage='voltage', current='current')
+# The twist of the message is in base_link, the velocity of the value in world.
+ODOM = Vectors(Odom, 'nav_msgs/msg/Odometry', WORLD, position='pose.pose.position xyz',
+               velocity='twist.twist.linear xyz', quaternion='pose.pose.orientation xyzw',
+               angular_velocity='twist.twist.angular xyz')
 
 
-def _floats(values):
-    return [float(v) for v in values]
-
-
-def _take_finite(read: Callable[[Any], Value], **names: str) -> Callable[[Any], Value]:
-    """Make ``take_*`` of ``read_*``: refuse non-finite attributes, by their names in messages."""
-    def take(message: Any) -> Value:
-        value = read(message)
-        for attribute, name in names.items():
-            finite(getattr(value, attribute), name)
-        return value
-
-    return take
-
-
-# --- sensors ------------------------------------------------------------------------------------
-
-def read_imu(message: Any) -> ImuReading:
-    """Read specific force and angular rates."""
-    return ImuReading(seconds(message.header.stamp), xyz(message.linear_acceleration),
-                     xyz(message.angular_velocity))
-
-
-take_imu = _take_finite(read_imu, specific_force='linear_acceleration',
-                        angular_velocity='angular_velocity')
-
-
-def write_imu(factory: MessageFactory, value: ImuReading) -> Any:
+def write_imu(value: ImuReading) -> Any:
     """Write specific force and angular rates, without orientation (REP-145)."""
-    message = _begin(factory, 'sensor_msgs/msg/Imu', value.stamp, BODY)
+    message = IMU.write(value)
     message.orientation.w = 1.0
     message.orientation_covariance[0] = -1.0
-    set_xyz(message.linear_acceleration, value.specific_force)
-    set_xyz(message.angular_velocity, value.angular_velocity)
     return message
 
 
-def read_pose(message: Any) -> PoseReading:
-    """Read a pose of base_link in world."""
-    return PoseReading(seconds(message.header.stamp), xyz(message.pose.position),
-                      xyzw(message.pose.orientation))
+def take_battery(message: Any) -> BatteryReading:
+    """Read voltage and current for flight; the current may be unknown."""
+    finite(message.voltage, 'voltage')
+    return BATTERY.read(message)
 
 
-# The estimator checks the length of the quaternion.
-take_pose = _take_finite(read_pose, position='position', quaternion='orientation')
-
-
-def write_pose(factory: MessageFactory, value: PoseReading | PoseTarget) -> Any:
-    """Write a measured pose or a pose target."""
-    message = _begin(factory, 'geometry_msgs/msg/PoseStamped', value.stamp, WORLD)
-    _set_pose(message.pose, value.position, value.quaternion)
-    return message
-
-
-def read_joints(message: Any) -> JointReading:
-    """Read the four tilt joints, in any order of names."""
-    order = _order(message.name, JOINTS)
-    return JointReading(
-        seconds(message.header.stamp), _values(message.position, order, 'position'),
-        _values(message.velocity, order, 'velocity') if len(message.velocity) else None,
-        _values(message.effort, order, 'effort') if len(message.effort) else None)
-
-
-def take_joints(message: Any) -> JointReading:
-    """Read the four tilt joints for flight; missing rates are 0."""
-    order = _order(message.name, JOINTS)
-    position = _values(message.position, order, 'position')
-    velocity = _values(message.velocity, order, 'velocity') if len(message.velocity) \
-        else np.zeros(4)
-    return JointReading(seconds(message.header.stamp), finite(position, 'position'),
-                  finite(velocity, 'velocity'))
-
-
-def take_known_joints(message: Any) -> JointReading:
-    """Read the tilt joints that the message contains; angle and rate of the others are NaN."""
-    places = [k for k, name in enumerate(JOINTS) if name in message.name]
-    order = _order(message.name, [JOINTS[k] for k in places])
-    position, velocity = np.full((2, 4), np.nan)
-    position[places] = finite(_values(message.position, order, 'position'), 'position')
-    velocity[places] = finite(_values(message.velocity, order, 'velocity'), 'velocity') \
-        if len(message.velocity) else 0.0
-    return JointReading(seconds(message.header.stamp), position, velocity)
-
-
-def write_joints(factory: MessageFactory, value: JointReading) -> Any:
-    """Write the joints that the value names."""
-    message = _begin(factory, 'sensor_msgs/msg/JointState', value.stamp)
-    message.name = list(value.names)
-    message.position = factory.doubles(value.position)
-    if value.velocity is not None:
-        message.velocity = factory.doubles(value.velocity)
-    if value.effort is not None:
-        message.effort = factory.doubles(value.effort)
-    return message
-
-
-def read_rotors(message: Any) -> RotorReading:
-    """Read the speeds measured by the ESCs."""
-    if list(message.name) != ROTORS or len(message.velocity) != len(ROTORS):
-        raise MessageError(f'expected velocities of {ROTORS}')
-    return RotorReading(seconds(message.header.stamp), np.array(message.velocity, dtype=float).T)
-
-
-def write_rotors(factory: MessageFactory, value: RotorReading) -> Any:
-    """Write the speeds."""
-    message = _begin(factory, 'sensor_msgs/msg/JointState', value.stamp)
-    message.name = ROTORS
-    message.velocity = factory.doubles(value.speed)
-    return message
-
-
-def read_battery(message: Any) -> BatteryReading:
-    """Read voltage and current."""
-    return BatteryReading(seconds(message.header.stamp), message.voltage, message.current)
-
-
-take_battery = _take_finite(read_battery, voltage='voltage')
-
-
-def write_battery(factory: MessageFactory, value: BatteryReading) -> Any:
+def write_battery(value: BatteryReading) -> Any:
     """Write voltage and current; unmeasured fields are NaN."""
-    message = _begin(factory, 'sensor_msgs/msg/BatteryState', value.stamp)
-    message.voltage, message.current = float(value.voltage), float(value.current)
+    message = BATTERY.write(value)
     message.temperature = message.charge = message.capacity = message.design_capacity \
         = message.percentage = float('nan')
     message.power_supply_status = message.POWER_SUPPLY_STATUS_DISCHARGING
     message.power_supply_technology = message.POWER_SUPPLY_TECHNOLOGY_LIPO
     message.present = True
-    message.cell_voltage = factory.singles([float('nan')] * value.cells)
+    message.cell_voltage = np.full(value.cells, np.nan, dtype=np.float32)
     return message
 
 
-# --- state and commands -------------------------------------------------------------------------
-
 def read_odom(message: Any) -> Odom:
     """Read pose and velocity; the velocity is rotated from base_link to world."""
-    return _odom(message, xyz(message.pose.pose.position), xyzw(message.pose.pose.orientation))
+    return _in_world(ODOM.fields(message))
 
 
 def take_odom(message: Any) -> Odom:
     """Read pose and velocity for flight."""
-    pose = message.pose.pose
-    odom = _odom(message, finite(xyz(pose.position), 'position'), unit(xyzw(pose.orientation)))
-    finite(odom.velocity, 'linear velocity')
-    finite(odom.angular_velocity, 'angular velocity')
-    return odom
+    fields = ODOM.fields(message, True)
+    return _in_world({**fields, 'quaternion': unit(fields['quaternion'])})
 
 
-def _odom(message, position, quaternion):
-    twist = message.twist.twist
-    velocity = xyz(twist.linear)
-    velocity = rotations.matrix(quaternion) @ velocity if velocity.ndim == 1 else \
-        np.einsum('ijn,nj->ni', rotations.matrix(tuple(quaternion.T)), velocity)
-    return Odom(seconds(message.header.stamp), position, velocity, quaternion, xyz(twist.angular))
+def _in_world(fields):
+    q, velocity = fields['quaternion'], fields['velocity']
+    fields['velocity'] = rotations.matrix(q) @ velocity if velocity.ndim == 1 else \
+        np.einsum('ijn,nj->ni', rotations.matrix(tuple(q.T)), velocity)
+    return Odom(**fields)
 
 
-def write_odom(factory: MessageFactory, value: Odom) -> Any:
+def write_odom(value: Odom) -> Any:
     """Write pose in world, twist in base_link, and covariances."""
-    message = _begin(factory, 'nav_msgs/msg/Odometry', value.stamp, WORLD)
+    message = ODOM.write(value)
     message.child_frame_id = BODY
-    _set_pose(message.pose.pose, value.position, value.quaternion)
-    set_xyz(message.twist.twist.linear, rotations.matrix(value.quaternion).T @ value.velocity)
-    set_xyz(message.twist.twist.angular, value.angular_velocity)
-    if value.pose_covariance is not None:
-        message.pose.covariance = _flat(value.pose_covariance)
-    if value.twist_covariance is not None:
-        message.twist.covariance = _flat(value.twist_covariance)
+    set_parts(message.twist.twist.linear, rotations.matrix(value.quaternion).T @ value.velocity)
+    for field, matrix in ((message.pose, value.pose_covariance),
+                          (message.twist, value.twist_covariance)):
+        if matrix is not None:
+            field.covariance = np.ascontiguousarray(matrix, dtype=float).reshape(36)
     return message
 
 
-def _flat(matrix):
-    return np.ascontiguousarray(matrix, dtype=float).reshape(36)
+def take_pose_target(message: Any) -> PoseTarget:
+    """Read a pose target; MessageError for another frame than world."""
+    fields = POSE_TARGET.fields(message, True)
+    _check_frame(message)
+    return PoseTarget(**{**fields, 'quaternion': unit(fields['quaternion'])})
+
+
+# --- messages of joints -------------------------------------------------------------------------
+
+def _of(message, field, names):
+    """Values (len(names),) or (N, len(names)) of a field of a JointState, by name."""
+    values = getattr(message, field)
+    try:
+        order = range(len(names)) if message.name[:len(names)] == names else \
+            [message.name.index(name) for name in names]
+        return np.array([values[k] for k in order], dtype=float).T
+    except ValueError:
+        raise MessageError(f"names are not {', '.join(names)}") from None
+    except IndexError:
+        raise MessageError(f'{field} has {len(values)} values, too few for the names') from None
+
+
+def read_joints(message: Any) -> JointReading:
+    """Read the four tilt joints, in any order of names."""
+    return JointReading(
+        seconds(message.header.stamp), _of(message, 'position', JOINTS),
+        _of(message, 'velocity', JOINTS) if len(message.velocity) else None,
+        _of(message, 'effort', JOINTS) if len(message.effort) else None)
+
+
+def take_joints(message: Any) -> JointReading:
+    """Read the tilt joints for flight: NaN for a joint that is not named, 0 for missing rates."""
+    names = [name for name in JOINTS if name in message.name]
+    position = _of(message, 'position', names)
+    velocity = _of(message, 'velocity', names) if len(message.velocity) else np.zeros(len(names))
+    finite(position, 'position')
+    finite(velocity, 'velocity')
+    if len(names) < len(JOINTS):
+        known, measured = np.isin(JOINTS, names), (position, velocity)
+        position, velocity = np.full((2, 4), np.nan)
+        position[known], velocity[known] = measured
+    return JointReading(seconds(message.header.stamp), position, velocity)
+
+
+def write_joints(value: JointReading) -> Any:
+    """Write the joints that the value names."""
+    message = _begin(JOINT_STATE, value.stamp)
+    message.name = list(value.names)
+    for field in ('position', 'velocity', 'effort'):
+        if (numbers := getattr(value, field)) is not None:
+            setattr(message, field, np.array(numbers, dtype=float))
+    return message
+
+
+def read_rotors(message: Any) -> RotorReading:
+    """Read the speeds measured by the ESCs."""
+    return RotorReading(seconds(message.header.stamp), _of(message, 'velocity', ROTORS))
+
+
+def write_rotors(value: RotorReading) -> Any:
+    """Write the speeds."""
+    message = _begin(JOINT_STATE, value.stamp)
+    message.name = ROTORS
+    message.velocity = np.array(value.speed, dtype=float)
+    return message
 
 
 def read_command(message: Any) -> Command:
     """Read four tilts and four thrusts."""
-    order = _order(message.name, COMMAND_NAMES)
-    return Command(seconds(message.header.stamp), _values(message.position, order[:4], 'position'),
-                   _values(message.effort, order[4:], 'effort'))
+    return Command(seconds(message.header.stamp), _of(message, 'position', JOINTS),
+                   _of(message, 'effort', ROTORS))
 
 
-take_command = _take_finite(read_command, tilt='tilt', thrust='thrust')
+def take_command(message: Any) -> Command:
+    """Read four tilts and four thrusts for flight."""
+    command = read_command(message)
+    finite(command.tilt, 'tilt')
+    finite(command.thrust, 'thrust')
+    return command
 
 
-def write_command(factory: MessageFactory, value: Command) -> Any:
+def write_command(value: Command) -> Any:
     """Write tilts as positions and thrusts as efforts, NaN for unused values."""
-    message = _begin(factory, 'sensor_msgs/msg/JointState', value.stamp)
+    message = _begin(JOINT_STATE, value.stamp)
     message.name = COMMAND_NAMES
-    message.position = factory.doubles([*_floats(value.tilt), *NO_VALUE])
-    message.effort = factory.doubles([*NO_VALUE, *_floats(value.thrust)])
+    message.position = np.array([*map(float, value.tilt), *NO_VALUE])
+    message.effort = np.array([*NO_VALUE, *map(float, value.thrust)])
     return message
 
 
@@ -358,7 +341,7 @@ def read_health(message: Any) -> HealthReport:
         thrust_limit=None if isnan(message.effort[8]) else float(message.effort[8])))
 
 
-def write_health(factory: MessageFactory, value: HealthReport) -> Any:
+def write_health(value: HealthReport) -> Any:
     """
     Write the health of the actuators.
 
@@ -371,127 +354,77 @@ def write_health(factory: MessageFactory, value: HealthReport) -> Any:
     stuck = [np.nan if angle is None else float(angle) for angle in health.stuck]
     efforts = [0.0 if not works else np.nan if held is None else float(held)
                for works, held in zip(health.rotors, health.held)]
-    message = _begin(factory, 'sensor_msgs/msg/JointState', value.stamp)
+    message = _begin(JOINT_STATE, value.stamp)
     message.name = HEALTH_NAMES
-    message.position = factory.doubles([*stuck, *NO_VALUE, *map(float, health.zeros)])
+    message.position = np.array([*stuck, *NO_VALUE, *map(float, health.zeros)])
     limit = np.nan if health.thrust_limit is None else float(health.thrust_limit)
-    message.effort = factory.doubles([*NO_VALUE, *efforts, *[limit] * 4])
+    message.effort = np.array([*NO_VALUE, *efforts, *[limit] * 4])
     return message
 
 
-def read_wrench(message: Any) -> Wrench:
-    """Read force in world and torque in base_link; ignores the frame_id."""
-    return Wrench(seconds(message.header.stamp), xyz(message.wrench.force),
-                  xyz(message.wrench.torque))
-
-
-take_wrench = _take_finite(read_wrench, force='force', torque='torque')
-
-
-def write_wrench(factory: MessageFactory, value: Wrench) -> Any:
-    """Write force in world and torque in base_link."""
-    message = _begin(factory, 'geometry_msgs/msg/WrenchStamped', value.stamp, WORLD)
-    set_xyz(message.wrench.force, value.force)
-    set_xyz(message.wrench.torque, value.torque)
-    return message
-
-
-# --- targets ------------------------------------------------------------------------------------
-
-def read_pose_target(message: Any) -> PoseTarget:
-    """Read a pose target, with a wide tolerance of the quaternion's length."""
-    return PoseTarget(xyz(message.pose.position), unit(xyzw(message.pose.orientation), 0.5, 2.0),
-                      seconds(message.header.stamp))
-
-
-def take_pose_target(message: Any) -> PoseTarget:
-    """Read a pose target for flight; MessageError for another frame than world."""
-    position = finite(xyz(message.pose.position), 'position')
-    quaternion = unit(xyzw(message.pose.orientation))
-    _check_frame(message)
-    return PoseTarget(position, quaternion, seconds(message.header.stamp))
-
-
-def _check_frame(message):
-    if message.header.frame_id not in ('', WORLD):
-        raise MessageError(f"frame_id '{message.header.frame_id[:40]}' is not '{WORLD}'",
-                           'wrong frame')
-
-
-def read_trajectory(message: Any) -> TrajectoryTarget:
-    """Read a trajectory; the times of the points count from the header's stamp."""
-    start, points = seconds(message.header.stamp), message.points
-    if not points or any(len(p.transforms) != 1 or len(p.velocities) != 1 for p in points):
-        raise MessageError('each trajectory point needs one transform and one velocity')
-    return TrajectoryTarget(
-        start + np.array([seconds(p.time_from_start) for p in points]),
-        np.array([xyz(p.transforms[0].translation) for p in points]),
-        np.array([xyzw(p.transforms[0].rotation) for p in points]),
-        np.array([xyz(p.velocities[0].linear) for p in points]),
-        np.array([xyz(p.velocities[0].angular) for p in points]), stamp=start)
-
+# --- trajectories -------------------------------------------------------------------------------
 
 def take_trajectory(message: Any) -> TrajectoryTarget:
-    """Read a trajectory for flight; MessageError for another frame than world."""
-    if not 2 <= len(message.points) <= POINTS:
-        raise MessageError(f'a trajectory of {len(message.points)} points: expected 2 to {POINTS}',
+    """Read a trajectory in world; the times of the points count from the header's stamp."""
+    start, points = seconds(message.header.stamp), message.points
+    if not 2 <= len(points) <= POINTS:
+        raise MessageError(f'a trajectory of {len(points)} points: expected 2 to {POINTS}',
                            'too few or too many points')
+    if any(len(p.transforms) != 1 or len(p.velocities) != 1 for p in points):
+        raise MessageError('each trajectory point needs one transform and one velocity')
     _check_frame(message)
-    path = read_trajectory(message)
+    path = TrajectoryTarget(
+        start + np.array([seconds(p.time_from_start) for p in points]),
+        np.array([xyz(p.transforms[0].translation) for p in points]),
+        np.array([unit(xyzw(p.transforms[0].rotation)) for p in points]),
+        np.array([xyz(p.velocities[0].linear) for p in points]),
+        np.array([xyz(p.velocities[0].angular) for p in points]), stamp=start)
     if np.any(np.diff(path.times) <= 0):
         raise MessageError('trajectory times do not increase')
     finite(path.positions, 'translation')
     finite(path.velocities, 'velocity')
     finite(path.angular_velocities, 'angular velocity')
-    return TrajectoryTarget(path.times, path.positions,
-                            np.array([unit(q) for q in path.quaternions]), path.velocities,
-                            path.angular_velocities, path.stamp)
+    return path
 
 
-def write_trajectory(factory: MessageFactory, value: TrajectoryTarget) -> Any:
+def write_trajectory(value: TrajectoryTarget) -> Any:
     """Write a trajectory; angular velocities are in the body frame of the reference."""
-    message = _begin(factory, 'trajectory_msgs/msg/MultiDOFJointTrajectory', value.stamp, WORLD)
+    message = _begin(TRAJECTORY, value.stamp, WORLD)
     message.joint_names = [BODY]
-    message.points = [_point(factory, value, k) for k in range(len(value.times))]
+    for k, time in enumerate(value.times):
+        point = new('trajectory_msgs/msg/MultiDOFJointTrajectoryPoint')
+        transform = new('geometry_msgs/msg/Transform')
+        twist = new('geometry_msgs/msg/Twist')
+        set_parts(transform.translation, value.positions[k])
+        set_parts(transform.rotation, value.quaternions[k])
+        set_parts(twist.linear, value.velocities[k])
+        set_parts(twist.angular, value.angular_velocities[k])
+        point.transforms, point.velocities = [transform], [twist]
+        set_time(point.time_from_start, time - value.stamp)
+        message.points.append(point)
     return message
-
-
-def _point(factory, path, k):
-    point = factory.new('trajectory_msgs/msg/MultiDOFJointTrajectoryPoint')
-    transform = factory.new('geometry_msgs/msg/Transform')
-    twist = factory.new('geometry_msgs/msg/Twist')
-    set_xyz(transform.translation, path.positions[k])
-    set_xyzw(transform.rotation, path.quaternions[k])
-    set_xyz(twist.linear, path.velocities[k])
-    set_xyz(twist.angular, path.angular_velocities[k])
-    point.transforms, point.velocities = [transform], [twist]
-    offset = point.time_from_start
-    offset.sec, offset.nanosec = divmod(nanoseconds(path.times[k] - path.stamp), 1_000_000_000)
-    return point
 
 
 def take_override(message: Any) -> TargetOverride:
     """Read the supervisor's target; None for a message without points."""
     return TargetOverride(seconds(message.header.stamp),
-                take_trajectory(message) if message.points else None)
+                          take_trajectory(message) if message.points else None)
 
 
-def write_override(factory: MessageFactory, value: TargetOverride) -> Any:
+def write_override(value: TargetOverride) -> Any:
     """Write the supervisor's target; a message without points for None."""
-    return factory.new('trajectory_msgs/msg/MultiDOFJointTrajectory') if value.target is None \
-        else write_trajectory(factory, value.target)
+    return new(TRAJECTORY) if value.target is None \
+        else write_trajectory(value.target)
 
 
 # --- text ---------------------------------------------------------------------------------------
 
-def read_text(message: Any) -> str:
-    """Read a text."""
-    return message.data
+read_text: Callable[[Any], str] = attrgetter('data')
 
 
-def write_text(factory: MessageFactory, value: str) -> Any:
+def write_text(value: str) -> Any:
     """Write a text."""
-    message = factory.new('std_msgs/msg/String')
+    message = new('std_msgs/msg/String')
     message.data = value
     return message
 
@@ -505,17 +438,16 @@ def read_diagnostics(message: Any) -> list[Diagnostic]:
             for status in message.status]
 
 
-def write_diagnostics(factory: MessageFactory, value: Sequence[Diagnostic]) -> Any:
+def write_diagnostics(value: Sequence[Diagnostic]) -> Any:
     """Write statuses into one message with the stamp of the first."""
-    message = _begin(factory, 'diagnostic_msgs/msg/DiagnosticArray', value[0].t)
+    message = _begin('diagnostic_msgs/msg/DiagnosticArray', value[0].t)
     for entry in value:
-        status = factory.new('diagnostic_msgs/msg/DiagnosticStatus')
-        status.level, status.name = factory.byte(entry.level), entry.name
+        status = new('diagnostic_msgs/msg/DiagnosticStatus')
+        status.level, status.name = int(entry.level), entry.name
         status.message, status.hardware_id = entry.message, 'beetle_omni'
         for key, text in entry.values.items():
-            pair = factory.new('diagnostic_msgs/msg/KeyValue')
+            pair = new('diagnostic_msgs/msg/KeyValue')
             pair.key, pair.value = str(key), str(text)
             status.values.append(pair)
         message.status.append(status)
     return message
-

@@ -11,16 +11,10 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
+from beetle_omni_ros.control.base import Command, TrajectoryTarget
 from beetle_omni_ros.messages import conversions as c
-from beetle_omni_ros.messages.values import Diagnostic, HealthReport, Odom, TargetOverride, Wrench
-from beetle_omni_ros.robot.readings import (
-    BatteryReading,
-    ImuReading,
-    JointReading,
-    PoseReading,
-    RotorReading,
-)
+from beetle_omni_ros.messages.values import Diagnostic, HealthReport, TargetOverride
+from beetle_omni_ros.robot.readings import JointReading, RotorReading
 
 
 class Qos(NamedTuple):
@@ -54,7 +48,7 @@ class Topic:
         qos: quality of service that its publisher offers.
         value: class of its values.
         read: message -> value; MessageError for another layout.
-        write: (message factory, value) -> message.
+        write: value -> message.
         meaning: description for the reference page.
         take: message -> value for use in flight; MessageError for unusable values. Default: read.
         required: whether a bag without it gets a warning.
@@ -67,7 +61,7 @@ class Topic:
     qos: Qos
     value: type
     read: Callable[[Any], Any]
-    write: Callable[[c.MessageFactory, Any], Any]
+    write: Callable[[Any], Any]
     meaning: str
     take: Callable[[Any], Any] | None = None
     required: bool = False
@@ -78,8 +72,11 @@ class Topic:
             object.__setattr__(self, 'take', self.read)
 
 
-POSE, JOINT_STATE = 'geometry_msgs/msg/PoseStamped', 'sensor_msgs/msg/JointState'
-TRAJECTORY = 'trajectory_msgs/msg/MultiDOFJointTrajectory'
+def _vectors(name, vectors, qos, meaning, **more):
+    """Topic of a message of vectors."""
+    return Topic(name, vectors.type, qos, vectors.value, **{
+        'read': vectors.read, 'take': vectors.take, 'write': vectors.write,
+        'meaning': meaning, **more})
 
 
 def _text(name, meaning, in_flight=False):
@@ -89,45 +86,44 @@ def _text(name, meaning, in_flight=False):
 
 def command_topic(controller: str) -> Topic:
     """Return the command topic of a controller."""
-    return Topic(f'{controller}/command', JOINT_STATE, COMMAND, Command, c.read_command,
+    return Topic(f'{controller}/command', c.JOINT_STATE, COMMAND, Command, c.read_command,
                  c.write_command, 'command of a controller, before the supervisor',
                  c.take_command)
 
 
 TABLE = (
-    Topic('mocap/pose', POSE, SENSOR, PoseReading, c.read_pose, c.write_pose,
-          'pose of base_link in world, stamped at capture, 100 Hz', c.take_pose, required=True),
-    Topic('imu/data_raw', 'sensor_msgs/msg/Imu', SENSOR, ImuReading, c.read_imu, c.write_imu,
-          'specific force and angular rate in base_link, without orientation (REP-145), 200 Hz',
-          c.take_imu, required=True),
-    Topic('joint_states', JOINT_STATE, SENSOR, JointReading, c.read_joints, c.write_joints,
+    _vectors('mocap/pose', c.POSE, SENSOR,
+             'pose of base_link in world, stamped at capture, 100 Hz', required=True),
+    _vectors('imu/data_raw', c.IMU, SENSOR, 'specific force and angular rate in base_link, '
+             'without orientation (REP-145), 200 Hz', write=c.write_imu, required=True),
+    Topic('joint_states', c.JOINT_STATE, SENSOR, JointReading, c.read_joints, c.write_joints,
           'position, velocity and effort of `gimbal1..4`', c.take_joints, required=True),
-    Topic('battery_state', 'sensor_msgs/msg/BatteryState', SENSOR, BatteryReading, c.read_battery,
-          c.write_battery, 'pack voltage and current, negative when discharging', c.take_battery),
-    Topic('rotor_states', JOINT_STATE, SENSOR, RotorReading, c.read_rotors, c.write_rotors,
+    _vectors('battery_state', c.BATTERY, SENSOR,
+             'pack voltage and current, negative when discharging', take=c.take_battery,
+             write=c.write_battery),
+    Topic('rotor_states', c.JOINT_STATE, SENSOR, RotorReading, c.read_rotors, c.write_rotors,
           '`velocity` of `rotor1..4` [rad/s], positive for both spins, NaN where unknown',
           in_flight=False),
-    Topic('odom', 'nav_msgs/msg/Odometry', ESTIMATE, Odom, c.read_odom, c.write_odom,
-          'estimate: pose in world, twist in base_link, both covariances', c.take_odom,
-          required=True),
-    Topic('target_pose', POSE, LATCHED, PoseTarget, c.read_pose_target, c.write_pose,
-          'target pose in world; `reference_node` or a user publishes it', c.take_pose_target,
-          required=True),
-    Topic('target_trajectory', TRAJECTORY, LATCHED, TrajectoryTarget, c.read_trajectory,
+    _vectors('odom', c.ODOM, ESTIMATE,
+             'estimate: pose in world, twist in base_link, both covariances', read=c.read_odom,
+             take=c.take_odom, write=c.write_odom, required=True),
+    _vectors('target_pose', c.POSE_TARGET, LATCHED,
+             'target pose in world; `reference_node` or a user publishes it',
+             read=c.take_pose_target, take=None, required=True),
+    Topic('target_trajectory', c.TRAJECTORY, LATCHED, TrajectoryTarget, c.take_trajectory,
           c.write_trajectory,
-          'time-parameterised reference; `reference_node` or a user publishes it',
-          c.take_trajectory),
+          'time-parameterised reference; `reference_node` or a user publishes it'),
     *map(command_topic, registry.standing_by()),      # topic_of() makes those of other controllers
-    Topic('command', JOINT_STATE, COMMAND, Command, c.read_command, c.write_command,
+    Topic('command', c.JOINT_STATE, COMMAND, Command, c.read_command, c.write_command,
           'selected and checked command, which the actuators execute', c.take_command,
           required=True),
     _text('supervisor/identity',
           'identity of the supervisor; the actuators execute commands with this identity only'),
-    Topic('supervisor/target', TRAJECTORY, LATCHED, TargetOverride, c.take_override,
+    Topic('supervisor/target', c.TRAJECTORY, LATCHED, TargetOverride, c.take_override,
           c.write_override,
           'target of the supervisor, which replaces that of the operator; without points: no '
           'replacement', in_flight=False),
-    Topic('supervisor/actuators', JOINT_STATE, LATCHED, HealthReport, c.read_health,
+    Topic('supervisor/actuators', c.JOINT_STATE, LATCHED, HealthReport, c.read_health,
           c.write_health,
           'health of `gimbal1..4` and `rotor1..4`, and `gimbal1_zero..4_zero`: `position` is the '
           'true angle of a stuck joint (NaN: the joint moves), or the zero of an encoder that '
@@ -137,11 +133,11 @@ TABLE = (
           'or `aborted` if the flight ended before the task'),
     _text('joint_bridge/state', '`ready`, `waiting: WHY` or `lost: WHY`'),
     _text('rotor_bridge/state', '`ready`, `waiting: WHY`, `silent: WHY` or `lost: WHY`'),
-    Topic('ground_truth/odom', 'nav_msgs/msg/Odometry', ESTIMATE, Odom, c.read_odom, c.write_odom,
-          'true state of the simulated robot', c.take_odom),
-    Topic('disturbance', 'geometry_msgs/msg/WrenchStamped', EVENT, Wrench, c.read_wrench,
-          c.write_wrench, 'external wrench on the simulated robot until the next message: force '
-          'in world, torque in base_link; a user or an experiment publishes it', c.take_wrench),
+    _vectors('ground_truth/odom', c.ODOM, ESTIMATE, 'true state of the simulated robot',
+             read=c.read_odom, take=c.take_odom, write=c.write_odom),
+    _vectors('disturbance', c.WRENCH, EVENT, 'external wrench on the simulated robot until the '
+             'next message: force in world, torque in base_link; a user or an experiment '
+             'publishes it'),
     _text('supervisor/state', 'state, a colon, and the active controller or the last fault',
           in_flight=True),
     Topic('diagnostics', 'diagnostic_msgs/msg/DiagnosticArray', EVENT, Diagnostic,

@@ -1,6 +1,7 @@
 """`beetle_omni drive`: targets from the keyboard, a joystick or lines of text."""
 
 from contextlib import contextmanager, ExitStack, nullcontext
+from functools import partial
 import os
 from pathlib import Path
 import select
@@ -61,13 +62,10 @@ class Driver(Operator):
         self.steering: Steering | None = None
         self.axes, self.buttons, self.joy_at = (), (), -np.inf
         node = self._node
-        wire.subscribe(node, 'odom', self._on_odom, qos=SENSOR)
+        wire.subscribe(node, 'odom', partial(setattr, self, 'odom'), qos=SENSOR)
         node.create_subscription(Joy, 'joy', self._on_joy, wire.profile(SENSOR))
         self._targets = wire.Publisher(node, 'target_pose')
         self._sent = None
-
-    def _on_odom(self, odom):
-        self.odom = odom
 
     def _on_joy(self, message):
         self.axes, self.buttons, self.joy_at = message.axes, message.buttons, self.time()
@@ -104,36 +102,30 @@ class Driver(Operator):
 
     def execute(self, action: Shift | Go | Order) -> str:
         """Execute an action; return the text for the user."""
-        if isinstance(action, Order):
-            return self._order(action)
-        if self.steering is None:
-            return f"nothing flies (supervisor in '{self.state or 'unknown'}'); arm first"
-        if isinstance(action, Shift):
-            return self.steering.shift(action.way, action.turn)
-        quaternion = self.steering.goal[1] if action.quaternion is None else action.quaternion
-        return self.steering.go(action.position, quaternion)
-
-    def _order(self, order):
-        if order.name in ('arm', 'land', 'emergency_stop'):
-            accepted, answer = self.call(order.name)
-            return f"{order.name}: {answer or ('done' if accepted else 'refused')}"
-        if order.name == 'controller':
-            name = order.value or self._other()
-            accepted, answer = self.set('supervisor_node', 'controller', name)
-            return f'controller {name}' if accepted else f'controller {name}: {answer}'
-        if order.name == 'where':
+        name, value = action if isinstance(action, Order) else ('', '')
+        if name in ('arm', 'land', 'emergency_stop'):
+            accepted, answer = self.call(name)
+            return f"{name}: {answer or ('done' if accepted else 'refused')}"
+        if name == 'controller':
+            names, now = list(registry.standing_by()), self.state.partition(':')[2]
+            other = names[(names.index(now) + 1) % len(names)] if now in names else names[0]
+            accepted, answer = self.set('supervisor_node', 'controller', value or other)
+            return f'controller {value or other}' + ('' if accepted else f': {answer}')
+        if name == 'where':
             return self.where()
         if self.steering is None:
             return f"nothing flies (supervisor in '{self.state or 'unknown'}'); arm first"
-        if order.name == 'hold':
+        position, quaternion = self.steering.goal
+        if isinstance(action, Shift):
+            return self.steering.shift(action.way, action.turn)
+        if isinstance(action, Go):
+            return self.steering.go(action.position, quaternion if action.quaternion is None
+                                    else action.quaternion)
+        if name == 'hold':
             self.steering.hold()
             return ''
-        yaw = rotations.to_rpy(self.steering.goal[1])[2]        # level
-        return self.steering.go(self.steering.goal[0], rotations.from_rpy(0.0, 0.0, yaw))
-
-    def _other(self):
-        names, now = list(registry.standing_by()), self.state.partition(':')[2]
-        return names[(names.index(now) + 1) % len(names)] if now in names else names[0]
+        level = rotations.from_rpy(0.0, 0.0, rotations.to_rpy(quaternion)[2])
+        return self.steering.go(position, level)
 
     def where(self) -> str:
         """Return state, pose of the robot and of its target in one line."""
@@ -205,6 +197,13 @@ def run_drive(source: str, *, parameters: Path | None = None, poses: Path | None
     return OK
 
 
+def _typed(size=4096) -> str | None:
+    """Return what was typed since the last call, '' at the end of the input, or None."""
+    if not select.select([sys.stdin], [], [], 0)[0]:
+        return None
+    return os.read(sys.stdin.fileno(), size).decode(errors='replace')
+
+
 class _Keyboard:
     """Actions from single keys of a terminal."""
 
@@ -225,19 +224,17 @@ class _Keyboard:
 
     def actions(self, seconds):
         """Return the actions of the keys since the last call."""
-        found = []
-        while select.select([sys.stdin], [], [], 0)[0]:
-            for key in os.read(sys.stdin.fileno(), 64).decode(errors='replace') or 'q':
-                shift, word = drive.shift_of_key(key, self._p), drive.KEY_WORDS.get(key)
-                if word == 'quit':
-                    self.done = True
-                    return found
-                if shift:
-                    found.append(Shift(*shift))
-                elif word in self._poses:
-                    found.append(drive.parse(word, self._poses))
-                elif word:
-                    found.append(Order(word))
+        found, typed = [], _typed(64)
+        for key in 'q' if typed == '' else typed or '':
+            shift, word = drive.shift_of_key(key, self._p), drive.KEY_WORDS.get(key)
+            if word == 'quit':
+                self.done = True
+                break
+            if shift:
+                found.append(Shift(*shift))
+            elif word:
+                found.append(drive.parse(word, self._poses) if word in self._poses
+                             else Order(word))
         return found
 
 
@@ -265,60 +262,46 @@ class _Joystick:
 
 
 class _Terminal:
-    """Actions from lines of standard input; at its end the last one is carried out."""
+    """Actions from lines of standard input; its end acts as `wait` and `quit`."""
 
     help = f'{drive.HELP}, or the name of a pose'
     open = staticmethod(nullcontext)
 
     def __init__(self, driver, p, poses, say):
         self._driver, self._poses, self._say = driver, poses, say
-        self._rest, self._ended, self.done = '', False, False
-        self._until = self._begin = None
+        self._text, self._ended, self.done = '', False, False
+        self._waits = None      # returns whether `wait` is not over; None without one
 
     def actions(self, seconds):
         """Return the actions of the next lines, up to the next `wait`."""
         found = []
-        while not self._waits() and not self.done:
-            line = self._line()
-            if line is None:
+        while not self.done and not (self._waits and self._waits()):
+            self._waits = None
+            if '\n' not in self._text and not self._ended and (read := _typed()) is not None:
+                self._ended = not read
+                self._text += read or '\nwait\nquit\n'
+            if '\n' not in self._text:
                 break
+            line, _, self._text = self._text.partition('\n')
             try:
                 action = drive.parse(line, self._poses)
             except WordError as error:
                 self._say(str(error))
                 continue
-            if isinstance(action, Order) and action.name == 'quit':
+            name = action.name if isinstance(action, Order) else ''
+            if name == 'quit':
                 self.done = True
-            elif isinstance(action, Order) and action.name == 'help':
+            elif name == 'help':
                 self._say(f"{self.help}: {', '.join(self._poses)}")
-            elif isinstance(action, Order) and action.name == 'wait':
-                self._begin = self._driver.time()
-                self._until = float(action.value) if action.value else None
+            elif name == 'wait':
+                self._waits = partial(self._is_waiting, self._driver.time(),
+                                      float(action.value) if action.value else None)
             elif action is not None:
                 found.append(action)
         return found
 
-    def _waits(self):
-        if self._begin is None:
-            return False
-        passed = self._driver.time() - self._begin
-        if self._until is None:
-            over = passed > SETTLE_TIME and self._driver.at_goal
-        else:
-            over = passed >= self._until
-        if over:
-            self._begin = None
-        return not over
-
-    def _line(self):
-        """Next complete line, or None; the end of the input acts as `wait` and `quit`."""
-        while '\n' not in self._rest and not self._ended \
-                and select.select([sys.stdin], [], [], 0)[0]:
-            read = os.read(sys.stdin.fileno(), 4096).decode(errors='replace')
-            self._ended = not read
-            self._rest += read or '\nwait\nquit\n'
-        line, newline, rest = self._rest.partition('\n')
-        if not newline:
-            return None
-        self._rest = rest
-        return line
+    def _is_waiting(self, begin, seconds):
+        passed = self._driver.time() - begin
+        if seconds is None:
+            return passed <= SETTLE_TIME or not self._driver.at_goal
+        return passed < seconds

@@ -1,10 +1,7 @@
 """`beetle_omni fly`: fly the ROS graph, record a bag, and print the results from the bag."""
 
-from collections.abc import Sequence
 from contextlib import contextmanager, ExitStack
-from dataclasses import replace
 from pathlib import Path
-import shutil
 import signal
 import subprocess
 import sys
@@ -22,7 +19,6 @@ from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.nodes import runner
 from beetle_omni_ros.nodes.graph import (
-    ACTUATORS,
     BRIDGES,
     child_environment,
     confine,
@@ -33,7 +29,6 @@ from beetle_omni_ros.nodes.graph import (
 )
 from beetle_omni_ros.nodes.node import ERROR
 from beetle_omni_ros.nodes.operator import Operator
-from beetle_omni_ros.nodes.runner import signals_ignored, sigterm_as_interrupt
 from beetle_omni_ros.robot.parameters import find_robot, RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError, RunError
 from beetle_omni_ros.runs import table
@@ -48,7 +43,7 @@ from beetle_omni_ros.sim.simulator import Simulator
 
 INTERRUPTED = 130
 VIEWER_STOP_TIMEOUT = 3.0       # s
-CLOCKS = {'auto': ('system', 'simulated'), 'system': ('system',), 'simulated': ('simulated',)}
+ACTUATORS, CLOCKS = ('emulated', 'direct'), ('auto', 'system', 'simulated')
 
 READY_TIMEOUT = 300.0   # s; the first start compiles the controller
 BRIDGES_TIMEOUT = 20.0  # s; the simulator makes their devices at its start
@@ -61,25 +56,18 @@ SPARE_TIME = 10.0       # s beyond the task's duration before a flight counts as
 CHECK_PERIOD = 0.1      # s between checks of processes and progress
 ON_GROUND = ('disarmed', 'emergency_stop')
 
-MAX_LOAD = 0.9          # part of a core that the composed nodes may need
+MAX_LOAD = 0.9          # part of a core that the composed nodes may need in real time
 PROBED = 1.0            # s of simulated time
-PER_NODE = 1.8          # CPU of a node relative to plant and estimator: seven nodes needed 12.8
-                        # times as much, six 11.9 times, on two busy cores of a Xeon
-WATCH_TIME = 2.0        # s before arming in which the simulator is checked for real time
-LOST_TIME = 0.2         # s that the simulator may lose in this time
+# CPU of the seven nodes relative to plant and estimator, on two busy cores of a Xeon.
+RELATIVE_LOAD = 12.8
 # s lost by the simulator above which a failure is attributed to the slow computer: the actuators
 # stop after so long without a command.
 SLOW_TIME = 0.1
-PAUSED = 'supervisor_paused'
 PACING = 'sim_node: pacing'
 # bridge -> (name of its status in diagnostics, prefix of the keys of a flight's measurements)
 MEASURED = {
     'joint_bridge_node': ('bus', 'servos'), 'rotor_bridge_node': ('board', 'motor_board')}
 QUANTILES = ('median_ms', 'p99_ms', 'max_ms')
-
-
-class TooSlowError(RunError):
-    """The computer is too slow to fly this flight in real time."""
 
 
 def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
@@ -109,7 +97,7 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
                                  'other; expected LOCALHOST, SUBNET or SYSTEM_DEFAULT')
         confine(requested=discovery)
         with ExitStack() as stack:
-            stack.enter_context(sigterm_as_interrupt())
+            stack.enter_context(runner.sigterm_as_interrupt())
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix='beetle_omni_')))
             bag = Path(bag).absolute() if bag else folder / 'bag'
             check_new(bag)
@@ -118,17 +106,17 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
                 RobotParameters.load(robot)))
             RobotParameters.load(plant or robot)
             injected = listed.load_faults(faults) if faults else []
-            actuators = _actuators_for(injected, actuators)
-            clocks = _clocks(clock, actuators)
-            options = GraphOptions(
+            actuators, clock = _actuators_and_clock(injected, actuators, clock, composed, console)
+            planned = plan(GraphOptions(
                 controller=controller, nmpc=_absolute(nmpc), policy=str(policy or ''),
                 standby=standby, allow_other_robot=allow_other_robot,
                 robot_file=_absolute(robot and find_robot(robot)),
                 plant_file=_absolute(plant and find_robot(plant)),
                 conditions=conditions, seed=int(seed),
                 task=_absolute(task) if Path(task).is_file() else str(task), bag=str(bag),
-                compression=compression, actuators='direct', ports=str(folder))
-            for name, reason in plan(options).left_out.items():
+                compression=compression, ports=str(folder), clock=clock,
+                actuators='bridges' if actuators == 'emulated' else 'direct'))
+            for name, reason in planned.left_out.items():
                 _print(console, f'{name} does not stand by: {reason}')
             controller = registry.find(controller).name
             number = stack.enter_context(reserved_domain()) if domain_id is None else domain_id
@@ -137,11 +125,17 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             meta = {'task': task, 'conditions': conditions, 'seed': seed,
                     'robot': str(robot) if robot else 'params/robot.yaml',
                     'plant': str(plant) if plant else None, 'version': __version__,
-                    'controller': controller, 'composed': composed}
+                    'controller': controller, 'composed': composed, 'clock': clock,
+                    'actuators': actuators}
             if injected:
                 meta['faults'] = [str(fault) for fault in injected]
-            status = _attempt(clocks, actuators, options, meta, folder, number, flown_task,
-                              listed.text(injected), console)
+            graph = Graph(planned.nodes, folder, number, composed)
+            try:
+                status = _fly(graph, controller, flown_task, meta, console, listed.text(injected))
+            except KeyboardInterrupt:
+                if (bag / 'metadata.yaml').exists():
+                    add_meta(bag, {**meta, 'interrupted': True})
+                raise
             if not bag.exists():
                 return status or runner.FAILED
             return max(status, _report(bag, controller, flown_task, meta, json_path, console))
@@ -153,14 +147,18 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
         return INTERRUPTED
 
 
-def _actuators_for(faults, actuators):
+def _actuators_and_clock(faults, actuators, clock, composed, console):
     """
-    Return the kind of actuators for a flight with these faults.
+    Choose what the user left open: devices need real time, real time a fast computer.
 
     Raises:
-        ParameterError: a fault that the simulator cannot make with these actuators.
+        ParameterError: unknown values, or faults that the simulator cannot make so.
 
     """
+    for key, value, known in (('actuators', actuators, (None, *ACTUATORS)),
+                              ('clock', clock, CLOCKS)):
+        if value not in known:
+            raise ParameterError(f"{key} '{value}': expected {' or '.join(filter(None, known))}")
     for fault in faults:
         if fault.is_process:
             raise ParameterError(f"--faults: '{fault.kind}' affects a process; expected a fault "
@@ -170,55 +168,26 @@ def _actuators_for(faults, actuators):
                 raise ParameterError(f"--faults: '{fault.kind}' affects a device; expected "
                                      '--actuators direct')
             actuators = 'direct'
-    return actuators
-
-
-def _clocks(clock, actuators):
-    """Clocks to try in turn, until the computer is fast enough."""
-    for key, value, known in (('actuators', actuators, (None, *ACTUATORS)),
-                              ('clock', clock, CLOCKS)):
-        if value not in known:
-            raise ParameterError(f"{key} '{value}': expected {' or '.join(filter(None, known))}")
     if clock == 'simulated' and actuators == 'emulated':
         raise ParameterError("actuators 'emulated': serial devices keep real time; expected "
                              "direct with clock 'simulated'")
-    return CLOCKS['system' if actuators == 'emulated' else clock]
+    if clock == 'auto':
+        clock = 'system'
+        if composed and actuators != 'emulated' and (load := needed_load()) > MAX_LOAD:
+            _print(console, 'this computer is too slow for real time: the nodes would need '
+                   f'{load:.0%} of a core; it flies in simulated time, which waits for the '
+                   'nodes, and without serial devices')
+            clock = 'simulated'
+    return actuators or ('direct' if clock == 'simulated' else 'emulated'), clock
 
 
 def _absolute(path):
     return str(Path(path).absolute()) if path else ''
 
 
-def _attempt(clocks, actuators, options, meta, folder, number, task, faults, console) -> int:
-    """Fly by the first clock that the computer is fast enough for; extends ``meta``."""
-    bag = Path(options.bag)
-    for kind in clocks:
-        meta |= {'clock': kind, 'actuators': actuators or (
-            'direct' if kind == 'simulated' else 'emulated')}
-        nodes = plan(replace(options, clock=kind, actuators='bridges' if meta[
-            'actuators'] == 'emulated' else 'direct')).nodes
-        graph, last = Graph(nodes, folder, number, meta['composed']), kind == clocks[-1]
-        try:
-            if graph.composed and not last and (load := needed_load(graph.nodes)) > MAX_LOAD:
-                raise TooSlowError(f'the nodes would need {load:.0%} of a core')
-            return _fly(graph, meta['controller'], task, meta, console, faults, may_be_slow=last)
-        except TooSlowError as error:
-            _print(console, f'this computer is too slow for real time: {error}; it flies in '
-                   'simulated time, which waits for the nodes, and without serial devices')
-            shutil.rmtree(bag, ignore_errors=True)
-            for log in folder.glob('*.log'):
-                log.unlink()
-        except KeyboardInterrupt:
-            with signals_ignored():
-                if (bag / 'metadata.yaml').exists():
-                    add_meta(bag, {**meta, 'interrupted': True})
-            raise
-    return runner.FAILED
-
-
-def needed_load(nodes: Sequence[str]) -> float:
+def needed_load() -> float:
     """
-    Predict the CPU of composed nodes without bridges, as a part of a core.
+    Predict the CPU of a composed graph without bridges, as a part of a core.
 
     Plant and estimator run in this process for a simulated second. The nodes do the same work and
     move its messages, mostly in Python, too. So their CPU time is a multiple of it on any
@@ -236,7 +205,7 @@ def needed_load(nodes: Sequence[str]) -> float:
         if frame.imu is not None:
             estimator.imu(frame.imu)
         used.append(time.thread_time() - begin)
-    return PER_NODE * len(set(nodes) - set(BRIDGES)) * float(np.median(used)) / simulator.tick
+    return RELATIVE_LOAD * float(np.median(used)) / simulator.tick
 
 
 @contextmanager
@@ -271,7 +240,7 @@ def _complain(error):
 
 
 def _fly(graph: Graph, controller: str, task: Task, meta: dict, console: Console,
-         faults: str, may_be_slow: bool) -> int:
+         faults: str) -> int:
     failure, operator = '', None
     try:
         graph.start()
@@ -279,11 +248,9 @@ def _fly(graph: Graph, controller: str, task: Task, meta: dict, console: Console
         columns = (TextColumn('{task.description}'), BarColumn(),
                    TextColumn('{task.fields[at]}'), TimeElapsedColumn())
         with Progress(*columns, console=console, transient=True) as bars:
-            flight = Flight(graph, operator, task, bars, may_be_slow, faults)
+            flight = Flight(graph, operator, task, bars, faults)
             try:
                 flight.fly()
-            except TooSlowError:
-                raise
             except RunError as error:
                 _complain(error)
                 failure = str(error)
@@ -294,10 +261,9 @@ def _fly(graph: Graph, controller: str, task: Task, meta: dict, console: Console
         operator.report('fly: graph', 'CPU of all nodes, latency of commands', flight.measured)
         operator.spin(0.2)
     finally:
-        with signals_ignored():
-            stubborn = graph.stop()
-            if operator:
-                operator.close()
+        stubborn = graph.stop()
+        if operator:
+            operator.close()
     for name in stubborn:
         _complain(f'{name} did not stop and was killed')
     for line in graph.warnings():
@@ -315,7 +281,6 @@ class Flight:
         operator: operator in the same ROS domain.
         task: task to fly.
         progress: display of the progress.
-        may_be_slow: fly even if the simulator does not keep real time.
         faults: value of sim_node's parameter ``faults`` from the task's start on.
 
     Attributes:
@@ -325,10 +290,10 @@ class Flight:
     """
 
     def __init__(self, graph: Graph, operator: Operator, task: Task, progress: Progress,
-                 may_be_slow: bool = True, faults: str = ''):
+                 faults: str = ''):
         self._graph, self._operator, self._task = graph, operator, task
         self._bridges = [node for node in graph.nodes if node in BRIDGES]
-        self._progress, self._faults, self._may_be_slow = progress, faults, may_be_slow
+        self._progress, self._faults = progress, faults
         self._bar = progress.add_task('', total=task.duration, at='')
         self._reported: set[str] = set()
         self.measured: dict[str, float] = {}
@@ -338,8 +303,7 @@ class Flight:
         Wait for the graph, take off and fly the task to its end.
 
         Raises:
-            TooSlowError: the simulator does not keep real time and ``may_be_slow`` is not set.
-            RunError: any other failure.
+            RunError: a failure; the text states whether the computer was too slow.
 
         """
         operator = self._operator
@@ -348,22 +312,15 @@ class Flight:
         self._await('actuators', lambda: not operator.waits_for(self._bridges), BRIDGES_TIMEOUT)
         self._await('watching the simulator', lambda: PACING in operator.diagnostics,
                     BRIDGES_TIMEOUT)
-        lost, begin = self._lost_time(), operator.time()
-        if not self._may_be_slow:
-            self._spin(WATCH_TIME)
-            if (late := self._lost_time() - lost) > LOST_TIME:
-                raise TooSlowError(f'the simulator fell {late:.1f} s behind in {WATCH_TIME:g} s')
+        lost = self._lost_time()
         try:
             self._take_off()
             self._fly_task()
         except RunError as error:
-            late, flown = self._lost_time() - lost, operator.time() - begin
-            paused = any(PAUSED in state for state in operator.states)
-            if late < SLOW_TIME and not paused:
+            if (late := self._lost_time() - lost) < SLOW_TIME:
                 raise
-            kind = RunError if self._may_be_slow else TooSlowError
-            raise kind(f'{error}; the simulator fell {late:.1f} s behind in {flown:.0f} s'
-                       + (', and supervisor_node was not scheduled' if paused else '')) from None
+            raise RunError(f'{error}; this computer was too slow, the simulator fell {late:.1f} s '
+                           'behind: try --clock simulated') from None
 
     def _lost_time(self):
         """Return the time that the simulator skipped because it was late [s]."""
@@ -390,28 +347,27 @@ class Flight:
         raise RunError(f'no take-off in {TAKEOFF_ATTEMPTS} attempts; see the warnings below')
 
     def _fly_task(self):
-        operator, graph, first = self._operator, self._graph, self._cycles()
-        cpu, bridges_cpu = graph.cpu_seconds(), graph.cpu_seconds(bridges=True)
-        start, steady = operator.time(), time.monotonic()
+        operator, graph = self._operator, self._graph
+        before, start, steady = self._counts(), operator.time(), time.monotonic()
         if self._faults:
             self._inject_faults()
         left = operator.countdown(self._task.duration + SPARE_TIME)
         while not operator.progress.startswith('done'):
             self._spin()
-            flown, passed = operator.time() - start, time.monotonic() - steady
-            self._show(f'{self._task.name} ({operator.state})', operator.progress, flown)
-            self.measured['cpu_percent'] = 100 * (graph.cpu_seconds() - cpu) / passed
-            if self._bridges:
-                self.measured['bridges_cpu_percent'] = \
-                    100 * (graph.cpu_seconds(bridges=True) - bridges_cpu) / passed
-            if graph.simulated:
-                self.measured['real_time_factor'] = flown / passed
+            self._show(f'{self._task.name} ({operator.state})', operator.progress,
+                       operator.time() - start)
             if operator.state in ON_GROUND:
                 raise RunError(f"the flight ended early, supervisor in '{operator.state}'")
             if next(left, None) is None:
                 raise RunError(f"the task does not continue at '{operator.progress}'")
-        if not graph.simulated:
-            self._take_latencies(first)
+        passed = time.monotonic() - steady
+        counts = {key: value - before.get(key, 0) for key, value in self._counts().items()}
+        self.measured = {key: 100 * value / passed if key.endswith('percent') else value
+                         for key, value in counts.items()}
+        if graph.simulated:
+            self.measured['real_time_factor'] = (operator.time() - start) / passed
+        else:
+            self._take_latencies()
 
     def _inject_faults(self):
         """Set the faults as the task begins, so that their times count from there."""
@@ -422,23 +378,25 @@ class Flight:
         if not accepted:
             raise RunError(f'sim_node refuses the faults: {answer}')
 
-    def _cycles(self):
-        """Counts of the bridges' cycles, from their diagnostics."""
-        return {f'{name}_{key}': int(value) for node, (status, name) in MEASURED.items()
-                for key, value in self._operator.values(f'{node}: {status}').items()
-                if key in ('cycles', 'missed_cycles')}
+    def _counts(self):
+        """CPU seconds so far, and counts of the bridges' cycles from their diagnostics."""
+        found = {'cpu_percent': self._graph.cpu_seconds()}
+        if self._bridges:
+            found['bridges_cpu_percent'] = self._graph.cpu_seconds(bridges=True)
+        for node, (status, name) in MEASURED.items():
+            values = self._operator.values(f'{node}: {status}')
+            found |= {f'{name}_{key}': int(values[key])
+                      for key in ('cycles', 'missed_cycles') if key in values}
+        return found
 
-    def _take_latencies(self, first):
-        """Add latencies, and cycles since ``first``; a bridge's begins with `command`."""
+    def _take_latencies(self):
+        """Add the latencies of the loop, and of each bridge from `command` on."""
         status, prefix = ('rotor_bridge_node', 'age_') if self._bridges else ('sim_node', '')
-        sources = [('latency', status, prefix), *(
-            (f'{name}_latency', node, '') for node, (_, name) in MEASURED.items())]
-        for name, node, prefix in sources:
+        for name, node, prefix in (('latency', status, prefix), *(
+                (f'{name}_latency', node, '') for node, (_, name) in MEASURED.items())):
             values = self._operator.values(f'{node}: latency')
             self.measured.update({f'{name}_{key}': float(values[prefix + key])
                                   for key in QUANTILES if prefix + key in values})
-        self.measured.update({key: cycles - first.get(key, 0)
-                              for key, cycles in self._cycles().items()})
 
     def land(self) -> None:
         """Land if the robot flies, and wait for the motors to stop."""

@@ -29,14 +29,19 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 
 BRIDGES = ('joint_bridge_node', 'rotor_bridge_node')
-ACTUATORS = ('emulated', 'direct')
 READY = 'ready'         # begin of a bridge's state
-# Executables: modules of this folder with a class of the same name, and the classes of two
-# controllers in `controller_node`, which runs any registered one as `<controller>_node`.
-NODES = ('sim_node', 'ekf_node', 'nmpc_node', 'rl_node', 'controller_node', 'supervisor_node',
-         *BRIDGES, 'reference_node', 'recorder_node', 'viewer_node')
+# Executable -> module of this folder with its class; `controller_node` runs any controller as
+# `<controller>_node`.
+NODES = {'sim_node': 'sim_node', 'ekf_node': 'control_nodes', 'nmpc_node': 'control_nodes',
+         'rl_node': 'control_nodes', 'controller_node': 'control_nodes',
+         'supervisor_node': 'control_nodes', **dict.fromkeys(BRIDGES, 'bridge_nodes'),
+         'reference_node': 'side_nodes', 'recorder_node': 'side_nodes',
+         'viewer_node': 'side_nodes'}
 GENERIC = 'controller_node'
+# Parameter autostart of a bridge -> lifecycle state to reach.
+AUTOSTART = {'none': '', 'configure': 'inactive', 'activate': 'active'}
 COMPOSED, BRIDGES_COMPOSED = 'composed', 'bridges'      # processes of several nodes
+BRIDGE_PROCESSES = (BRIDGES_COMPOSED, *BRIDGES)
 PORT_TIMEOUT = 30.0     # s for the simulator to make its serial ports
 STOP_TIMEOUT = 8.0      # s from SIGINT to SIGKILL
 Parameters = dict[str, dict]        # node name -> parameters that differ from the shipped ones
@@ -197,10 +202,7 @@ def plan(options: GraphOptions) -> Plan:
                              'simulator, with direct actuators')
     robot = {'robot_file': options.robot_file} if options.robot_file else {}
     plant = {'robot_file': options.plant_file} if options.plant_file else robot
-    controllers, left_out = controller_nodes(
-        options.controller, robot_file=options.robot_file, nmpc=options.nmpc,
-        policy=options.policy, allow_other_robot=options.allow_other_robot,
-        standby=options.standby)
+    controllers, left_out = controller_nodes(options)
     active = registry.find(options.controller).name
     # The default of these nodes is the list of standby controllers.
     others = {} if active in registry.standing_by() else {
@@ -243,11 +245,9 @@ def in_simulated_time(nodes: Parameters) -> Parameters:
             for name, values in nodes.items()}
 
 
-def controller_nodes(active: str, *, robot_file: str = '', nmpc: str = '', policy: str = '',
-                     allow_other_robot: bool = False, standby: bool = True
-                     ) -> tuple[Parameters, dict[str, str]]:
+def controller_nodes(options: GraphOptions) -> tuple[Parameters, dict[str, str]]:
     """
-    Return the parameters of the controllers' nodes; arguments as in :class:`GraphOptions`.
+    Return the parameters of the controllers' nodes.
 
     A standby policy that is not for this robot is omitted, because a node that refuses its
     parameters ends the shared process.
@@ -259,11 +259,11 @@ def controller_nodes(active: str, *, robot_file: str = '', nmpc: str = '', polic
         ParameterError: the active controller cannot be built, or its policy is unusable.
 
     """
-    first = registry.find(active)
+    first, nmpc = registry.find(options.controller), options.nmpc
     if first.reference not in registry.SHIPPED:     # in one line here, not in another process
-        first.make(RobotParameters.load(robot_file or None))
+        first.make(RobotParameters.load(options.robot_file or None))
     entries = [first, *(registry.find(name) for name in registry.standing_by()
-                        if standby and name != first.name)]
+                        if options.standby and name != first.name)]
     if nmpc and not any(entry.option == '--nmpc' for entry in entries):
         raise ParameterError(f"--nmpc {nmpc}: for the controller '{registry.owner('--nmpc')}', "
                              'which does not run')
@@ -271,15 +271,15 @@ def controller_nodes(active: str, *, robot_file: str = '', nmpc: str = '', polic
     for entry in entries:
         node = f'{entry.name}_node'
         values = {} if node in NODES else {'controller': entry.reference}
-        values |= {'robot_file': robot_file} if robot_file else {}
+        values |= {'robot_file': options.robot_file} if options.robot_file else {}
         if nmpc and entry.option == '--nmpc' and entry.parameter_class:
             schema.load(entry.parameter_class, nmpc)    # an error here, not in another process
             values[entry.file_key] = nmpc
         if entry.policy_file:
-            given = policy if entry.name == registry.owner('--policy') else ''
+            given = options.policy if entry.name == registry.owner('--policy') else ''
             values |= {'policy': str(Path(given).absolute())} if given else {}
-            values |= {'allow_other_robot': True} if allow_other_robot else {}
-            if reason := unfit(given or entry.policy_file, robot_file, allow_other_robot):
+            values |= {'allow_other_robot': True} if options.allow_other_robot else {}
+            if reason := unfit(given or entry.policy_file, options):
                 if entry is first:
                     raise ParameterError(reason)
                 left_out[entry.name] = reason
@@ -288,11 +288,12 @@ def controller_nodes(active: str, *, robot_file: str = '', nmpc: str = '', polic
     return nodes, left_out
 
 
-def unfit(policy: str, robot_file: str = '', allow_other_robot: bool = False) -> str:
-    """Return why a policy is unusable for a robot file ('': the shipped one), or ''."""
+def unfit(policy: str, options: GraphOptions) -> str:
+    """Return why a policy is unusable for the robot file, or ''."""
     try:
         from beetle_omni_ros.control.policy_file import PolicyNetwork
-        PolicyNetwork(policy, RobotParameters.load(robot_file or None), allow_other_robot)
+        PolicyNetwork(policy, RobotParameters.load(options.robot_file or None),
+                      options.allow_other_robot)
     except (ParameterError, ImportError) as error:
         return str(error)
     return ''
@@ -355,7 +356,7 @@ class Graph:
 
         Each process ends with this one, even if this one is killed.
         """
-        bridges = [name for name in self._commands if name in (BRIDGES_COMPOSED, *BRIDGES)]
+        bridges = [name for name in self._commands if name in BRIDGE_PROCESSES]
         for name in self._commands:
             if name not in bridges:
                 self.start_process(name)
@@ -389,7 +390,7 @@ class Graph:
     def cpu_seconds(self, bridges: bool = False) -> float:
         """Return the CPU time of the running processes, or of the bridges only [s]."""
         return sum(_cpu_seconds(p.pid) for name, p in self.processes.items() if p.poll() is None
-                   and (not bridges or name in (BRIDGES_COMPOSED, *BRIDGES)))
+                   and (not bridges or name in BRIDGE_PROCESSES))
 
     def kill(self, name: str) -> None:
         """Kill one process."""
@@ -403,7 +404,7 @@ class Graph:
         Bridges stop first, because they switch off the actuators, which the simulator emulates.
         The recorder stops last, so that the bag contains the end.
         """
-        first = [name for name in self.processes if name in (BRIDGES_COMPOSED, *BRIDGES)]
+        first = [name for name in self.processes if name in BRIDGE_PROCESSES]
         last = [name for name in self.processes if name == 'recorder_node']
         others = [name for name in self.processes if name not in (*first, *last)]
         return self._end(first) + self._end(others) + self._end(last)

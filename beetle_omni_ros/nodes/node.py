@@ -3,8 +3,8 @@
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 import math
-import secrets
 import time
 from typing import Any
 
@@ -18,15 +18,10 @@ from beetle_omni_ros.messages.topics import Qos, topic_of
 from beetle_omni_ros.messages.values import Diagnostic, MessageError
 from beetle_omni_ros.nodes import parameters, wire
 from beetle_omni_ros.nodes.graph import claim
-from beetle_omni_ros.safety.events import ERROR as EVENT_ERROR
-from beetle_omni_ros.safety.events import WARNING as EVENT_WARNING
 
 OK, WARN, ERROR, STALE = range(4)   # of diagnostic_msgs/DiagnosticStatus
 PERIOD = 1.0            # s between two diagnostics
-REPEAT = 1.0            # s between two log lines about refusals of one kind
-KINDS = 20              # kinds of refusals that are counted separately for each topic
 FUTURE = 0.05           # s ahead of the clock above which a stamp is refused
-UNIQUE_CHECKS = 3
 IDENTITY = 'supervisor/identity'
 TEXT_LIMIT = 40         # characters of a foreign frame_id in an error message
 
@@ -64,7 +59,6 @@ class FlightNode(Node):
         """
         super().__init__(name)
         domain, name = self.context.get_domain_id(), self.get_fully_qualified_name()
-        # At once for this computer; discovery of other ones takes seconds.
         self._claim = claim(f'{domain}{name}')
         if self._claim is None:
             raise StartError(f'{name} runs already (ROS domain {domain}); stop it first')
@@ -74,25 +68,12 @@ class FlightNode(Node):
         self.flight_clock = self.get_clock() if self.simulated else self.steady_clock
         self.parameters = parameters.declare(self, parameter_class, file, file_key,
                                              on_change, changeable, completed)
-        parameters.lock_clock(self)
         self.health = Health(self)
         self.get_logger().debug('started')      # the first call is slow: not during a flight
-        self._unique_checks = 0
-        self._unique_timer = self.create_timer(1.0, self._check_unique, clock=self.steady_clock)
-
-    def _check_unique(self):
-        """End if another computer runs a node of this name; its discovery takes seconds."""
-        own = (self.get_name(), self.get_namespace())
-        if self.get_node_names_and_namespaces().count(own) > 1:
-            raise StartError(f'{self.get_fully_qualified_name()} runs already on another computer '
-                             f'(ROS domain {self.context.get_domain_id()}); stop it first')
-        self._unique_checks += 1
-        if self._unique_checks >= UNIQUE_CHECKS:
-            self._unique_timer.cancel()
 
     def now(self) -> float:
-        """ROS time [s]."""
-        return self.get_clock().now().nanoseconds * 1e-9
+        """ROS time [s]; the system's time costs a tenth of the call of rclpy."""
+        return self.get_clock().now().nanoseconds * 1e-9 if self.simulated else time.time()
 
     def elapsed(self) -> float:
         """Return steady time, or simulated time if it is used [s]."""
@@ -102,9 +83,9 @@ class FlightNode(Node):
         """Log ``text`` with a severity of :mod:`~beetle_omni_ros.safety.events`."""
         # One call for each severity: rclpy ties a severity to the line of the call.
         logger = self.get_logger()
-        if severity == EVENT_ERROR:
+        if severity == 'error':
             logger.error(text)
-        elif severity == EVENT_WARNING:
+        elif severity == 'warning':
             logger.warning(text)
         else:
             logger.info(text)
@@ -130,8 +111,7 @@ class FlightNode(Node):
             read: message -> value with a ``stamp``, raises MessageError; default: the table's
                 ``take``.
             qos: quality of service; default: the table's.
-            any_qos: receive from publishers of any quality of service, see
-                :class:`~beetle_omni_ros.nodes.wire.AnyQosSubscription`.
+            any_qos: receive from publishers of any quality of service.
             max_age: limit of a stamp's age [s], also refuses future stamps; None: no check.
             stale_after: silence after a message that is an error [s]; None: never.
             published: whether ``check`` and ``handle`` also get the time of publication [s, system
@@ -139,31 +119,32 @@ class FlightNode(Node):
             check: called with the value before ``handle``; raises MessageError.
 
         """
-        entry, health = topic_of(topic), self.health
+        entry, counts = topic_of(topic), Input(stale_after)
         read = read or entry.take
-        health.inputs[topic] = Input(stale_after)
+        self.health.inputs[topic] = counts
 
-        def callback(message, *publication):
+        def callback(data, *publication):
             try:
-                value = read(message)
+                value = read(wire.message(entry, data))
                 age = self.now() - value.stamp
                 if max_age is not None and not -FUTURE <= age <= max_age:
                     raise MessageError('stale stamp' if age > 0 else 'stamp in the future')
                 if check is not None:
                     check(value, *publication)
             except MessageError as error:
-                health.rejected(topic, str(error), error.kind)
+                self.health.rejected(topic, str(error), error.kind)
                 return
-            health.received(topic, age)
+            counts.received += 1
+            counts.age, counts.seen = age, self.elapsed()
             handle(value, *publication)
 
-        kind = wire.message_class(entry.type)
         if any_qos:
-            wire.AnyQosSubscription(self, kind, topic, callback if published else
-                                    lambda message, _: callback(message))
+            wire.subscribe_any(self, topic, callback if published else
+                               lambda data, _: callback(data))
             return
-        taken = wire.with_publication(callback) if published else callback
-        self.create_subscription(kind, topic, taken, wire.profile(qos or entry.qos))
+        self.create_subscription(
+            wire.message_class(entry.type), topic, wire.with_publication(callback)
+            if published else callback, wire.profile(qos or entry.qos), raw=True)
 
     def timed(self, function: Callable, *args):
         """Call ``function`` and count its CPU and wall time."""
@@ -173,8 +154,9 @@ class FlightNode(Node):
         return result
 
     def waits_for(self) -> str:
-        """Return the inputs without which the node does not work, as text; '' for none."""
-        return ', '.join(self.health.waits_for())
+        """Return the required topics without a message so far; overridden by subclasses."""
+        return ', '.join(topic for topic, entry in self.health.inputs.items()
+                         if entry.seen is None and entry.stale_after is not None)
 
     def introduce(self) -> None:
         """Log in one line what the node does and which inputs are missing."""
@@ -192,11 +174,6 @@ class FlightNode(Node):
             self._claim.close()
 
 
-def new_identity(name: str) -> str:
-    """Return an identity for one run of a node: its name and 8 random hex digits."""
-    return f'{name}:{secrets.token_hex(4)}'
-
-
 class CommandSource:
     """
     Reads commands for a node that executes them.
@@ -207,10 +184,7 @@ class CommandSource:
 
     def __init__(self, node):
         self._identity = ''
-        wire.subscribe(node, IDENTITY, self._on_identity)
-
-    def _on_identity(self, identity):
-        self._identity = identity
+        wire.subscribe(node, IDENTITY, partial(setattr, self, '_identity'))
 
     def read(self, message: Any) -> Command:
         """Read a command; MessageError if it is malformed or not from the supervisor."""
@@ -253,6 +227,10 @@ class Distribution:
         return {f'{prefix}median_ms': 1e3 * self.quantile(0.5),
                 f'{prefix}p99_ms': 1e3 * self.quantile(0.99), f'{prefix}max_ms': 1e3 * self.max}
 
+    def status(self, text: str, **more: float) -> tuple[int, str, dict]:
+        """Return the distribution as a diagnostic status."""
+        return OK, text, {**self.milliseconds(), 'count': self.count, **more}
+
 
 @dataclass
 class Input:
@@ -266,7 +244,6 @@ class Input:
     rejected: Counter = field(default_factory=Counter)
     rejected_reported: int = 0
     last_refusal: str = ''
-    logged: dict = field(default_factory=dict)      # kind -> elapsed() of its last line
 
 
 class Health:
@@ -288,40 +265,17 @@ class Health:
         node.create_timer(PERIOD, self._publish, clock=node.steady_clock)
         self._last = node.elapsed()
 
-    def received(self, topic: str, age: float) -> None:
-        """Count an accepted message whose stamp is ``age`` [s] old."""
-        entry = self.inputs[topic]
-        entry.received += 1
-        entry.age = age
-        first, entry.seen = entry.seen is None, self._node.elapsed()
-        if first and entry.stale_after is not None and not self.waits_for():
-            self._node.get_logger().info('all required inputs have arrived')
-
-    def waits_for(self) -> list[str]:
-        """Return the required topics without a message so far."""
-        return [topic for topic, entry in self.inputs.items()
-                if entry.seen is None and entry.stale_after is not None]
-
     def rejected(self, topic: str, reason: str, kind: str = '') -> None:
         """
-        Count a refused message under ``kind``, or under its reason.
+        Count a refused message under ``kind``, or under its reason; log the first of a kind.
 
-        The first message of a kind is logged, except old stamps before the first accepted message.
-        If reasons differ within a kind, at most one a second is logged.
+        Old stamps before the first accepted message are not logged.
         """
-        entry, now = self.inputs[topic], self._node.elapsed()
-        kind, detailed = kind or reason, bool(kind) and kind != reason
-        if kind not in entry.rejected and len(entry.rejected) >= KINDS:
-            kind, detailed = 'other reasons', True
-        if detailed:
-            is_news = not 0 <= now - entry.logged.get(kind, -math.inf) < REPEAT
-        else:
-            is_news = kind not in entry.rejected and (entry.received or 'stamp' not in kind)
-        if is_news:
-            entry.logged[kind] = now
+        entry, kind = self.inputs[topic], kind or reason
+        if kind not in entry.rejected and (entry.received or 'stamp' not in kind):
             self._node.get_logger().warning(f'{topic}: message refused, {reason}')
         entry.rejected[kind] += 1
-        entry.last_refusal = reason if detailed else ''
+        entry.last_refusal = reason
 
     def track_compute(self, deadline: float) -> None:
         """Report compute times against a ``deadline`` [s] under '<node>: compute'."""
@@ -342,7 +296,7 @@ class Health:
         if self._compute is not None:
             statuses.append(('compute', self._compute_status))
         statuses = [*statuses, *self._extra] or [('node', lambda: (OK, 'running', {}))]
-        stamp, name = self._node.get_clock().now().nanoseconds * 1e-9, self._node.get_name()
+        stamp, name = self._node.now(), self._node.get_name()
         found = [(part, *source()) for part, source in statuses]
         self._publisher.publish([Diagnostic(stamp, f'{name}: {part}', level, text, texts(values))
                                  for part, level, text, values in found])
@@ -362,8 +316,8 @@ class Health:
                 faults.append(f'{topic} silent for {now - entry.seen:.1f} s')
             if count > entry.rejected_reported:
                 level = max(level, WARN)
-                faults.append(f'{topic}: {count - entry.rejected_reported} rejected' + (
-                    f', {entry.last_refusal}' if entry.last_refusal else ''))
+                faults.append(f'{topic}: {count - entry.rejected_reported} rejected, '
+                              f'{entry.last_refusal}')
             elif entry.seen is None and entry.stale_after is not None:
                 faults.append(f'waiting for {topic}')
             entry.reported, entry.rejected_reported = entry.received, count

@@ -1,7 +1,12 @@
-"""ROS clients outside the flight: an operator, and the listener of `beetle_omni check`."""
+"""ROS clients outside the flight: operator, listener of `check`, live graph of `view`."""
 
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, suppress
 from functools import partial
+import os
+from pathlib import Path
+import threading
 import time
 
 import numpy as np
@@ -9,26 +14,44 @@ from rcl_interfaces.srv import SetParameters
 import rclpy
 from rclpy.exceptions import NameValidationException
 from rclpy.signals import SignalHandlerOptions
+from rich.console import Console
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
-from beetle_omni_ros.bringup import graph as bringup
+from beetle_omni_ros.bringup import findings
 from beetle_omni_ros.control import registry
+from beetle_omni_ros.control.base import PoseTarget
+from beetle_omni_ros.messages.bag_types import from_bytes
 from beetle_omni_ros.messages.conversions import seconds as seconds_of
-from beetle_omni_ros.messages.topics import command_topic, LOG, SENSOR, TOPICS
+from beetle_omni_ros.messages.topics import (
+    command_topic,
+    controller_of,
+    LOG,
+    SENSOR,
+    topic_of,
+    TOPICS,
+)
 from beetle_omni_ros.messages.values import Diagnostic, MessageError
 from beetle_omni_ros.nodes import node as nodes
 from beetle_omni_ros.nodes import runner, wire
 from beetle_omni_ros.nodes.graph import BRIDGES, confine, READY
+from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 
 # Simulated time may be slow, or stop if the simulator dies: waiting ends after this much steady
 # time for each second of the timeout.
 SLOWEST = 20.0
 SERVICES = ('arm', 'disarm', 'land', 'emergency_stop')
+SUPERVISOR = 'supervisor_node'
 # Topic -> attribute of its values that changes with every sample of a working sensor.
-STREAMS = {'mocap/pose': 'position', 'imu/data_raw': 'specific_force',
+SENSORS = {'mocap/pose': 'position', 'imu/data_raw': 'specific_force',
            'joint_states': 'position', 'battery_state': 'voltage'}
+# Only the newest message of these is read for each picture; of the others, every message is read.
+SHOWN = ('odom', 'ground_truth/odom', 'joint_states', 'command', 'battery_state')
+EVENTS = ('supervisor/state', 'disturbance', 'diagnostics')
+TARGETS = ('target_pose', 'target_trajectory')      # with any quality of service
+MOST_EVENTS = 200       # of one topic that are kept until the next picture
+NICENESS = 10           # of the view; the nodes of the flight have precedence
 
 
 def join(name: str, domain: int | None = None, namespace: str = '',
@@ -99,7 +122,7 @@ class Operator:
         wire.subscribe(node, 'diagnostics', lambda statuses: self.diagnostics.update(
             (status.name, status) for status in statuses))
         self._diagnostics = wire.Publisher(node, 'diagnostics')
-        self._clients = {name: node.create_client(Trigger, f'supervisor_node/{name}')
+        self._clients = {name: node.create_client(Trigger, f'{SUPERVISOR}/{name}')
                          for name in SERVICES}
 
     def _on_clock(self, message):
@@ -163,7 +186,7 @@ class Operator:
         """Call a service of the supervisor; return (accepted, answer)."""
         future = self._clients[name].call_async(Trigger.Request())
         if not self.wait(future.done, timeout):
-            return False, f'supervisor_node does not answer to {name}'
+            return False, f'{SUPERVISOR} does not answer to {name}'
         return future.result().success, future.result().message
 
     def set(self, node: str, name: str, value, timeout: float = 5.0) -> tuple[bool, str]:
@@ -192,8 +215,10 @@ class Operator:
         leave(self._node)
 
 
+# --- beetle_omni check --------------------------------------------------------------------------
+
 def listen(seconds: float, namespace: str = '', discovery: str | None = None
-           ) -> bringup.ObservedGraph:
+           ) -> findings.ObservedGraph:
     """
     Record the traffic of a graph for ``seconds``; publishes nothing.
 
@@ -203,16 +228,17 @@ def listen(seconds: float, namespace: str = '', discovery: str | None = None
     """
     node, executor = join('check', namespace=namespace, discovery=discovery)
     try:
-        graph = bringup.ObservedGraph(node.context.get_domain_id(), seconds,
-                                      {topic: bringup.Stream() for topic in STREAMS})
-        for topic in STREAMS:
+        graph = findings.ObservedGraph(node.context.get_domain_id(), seconds,
+                                       {topic: findings.Stream() for topic in SENSORS})
+        for topic in SENSORS:
             node.create_subscription(
                 wire.message_class(TOPICS[topic].type), topic,
-                partial(_take, node, topic, graph.streams[topic]), wire.profile(LOG))
-        for bridge in bringup.BRIDGES:
+                partial(_observe, node, TOPICS[topic], graph.streams[topic]), wire.profile(LOG),
+                raw=True)
+        for bridge in findings.BRIDGES:
             wire.subscribe(node, f'{bridge}/state', partial(graph.states.__setitem__, bridge))
         wire.subscribe(node, 'diagnostics', lambda statuses: graph.diagnostics.update(
-            (status.name, bringup.Status(status.level, status.message, status.values))
+            (status.name, findings.Status(status.level, status.message, status.values))
             for status in statuses))
         deadline = time.monotonic() + seconds
         while (left := deadline - time.monotonic()) > 0:
@@ -228,12 +254,139 @@ def listen(seconds: float, namespace: str = '', discovery: str | None = None
     return graph
 
 
-def _take(node, topic, stream, message):
+def _observe(node, topic, stream, data):
     now = node.get_clock().now().nanoseconds * 1e-9
-    stream.arrivals.append(time.monotonic())
-    stream.ages.append(now - seconds_of(message.header.stamp))
     try:
-        stream.norms.append(float(np.linalg.norm(getattr(TOPICS[topic].take(message),
-                                                         STREAMS[topic]))))
+        message = wire.message(topic, data)
+        stream.arrivals.append(time.monotonic())
+        stream.ages.append(now - seconds_of(message.header.stamp))
+        norm = float(np.linalg.norm(getattr(topic.take(message), SENSORS[topic.name])))
+        if np.isnan(norm):
+            raise MessageError('not all joints are named')
+        stream.norms.append(norm)
     except MessageError as error:
         stream.refused[str(error)] += 1
+
+
+# --- beetle_omni view ---------------------------------------------------------------------------
+
+class LiveGraph:
+    """
+    ROS side of the page; implements :class:`~beetle_omni_ros.view.live.Graph`.
+
+    Targets and selections of a controller are sent only if ``writable``.
+
+    Raises:
+        ParameterError: invalid namespace or range of discovery.
+
+    """
+
+    def __init__(self, namespace: str = '', domain: int | None = None,
+                 discovery: str | None = None, writable: bool = False):
+        self._node, self._executor = join('view', domain, namespace, discovery)
+        node = self._node
+        self._lock = threading.Lock()
+        self._newest: dict[str, bytes] = {}
+        self._waiting: dict[str, list[bytes]] = defaultdict(list)
+        for topic in SHOWN:
+            self._subscribe(topic, partial(self._keep, topic), SENSOR)
+        for topic in EVENTS:
+            self._subscribe(topic, partial(self._queue, topic))
+        for topic in TARGETS:
+            wire.subscribe_any(node, topic, partial(self._queue, topic))
+        self._targets = wire.Publisher(node, 'target_pose') if writable else None
+        self._setting = node.create_client(SetParameters, f'{SUPERVISOR}/set_parameters') \
+            if writable else None
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._spin, daemon=True)
+        self._thread.start()
+
+    def _spin(self):
+        while not self._stopped.is_set():
+            self._executor.spin_once(timeout_sec=0.2)
+
+    def _keep(self, topic, data):
+        with self._lock:
+            self._newest[topic] = data
+
+    def _subscribe(self, topic, callback, qos=None):
+        entry = topic_of(topic)
+        self._node.create_subscription(wire.message_class(entry.type), topic, callback,
+                                       wire.profile(qos or entry.qos), raw=True)
+
+    def _queue(self, topic, data, _=None):
+        with self._lock:
+            if len(self._waiting[topic]) < MOST_EVENTS:
+                self._waiting[topic].append(data)
+
+    def take(self, sampler) -> None:
+        """Write the messages since the last call to a view.frames.Sampler."""
+        now = self._node.get_clock().now().nanoseconds * 1e-9
+        with self._lock:
+            newest, self._newest = self._newest, {}
+            waiting, self._waiting = self._waiting, defaultdict(list)
+        for topic, data in (*newest.items(), *((topic, data) for topic, queue in waiting.items()
+                                               for data in queue)):
+            known = topic_of(topic)
+            with suppress(Exception):   # broken bytes raise anything; the nodes report refusals
+                sampler.write(topic, known.take(from_bytes(data, known.type)), now)
+
+    def controllers(self) -> list[str]:
+        """Return the names of the controllers whose command topic exists."""
+        prefix = self._node.get_namespace().rstrip('/') + '/'
+        names = (controller_of(name.removeprefix(prefix))
+                 for name, _ in self._node.get_topic_names_and_types() if name.startswith(prefix))
+        return sorted(filter(None, names))
+
+    def publish_target(self, target: PoseTarget) -> None:
+        """Publish a target, latched, on target_pose."""
+        if self._targets is not None:
+            self._targets.publish(target)
+
+    def select(self, controller: str, answer) -> None:
+        """Set the supervisor's parameter ``controller``."""
+        if self._setting is None or not self._setting.service_is_ready():
+            answer(f'{SUPERVISOR} is not there')
+            return
+
+        def done(future):
+            result = future.result().results[0]
+            answer('' if result.successful else result.reason or 'no reason given')
+        request = wire.parameter_request('controller', controller)
+        self._setting.call_async(request).add_done_callback(done)
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._stopped.set()
+        self._thread.join(2.0)
+        leave(self._node)
+
+
+def run_live(*, namespace: str = '', domain_id: int | None = None, discovery: str | None = None,
+             robot: Path | None = None, urdf: Path | None = None, host: str, port: int,
+             dark: bool = False, allow_targets: bool = False,
+             console: Console | None = None) -> None:
+    """
+    Show a running graph until Ctrl-C; arguments are the options of `beetle_omni view`.
+
+    Raises:
+        ParameterError: unusable input.
+
+    """
+    from beetle_omni_ros.robot.urdf import Model
+    from beetle_omni_ros.view.live import Live
+    from beetle_omni_ros.view.page import Page
+    from beetle_omni_ros.view.recording import announce
+    runner.end_with_parent()
+    model, parameters = Model.load(urdf), RobotParameters.load(robot)
+    with ExitStack() as stack:
+        listener = LiveGraph(namespace, domain_id, discovery, allow_targets)
+        stack.callback(listener.close)
+        os.nice(NICENESS)
+        page = Page(['live'], model, parameters, title='Flight', host=host, port=port, dark=dark)
+        stack.callback(page.close)
+        page.look_at_room()
+        live = Live(page, listener, parameters, allow_targets)
+        announce(page.url, console or Console())
+        with suppress(KeyboardInterrupt):       # the regular end
+            live.run()

@@ -10,12 +10,7 @@ import types
 from typing import get_args, get_origin, Union
 
 import numpy as np
-from rcl_interfaces.msg import (
-    FloatingPointRange,
-    IntegerRange,
-    ParameterDescriptor,
-    SetParametersResult,
-)
+from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.node import Node
 
 from beetle_omni_ros.robot import schema
@@ -26,7 +21,11 @@ from beetle_omni_ros.robot.schema import NAMES, ParameterError
 CLOCK = 'use_sim_time'
 ROS_OWN = (CLOCK, 'start_type_description_service')
 ROS_OWN_PREFIX = 'qos_overrides.'
-UNBOUNDED = 1e300       # FloatingPointRange needs both ends
+
+
+def file_parameter(what: str = 'robot file'):
+    """Make the parameter of a node that names a file."""
+    return schema.parameter('', doc=f'{what}; empty: the shipped one', read_only=True)
 
 
 def declare(node: Node, cls: type, file: str | None = None, file_key: str | None = None,
@@ -70,7 +69,7 @@ def declare(node: Node, cls: type, file: str | None = None, file_key: str | None
             continue    # structured values live in files only
         fixed = on_change is None or changeable is not None and name not in changeable
         node.declare_parameter(name, _plain(value, hint),
-                               _descriptor(entry, hint, fixed, value is None),
+                               _descriptor(entry, hint, fixed),
                                ignore_override=True)
     if on_change:
         _validate_changes(node, cls, instance, on_change)
@@ -101,28 +100,17 @@ def _kind(hint):
     return hint
 
 
-def _descriptor(entry, hint, fixed, absent) -> ParameterDescriptor:
+def _descriptor(entry, hint, fixed) -> ParameterDescriptor:
     meta = entry.metadata
     unit = f" [{meta['unit']}]" if meta.get('unit') else ''
-    descriptor = ParameterDescriptor(
+    return ParameterDescriptor(
         description=meta.get('doc', '') + unit,
         # ROS gives an empty list another type, and [2] is a list of integers.
         dynamic_typing=hint is np.ndarray and meta.get('shape') is None or hint == NAMES,
         read_only=fixed or bool(meta.get('read_only')),
         additional_constraints=f"one of {', '.join(meta['choices'])}" if meta.get('choices')
-        else '')
-    low, high = meta.get('low'), meta.get('high')
-    if absent or (low is None and high is None) or _kind(hint) not in (int, float):
-        return descriptor   # NaN, which stands for an absent number, is in no range
-    if _kind(hint) is int:
-        descriptor.integer_range = [IntegerRange(
-            from_value=int(-2**31 if low is None else low),
-            to_value=int(2**31 if high is None else high), step=0)]
-    else:
-        descriptor.floating_point_range = [FloatingPointRange(
-            from_value=float(-UNBOUNDED if low is None else low),
-            to_value=float(UNBOUNDED if high is None else high), step=0.0)]
-    return descriptor
+        else ' to '.join(f'{meta[end]:g}' for end in ('low', 'high')
+                         if meta.get(end) is not None))
 
 
 def _validate_changes(node, cls, instance, on_change):
@@ -140,16 +128,3 @@ def _validate_changes(node, cls, instance, on_change):
         return SetParametersResult(successful=True)
 
     node.add_on_set_parameters_callback(changed)
-
-
-def lock_clock(node: Node) -> None:
-    """
-    Make ``use_sim_time`` read-only: timers and ages use the clock of the start.
-
-    The descriptor does this, because rclpy checks it first. Another callback that refuses the
-    change is not enough: rclpy's own callback switches the clock anyway.
-    """
-    description = node.describe_parameter(CLOCK)
-    node.set_descriptor(CLOCK, ParameterDescriptor(
-        name=CLOCK, type=description.type, read_only=True,
-        description='use the time on /clock; only at the start of the node'))

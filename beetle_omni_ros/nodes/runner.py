@@ -5,13 +5,13 @@ Runs nodes in one process: start, spin, stop; errors are one line and an exit st
 registered controller name, or the reference of a controller's class.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import contextmanager
 import ctypes
+from functools import partial
 import gc
 from importlib import import_module
 import os
-import re
 import signal
 import socket
 import sys
@@ -38,69 +38,49 @@ PR_SET_PDEATHSIG = 1    # of linux/prctl.h
 ENDING = (signal.SIGINT, signal.SIGTERM)
 
 
-def main(node_class: type, args: Sequence[str] | None = None) -> None:
+def main(name: str) -> None:
     """Entry point of a node's executable."""
-    argv, name = list(sys.argv if args is None else args), executable(node_class)
+    kind = node_class(name)
     usage = f'usage: {name} [{ARGUMENT} RANGE] [--ros-args -p KEY:=VALUE --params-file FILE ...]'
-    rest = _own_arguments(argv, name, f'{usage}\n\n{(node_class.__doc__ or "").strip()}')
+    rest = _own_arguments(name, f'{usage}\n\n{(kind.__doc__ or "").strip()}')
     if rest:
         sys.exit(_fail(name, f"unknown argument '{rest[0]}'; {usage}", UNUSABLE))
-    sys.exit(run([node_class], argv, name))
+    sys.exit(run({name: kind}, sys.argv, name))
 
 
-def composed(args: Sequence[str] | None = None) -> None:
+def composed() -> None:
     """Run the named nodes on one events executor."""
-    argv = list(sys.argv if args is None else args)
     usage = ('usage: composed NODE... [--discovery RANGE] [--ros-args -p NODE:KEY:=VALUE ...]; '
              f"NODE: {', '.join(NODES)}, a controller's name, {registry.CLASS}")
-    names = _own_arguments(argv, COMPOSED, usage)
+    names = _own_arguments(COMPOSED, usage)
     unknown = [name for name in names if name not in NODES and ':' not in name
                and name not in registry.names()]
     if unknown or not names or len(set(names)) < len(names):
         problem = f"unknown node '{unknown[0]}'" if unknown else 'each node once, at least one'
         sys.exit(_fail(COMPOSED, f'{problem}; {usage}', UNUSABLE))
     try:
-        classes = [node_class(name) if name in NODES else _controller_class(name)
-                   for name in names]
+        nodes = {name: node_class(name) if name in NODES else
+                 partial(node_class(GENERIC), registry.find(name)) for name in names}
     except ModuleNotFoundError as error:
         sys.exit(_fail(COMPOSED, f"a node needs the Python package '{error.name}'; what bridges "
                        "need installs the extra 'hardware' of beetle_omni_ros", UNUSABLE))
     except ParameterError as error:
         sys.exit(_fail(COMPOSED, error, UNUSABLE))
-    sys.exit(run(classes, [argument for argument in argv if argument not in names], COMPOSED))
+    sys.exit(run(nodes, [each for each in sys.argv if each not in names], COMPOSED))
 
 
 def node_class(name: str) -> type:
     """Import the class of a node's executable: ekf_node -> EkfNode."""
     kind = ''.join(part.capitalize() for part in name.split('_'))
-    module = GENERIC if name in ('nmpc_node', 'rl_node') else name
-    return getattr(import_module(f'{__package__}.{module}'), kind)
+    return getattr(import_module(f'{__package__}.{NODES[name]}'), kind)
 
 
-def _controller_class(reference):
-    entry = registry.find(reference)
-
-    class Named(node_class(GENERIC)):
-        executable = f'{entry.name}_node'
-
-        def __init__(self):
-            super().__init__(entry)
-
-    return Named
-
-
-def executable(node_class: type) -> str:
-    """Return a node class's attribute ``executable``, or its name as one: EkfNode -> ekf_node."""
-    return getattr(node_class, 'executable', '') \
-        or re.sub(r'(?<=[a-z])(?=[A-Z])', '_', node_class.__name__).lower()
-
-
-def run(node_classes: Sequence[Callable], argv: Sequence[str], name: str) -> int:
+def run(nodes_to_make: Mapping[str, Callable], argv: Sequence[str], name: str) -> int:
     """
-    Run the nodes on one events executor until a signal or a fatal error.
+    Run nodes on one events executor until a signal or a fatal error.
 
     Args:
-        node_classes: classes that are called without arguments.
+        nodes_to_make: name of each node -> its class, called without arguments.
         argv: program name and ROS arguments.
         name: name of the process in messages.
 
@@ -116,9 +96,8 @@ def run(node_classes: Sequence[Callable], argv: Sequence[str], name: str) -> int
         # rclpy's handlers would end the context while a callback still publishes.
         rclpy.init(args=list(argv), signal_handler_options=SignalHandlerOptions.NO)
         executor = make_executor()
-        for node_class in node_classes:
-            name = executable(node_class)
-            node = node_class()
+        for name, make in nodes_to_make.items():
+            node = make()
             nodes.append(node)
             node.introduce()
             executor.add_node(node)
@@ -149,13 +128,13 @@ def run(node_classes: Sequence[Callable], argv: Sequence[str], name: str) -> int
     return status
 
 
-def _own_arguments(argv, name, help_text):
+def _own_arguments(name, help_text):
     """Apply ``--discovery RANGE``, print the help; return what is not for ROS either."""
     try:
-        for flag, path in zip(argv, argv[1:]):
+        for flag, path in zip(sys.argv, sys.argv[1:]):
             if flag == '--params-file':     # by file and line; ROS would print a traceback
                 load_yaml(path)
-        rest, left = [], iter(remove_ros_args(list(argv))[1:])
+        rest, left = [], iter(remove_ros_args(list(sys.argv))[1:])
         for argument in left:
             flag, equals, value = argument.partition('=')
             if flag == ARGUMENT:
@@ -253,29 +232,16 @@ def sigterm_as_interrupt():
             signal.signal(each, signal.SIG_IGN)
         raise KeyboardInterrupt
 
-    with _handled_by(interrupt):
-        try:
-            yield
-        except Exception:
-            if received:
-                raise KeyboardInterrupt from None
-            raise
-
-
-def signals_ignored():
-    """Ignore signals during a clean-up: a launch system sends them twice."""
-    return _handled_by(signal.SIG_IGN)
-
-
-@contextmanager
-def _handled_by(handler):
-    """Set a handler of the ending signals; without effect outside the main thread."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = {number: signal.signal(number, handler) for number in ENDING}
+    before = {number: signal.signal(number, interrupt) for number in ENDING}
     try:
         yield
+    except Exception:
+        if received:
+            raise KeyboardInterrupt from None
+        raise
     finally:
         for number, previous in before.items():
             signal.signal(number, previous)

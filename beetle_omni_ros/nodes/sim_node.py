@@ -1,5 +1,6 @@
 """ROS node of the simulated robot, with topics or emulated serial devices as actuators."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import degrees
 import time
@@ -13,6 +14,7 @@ from beetle_omni_ros.messages.topics import SENSOR
 from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.node import CommandSource, Distribution, ERROR, FlightNode, OK, WARN
+from beetle_omni_ros.nodes.parameters import file_parameter
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import group, parameter, ParameterError
 from beetle_omni_ros.sim.emulated import (
@@ -32,8 +34,6 @@ CATCH_UP_TICKS = 8
 EARLY = 0.3             # part of a tick that the timer may come before the tick
 PHASE_WINDOW = 50       # calls of the timer from which its phase is estimated
 SLEW = 0.01             # largest shift of a tick towards the timer's phase, in ticks
-CLOCK_STEP = 0.005      # s of change between ROS and steady time above which the clock was set
-CLOCK_READING = 0.001   # s within which both clocks must have been read to be compared
 # Simulated time waits for a node that is farther behind than in real time, where the newest sample
 # is one period old. It does not wait for a node that has stopped.
 LAG = 0.02              # s between the newest sample and the newest answered one
@@ -46,44 +46,34 @@ EVENTS = {*(f'servo_faults.{name}' for name in SERVO_EVENTS),
 
 class RealTimePacing:
     """
-    Ticks on the steady clock, stamps in ROS time; starts with the first call of :meth:`due`.
+    Ticks by the ROS clock; starts with the first call of :meth:`due`.
 
     Attributes:
         ticks: number of ticks so far.
         lost_ticks: ticks skipped after stalls; the simulation stopped meanwhile.
-        clock_steps: how often the ROS clock was set.
+        epoch: time at which simulated time is zero [s]; None before the start.
 
     """
 
-    def __init__(self, tick: float, steady, ros):
-        self._tick, self._steady, self._ros = tick, steady, ros
-        self._started: float | None = None
-        self._offset = ros() - steady()     # ROS time minus steady time
+    def __init__(self, tick: float, clock: Callable[[], float]):
+        self._tick, self._clock = tick, clock
+        self.epoch: float | None = None
         self._lateness: list[float] = []
         self._slew = 0.0
-        self.ticks = self.lost_ticks = self.clock_steps = 0
-
-    @property
-    def started(self) -> bool:
-        """Whether the first tick was due."""
-        return self._started is not None
-
-    @property
-    def epoch(self) -> float:
-        """ROS time at which simulated time is zero [s]."""
-        return self._offset + self._started
+        self.ticks = self.lost_ticks = 0
 
     def due(self) -> int:
         """Return the number of ticks that are due now; called by the timer, once a tick."""
-        now, tick = self._steady(), self._tick
-        if self._started is None:
-            self._started = now - tick
-        self._follow_clock()
-        due = int((now - self._started) / tick + EARLY) - self.ticks
-        lost = max(0, due - CATCH_UP_TICKS)
-        self.lost_ticks += lost
-        self._started += lost * tick
-        due -= lost
+        now, tick = self._clock(), self._tick
+        if self.epoch is None:
+            self.epoch = now - tick
+        due = int((now - self.epoch) / tick + EARLY) - self.ticks
+        if not -CATCH_UP_TICKS <= due <= CATCH_UP_TICKS:    # a stall, or the clock was set
+            lost = due - (CATCH_UP_TICKS if due > 0 else 0)
+            self.lost_ticks += max(lost, 0)
+            self.epoch += lost * tick
+            due -= lost
+        due = max(due, 0)
         self._follow_timer(now, due)
         self.ticks += due
         return due
@@ -95,27 +85,15 @@ class RealTimePacing:
         The phase of the timer is unknown at first. If ticks were always due some milliseconds
         before the timer, every stamp would be too old by this time.
         """
-        if due > 0:
-            self._lateness.append(now - self._started - (self.ticks + due) * self._tick)
+        if due:
+            self._lateness.append(now - self.epoch - (self.ticks + due) * self._tick)
         if len(self._lateness) == PHASE_WINDOW:
             self._slew = min(self._lateness)
             self._lateness.clear()
         limit = SLEW * self._tick
         step = min(max(self._slew, -limit), limit)
         self._slew -= step
-        self._started += step
-
-    def _follow_clock(self):
-        """Detect that the ROS clock was set, and update its offset from the steady clock."""
-        before = self._steady()
-        ros = self._ros()
-        after = self._steady()
-        if after - before > CLOCK_READING:
-            return      # preempted between the readings
-        offset = ros - 0.5 * (before + after)
-        if abs(offset - self._offset) > CLOCK_STEP:
-            self.clock_steps += 1
-            self._offset = offset
+        self.epoch += step
 
 
 class SimulatedTimePacing:
@@ -127,33 +105,29 @@ class SimulatedTimePacing:
 
     Args:
         tick: period [s].
-        steady: steady clock [s].
         epoch: time of the stamps at which simulated time is zero [s].
+        steady: steady clock [s].
 
     Attributes:
         ticks: number of ticks so far.
-        waits: calls of :meth:`due` that returned no tick.
-        started, lost_ticks, clock_steps: as in :class:`RealTimePacing`; no tick is lost.
+        lost_ticks: 0, as no tick is lost.
+        sent: stamp of the newest published sample.
 
     """
 
-    started, lost_ticks, clock_steps = True, 0, 0
+    lost_ticks = 0
 
-    def __init__(self, tick: float, steady, epoch: float):
+    def __init__(self, tick: float, epoch: float, steady: Callable[[], float] = time.monotonic):
         self._tick, self._steady, self.epoch = tick, steady, epoch
-        self._sent = float('-inf')
+        self.sent = float('-inf')
         self._answers: dict[str, tuple[float, float]] = {}
         self._last = steady()
-        self.ticks = self.waits = 0
+        self.ticks = 0
 
     @property
     def now(self) -> float:
         """Simulated time [s]."""
         return self.epoch + self.ticks * self._tick
-
-    def sample_sent(self, stamp: float) -> None:
-        """Record the stamp of a published sample."""
-        self._sent = stamp
 
     def answered(self, name: str, stamp: float) -> None:
         """Record that ``name`` has answered the sample with this stamp."""
@@ -162,10 +136,9 @@ class SimulatedTimePacing:
     def due(self) -> int:
         """Return the number of ticks that are due now: 1 or 0."""
         now = self._steady()
-        late = any(self._sent - stamp > LAG and now - arrived < PATIENCE
+        late = any(self.sent - stamp > LAG and now - arrived < PATIENCE
                    for stamp, arrived in self._answers.values())
         if late and now - self._last < PATIENCE:
-            self.waits += 1
             return 0
         self._last = now
         self.ticks += 1
@@ -176,10 +149,8 @@ class SimulatedTimePacing:
 class SimNodeParameters:
     """Parameters of sim_node."""
 
-    robot_file: str = parameter(
-        '', doc='robot file of the simulated robot; empty: the shipped one', read_only=True)
-    simulator_file: str = parameter(
-        '', doc='simulator file; empty: the shipped one', read_only=True)
+    robot_file: str = file_parameter('robot file of the simulated robot')
+    simulator_file: str = file_parameter('simulator file')
     conditions: str = parameter('nominal', choices=('nominal', 'published'), read_only=True,
                                 doc='randomisation of plant and sensors')
     seed: int = parameter(0, doc='seed of all random numbers', low=0, high=2**31 - 1,
@@ -191,9 +162,7 @@ class SimNodeParameters:
                                 'one', read_only=True)
     board_port: str = parameter('', doc="path of the emulated motor board's port; empty: a "
                                 'temporary one', read_only=True)
-    servo_bus_file: str = parameter(
-        '', doc='ids, signs, zeros and baud rate of the emulated servos; empty: the shipped file',
-        read_only=True)
+    servo_bus_file: str = file_parameter('ids, signs, zeros and baud rate of the emulated servos')
     clock: str = parameter('system', choices=('system', 'simulated'), read_only=True,
                            doc='real time, or simulated time on /clock, which waits for late '
                            'nodes; all other nodes then need use_sim_time')
@@ -206,7 +175,7 @@ class SimNodeParameters:
 
 class SimNode(FlightNode):
     """
-    Steps the simulator on the steady clock, stamps its readings in ROS time.
+    Steps the simulator by the ROS clock.
 
     With ``clock`` simulated it publishes /clock after each step. Steps then wait until estimator
     and supervisor have answered the newest samples.
@@ -242,11 +211,11 @@ class SimNode(FlightNode):
 
     def _make_pacing(self, given):
         if given.clock == 'system':
-            return RealTimePacing(self._simulator.tick, time.monotonic, self.now)
+            return RealTimePacing(self._simulator.tick, self.now)
         if given.actuators == 'emulated':
             raise ParameterError("key 'clock': simulated: serial devices keep real time; start "
                                  'with actuators:=direct')
-        pacing = SimulatedTimePacing(self._simulator.tick, time.monotonic, super().now())
+        pacing = SimulatedTimePacing(self._simulator.tick, super().now())
         self._clock_publisher = self.create_publisher(Clock, '/clock', wire.profile(SENSOR))
         self.listen('odom', lambda odom: pacing.answered('odom', odom.stamp))
         return pacing
@@ -264,7 +233,8 @@ class SimNode(FlightNode):
         self._publish_to['rotors'] = self.publisher('rotor_states')
         self.listen('command', self._on_command, read=CommandSource(self).read,
                     max_age=COMMAND_AGE)
-        self.health.report('latency', self._latency_status)
+        self.health.report('latency', lambda: self._latency.status(
+            'stamp of the answered IMU sample to the arrival of its command'))
 
     def _make_devices(self):
         """Connect emulated devices to the plant, for the drivers of the bridges."""
@@ -351,7 +321,7 @@ class SimNode(FlightNode):
                 set_time(message.clock, self._pacing.now)
                 self._clock_publisher.publish(message)
                 if frame.imu is not None:
-                    self._pacing.sample_sent(self._pacing.epoch + frame.imu.stamp)
+                    self._pacing.sent = self._pacing.epoch + frame.imu.stamp
             self._publish(frame)
 
     def _publish(self, frame):
@@ -368,7 +338,7 @@ class SimNode(FlightNode):
         self._latency.add(self.now() - command.stamp)
         if self._clock_publisher is not None:
             self._pacing.answered('command', command.stamp)
-        if self._pacing.started:
+        if self._pacing.epoch is not None:
             self._simulator.command(replace(command, stamp=command.stamp - self._pacing.epoch))
 
     def _on_wrench(self, wrench):
@@ -380,7 +350,7 @@ class SimNode(FlightNode):
         return level, f'{pacing.lost_ticks} ticks lost', {
             'ticks': pacing.ticks, 'lost_ticks': pacing.lost_ticks,
             'lost_s': pacing.lost_ticks * self._simulator.tick,
-            'clock_steps': pacing.clock_steps, 'simulated_s': self._simulator.time}
+            'simulated_s': self._simulator.time}
 
     def _robot_status(self):
         simulator = self._simulator
@@ -397,8 +367,3 @@ class SimNode(FlightNode):
         faults = self._devices.faults
         level = WARN if faults else OK
         return level, 'faults: ' + (', '.join(faults) or 'none'), self._devices.status()
-
-    def _latency_status(self):
-        times = self._latency
-        return OK, 'stamp of the answered IMU sample to the arrival of its command', {
-            **times.milliseconds(), 'count': times.count}

@@ -1,8 +1,7 @@
 """rclpy side of the table of topics: message classes, quality of service, both ends."""
 
-from array import array
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cache
 from importlib import import_module
 import inspect
@@ -15,9 +14,10 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from beetle_omni_ros.messages.topics import Qos, topic_of
+from beetle_omni_ros.messages.bag_types import from_bytes, to_bytes
+from beetle_omni_ros.messages.topics import Qos, Topic, topic_of
+from beetle_omni_ros.messages.values import MessageError
 
-CHECK_PERIOD = 0.5      # s between checks of the publishers' quality of service
 COPIES = 64             # newest messages that are compared to detect a copy
 TWO_ARGUMENTS = inspect.Signature([
     inspect.Parameter(name, inspect.Parameter.POSITIONAL_ONLY) for name in ('message', 'info')])
@@ -30,29 +30,6 @@ def message_class(name: str) -> type:
     return getattr(import_module(f'{package}.msg'), message)
 
 
-class RclpyFactory:
-    """See :class:`~beetle_omni_ros.messages.conversions.MessageFactory`."""
-
-    def new(self, name: str) -> Any:
-        """Make a message with default values, by its ROS type."""
-        return message_class(name)()
-
-    def doubles(self, values: Sequence[float]) -> array:
-        """Return an array of doubles."""
-        return array('d', values)
-
-    def singles(self, values: Sequence[float]) -> array:
-        """Return an array of floats."""
-        return array('f', values)
-
-    def byte(self, value: int) -> bytes:
-        """Return one byte."""
-        return bytes((value,))
-
-
-RCLPY = RclpyFactory()
-
-
 def profile(qos: Qos) -> QoSProfile:
     """Return the quality of service for rclpy."""
     return QoSProfile(
@@ -61,12 +38,21 @@ def profile(qos: Qos) -> QoSProfile:
         durability=DurabilityPolicy.TRANSIENT_LOCAL if qos.latched else DurabilityPolicy.VOLATILE)
 
 
-def message(topic: str, value: Any, frame: str | None = None) -> Any:
-    """Make the message of a topic's value; ``frame`` replaces the topic's frame_id."""
-    made = topic_of(topic).write(RCLPY, value)
+def serialized(topic: str, value: Any, frame: str | None = None) -> bytes:
+    """Make the CDR message of a topic's value; ``frame`` replaces the topic's frame_id."""
+    entry = topic_of(topic)
+    made = entry.write(value)
     if frame is not None:
         made.header.frame_id = frame
-    return made
+    return bytes(to_bytes(made, entry.type))
+
+
+def message(topic: Topic, data: bytes) -> Any:
+    """Decode the message of a topic; MessageError for broken bytes."""
+    try:
+        return from_bytes(data, topic.type)
+    except Exception:       # broken bytes raise anything
+        raise MessageError('not readable') from None
 
 
 def parameter_request(name: str, value: Any) -> SetParameters.Request:
@@ -75,33 +61,25 @@ def parameter_request(name: str, value: Any) -> SetParameters.Request:
 
 
 class Publisher:
-    """Publishes the values of a topic; ``qos`` replaces the quality of service of the table."""
+    """Publishes the values of a topic."""
 
-    def __init__(self, node: Node, topic: str, qos: Qos | None = None):
+    def __init__(self, node: Node, topic: str):
         entry, self._topic = topic_of(topic), topic
         self._publisher = node.create_publisher(message_class(entry.type), topic,
-                                                profile(qos or entry.qos))
+                                                profile(entry.qos))
 
     def publish(self, value: Any, frame: str | None = None) -> None:
-        """Publish one value, see :func:`message`."""
-        self._publisher.publish(message(self._topic, value, frame))
-
-    def get_subscription_count(self) -> int:
-        """Return the number of matched subscriptions."""
-        return self._publisher.get_subscription_count()
+        """Publish one value, see :func:`serialized`."""
+        self._publisher.publish(serialized(self._topic, value, frame))
 
 
-def subscribe(node: Node, topic: str, handle: Callable[[Any], None], *, qos: Qos | None = None,
-              read: Callable[[Any], Any] | None = None) -> None:
-    """
-    Subscribe a topic without checks of age.
-
-    ``qos`` replaces the quality of service of the table, ``read`` its ``take``.
-    """
+def subscribe(node: Node, topic: str, handle: Callable[[Any], None],
+              qos: Qos | None = None) -> None:
+    """Subscribe a topic without checks of age; ``qos`` replaces that of the table."""
     entry = topic_of(topic)
-    take = read or entry.take
     node.create_subscription(message_class(entry.type), topic,
-                             lambda received: handle(take(received)), profile(qos or entry.qos))
+                             lambda data: handle(entry.take(message(entry, data))),
+                             profile(qos or entry.qos), raw=True)
 
 
 def with_publication(callback: Callable) -> Callable:
@@ -125,59 +103,33 @@ def with_publication(callback: Callable) -> Callable:
     return take
 
 
-class AnyQosSubscription:
+def subscribe_any(node: Node, topic: str, callback: Callable, *, depth: int = 10,
+                  on_lost: Callable | None = None) -> None:
     """
-    Receives the messages of publishers with any quality of service, each message once.
+    Receive the messages of publishers with any quality of service, each message once.
 
     A subscription of latched messages is incompatible with a volatile publisher, such as
-    `ros2 topic pub`; a volatile subscription misses messages latched earlier. So there is a
-    volatile one at first, and others follow as soon as a publisher offers what needs them. This
-    way neither end logs a warning about incompatible quality of service.
-
-    A message that two subscriptions receive is passed on once, by its time of publication.
+    `ros2 topic pub`; a volatile subscription misses messages latched earlier. So there are both.
+    A message that both receive is passed on once, by its time of publication.
 
     Args:
-        node: subscribing FlightNode.
-        message_type: ROS message class.
+        node: subscribing node.
         topic: name.
-        callback: called with (message, time of publication [s, system time, or nan]).
+        callback: called with (CDR, time of publication [s, system time, or nan]).
         depth: depth of the queues.
-        raw: whether the callback gets serialized messages.
         on_lost: called with rclpy's event of lost messages.
 
     """
+    seen: deque[float] = deque(maxlen=COPIES)
 
-    def __init__(self, node: Node, message_type: type, topic: str, callback: Callable, *,
-                 depth: int = 10, raw: bool = False, on_lost: Callable | None = None):
-        self._node, self._type, self._topic = node, message_type, topic
-        self._depth, self._raw, self._on_lost = depth, raw, on_lost
-        self._callback = callback
-        self._seen: deque[float] = deque(maxlen=COPIES)     # times of publication
-        self._profiles: set[tuple[ReliabilityPolicy, DurabilityPolicy]] = set()
-        self._subscribe(ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE)
-        node.create_timer(CHECK_PERIOD, self._check_publishers, clock=node.steady_clock)
+    def take(data, publication):
+        if publication not in seen:     # nan never is
+            seen.append(publication)
+            callback(data, publication)
 
-    def _subscribe(self, reliability, durability):
-        if (reliability, durability) in self._profiles:
-            return
-        self._profiles.add((reliability, durability))
-        self._node.create_subscription(
-            self._type, self._topic, with_publication(self._take),
-            QoSProfile(depth=self._depth, reliability=reliability, durability=durability),
-            raw=self._raw, event_callbacks=SubscriptionEventCallbacks(
-                incompatible_qos=lambda event: None, message_lost=self._on_lost))
-
-    def _take(self, message, publication):
-        if publication in self._seen:       # never true for nan
-            return
-        self._seen.append(publication)
-        self._callback(message, publication)
-
-    def _check_publishers(self):
-        """Add the subscriptions that the present publishers need."""
-        for publisher in self._node.get_publishers_info_by_topic(self._topic):
-            offer = publisher.qos_profile
-            if offer.durability == DurabilityPolicy.TRANSIENT_LOCAL:
-                self._subscribe(ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL)
-            if offer.reliability == ReliabilityPolicy.BEST_EFFORT:
-                self._subscribe(ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE)
+    for is_latched in (False, True):
+        node.create_subscription(
+            message_class(topic_of(topic).type), topic, with_publication(take),
+            profile(Qos(depth, reliable=is_latched, latched=is_latched)), raw=True,
+            event_callbacks=SubscriptionEventCallbacks(
+                incompatible_qos=lambda event: None, message_lost=on_lost))

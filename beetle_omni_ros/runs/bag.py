@@ -19,8 +19,7 @@ from mcap.writer import MCAP0_MAGIC
 import numpy as np
 
 from beetle_omni_ros.control.base import TrajectoryTarget
-from beetle_omni_ros.messages.bag_types import from_bytes
-from beetle_omni_ros.messages.columns import read_all
+from beetle_omni_ros.messages.bag_types import from_bytes, read_all
 from beetle_omni_ros.messages.conversions import from_nanoseconds
 from beetle_omni_ros.messages.topics import (
     controller_of,

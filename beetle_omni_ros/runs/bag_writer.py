@@ -18,7 +18,7 @@ from rosbags.rosbag2.storage_mcap import McapWriter, write_channel, write_string
 from rosbags.serde import SerdeError
 import yaml
 
-from beetle_omni_ros.messages.bag_types import BAG, from_bytes, offered, to_bytes, TYPESTORE
+from beetle_omni_ros.messages.bag_types import from_bytes, new, offered, to_bytes, TYPESTORE
 from beetle_omni_ros.messages.conversions import BODY, nanoseconds, WORLD
 from beetle_omni_ros.messages.topics import ALL, EVENT, LATCHED, Qos, topic_of, TOPICS
 from beetle_omni_ros.robot.schema import read_yaml
@@ -137,16 +137,16 @@ class FrameWriter:
         self._write('/tf_static', TRANSFORMS, _transforms(
             [(joint.parent, joint.child, stamp, joint.position, joint.quaternion)
              for joint in self._fixed]), t)
-        text = BAG.new(TEXT)
+        text = new(TEXT)
         text.data = self._text
         self._write(list(self.topics)[-1], TEXT, to_bytes(text, TEXT), t)
 
 
 def _transforms(frames):
     """CDR of frames: parent, child, stamp, position, quaternion."""
-    message = BAG.new(TRANSFORMS)
+    message = new(TRANSFORMS)
     for parent, child, stamp, position, quaternion in frames:
-        frame = BAG.new('geometry_msgs/msg/TransformStamped')
+        frame = new('geometry_msgs/msg/TransformStamped')
         frame.header.frame_id, frame.child_frame_id, frame.header.stamp = parent, child, stamp
         at, turn = frame.transform.translation, frame.transform.rotation
         at.x, at.y, at.z = map(float, position)
@@ -234,7 +234,7 @@ class BagWriter(Recorder):
             self._declare(name, entry.type, entry.qos)
         if received is None:
             received = value[0].t if isinstance(value, list) else value.stamp
-        message = entry.write(BAG, value)
+        message = entry.write(value)
         if self._epoch and hasattr(message, 'header'):
             message.header.stamp.sec += self._epoch
         self.write_raw(name, entry.type, to_bytes(message, entry.type), received)

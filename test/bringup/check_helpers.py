@@ -5,14 +5,12 @@ from dataclasses import replace
 from board_bench import QUICK
 from servo_bench import PATIENT
 
-from beetle_omni_ros.bringup.board import check_board
-from beetle_omni_ros.bringup.limits import CheckLimits
-from beetle_omni_ros.bringup.servos import check_servos
+from beetle_omni_ros.bringup.devices import check_board, check_servos
 from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters, ServoBusParameters
 from beetle_omni_ros.robot.parameters import RobotParameters
 
-LIMITS, ROBOT = CheckLimits.load(), RobotParameters.load()
-__all__ = ['QUICK', 'LIMITS', 'ROBOT']
+ROBOT = RobotParameters.load()
+__all__ = ['QUICK', 'ROBOT']
 
 
 def by_item(findings):
@@ -47,10 +45,10 @@ def levels(found, *, without='ok'):
 def servos(port, graph=None, **changes):
     """Check a bus; item -> finding."""
     parameters = replace(ServoBusParameters.load(), port=port, timing=PATIENT, **changes)
-    return by_item(check_servos(parameters, ROBOT.joints, LIMITS, graph))
+    return by_item(check_servos(parameters, ROBOT.joints, graph))
 
 
 def board(port, graph=None, seconds=1.2, **changes):
     """Check a motor board; item -> finding."""
     parameters = replace(MotorBoardParameters.load(), port=port, **changes)
-    return by_item(check_board(parameters, ROBOT, LIMITS, seconds, graph))
+    return by_item(check_board(parameters, ROBOT, seconds, graph))

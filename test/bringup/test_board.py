@@ -77,7 +77,8 @@ def test_each_fault_is_found_and_named(emulated, break_it, changes, bad, words):
 def test_firmware_with_another_protocol_version_is_refused(emulated, monkeypatch):
     monkeypatch.setattr(motor_board_state, 'CONTRACT_VERSION', 2)
     found = board_with(emulated, {'board firmware': 'fail'})
-    assert 'contract 1, this driver uses 2' in found['board firmware'].found
+    assert 'contract 1' in found['board firmware'].found
+    assert 'contract 2' in found['board firmware'].remedy
 
 
 def test_a_silent_or_foreign_board_ends_the_checks(emulated):

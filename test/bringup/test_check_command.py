@@ -1,7 +1,6 @@
 """`beetle_omni check` from the command line: table, JSON, exit status, one-line refusals."""
 
 import json
-import subprocess
 import sys
 
 import pytest
@@ -10,10 +9,11 @@ pytest.importorskip('dynamixel_sdk')
 pytest.importorskip('pymavlink')
 
 from check_helpers import QUICK, repeated
+import serial
 
 from beetle_omni_ros import cli
 from beetle_omni_ros.bringup.command import run_check
-from beetle_omni_ros.bringup.graph import ObservedGraph, Status
+from beetle_omni_ros.bringup.findings import ObservedGraph, Status
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
 
@@ -81,18 +81,11 @@ def test_a_port_in_use_by_the_bridge_is_not_opened(robot, tmp_path):
                   {'joint_bridge_node: gimbal2': Status(2, 'overload', {})})
     path, packets = tmp_path / 'result.json', []
     bus.handle = lambda packet, *_: packets.append(packet) or []
-    bridge = subprocess.Popen([sys.executable, '-c', 'import sys; f = open(sys.argv[1], "rb", 0); '
-                               'print("open", flush=True); sys.stdin.read()', bus.port],
-                              stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-    try:
-        bridge.stdout.readline()
+    with serial.Serial(bus.port, exclusive=True):
         status = run_check(listen=lambda _: graph, servo_port=bus.port, skip=('board',),
                            json_path=path)
-    finally:
-        bridge.communicate()
     rows = {row['item']: row for row in json.loads(path.read_text())['findings']}
     assert status == 1 and not packets
     assert rows['servo port']['level'] == rows['joint_bridge state']['level'] == 'ok'
-    assert str(bridge.pid) in rows['servo port']['found']
     assert rows['joint_bridge gimbal2']['level'] == 'fail'
     assert rows['joint_bridge gimbal2']['part'] == 'servos'

@@ -11,7 +11,7 @@ pytest.importorskip('pymavlink')
 from check_helpers import levels, repeated, servos
 from servo_bench import running
 
-from beetle_omni_ros.bringup import servos as room
+from beetle_omni_ros.bringup import devices as room
 from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
 
 pytestmark = pytest.mark.real_time
@@ -21,9 +21,8 @@ NAMES = [f'gimbal{k}' for k in (1, 2, 3, 4)]
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch):
-    """Use few reads and few IDs."""
+    """Use few reads."""
     monkeypatch.setattr(room, 'ROUNDS', 5)
-    monkeypatch.setattr(room, 'OTHER_IDS', (1, 7))
 
 
 def test_a_good_bus_passes_and_its_measurements_are_reported():
@@ -80,9 +79,7 @@ def put(**faults):
 # options of the bus and of the check, what is wrong, levels that are not ok, item, its words
 FAULTS = {
     'baud rate': ({}, {}, at_another_rate, {'gimbal2': 'fail'}, 'gimbal2',
-                  ('does not answer', 'id 2 answers at 57600 bit/s')),
-    'id': ({'identifiers': (1, 2, 7, 4)}, {}, put(), {'gimbal3': 'fail'}, 'gimbal3',
-           ('id 7 at 1000000 bit/s',)),
+                  ('does not answer',)),
     'missing': ({}, {}, put(silent={4}), {'gimbal4': 'fail'}, 'gimbal4', ('connector',)),
     'empty': ({}, {}, put(silent={1, 2, 3, 4}), {'servo bus': 'fail'}, 'servo bus', ('supply',)),
     'model': ({'firmware': 44}, {}, another_model, {'gimbal1': 'fail'}, 'gimbal1',

@@ -17,7 +17,7 @@ from beetle_omni_ros.identify.recording.check import damages, repaired
 from beetle_omni_ros.identify.recording.limits import RecordingLimits
 from beetle_omni_ros.identify.recording.motion import Motion
 from beetle_omni_ros.identify.recording.readings import reading_damages
-from beetle_omni_ros.messages import columns as message_columns
+from beetle_omni_ros.messages import bag_types
 from beetle_omni_ros.runs.bag_writer import BagWriter
 
 P = GapParameters.load()
@@ -363,7 +363,7 @@ def test_reading_all_messages_at_once_equals_reading_each(tmp_path, monkeypatch)
         for k in range(60):
             bag.write_raw(f'/{IMU}', 'sensor_msgs/msg/Imu', _imu_bytes(k), 0.1 * k + 1.0)
     at_once = read_recording(tmp_path / 'bag')
-    monkeypatch.setattr(message_columns, 'LAYOUTS', 0)
+    monkeypatch.setattr(bag_types, 'LAYOUTS', 0)
     one_by_one = read_recording(tmp_path / 'bag')
     for part in ('times', 'values', 'received'):
         assert np.array_equal(getattr(at_once, part)[IMU], getattr(one_by_one, part)[IMU])

@@ -7,9 +7,8 @@ import pytest
 from witness import Sent
 
 from beetle_omni_ros.messages import conversions
-from beetle_omni_ros.nodes.ekf_node import EkfNode
-from beetle_omni_ros.nodes.reference_node import ReferenceNode
-from beetle_omni_ros.nodes.supervisor_node import SupervisorNode
+from beetle_omni_ros.nodes.control_nodes import EkfNode, SupervisorNode
+from beetle_omni_ros.nodes.side_nodes import ReferenceNode
 from beetle_omni_ros.robot.readings import ImuReading, PoseReading
 
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
@@ -19,18 +18,18 @@ def test_the_supervisor_refuses_to_arm_with_the_reason_of_bridges_or_estimator(m
     node = make(SupervisorNode)
 
     def refusal():
-        answer = node._request('arm')(None, SimpleNamespace())
+        answer = node._on_request('arm', None, SimpleNamespace())
         assert not answer.success and node._state == 'disarmed'
         return answer.message
 
     assert 'ekf_node' in refusal()
-    node._on_bridge('rotor')('waiting: battery low')
+    node._on_bridge('rotor', 'waiting: battery low')
     assert refusal() == 'arm refused: rotor_bridge_node waiting: battery low'
-    node._on_bridge('joint')('lost: gimbal3 silent')
+    node._on_bridge('joint', 'lost: gimbal3 silent')
     assert refusal() == 'arm refused: joint_bridge_node lost: gimbal3 silent; rotor_bridge_node ' \
                         'waiting: battery low'
     for name in ('joint', 'rotor'):
-        node._on_bridge(name)('ready')
+        node._on_bridge(name, 'ready')
     assert 'no fresh state estimate' in refusal()
 
 
@@ -83,7 +82,7 @@ def test_the_estimator_publishes_only_valid_estimates(make):
     for k in range(400):
         stamp = 100 + 0.005 * k
         if k % 2:
-            node._on_pose(PoseReading(stamp - 0.01, np.array([0, 0, 0.3]), LEVEL))
+            node._ekf.pose(PoseReading(stamp - 0.01, np.array([0, 0, 0.3]), LEVEL))
         node._on_imu(ImuReading(stamp, np.array([0, 0, 9.80665]), np.zeros(3)))
         if k == 3:
             assert not node._publisher      # too few poses for an estimate

@@ -4,7 +4,6 @@ from itertools import count
 from pathlib import Path
 import subprocess
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,8 +16,7 @@ from beetle_omni_ros.control.registry import ControllerEntry
 from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes import graph
 from beetle_omni_ros.nodes import node as base
-from beetle_omni_ros.nodes.controller_node import ControllerNode
-from beetle_omni_ros.nodes.supervisor_node import SupervisorNode
+from beetle_omni_ros.nodes.control_nodes import ControllerNode, SupervisorNode
 from beetle_omni_ros.robot.allocation import ActuatorHealth
 from beetle_omni_ros.robot.readings import JointReading
 from beetle_omni_ros.robot.schema import ParameterError
@@ -79,7 +77,7 @@ def follower(make):
 
 def test_the_controller_steps_once_a_period_and_stamps_with_the_state(follower):
     health = ActuatorHealth(zeros=(0.1, 0.0, 0.0, -0.2))
-    follower._on_actuators(SimpleNamespace(health=health))
+    follower._host.on_health(health)
     stamps = 101 + 0.005 * np.arange(200)
     fly(follower, stamps)
     assert np.allclose(follower._publisher.stamps(), stamps[::2])
@@ -95,7 +93,7 @@ def test_a_controller_on_standby_steps_between_the_steps_of_the_one_that_flies(f
         for stamp in begin + np.arange(rate) / rate:
             due = round((stamp - begin) * rate) % (rate // 100) == 0
             if due and follower._host.mode == 'flying:rl':
-                follower._on_command(Command(stamp, np.zeros(4), np.full(4, 7.5)))
+                follower._command = Command(stamp, np.zeros(4), np.full(4, 7.5))
             fly(follower, stamp)
         return follower._publisher.stamps()[before:]
 

@@ -7,14 +7,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from beetle_omni_ros.nodes import graph
+from beetle_omni_ros.nodes import graph, runner
 from beetle_omni_ros.robot.schema import ParameterError
-
-PROBE = ('import os, sys\n'
-         'from beetle_omni_ros.nodes import runner\n'
-         'class ProbeNode:\n'
-         '    def __init__(self):\n'
-         '        raise runner.ParameterError(os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE"))\n')
 
 
 @pytest.fixture
@@ -39,19 +33,24 @@ def test_an_unknown_range_is_refused():
         graph.confine({'BEETLE_OMNI_DISCOVERY': 'world'})
 
 
-@pytest.mark.parametrize(('start', 'variable', 'holds'), [
-    ('runner.main(ProbeNode, ["probe"])', '', 'LOCALHOST'),
-    ('sys.exit(runner.run([ProbeNode], ["x"], "composed"))', '', 'LOCALHOST'),
-    ('sys.exit(runner.run([ProbeNode], ["x"], "composed"))', 'subnet', 'SUBNET'),
-    ('runner.main(ProbeNode, ["probe", "--discovery", "SUBNET"])', '', 'SUBNET'),
-    ('runner.main(ProbeNode, ["probe", "--discovery=off", "--ros-args"])', '', 'OFF'),
-    ('runner.main(ProbeNode, ["probe", "--discovery"])', '',
-     "--discovery: expected one of LOCALHOST, SUBNET, OFF, SYSTEM_DEFAULT, found 'NOTHING'")])
-def test_a_separate_or_composed_node_is_limited_to_this_computer_unless_requested(
-        ros_domain, unset, start, variable, holds):
-    done = subprocess.run([sys.executable, '-c', PROBE + start], capture_output=True, text=True,
-                          timeout=60, env={**os.environ, graph.VARIABLE: variable})
-    assert done.stderr.strip() == f'probe_node: error: {holds}'
+@pytest.mark.parametrize(('arguments', 'variable', 'holds'), [
+    ([], '', 'LOCALHOST'), ([], 'subnet', 'SUBNET'), (['--discovery', 'SUBNET'], '', 'SUBNET'),
+    (['--discovery=off'], '', 'OFF')])
+def test_a_process_of_nodes_is_limited_to_this_computer_unless_requested(
+        unset, monkeypatch, arguments, variable, holds):
+    def probe():
+        raise ParameterError(os.environ[graph.RANGE])
+
+    monkeypatch.setenv(graph.RANGE, '')        # put back afterwards
+    monkeypatch.setenv(graph.VARIABLE, variable)
+    failures = []
+    monkeypatch.setattr(sys, 'argv', ['ekf_node', *arguments, '--ros-args'])
+    monkeypatch.setattr(runner, 'node_class', lambda name: probe)
+    monkeypatch.setattr(runner, '_fail', lambda name, error, status: failures.append(str(error)))
+    monkeypatch.setattr(runner.signal, 'signal', lambda *_: None)
+    with pytest.raises(SystemExit):
+        runner.main('ekf_node')
+    assert failures == [holds]
 
 
 @pytest.mark.parametrize('composed', [True, False])
@@ -73,18 +72,6 @@ def test_an_argument_of_fly_reaches_every_node_of_the_plan(tmp_path, unset, monk
                                         bag=str(tmp_path / 'bag'))).nodes
     graph.Graph(nodes, tmp_path, 7, composed).start()
     assert ranges == [holds] * (2 if composed else len(nodes))
-
-
-def test_a_name_is_free_again_when_its_process_ends():
-    name = f'test/{os.getpid()}'
-    with graph.claim(name):
-        assert graph.claim(name) is None
-    code = f'from beetle_omni_ros.nodes import graph; print(graph.claim({name!r}))'
-    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
-                          check=True, timeout=60)
-    assert 'socket' in done.stdout
-    with graph.claim(name):
-        pass
 
 
 def test_two_reserved_domains_differ(monkeypatch):

@@ -10,10 +10,10 @@ import subprocess
 import sys
 import termios
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from sensor_msgs.msg import Joy
 from witness import running_graph
 
 from beetle_omni_ros import cli
@@ -188,43 +188,18 @@ def test_lines_of_text_fly_the_robot_within_the_fence(flight):
         np.radians(60), 0, rotations.to_rpy(truth.quaternion)[2])) < np.radians(8)
 
 
-def test_a_stick_moves_the_robot_at_its_speed_and_a_silent_joystick_holds_it(flight):
-    domain, witness = flight
-    p, driver = DriveParameters.load(), drive('joystick', domain)
-    joy = witness._node.create_publisher(Joy, 'joy', wire.profile(EVENT))
-
-    def push(seconds, **values):
-        message = Joy(axes=[0.0] * 8, buttons=[0] * 11)
-        for name, value in values.items():
-            if name == 'x':
-                message.axes[int(p.axes[0])] = value * float(p.signs[0])
-            else:
-                message.buttons[p.buttons[name]] = value
-        for _ in range(round(seconds / 0.05)):
-            joy.publish(message)
-            witness.spin(0.05)
-
-    try:
-        assert witness.wait(joy.get_subscription_count, 30)
-        witness.spin(1.0)
-        for _ in range(5):
-            push(0.5)
-            push(0.5, arm=1)
-            if witness.wait(lambda: witness.state.startswith('flying'), 8):
-                break
-        assert witness.state.startswith('flying'), witness.states
-        begin, at = witness.truth.position[0], witness.time()
-        push(2.0, x=1.0)
-        pushed = witness.time() - at + p.joystick_timeout
-        witness.spin(1.0)
-        assert witness.wait(lambda: np.linalg.norm(witness.truth.velocity) < 0.02, 20)
-        moved = witness.truth.position[0] - begin
-        assert 0.4 < moved < pushed * p.speed + 0.1
-        witness.spin(1.0)
-        assert witness.truth.position[0] - begin == pytest.approx(moved, abs=0.05)
-    finally:
-        driver.terminate()
-        driver.communicate(timeout=10)
+def test_sticks_and_buttons_are_actions_until_the_joystick_is_silent():
+    p = DriveParameters.load()
+    pilot = SimpleNamespace(axes=[0.0] * 8, buttons=[0] * 11, joy_at=5.0, steering=object(),
+                            time=lambda: 5.0)
+    joystick = driver._Joystick(pilot, p, {}, print)
+    assert joystick.actions(0.1) == []
+    pilot.axes[int(p.axes[0])], pilot.buttons[p.buttons['arm']] = float(p.signs[0]), 1
+    order, shift = joystick.actions(0.1)
+    assert order.name == 'arm' and shift.way == pytest.approx([0.1 * p.speed, 0, 0])
+    assert len(joystick.actions(0.1)) == 1      # the button is still pressed
+    pilot.time = lambda: 5.0 + 2 * p.joystick_timeout
+    assert joystick.actions(0.1) == []
 
 
 @pytest.mark.parametrize(('arguments', 'expected'), [

@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from beetle_omni_ros.nodes.runner import signals_ignored, sigterm_as_interrupt
+from beetle_omni_ros.nodes.runner import sigterm_as_interrupt
 from beetle_omni_ros.runs.bag import read_bag
 
 
@@ -23,29 +23,6 @@ def test_a_signal_is_an_interrupt_even_if_a_library_converts_it(number):
         except KeyboardInterrupt:
             raise RuntimeError('context is not valid') from None
     assert signal.getsignal(number) is before
-
-
-def test_a_second_signal_does_not_interrupt_the_clean_up():
-    cleaned = []
-    with pytest.raises(KeyboardInterrupt), sigterm_as_interrupt():
-        try:
-            os.kill(os.getpid(), signal.SIGTERM)
-            time.sleep(1)
-        finally:
-            os.kill(os.getpid(), signal.SIGTERM)
-            os.kill(os.getpid(), signal.SIGINT)
-            time.sleep(0.01)
-            cleaned.append(True)
-    assert cleaned
-
-
-def test_a_signal_while_a_flight_that_is_over_is_cleaned_up_waits():
-    cleaned = False
-    with sigterm_as_interrupt(), signals_ignored():
-        os.kill(os.getpid(), signal.SIGTERM)
-        time.sleep(0.01)
-        cleaned = True
-    assert cleaned
 
 
 @pytest.mark.parametrize(('moment', 'options'), [

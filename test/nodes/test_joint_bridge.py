@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.messages import conversions
-from beetle_omni_ros.messages.values import MessageError
 from beetle_omni_ros.robot.parameters import JOINT_NAMES
 from beetle_omni_ros.sim.emulated import ServoFaults
 from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
@@ -140,33 +139,9 @@ def test_a_silent_servo_leaves_joint_states_incomplete_and_is_named(active):
     assert 'gimbal3' in operator.now and 'silent; check its cable and power' in operator.now
     operator.until(lambda: list(operator.joints[-1][0].name) == ['gimbal1', 'gimbal2', 'gimbal4'])
     assert operator.status('bus').level == operator.status('gimbal3').level == ERROR
-    with pytest.raises(MessageError, match='gimbal3'):
-        conversions.take_joints(operator.joints[-1][0])
+    known = conversions.take_joints(operator.joints[-1][0])
+    assert np.isnan(known.position).tolist() == [False, False, True, False]
     emulated.faults.silent = set()
-    is_back(emulated, operator)
-
-
-def test_an_unplugged_cable_is_reported_lost_until_it_is_back(active):
-    emulated, operator = active
-    emulated.unplug()
-    operator.reaches(f'lost: {emulated.port}: no connection')
-    operator.joints.clear()
-    operator.spin(0.2)
-    assert not operator.joints, 'nothing is made up'
-    emulated.replug()
-    is_back(emulated, operator)
-
-
-def test_an_overheated_servo_is_lost_until_it_is_rebooted(active):
-    emulated, operator = active
-    emulated.faults.overheated = {4}
-    operator.until(lambda: 'lost: gimbal4' in operator.now
-                   and 'shut down (overheated)' in operator.now, 'not noticed')
-    assert emulated.torque_enabled.tolist() == [True, True, True, False]
-    emulated.faults.overheated = set()
-    operator.spin(0.3)
-    assert not emulated.torque_enabled[3], 'no torque was requested'
-    assert operator.ask('reboot_gimbal4').message == 'restarting gimbal4'
     is_back(emulated, operator)
 
 

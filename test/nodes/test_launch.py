@@ -73,24 +73,6 @@ def test_composed_is_one_process_and_one_for_the_bridges(bringup):
     assert command[-2:] == ['-r', '__ns:=/robot1']
 
 
-def test_separate_nodes_and_no_simulator_for_another_backend(bringup):
-    _, *nodes = bringup.start(composed='false', backend='none', task='waypoints',
-                              viewer='true', namespace='robot1')
-    assert [n.kwargs['executable'] for n in nodes] == [
-        'ekf_node', 'nmpc_node', 'rl_node', 'supervisor_node', 'reference_node', 'viewer_node']
-    assert all(n.kwargs['namespace'] == 'robot1' for n in nodes)
-
-
-def test_robot_state_publisher_has_the_links(bringup):
-    state_publisher, *_ = bringup.start(viewer='true', namespace='robot1', composed='false')
-    given = state_publisher.kwargs
-    assert (given['package'], given['namespace']) == ('robot_state_publisher', 'robot1')
-    text = given['parameters'][0]['robot_description']
-    assert text.args[0].startswith('<?xml') and text.kwargs == {'value_type': str}
-    assert all(n.kwargs['package'] != 'robot_state_publisher'
-               for n in bringup.start(composed='false'))
-
-
 def given_to(nodes):
     """Name -> parameters of separate nodes."""
     return {node.kwargs['name']: node.kwargs['parameters'][0] for node in nodes}
@@ -102,8 +84,15 @@ def test_simulator_and_bridges_meet_at_the_same_ports_in_a_private_folder(bringu
     assert nodes['sim_node']['servo_port'] == nodes['joint_bridge_node']['port']
     assert nodes['sim_node']['board_port'] == nodes['rotor_bridge_node']['port']
     assert nodes['joint_bridge_node']['autostart'] == 'activate'
-    direct = given_to(bringup.start(composed='false', actuators='direct'))
+    folders = {Path(given_to(bringup.start(composed='false'))['sim_node']['servo_port']).parent
+               for _ in range(2)}
+    assert len(folders) == 2
+    assert all(stat.S_IMODE(folder.stat().st_mode) == 0o700 for folder in folders)
+    direct = given_to(bringup.start(composed='false', actuators='direct', robot_file='a.yaml',
+                                    plant_file='b.yaml'))
     assert not set(BRIDGES) & set(direct) and 'actuators' not in direct['sim_node']
+    assert [direct[name]['robot_file'] for name in ('sim_node', 'ekf_node')] == [
+        'b.yaml', 'a.yaml']
 
 
 @pytest.mark.real_time
@@ -121,14 +110,6 @@ def test_the_bridges_of_the_service_start_and_wait_for_their_ports(tmp_path, ros
         operator.close()
         service.send_signal(signal.SIGINT)
         assert service.wait(20) == 0
-
-
-def test_the_plant_may_differ_from_the_robot_file(bringup):
-    nodes = given_to(bringup.start(composed='false', robot_file='a.yaml', plant_file='b.yaml',
-                                   actuators='direct'))
-    files = {name: parameters.get('robot_file') for name, parameters in nodes.items()}
-    assert files == {'sim_node': 'b.yaml', 'ekf_node': 'a.yaml', 'nmpc_node': 'a.yaml',
-                     'rl_node': 'a.yaml', 'supervisor_node': 'a.yaml'}
 
 
 def test_each_controller_can_be_active_with_the_other_on_standby(bringup, capsys, monkeypatch):
@@ -176,13 +157,6 @@ def test_a_launch_is_visible_on_this_computer_only(bringup, monkeypatch):
     assert os.environ[graph.RANGE] == 'SUBNET'
     bringup.start(composed='false', discovery='OFF')
     assert os.environ[graph.RANGE] == 'OFF'
-
-
-def test_the_ports_of_a_launch_are_in_a_private_folder(bringup):
-    folders = {Path(n.kwargs['parameters'][0]['servo_port']).parent for _ in range(2)
-               for n in bringup.start(composed='false') if n.kwargs['name'] == 'sim_node'}
-    assert len(folders) == 2
-    assert all(stat.S_IMODE(folder.stat().st_mode) == 0o700 for folder in folders)
 
 
 def test_the_browser_viewer_is_a_separate_process_without_targets(bringup):

@@ -7,7 +7,7 @@ from rcl_interfaces.msg import SetParametersResult
 from beetle_omni_ros.control.base import Command, PoseTarget
 from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes import wire
-from beetle_omni_ros.nodes.live_view import LiveGraph
+from beetle_omni_ros.nodes.operator import LiveGraph
 from beetle_omni_ros.view.frames import COLUMNS, pose, Sampler
 
 pytestmark = pytest.mark.real_time
@@ -77,16 +77,3 @@ def test_the_supervisor_accepts_or_refuses_a_controller(bench, listener):
     listener.select('hover', answers.append)
     assert bench.wait(lambda: answers == ['', 'rl alone'])
     assert bench.user.get_parameter('controller').value == 'rl'
-
-
-def test_a_read_only_graph_publishes_no_target(bench, ros_domain):
-    silent = LiveGraph(domain=ros_domain)
-    try:
-        silent.publish_target(PoseTarget(np.zeros(3), TURNED, 1.0))
-        answers = []
-        silent.select('rl', answers.append)
-        assert answers == ['supervisor_node is not there']
-        assert bench.wait(lambda: bench.user.count_subscribers('odom'))    # it is in the graph
-        assert not bench.user.count_publishers('target_pose')
-    finally:
-        silent.close()

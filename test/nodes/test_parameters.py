@@ -57,7 +57,7 @@ def test_file_and_overrides_arrive_in_the_dataclass(make_node, tmp_path):
     assert node.get_parameter('gains.kp').value == 4.0
     descriptor = node.describe_parameter('gains.kp')
     assert 'stiffness' in descriptor.description
-    assert descriptor.floating_point_range[0].to_value == 10
+    assert descriptor.additional_constraints == '0 to 10'
 
 
 @pytest.mark.parametrize('override, named', [

@@ -9,8 +9,8 @@ import pytest
 from beetle_omni_ros.control.base import PoseTarget, State
 from beetle_omni_ros.control.policy import PolicyController, PolicyParameters
 from beetle_omni_ros.messages.values import Odom
-from beetle_omni_ros.nodes.controller_node import RlNode
-from beetle_omni_ros.nodes.graph import controller_nodes
+from beetle_omni_ros.nodes.control_nodes import RlNode
+from beetle_omni_ros.nodes.graph import controller_nodes, GraphOptions
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import JointReading
 from beetle_omni_ros.robot.resources import share_path
@@ -21,6 +21,10 @@ pytest.importorskip('onnx')
 from policy_files import write
 
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+def plan_of(controller, **options):
+    return controller_nodes(GraphOptions(controller=controller, **options))
 
 
 def test_the_node_publishes_the_commands_of_the_policy(make, tmp_path):
@@ -47,22 +51,21 @@ def test_a_file_of_the_nmpc_reaches_its_node(tmp_path):
     mine = tmp_path / 'mine.yaml'
     mine.write_text('limits: {tilt_rate_share: 0.5}\n')
     for active in ('nmpc', 'hover'):
-        assert controller_nodes(active, nmpc=str(mine))[0]['nmpc_node'] == {'nmpc_file': str(mine)}
+        assert plan_of(active, nmpc=str(mine))[0]['nmpc_node'] == {'nmpc_file': str(mine)}
     with pytest.raises(ParameterError, match="for the controller 'nmpc', which does not run"):
-        controller_nodes('hover', nmpc=str(mine), standby=False)
+        plan_of('hover', nmpc=str(mine), standby=False)
     mine.write_text('limits: {tilt_rate: 7.0}\n')
     with pytest.raises(ParameterError, match="unknown key; did you mean 'tilt_rate_share'"):
-        controller_nodes('nmpc', nmpc=str(mine))
+        plan_of('nmpc', nmpc=str(mine))
 
 
 def test_an_unusable_policy_is_not_on_standby(tmp_path):
     policy = str(write(tmp_path / 'policy.onnx'))
     other = str(share_path('params/robot_weak_and_heavy.yaml'))
-    assert list(controller_nodes('nmpc', policy=policy)[0]) == ['nmpc_node', 'rl_node']
-    nodes, reason = controller_nodes('nmpc', policy=policy, robot_file=other)
+    assert list(plan_of('nmpc', policy=policy)[0]) == ['nmpc_node', 'rl_node']
+    nodes, reason = plan_of('nmpc', policy=policy, robot_file=other)
     assert list(nodes) == ['nmpc_node'] and 'mass' in reason['rl']
-    nodes, reason = controller_nodes('nmpc', policy=policy, robot_file=other,
-                                     allow_other_robot=True)
+    nodes, reason = plan_of('nmpc', policy=policy, robot_file=other, allow_other_robot=True)
     assert nodes['rl_node'] == {'robot_file': other, 'policy': policy, 'allow_other_robot': True}
     with pytest.raises(ParameterError, match='no such file'):
-        controller_nodes('rl', policy=str(tmp_path / 'none.onnx'))
+        plan_of('rl', policy=str(tmp_path / 'none.onnx'))

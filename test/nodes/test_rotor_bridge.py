@@ -121,22 +121,6 @@ def test_commands_are_repeated_and_the_rotors_stop_with_the_stream_or_with_old_c
     operator.counts('inputs', 'command rejected: stale stamp', above=5)
 
 
-def test_a_lost_board_stays_disarmed_until_the_supervisor_is_disarmed(flying):
-    board, operator = flying.board, flying.operator
-    board.unplug()
-    operator.reaches(f'lost: {board.port}: port is away')
-    flying.stops()
-    board.plug()
-    operator.spin(0.3)         # the supervisor continues, and the board could be armed again
-    assert operator.now.startswith('lost') and not board.armed
-    operator.supervise('emergency_stop')
-    operator.spin(0.1)
-    assert operator.now.startswith('lost')
-    operator.thrust = None
-    operator.supervise('disarmed')
-    flying.take_off()
-
-
 def test_battery_and_rotor_speeds_are_published_in_ros_units_and_signs(bridge):
     board, operator = bridge.board, bridge.operator
     board.set_battery(23.456, 12.34)

@@ -9,7 +9,6 @@ from rclpy.parameter import Parameter
 
 from beetle_omni_ros.nodes import node as base
 from beetle_omni_ros.nodes.sim_node import SimNode
-from beetle_omni_ros.robot.schema import ParameterError
 
 pytestmark = pytest.mark.real_time
 
@@ -76,11 +75,6 @@ def test_the_simulator_publishes_simulated_time_only_without_serial_devices(sim)
     assert np.allclose(np.diff([before, *ticks]), 0.005, rtol=0, atol=1e-6)
 
 
-def test_simulated_time_is_refused_with_serial_devices(sim):
-    with pytest.raises(ParameterError, match=r"key 'clock': simulated: serial devices keep real"):
-        sim('clock:=simulated')
-
-
 def test_an_existing_path_is_refused_and_unchanged(sim, tmp_path):
     servos, taken = tmp_path / 'servos', tmp_path / 'notes.txt'
     taken.write_text('keep')
@@ -130,9 +124,3 @@ def test_the_emulated_servos_are_those_of_the_bus_file(sim, tmp_path):
     assert [servo.sign for servo in servos] == [1, -1, 1, -1]
     assert [servo.zero for servo in servos] == [2000, 2100, 2048, 1900]
     assert {servo['Baud Rate'] for servo in servos} == {5}      # 3 Mbit/s
-
-
-def test_a_payload_changes_in_flight_within_its_range(sim):
-    node = sim('payload:=0.25', actuators='direct')
-    assert put(node, payload=1.0).successful and node._simulator._payload == 1.0
-    assert not put(node, payload=-1.0).successful and not put(node, seed=3).successful

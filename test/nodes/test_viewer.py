@@ -8,8 +8,8 @@ import pytest
 from beetle_omni_ros.control.base import Command, PoseTarget
 from beetle_omni_ros.messages import conversions
 from beetle_omni_ros.messages.values import Odom
-from beetle_omni_ros.nodes import viewer_node
-from beetle_omni_ros.nodes.viewer_node import ViewerNode
+from beetle_omni_ros.nodes import side_nodes
+from beetle_omni_ros.nodes.side_nodes import ViewerNode
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.readings import JointReading
 
@@ -61,7 +61,7 @@ def test_thrust_arrows_point_along_the_tilted_rotors(viewer):
 
 
 def test_the_frame_of_the_body_is_sent_once_for_each_estimate(viewer, monkeypatch):
-    monkeypatch.setattr(viewer_node, 'TFMessage', SimpleNamespace)
+    monkeypatch.setattr(side_nodes, 'TFMessage', SimpleNamespace)
     rotation, position = rotations.from_rpy(0.4, -0.2, 1.0), np.array([1.0, 2.0, 3.0])
     viewer._odom = Odom(5.0, position, np.zeros(3), rotation, np.zeros(3))
     viewer._move()

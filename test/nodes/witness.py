@@ -8,7 +8,7 @@ import pytest
 import rclpy
 
 from beetle_omni_ros.messages import conversions
-from beetle_omni_ros.messages.topics import EVENT, SENSOR
+from beetle_omni_ros.messages.topics import EVENT, SENSOR, topic_of
 from beetle_omni_ros.nodes import runner, wire
 from beetle_omni_ros.nodes.graph import Graph
 from beetle_omni_ros.nodes.operator import Operator
@@ -33,7 +33,7 @@ class Sent(list):
 
     def publish(self, value):
         """Store a value."""
-        self.append(wire.message(self._topic, value))
+        self.append(topic_of(self._topic).write(value))
 
     def stamps(self):
         """Return the stamps of all messages [s]."""

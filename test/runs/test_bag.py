@@ -16,7 +16,7 @@ from synthetic_flights import (
 )
 
 from beetle_omni_ros.messages import conversions
-from beetle_omni_ros.messages.bag_types import BAG, to_bytes, TYPESTORE
+from beetle_omni_ros.messages.bag_types import new, to_bytes, TYPESTORE
 from beetle_omni_ros.robot.readings import ImuReading
 from beetle_omni_ros.runs.bag import BagError, read_bag, read_messages, replay
 from beetle_omni_ros.runs.bag_writer import add_meta, BagWriter
@@ -157,10 +157,10 @@ def test_missing_topics_are_named(tmp_path):
 
 def joint_states(t, names, position, velocity=()):
     """Type and bytes of a message with any names."""
-    message = BAG.new('sensor_msgs/msg/JointState')
+    message = new('sensor_msgs/msg/JointState')
     conversions.set_time(message.header.stamp, t)
-    message.name, message.position = names, BAG.doubles(position)
-    message.velocity = BAG.doubles(velocity)
+    message.name, message.position = names, np.array(position, dtype=float)
+    message.velocity = np.array(velocity, dtype=float)
     return 'sensor_msgs/msg/JointState', to_bytes(message, 'sensor_msgs/msg/JointState')
 
 
@@ -177,7 +177,7 @@ def test_a_message_that_cannot_be_used_is_counted_and_loses_no_other(tmp_path):
 
 
 def test_raw_messages_and_late_topics_are_written(tmp_path):
-    text = to_bytes(conversions.write_text(BAG, 'hello'), 'std_msgs/msg/String')
+    text = to_bytes(conversions.write_text('hello'), 'std_msgs/msg/String')
     with BagWriter(tmp_path / 'bag', topics=['imu/data_raw']) as writer:
         write_imu(writer, 1.0, (0, 0, 9.8), (0, 0, 0))
         writer.write_raw('/notes', 'std_msgs/msg/String', text, 2.0)
@@ -191,7 +191,7 @@ def test_namespaces_are_removed_and_several_robots_need_a_choice(tmp_path):
     with BagWriter(tmp_path / 'one', namespace='robot1') as writer:
         write_command(writer, 1.0, np.ones(4), np.ones(4))
         write_request(writer, 'nmpc', 1.0, np.zeros(4), np.ones(4))
-        imu = to_bytes(conversions.write_imu(BAG, ImuReading(2.0, (0, 0, 1), (0, 0, 0))),
+        imu = to_bytes(conversions.write_imu(ImuReading(2.0, (0, 0, 1), (0, 0, 0))),
                        'sensor_msgs/msg/Imu')
         writer.write_raw('/robot2/imu/data_raw', 'sensor_msgs/msg/Imu', imu, 2.0)
     with pytest.raises(BagError, match='several robots'):

@@ -16,7 +16,7 @@ from synthetic_flights import fly, write_odom
 import yaml
 
 from beetle_omni_ros.messages import conversions
-from beetle_omni_ros.messages.bag_types import BAG, to_bytes
+from beetle_omni_ros.messages.bag_types import new, to_bytes
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.robot.urdf import description, joints
@@ -176,8 +176,8 @@ def placed(frames, name):
 
 def test_unusable_joint_states_cost_only_frames(tmp_path):
     kind = 'sensor_msgs/msg/JointState'
-    odd = BAG.new(kind)
-    odd.name, odd.position = ['gimbal1'], BAG.doubles([0.1])
+    odd = new(kind)
+    odd.name, odd.position = ['gimbal1'], np.array([0.1])
     with BagWriter(tmp_path / 'bag', description=description()) as writer:
         writer.write_raw('/joint_states', kind, b'\x00\x01\x00\x00\xff', 1.0)
         write_odom(writer, 1.0, np.zeros(3), np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3))

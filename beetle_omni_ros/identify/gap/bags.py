@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from beetle_omni_ros.messages.bag_types import from_bytes
-from beetle_omni_ros.messages.columns import read_all
+from beetle_omni_ros.messages.bag_types import from_bytes, read_all
 from beetle_omni_ros.messages.topics import is_ambiguous, split_topic, TOPICS
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, ROTOR_NAMES
 from beetle_omni_ros.runs.bag import BagError, read_together

@@ -1,0 +1,551 @@
+"""ROS lifecycle nodes between the topics and the actuators: tilt servos and motor board."""
+
+from collections import Counter
+from dataclasses import dataclass, replace
+from functools import partial
+import math
+import time
+
+import numpy as np
+from rclpy.lifecycle import LifecycleNodeMixin, TransitionCallbackReturn
+from std_srvs.srv import Trigger
+
+from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters, ServoBusParameters
+from beetle_omni_ros.drivers.motor_board import Arming, FLIES, LOST, MotorBoard
+from beetle_omni_ros.drivers.serial_port import SerialPortError
+from beetle_omni_ros.drivers.servo_bus import ServoBus
+from beetle_omni_ros.drivers.servo_link import ServoBusError
+from beetle_omni_ros.drivers.servo_loop import ServoLoop
+from beetle_omni_ros.nodes.graph import AUTOSTART
+from beetle_omni_ros.nodes.node import CommandSource, Distribution, ERROR, FlightNode, OK, WARN
+from beetle_omni_ros.nodes.parameters import file_parameter
+from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters
+from beetle_omni_ros.robot.readings import JointReading, RotorReading
+from beetle_omni_ros.robot.schema import parameter
+
+UNCONFIGURED, INACTIVE, ACTIVE = 'unconfigured', 'inactive', 'active'
+RETRY = 1.0             # [s] between attempts to start by itself
+COMMAND_AGE = 0.1       # [s] older commands are not written to the servos
+LOST_AFTER = 0.3        # [s] after which a servo without response or torque is lost
+CHECK_PERIOD = 0.05     # [s] between checks of the bus thread's events
+RPM = math.pi / 30      # [rad/s]
+POLL_CYCLES = 2         # the board sends its rotors' speeds 100 times a second
+
+
+class BridgeNode(LifecycleNodeMixin, FlightNode):
+    """
+    Base of a node that opens a device when configured and powers it when activated.
+
+    A subclass overrides ``configure`` (open the device), ``activate`` (power it), ``deactivate``,
+    ``release`` (switch the power off and close it, in any state) and ``changed``, which is called
+    after each transition. ServoBusError and SerialPortError refuse a transition. Their text goes
+    to the log and to ``refusal``, and the state stays as it was.
+    """
+
+    real_time = True
+
+    def __init__(self, *args, **kwargs):
+        FlightNode.__init__(self, *args, **kwargs)
+        LifecycleNodeMixin.__init__(self)
+        self.refusal = ''       # why the last transition was refused, '' if it was not
+        self._start_timer = None
+        self._starts = False    # during an automatic transition
+        # In rclpy, an impossible transition ends the process.
+        self._answer_change = self._service_change_state.callback
+        self._service_change_state.callback = self._on_change_state
+
+    @property
+    def stage(self) -> str:
+        """Name of the present state."""
+        return self._state_machine.current_state[1]
+
+    def start_by_itself(self) -> None:
+        """Go to the state of the parameter ``autostart``; repeat until it succeeds."""
+        if AUTOSTART[self.parameters.autostart]:
+            self._start_timer = self.create_timer(RETRY, self.try_to_start,
+                                                  clock=self.steady_clock)
+
+    def try_to_start(self) -> None:
+        """Make the next transitions of the automatic start."""
+        self._starts, goal = True, AUTOSTART[self.parameters.autostart]
+        if self.stage == UNCONFIGURED:
+            self.trigger_configure()
+        if self.stage == INACTIVE and goal == ACTIVE:
+            self.trigger_activate()
+        if self.stage not in (UNCONFIGURED, INACTIVE) or self.stage == goal:
+            self._start_timer.cancel()
+        self._starts = False
+        self.changed()
+
+    # --- called by rclpy ----------------------------------------------------------------------
+
+    def on_configure(self, state):
+        """Open the device."""
+        return self._attempt('configure', self.configure, self.release)
+
+    def on_activate(self, state):
+        """Power the device."""
+        return self._attempt('activate', self.activate)
+
+    def on_deactivate(self, state):
+        """Switch the power off; ends the automatic start."""
+        return self._end('deactivate', self.deactivate)
+
+    def on_cleanup(self, state):
+        """Close the device; ends the automatic start."""
+        return self._end('clean up', self.release)
+
+    def on_shutdown(self, state):
+        """Close the device."""
+        return self._end('shut down', self.release)
+
+    def on_error(self, state):
+        """Close the device after an unexpected exception; it can be configured again."""
+        self.release()
+        return TransitionCallbackReturn.SUCCESS
+
+    def _end(self, what, action):
+        if self._start_timer is not None:
+            self._start_timer.cancel()
+        return self._attempt(what, action)
+
+    def _attempt(self, what, action, undo=lambda: None):
+        before, self.refusal = self.refusal, ''
+        try:
+            action()
+        except (ServoBusError, SerialPortError) as error:
+            undo()
+            self.refusal = ' '.join(str(error).split())
+            if self.refusal != before:      # attempts are repeated, lines are not
+                self.log_line('warning' if self._starts else 'error',
+                              f'cannot {what}: {self.refusal}'
+                              + ('; tries again' if self._starts else ''))
+            return TransitionCallbackReturn.FAILURE
+        except Exception as error:
+            self.get_logger().fatal(f'cannot {what}: {type(error).__name__}: {error}')
+            raise
+        return TransitionCallbackReturn.SUCCESS
+
+    def _on_change_state(self, request, response):
+        try:
+            self._answer_change(request, response)
+        except Exception as error:      # rclpy does not export the class
+            if 'RCLError' not in type(error).__name__:
+                raise
+            self.get_logger().warning(f'refused: no such transition from {self.stage}')
+            response.success = False
+        self.changed()
+        return response
+
+
+# --- servos -------------------------------------------------------------------------------------
+
+@dataclass(frozen=True, kw_only=True)
+class JointBridgeNodeParameters(ServoBusParameters):
+    """Parameters of joint_bridge_node: the bus's parameters, the files, and autostart."""
+
+    robot_file: str = file_parameter()
+    servo_bus_file: str = file_parameter('servo file to start from')
+    autostart: str = parameter('none', choices=tuple(AUTOSTART), read_only=True,
+                               doc='transition at the start, repeated until it succeeds')
+
+
+class JointBridgeNode(BridgeNode):
+    """Lifecycle node: configure checks the servos, activate switches their torque on."""
+
+    def __init__(self):
+        super().__init__('joint_bridge_node', JointBridgeNodeParameters, 'params/servo_bus.yaml',
+                         'servo_bus_file', on_change=self._changed,
+                         changeable=('confirm_tilts', 'confirmed_tilts'))
+        self._travel = RobotParameters.load(self.parameters.robot_file or None).joints
+        self._bus = self._loop = None
+        self._lost_reason = ''
+        self._latency, self._since = Distribution(), 'publication'
+        self._state = self.publisher('joint_bridge/state')
+        self._published = ''
+        self._joints = self.publisher('joint_states')
+        self.listen('command', self._on_command, read=CommandSource(self).read,
+                    max_age=COMMAND_AGE, stale_after=None, published=True)
+        # loop, its cycles and missed cycles, and the time of the last bus status
+        self._counted = (None, 0, 0, time.monotonic())
+        self.health.report('bus', self._bus_status)
+        self.health.report('latency', lambda: self._latency.status(
+            f'{self._since} of command to its last byte written'))
+        for k, name in enumerate(JOINT_NAMES):
+            self.health.report(name, partial(self._servo_status, k))
+            self.create_service(Trigger, f'~/reboot_{name}', partial(self._on_reboot, [k]))
+        self.create_service(Trigger, '~/reboot', partial(self._on_reboot, None))
+        self.create_timer(CHECK_PERIOD, self.changed, clock=self.steady_clock)
+        self.start_by_itself()
+        self.changed()
+
+    def waits_for(self):
+        """Return the state of the servos."""
+        return self._published.replace('waiting:', 'its servos:')
+
+    def configure(self):
+        """Open the port, check and write the servos' settings, and start to read angles."""
+        self._bus = ServoBus(self.parameters, self._travel, self.now)
+        self._bus.open()
+        self._bus.configure()
+        self._lost_reason = ''
+        self._loop = ServoLoop(self._bus, self._publish, self._on_written)
+        self._loop.start()
+
+    def activate(self):
+        """Switch the torque on; the servos hold their present angles."""
+        if self._loop.failure:
+            raise ServoBusError(f'{self._loop.failure}; clean up and configure again')
+        with self._loop.exclusive() as bus:
+            bus.enable()
+
+    def deactivate(self):
+        """Switch the torque off."""
+        if self._bus.enabled:
+            self._lost_reason = 'no torque, deactivated'
+        with self._loop.exclusive() as bus:
+            confirmed = bus.disable()
+        if not confirmed:
+            self.get_logger().error('torque off is not confirmed by all servos; it is switched '
+                                    'off as soon as they respond')
+
+    def release(self):
+        """Switch the torque off and close the port."""
+        loop, bus = self._loop, self._bus
+        self._loop = self._bus = None
+        if bus is None:
+            return
+        if bus.enabled:
+            self._lost_reason = 'no torque, the node was shut down'
+        if loop is not None:
+            loop.stop()
+        bus.close()
+        if loop is not None:    # without a loop, the refusal was logged
+            self._log(bus)
+
+    def close(self):
+        """Switch the torque off and publish the state."""
+        self.release()
+        self.changed()
+
+    def _changed(self, new):
+        self.parameters = new
+        if self._loop is not None:
+            with self._loop.exclusive() as bus:
+                bus.parameters = new
+
+    def _on_reboot(self, which, _, response):
+        if self._loop is None:
+            response.success, response.message = False, 'not configured'
+            return response
+        if which is None:
+            which = [k for k, servo in enumerate(self._bus.servos)
+                     if servo.errors and not servo.torque] or range(4)
+        with self._loop.exclusive() as bus:
+            for k in which:
+                bus.reboot(int(self.parameters.ids[k]))
+        response.success = True
+        response.message = f"restarting {', '.join(JOINT_NAMES[k] for k in which)}"
+        return response
+
+    def _on_command(self, command, published):
+        if self._loop is not None:
+            if math.isnan(published):
+                self._since, published = 'arrival', time.time()
+            left = COMMAND_AGE - max(0.0, self.now() - command.stamp)
+            self._loop.offer(command.tilt, published, time.monotonic() + left)
+
+    def _on_written(self, published):
+        self._latency.add(time.time() - published)
+
+    def _publish(self, readings, good):
+        if good.any():
+            self._joints.publish(JointReading(
+                readings.stamp, readings.position[good], readings.velocity[good],
+                readings.effort[good], [n for n, is_good in zip(JOINT_NAMES, good) if is_good]))
+
+    def changed(self):
+        """Log the thread's events; publish the state if it changed."""
+        if self._loop is not None:
+            self._log(self._bus)
+        text = self._state_text()
+        if text != self._published:
+            self.log_line('error' if text.startswith('lost') and not self._lost_reason
+                          else 'info', text)
+            self._published = text
+            self._state.publish(text)
+
+    def _log(self, bus):
+        for line in bus.take_events():
+            self.get_logger().warning(line)
+
+    def _state_text(self):
+        if self.stage == ACTIVE and self._loop is not None:
+            lost = self._loop.lost(LOST_AFTER)
+            return f'lost: {lost}' if lost else 'ready'
+        if self.refusal:
+            return f'waiting: {self.refusal}'
+        if self._lost_reason:
+            return f'lost: {self._lost_reason}'
+        return 'waiting: no torque, not activated' if self.stage == INACTIVE \
+            else 'waiting: not configured'
+
+    def _bus_status(self):
+        loop, bus, text, now = self._loop, self._bus, self._published, time.monotonic()
+        if loop is None:
+            return WARN if self.stage == ACTIVE else OK, text, {'stage': self.stage}
+        before, cycles, missed, then = self._counted
+        if loop is not before:
+            cycles = missed = 0
+        self._counted = (loop, loop.cycles, loop.missed, now)
+        missed = loop.missed - missed
+        values = {
+            'stage': self.stage, 'cycles': loop.cycles, 'missed_cycles': loop.missed,
+            'rate_hz': (loop.cycles - cycles) / max(now - then, 1e-3),
+            'connected': bus.link.is_open, 'goals_written': loop.written,
+            'goals_stale': loop.stale, 'goals_clipped': bus.clipped,
+            'incomplete': loop.incomplete, **bus.link.counts}
+        if text.startswith('lost'):
+            return ERROR, text, values
+        if not bus.link.is_open:
+            return WARN, 'no connection', values
+        return (WARN, f'{missed} cycles missed', values) if missed else (OK, text, values)
+
+    def _servo_status(self, k):
+        if self._bus is None:
+            return OK, 'not configured', {}
+        one = self._bus.servos[k]
+        recovering = one.recovery is not None or one.restarting
+        values = {'id': one.identifier, 'responding': not one.silent,
+                  'torque': 'unknown' if one.torque is None else one.torque,
+                  'voltage_v': one.voltage, 'temperature_c': one.temperature,
+                  'errors': ', '.join(one.errors) or 'none',
+                  'watchdog_expired': one.watchdog_expired, 'recovering': recovering}
+        if one.message:
+            bad = one.silent or (one.errors and not one.torque)
+            return (ERROR if bad else WARN), one.message, values
+        return OK, 'being brought back' if recovering else 'ok', values
+
+
+# --- motor board --------------------------------------------------------------------------------
+
+@dataclass(frozen=True, kw_only=True)
+class RotorBridgeNodeParameters(MotorBoardParameters):
+    """Parameters of rotor_bridge_node: the driver's parameters, the files, and autostart."""
+
+    robot_file: str = file_parameter('robot file with the rotor map')
+    motor_board_file: str = file_parameter('motor board file')
+    autostart: str = parameter('activate', choices=tuple(AUTOSTART), read_only=True,
+                               doc='transition at the start')
+
+
+class RotorBridgeNode(BridgeNode):
+    """
+    Executes the thrusts of command; publishes battery_state, rotor_states and its own state.
+
+    A lifecycle node: configure opens the port, activate permits arming. The node arms the motor
+    board when the supervisor takes off. It disarms the board when the supervisor disarms or stops,
+    and when this process ends. rotor_bridge/state (latched) is 'ready', 'waiting: WHY' or
+    'lost: WHY'.
+    """
+
+    def __init__(self):
+        super().__init__('rotor_bridge_node', RotorBridgeNodeParameters,
+                         'params/motor_board.yaml', 'motor_board_file')
+        given = self.parameters
+        robot = RobotParameters.load(given.robot_file or None)
+        self._cells = robot.battery.cells
+        self._period = 1 / given.target_rate
+        self._board = MotorBoard(given, robot, clock=self.now)
+        self._arming = Arming(self._board)
+        self._arming.inhibit('not configured')
+        self._command = self._battery = self._speeds = None
+        # _port_error: why the port is closed, '' if not yet known; None: open, or not configured.
+        self._state, self._port_error = '', None
+        self._updated = self._next_try = time.monotonic()
+        self._cycle, self._sent_at = 0, 0.0
+        # Counts of the targets: one is due in each period while the robot flies.
+        self._last_target = None
+        self._cycles = self._missed = self._missed_reported = 0
+        self._unsent = Counter()
+        self._latency, self._since, self._age = Distribution(), 'no command yet', Distribution()
+        self._normalised = np.zeros(4)
+        self._saturated, self._saturated_reported = np.zeros((2, 4), dtype=int)
+        self._states = self.publisher('rotor_bridge/state')
+        self._batteries = self.publisher('battery_state')
+        self._rotors = self.publisher('rotor_states')
+        self.health.report('board', self._board_status)
+        self.health.report('latency', lambda: self._latency.status(
+            f'from {self._since} to the last byte written', **self._age.milliseconds('age_')))
+        for k in range(4):
+            self.health.report(f'rotor{k + 1}', partial(self._rotor_status, k))
+        self.listen('command', self._on_command, read=CommandSource(self).read,
+                    max_age=given.stamp_age_limit, stale_after=None, published=True)
+        self.follow('supervisor/state', self._on_supervisor)
+        self._timer = self.create_timer(self._period, self._on_timer, clock=self.steady_clock)
+        self.start_by_itself()
+        if given.autostart != 'none':
+            self.try_to_start()     # at once; nothing is refused here
+
+    def waits_for(self):
+        """Return the state of the motor board."""
+        self.changed()
+        return self._state.replace('waiting:', 'the motor board:')
+
+    def configure(self):
+        """Open the port, now or as soon as it exists; then battery and rotors are published."""
+        self._port_error, self._next_try = '', time.monotonic()
+        self._arming.inhibit('not activated')
+
+    def activate(self):
+        """Permit arming, which the supervisor requests."""
+        self._arming.inhibit('')
+
+    def deactivate(self):
+        """Disarm, also in flight."""
+        self._arming.inhibit('not activated')
+
+    def release(self):
+        """Disarm and close the port."""
+        self._arming.inhibit('not configured')
+        self._port_error = None
+        self._board.close()
+
+    def close(self):
+        """Disarm."""
+        self._arming.end()
+        self._states.publish(self._arming.text)
+        self._board.close()
+
+    def _on_command(self, command, published):
+        self._command = command
+        if not self._send():
+            return
+        self._timer.reset()     # sends this command again after a period without a newer one
+        age = self.now() - command.stamp
+        self._age.add(age)
+        if math.isnan(published):
+            self._since = 'the stamp of the command'
+            self._latency.add(age)
+        else:
+            self._since = 'the publication of the command'
+            self._latency.add(time.time() - published)
+
+    def _on_supervisor(self, state):
+        self._arming.follow(state)
+        self.changed()
+
+    def _on_timer(self):
+        now = time.monotonic()
+        self._open(now)
+        self._arming.update(now - self._updated)
+        self._updated = now
+        if now - self._sent_at < self._period / 2:
+            # A command came between this expiry and its callback; its reset of the timer was
+            # too late.
+            self._timer.reset()
+        else:
+            self._send()
+        self._cycle += 1
+        if self._cycle % POLL_CYCLES == 0:
+            self._poll()
+        self.changed()
+
+    def _open(self, now):
+        """Try to open the port; afterwards the driver itself reconnects."""
+        if self._port_error is None or now < self._next_try:
+            return
+        self._next_try = now + self.parameters.reconnect_period
+        try:
+            self._board.open()
+        except SerialPortError as error:
+            if str(error) != self._port_error:
+                self._port_error = str(error)
+                self.get_logger().warning(f'{error}; searching for it')
+        else:
+            self._port_error = None
+
+    def _send(self):
+        """Send the newest thrusts while flying; return whether they were sent."""
+        command = self._command
+        if self._arming.phase != FLIES or command is None \
+                or self.now() - command.stamp > self.parameters.stamp_age_limit:
+            self._last_target = None    # no period counts as missed before the next target
+            return False
+        sent = self._board.send(command.thrust, command.stamp)
+        self._sent_at = now = time.monotonic()
+        if sent.reason:
+            self._unsent[sent.reason] += 1
+            return False
+        if self._last_target is not None:
+            # A gap nearer to one period than to two was in time.
+            cycles = round((now - self._last_target) / self._period)
+            self._cycles += cycles
+            self._missed += max(cycles - 1, 0)
+        self._last_target = now
+        self._normalised = sent.command
+        self._saturated += sent.saturated
+        return True
+
+    def _poll(self):
+        battery, rotors, events = self._board.poll()
+        if battery is not None:
+            self._battery = battery
+            self._batteries.publish(replace(battery, cells=self._cells))
+        if rotors is not None:
+            self._speeds = rotors
+            self._rotors.publish(RotorReading(rotors.stamp, RPM * rotors.rpm))
+        for event in events:
+            self.log_line(*event)
+
+    def changed(self):
+        """Publish the state if it changed."""
+        text = self._arming.text
+        if self._port_error and text.startswith('waiting'):
+            text = f'waiting: {self._port_error}'
+        if text != self._state:
+            if not text.startswith('waiting'):
+                self.log_line('error' if text.startswith('lost') else 'info',
+                              f'motor board: {text}')
+            self._state = text
+            self._states.publish(text)
+
+    def _board_status(self):
+        arming, text = self._arming, self._arming.text
+        values = {'phase': arming.phase, 'cycles': self._cycles, 'missed_cycles': self._missed,
+                  **{f'not sent: {reason}': n for reason, n in self._unsent.items()}}
+        missed, self._missed_reported = self._missed - self._missed_reported, self._missed
+        level = ERROR if arming.phase == LOST else \
+            OK if text == 'ready' and not missed else WARN
+        if missed and text == 'ready':
+            text = f'{missed} cycles missed'
+        if status := self._board.state.status:
+            values.update({'armed': int(status.armed), 'state': status.state,
+                           'last disarmed': status.stop_reason,
+                           'conditions': ', '.join(status.conditions),
+                           'contract': status.contract})
+        if self._battery is not None:
+            values.update({'voltage_V': self._battery.voltage, 'current_A': self._battery.current})
+        return level, text, {**values, **self._board.link()}
+
+    def _rotor_status(self, k):
+        rotors, saturated = self._speeds, int(self._saturated[k])
+        values = {'saturated': saturated, 'command': float(self._normalised[k])
+                  if self._arming.phase == FLIES else 0.0}
+        saturates = saturated > self._saturated_reported[k]
+        self._saturated_reported[k] = saturated
+        if rotors is None:
+            return OK, 'no data yet', values
+        faults = list(rotors.failures[k])
+        if math.isnan(rotors.rpm[k]):
+            faults.append('offline')
+        values.update({
+            'speed_rad_s': RPM * float(rotors.rpm[k]),
+            'voltage_V': float(rotors.voltage[k]), 'current_A': float(rotors.current[k]),
+            'temperature_C': float(rotors.temperature[k]), 'failures': ', '.join(faults),
+            'error_count': int(rotors.error_count[k])})
+        if faults:
+            return ERROR, ', '.join(faults), values
+        if saturates:
+            return WARN, 'target above the thrust that the battery permits', values
+        return OK, 'ok', values

@@ -1,0 +1,410 @@
+"""ROS nodes of the control loop: state estimator, any registered controller, supervisor."""
+
+from dataclasses import dataclass, make_dataclass, replace
+from functools import partial
+import math
+import secrets
+
+import numpy as np
+from rclpy.node import Node
+from std_srvs.srv import Trigger
+
+from beetle_omni_ros.control import registry
+from beetle_omni_ros.control.base import guidance_of, PoseTarget, State
+from beetle_omni_ros.control.host import ControllerHost, MOTORS_OFF
+from beetle_omni_ros.control.hover import HoverController
+from beetle_omni_ros.control.registry import ControllerEntry
+from beetle_omni_ros.estimation.ekf import ErrorStateEkf
+from beetle_omni_ros.estimation.parameters import EkfParameters
+from beetle_omni_ros.estimation.state import pose_covariance, twist_covariance
+from beetle_omni_ros.messages.values import HealthReport, MessageError, Odom, TargetOverride
+from beetle_omni_ros.nodes.node import CommandSource, ERROR, FlightNode, IDENTITY, OK, WARN
+from beetle_omni_ros.nodes.parameters import file_parameter
+from beetle_omni_ros.robot.allocation import ALL_HEALTHY
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import NAMES, parameter, ParameterError
+from beetle_omni_ros.runs.targets import TargetChecks
+from beetle_omni_ros.safety.parameters import SupervisorParameters
+from beetle_omni_ros.safety.supervisor import DISARMED, FALLBACK, FLYING, STOPPED, Supervisor
+
+SENSOR_AGE = 0.2        # s, an older sample is of a stuck driver or another clock
+ODOM_AGE = 0.05         # s, no command answers an older estimate
+JOINT_AGE = 0.1         # s
+# s between a target's stamp and simulated time above which the stamp is of another clock
+OTHER_CLOCK = 3600.0
+STEP_TOLERANCE = 0.0025     # s, half of the smallest interval between estimates
+REPEAT = 1.0            # s between two log lines about a controller
+WATCH_PERIOD = 0.01     # s between checks for silent inputs
+NAME = 'controller_node'    # of the executable, before its controller is known
+
+
+# --- estimator ----------------------------------------------------------------------------------
+
+@dataclass(frozen=True, kw_only=True)
+class EkfNodeParameters(EkfParameters):
+    """Parameters of ekf_node: the estimator's parameters and the files."""
+
+    robot_file: str = file_parameter()
+    ekf_file: str = file_parameter('estimator file to start from')
+
+
+class EkfNode(FlightNode):
+    """Publishes odom for every IMU sample, corrected by MoCap poses at their capture time."""
+
+    real_time = True
+
+    def __init__(self):
+        super().__init__('ekf_node', EkfNodeParameters, 'params/ekf.yaml', 'ekf_file')
+        robot = RobotParameters.load(self.parameters.robot_file or None)
+        self._ekf = ErrorStateEkf(self.parameters.of_robot(robot), robot.gravity)
+        self._status = self._ekf.status
+        self._publisher = self.publisher('odom')
+        self.listen('imu/data_raw', self._on_imu, max_age=SENSOR_AGE)
+        self.listen('mocap/pose', partial(self.timed, self._ekf.pose), max_age=SENSOR_AGE)
+        self.health.track_compute(1 / self.parameters.imu.rate)
+        self.health.report('estimator', self._estimator_status)
+
+    def _on_imu(self, sample):
+        accepted = self.timed(self._ekf.imu, sample)
+        status = self._ekf.status
+        if status != self._status:
+            self.get_logger().info(f'{self._status} -> {status}')
+            self._status = status
+        # A lost estimate is not published: the readers detect the missing messages.
+        if accepted and status in ('tracking', 'dead_reckoning'):
+            estimate = self._ekf.estimate
+            self._publisher.publish(Odom.of(
+                estimate, pose_covariance(estimate),
+                twist_covariance(estimate, self.parameters.imu.gyroscope_noise)))
+
+    def _estimator_status(self):
+        level = {'tracking': OK, 'dead_reckoning': WARN, 'lost': ERROR}
+        values = {f'rejected: {reason}': count for reason, count in self._ekf.rejected.items()}
+        return level.get(self._status, OK), self._status, values
+
+
+# --- controllers --------------------------------------------------------------------------------
+
+class ControllerNode(FlightNode):
+    """
+    Steps a controller once a period, triggered by the estimate; see ControllerHost.
+
+    An exception of the controller is logged and reported in diagnostics.
+    """
+
+    real_time = True
+
+    def __init__(self, controller: ControllerEntry | str = ''):
+        """
+        Build the controller and subscribe its inputs.
+
+        Args:
+            controller: registry entry, name or ``package.module:Class``; '' reads the node's
+                parameter ``controller``. Commands go to '<name>/command'.
+
+        """
+        entry = controller if isinstance(controller, ControllerEntry) else \
+            registry.find(controller or _requested_controller())
+        is_own = isinstance(controller, str) and controller     # the executable has one controller
+        super().__init__(f'{entry.name}_node', node_parameters(entry, not is_own),
+                         entry.parameters_file, entry.file_key, completed=entry.completed)
+        self._entry = entry
+        robot = RobotParameters.load(self.parameters.robot_file or None)
+        controller = entry.make(
+            robot, parameters=self.parameters if entry.parameter_class else None)
+        self._host = ControllerHost(entry.name, controller, self.timed, self._log)
+        self._checks, self._sensors = TargetChecks(robot), robot.sensors
+        self._joints = self._command = None
+        self._last_step = 0.0
+        self._reported_errors, self._logged = 0, ('', -math.inf)    # text, time of the line
+        self._publisher = self.publisher(f'{entry.name}/command')
+        self.listen('odom', self._on_odom, max_age=ODOM_AGE)
+        self.listen('joint_states', self._on_joints, max_age=JOINT_AGE)
+        self.listen('command', partial(setattr, self, '_command'), read=CommandSource(self).read,
+                    stale_after=None)
+        # Publishers that follow INTERFACES latch targets; `ros2 topic pub` does not.
+        for topic in ('target_pose', 'target_trajectory'):
+            self.listen(topic, self._on_target, any_qos=True, stale_after=None,
+                        published=True, check=self._check_target)
+        self.follow('supervisor/state', self._on_mode)
+        self.listen('supervisor/target', self._on_override, stale_after=None)
+        self.listen('supervisor/actuators', lambda report: self._host.on_health(report.health),
+                    stale_after=None)
+        self.health.track_compute(controller.period)
+        self.health.report('controller', self._controller_status)
+
+    def _on_joints(self, joints):
+        if not np.isnan(joints.position).any():     # a bridge has lost a servo for the moment
+            self._joints = joints.corrected(self._sensors)
+
+    def _check_target(self, target, published):
+        # The age counts at publication: a latched target stays valid for a node that starts
+        # later. Publication times are system time. In simulated time, only a stamp that is very
+        # far off is refused, once the clock is known.
+        then = None if math.isnan(published) else published
+        if self.simulated:
+            now = self.now()
+            then = now if now and abs(now - target.stamp) > OTHER_CLOCK else None
+        reason = self._checks.why_not(target, then) or (
+            self._host.too_far(target, self.now()) if self._host.active else '')
+        if reason:
+            raise MessageError(reason, 'cannot be flown')
+
+    def _on_target(self, target, _=math.nan):
+        now = self.now()
+        if target.stamp == 0.0:     # `ros2 topic pub` sets no stamp: valid from now on
+            target = replace(target, stamp=now, **(
+                {} if isinstance(target, PoseTarget) else {'times': target.times + now}))
+        elif target.stamp > now:    # a clock that is ahead must not make it outlast later targets
+            target = replace(target, stamp=now)
+        # Latched and volatile copies may overtake each other: the newest stamp counts, except
+        # after the clock was set back.
+        old = self._host.target
+        if old is None or not target.stamp < old.stamp <= now:
+            self._host.target = target
+
+    def _on_override(self, override):
+        self._host.override = override.target
+
+    def _on_mode(self, mode):
+        if mode.partition(':')[0] in MOTORS_OFF:
+            self._command = None
+        if reason := self._host.on_mode(mode, self.now()):
+            self.health.rejected('target_pose', f'{reason}; the present pose is held',
+                                 'cannot be flown')
+
+    def _on_odom(self, odom):
+        self._host.on_estimate(odom)
+        if self._joints is None or not self._is_due(odom.stamp):
+            return
+        self._last_step = odom.stamp
+        command = self._host.step(State.join(odom, self._joints, self._command))
+        if command is not None:
+            self._publisher.publish(command)
+
+    def _log(self, error):
+        text, at = self._logged
+        if text != error and not 0 <= (now := self.elapsed()) - at < REPEAT:
+            self._logged = error, now
+            self.get_logger().error(error)
+
+    def _is_due(self, stamp):
+        period = self._host.controller.period
+        since = stamp - self._last_step
+        if since < 0:
+            return True     # the clock was set back
+        if self._coincides_with_active(stamp):
+            # One estimate later: from then on this node computes between the steps of the active
+            # controller, whose command would otherwise be delayed.
+            period *= 1.5
+        return since >= period - STEP_TOLERANCE
+
+    def _coincides_with_active(self, stamp):
+        """Whether the active controller is another one and answers the same estimates."""
+        host = self._host
+        if self._command is None or not host.mode.startswith('flying:') or host.active:
+            return False
+        part = (stamp - self._command.stamp) / host.controller.period % 1.0
+        return not 0.25 < part < 0.75
+
+    def _controller_status(self):
+        host, controller = self._host, self._host.controller
+        report = host.call('diagnostics', getattr(controller, 'diagnostics', dict)) or {}
+        new, self._reported_errors = host.errors - self._reported_errors, host.errors
+        values = {**report, 'guidance': guidance_of(controller)}
+        if host.errors:
+            values['errors'] = host.errors
+        if new:
+            return ERROR, host.error, values
+        return OK, getattr(controller, 'name', self._entry.name), values
+
+
+class NmpcNode(ControllerNode):
+    """Publishes nmpc/command, stamped with the state that it answers."""
+
+    def __init__(self):
+        super().__init__('nmpc')
+
+
+class RlNode(ControllerNode):
+    """Publishes rl/command, stamped with the state that it answers."""
+
+    def __init__(self):
+        super().__init__('rl')
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoParameters:
+    """Parameters of a controller that has none."""
+
+
+def node_parameters(entry: ControllerEntry, selectable: bool) -> type:
+    """Make the parameter class of a controller's node: controller, robot and controller file."""
+    base = entry.parameter_class or NoParameters
+    more = {'robot_file': ('', 'robot file of the controller; empty: the shipped one'),
+            entry.file_key: ('', f"controller file; empty: {entry.parameters_file or 'none'}")}
+    if selectable:
+        more['controller'] = (entry.reference, 'controller that this node runs')
+    return make_dataclass(
+        f'{entry.name}_parameters',
+        [(name, str, parameter(default, doc=doc, read_only=True))
+         for name, (default, doc) in more.items()],
+        bases=(base,), frozen=base.__dataclass_params__.frozen, kw_only=True)
+
+
+def _requested_controller() -> str:
+    """Read the parameter ``controller`` by a temporary node, before the real one is made."""
+    probe = Node(NAME, start_parameter_services=False, enable_rosout=False)
+    given, name = probe._parameter_overrides.get('controller'), probe.get_name()
+    probe.destroy_node()
+    if given is not None:
+        return str(given.value)
+    if name != NAME:
+        return name.removesuffix('_node')
+    raise ParameterError("key 'controller': missing; expected a registered controller "
+                         f"({', '.join(registry.names())}) or {registry.CLASS}")
+
+
+# --- supervisor ---------------------------------------------------------------------------------
+
+@dataclass(frozen=True, kw_only=True)
+class SupervisorNodeParameters(SupervisorParameters):
+    """Parameters of supervisor_node: the supervisor's parameters, controllers and files."""
+
+    controllers: NAMES = parameter(
+        tuple(registry.standing_by()), read_only=True,
+        doc='controllers that may be active: registered names, or FILE.py:Class')
+    robot_file: str = file_parameter()
+    supervisor_file: str = file_parameter('supervisor file')
+
+
+class SupervisorNode(FlightNode):
+    """
+    Publishes command, the only topic that actuators execute, and supervisor/state (latched).
+
+    Services ~/arm, ~/disarm, ~/land and ~/emergency_stop; the parameter controller selects the
+    active controller, also in flight.
+    """
+
+    real_time = True
+
+    def __init__(self):
+        super().__init__('supervisor_node', SupervisorNodeParameters, 'params/supervisor.yaml',
+                         'supervisor_file', self._changed, changeable=('controller',))
+        robot = RobotParameters.load(self.parameters.robot_file or None)
+        self._sensors = robot.sensors
+        self._controllers = [registry.find(name).name if ':' in name else name
+                             for name in self.parameters.controllers]
+        if self.parameters.controller not in self._controllers:
+            raise ParameterError(f"key 'controller': expected one of "
+                                 f"{', '.join(self._controllers)}, found "
+                                 f"'{self.parameters.controller}'")
+        self._supervisor = Supervisor(self.parameters, robot, HoverController(robot),
+                                      self._controllers)
+        self._joints = None
+        self._sent = (None, '')     # stamp and source of the last command
+        self._state = ''
+        self._publisher = self.publisher('command')
+        self._identity = f'supervisor_node:{secrets.token_hex(4)}'      # of this run of the node
+        self._identities = self.publisher(IDENTITY)
+        self._identities.publish(self._identity)
+        self._states = self.publisher('supervisor/state')
+        self._targets = self.publisher('supervisor/target')
+        self._actuators = self.publisher('supervisor/actuators')
+        self._override, self._health = None, ALL_HEALTHY
+        self._listen()
+        for name in ('arm', 'disarm', 'land', 'emergency_stop'):
+            self.create_service(Trigger, f'~/{name}', partial(self._on_request, name))
+        self.health.report('supervisor', self._supervisor_status)
+        self.create_timer(WATCH_PERIOD, self._update, clock=self.flight_clock)
+        self._update()
+
+    def waits_for(self):
+        """Return the missing sensors and the arming."""
+        return f'{super().waits_for()}; then for ~/arm'
+
+    def _listen(self):
+        supervisor = self._supervisor
+        self.listen('odom', self._on_odom)
+        self.listen('joint_states', self._on_joints, max_age=SENSOR_AGE)
+        self.listen('imu/data_raw', lambda s: supervisor.on_imu(
+            s.stamp, s.specific_force, s.angular_velocity), max_age=SENSOR_AGE)
+        self.listen('mocap/pose', lambda s: supervisor.on_mocap(
+            s.stamp, s.position, s.quaternion), max_age=SENSOR_AGE)
+        self.listen('rotor_states', lambda r: supervisor.on_rotors(r.stamp, r.speed),
+                    stale_after=None)
+        self.listen('battery_state', lambda battery: supervisor.on_battery(battery.voltage))
+        for name in self._controllers:
+            self.listen(f'{name}/command', partial(self._on_command, name), stale_after=None)
+        for name in ('joint', 'rotor'):
+            self.follow(f'{name}_bridge/state', partial(self._on_bridge, name))
+
+    def _changed(self, new):
+        answer = self._supervisor.select(new.controller, self.now())
+        self._publish_states()
+        if not answer:
+            raise ParameterError(f"key 'controller': {answer.text}")
+
+    def _on_request(self, name, _, response):
+        answer = getattr(self._supervisor, name)(self.now())
+        self._update()
+        response.success, response.message = bool(answer), answer.text
+        return response
+
+    def _on_joints(self, joints):
+        joints = joints.corrected(self._sensors)
+        if not np.isnan(joints.position).any():
+            self._joints = joints
+        self._supervisor.on_joints(joints.stamp, joints.position, joints.velocity)
+
+    def _on_odom(self, odom):
+        if self._joints is None:
+            return
+        self._supervisor.on_state(State.join(odom, self._joints))
+        if self._supervisor.state not in (DISARMED, FLYING):
+            self._update()      # the fallback controller answers each estimate
+
+    def _on_command(self, name, command):
+        supervisor = self._supervisor
+        accepted = supervisor.on_command(name, command, self.now())
+        if accepted and name == supervisor.active and supervisor.state == FLYING:
+            self._update()      # at once, not at the next timer
+
+    def _on_bridge(self, name, text):
+        self._supervisor.on_actuators(name, text, self.now())
+        self._update()
+
+    def _update(self):
+        supervisor = self._supervisor
+        command = supervisor.update(self.now())
+        # A command is not repeated: the actuators detect missing commands by the age.
+        if command is not None and (command.stamp, supervisor.source) != self._sent:
+            self._sent = (command.stamp, supervisor.source)
+            self._publisher.publish(command, self._identity)
+        self._publish_states()
+
+    def _publish_states(self):
+        supervisor = self._supervisor
+        state = supervisor.reported_state
+        if state != self._state:
+            self._state = state
+            self._states.publish(state)
+        if supervisor.target_override is not self._override:
+            self._override = supervisor.target_override
+            self._targets.publish(TargetOverride.of(self._override))
+        if supervisor.health is not self._health:
+            self._health = supervisor.health
+            self._actuators.publish(HealthReport(self.now(), self._health))
+        for event in supervisor.events:
+            self.log_line(event.severity, event.text)
+        supervisor.events.clear()
+
+    def _supervisor_status(self):
+        supervisor = self._supervisor
+        values = supervisor.diagnostics()
+        for name, at in supervisor.faults.items():
+            values[f'fault.{name}'] = f'{at:.3f}'     # [s]: six digits are too few for a stamp
+        level = {FALLBACK: WARN, STOPPED: ERROR}.get(
+            supervisor.state, WARN if supervisor.faults else OK)
+        named = ', '.join(supervisor.faults)
+        return level, f'{self._state}; faults: {named}' if named else self._state, values
