@@ -1,4 +1,8 @@
-"""Figures of poses, waypoints, disturbances, payload, the lemniscate and a hover."""
+"""
+Figures of poses, waypoints, disturbances, payload and the lemniscate.
+
+Each is drawn from the results of one task under one set of conditions.
+"""
 
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
@@ -6,7 +10,7 @@ import numpy as np
 
 from beetle_omni_ros.comparison.flights import Flight
 from beetle_omni_ros.comparison.summary import look, PUBLISHED
-from beetle_omni_ros.pages.figures import FAINT, INK, panels, WIDTH
+from beetle_omni_ros.pages.figures import FAINT, INK, panels
 from beetle_omni_ros.runs import lemniscate as curve
 from beetle_omni_ros.runs import published
 from beetle_omni_ros.runs.log import roll_pitch_yaw
@@ -19,8 +23,6 @@ STEP = 0.05  # [s] between points of a folded curve
 BINS = 28  # edges of a histogram
 BEFORE = 2.0  # [s] of hover shown before the first disturbance
 SHOWN = {'position': 2.0, 'orientation': 180.0}  # largest limit of a disturbance's axes [m], [deg]
-HOVER_SHOWN = 0.5  # [s] of commands
-
 
 Groups = dict[str, list[dict]]      # controller -> one result with a trace for each seed
 
@@ -120,7 +122,7 @@ def _reached_box(panel):
     panel.set_ylabel('U orientation error [deg]')
 
 
-def convergence(groups: Groups) -> Figure:
+def convergence(groups: Groups, task: str) -> Figure:
     """Errors in the 8 s of a pose: median and 10 to 90 % band over all poses."""
     figure, axes = panels(1, 2, height=2.8)
     grid = np.arange(0.0, POSE_DURATION, STEP)
@@ -160,7 +162,7 @@ def _folded(results, key, grid):
     return np.array(rows)
 
 
-def waypoints(groups: Groups) -> Figure:
+def waypoints(groups: Groups, task: str) -> Figure:
     """States over one round of the waypoints: mean of all rounds, minimum to maximum as a band."""
     duration = len(WAYPOINTS) * POSE_DURATION
     grid = np.arange(0.0, duration, STEP)
@@ -262,7 +264,7 @@ def _error_curve(panel, result, what, name, k):
     return float(np.max(shown)) if shown.size else 0.0
 
 
-def payload(groups: Groups) -> Figure:
+def payload(groups: Groups, task: str) -> Figure:
     """Steady errors against the mass, and the height over time."""
     figure, axes = panels(1, 3, height=2.7, width_ratios=(1, 1, 1.5))
     for number, (name, results) in enumerate(groups.items()):
@@ -321,45 +323,7 @@ def _laps(results, keys):
     return grid, np.array(rounds)
 
 
-def lemniscate_path(groups: Groups) -> Figure | None:
-    """Mean path of all rounds in space, from above and from the side."""
-    laps = {name: rounds for name, results in groups.items()
-            if len((rounds := _laps(results, ('position',))[1]))}
-    if not laps:
-        return None
-    figure = Figure(figsize=(WIDTH, 4.1), layout='constrained')
-    parts = figure.add_gridspec(2, 2, width_ratios=(1.15, 1), height_ratios=(1.75, 1))
-    space = figure.add_subplot(parts[:, 0], projection='3d')
-    above = figure.add_subplot(parts[0, 1])
-    side = figure.add_subplot(parts[1, 1], sharex=above)
-    for name, rounds in laps.items():
-        path = np.vstack([rounds.mean(axis=0), rounds.mean(axis=0)[:1]])
-        _path(space, above, side, path, look(name).colour, ls=look(name).dashes, lw=1.5,
-              label=look(name).label)
-    samples = [curve.sample(curve.RAMP + s) for s in np.arange(0, curve.PERIOD + 0.01, STEP)]
-    _path(space, above, side, np.array([sample.position for sample in samples]), INK,
-          ls=(0, (3, 2)), lw=0.8, label='reference', zorder=5)
-    for panel, label in ((above, 'y [m]'), (side, 'z [m]')):
-        panel.margins(0.05)
-        panel.set_ylabel(label)
-    above.tick_params(labelbottom=False)
-    side.set_xlabel('x [m]')
-    space.set(xlabel='x [m]', ylabel='y [m]', zlabel='z [m]', zlim=(0.6, 1.4),
-              xticks=(-1, 0, 1), yticks=(-0.5, 0, 0.5), zticks=(0.7, 1.0, 1.3))
-    space.set_box_aspect((2, 1.2, 1.0), zoom=1.02)
-    space.view_init(elev=26, azim=-62)
-    label_once(figure, space)
-    return figure
-
-
-def _path(space, above, side, path, colour, **style):
-    """Draw (N, 3) positions into the 3D view and the two projections."""
-    space.plot(*path.T, color=colour, **style)
-    above.plot(path[:, 0], path[:, 1], color=colour, **style)
-    side.plot(path[:, 0], path[:, 2], color=colour, **style)
-
-
-def lemniscate_errors(groups: Groups) -> Figure | None:
+def lemniscate_errors(groups: Groups, task: str) -> Figure | None:
     """Tracking errors over a round: mean of all rounds, minimum to maximum as a band."""
     figure, axes = panels(2, height=1.6, sharex=True)
     drawn = False
@@ -383,27 +347,20 @@ def lemniscate_errors(groups: Groups) -> Figure | None:
     return figure
 
 
-def hover_commands(groups: Groups) -> Figure | None:
-    """Commands in the last half second of a hover, which show chatter."""
-    groups = {name: results for name, results in groups.items()
-              if len(results[0]['trace']['command_t'])}
-    if not groups:
-        return None
-    figure, axes = panels(2, len(groups), height=1.35, sharex=True, sharey='row')
-    for column, (name, results) in enumerate(groups.items()):
-        trace, style = results[0]['trace'], look(name)
-        t = trace['command_t'] - trace['command_t'][-1]
-        for row, values in enumerate((trace['command_tilt'], trace['command_thrust'])):
-            for k in range(4):
-                axes[row, column].step(t, values[:, k] - values[:, k].mean(), where='post',
-                                       color=style.colour, lw=1.0, alpha=1 - 0.2 * k)
-        axes[0, column].set_title(style.label, color=style.colour, fontsize=9)
-        axes[1, column].set_xlim(-HOVER_SHOWN, 0)
-        axes[1, column].set_xticks((-HOVER_SHOWN, -HOVER_SHOWN / 2, 0))
-        axes[1, column].set_xlabel('time before the end [s]')
-    for panel, label, least in zip(axes[:, 0], ('tilt [rad]', 'thrust [N]'), (0.02, 0.25),
-                                   strict=True):
-        panel.set_ylabel(f'{label}\nabout its mean')
-        largest = max(abs(limit) for limit in panel.get_ylim())
-        panel.set_ylim(-max(largest, least), max(largest, least))
-    return figure
+# Kind of a task -> name, caption and function of each figure.
+DRAWN = {
+    'random': [('errors', 'Errors at the target; stars: published means, with their ranges',
+                distributions),
+               ('convergence', 'Errors after a pose was asked for: median and 10 to 90 % band '
+                'over all poses', convergence)],
+    'waypoints': [('states', 'States in a round: mean of all rounds, least to largest as a band',
+                   waypoints)],
+    'lemniscate': [('errors', 'Tracking errors in a round: mean of all rounds, least to largest '
+                    'as a band', lemniscate_errors)],
+    'force': [('errors', 'Errors in time, the disturbance dashed; × where control was lost; thin '
+               'lines: further seeds', disturbance)],
+    'torque': [('errors', 'Errors in time, the disturbance dashed; × where control was lost; thin '
+                'lines: further seeds; each torque lasts 0.05 s', disturbance)],
+    'payload': [('errors', 'Errors against the payload, range over the seeds; right: height in '
+                 'time', payload)],
+    'hover': []}

@@ -11,7 +11,12 @@ numbers.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
+import gc
+import time
+
+import numpy as np
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import Controller, State, Target
@@ -20,13 +25,12 @@ from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.estimation.samples import pose_covariance, twist_covariance
-from beetle_omni_ros.evaluation.compute import collector_off, ComputeTimer
 from beetle_omni_ros.evaluation.processes import Processes
 from beetle_omni_ros.messages.values import Odom, Wrench
 from beetle_omni_ros.robot.actuator_health import ALL_HEALTHY
-from beetle_omni_ros.robot.effects import SensorErrors
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import RunError
+from beetle_omni_ros.runs.log import Recorder
 from beetle_omni_ros.runs.targets import TargetChecks
 from beetle_omni_ros.runs.tasks import Task, TaskPlayer
 from beetle_omni_ros.safety.parameters import SupervisorParameters
@@ -44,80 +48,97 @@ CLOCK_SET_BACK = 0.1     # [s] least age of a command that shows that the clock 
 SETTLE_TIME = 0.5        # [s] on the ground before arming, for the start of the estimator
 
 
+@contextmanager
+def collector_off():
+    """
+    Disable Python's cycle collector during a flight, as the nodes do.
+
+    Its passes become longer with the log. A controller step that it interrupts would appear to
+    take tens of milliseconds.
+    """
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()
+
+
+class ComputeTimer:
+    """
+    CPU times of all steps of one controller; a deadline miss takes longer than ``period`` [s].
+
+    The CPU time of the calling thread is measured, because wall time on a shared computer includes
+    other programs.
+    """
+
+    def __init__(self, period: float):
+        self._period, self._times = period, []
+
+    def call(self, function, *arguments):
+        """Run ``function(*arguments)`` and store its CPU time."""
+        start = time.thread_time()
+        result = function(*arguments)
+        self._times.append(time.thread_time() - start)
+        return result
+
+    def summary(self) -> dict[str, float | int]:
+        """Median, 99th percentile and maximum [ms], deadline misses, number of steps."""
+        times = 1e3 * np.array(self._times or [0.0])
+        return {'median': float(np.median(times)), 'p99': float(np.percentile(times, 99)),
+                'max': float(times.max()),
+                'deadline_misses': int(np.sum(times > 1e3 * self._period)),
+                'count': len(self._times)}
+
+
 class FlightLoop:
     """
-    One flight of a task.
+    One flight with the shipped parameters; the supervisor selects the first controller.
 
     Args:
-        simulator: plant and sensors.
-        estimator: the EKF.
-        controllers: name -> controller; all are stepped, the supervisor selects one.
-        supervisor: supervisor with a selected controller.
+        robot: robot of estimator and supervisor.
+        plant: simulated robot.
+        controllers: name -> controller; all are stepped.
         recorder: LogRecorder, BagWriter or both.
-        gyroscope_noise: noise of one sample, for the covariance of the recorded twist [rad/s].
+        conditions: 'nominal' or 'published'.
+        seed: seed of the simulation.
         faults: faults of robot, devices and processes; ``at`` counts from the task's start.
-        check_target: function that returns why the target of a fault is refused, or ''.
 
     Attributes:
-        simulator, supervisor: the arguments.
+        simulator, supervisor: parts of the loop.
         refusals: reasons of refused targets.
         ending: time in the task and reason of an early end of the flight by the supervisor, or ''.
 
     """
 
-    def __init__(self, simulator: Simulator, estimator: ErrorStateEkf,
-                 controllers: dict[str, Controller], supervisor: Supervisor, recorder,
-                 gyroscope_noise: float, faults: Sequence[Fault] = (),
-                 check_target: Callable[[Target], str] = lambda target: '',
-                 errors: SensorErrors = SensorErrors()):
-        self._gyroscope_noise, self._errors = gyroscope_noise, errors
-        self._faults, self._check_target = tuple(faults), check_target
-        self._processes = Processes(simulator.tick, supervisor)
+    def __init__(self, robot: RobotParameters, plant: RobotParameters,
+                 controllers: dict[str, Controller], recorder: Recorder, *,
+                 conditions: str = 'nominal', seed: int = 0, faults: Sequence[Fault] = ()):
+        estimator, active = EkfParameters.load().of_robot(robot), next(iter(controllers))
+        self.simulator = Simulator(plant, SimulatorParameters.load(), conditions=conditions,
+                                   seed=seed)
+        self.supervisor = Supervisor(SupervisorParameters.load(), robot, HoverController(robot),
+                                     tuple(dict.fromkeys((*registry.names(), active))))
+        self.supervisor.select(active)
+        self.refusals: list[str] = []
+        self.ending = ''
+        self._estimator = ErrorStateEkf(estimator, robot.gravity)
+        self._gyroscope_noise, self._errors = estimator.imu.gyroscope_noise, robot.sensors
+        self._recorder, self._faults = recorder, tuple(faults)
+        self._check_target = TargetChecks(robot).why_not
+        self._processes = Processes(self.simulator.tick, self.supervisor)
         self._other_target: Target | None = None     # of a fault
         self._accepts_other = False
-        self.refusals: list[str] = []
-        self.simulator, self._estimator = simulator, estimator
-        self.supervisor, self._recorder = supervisor, recorder
         self._timers = {name: ComputeTimer(c.period) for name, c in controllers.items()}
-        self._every = {name: max(1, round(c.period / simulator.tick))
+        self._every = {name: max(1, round(c.period / self.simulator.tick))
                        for name, c in controllers.items()}
         self._hosts = {name: ControllerHost(name, c, self._timers[name].call)
                        for name, c in controllers.items()}
-        self._joints = self._battery = self._command = self._estimated = None
+        self._joints = self._command = self._estimated = None
         self._ticks = 0
         self._state_name = self._recorded_state = ''
         self._override, self._health = None, ALL_HEALTHY
         self._crashed = False
         self._began = 0.0       # of the task, simulated time
-        self.ending = ''
-
-    @classmethod
-    def shipped(cls, robot: RobotParameters, plant: RobotParameters,
-                controllers: dict[str, Controller], recorder, *, conditions: str, seed: int,
-                faults: Sequence[Fault] = ()) -> FlightLoop:
-        """
-        Loop with the shipped parameters, in which the first controller is selected.
-
-        Args:
-            robot: robot of estimator and supervisor.
-            plant: simulated robot.
-            controllers: name -> controller.
-            recorder: recorder of the loop.
-            conditions: 'nominal' or 'published'.
-            seed: seed of the simulation.
-            faults: faults of the loop.
-
-        """
-        estimator, active = EkfParameters.load().of_robot(robot), next(iter(controllers))
-        supervisor = Supervisor(SupervisorParameters.load(), robot, HoverController(robot),
-                                tuple(dict.fromkeys((*registry.names(), active))))
-        loop = cls(
-            Simulator(plant, SimulatorParameters.load(), conditions=conditions, seed=seed),
-            ErrorStateEkf(estimator, robot.gravity), controllers, supervisor, recorder,
-            estimator.imu.gyroscope_noise, faults, TargetChecks(robot).why_not,
-            robot.sensors)
-        supervisor.select(active)
-        return loop
 
     @property
     def compute(self) -> dict[str, dict]:
@@ -132,11 +153,7 @@ class FlightLoop:
 
     def fly(self, task: Task, progress: Callable[[float], None] = lambda part: None) -> bool:
         """
-        Take off and fly the task.
-
-        Args:
-            task: the task.
-            progress: called with the completed fraction of the task, 0 to 1.
+        Take off and fly the task; ``progress`` is called with its completed fraction, 0 to 1.
 
         Returns:
             whether the robot was airborne to the end.
