@@ -48,7 +48,7 @@ TASKS = [
     ('random1000000', 'random1 to random999999'), ('random-3', 'random1 to random999999'),
     ('none.csv', 'none.csv: no such file'), ('folder', 'folder: '),
     ('no_header.csv', 'row 1: the header is missing; expected x_m'),
-    ('unknown.csv', "row 1: unknown column 'x'; expected x_m"),
+    ('unknown.csv', "row 1: column 'x_m' is missing; expected x_m"),
     ('missing.csv', "row 1: column 'yaw_deg' is missing; expected"),
     ('twice.csv', "column 'x_m' occurs twice; expected"),
     ('text.csv', "row 3, column roll_deg: expected a finite number, found 'east'"),

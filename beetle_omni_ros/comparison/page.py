@@ -9,7 +9,6 @@ from base64 import b64encode
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from io import BytesIO
-from math import isfinite
 from pathlib import Path
 import re
 
@@ -20,7 +19,7 @@ from PIL import Image
 from beetle_omni_ros.comparison import plots
 from beetle_omni_ros.comparison.summary import CONDITIONS, look, PUBLISHED, task_title
 from beetle_omni_ros.pages import figures
-from beetle_omni_ros.pages.page import ABSENT, Grid, rendered
+from beetle_omni_ros.pages.page import ABSENT, at, Grid, number, rendered
 from beetle_omni_ros.runs.metrics import POSE_KEYS
 
 DOTS = 180  # per inch
@@ -163,24 +162,6 @@ class Numbers:
             return 'never'
         return f'{low:g} {unit}' if low == high else \
             f'{low:g} {unit} or never' if high is None else f'{low:g} to {high:g} {unit}'
-
-
-def at(found, path: str):
-    """Value at a path of keys and indices; None if absent."""
-    for key in path.split('.'):
-        try:
-            found = found[int(key) if isinstance(found, list) else key]
-        except (KeyError, IndexError, TypeError):
-            return None
-    return found
-
-
-def number(value: float | None, digits: int | None) -> str:
-    """Text of a number; ``digits`` None: as short as possible."""
-    if value is None or not isfinite(value):
-        return ABSENT
-    text = f'{value:g}' if digits is None else f'{value:.{digits}f}'
-    return text.removeprefix('-') if float(text) == 0 else text
 
 
 def both(prefix: str, error: str = 'U') -> str:

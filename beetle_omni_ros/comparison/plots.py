@@ -1,5 +1,5 @@
 """
-Figures of poses, waypoints, disturbances, payload and the lemniscate.
+Figures of poses, disturbances and the lemniscate.
 
 Each is drawn from the results of one task under one set of conditions.
 """
@@ -11,11 +11,9 @@ import numpy as np
 from beetle_omni_ros.comparison.flights import Flight
 from beetle_omni_ros.comparison.summary import look, PUBLISHED
 from beetle_omni_ros.pages.figures import FAINT, INK, panels
-from beetle_omni_ros.runs import lemniscate as curve
-from beetle_omni_ros.runs import published
-from beetle_omni_ros.runs.log import roll_pitch_yaw
+from beetle_omni_ros.runs import table as published
 from beetle_omni_ros.runs.metrics import L_WINDOW, REACHED_ORIENTATION, REACHED_POSITION, U_WINDOW
-from beetle_omni_ros.runs.tasks import make_task, POSE_DURATION, WAYPOINTS
+from beetle_omni_ros.runs.tasks import make_task, PERIOD, POSE_DURATION
 
 FLOOR = {'position': 2e-4, 'orientation': 1e-2}  # of logarithmic errors [m], [deg]
 UNITS = {'position': 'm', 'orientation': 'deg'}
@@ -162,53 +160,6 @@ def _folded(results, key, grid):
     return np.array(rows)
 
 
-def waypoints(groups: Groups, task: str) -> Figure:
-    """States over one round of the waypoints: mean of all rounds, minimum to maximum as a band."""
-    duration = len(WAYPOINTS) * POSE_DURATION
-    grid = np.arange(0.0, duration, STEP)
-    figure, axes = panels(4, 2, height=1.35, sharex=True)
-    targets = WAYPOINTS[np.minimum((grid / POSE_DURATION).astype(int), len(WAYPOINTS) - 1)]
-    for row in range(3):
-        for column in range(2):
-            axes[row, column].plot(grid, targets[:, row + 3 * column], color=INK, lw=0.9,
-                                   ls=(0, (3, 2)), label='target')
-    for name, results in groups.items():
-        style = look(name)
-        rounds = _rounds(results, grid, duration)
-        flown = ~np.all(np.isnan(rounds[:, :, 0]), axis=0)
-        for panel, values in zip(axes.T.ravel(), np.moveaxis(rounds[:, flown], 2, 0),
-                                 strict=True):
-            panel.fill_between(grid[flown], np.nanmin(values, axis=0), np.nanmax(values, axis=0),
-                               color=style.colour, alpha=0.2, lw=0)
-            panel.plot(grid[flown], np.nanmean(values, axis=0), color=style.colour,
-                       ls=style.dashes, lw=1.2, label=style.label)
-    for panel, label in zip(axes.T.ravel(), (
-            'x [m]', 'y [m]', 'z [m]', '‖v‖ [m/s]', 'roll [deg]', 'pitch [deg]', 'yaw [deg]',
-            '‖ω‖ [rad/s]'), strict=True):
-        panel.set_ylabel(label)
-        panel.set_xlim(0, duration)
-        panel.set_xticks(np.arange(0, duration + 1, POSE_DURATION))
-    for panel in axes[-1]:
-        panel.set_xlabel('time in the round [s]')
-    label_once(figure, axes[0, 0])
-    return figure
-
-
-def _rounds(results, grid, duration):
-    """(R, len(grid), 8) x, y, z, speed, roll, pitch, yaw, rate of rounds; NaN after the end."""
-    rounds = []
-    for result in results:
-        trace = result['trace']
-        t = trace['t']
-        angles = np.degrees(np.unwrap(np.radians(roll_pitch_yaw(trace['quaternion'])), axis=0))
-        states = np.column_stack([trace['position'], trace['speed'], angles, trace['rate']])
-        for k in range(max(1, int(np.ceil(t[-1] / duration - 0.01)))):
-            rounds.append(np.column_stack([
-                np.interp(grid + k * duration - 1e-3, t, column, right=np.nan)
-                for column in states.T]))
-    return np.array(rounds)
-
-
 def disturbance(groups: Groups, kind: str) -> Figure:
     """Errors over time with the disturbance dashed, as in the publication."""
     unit = 'N' if kind == 'force' else 'N m'
@@ -264,54 +215,9 @@ def _error_curve(panel, result, what, name, k):
     return float(np.max(shown)) if shown.size else 0.0
 
 
-def payload(groups: Groups, task: str) -> Figure:
-    """Steady errors against the mass, and the height over time."""
-    figure, axes = panels(1, 3, height=2.7, width_ratios=(1, 1, 1.5))
-    for number, (name, results) in enumerate(groups.items()):
-        style = look(name)
-        entries = [result['metrics']['payload'] for result in results]
-        masses = np.array([entry['payload_kg'] for entry in entries[0]])
-        shift = 0.012 * (number - (len(groups) - 1) / 2)
-        for panel, key, scale in ((axes[0, 0], 'height_error_m', 1e3),
-                                  (axes[0, 1], 'orientation_deg', 1.0)):
-            values = scale * np.array([[np.nan if e[key] is None else e[key] for e in part]
-                                       for part in entries])
-            if np.all(np.isnan(values)):
-                continue
-            middle = np.nanmean(values, axis=0)
-            panel.errorbar(masses + shift, middle, yerr=[middle - np.nanmin(values, axis=0),
-                                                         np.nanmax(values, axis=0) - middle],
-                           color=style.colour, ls=style.dashes, marker=style.marker, ms=4.5,
-                           lw=1.4, capsize=2, label=style.label)
-        trace = results[0]['trace']
-        axes[0, 2].plot(trace['t'], 1e3 * (trace['position'][:, 2] - 1.0), color=style.colour,
-                        ls=style.dashes, lw=1.1)
-    for panel, label in zip(axes[0], ('steady height error [mm]', 'steady orientation error [deg]',
-                                      'height error [mm]'), strict=True):
-        panel.set_ylabel(label)
-    for panel in axes[0, :2]:
-        panel.set_xlabel('payload [kg]')
-    _mark_masses(axes[0, 2])
-    axes[0, 1].set_ylim(bottom=0)
-    axes[0, 0].axhline(0, color=FAINT, lw=0.8)
-    label_once(figure, axes[0, 0])
-    return figure
-
-
-def _mark_masses(panel):
-    begin = 0.0
-    for segment in make_task('payload').segments:
-        panel.axvline(begin, color=FAINT, lw=0.7)
-        panel.text(begin + 0.4, 0.985, f'{segment.payload:g} kg', color=FAINT, fontsize=7.5,
-                   va='top', transform=panel.get_xaxis_transform())
-        begin += segment.duration
-    panel.set_xlim(0, begin)
-    panel.set_xlabel('time [s]')
-
-
 def _laps(results, keys):
     """Phase grid (N,) [s] of a round and (R, N, len(keys)) values of all complete rounds."""
-    grid = np.arange(0.0, curve.PERIOD, STEP)
+    grid = np.arange(0.0, PERIOD, STEP)
     rounds = []
     for result in results:
         trace = result['trace']
@@ -341,7 +247,7 @@ def lemniscate_errors(groups: Groups, task: str) -> Figure | None:
     for panel, what in zip(axes[:, 0], UNITS, strict=True):
         panel.set_ylabel(f'{what} error [{UNITS[what]}]')
         panel.set_ylim(bottom=0)
-        panel.set_xlim(0, curve.PERIOD)
+        panel.set_xlim(0, PERIOD)
     axes[1, 0].set_xlabel('time in the round [s]')
     label_once(figure, axes[0, 0])
     return figure
@@ -353,14 +259,10 @@ DRAWN = {
                 distributions),
                ('convergence', 'Errors after a pose was asked for: median and 10 to 90 % band '
                 'over all poses', convergence)],
-    'waypoints': [('states', 'States in a round: mean of all rounds, least to largest as a band',
-                   waypoints)],
     'lemniscate': [('errors', 'Tracking errors in a round: mean of all rounds, least to largest '
                     'as a band', lemniscate_errors)],
     'force': [('errors', 'Errors in time, the disturbance dashed; × where control was lost; thin '
                'lines: further seeds', disturbance)],
     'torque': [('errors', 'Errors in time, the disturbance dashed; × where control was lost; thin '
                 'lines: further seeds; each torque lasts 0.05 s', disturbance)],
-    'payload': [('errors', 'Errors against the payload, range over the seeds; right: height in '
-                 'time', payload)],
-    'hover': []}
+    'waypoints': [], 'payload': [], 'hover': []}

@@ -10,6 +10,7 @@ numbers.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -19,13 +20,12 @@ import time
 import numpy as np
 
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.control.base import Controller, State, Target
+from beetle_omni_ros.control.base import Command, Controller, PoseTarget, State, Target
 from beetle_omni_ros.control.host import ControllerError, ControllerHost
 from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.estimation.samples import pose_covariance, twist_covariance
-from beetle_omni_ros.evaluation.processes import Processes
 from beetle_omni_ros.messages.values import Odom, Wrench
 from beetle_omni_ros.robot.actuator_health import ALL_HEALTHY
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -35,7 +35,7 @@ from beetle_omni_ros.runs.targets import TargetChecks
 from beetle_omni_ros.runs.tasks import Task, TaskPlayer
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.supervisor import Supervisor
-from beetle_omni_ros.sim.faults import Fault
+from beetle_omni_ros.sim.faults import Fault, Schedule
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.readings import Frame
 from beetle_omni_ros.sim.simulator import Simulator
@@ -45,6 +45,7 @@ TAKEOFF_TIMEOUT = 30.0   # [s] simulated time for the take-off
 COMPUTE_REPORT = 1.0     # [s] between two records of compute times, as of the nodes
 SWAP_CHARGE = 0.3         # [-] charge below which the pack is replaced at the next target
 CLOCK_SET_BACK = 0.1     # [s] least age of a command that shows that the clock was set back
+QUEUE = 10      # messages of a topic that wait for a process; older ones are dropped, as in ROS
 SETTLE_TIME = 0.5        # [s] on the ground before arming, for the start of the estimator
 
 
@@ -88,6 +89,85 @@ class ComputeTimer:
                 'max': float(times.max()),
                 'deadline_misses': int(np.sum(times > 1e3 * self._period)),
                 'count': len(self._times)}
+
+
+class Processes:
+    """
+    Messages from and to estimator, controllers and supervisor, modified by faults of processes.
+
+    Without a fault all messages pass unchanged.
+
+    Attributes:
+        clock_step: error of the flight computer's clock [s].
+
+    """
+
+    def __init__(self, tick: float, supervisor: Supervisor):
+        """``tick``: time between two calls of :meth:`frame` [s]."""
+        self._supervisor = supervisor
+        self._schedule = Schedule(tick, np.random.SeedSequence(0))
+        self._waiting: dict[str, deque] = {}
+        self._reported: dict[str, str] = {}     # bridge -> last reported state
+        self.clock_step = 0.0
+
+    def set_faults(self, faults: Sequence[Fault], now: float) -> None:
+        """Set the faults of processes; their ``at`` counts from ``now`` [s]."""
+        self._schedule.set(faults, now)
+
+    def frame(self, frame: Frame) -> Frame:
+        """Start a tick; returns the frame with stamps of the flight computer's clock."""
+        if self._schedule.empty:
+            return frame
+        self._schedule.update(frame.time)
+        self.clock_step = sum(self._schedule.each('clock'))
+        if not self.supervisor_waits:
+            waiting, self._waiting = self._waiting, {}
+            for method, messages in waiting.items():
+                for message in messages:
+                    getattr(self._supervisor, method)(*message)
+        if not self.clock_step:
+            return frame
+        shifted = {name: replace(reading, stamp=reading.stamp + self.clock_step)
+                   for name in ('imu', 'mocap', 'joints', 'rotors', 'battery')
+                   if (reading := getattr(frame, name)) is not None}
+        return replace(frame, time=frame.time + self.clock_step, **shifted)
+
+    @property
+    def supervisor_waits(self) -> bool:
+        """Whether the supervisor is not scheduled at present."""
+        return bool(self._schedule.each('waits'))
+
+    def send(self, method: str, *message) -> None:
+        """Call one of the supervisor's ``on_`` methods, or queue the message."""
+        if not self._schedule.empty and self.supervisor_waits:
+            self._waiting.setdefault(method, deque(maxlen=QUEUE)).append(message)
+        else:
+            getattr(self._supervisor, method)(*message)
+
+    def estimate(self, state: State) -> State | None:
+        """Estimate after the faults; None if it is not sent."""
+        return next(iter(self._schedule.through('estimate', state, 0.0)), None)
+
+    def requests(self, command: Command | None, now: float) -> list[Command]:
+        """Commands of the active controller that arrive now; None: delayed ones only."""
+        return self._schedule.through('request', command, now)
+
+    def target(self, target: Target) -> PoseTarget | None:
+        """Target of a fault while ``target`` is in force, or None."""
+        for pose in self._schedule.each('target'):
+            return PoseTarget(*pose, stamp=target.stamp)
+        return None
+
+    @property
+    def bridges(self) -> dict[str, str]:
+        """Bridge -> its reported state, if that has changed."""
+        if self._schedule.empty:
+            return {}
+        states = {name: text for bridges in self._schedule.each('bridges')
+                  for name, text in bridges.items()}
+        new = {name: text for name, text in states.items() if self._reported.get(name) != text}
+        self._reported.update(new)
+        return new
 
 
 class FlightLoop:
@@ -136,14 +216,9 @@ class FlightLoop:
         self._joints = self._command = self._estimated = None
         self._ticks = 0
         self._state_name = self._recorded_state = ''
-        self._override, self._health = None, ALL_HEALTHY
+        self._health = ALL_HEALTHY
         self._crashed = False
         self._began = 0.0       # of the task, simulated time
-
-    @property
-    def compute(self) -> dict[str, dict]:
-        """Controller -> summary of its CPU times."""
-        return {name: timer.summary() for name, timer in self._timers.items()}
 
     @property
     def controller_error(self) -> str:
@@ -254,22 +329,17 @@ class FlightLoop:
             self._estimated = estimate.stamp    # each estimate is sent once
             state = processes.estimate(State.join(estimate, self._joints, self._command))
             if state is not None:
-                self._send_estimate(state, estimate, now)
+                processes.send('on_state', state, self._estimator.status)
+                self._control(state, now)
+                self._recorder.write('odom', Odom.of(state, *(
+                    (pose_covariance(estimate), twist_covariance(estimate, self._gyroscope_noise))
+                    if self._recorder.keeps_covariances else ())))
         for late in processes.requests(None, now):
             self._request(self.supervisor.active, late, now)
         if not processes.supervisor_waits:
             self._execute(self.supervisor.update(now), now)
             self._note_state(now)
         return frame
-
-    def _send_estimate(self, state, estimate, now):
-        """Send the estimate to supervisor, controllers and recorder."""
-        recorder = self._recorder
-        self._processes.send('on_state', state, self._estimator.status)
-        self._control(state, now)
-        covariances = () if not recorder.keeps_covariances else (
-            pose_covariance(estimate), twist_covariance(estimate, self._gyroscope_noise))
-        recorder.write('odom', Odom.of(state, *covariances))
 
     def _execute(self, command, now):
         if command is None:
@@ -308,14 +378,11 @@ class FlightLoop:
     def _control(self, state, now):
         """Step the controllers that are due."""
         supervisor = self.supervisor
-        for host in self._hosts.values():
+        for name, host in self._hosts.items():
             host.on_estimate(state)
-            if supervisor.target_override is not self._override:
-                host.override = supervisor.target_override
+            host.override = supervisor.target_override
             if supervisor.health is not self._health:
                 host.on_health(supervisor.health)
-        self._override, self._health = supervisor.target_override, supervisor.health
-        for name, host in self._hosts.items():
             if self._ticks % self._every[name]:
                 continue
             command = host.step(state, self._target_of_fault(host))
@@ -324,6 +391,7 @@ class FlightLoop:
                     self._request(name, passed, now)
             elif command is not None:
                 self._request(name, command, now)
+        self._health = supervisor.health
 
     def _request(self, name, command, now):
         self._recorder.write(f'{name}/command', command, now)
@@ -365,6 +433,6 @@ class FlightLoop:
             self._state_name = name
 
     def _report_compute(self):
-        for name, summary in self.compute.items():
-            self._recorder.write_compute(self.simulator.time, name, **summary)
+        for name, timer in self._timers.items():
+            self._recorder.write_compute(self.simulator.time, name, **timer.summary())
 

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
+from math import isfinite
 import os
 import sys
 
@@ -19,6 +20,24 @@ LONGEST_TITLE = 78      # characters that fit on one line of a terminal
 PUBLISHED = ' class="published"'
 LONG = ' class="long"'
 LONGEST_CELL = 45       # characters that fit on one line of a page's cell
+
+
+def number(value: float | None, digits: int | None = 2) -> str:
+    """Return the text of a number; ``digits`` None: as short as possible."""
+    if value is None or not isfinite(value):
+        return ABSENT
+    text = f'{value:g}' if digits is None else f'{value:.{digits}f}'
+    return text.removeprefix('-') if float(text) == 0 else text
+
+
+def at(found, path: str):
+    """Return the value at a path of keys and indices such as 'mean.U_position_m', or None."""
+    for key in path.split('.'):
+        try:
+            found = found[int(key) if isinstance(found, list) else key]
+        except (KeyError, IndexError, TypeError):
+            return None
+    return found
 
 
 class Terminal(Console):

@@ -15,7 +15,7 @@ from beetle_omni_ros.control.references import (
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot import rotations, schema
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.runs import lemniscate
+from beetle_omni_ros.runs.tasks import lemniscate_target
 
 ROBOT = RobotParameters.load()
 TIMES = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.4])
@@ -122,7 +122,7 @@ def test_a_joint_that_follows_a_moving_reference_does_not_jump_at_half_a_turn():
 
 
 def test_commands_lead_a_moving_reference_so_that_the_lag_arrives_on_time():
-    target = lemniscate.target(0.0)
+    target = lemniscate_target(0.0)
     reference = planner().plan(target, 20.0, LEVEL, np.zeros(4), np.zeros(10))
     for values, lead, lag in ((TILT, TILT_LEAD, LAG),
                               (THRUST, THRUST_LEAD, ROBOT.rotors.time_constant)):
@@ -133,7 +133,7 @@ def test_commands_lead_a_moving_reference_so_that_the_lag_arrives_on_time():
 
 
 def test_a_trajectory_samples_its_own_derivatives():
-    target = lemniscate.target(3.0)
+    target = lemniscate_target(3.0)
     times, step = np.linspace(12, 80, 50), 1e-3
     before, now, after = (target.sample(times + s) for s in (-step, 0, step))
     assert np.allclose((after.position - before.position) / (2 * step), now.velocity, atol=6e-3)
@@ -147,7 +147,7 @@ def test_a_trajectory_samples_its_own_derivatives():
 
 
 def test_outside_its_time_a_trajectory_rests_at_its_ends():
-    target = lemniscate.target(3.0)
+    target = lemniscate_target(3.0)
     for time, end in ((0.0, 0), (1e4, -1)):
         sample = target.at(time)
         assert np.array_equal(sample.position, target.positions[end])
