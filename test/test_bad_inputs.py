@@ -147,7 +147,7 @@ def rows():
             ('--healthy', 'nan', "--healthy 'nan'"),
             ('--healthy', '-1', "--healthy '-1': expected"),
             ('--conditions', 'windy', 'windy'), ('--controller', 'npmc', 'npmc'),
-            ('--docs', 'notes.txt', 'notes.txt: no line'), ('--output', 'notes.txt', 'notes.txt'),
+            ('--output', 'notes.txt', 'notes.txt'),
             ('--jobs', '0', "--jobs '0': expected"), ('--json', 'folder', 'it is a folder')):
         yield ['faults', '--only', 'mocap_lost', option, value], fragment
     yield ['faults', '--only', 'mocap_lost', '--bags'], '--bags: expected --output'
@@ -196,7 +196,7 @@ def rows():
 
 ROWS = list(rows())
 EXPECTATIONS = ('expected', 'See beetle_omni', 'no such', 'known', 'needs', 'there is no folder',
-                'it is a folder', 'not a', 'no .mcap', 'ros2 bag', 'at most', 'cannot', 'no line',
+                'it is a folder', 'not a', 'no .mcap', 'ros2 bag', 'at most', 'cannot',
                 'no module', 'missing', 'outside', 'beside it or among')
 TRAINING = [
     ([], '--output'), (['--output', 'out', '--set', 'a'], "--set 'a': expected key=value"),
