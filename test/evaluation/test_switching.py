@@ -1,6 +1,5 @@
 """The policy in the whole loop: switched in flight, and with faults in flight."""
 
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ from beetle_omni_ros.evaluation import command, loop
 from beetle_omni_ros.evaluation.loop import FlightLoop
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import ParameterError, RunError
+from beetle_omni_ros.robot.schema import RunError
 from beetle_omni_ros.runs.log import LogRecorder
 from beetle_omni_ros.runs.metrics import metrics
 from beetle_omni_ros.runs.tasks import make_task
@@ -136,11 +135,3 @@ def test_implausible_commands_never_get_control(tmp_path, monkeypatch):
     absurd = write(tmp_path / 'absurd.onnx', bias=np.r_[np.zeros(4), np.full(4, 1e6)])
     with pytest.raises(RunError, match="'fallback'.*rl_node.*thrust out of range"):
         fly_poses(tmp_path, absurd, 1.0)
-
-
-def test_a_policy_of_another_robot_flies_with_permission(tmp_path):
-    options = ControllerOptions(policy=write_hover_policy(tmp_path / 'p.onnx'))
-    other = replace(ROBOT, mass=3.1)
-    with pytest.raises(ParameterError, match='mass 3.0386 in training, 3.1 here'):
-        registry.make('rl', other, options)
-    registry.make('rl', other, replace(options, allow_other_robot=True))
