@@ -39,6 +39,7 @@ def shared(*folders):
 REQUIREMENTS = [
     'casadi>=3.8,<4',
     'filterpy>=1.4.5,<3',
+    'jinja2>=3.0,<4',
     'joblib>=1.4,<2',
     'matplotlib>=3.6,<4',
     'mcap>=1.2,<2',
@@ -121,7 +122,7 @@ setup(
     license='BSD-3-Clause',
     python_requires='>=3.10,<3.14',
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
-    package_data={'': ['*.c', '*.css', '*.h', '*.html', '*.js', 'vendor/*']},
+    package_data={'': ['*.c', '*.css', '*.h', '*.html', '*.js', '*.md', 'vendor/*']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),

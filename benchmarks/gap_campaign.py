@@ -136,7 +136,7 @@ def main(arguments: list[str] | None = None) -> int:
         cases = select(make_cases(settings, given.set, given.seed, given.command_age),
                        given.only)
         workflows = choose_workflows(given)
-        from beetle_omni_ros.comparison.flights import check_backend, workers
+        from beetle_omni_ros.evaluation.campaign import check_backend, workers
         check_backend(given.backend)
     except ValueError as error:
         console.print(str(error), style='red', markup=False)

@@ -21,6 +21,7 @@ from math import ceil
 from pathlib import Path
 import sys
 
+import joblib
 import numpy as np
 from rich.console import Console
 from rich.progress import track
@@ -28,8 +29,8 @@ from rich.table import Table
 from scipy.stats import chi2
 
 from beetle_omni_ros.control.registry import ControllerOptions
+from beetle_omni_ros.evaluation.campaign import workers
 from beetle_omni_ros.evaluation.command import fly
-from beetle_omni_ros.faults.campaign import fly_all
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.metrics import metrics
@@ -113,9 +114,10 @@ def main() -> None:
               for kind, count in (('nominal', number), ('published', number),
                                   (DRAWN, chosen.draws)) for k in range(count)]
     console = Console(width=None if sys.stdout.isatty() else 140)
-    flights = list(track(
-        fly_all(fly_one, trials, chosen.robot, chosen.plant, jobs=chosen.jobs),
-        'flights', total=len(trials), console=console))
+    with workers(jobs=chosen.jobs):
+        flights = list(track(joblib.Parallel(return_as='generator_unordered', batch_size=1)(
+            joblib.delayed(fly_one)(trial, chosen.robot, chosen.plant) for trial in trials),
+            'flights', total=len(trials), console=console))
     flights.sort(key=lambda one: trials.index(Trial(*(
         one[key] for key in ('controller', 'kind', 'seed')))))
     rows = summary(flights)

@@ -27,19 +27,13 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.control.nmpc import NmpcController
 from beetle_omni_ros.control.policy import PolicyController, PolicyParameters
-from beetle_omni_ros.estimation.ekf import ErrorStateEkf
-from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.evaluation.loop import FlightLoop
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.log import LogRecorder
 from beetle_omni_ros.runs.tasks import make_task
-from beetle_omni_ros.safety.parameters import SupervisorParameters
-from beetle_omni_ros.safety.supervisor import Supervisor
-from beetle_omni_ros.sim.simulator import Simulator
 
 TARGETS = {'median': 0.1, 'p99': 0.2}   # [ms] of inference with its observation
 
@@ -93,13 +87,10 @@ class TimedPolicy(PolicyController):
 
 def measure(parameters: PolicyParameters, poses: int, seed: int) -> tuple[Clock, str]:
     """Fly; return the times and the policy's properties."""
-    robot, estimator, clock = RobotParameters.load(), EkfParameters.load(), Clock()
+    robot, clock = RobotParameters.load(), Clock()
     policy = TimedPolicy(robot, parameters, clock)
-    supervisor = Supervisor(SupervisorParameters.load(), robot, HoverController(robot))
-    flight = FlightLoop(Simulator(robot, seed=seed), ErrorStateEkf(estimator, robot.gravity),
-                        {'nmpc': Timed(NmpcController(robot), clock),
-                         'rl': Timed(policy, clock)},
-                        supervisor, LogRecorder(), estimator.imu.gyroscope_noise)
+    flight = FlightLoop(robot, robot, {'nmpc': Timed(NmpcController(robot), clock),
+                                       'rl': Timed(policy, clock)}, LogRecorder(), seed=seed)
     flight.fly(make_task(f'random{poses}', seed))
     return clock, f'{policy.contract.name}, ' \
                   f'{policy.contract.observation_size} inputs, {parameters.policy}'

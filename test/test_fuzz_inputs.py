@@ -2,7 +2,6 @@
 
 import io
 from pathlib import Path
-import struct
 
 import numpy as np
 from test_packaging import parameter_classes
@@ -14,7 +13,7 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import BatteryReading, ImuReading, JointReading, PoseReading
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.bag import BagError, read_bag, read_messages
+from beetle_omni_ros.runs.bag import BagError, read_bag
 from beetle_omni_ros.runs.bag_writer import BagWriter
 from beetle_omni_ros.runs.report import make_page, make_runs, results_of
 from beetle_omni_ros.runs.targets import COLUMNS
@@ -23,7 +22,6 @@ from beetle_omni_ros.sim.fault_lists import load_faults
 
 LEVEL, ZERO = np.array([0, 0, 0, 1.0]), np.zeros(3)
 LONGEST_TEXT = 2000     # characters of a refusal
-NUMBERS = (np.nan, np.inf, -np.inf, 1e308, -1e308, 1e-320, 0.0)
 LAUGHS = 'a: &a [x, x, x, x, x, x, x, x, x]\n' + ''.join(
     f'{two}: &{two} [{", ".join(["*" + one] * 9)}]\n' for one, two in zip('abcdefgh', 'bcdefghi'))
 # Values that have broken a reader somewhere.
@@ -115,38 +113,6 @@ def write_bag(folder):
     return next((folder / 'bag').glob('*.mcap')).read_bytes()
 
 
-def mutate_messages(rng, data, folder):
-    """Write the bag again with hostile numbers, bytes, stamps or lengths in some messages."""
-    source = folder / 'source.mcap'
-    source.write_bytes(data)
-    place = folder / f'again_{rng.integers(1 << 60)}'
-    with BagWriter(place, {'task': 'hover'}) as writer:
-        for message in read_messages(source):
-            raw = bytearray(message.data)
-            if rng.random() < 0.1:
-                spoil(rng, raw)
-            at = message.received * (1 if rng.random() > 0.01 else rng.integers(1 << 20))
-            writer.write_raw(message.topic, message.type, bytes(raw), at)
-    return next(place.glob('*.mcap')).read_bytes()
-
-
-def spoil(rng, raw):
-    """Change the bytes of one message in place."""
-    at = int(rng.integers(4, len(raw)))
-    match rng.integers(5):
-        case 0:
-            raw[at] ^= 1 << int(rng.integers(8))
-        case 1:
-            del raw[at:]
-        case 2:
-            raw[at:at] = rng.bytes(int(rng.integers(1, 100)))
-        case 3 | 4:
-            at -= at % 8 - 4        # CDR numbers are aligned behind a header of four bytes
-            raw[at:at + 8] = struct.pack('<d', NUMBERS[rng.integers(len(NUMBERS))])
-
-
-
-
 def read_flight(path):
     """Read a bag, compute metrics and draw the page, like ``beetle_omni report``."""
     with np.errstate(all='ignore'):
@@ -210,13 +176,6 @@ def test_a_damaged_bag_is_read_up_to_the_damage(tmp_path):
     bag = write_bag(tmp_path)
     refusals(25, tmp_path, '.mcap', {'bag': bag}, mutate_bytes,
              lambda path, _: make_page(*read_flight(path)))
-    refusals(6, tmp_path, '.mcap', {'bag': bag},
-             lambda rng, data: mutate_messages(rng, data, tmp_path),
-             lambda path, _: make_page(*read_flight(path)))
-
-
-def test_a_bag_with_damaged_metadata_is_read(tmp_path):
-    write_bag(tmp_path)
     metadata = tmp_path / 'bag' / 'metadata.yaml'
     sound = metadata.read_bytes()
     for k in range(15):

@@ -14,7 +14,7 @@ import typer
 from typer.main import get_command
 
 from beetle_omni_ros import __version__
-from beetle_omni_ros.cli import flights, live, models
+from beetle_omni_ros.cli import commands, live
 from beetle_omni_ros.cli.options import (
     fail,
     FAILED,
@@ -34,13 +34,13 @@ HELP = {'help_option_names': ['-h', '--help']}
 
 app = typer.Typer(no_args_is_help=True, context_settings=HELP,
                   help='Fly, evaluate and report on the tiltable quadrotor.')
-for command in (flights.fly, flights.evaluate, flights.compare, flights.faults, flights.report,
-                flights.film, live.view, models.gap, models.train, live.check, live.drive,
-                flights.controllers):
+for command in (commands.fly, commands.evaluate, commands.compare, commands.faults,
+                commands.report, commands.film, live.view, commands.gap, commands.train,
+                live.check, live.drive, commands.controllers):
     app.command()(command)
 identify = typer.Typer(no_args_is_help=True, context_settings=HELP,
                        help='Fit the actuator models from measured data.')
-for command in (models.joint, models.rotor, models.robot):
+for command in (commands.joint, commands.rotor, commands.robot):
     identify.command()(command)
 app.add_typer(identify, name='identify')
 
@@ -61,7 +61,7 @@ def main(args: list[str] | None = None) -> int:
     """Run the command and return its exit status."""
     args = list(sys.argv[1:] if args is None else args)
     if args[:1] == ['gap']:
-        args = ['gap', *models.spread(args[1:])]
+        args = ['gap', *commands.spread(args[1:])]
     try:
         refuse_empty(args)
         status = get_command(app).main(args=args, prog_name='beetle_omni', standalone_mode=False)

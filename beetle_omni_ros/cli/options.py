@@ -12,6 +12,7 @@ from beetle_omni_ros.runs.files import check_writable
 
 UNUSABLE, FAILED, INTERRUPTED = 2, 1, 130
 CONDITIONS = ('nominal', 'published')
+COMPRESSIONS = ('none', 'zstd')
 
 # Without controllers of other packages, because --help does not search installed packages.
 KNOWN = f"{', '.join(registry.SHIPPED)}, any registered one, {registry.CLASS}"
@@ -107,21 +108,14 @@ def check_files(*files: Path | None):
             raise ParameterError(f'{file}: no such file')
 
 
-def check_flight(*, task, seed, conditions, bag, compression, json_path, files):
+def check_flight(conditions: str, compression: str, json_path: Path | None, *files: Path | None):
     """Refuse unusable input before the flight starts."""
-    from beetle_omni_ros.runs.bag_writer import COMPRESSIONS
-    from beetle_omni_ros.runs.tasks import make_task
-    if conditions not in CONDITIONS:
-        raise ParameterError(f"--conditions '{conditions}': expected {' or '.join(CONDITIONS)}")
-    if compression not in COMPRESSIONS:
-        raise ParameterError(f"--compression '{compression}': expected "
-                             f"{' or '.join(COMPRESSIONS)}")
+    for option, given, known in (('conditions', conditions, CONDITIONS),
+                                 ('compression', compression, COMPRESSIONS)):
+        if given not in known:
+            raise ParameterError(f"--{option} '{given}': expected {' or '.join(known)}")
     check_files(*files)
-    make_task(task, seed)
     check_writable(json_path)
-    if bag:
-        from beetle_omni_ros.runs.bag_writer import check_new
-        check_new(bag, compression)
 
 
 def names(option: str, text: str | None) -> list[str] | None:

@@ -1,38 +1,30 @@
 """`beetle_omni compare`: flies every experiment with several controllers and writes the page."""
 
+from dataclasses import replace
 from pathlib import Path
 import platform
 import sys
 
 import joblib
-import numpy as np
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    SpinnerColumn,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
 from beetle_omni_ros import __version__
-from beetle_omni_ros.comparison import grids, page
-from beetle_omni_ros.comparison.fingerprint import commit, file_digest, policy_file, versions
-from beetle_omni_ros.comparison.flights import (
-    check_backend,
-    CONDITIONS,
-    Flight,
-    plan,
-    Store,
-    sweep,
-    TASKS,
-)
-from beetle_omni_ros.comparison.summary import look, summarise
+from beetle_omni_ros.comparison import page
+from beetle_omni_ros.comparison.flights import CONDITIONS, fly_flight, plan, TASKS
+from beetle_omni_ros.comparison.summary import summarise
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import guidance_of
 from beetle_omni_ros.control.registry import ControllerOptions
-from beetle_omni_ros.pages.page import Grid, print_grids, Terminal
+from beetle_omni_ros.evaluation.campaign import (
+    check_backend,
+    commit,
+    file_digest,
+    policy_file,
+    Store,
+    sweep,
+    versions,
+)
+from beetle_omni_ros.pages.page import print_grids, Terminal
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.files import write_json, write_text
@@ -48,7 +40,7 @@ def run_compare(*, output: Path, controllers: list[str] | None = None,
                 tasks: list[str] | None = None, conditions: list[str] | None = None,
                 seeds: list[int] | None = None, jobs: int | None = None,
                 backend: str = 'processes', address: str | None = None,
-                cache: Path | None = None, fresh: bool = False, policy: Path | None = None,
+                cache: Path | None = None, policy: Path | None = None,
                 plant: Path | None = None, json_path: Path | None = None,
                 console: Console | None = None) -> dict:
     """
@@ -77,22 +69,23 @@ def run_compare(*, output: Path, controllers: list[str] | None = None,
     flights = plan([entry.reference for entry in available], *arguments[1:], policy=policy,
                    plant=plant)
     output = Path(output)
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ParameterError(f'{output}: cannot write there ({error.strerror})') from None
     store = Store(cache or output / FLIGHTS)
     try:
-        flown = _fly(flights, store, console, backend=backend, jobs=jobs, fresh=fresh,
-                     address=address)
+        output.mkdir(parents=True, exist_ok=True)
+        made = sweep(fly_flight, [(flight, flight.make_task()) for flight in flights],
+                     store=store, backend=backend, jobs=jobs, address=address, console=console,
+                     line=_line)
     except KeyboardInterrupt:
         print(f'beetle_omni: finished flights are kept in {store.folder}; the same command '
               'continues from there', file=sys.stderr)
         raise
-    results = _results(flown, arguments, [entry.name for entry in available], skipped, policy,
-                       plant)
+    except OSError as error:
+        raise ParameterError(f'{output}: cannot write there ({error.strerror})') from None
+    flown = dict(zip(flights, made, strict=True))
+    results = results_of(flown, arguments, [entry.name for entry in available], skipped, policy,
+                         plant)
     results['meta']['guidance'] = {entry.name: text for entry, text in available.items()}
-    _write(results, flown, output, console)
+    write(results, flown, output, console)
     write_json(json_path, results)
     return results
 
@@ -120,25 +113,6 @@ def _available(names, policy, refuse):
     return available, skipped
 
 
-def _fly(flights, store, console, **options):
-    columns = (SpinnerColumn(), TextColumn('{task.description}'), BarColumn(),
-               TimeElapsedColumn(), TextColumn('left'), TimeRemainingColumn())
-    count = {'done': 0}
-    with Progress(*columns, console=console, transient=True,
-                  speed_estimate_period=1200) as progress:
-        bar = progress.add_task('', total=sum(flight.cost for flight in flights))
-
-        def done(flight, result, kept):
-            count['done'] += 1
-            progress.update(bar, advance=flight.cost,
-                            description=f"{count['done']} of {len(flights)} flights")
-            progress.console.print(_line(flight, result, kept), highlight=False,
-                                   style='red' if result['failure'] else 'dim' if kept else None)
-
-        progress.update(bar, description=f'0 of {len(flights)} flights')
-        return sweep(flights, store=store, done=done, **options)
-
-
 def _line(flight, result, kept):
     if result['failure']:
         return f"{flight.name}: failed, {result['failure']}"
@@ -157,7 +131,8 @@ def _line(flight, result, kept):
     return f"{flight.name}: {', '.join(parts)}"
 
 
-def _results(flown, arguments, names, skipped, policy, plant=None):
+def results_of(flown: dict, arguments: tuple, names: list[str], skipped: dict,
+               policy: Path | None = None, plant: Path | None = None) -> dict:
     """Content of the JSON file, from plain values, so that it is equal after reading."""
     _, tasks, conditions, seeds = arguments
     order = {name: k for k, name in enumerate((*tasks, *conditions, *names))}
@@ -165,8 +140,8 @@ def _results(flown, arguments, names, skipped, policy, plant=None):
         order[flight.task], order[flight.conditions], order[flight.controller], flight.seed))
     specs = {flight.controller: flight.spec for flight in flights if flight.spec}
     references = [specs.get(name, name) for name in names]
-    files = {name: policy_file(reference, policy)
-             for name, reference in zip(names, references, strict=True)}
+    files = {flight.controller: policy_file(flight.reference, flight.policy)
+             for flight in flights}
     command = (f"beetle_omni compare --controllers {','.join(references)} "
                f"--tasks {','.join(tasks)} --conditions {','.join(conditions)}"
                + (f" --seeds {','.join(map(str, seeds))}" if seeds else '')
@@ -179,8 +154,8 @@ def _results(flown, arguments, names, skipped, policy, plant=None):
                  'seeds': sorted({flight.seed for flight in flights}),
                  'policy_file': str(policy) if policy else None,
                  'plant': str(plant) if plant else None,
-                 'policies': {name: f'{file.name} ({file_digest(file)})'
-                              for name, file in files.items() if file},
+                 'policies': {name: f'{files[name].name} ({file_digest(files[name])})'
+                              for name in names if files[name]},
                  'cpu_s': sum(result.get('cpu_s', 0.0) for result in flown.values()),
                  'machine': {'processor': _processor(), 'cores': joblib.cpu_count(),
                              'system': f'{platform.system()} {platform.machine()}'},
@@ -200,39 +175,25 @@ def _processor():
         return platform.processor() or platform.machine()
 
 
-def _write(results, flown, output, console):
-    ordered = {flight: flown[flight] for flight in sorted(
-        flown, key=lambda flight: (results['meta']['controllers'].index(flight.controller),
-                                   flight))}
-    made = page.sections(results, ordered)
-    how = HOW if (output / HOW).is_file() else ''
-    try:
-        for picture in page.pictures(made):
-            (output / f'{picture.name}.png').write_bytes(picture.data)
-    except OSError as error:
-        raise ParameterError(f'{output}: cannot write the page ({error.strerror})') from None
-    write_text(output / PAGE, page.page(results, made), 'page')
-    write_text(output / TEXT, page.markdown(results, made, how), 'page')
+def write(results: dict, flown: dict, output: Path, console: Console) -> None:
+    """Write page, pictures, text and numbers, and print the table of all experiments."""
+    controllers = results['meta']['controllers']
+    sections = page.sections(results, {flight: flown[flight] for flight in sorted(
+        flown, key=lambda flight: (controllers.index(flight.controller), flight))})
+    for picture in page.pictures(sections):
+        (output / f'{picture.name}.png').write_bytes(picture.data)
+    write_text(output / PAGE, page.as_page(results, sections), 'page')
+    write_text(output / TEXT, page.as_markdown(
+        results, sections, HOW if (output / HOW).is_file() else ''), 'page')
     write_json(output / NUMBERS, results)
-    print_grids([_for_terminal(grids.glance(results), results, console.width)], console)
-    failed = sum(bool(result['failure']) for result in flown.values())
-    if failed:
-        console.print(f'{failed} of {len(flown)} flights failed, see above and on the page',
+    glance = page.glance(results)
+    if console.width < WIDE:
+        shown = [k for k in range(len(glance.header)) if k not in glance.faint_columns]
+        glance = replace(glance, header=[glance.header[k] for k in shown], rows=[
+            [row[k] for k in shown] for row in glance.rows], faint_columns=frozenset())
+    print_grids([glance], console)
+    broken = sum(bool(result['failure']) for result in flown.values())
+    if broken:
+        console.print(f'{broken} of {len(flown)} flights failed, see above and on the page',
                       style='red', highlight=False)
     console.print(f'{output / PAGE}', highlight=False)
-
-
-def _for_terminal(grid, results, width):
-    """The table as text, without the published columns if the terminal is narrow."""
-    shown = [k for k, column in enumerate(grid.columns)
-             if column.group != 'published' or width >= WIDE]
-    published = [grid.columns[k].group == 'published' for k in shown]
-    names = [look(grid.columns[k].controller).label for k in shown]
-    return Grid(grid.title, ['', *(f'published {name}' if theirs else name
-                                   for name, theirs in zip(names, published, strict=True))],
-                [[name, *(grids.text_of(cells[k].main + cells[k].small, results) for k in shown)]
-                 for name, cells in grid.rows],
-                faint_columns=frozenset(np.flatnonzero([False, *published]).tolist()))
-
-
-__all__ = ['Flight', 'run_compare']

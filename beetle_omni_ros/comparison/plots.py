@@ -1,4 +1,8 @@
-"""Figures of poses, waypoints, disturbances, payload, the lemniscate and a hover."""
+"""
+Figures of poses, disturbances and the lemniscate.
+
+Each is drawn from the results of one task under one set of conditions.
+"""
 
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
@@ -6,12 +10,10 @@ import numpy as np
 
 from beetle_omni_ros.comparison.flights import Flight
 from beetle_omni_ros.comparison.summary import look, PUBLISHED
-from beetle_omni_ros.pages.figures import FAINT, INK, panels, WIDTH
-from beetle_omni_ros.runs import lemniscate as curve
-from beetle_omni_ros.runs import published
-from beetle_omni_ros.runs.log import roll_pitch_yaw
+from beetle_omni_ros.pages.figures import FAINT, INK, panels
+from beetle_omni_ros.runs import table as published
 from beetle_omni_ros.runs.metrics import L_WINDOW, REACHED_ORIENTATION, REACHED_POSITION, U_WINDOW
-from beetle_omni_ros.runs.tasks import make_task, POSE_DURATION, WAYPOINTS
+from beetle_omni_ros.runs.tasks import make_task, PERIOD, POSE_DURATION
 
 FLOOR = {'position': 2e-4, 'orientation': 1e-2}  # of logarithmic errors [m], [deg]
 UNITS = {'position': 'm', 'orientation': 'deg'}
@@ -19,8 +21,6 @@ STEP = 0.05  # [s] between points of a folded curve
 BINS = 28  # edges of a histogram
 BEFORE = 2.0  # [s] of hover shown before the first disturbance
 SHOWN = {'position': 2.0, 'orientation': 180.0}  # largest limit of a disturbance's axes [m], [deg]
-HOVER_SHOWN = 0.5  # [s] of commands
-
 
 Groups = dict[str, list[dict]]      # controller -> one result with a trace for each seed
 
@@ -120,7 +120,7 @@ def _reached_box(panel):
     panel.set_ylabel('U orientation error [deg]')
 
 
-def convergence(groups: Groups) -> Figure:
+def convergence(groups: Groups, task: str) -> Figure:
     """Errors in the 8 s of a pose: median and 10 to 90 % band over all poses."""
     figure, axes = panels(1, 2, height=2.8)
     grid = np.arange(0.0, POSE_DURATION, STEP)
@@ -158,53 +158,6 @@ def _folded(results, key, grid):
             if np.any(inside) and t[inside][-1] >= k * POSE_DURATION + U_WINDOW[1]:
                 rows.append(np.interp(grid, t[inside] - k * POSE_DURATION, values[inside]))
     return np.array(rows)
-
-
-def waypoints(groups: Groups) -> Figure:
-    """States over one round of the waypoints: mean of all rounds, minimum to maximum as a band."""
-    duration = len(WAYPOINTS) * POSE_DURATION
-    grid = np.arange(0.0, duration, STEP)
-    figure, axes = panels(4, 2, height=1.35, sharex=True)
-    targets = WAYPOINTS[np.minimum((grid / POSE_DURATION).astype(int), len(WAYPOINTS) - 1)]
-    for row in range(3):
-        for column in range(2):
-            axes[row, column].plot(grid, targets[:, row + 3 * column], color=INK, lw=0.9,
-                                   ls=(0, (3, 2)), label='target')
-    for name, results in groups.items():
-        style = look(name)
-        rounds = _rounds(results, grid, duration)
-        flown = ~np.all(np.isnan(rounds[:, :, 0]), axis=0)
-        for panel, values in zip(axes.T.ravel(), np.moveaxis(rounds[:, flown], 2, 0),
-                                 strict=True):
-            panel.fill_between(grid[flown], np.nanmin(values, axis=0), np.nanmax(values, axis=0),
-                               color=style.colour, alpha=0.2, lw=0)
-            panel.plot(grid[flown], np.nanmean(values, axis=0), color=style.colour,
-                       ls=style.dashes, lw=1.2, label=style.label)
-    for panel, label in zip(axes.T.ravel(), (
-            'x [m]', 'y [m]', 'z [m]', '‖v‖ [m/s]', 'roll [deg]', 'pitch [deg]', 'yaw [deg]',
-            '‖ω‖ [rad/s]'), strict=True):
-        panel.set_ylabel(label)
-        panel.set_xlim(0, duration)
-        panel.set_xticks(np.arange(0, duration + 1, POSE_DURATION))
-    for panel in axes[-1]:
-        panel.set_xlabel('time in the round [s]')
-    label_once(figure, axes[0, 0])
-    return figure
-
-
-def _rounds(results, grid, duration):
-    """(R, len(grid), 8) x, y, z, speed, roll, pitch, yaw, rate of rounds; NaN after the end."""
-    rounds = []
-    for result in results:
-        trace = result['trace']
-        t = trace['t']
-        angles = np.degrees(np.unwrap(np.radians(roll_pitch_yaw(trace['quaternion'])), axis=0))
-        states = np.column_stack([trace['position'], trace['speed'], angles, trace['rate']])
-        for k in range(max(1, int(np.ceil(t[-1] / duration - 0.01)))):
-            rounds.append(np.column_stack([
-                np.interp(grid + k * duration - 1e-3, t, column, right=np.nan)
-                for column in states.T]))
-    return np.array(rounds)
 
 
 def disturbance(groups: Groups, kind: str) -> Figure:
@@ -262,54 +215,9 @@ def _error_curve(panel, result, what, name, k):
     return float(np.max(shown)) if shown.size else 0.0
 
 
-def payload(groups: Groups) -> Figure:
-    """Steady errors against the mass, and the height over time."""
-    figure, axes = panels(1, 3, height=2.7, width_ratios=(1, 1, 1.5))
-    for number, (name, results) in enumerate(groups.items()):
-        style = look(name)
-        entries = [result['metrics']['payload'] for result in results]
-        masses = np.array([entry['payload_kg'] for entry in entries[0]])
-        shift = 0.012 * (number - (len(groups) - 1) / 2)
-        for panel, key, scale in ((axes[0, 0], 'height_error_m', 1e3),
-                                  (axes[0, 1], 'orientation_deg', 1.0)):
-            values = scale * np.array([[np.nan if e[key] is None else e[key] for e in part]
-                                       for part in entries])
-            if np.all(np.isnan(values)):
-                continue
-            middle = np.nanmean(values, axis=0)
-            panel.errorbar(masses + shift, middle, yerr=[middle - np.nanmin(values, axis=0),
-                                                         np.nanmax(values, axis=0) - middle],
-                           color=style.colour, ls=style.dashes, marker=style.marker, ms=4.5,
-                           lw=1.4, capsize=2, label=style.label)
-        trace = results[0]['trace']
-        axes[0, 2].plot(trace['t'], 1e3 * (trace['position'][:, 2] - 1.0), color=style.colour,
-                        ls=style.dashes, lw=1.1)
-    for panel, label in zip(axes[0], ('steady height error [mm]', 'steady orientation error [deg]',
-                                      'height error [mm]'), strict=True):
-        panel.set_ylabel(label)
-    for panel in axes[0, :2]:
-        panel.set_xlabel('payload [kg]')
-    _mark_masses(axes[0, 2])
-    axes[0, 1].set_ylim(bottom=0)
-    axes[0, 0].axhline(0, color=FAINT, lw=0.8)
-    label_once(figure, axes[0, 0])
-    return figure
-
-
-def _mark_masses(panel):
-    begin = 0.0
-    for segment in make_task('payload').segments:
-        panel.axvline(begin, color=FAINT, lw=0.7)
-        panel.text(begin + 0.4, 0.985, f'{segment.payload:g} kg', color=FAINT, fontsize=7.5,
-                   va='top', transform=panel.get_xaxis_transform())
-        begin += segment.duration
-    panel.set_xlim(0, begin)
-    panel.set_xlabel('time [s]')
-
-
 def _laps(results, keys):
     """Phase grid (N,) [s] of a round and (R, N, len(keys)) values of all complete rounds."""
-    grid = np.arange(0.0, curve.PERIOD, STEP)
+    grid = np.arange(0.0, PERIOD, STEP)
     rounds = []
     for result in results:
         trace = result['trace']
@@ -321,45 +229,7 @@ def _laps(results, keys):
     return grid, np.array(rounds)
 
 
-def lemniscate_path(groups: Groups) -> Figure | None:
-    """Mean path of all rounds in space, from above and from the side."""
-    laps = {name: rounds for name, results in groups.items()
-            if len((rounds := _laps(results, ('position',))[1]))}
-    if not laps:
-        return None
-    figure = Figure(figsize=(WIDTH, 4.1), layout='constrained')
-    parts = figure.add_gridspec(2, 2, width_ratios=(1.15, 1), height_ratios=(1.75, 1))
-    space = figure.add_subplot(parts[:, 0], projection='3d')
-    above = figure.add_subplot(parts[0, 1])
-    side = figure.add_subplot(parts[1, 1], sharex=above)
-    for name, rounds in laps.items():
-        path = np.vstack([rounds.mean(axis=0), rounds.mean(axis=0)[:1]])
-        _path(space, above, side, path, look(name).colour, ls=look(name).dashes, lw=1.5,
-              label=look(name).label)
-    samples = [curve.sample(curve.RAMP + s) for s in np.arange(0, curve.PERIOD + 0.01, STEP)]
-    _path(space, above, side, np.array([sample.position for sample in samples]), INK,
-          ls=(0, (3, 2)), lw=0.8, label='reference', zorder=5)
-    for panel, label in ((above, 'y [m]'), (side, 'z [m]')):
-        panel.margins(0.05)
-        panel.set_ylabel(label)
-    above.tick_params(labelbottom=False)
-    side.set_xlabel('x [m]')
-    space.set(xlabel='x [m]', ylabel='y [m]', zlabel='z [m]', zlim=(0.6, 1.4),
-              xticks=(-1, 0, 1), yticks=(-0.5, 0, 0.5), zticks=(0.7, 1.0, 1.3))
-    space.set_box_aspect((2, 1.2, 1.0), zoom=1.02)
-    space.view_init(elev=26, azim=-62)
-    label_once(figure, space)
-    return figure
-
-
-def _path(space, above, side, path, colour, **style):
-    """Draw (N, 3) positions into the 3D view and the two projections."""
-    space.plot(*path.T, color=colour, **style)
-    above.plot(path[:, 0], path[:, 1], color=colour, **style)
-    side.plot(path[:, 0], path[:, 2], color=colour, **style)
-
-
-def lemniscate_errors(groups: Groups) -> Figure | None:
+def lemniscate_errors(groups: Groups, task: str) -> Figure | None:
     """Tracking errors over a round: mean of all rounds, minimum to maximum as a band."""
     figure, axes = panels(2, height=1.6, sharex=True)
     drawn = False
@@ -377,33 +247,22 @@ def lemniscate_errors(groups: Groups) -> Figure | None:
     for panel, what in zip(axes[:, 0], UNITS, strict=True):
         panel.set_ylabel(f'{what} error [{UNITS[what]}]')
         panel.set_ylim(bottom=0)
-        panel.set_xlim(0, curve.PERIOD)
+        panel.set_xlim(0, PERIOD)
     axes[1, 0].set_xlabel('time in the round [s]')
     label_once(figure, axes[0, 0])
     return figure
 
 
-def hover_commands(groups: Groups) -> Figure | None:
-    """Commands in the last half second of a hover, which show chatter."""
-    groups = {name: results for name, results in groups.items()
-              if len(results[0]['trace']['command_t'])}
-    if not groups:
-        return None
-    figure, axes = panels(2, len(groups), height=1.35, sharex=True, sharey='row')
-    for column, (name, results) in enumerate(groups.items()):
-        trace, style = results[0]['trace'], look(name)
-        t = trace['command_t'] - trace['command_t'][-1]
-        for row, values in enumerate((trace['command_tilt'], trace['command_thrust'])):
-            for k in range(4):
-                axes[row, column].step(t, values[:, k] - values[:, k].mean(), where='post',
-                                       color=style.colour, lw=1.0, alpha=1 - 0.2 * k)
-        axes[0, column].set_title(style.label, color=style.colour, fontsize=9)
-        axes[1, column].set_xlim(-HOVER_SHOWN, 0)
-        axes[1, column].set_xticks((-HOVER_SHOWN, -HOVER_SHOWN / 2, 0))
-        axes[1, column].set_xlabel('time before the end [s]')
-    for panel, label, least in zip(axes[:, 0], ('tilt [rad]', 'thrust [N]'), (0.02, 0.25),
-                                   strict=True):
-        panel.set_ylabel(f'{label}\nabout its mean')
-        largest = max(abs(limit) for limit in panel.get_ylim())
-        panel.set_ylim(-max(largest, least), max(largest, least))
-    return figure
+# Kind of a task -> name, caption and function of each figure.
+DRAWN = {
+    'random': [('errors', 'Errors at the target; stars: published means, with their ranges',
+                distributions),
+               ('convergence', 'Errors after a pose was asked for: median and 10 to 90 % band '
+                'over all poses', convergence)],
+    'lemniscate': [('errors', 'Tracking errors in a round: mean of all rounds, least to largest '
+                    'as a band', lemniscate_errors)],
+    'force': [('errors', 'Errors in time, the disturbance dashed; × where control was lost; thin '
+               'lines: further seeds', disturbance)],
+    'torque': [('errors', 'Errors in time, the disturbance dashed; × where control was lost; thin '
+                'lines: further seeds; each torque lasts 0.05 s', disturbance)],
+    'waypoints': [], 'payload': [], 'hover': []}

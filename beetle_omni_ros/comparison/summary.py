@@ -14,7 +14,7 @@ import numpy as np
 
 from beetle_omni_ros.comparison.flights import Flight
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.runs import published
+from beetle_omni_ros.runs import table as published
 from beetle_omni_ros.runs.metrics import POSE_KEYS
 
 PREFIX = 'published_'    # prefix of a controller in the publication

@@ -10,28 +10,32 @@ numbers.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
+import gc
+import time
+
+import numpy as np
 
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.control.base import Controller, State, Target
+from beetle_omni_ros.control.base import Command, Controller, PoseTarget, State, Target
 from beetle_omni_ros.control.host import ControllerError, ControllerHost
 from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.estimation.state import pose_covariance, twist_covariance
-from beetle_omni_ros.evaluation.compute import collector_off, ComputeTimer
-from beetle_omni_ros.evaluation.processes import Processes
 from beetle_omni_ros.messages.values import Odom, Wrench
 from beetle_omni_ros.robot.allocation import ALL_HEALTHY
-from beetle_omni_ros.robot.effects import SensorErrors
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import RunError
+from beetle_omni_ros.runs.log import Recorder
 from beetle_omni_ros.runs.targets import TargetChecks
 from beetle_omni_ros.runs.tasks import Task, TaskPlayer
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.supervisor import Supervisor
-from beetle_omni_ros.sim.faults import Fault
+from beetle_omni_ros.sim.faults import Fault, Schedule
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.readings import Frame
 from beetle_omni_ros.sim.simulator import Simulator
@@ -41,88 +45,180 @@ TAKEOFF_TIMEOUT = 30.0   # [s] simulated time for the take-off
 COMPUTE_REPORT = 1.0     # [s] between two records of compute times, as of the nodes
 SWAP_CHARGE = 0.3         # [-] charge below which the pack is replaced at the next target
 CLOCK_SET_BACK = 0.1     # [s] least age of a command that shows that the clock was set back
+QUEUE = 10      # messages of a topic that wait for a process; older ones are dropped, as in ROS
 SETTLE_TIME = 0.5        # [s] on the ground before arming, for the start of the estimator
+
+
+@contextmanager
+def collector_off():
+    """
+    Disable Python's cycle collector during a flight, as the nodes do.
+
+    Its passes become longer with the log. A controller step that it interrupts would appear to
+    take tens of milliseconds.
+    """
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()
+
+
+class ComputeTimer:
+    """
+    CPU times of all steps of one controller; a deadline miss takes longer than ``period`` [s].
+
+    The CPU time of the calling thread is measured, because wall time on a shared computer includes
+    other programs.
+    """
+
+    def __init__(self, period: float):
+        self._period, self._times = period, []
+
+    def call(self, function, *arguments):
+        """Run ``function(*arguments)`` and store its CPU time."""
+        start = time.thread_time()
+        result = function(*arguments)
+        self._times.append(time.thread_time() - start)
+        return result
+
+    def summary(self) -> dict[str, float | int]:
+        """Median, 99th percentile and maximum [ms], deadline misses, number of steps."""
+        times = 1e3 * np.array(self._times or [0.0])
+        return {'median': float(np.median(times)), 'p99': float(np.percentile(times, 99)),
+                'max': float(times.max()),
+                'deadline_misses': int(np.sum(times > 1e3 * self._period)),
+                'count': len(self._times)}
+
+
+class Processes:
+    """
+    Messages from and to estimator, controllers and supervisor, modified by faults of processes.
+
+    Without a fault all messages pass unchanged.
+
+    Attributes:
+        clock_step: error of the flight computer's clock [s].
+
+    """
+
+    def __init__(self, tick: float, supervisor: Supervisor):
+        """``tick``: time between two calls of :meth:`frame` [s]."""
+        self._supervisor = supervisor
+        self._schedule = Schedule(tick, np.random.SeedSequence(0))
+        self._waiting: dict[str, deque] = {}
+        self._reported: dict[str, str] = {}     # bridge -> last reported state
+        self.clock_step = 0.0
+
+    def set_faults(self, faults: Sequence[Fault], now: float) -> None:
+        """Set the faults of processes; their ``at`` counts from ``now`` [s]."""
+        self._schedule.set(faults, now)
+
+    def frame(self, frame: Frame) -> Frame:
+        """Start a tick; returns the frame with stamps of the flight computer's clock."""
+        if self._schedule.empty:
+            return frame
+        self._schedule.update(frame.time)
+        self.clock_step = sum(self._schedule.each('clock'))
+        if not self.supervisor_waits:
+            waiting, self._waiting = self._waiting, {}
+            for method, messages in waiting.items():
+                for message in messages:
+                    getattr(self._supervisor, method)(*message)
+        if not self.clock_step:
+            return frame
+        shifted = {name: replace(reading, stamp=reading.stamp + self.clock_step)
+                   for name in ('imu', 'mocap', 'joints', 'rotors', 'battery')
+                   if (reading := getattr(frame, name)) is not None}
+        return replace(frame, time=frame.time + self.clock_step, **shifted)
+
+    @property
+    def supervisor_waits(self) -> bool:
+        """Whether the supervisor is not scheduled at present."""
+        return bool(self._schedule.each('waits'))
+
+    def send(self, method: str, *message) -> None:
+        """Call one of the supervisor's ``on_`` methods, or queue the message."""
+        if not self._schedule.empty and self.supervisor_waits:
+            self._waiting.setdefault(method, deque(maxlen=QUEUE)).append(message)
+        else:
+            getattr(self._supervisor, method)(*message)
+
+    def estimate(self, state: State) -> State | None:
+        """Estimate after the faults; None if it is not sent."""
+        return next(iter(self._schedule.through('estimate', state, 0.0)), None)
+
+    def requests(self, command: Command | None, now: float) -> list[Command]:
+        """Commands of the active controller that arrive now; None: delayed ones only."""
+        return self._schedule.through('request', command, now)
+
+    def target(self, target: Target) -> PoseTarget | None:
+        """Target of a fault while ``target`` is in force, or None."""
+        for pose in self._schedule.each('target'):
+            return PoseTarget(*pose, stamp=target.stamp)
+        return None
+
+    @property
+    def bridges(self) -> dict[str, str]:
+        """Bridge -> its reported state, if that has changed."""
+        if self._schedule.empty:
+            return {}
+        states = {name: text for bridges in self._schedule.each('bridges')
+                  for name, text in bridges.items()}
+        new = {name: text for name, text in states.items() if self._reported.get(name) != text}
+        self._reported.update(new)
+        return new
 
 
 class FlightLoop:
     """
-    One flight of a task.
+    One flight with the shipped parameters; the supervisor selects the first controller.
 
     Args:
-        simulator: plant and sensors.
-        estimator: the EKF.
-        controllers: name -> controller; all are stepped, the supervisor selects one.
-        supervisor: supervisor with a selected controller.
+        robot: robot of estimator and supervisor.
+        plant: simulated robot.
+        controllers: name -> controller; all are stepped.
         recorder: LogRecorder, BagWriter or both.
-        gyroscope_noise: noise of one sample, for the covariance of the recorded twist [rad/s].
+        conditions: 'nominal' or 'published'.
+        seed: seed of the simulation.
         faults: faults of robot, devices and processes; ``at`` counts from the task's start.
-        check_target: function that returns why the target of a fault is refused, or ''.
 
     Attributes:
-        simulator, supervisor: the arguments.
+        simulator, supervisor: parts of the loop.
         refusals: reasons of refused targets.
         ending: time in the task and reason of an early end of the flight by the supervisor, or ''.
 
     """
 
-    def __init__(self, simulator: Simulator, estimator: ErrorStateEkf,
-                 controllers: dict[str, Controller], supervisor: Supervisor, recorder,
-                 gyroscope_noise: float, faults: Sequence[Fault] = (),
-                 check_target: Callable[[Target], str] = lambda target: '',
-                 errors: SensorErrors = SensorErrors()):
-        self._gyroscope_noise, self._errors = gyroscope_noise, errors
-        self._faults, self._check_target = tuple(faults), check_target
-        self._processes = Processes(simulator.tick, supervisor)
+    def __init__(self, robot: RobotParameters, plant: RobotParameters,
+                 controllers: dict[str, Controller], recorder: Recorder, *,
+                 conditions: str = 'nominal', seed: int = 0, faults: Sequence[Fault] = ()):
+        estimator, active = EkfParameters.load().of_robot(robot), next(iter(controllers))
+        self.simulator = Simulator(plant, SimulatorParameters.load(), conditions=conditions,
+                                   seed=seed)
+        self.supervisor = Supervisor(SupervisorParameters.load(), robot, HoverController(robot),
+                                     tuple(dict.fromkeys((*registry.names(), active))))
+        self.supervisor.select(active)
+        self.refusals: list[str] = []
+        self.ending = ''
+        self._estimator = ErrorStateEkf(estimator, robot.gravity)
+        self._gyroscope_noise, self._errors = estimator.imu.gyroscope_noise, robot.sensors
+        self._recorder, self._faults = recorder, tuple(faults)
+        self._check_target = TargetChecks(robot).why_not
+        self._processes = Processes(self.simulator.tick, self.supervisor)
         self._other_target: Target | None = None     # of a fault
         self._accepts_other = False
-        self.refusals: list[str] = []
-        self.simulator, self._estimator = simulator, estimator
-        self.supervisor, self._recorder = supervisor, recorder
         self._timers = {name: ComputeTimer(c.period) for name, c in controllers.items()}
-        self._every = {name: max(1, round(c.period / simulator.tick))
+        self._every = {name: max(1, round(c.period / self.simulator.tick))
                        for name, c in controllers.items()}
         self._hosts = {name: ControllerHost(name, c, self._timers[name].call)
                        for name, c in controllers.items()}
-        self._joints = self._battery = self._command = self._estimated = None
+        self._joints = self._command = self._estimated = None
         self._ticks = 0
         self._state_name = self._recorded_state = ''
-        self._override, self._health = None, ALL_HEALTHY
+        self._health = ALL_HEALTHY
         self._crashed = False
         self._began = 0.0       # of the task, simulated time
-        self.ending = ''
-
-    @classmethod
-    def shipped(cls, robot: RobotParameters, plant: RobotParameters,
-                controllers: dict[str, Controller], recorder, *, conditions: str, seed: int,
-                faults: Sequence[Fault] = ()) -> FlightLoop:
-        """
-        Loop with the shipped parameters, in which the first controller is selected.
-
-        Args:
-            robot: robot of estimator and supervisor.
-            plant: simulated robot.
-            controllers: name -> controller.
-            recorder: recorder of the loop.
-            conditions: 'nominal' or 'published'.
-            seed: seed of the simulation.
-            faults: faults of the loop.
-
-        """
-        estimator, active = EkfParameters.load().of_robot(robot), next(iter(controllers))
-        supervisor = Supervisor(SupervisorParameters.load(), robot, HoverController(robot),
-                                tuple(dict.fromkeys((*registry.names(), active))))
-        loop = cls(
-            Simulator(plant, SimulatorParameters.load(), conditions=conditions, seed=seed),
-            ErrorStateEkf(estimator, robot.gravity), controllers, supervisor, recorder,
-            estimator.imu.gyroscope_noise, faults, TargetChecks(robot).why_not,
-            robot.sensors)
-        supervisor.select(active)
-        return loop
-
-    @property
-    def compute(self) -> dict[str, dict]:
-        """Controller -> summary of its CPU times."""
-        return {name: timer.summary() for name, timer in self._timers.items()}
 
     @property
     def controller_error(self) -> str:
@@ -132,11 +228,7 @@ class FlightLoop:
 
     def fly(self, task: Task, progress: Callable[[float], None] = lambda part: None) -> bool:
         """
-        Take off and fly the task.
-
-        Args:
-            task: the task.
-            progress: called with the completed fraction of the task, 0 to 1.
+        Take off and fly the task; ``progress`` is called with its completed fraction, 0 to 1.
 
         Returns:
             whether the robot was airborne to the end.
@@ -237,22 +329,17 @@ class FlightLoop:
             self._estimated = estimate.stamp    # each estimate is sent once
             state = processes.estimate(State.join(estimate, self._joints, self._command))
             if state is not None:
-                self._send_estimate(state, estimate, now)
+                processes.send('on_state', state, self._estimator.status)
+                self._control(state, now)
+                self._recorder.write('odom', Odom.of(state, *(
+                    (pose_covariance(estimate), twist_covariance(estimate, self._gyroscope_noise))
+                    if self._recorder.keeps_covariances else ())))
         for late in processes.requests(None, now):
             self._request(self.supervisor.active, late, now)
         if not processes.supervisor_waits:
             self._execute(self.supervisor.update(now), now)
             self._note_state(now)
         return frame
-
-    def _send_estimate(self, state, estimate, now):
-        """Send the estimate to supervisor, controllers and recorder."""
-        recorder = self._recorder
-        self._processes.send('on_state', state, self._estimator.status)
-        self._control(state, now)
-        covariances = () if not recorder.keeps_covariances else (
-            pose_covariance(estimate), twist_covariance(estimate, self._gyroscope_noise))
-        recorder.write('odom', Odom.of(state, *covariances))
 
     def _execute(self, command, now):
         if command is None:
@@ -291,14 +378,11 @@ class FlightLoop:
     def _control(self, state, now):
         """Step the controllers that are due."""
         supervisor = self.supervisor
-        for host in self._hosts.values():
+        for name, host in self._hosts.items():
             host.on_estimate(state)
-            if supervisor.target_override is not self._override:
-                host.override = supervisor.target_override
+            host.override = supervisor.target_override
             if supervisor.health is not self._health:
                 host.on_health(supervisor.health)
-        self._override, self._health = supervisor.target_override, supervisor.health
-        for name, host in self._hosts.items():
             if self._ticks % self._every[name]:
                 continue
             command = host.step(state, self._target_of_fault(host))
@@ -307,6 +391,7 @@ class FlightLoop:
                     self._request(name, passed, now)
             elif command is not None:
                 self._request(name, command, now)
+        self._health = supervisor.health
 
     def _request(self, name, command, now):
         self._recorder.write(f'{name}/command', command, now)
@@ -348,6 +433,6 @@ class FlightLoop:
             self._state_name = name
 
     def _report_compute(self):
-        for name, summary in self.compute.items():
-            self._recorder.write_compute(self.simulator.time, name, **summary)
+        for name, timer in self._timers.items():
+            self._recorder.write_compute(self.simulator.time, name, **timer.summary())
 

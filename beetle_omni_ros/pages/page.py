@@ -1,12 +1,13 @@
 """Tables of text for the terminal, as Markdown and as HTML, and structure and style of pages."""
 
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
+from math import isfinite
 import os
 import sys
 
+from jinja2 import Environment, PackageLoader, select_autoescape
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -19,6 +20,24 @@ LONGEST_TITLE = 78      # characters that fit on one line of a terminal
 PUBLISHED = ' class="published"'
 LONG = ' class="long"'
 LONGEST_CELL = 45       # characters that fit on one line of a page's cell
+
+
+def number(value: float | None, digits: int | None = 2) -> str:
+    """Return the text of a number; ``digits`` None: as short as possible."""
+    if value is None or not isfinite(value):
+        return ABSENT
+    text = f'{value:g}' if digits is None else f'{value:.{digits}f}'
+    return text.removeprefix('-') if float(text) == 0 else text
+
+
+def at(found, path: str):
+    """Return the value at a path of keys and indices such as 'mean.U_position_m', or None."""
+    for key in path.split('.'):
+        try:
+            found = found[int(key) if isinstance(found, list) else key]
+        except (KeyError, IndexError, TypeError):
+            return None
+    return found
 
 
 class Terminal(Console):
@@ -42,6 +61,7 @@ class Grid:
         faint: indices of rows with published results.
         faint_columns: indices of columns with published results.
         note: meaning of the columns, below the title.
+        best: (row, column) of cells in bold.
 
     """
 
@@ -51,6 +71,7 @@ class Grid:
     faint: frozenset[int] = frozenset()
     faint_columns: frozenset[int] = frozenset()
     note: str = ''
+    best: frozenset[tuple[int, int]] = frozenset()
 
 
 def print_grids(shown: list[Grid], console: Console) -> None:
@@ -98,11 +119,13 @@ def _total(widths):
     return sum(widths) + SPACE * len(widths)
 
 
-def markdown(header: Sequence[str], rows: Iterable[Sequence[str]], numeric: bool = False) -> str:
+def markdown(grid: Grid, numeric: bool = False) -> str:
     """Return GitHub Markdown; ``numeric`` aligns all columns but the first to the right."""
-    rule = ['---'] + ['---:' if numeric else '---'] * (len(header) - 1)
+    rule = ['---'] + ['---:' if numeric else '---'] * (len(grid.header) - 1)
+    rows = [[f'**{cell}**' if (row, k) in grid.best else cell for k, cell in enumerate(cells)]
+            for row, cells in enumerate(grid.rows)]
     return ''.join('| ' + ' | '.join(cell.replace('|', '\\|') for cell in line) + ' |\n'
-                   for line in (header, rule, *rows))
+                   for line in (grid.header, rule, *rows))
 
 
 def html(grid: Grid) -> str:
@@ -110,7 +133,8 @@ def html(grid: Grid) -> str:
     def cell(tag, text, row, column):
         faint = row in grid.faint or column in grid.faint_columns
         style = PUBLISHED if faint else LONG if len(text) > LONGEST_CELL else ''
-        return f'<{tag}{style}>{escape(text)}</{tag}>'
+        shown = f'<b>{escape(text)}</b>' if (row, column) in grid.best else escape(text)
+        return f'<{tag}{style}>{shown}</{tag}>'
 
     head = ''.join(cell('th', text, None, k) for k, text in enumerate(grid.header))
     body = ''.join(
@@ -156,19 +180,13 @@ def page(title: str, subtitle: str, grids: list[Grid], notes: list[str],
 
 def frame(title: str, subtitle: str, content: str, css: str = '') -> str:
     """Return a page with the HTML ``content`` and additional ``css``."""
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{escape(': '.join(filter(None, (title, subtitle))))}</title>
-<style>{shipped('page.css')}{css}</style>
-</head>
-<body>
-<main>
-<header><h1>{escape(title)}</h1>{f'<p>{escape(subtitle)}</p>' if subtitle else ''}</header>
-{content}
-</main>
-</body>
-</html>
-"""
+    return rendered('page.html', title=title, subtitle=subtitle, content=content, css=css)
+
+
+def rendered(template: str, **values) -> str:
+    """Return a template of this folder with these values, in HTML escaped."""
+    environment = Environment(loader=PackageLoader(PACKAGE, 'pages'), trim_blocks=True,
+                              lstrip_blocks=True, keep_trailing_newline=True,
+                              autoescape=select_autoescape())
+    environment.globals.update(shipped=shipped, markdown=markdown, html=html)
+    return environment.get_template(template).render(**values)

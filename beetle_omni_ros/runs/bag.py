@@ -233,21 +233,17 @@ def replay(path: str | Path, recorder: Recorder, warnings: list[str], *,
            namespace: str | None = None, leave_out: Container[str] | None = None
            ) -> Iterator[np.ndarray]:
     """
-    Pass the messages of a bag to a recorder, a few seconds at a time.
+    Pass the messages of a bag to a recorder, a few seconds at a time, as :func:`read_bag` does.
 
     Args:
         path: rosbag2 folder, or one of its files.
-        recorder: recorder that accepts series as values whose fields are arrays; other values
-            come one by one.
+        recorder: recorder that accepts values whose fields are arrays; texts come one by one.
         warnings: list to which missing and unusable data are added at the end.
         namespace: namespace of the robot, if the bag contains several.
         leave_out: topics without namespace to skip, beside commands of controllers; None: none.
 
     Yields:
         (N,) times of recording of the messages so far passed on [s].
-
-    Raises:
-        BagError: no such bag, unreadable, not MCAP, or several robots in it.
 
     """
     reading = _Reading(str(path), namespace, recorder, leave_out)
@@ -366,18 +362,15 @@ def _metadata(path, warnings):
     except (YamlError, KeyError, TypeError, AttributeError, ValueError, RecursionError):
         warnings.append('metadata.yaml is not readable')
         return {}
-    unusable = [key for key, value in meta.items() if not _usable(key, value)]
-    warnings.extend(f'metadata.yaml: {quoted(key)} is not usable, found {quoted(meta[key])}'
-                    for key in unusable)
-    return {key: value for key, value in meta.items() if key not in unusable}
+    used = {key: value for key, value in meta.items() if _usable(key, value)}
+    warnings.extend(f'metadata.yaml: {quoted(key)} is not usable, found {quoted(value)}'
+                    for key, value in meta.items() if key not in used)
+    return used
 
 
 def _usable(key, value):
     """Whether a value has the type that readers of the log rely on."""
-    if value is None:
+    if value is None or key not in ('seed', *META_TEXTS):
         return True
-    if key == 'seed':
-        return isinstance(value, int) and 0 <= value < 1 << 63
-    if key in META_TEXTS:
-        return isinstance(value, str) and len(value) <= LONGEST_TEXT and value.isprintable()
-    return True
+    return isinstance(value, int) and 0 <= value < 1 << 63 if key == 'seed' else \
+        isinstance(value, str) and len(value) <= LONGEST_TEXT and value.isprintable()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import contextmanager
 from io import BytesIO
 import json
 from math import isfinite
@@ -65,12 +66,6 @@ class JazzyWriter(Writer):
     """rosbags' writer with :class:`JazzyStorage`."""
 
     STORAGE_PLUGINS: ClassVar = {StoragePlugin.MCAP: JazzyStorage}
-
-    def __init__(self, path: Path, compression: str = 'none'):
-        """Prepare a bag at ``path``; ``compression`` is one of ``COMPRESSIONS``."""
-        super().__init__(path, version=VERSION, storage_plugin=StoragePlugin.MCAP)
-        if compression == 'zstd':
-            self.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
 
     def close(self) -> None:
         """Finish the bag."""
@@ -181,7 +176,7 @@ class BagWriter(Recorder):
             epoch: UNIX time of time 0 [s], so that a flight that begins at 0 s gets a real date.
 
         Raises:
-            BagError: the folder exists or cannot be made; unknown compression.
+            BagError: the folder exists or cannot be made.
 
         """
         self.path = Path(path)
@@ -189,9 +184,12 @@ class BagWriter(Recorder):
         self._epoch = int(epoch)
         self._connections: dict[str, Connection] = {}
         self._prefix = '/' + namespace.strip('/') + '/' if namespace.strip('/') else '/'
-        check_new(self.path, compression)
+        check_new(self.path)
         try:
-            self._writer: JazzyWriter | None = JazzyWriter(self.path, compression)
+            self._writer: JazzyWriter | None = JazzyWriter(
+                self.path, version=VERSION, storage_plugin=StoragePlugin.MCAP)
+            if compression == 'zstd':
+                self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
             self._writer.open()
         except (OSError, WriterError) as error:
             reason = getattr(error, 'strerror', None) or error
@@ -264,11 +262,9 @@ class BagWriter(Recorder):
         first, self._last_t = self._last_t is None, t
         if first and self.meta:     # now a time of the flight is known
             self._tell_meta()
-        try:
+        with self._disk():
             self._writer.write(connection, max(0, nanoseconds(t)) + self._epoch * 1_000_000_000,
                                data)
-        except OSError as error:
-            raise BagError(f'{self.path}: {error.strerror}') from error
         if self._frames is not None:
             self._frames.take(topic, data, t)
 
@@ -277,12 +273,10 @@ class BagWriter(Recorder):
         if self._writer is None:
             return
         storage = self._writer.storage
-        try:
+        with self._disk():
             if storage.chunk.msgs:
                 storage.close_chunk()
             storage.bio.flush()
-        except OSError as error:
-            raise BagError(f'{self.path}: {error.strerror}') from error
 
     def close(self) -> None:
         """Write index and metadata.yaml. A second call does nothing."""
@@ -294,8 +288,13 @@ class BagWriter(Recorder):
         if not any(writer.counts.values()):
             writer.min_timestamp = writer.storage.message_start_time = 0
             writer.storage.chunk.message_start_time = 0
-        try:
+        with self._disk():
             writer.close()
+
+    @contextmanager
+    def _disk(self):
+        try:
+            yield
         except OSError as error:
             raise BagError(f'{self.path}: {error.strerror}') from error
 
@@ -309,17 +308,14 @@ class BagWriter(Recorder):
         self.write_diagnostic(self._last_t, f'recorder_node: {RUN_STATUS}', self.meta)
 
 
-def check_new(path: str | Path, compression: str = 'none') -> None:
+def check_new(path: str | Path) -> None:
     """
     Check before a flight that its bag can be written.
 
     Raises:
-        BagError: the folder exists, its nearest existing parent is no writable folder, or unknown
-            compression.
+        BagError: the folder exists, or its nearest existing parent is no writable folder.
 
     """
-    if compression not in COMPRESSIONS:
-        raise BagError(f"compression '{compression}': expected {' or '.join(COMPRESSIONS)}")
     path = Path(path)
     if path.exists() or path.is_symlink():
         raise BagError(f'{path}: exists already; a bag needs a new folder')

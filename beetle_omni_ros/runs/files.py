@@ -38,18 +38,14 @@ class Table:
 
 
 def read_table(path: str | Path, wanted: Callable[[list[str]], list[str]], expected: str, *,
-               rows: str = '', comment: str | None = '#', error: type[ParameterError] = LogError,
                check: Callable[[list[float]], str] = lambda values: '') -> Table:
     """
-    Read columns of a CSV file; blank lines, comments and further columns are ignored.
+    Read columns of a CSV file; blank lines, comments (#) and further columns are ignored.
 
     Args:
         path: path of the file.
-        wanted: header -> names of the columns to read; may raise ``error`` without the path.
+        wanted: header -> names of the columns to read; may raise LogError without the path.
         expected: example of a header, for messages.
-        rows: expected content below the header, for the message about an empty file.
-        comment: first character of a comment; None: a file has no comments.
-        error: class of the raised errors.
         check: values of a row -> text about an unusable row after its number, or ''.
 
     Raises:
@@ -63,24 +59,24 @@ def read_table(path: str | Path, wanted: Callable[[list[str]], list[str]], expec
             reader = csv.reader(file)
             lines = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
     except FileNotFoundError:
-        raise error(f'{path}: no such file') from None
+        raise LogError(f'{path}: no such file') from None
     except (OSError, UnicodeDecodeError, csv.Error) as cause:
         reason = f"not a CSV text file ({getattr(cause, 'strerror', None) or cause})"
-        raise error(f'{path}: {reason}') from None
+        raise LogError(f'{path}: {reason}') from None
     lines = [(number, row) for number, row in lines
-             if any(row) and (comment is None or not row[0].startswith(comment))]
+             if any(row) and not row[0].startswith('#')]
     if not lines:
-        raise error(f'{path}: empty; expected the header {expected}{rows}')
+        raise LogError(f'{path}: empty; expected the header {expected}')
     number, header = lines.pop(0)
     if all(map(_is_number, header)):
-        raise error(f'{path}: row {number}: the header is missing; expected {expected}')
+        raise LogError(f'{path}: row {number}: the header is missing; expected {expected}')
     try:
         names = wanted(header)
-    except error as cause:
-        raise error(f'{path}: row {number}: {cause}; expected {expected}') from None
+    except LogError as cause:
+        raise LogError(f'{path}: row {number}: {cause}; expected {expected}') from None
     for name in names:
         if header.count(name) > 1:
-            raise error(f"{path}: row {number}: column '{name}' occurs twice; "
+            raise LogError(f"{path}: row {number}: column '{name}' occurs twice; "
                         f'expected {expected}')
     index, values = [header.index(name) for name in names], []
     for line, row in lines:
@@ -89,7 +85,7 @@ def read_table(path: str | Path, wanted: Callable[[list[str]], list[str]], expec
             values.append([float(row[k]) for k in index])
             reason = check(values[-1])
         if reason:
-            raise error(f'{path}: row {line}{reason}')
+            raise LogError(f'{path}: row {line}{reason}')
     table = np.array(values).reshape(len(lines), len(names))
     return Table(path, {name: table[:, k] for k, name in enumerate(names)},
                  np.array([line for line, _ in lines], dtype=int))

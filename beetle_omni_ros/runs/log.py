@@ -34,17 +34,12 @@ SERIES_OF = {'ground_truth/odom': 'truth', 'odom': 'odom', 'imu/data_raw': 'imu'
              'command': 'command', 'disturbance': 'wrench'}
 """Topic -> series of its values."""
 
-WIDTHS = {name: 1 + sum(max(1, width) for width in channels.values())
-          for name, channels in SERIES.items()}
-"""Series -> count of numbers in one sample, including its time."""
-
 RUN_STATUS = 'run'  # diagnostic status '<node>: run' with a flight's metadata
 COMPUTE_STATUS = 'compute'  # diagnostic status '<name>_node: compute'
 SUPERVISOR_STATUS, FAULT_KEY = 'supervisor_node: supervisor', 'fault.'
 COMPUTE_KEYS = {'median_ms': 'median', 'p99_ms': 'p99', 'max_ms': 'max',
                 'deadline_misses': 'deadline_misses', 'count': 'count'}
 """Diagnostic key -> key in ``FlightLog.compute``; the times are CPU milliseconds."""
-CHANNELS = {series: tuple(channels.items()) for series, channels in SERIES.items()}
 # [s] tolerance of a window's edges. Stamps are integer nanoseconds in a bag and floats in memory,
 # where UNIX time has a resolution of 0.24 us.
 EDGE = 1e-5
@@ -283,18 +278,17 @@ class LogRecorder(Recorder):
             self._add_all(series, rows, value, received)
             return
         row = [stamp]
-        for channel, width in CHANNELS[series]:
-            if not width:
-                row.append(getattr(value, channel) if channel != 'received' else
-                           stamp if received is None else received)
+        for channel, width in SERIES[series].items():
+            if channel == 'received':
+                row.append(stamp if received is None else received)
                 continue
             part = getattr(value, channel)
-            if isinstance(part, np.ndarray):
+            if not width:
+                row.append(part)
+            elif isinstance(part, np.ndarray):
                 row += part.tolist()    # floats are added faster than numpy's numbers
             else:
                 row += [np.nan] * width if part is None else part
-        if len(row) != WIDTHS[series]:
-            raise ValueError(f'{series}: expected {WIDTHS[series]} values, found {len(row)}')
         rows.extend(row)
 
     def _add_all(self, series, rows, value, received):
@@ -329,8 +323,8 @@ class LogRecorder(Recorder):
         """Return the flight so far, each series sorted by time."""
         log = self._log
         for series, channels in SERIES.items():
-            _unpack(log, series + '_', self._rows[series], channels, WIDTHS[series])
-        log.requests = {name: _unpack(Commands(), '', rows, SERIES['command'], WIDTHS['command'])
+            _unpack(log, series + '_', self._rows[series], channels)
+        log.requests = {name: _unpack(Commands(), '', rows, SERIES['command'])
                         for name, rows in self._requests.items()}
         log.targets = _in_order(log.targets)
         states = sorted(self._states, key=lambda entry: entry[0])
@@ -340,7 +334,8 @@ class LogRecorder(Recorder):
         return log
 
 
-def _unpack(into, prefix, rows, channels, width):
+def _unpack(into, prefix, rows, channels):
+    width = 1 + sum(max(1, width) for width in channels.values())
     table = np.array(rows, dtype=float).reshape(-1, width)
     table = table[np.argsort(table[:, 0], kind='stable')]
     setattr(into, prefix + 't', table[:, 0].copy())

@@ -4,8 +4,7 @@ from itertools import zip_longest
 
 from rich.console import Console
 
-from beetle_omni_ros.pages.page import ABSENT, Grid, print_grids, Terminal
-from beetle_omni_ros.runs import published
+from beetle_omni_ros.pages.page import ABSENT, at, Grid, number, print_grids, Terminal
 
 FILES, SHIPPED_ROBOT = ('robot', 'plant'), 'params/robot.yaml'    # keys in the metadata
 MANY_POSES = 20  # above this number, only the summary is shown
@@ -31,6 +30,67 @@ EFFORT_ROWS = (
     ('CPU of a step, 99 % [ms]', 'compute_ms.p99', 2),
     ('CPU of a step, max [ms]', 'compute_ms.max', 2),
     ('deadline misses', 'compute_ms.deadline_misses', 0))
+
+# Published results of the same tasks, in the form of our metrics. Source: Zhang et al., Learning
+# Agile and Robust Omnidirectional Aerial Motion on Overactuated Tiltable-Quadrotors: tables of
+# continuous pose reaching in simulation (100 random poses) and in the real world (five waypoints),
+# and the text on tracking.
+RANDOM_POSES = {
+    'NMPC': {'mean': {'U_position_m': 0.02, 'U_orientation_deg': 40.99,
+                      'L_position_m': 0.31, 'L_orientation_deg': 51.75},
+             'min': {'U_position_m': 0.002, 'U_orientation_deg': 0.41,
+                     'L_position_m': 0.09, 'L_orientation_deg': 6.38},
+             'max': {'U_position_m': 0.116, 'U_orientation_deg': 136.97,
+                     'L_position_m': 0.76, 'L_orientation_deg': 143.15},
+             'hover_speed_mean_m_s': 0.008, 'hover_speed_std_m_s': 0.0005,
+             'hover_angular_speed_mean_rad_s': 0.007, 'hover_angular_speed_std_rad_s': 0.003,
+             'joint_error_mean_rad': 0.004, 'joint_error_std_rad': 0.011,
+             'thrust_mean_N': 9.17, 'thrust_std_N': 3.48},
+    'RL': {'mean': {'U_position_m': 0.08, 'U_orientation_deg': 5.89,
+                    'L_position_m': 0.18, 'L_orientation_deg': 13.59},
+           'min': {'U_position_m': 0.014, 'U_orientation_deg': 0.34,
+                   'L_position_m': 0.06, 'L_orientation_deg': 0.75},
+           'max': {'U_position_m': 0.232, 'U_orientation_deg': 85.49,
+                   'L_position_m': 0.58, 'L_orientation_deg': 104.35},
+           'hover_speed_mean_m_s': 0.015, 'hover_speed_std_m_s': 0.049,
+           'hover_angular_speed_mean_rad_s': 0.012, 'hover_angular_speed_std_rad_s': 0.044,
+           'joint_error_mean_rad': 0.026, 'joint_error_std_rad': 0.074,
+           'thrust_mean_N': 10.08, 'thrust_std_N': 3.36},
+}
+
+WAYPOINTS = {  # real robot; poses in the order of tasks.WAYPOINTS
+    'NMPC, real robot': {'mean': {'U_position_m': 0.042, 'U_orientation_deg': 4.350},
+                         'max': {'U_position_m': 0.074, 'U_orientation_deg': 8.225},
+                         'by_pose': [{'U_position_m': 0.026, 'U_orientation_deg': 2.644},
+                                     {'U_position_m': 0.074, 'U_orientation_deg': 4.372},
+                                     {'U_position_m': 0.054, 'U_orientation_deg': 8.225},
+                                     {'U_position_m': 0.028, 'U_orientation_deg': 4.742},
+                                     {'U_position_m': 0.028, 'U_orientation_deg': 1.768}]},
+    'RL, real robot': {'mean': {'U_position_m': 0.077, 'U_orientation_deg': 4.261},
+                       'max': {'U_position_m': 0.114, 'U_orientation_deg': 5.561},
+                       'by_pose': [{'U_position_m': 0.114, 'U_orientation_deg': 2.589},
+                                   {'U_position_m': 0.060, 'U_orientation_deg': 4.350},
+                                   {'U_position_m': 0.046, 'U_orientation_deg': 4.214},
+                                   {'U_position_m': 0.074, 'U_orientation_deg': 5.561},
+                                   {'U_position_m': 0.091, 'U_orientation_deg': 4.590}]},
+}
+
+# Levels at which control was lost in Gazebo, from the text; other levels are not published.
+DISTURBANCE = {
+    'NMPC': {'force_N': 100.0, 'torque_N_m': 25.0},
+    'RL': {'force_N': 100.0, 'torque_N_m': 15.0},
+}
+
+LEMNISCATE = {
+    'NMPC, real robot': {'position_mean_m': 0.05, 'position_std_m': 0.02,
+                         'orientation_mean_deg': 5.19, 'orientation_std_deg': 2.46},
+    'RL, real robot': {'position_mean_m': 0.16, 'position_std_m': 0.04,
+                       'orientation_mean_deg': 8.06, 'orientation_std_deg': 2.45},
+}
+
+# Task -> published results of poses, and of tracking, in the form of our metrics.
+POSES = {'random100': RANDOM_POSES, 'waypoints': WAYPOINTS}
+TRACKING = {'lemniscate': LEMNISCATE}
 
 
 def grids(results: dict, *, with_poses: bool | None = None) -> list[Grid]:
@@ -76,11 +136,11 @@ def _same_poses(by_label):
 
 def _summary(by_label, task):
     """Table with a column for each controller and published result, a row for each metric."""
-    others = published.POSES.get(task, {})
+    others = POSES.get(task, {})
     columns = [*by_label.values(), *others.values()]
     # The only pose of a trajectory is its start: to reach it says nothing about the path.
     posed = not all('trajectory' in result for result in by_label.values())
-    rows = [[text, *(_number(_at(column, path), digits) for column in columns)]
+    rows = [[text, *(number(at(column, path), digits) for column in columns)]
             for text, path, digits in ERROR_ROWS]
     rows.append(['poses reached', *(_reached(column) for column in columns)])
     rows = [*(rows if posed else []),
@@ -89,13 +149,13 @@ def _summary(by_label, task):
              ['crashed', *({True: 'yes', False: 'no'}.get(column.get('crashed'), ABSENT)
                            for column in columns)],
              ['lowest point [m]', *(_lowest(column) for column in columns)]]
-    rows += [[text, *(_number(_at(column, path), digits) for column in columns)]
+    rows += [[text, *(number(at(column, path), digits) for column in columns)]
              for text, path, digits in EFFORT_ROWS]
     if any(column.get('guidance') for column in columns):
         rows.append(['guidance', *(column.get('guidance') or ABSENT for column in columns)])
     if any('stamp_to_command_ms' in column for column in columns):
         rows.append(['stamp to command, 99 % [ms]', *(
-            _number(_at(column, 'stamp_to_command_ms.p99'), 2) for column in columns)])
+            number(at(column, 'stamp_to_command_ms.p99'), 2) for column in columns)])
     first = len(by_label) + 1
     return Grid(POSE_ROWS if posed else 'Flight',
                 ['', *by_label, *(f'published {name}' for name in others)], rows,
@@ -105,20 +165,13 @@ def _summary(by_label, task):
 def _lowest(result):
     found = result.get('lowest') or {}
     pose = None if 'trajectory' in result else found.get('pose')
-    return _number(found.get('height_m'), 2) + ('' if pose is None else f' (pose {pose + 1})')
-
-
-def _at(result, path):
-    for key in path.split('.'):
-        result = (result or {}).get(key)
-    return result
+    return number(found.get('height_m'), 2) + ('' if pose is None else f' (pose {pose + 1})')
 
 
 def _reached(result):
     if 'poses' not in result:
         return ABSENT
     return f"{sum(pose['reached'] for pose in result['poses'])} of {len(result['poses'])}"
-
 
 
 def _tracking(by_label, task):
@@ -131,14 +184,14 @@ def _tracking(by_label, task):
         rows.append([name, 'all', *_tracking_cells(tracking)])
     ours = len(rows)
     rows += [[f'published {name}', 'all', *_tracking_cells(part)]
-             for name, part in published.TRACKING.get(task, {}).items()]
+             for name, part in TRACKING.get(task, {}).items()]
     return Grid('Trajectory tracking', header, rows, frozenset(range(ours, len(rows))))
 
 
 def _tracking_cells(part):
     cells = []
     for name, unit, digits in (('position', 'm', 3), ('orientation', 'deg', 2)):
-        mean, std, worst = (_number(part.get(f'{name}_{what}_{unit}'), digits)
+        mean, std, worst = (number(part.get(f'{name}_{what}_{unit}'), digits)
                             for what in ('mean', 'std', 'max'))
         cells.append(f'{mean} ± {std} ({worst})' if worst != ABSENT else f'{mean} ± {std}')
     return cells
@@ -155,8 +208,8 @@ def _levels(by_label, kind, unit):
         row = [f'{step:g}']
         for entries in levels:
             entry = entries.get(step)
-            row += [_number(entry['peak_position_m'], 3) + (' lost' if entry['lost'] else ''),
-                    _number(entry['peak_orientation_deg'], 1)] if entry else [ABSENT, ABSENT]
+            row += [number(entry['peak_position_m'], 3) + (' lost' if entry['lost'] else ''),
+                    number(entry['peak_orientation_deg'], 1)] if entry else [ABSENT, ABSENT]
         rows.append(row)
     lost = [result[kind].get(f'lost_at_{unit}') for result in by_label.values()]
     rows.append(['lost at'] + [cell for level in lost for cell in
@@ -171,7 +224,7 @@ def _payloads(by_label):
     for entries in zip_longest(*(result['payload'] for result in by_label.values())):
         mass = next(entry['payload_kg'] for entry in entries if entry)
         rows.append([f'{mass:g}'] + [cell for entry in entries for cell in (
-            [_number(entry['height_error_m'], 4), _number(entry['orientation_deg'], 2)]
+            [number(entry['height_error_m'], 4), number(entry['orientation_deg'], 2)]
             if entry else [ABSENT, ABSENT])])
     return Grid('Payload, steady errors', header, rows)
 
@@ -191,14 +244,10 @@ def _poses(by_label):
         row = [str(k + 1), ' '.join([*(f'{v:.2f}' for v in target[:3]),
                                      *(f'{v:.0f}' for v in target[3:])])]
         for pose in poses:
-            row += [_number(pose['U_position_m'], 4) + ('' if pose['reached'] else ' ✗'),
-                    _number(pose['U_orientation_deg'], 2)]
+            row += [number(pose['U_position_m'], 4) + ('' if pose['reached'] else ' ✗'),
+                    number(pose['U_orientation_deg'], 2)]
         rows.append(row)
     return Grid('Poses', header, rows)
-
-
-def _number(value, digits):
-    return ABSENT if value is None else f'{value:.{digits}f}'
 
 
 def title(meta: dict) -> str:

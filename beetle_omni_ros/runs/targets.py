@@ -11,8 +11,8 @@ import numpy as np
 from beetle_omni_ros.control.base import PoseTarget, Target
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import parameter, ParameterError, ParameterFile, quoted
-from beetle_omni_ros.runs.files import read_table
+from beetle_omni_ros.robot.schema import parameter, ParameterError, ParameterFile
+from beetle_omni_ros.runs.files import missing, read_table
 
 UNIT_TOLERANCE = 0.02   # of a quaternion's squared length
 START = (0.0, 0.0, 1.0)     # [m] position after the take-off
@@ -157,8 +157,7 @@ def read_poses(path: str | Path, reach: float = np.inf) -> np.ndarray:
         ParameterError: unusable file; names file, row (as in an editor), column and expectation.
 
     """
-    table = read_table(path, _columns, ','.join(COLUMNS), rows=' and poses', comment=None,
-                       error=ParameterError, check=_unusable)
+    table = read_table(path, _columns, ','.join(COLUMNS), check=_unusable)
     if not len(table):
         raise ParameterError(f'{path}: no pose below the header; expected at least one row')
     poses = np.stack(list(table.columns.values()), axis=1)
@@ -183,10 +182,9 @@ def check_steps(poses: np.ndarray, reach: float, where: Callable[[int], str]) ->
 
 
 def _columns(header):
-    if unknown := [cell for cell in header if cell not in COLUMNS]:
-        raise ParameterError(f'unknown column {quoted(unknown[0])}')
-    if missing := [name for name in COLUMNS if name not in header]:
-        raise ParameterError(f"column '{missing[0]}' is missing")
+    for name in COLUMNS:
+        if name not in header:
+            raise missing(name, header)
     return list(COLUMNS)    # a column that occurs twice is refused by read_table
 
 

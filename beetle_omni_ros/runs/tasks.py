@@ -2,15 +2,16 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from math import cos, pi, sin
 from pathlib import Path
 import re
 
 import numpy as np
 
-from beetle_omni_ros.control.base import PoseTarget, Target, TrajectoryTarget
+from beetle_omni_ros.control.base import PoseTarget, Reference, Target, TrajectoryTarget
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs import lemniscate, targets
+from beetle_omni_ros.runs.targets import read_poses
 
 POSE_DURATION = 8.0  # [s] of one pose
 HOVER_DURATION = 60.0  # [s]
@@ -32,6 +33,24 @@ WAYPOINTS = np.array([[0.0, 0.0, 0.8, 0.0, 0.0, 0.0],
                       [-1.0, 0.0, 1.0, -25.0, 0.0, 0.0],
                       [0.0, 0.0, 0.8, 0.0, 0.0, 90.0]])
 WAYPOINT_ROUNDS = 3
+
+# The 3D lemniscate of the publication: a figure of eight with varying height and attitude. With
+# the phase phi, one round of which is 2 pi, and theta = phi + pi / 2:
+#   x = A cos(theta),  y = A sin(2 theta) / 2,  z = H + C sin(2 theta + pi / 2)
+#   roll = -D sin(2 theta),  pitch = D cos(theta),  yaw = pi / 2 (1 - sin(theta))
+# Curve and numbers are those of the authors' code (`LemniscateTrajOmni` in
+# https://github.com/jsk-ros-pkg/jsk_aerial_robot). Yaw is within [0, pi] there; the publication
+# states [0, 2 pi]. In addition, the phase starts and ends at rest here: its rate follows a quintic
+# smoothstep over ramps before the first and after the last round, so all rounds have equal speed.
+LENGTH = 1.0  # [m] A, half the extent in x, and the extent in y
+HEIGHT = 1.0  # [m] H, mean height
+RISE = 0.3  # [m] C, half the extent in z
+TILT = 0.5  # [rad] D, largest roll and pitch
+PERIOD = 20.0  # [s] of one round
+ROUNDS = 5
+RAMP = 4.0  # [s] from rest to full speed
+DURATION = 2 * RAMP + ROUNDS * PERIOD  # [s]
+SAMPLE_PERIOD = 0.02  # [s] between the samples of the published trajectory
 
 NAMES = ('waypoints', 'random100', 'lemniscate', 'hover', 'force', 'torque', 'payload')
 
@@ -215,11 +234,15 @@ def make_task(name: str | Path, seed: int = 0, reach: float = np.inf) -> Task:
             Segment(POSE_DURATION, _builder(HOVER), payload=mass, level=mass)
             for mass in PAYLOADS), np.tile(HOVER, (len(PAYLOADS), 1)))
     if name in ('force', 'torque'):
-        levels = _force_levels() if name == 'force' else _torque_levels()
+        levels = [Segment(DISTURBANCE_PERIOD, force_world=np.array([0.0, 0.0, level]), level=level)
+                  for level in FORCE_LEVELS] if name == 'force' else [
+            segment for level in TORQUE_LEVELS for segment in (
+                Segment(TORQUE_IMPULSE, torque_body=np.array([level, 0.0, 0.0]), level=level),
+                Segment(DISTURBANCE_PERIOD - TORQUE_IMPULSE, level=level))]
         return Task(name, name, (Segment(POSE_DURATION, _builder(DISTURBED)), *levels),
                     DISTURBED[None])
     if name.lower().endswith('.csv') or name and Path(name).exists():
-        return _pose_task(name, targets.read_poses(name, reach))
+        return _pose_task(name, read_poses(name, reach))
     raise ParameterError(f"task '{name}': expected a CSV file of poses, random1 to random999999 "
                          f"or one of {', '.join(NAMES)}")
 
@@ -246,26 +269,64 @@ def _pose_task(name, poses):
     return Task(name, 'poses', segments, poses)
 
 
-def _force_levels():
-    return [Segment(DISTURBANCE_PERIOD, force_world=np.array([0.0, 0.0, level]), level=level)
-            for level in FORCE_LEVELS]
-
-
-def _torque_levels():
-    return [segment for level in TORQUE_LEVELS for segment in (
-        Segment(TORQUE_IMPULSE, torque_body=np.array([level, 0.0, 0.0]), level=level),
-        Segment(DISTURBANCE_PERIOD - TORQUE_IMPULSE, level=level))]
-
-
 def _lemniscate_task(name):
-    first = lemniscate.sample(0.0)
+    first = lemniscate(0.0)
     pose = np.concatenate([first.position, np.degrees(rotations.to_rpy(first.quaternion))])
-    hold = Segment(POSE_DURATION, _builder(pose))
-    track = Segment(lemniscate.DURATION, lemniscate.target)
-    begin = POSE_DURATION + lemniscate.RAMP
-    rounds = tuple((begin + k * lemniscate.PERIOD, begin + (k + 1) * lemniscate.PERIOD)
-                   for k in range(lemniscate.ROUNDS))
-    return Task(name, 'trajectory', (hold, track), pose[None], rounds)
+    begin = POSE_DURATION + RAMP
+    return Task(name, 'trajectory', (Segment(POSE_DURATION, _builder(pose)),
+                                     Segment(DURATION, lemniscate_target)), pose[None],
+                tuple((begin + k * PERIOD, begin + (k + 1) * PERIOD) for k in range(ROUNDS)))
+
+
+def lemniscate_phase(time: float) -> tuple[float, float]:
+    """Return phase [rad], 0 at the begin of round one, and rate [rad/s] at ``time`` [s]."""
+    rate = 2 * pi / PERIOD
+    if time < RAMP:
+        return -_ramp_phase(RAMP, rate) + _ramp_phase(max(time, 0.0), rate), \
+            rate * _smoothstep(time / RAMP)
+    rest = DURATION - time
+    if rest < RAMP:
+        total = 2 * pi * ROUNDS + _ramp_phase(RAMP, rate)
+        return total - _ramp_phase(max(rest, 0.0), rate), rate * _smoothstep(rest / RAMP)
+    return rate * (time - RAMP), rate
+
+
+def _smoothstep(s):
+    s = min(max(s, 0.0), 1.0)
+    return s ** 3 * (10 - 15 * s + 6 * s * s)
+
+
+def _ramp_phase(time, rate):
+    """Integral of ``rate * smoothstep`` over the ramp, from rest."""
+    s = time / RAMP
+    return rate * RAMP * s ** 4 * (2.5 - 3 * s + s * s)
+
+
+def lemniscate(time: float) -> Reference:
+    """Return pose and velocity in world and body rates at ``time`` since the start [s]."""
+    phi, rate = lemniscate_phase(time)
+    once, twice = phi + pi / 2, 2 * phi + pi
+    position = np.array([LENGTH * cos(once), LENGTH / 2 * sin(twice),
+                         HEIGHT + RISE * sin(twice + pi / 2)])
+    velocity = rate * np.array([-LENGTH * sin(once), LENGTH * cos(twice),
+                                2 * RISE * cos(twice + pi / 2)])
+    roll, pitch, yaw = -TILT * sin(twice), TILT * cos(once), pi / 2 * (1 - sin(once))
+    roll_rate, pitch_rate, yaw_rate = rate * np.array([
+        -2 * TILT * cos(twice), -TILT * sin(once), -pi / 2 * cos(once)])
+    angular_velocity = np.array([  # body rates of R = Rz(yaw) Ry(pitch) Rx(roll)
+        roll_rate - yaw_rate * sin(pitch),
+        pitch_rate * cos(roll) + yaw_rate * cos(pitch) * sin(roll),
+        -pitch_rate * sin(roll) + yaw_rate * cos(pitch) * cos(roll)])
+    return Reference(position, rotations.from_rpy(roll, pitch, yaw), velocity, angular_velocity)
+
+
+def lemniscate_target(start: float) -> TrajectoryTarget:
+    """Return the whole lemniscate, beginning at ``start`` [s]."""
+    times = np.linspace(0.0, DURATION, round(DURATION / SAMPLE_PERIOD) + 1)
+    samples = [lemniscate(float(t)) for t in times]
+    columns = (np.array([getattr(sample, name) for sample in samples])
+               for name in ('position', 'quaternion', 'velocity', 'angular_velocity'))
+    return TrajectoryTarget(start + times, *columns, stamp=start)
 
 
 def trajectory_task(name: str, times: np.ndarray, positions: np.ndarray,

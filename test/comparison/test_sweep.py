@@ -1,22 +1,19 @@
-"""Flights of a comparison: plan, both backends, cache, failures."""
+"""Flights of a comparison: plan, both backends, stored results, failures."""
 
 import importlib.util
 import io
 import json
-from pathlib import Path
-import shutil
-import subprocess
-import sys
 
 import pytest
 from rich.console import Console
 
-from beetle_omni_ros.comparison import command, fingerprint
+from beetle_omni_ros.comparison import command
 from beetle_omni_ros.comparison import flights as flights_module
-from beetle_omni_ros.comparison.flights import CONDITIONS, Flight, plan, Store, TASKS
+from beetle_omni_ros.comparison.flights import CONDITIONS, Flight, fly_flight, plan, TASKS
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.runs.tasks import make_task
+from beetle_omni_ros.evaluation import campaign
+from beetle_omni_ros.evaluation.campaign import Store
+from beetle_omni_ros.robot.schema import RunError
 
 HAS_RAY = importlib.util.find_spec('ray') is not None
 
@@ -36,6 +33,11 @@ def without_times(result):
                                  result['trace'].items()}
 
 
+def sweep(flights, **options):
+    return campaign.sweep(fly_flight, [(flight, flight.make_task()) for flight in flights],
+                          **options)
+
+
 def never(*arguments):
     """Replacement of a flight that must not happen."""
     raise AssertionError('flown again')
@@ -44,138 +46,79 @@ def never(*arguments):
 def test_a_plan_contains_each_combination_once_longest_first():
     controllers = registry.compared()
     flights = plan(controllers, seeds=(0, 5))
-    assert len(flights) == len(set(flights)) == \
+    assert len({flight.name for flight in flights}) == len(flights) == \
         len(controllers) * len(TASKS) * len(CONDITIONS) * 2
     costs = [flight.cost for flight in flights]
-    assert costs == sorted(costs, reverse=True)
-    assert flights[0].task == 'random100'
-    assert len({flight.slug for flight in flights}) == len(flights)
+    assert costs == sorted(costs, reverse=True) and flights[0].task == 'random100'
 
 
-def test_worker_processes_give_the_same_numbers_as_this_process(poses, tmp_path):
+def test_workers_give_the_numbers_of_this_process_and_are_flown_once(poses, tmp_path, monkeypatch):
+    store, lines = Store(tmp_path / 'kept'), []
     flights = plan(['hover'], [poses], ['published'], [3, 4])
-    flown = flights_module.sweep(flights, store=Store(tmp_path / 'kept'), jobs=2)
-    assert list(flown) == flights
-    here = flights_module.fly_flight(flights[1], flights[1].make_task())
-    assert without_times(here) == without_times(flown[flights[1]])
+
+    def interrupt(flight, result, kept):
+        lines.append((flight.seed, kept))
+        if len(lines) == 2:
+            raise KeyboardInterrupt     # which keeps the finished flights
+        return ''
+
+    first = sweep(flights[:1], store=store, jobs=2)
+    assert without_times(fly_flight(flights[0], flights[0].make_task())) \
+        == without_times(first[0])
+    with pytest.raises(KeyboardInterrupt):
+        sweep(flights, store=store, jobs=1, line=interrupt)
+    assert lines == [(3, True), (4, False)]
+    monkeypatch.setattr(flights_module, 'fly', never)
+    both = sweep(flights, store=store, jobs=1)
+    assert without_times(first[0]) == without_times(both[0])
+    assert both[1]['metrics']['poses'] and not both[1]['failure']
 
 
 @pytest.mark.skipif(not HAS_RAY, reason='ray is not installed')
 @pytest.mark.timeout(180)
-def test_ray_gives_the_same_numbers_as_processes(poses, tmp_path):
+def test_ray_gives_the_same_numbers_as_processes(poses):
     flights = plan(['hover'], [poses], ['nominal'], [0, 1])
-    by_ray = flights_module.sweep(flights, store=Store(tmp_path / 'ray'), backend='ray', jobs=2)
-    by_processes = flights_module.sweep(flights, store=Store(tmp_path / 'processes'), jobs=2)
-    assert list(by_ray) == list(by_processes) == flights
-    for flight in flights:
-        assert by_ray[flight]['failure'] is None
-        assert without_times(by_ray[flight]) == without_times(by_processes[flight])
+    by_ray, by_processes = (sweep(flights, backend=backend, jobs=2)
+                            for backend in ('ray', 'processes'))
+    assert [one['failure'] for one in by_ray] == [None, None]
+    assert list(map(without_times, by_ray)) == list(map(without_times, by_processes))
     import ray
     assert not ray.is_initialized()
 
 
-def test_finished_flights_are_cached_and_only_missing_ones_are_flown(poses, tmp_path, monkeypatch):
-    store = Store(tmp_path / 'kept')
-    flights = plan(['hover'], [poses], ['nominal'], [0, 1])
-    first = flights_module.sweep(flights[:1], store=store, jobs=1)
-    calls = []
-
-    def interrupt(flight, result, kept):
-        calls.append((flight, kept))
-        if len(calls) == 2:
-            raise KeyboardInterrupt     # which keeps the finished flights
-
-    with pytest.raises(KeyboardInterrupt):
-        flights_module.sweep(flights, store=store, jobs=1, done=interrupt)
-    assert calls == [(flights[0], True), (flights[1], False)]
-    monkeypatch.setattr(flights_module, 'fly_flight', never)
-    both = flights_module.sweep(flights, store=store, jobs=1)
-    assert without_times(first[flights[0]]) == without_times(both[flights[0]])
-    assert both[flights[0]]['metrics']['compute_ms'] == first[flights[0]]['metrics']['compute_ms']
-    with pytest.raises(AssertionError, match='flown again'):
-        flights_module.sweep(flights, store=store, jobs=1, fresh=True)
-
-
-def test_a_cached_flight_is_reused_for_equal_inputs_only(poses, tmp_path, monkeypatch):
+def test_a_stored_flight_is_reused_for_equal_inputs_only(poses, tmp_path, monkeypatch):
     store, flight = Store(tmp_path / 'kept'), Flight(poses, 'nominal', 'hover', 0)
-    store.save(flight, {'failure': None, 'metrics': {}, 'trace': {}})
+    store.save(flight, {'failure': None, 'metrics': {'a': list(range(999))}, 'trace': {}})
     assert store.load(flight) is not None
     assert store.load(Flight(poses, 'nominal', 'hover', 1)) is None
+    with monkeypatch.context() as patch:
+        patch.setattr(campaign, 'code_fingerprint', lambda *_: 'other code')
+        assert store.load(flight) is None
     with open(poses, 'a') as file:
         file.write('0,0,1,0,0,0\n')
     assert store.load(flight) is None
-    store.save(flight, {'failure': None, 'metrics': {}, 'trace': {}})
-    monkeypatch.setattr(flights_module, 'code_fingerprint', lambda *_: 'other code')
-    assert store.load(flight) is None
-
-
-def test_another_policy_file_is_another_flight(tmp_path):
-    flights = []
-    for text in ('one', 'two'):
-        file = tmp_path / f'{text}.onnx'
-        file.write_text(text)
-        flights += plan(['rl'], ['hover'], ['nominal'], [0], policy=file)
-    keys = [flights_module.flight_key(flight) for flight in flights]
-    assert keys[0] != keys[1]
-    (tmp_path / 'two.onnx').write_text('one')
-    assert flights_module.flight_key(flights[1]) == keys[0]
-
-
-def test_another_plant_is_another_flight_as_far_as_its_values_differ(tmp_path):
-    heavy = tmp_path / 'heavy.yaml'
-    keys = []
-    for text in ('name: same', 'mass: 3.3', 'name: other\nmass: 3.3'):
-        heavy.write_text(f'extends: robot.yaml\n{text}\n')
-        [flight] = plan(['nmpc'], ['hover'], ['nominal'], [0], plant=heavy)
-        keys.append(flights_module.flight_key(flight))
-    assert keys[0] != keys[1] == keys[2]
-    assert 'heavy' in flight.name
-
-
-@pytest.mark.parametrize('name, controller, flies', [
-    ('rl.yaml', 'rl', True), ('rl.yaml', 'nmpc', False), ('nmpc.yaml', 'hover', False),
-    ('drive.yaml', None, False), ('supervisor.yaml', 'hover', True)])
-def test_changes_of_unused_parameters_repeat_no_flight(tmp_path, monkeypatch, name,
-                                                       controller, flies):
-    copy = Path(shutil.copytree(share_path('params'), tmp_path / 'params'))
-    monkeypatch.setattr(fingerprint, 'share_path', lambda _: copy)
-    before = fingerprint.code_fingerprint.__wrapped__(controller)
-    (copy / name).write_text((copy / name).read_text() + '\n')
-    assert (fingerprint.code_fingerprint.__wrapped__(controller) != before) == flies
-
-
-@pytest.mark.parametrize('controller', ['nmpc', 'rl_memory'])
-def test_all_that_a_flight_loads_is_in_its_fingerprint(poses, controller):
-    code = f"""if True:
-        import sys
-        def opened(event, given):
-            if event == 'open' and str(given[0]).endswith('.yaml'):
-                print(given[0])
-        sys.addaudithook(opened)
-        from beetle_omni_ros.comparison.flights import Flight, fly_flight
-        flight = Flight({poses!r}, 'published', {controller!r}, 0)
-        assert fly_flight(flight, flight.make_task())['metrics']
-        print(*(module.__file__ for name, module in list(sys.modules.items())
-                if name.startswith('beetle_omni_ros.')), sep='\\n')"""
-    loaded = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
-                            check=True, timeout=200).stdout.split()
-    counted = {file.resolve() for file in fingerprint.flown_files(controller)}
-    # Neither a flight nor its metrics depend on the fingerprint.
-    counted.add(Path(fingerprint.__file__).resolve())
-    missing = [file for file in loaded if (path := Path(file).resolve()) not in counted
-               and path.name != '__init__.py']
-    assert len(loaded) > 50 and not missing
-
-
-def test_a_flight_with_a_truncated_file_is_repeated(poses, tmp_path):
-    store, flight = Store(tmp_path), Flight(poses, 'nominal', 'hover', 0)
-    store.save(flight, {'failure': None, 'metrics': {'a': list(range(999))}, 'trace': {}})
-    kept, = tmp_path.glob('*.npz')
+    store.save(flight, {'failure': None})
+    kept, = (tmp_path / 'kept').glob('*.npz')       # in place of the old one
     kept.write_bytes(kept.read_bytes()[:200])
     assert store.load(flight) is None
 
 
-def test_a_failed_flight_is_a_result_with_its_reason_and_not_cached(poses, tmp_path, monkeypatch):
+def test_policy_and_plant_distinguish_flights_by_their_content(tmp_path):
+    keys = []
+    for text in ('one', 'two', 'one'):
+        file = tmp_path / f'{len(keys)}.onnx'
+        file.write_text(text)
+        keys += [flight.key for flight in plan(['rl'], ['hover'], ['nominal'], [0], policy=file)]
+    assert keys[0] != keys[1] and keys[0] == keys[2]
+    heavy, keys = tmp_path / 'heavy.yaml', []
+    for text in ('name: same', 'mass: 3.3', 'name: other\nmass: 3.3'):
+        heavy.write_text(f'extends: robot.yaml\n{text}\n')
+        keys += [flight.key for flight in plan(['nmpc'], ['hover'], ['nominal'], [0],
+                                               plant=heavy)]
+    assert keys[0] != keys[1] == keys[2]
+
+
+def test_a_failed_flight_is_a_result_with_its_reason_and_not_stored(poses, tmp_path, monkeypatch):
     def fly(controller, *arguments, **options):
         if controller == 'nmpc':
             raise ZeroDivisionError('no way\nout')
@@ -193,8 +136,6 @@ def test_a_failed_flight_is_a_result_with_its_reason_and_not_cached(poses, tmp_p
     assert len(list((tmp_path / 'out' / '.flights').glob('*.npz'))) == 1
 
 
-def test_a_worker_with_different_code_is_refused(monkeypatch):
-    monkeypatch.setattr(flights_module, 'fly', never)
-    flight = Flight('hover', 'nominal', 'hover', 0)
-    result = flights_module.fly_flight(flight, make_task('hover'), code='another')
-    assert 'another version of the code' in result['failure']
+def test_a_worker_with_different_code_is_refused():
+    with pytest.raises(RunError, match='another version of the code'):
+        campaign._fly_one(0, 'another', fly_flight, ())

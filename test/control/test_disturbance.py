@@ -97,8 +97,7 @@ def test_targets_reverse_by_more_than_noise_only():
 
 def test_the_measured_robot_with_friction_of_its_servos_does_not_hunt_in_hover():
     robot = RobotParameters.load(find_robot('measured'))
-    loop = FlightLoop.shipped(robot, robot, {'nmpc': NmpcController(robot)}, LogRecorder({}),
-                              conditions='nominal', seed=0)
+    loop = FlightLoop(robot, robot, {'nmpc': NmpcController(robot)}, LogRecorder())
     loop.take_off()
     start = loop.simulator.time
     loop.aim(PoseTarget(np.array([0, 0, 1.0]), np.array([0, 0, 0, 1.0])))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.control.base import Command, PoseTarget, State
-from beetle_omni_ros.evaluation.processes import Processes, QUEUE
+from beetle_omni_ros.evaluation.loop import Processes, QUEUE
 from beetle_omni_ros.robot.readings import BatteryReading, ImuReading
 from beetle_omni_ros.sim.faults import Fault
 from beetle_omni_ros.sim.readings import Frame

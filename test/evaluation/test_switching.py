@@ -1,6 +1,5 @@
 """The policy in the whole loop: switched in flight, and with faults in flight."""
 
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,21 +10,16 @@ from hover_policy import write_hover_policy
 from policy_files import write
 
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.control.registry import ControllerOptions
-from beetle_omni_ros.estimation.ekf import ErrorStateEkf
-from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.evaluation import command, loop
 from beetle_omni_ros.evaluation.loop import FlightLoop
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import ParameterError, RunError
+from beetle_omni_ros.robot.schema import RunError
 from beetle_omni_ros.runs.log import LogRecorder
 from beetle_omni_ros.runs.metrics import metrics
 from beetle_omni_ros.runs.tasks import make_task
 from beetle_omni_ros.safety.parameters import SupervisorParameters
-from beetle_omni_ros.safety.supervisor import Supervisor
-from beetle_omni_ros.sim.simulator import Simulator
 
 ROBOT = RobotParameters.load()
 POSES, SWITCHES = 2, 20
@@ -43,9 +37,9 @@ def flight():
 class Switching(LogRecorder):
     """Stand-in for the recorder that selects the other controller at given times."""
 
-    def __init__(self, supervisor, times):
+    def __init__(self, times):
         super().__init__()
-        self.supervisor, self.times, self.switched = supervisor, list(times), []
+        self.supervisor, self.times, self.switched = None, list(times), []
 
     def write(self, topic, value, received=None):
         super().write(topic, value, received)
@@ -59,15 +53,13 @@ class Switching(LogRecorder):
 
 def fly_switching(policy, seed):
     """Both controllers in one loop over random poses, switched at times drawn from ``seed``."""
-    estimator = EkfParameters.load()
-    supervisor = Supervisor(SupervisorParameters.load(), ROBOT, HoverController(ROBOT))
     times = np.sort(np.random.default_rng(seed).uniform(4.0, 3.8 + 8 * POSES, SWITCHES))
-    recorder = Switching(supervisor, times)
+    recorder = Switching(times)
     controllers = {name: registry.make(name, ROBOT, ControllerOptions(policy=policy)
                                        if name == 'rl' else ControllerOptions())
                    for name in ('nmpc', 'rl')}
-    flight = FlightLoop(Simulator(ROBOT), ErrorStateEkf(estimator, ROBOT.gravity),
-                        controllers, supervisor, recorder, estimator.imu.gyroscope_noise)
+    flight = FlightLoop(ROBOT, ROBOT, controllers, recorder)
+    recorder.supervisor = flight.supervisor
     task = make_task(f'random{POSES}', seed)
     return flight.fly(task), recorder, task
 
@@ -143,11 +135,3 @@ def test_implausible_commands_never_get_control(tmp_path, monkeypatch):
     absurd = write(tmp_path / 'absurd.onnx', bias=np.r_[np.zeros(4), np.full(4, 1e6)])
     with pytest.raises(RunError, match="'fallback'.*rl_node.*thrust out of range"):
         fly_poses(tmp_path, absurd, 1.0)
-
-
-def test_a_policy_of_another_robot_flies_with_permission(tmp_path):
-    options = ControllerOptions(policy=write_hover_policy(tmp_path / 'p.onnx'))
-    other = replace(ROBOT, mass=3.1)
-    with pytest.raises(ParameterError, match='mass 3.0386 in training, 3.1 here'):
-        registry.make('rl', other, options)
-    registry.make('rl', other, replace(options, allow_other_robot=True))

@@ -3,7 +3,7 @@
 import pytest
 
 from beetle_omni_ros import cli
-from beetle_omni_ros.cli.models import spread
+from beetle_omni_ros.cli.commands import spread
 from beetle_omni_ros.identify.gap import command
 
 

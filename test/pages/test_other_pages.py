@@ -11,9 +11,8 @@ from rotor_logs import bench
 from rotor_logs import write as write_bench
 
 from beetle_omni_ros import cli
-from beetle_omni_ros.comparison import grids
-from beetle_omni_ros.comparison.page import page as comparison_page
-from beetle_omni_ros.comparison.page import Section
+from beetle_omni_ros.comparison.page import as_page as comparison_page
+from beetle_omni_ros.comparison.page import compute, glance, Section
 from beetle_omni_ros.faults.page import as_page
 from beetle_omni_ros.pages.page import Grid, page, section, verdict_head
 from beetle_omni_ros.sim.fault_lists import FaultList
@@ -30,16 +29,18 @@ def rotor(folder):
 
 def comparison(folder):
     results = json.loads((ROOT / 'docs' / 'comparison' / 'comparison.json').read_text())
-    return comparison_page(results, [Section('At a glance', LONG, [grids.glance(results)]),
-                                     Section('Time', '', [grids.compute(results)])])
+    return comparison_page(results, [Section('At a glance', LONG, [glance(results)]),
+                                     Section('Time', '', [compute(results)])])
 
 
 def faults(folder):
     flight = {'case': 'rotor_1_stops', 'start': 'upside_down', 'seed': 0, 'conditions': 'nominal',
               'expected': 'lands', 'controller': 'nmpc', 'bag_lost': False,
-              'outcome': 'crash', 'good': False, 'error': '', 'said': LONG, 'impact_m_s': 3.0}
+              'outcome': 'crash', 'good': False, 'error': '', 'said': LONG, 'impact_m_s': 3.0,
+              'plant': ''}
     row = {'what': LONG, 'expected': 'lands', 'flights': 3, 'good': 2, 'outcomes': {'crash': 1},
-           'impact_median_m_s': 1.0, 'impact_worst_m_s': 3.0, 'named_s': 0.2}
+           'impact_median_m_s': 1.0, 'impact_worst_m_s': 3.0, 'named_s': 0.2,
+           'inclination_worst_deg': None, 'alarms': {}}
     total = dict.fromkeys(('good', 'flights', 'flyaways', 'motors_on_after_crash', 'takeoffs',
                            'lost_bags', 'errors'), 1)
     meta = {'command': 'beetle_omni faults ' + '--only a_long_name_of_one ' * 3, 'commit': None,

@@ -103,17 +103,6 @@ def test_files_of_other_writers_give_the_same_messages(recorded, tmp_path, chunk
     assert_equal_logs(memory, log)
 
 
-def test_a_command_is_laid_out_as_the_interface_says(recorded):
-    folder, _, _ = recorded
-    raw = next(m for m in read_messages(folder) if m.topic == '/command')
-    message = TYPESTORE.deserialize_cdr(raw.data, raw.type)
-    assert message.name == ['gimbal1', 'gimbal2', 'gimbal3', 'gimbal4',
-                            'rotor1', 'rotor2', 'rotor3', 'rotor4']
-    assert np.isnan(message.position).tolist() == [False] * 4 + [True] * 4
-    assert np.isnan(message.effort).tolist() == [True] * 4 + [False] * 4
-    assert len(message.velocity) == 0
-
-
 def test_a_bag_cut_at_any_byte_reads_up_to_the_cut(recorded, tmp_path):
     folder, whole, _ = recorded
     with BagWriter(tmp_path / 'flushed') as writer:

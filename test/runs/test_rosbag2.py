@@ -18,8 +18,7 @@ import yaml
 from beetle_omni_ros.messages import conversions
 from beetle_omni_ros.messages.bag_types import new, to_bytes
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.robot.urdf import description, joints
+from beetle_omni_ros.robot.urdf import description
 from beetle_omni_ros.runs.bag import read_bag
 from beetle_omni_ros.runs.bag_writer import BagWriter
 from beetle_omni_ros.runs.tasks import make_task
@@ -185,10 +184,3 @@ def test_unusable_joint_states_cost_only_frames(tmp_path):
         write_odom(writer, 1.1, np.full(3, np.nan), np.array([0, 0, 0, 1.0]), np.zeros(3),
                    np.zeros(3))
         assert writer.counts['/tf'] == 0 and writer.counts['/odom'] == 2
-
-
-def test_an_unusable_description_is_refused_in_one_line(tmp_path):
-    for text in ('hello', '<robot><joint name="a" type="prismatic"/></robot>',
-                 '<robot><joint name="a" type="fixed"/></robot>'):
-        with pytest.raises(ParameterError, match='robot description: not usable'):
-            joints(text)
