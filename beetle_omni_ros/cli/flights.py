@@ -273,7 +273,7 @@ def report(runs: Annotated[list[Path], typer.Argument(
     """
     check_writable(output, 'report')
     check_writable(json_path)
-    from beetle_omni_ros.runs.report import run_report
+    from beetle_omni_ros.view.report import run_report
     run_report(runs, output, json_path=json_path)
 
 

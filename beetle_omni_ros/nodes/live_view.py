@@ -19,9 +19,9 @@ from beetle_omni_ros.nodes.operator import join, leave
 from beetle_omni_ros.nodes.wire import AnyQosSubscription
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.urdf import Model
-from beetle_omni_ros.view.frames import Sampler
-from beetle_omni_ros.view.live import Live
-from beetle_omni_ros.view.recording import announce
+from beetle_omni_ros.view.live import Live, Newest
+from beetle_omni_ros.view.recorded import announce
+from beetle_omni_ros.view.scene import close, serve
 
 # Only the newest message of these is read for each picture. Of EVENTS and TARGETS, every message
 # is read.
@@ -84,17 +84,16 @@ class LiveGraph:
             if len(self._waiting[topic]) < MOST_EVENTS:
                 self._waiting[topic].append(data)
 
-    def take(self, sampler: Sampler) -> None:
+    def take(self, newest: Newest) -> None:
         """Pass on the messages since the last call, without the unreadable ones."""
-        now = self._node.get_clock().now().nanoseconds * 1e-9
         with self._lock:
-            newest, self._newest = self._newest, {}
+            latest, self._newest = self._newest, {}
             waiting, self._waiting = self._waiting, defaultdict(list)
-        for topic, data in (*newest.items(), *((topic, data) for topic, queue in waiting.items()
+        for topic, data in (*latest.items(), *((topic, data) for topic, queue in waiting.items()
                                                for data in queue)):
             try:
                 known = topic_of(topic)
-                sampler.write(topic, known.take(from_bytes(data, known.type)), now)
+                newest.write(topic, known.take(from_bytes(data, known.type)))
             except Exception:   # broken bytes raise anything; the nodes report what they refuse
                 continue
 
@@ -142,15 +141,12 @@ def run_live(*, namespace: str = '', domain_id: int | None = None, discovery: st
     """
     runner.end_with_parent()
     model, parameters = Model.load(urdf), RobotParameters.load(robot)
-    from beetle_omni_ros.view.page import Page
     with ExitStack() as stack:
-        listener = LiveGraph(namespace, domain_id, discovery, allow_targets)
-        stack.callback(listener.close)
+        graph = LiveGraph(namespace, domain_id, discovery, allow_targets)
+        stack.callback(graph.close)
         os.nice(NICENESS)
-        page = Page(['live'], model, parameters, title='Flight', host=host, port=port, dark=dark)
-        stack.callback(page.close)
-        page.look_at_room()
-        live = Live(page, listener, parameters, allow_targets)
-        announce(page.url, console or Console())
+        server = serve(host, port, dark)
+        stack.callback(close, server)
+        announce(host, server.get_port(), console or Console())
         with suppress(KeyboardInterrupt):       # the regular end
-            live.run()
+            Live(server, graph, model, parameters, allow_targets).run()

@@ -48,7 +48,7 @@ def opened(chromium, file, width):
 def cut_off(page):
     """Elements beyond the width of the page that cannot be scrolled to."""
     return page.evaluate("""() => [...document.querySelectorAll('main *')].filter(e => {
-        if (e.closest('.scroll, .strip, #scene, .u-wrap') || e.closest('[hidden]')) return false;
+        if (e.closest('.scroll, .plotly-graph-div') || e.closest('[hidden]')) return false;
         const box = e.getBoundingClientRect();
         return box.width > 0 && box.right > innerWidth + 1;
     }).map(e => e.outerHTML.slice(0, 80))""")

@@ -12,8 +12,8 @@ import yaml
 from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.runs.bag import read_bag
 from beetle_omni_ros.runs.bag_writer import BagWriter
-from beetle_omni_ros.runs.report import make_page, make_runs, results_of, run_report
 from beetle_omni_ros.runs.table import grids
+from beetle_omni_ros.view.report import make_page, make_runs, results_of, run_report
 
 LEVEL = np.array([0, 0, 0, 1.0])
 
