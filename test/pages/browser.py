@@ -33,7 +33,7 @@ def opened(chromium, file, width):
     page.set_default_timeout(60_000)
     wrong = []
     page.on('console', lambda message: wrong.append(message.text)
-            if message.type in ('error', 'warning') and 'GPU stall' not in message.text else None)
+            if message.type == 'error' else None)
     page.on('pageerror', lambda error: wrong.append(str(error)))
     page.on('request', lambda request: wrong.append(request.url)
             if not request.url.startswith(('file:', 'data:', 'blob:')) else None)
