@@ -26,7 +26,6 @@ ALLOWED = {
     'evaluation': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs', 'messages'),
     'faults': ('robot', 'pages', 'control', 'estimation', 'sim', 'safety', 'runs', 'evaluation',
                'comparison.fingerprint'),
-    'film': ('robot', 'pages', 'runs', 'sim', 'view'),
     'comparison': ('robot', 'pages', 'control', 'runs', 'evaluation'),
     'identify': ('robot', 'pages', 'runs', 'messages'),
     'bringup': ('robot', 'drivers', 'runs.files'),
@@ -37,7 +36,7 @@ ALLOWED = {
     'train': ('robot', 'control.observation', 'control.onnx_runtime', 'control.policy_file',
               'control.policy_checksum', 'runs.files'),
     'cli': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs', 'evaluation', 'comparison',
-            'faults', 'film', 'nodes', 'train', 'identify', 'bringup', 'view'),
+            'faults', 'nodes', 'train', 'identify', 'bringup', 'view'),
 }
 
 # Library -> the only subpackage that imports it.

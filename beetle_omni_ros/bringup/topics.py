@@ -67,8 +67,7 @@ def _absent(topic, source, stream, graph):
                        'multicast and MTU of the network, BEETLE_OMNI_DISCOVERY')
     if stream.other_types:
         return Finding(topic, FAIL, f"published as {', '.join(stream.other_types)}",
-                       f'{source} must publish the type of docs/reference/topics.md: '
-                       'set or remap it')
+                       f'{source} must publish another type: set or remap it')
     return Finding(topic, FAIL, f'no publisher in ROS domain {graph.domain}',
                    f'start {source}, remap its topic, set the same ROS_DOMAIN_ID on all '
                    'computers, and BEETLE_OMNI_DISCOVERY=SUBNET if it runs on another one')

@@ -35,7 +35,7 @@ HELP = {'help_option_names': ['-h', '--help']}
 app = typer.Typer(no_args_is_help=True, context_settings=HELP,
                   help='Fly, evaluate and report on the tiltable quadrotor.')
 for command in (flights.fly, flights.evaluate, flights.compare, flights.faults, flights.report,
-                flights.film, live.view, models.gap, models.train, live.check, live.drive,
+                live.view, models.gap, models.train, live.check, live.drive,
                 flights.controllers):
     app.command()(command)
 identify = typer.Typer(no_args_is_help=True, context_settings=HELP,
