@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from beetle_omni_ros.control.base import Target
-from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.runs.log import FlightLog, hold, motion
+from beetle_omni_ros.runs.log import FlightLog, geodesic_angles, hold, motion
 
+LARGEST = 1e6           # [m, rad, N] of what is drawn; a damaged bag may have any number
 Placed = tuple[np.ndarray, np.ndarray]      # position (3,) in world [m], quaternion (4,)
 
 
@@ -40,9 +40,14 @@ class Moment:
         parts = [self.state] if self.state else []
         if self.target is not None:
             away = np.linalg.norm(self.position - self.target[0])
-            angle = rotations.geodesic_angle(self.quaternion, self.target[1])
+            angle, = geodesic_angles(self.quaternion[None], self.target[1])
             parts.append(f'{1e3 * away:.0f} mm, {np.degrees(angle):.1f}° off target')
         return ', '.join(parts)
+
+
+def drawable(values: np.ndarray) -> np.ndarray:
+    """Return values without NaN, within LARGEST."""
+    return np.clip(np.nan_to_num(values), -LARGEST, LARGEST)
 
 
 def target_at(targets: list[Target], t: float) -> Placed | None:
@@ -63,9 +68,9 @@ def moments(log: FlightLog, times: np.ndarray) -> list[Moment | None]:
     body = motion(log)
 
     def held(t, values, width):
-        return np.nan_to_num(hold(t, values, times)) if len(t) else np.zeros((len(times), width))
+        return drawable(hold(t, values, times)) if len(t) else np.zeros((len(times), width))
 
-    rows = zip(times, hold(body.t, body.position, times), hold(body.t, body.quaternion, times),
+    rows = zip(times, held(body.t, body.position, 3), held(body.t, body.quaternion, 4),
                held(*(log.joint_t, log.joint_position) if len(log.joint_t) else
                     (log.command_t, log.command_tilt), 4),
                held(log.command_t, log.command_thrust, 4), held(log.wrench_t, log.wrench_force, 3))

@@ -12,7 +12,7 @@ from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.robot.urdf import Model
 from beetle_omni_ros.runs.bag import names_of, no_pose, read_bag, runs_in
 from beetle_omni_ros.runs.log import FlightLog, motion
-from beetle_omni_ros.view.moments import moments
+from beetle_omni_ros.view.moments import drawable, moments
 from beetle_omni_ros.view.scene import close, Room, serve
 
 RATE, MOST = 20.0, 4000     # [Hz] of the pictures; of all robots
@@ -45,10 +45,10 @@ def recorded_scene(logs: Mapping[str, FlightLog], model: Model | None = None,
     server = serve(LOCAL, 8080)
     try:
         room = Room(server, model or Model.load(), len(logs))
-        for number, log in enumerate(logs.values()):
-            path = motion(log).position
+        paths = [drawable(motion(log).position) for log in logs.values()]
+        for number, path in enumerate(paths):
             room.draw_path(number, path[::max(1, len(path) // PATH_POINTS)])
-        every = np.concatenate([motion(log).position for log in logs.values()])
+        every = np.concatenate(paths)
         room.look_at(every.min(axis=0), every.max(axis=0))
         recording = server.get_scene_serializer()
         texts = [''] * len(logs)
