@@ -12,7 +12,7 @@ unexport LD_LIBRARY_PATH
 endif
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE PYTHONHOME VIRTUAL_ENV
 
-.PHONY: help setup setup-train fly test lint docs evaluate compare faults gap report film clean
+.PHONY: help setup setup-train fly test lint docs evaluate compare faults gap report clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z]*\):.*## /\1|/p' Makefile | awk -F'|' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -33,8 +33,7 @@ lint: setup  ## style of every Python file, types of the core
 	@.venv/bin/ruff check .
 	@.venv/bin/python -m mypy
 
-docs: setup  ## reference pages from the code, then the site with all links checked; to build/site/
-	.venv/bin/python docs/generate_reference.py
+docs: setup  ## the site with reference pages from the code, all links checked; to build/site/
 	.venv/bin/python -m mkdocs build --strict
 
 evaluate: setup  ## 100 random poses, in one process and faster than real time
@@ -58,9 +57,6 @@ report: setup  ## one HTML page about the runs in runs_out/ (or RUNS='DIR...')
 	    [ -n '$(RUNS)' ] || [ ! -f "$$bag" ] || runs="$$runs $${bag%/*}"; done; \
 	if [ -z "$$runs" ]; then echo 'no runs in runs_out/: make fly first, or RUNS=DIR' >&2; exit 2; fi; \
 	mkdir -p runs_out; $(TOOL) report $$runs --output runs_out/report.html $(ARGS)
-
-film: setup  ## fly and draw the films of the pages, docs/pictures/*.gif
-	.venv/bin/python benchmarks/film.py $(ARGS)
 
 clean:  ## remove the environment and files of builds and tools; keep runs_out/
 	rm -rf .venv build install log dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -47,6 +47,7 @@ REQUIREMENTS = [
     'numpy>=1.26,<3',
     'onnxruntime>=1.18,<2',
     'pillow>=9.1',
+    'plotly>=6,<8',
     'pyyaml>=6.0',
     'rich>=13.7',
     'rosbags>=0.11,<0.12',
@@ -122,7 +123,7 @@ setup(
     license='BSD-3-Clause',
     python_requires='>=3.10,<3.14',
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
-    package_data={'': ['*.c', '*.css', '*.h', '*.html', '*.js', '*.md', 'vendor/*']},
+    package_data={'': ['*.c', '*.css', '*.h', '*.html', '*.md']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),

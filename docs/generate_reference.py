@@ -1,27 +1,18 @@
 """
-Write the pages of docs/reference that are made from code: ``python docs/generate_reference.py``.
+Pages of docs/reference that are made from code, for docs/hooks.py.
 
-| page | made from |
-| --- | --- |
-| parameters.md | the dataclasses that read params/*.yaml, and the values in these files |
-| topics.md | messages/topics.py, and the publishers and subscribers in nodes/*.py |
-| command_line.md | the options of ``beetle_omni`` and its subcommands |
-| effects.md | the catalogue of effects |
-| python.md | the docstrings of the public module and of a flight's arrays |
-
-``--check`` writes nothing and exits with status 1 where a page is out of date. ROS is not needed:
-the files of the nodes are read, not imported.
+``python docs/generate_reference.py`` writes effects.md, the only one in the repository. ROS is not
+needed.
 """
 
 from __future__ import annotations
 
-import ast
 from dataclasses import fields, is_dataclass
 from importlib import import_module
 import inspect
 from pathlib import Path
 import re
-import sys
+from textwrap import fill
 
 import numpy as np
 
@@ -81,10 +72,6 @@ A file that extends another moves what depends on its numbers:
 
 """
 
-# Classes of nodes/ whose calls count for other nodes; '' for none.
-SHARED = {'ControllerNode': 'nmpc_node, rl_node', 'Health': 'every node',
-          'RecorderNode': ''}
-
 # Topics that viewers and clocks need, which no other part of the package reads.
 OTHERS = {
     '/clock': ('rosgraph_msgs/Clock', 'SENSOR', 'simulated time, with `--clock simulated`'),
@@ -94,6 +81,38 @@ OTHERS = {
                    'fixed frames: rotors, main body, end effector, IMU'),
     'robot_description': ('std_msgs/String', 'LATCHED', 'URDF for viewers'),
     'markers': ('visualization_msgs/MarkerArray', 'EVENT', 'targets and thrusts for viewers')}
+
+
+CONVENTIONS = """Names are relative; a launch argument sets a namespace. On the robot, the drivers
+of MoCap and IMU publish `mocap/pose` and `imu/data_raw` in place of `sim_node`.
+
+- Units are SI, angles are radians, times are seconds.
+- Axes follow REP-103: x forward, y left, z up. `world` is the frame of the MoCap, with z up.
+- `base_link` is at the centre of gravity.
+- Quaternions are (x, y, z, w).
+- A command is one `sensor_msgs/JointState` with `name = [gimbal1..4, rotor1..4]`. `position` holds
+  the four tilt targets [rad], then four NaN. `effort` holds four NaN, then the four thrust targets
+  [N]. `velocity` is empty.
+- The stamp of a command is the time of the state estimate from which it was computed.
+"""
+STATUS = """\
+`beetle_omni` is also `ros2 run beetle_omni_ros beetle_omni`. Each subcommand has `--help`.
+
+| exit status | meaning |
+| --- | --- |
+| 0 | success |
+| 1 | a flight failed or crashed, or a check failed |
+| 2 | unusable input; one line on standard error |
+| 3 | `gap`: the verdict `bad_data` |
+| 130 | interrupted |
+"""
+TIMES = """The functions of `import beetle_omni_ros as bo`, which `help` shows too. They need no
+ROS. Short scripts are in `examples/`.
+
+The times of a recorded flight (`bo.read_run`) are absolute, in seconds since 1970-01-01 UTC. Those
+of `bo.simulate` begin at 0. `log.imu_t - log.start` is the time since the start of either. The
+times of a `TrajectoryTarget`, and the argument of `target.at(t)`, are on the same clock.
+"""
 
 
 def table(head: list[str], rows: list[list[str]]) -> str:
@@ -189,163 +208,37 @@ def _anchor(heading: str) -> str:
     return re.sub(r'[^\w\- ]', '', heading.lower()).strip().replace(' ', '-')
 
 
-def _topic(value, constants) -> list[str]:
-    """Topic names of an argument: text, a constant, or text with the name of a part in it."""
-    if isinstance(value, ast.Constant):
-        return [value.value]
-    if isinstance(value, ast.Name):
-        return constants.get(value.id, [])
-    if isinstance(value, ast.JoinedStr):
-        end = ''.join(part.value for part in value.values if isinstance(part, ast.Constant))
-        return ['joint_bridge/state', 'rotor_bridge/state'] if end.endswith('bridge/state') \
-            else [f'<controller>{end}']
-    return []
-
-
-def _constants(tree: ast.AST) -> dict[str, list[str]]:
-    """Names of a file that stand for topics: constants, and what a loop runs over."""
-    found = {}
-    for item in ast.walk(tree):
-        if isinstance(item, ast.Assign) and isinstance(item.targets[0], ast.Name):
-            found[item.targets[0].id] = _topic(item.value, {})
-        elif isinstance(item, ast.For) and isinstance(item.target, ast.Name) \
-                and isinstance(item.iter, ast.Tuple):
-            found[item.target.id] = [name for one in item.iter.elts for name in _topic(one, {})]
-    return found
-
-
-def _ends() -> dict[str, dict[str, list[str]]]:
-    """Topic -> its publishers and its subscribers, from the files of the nodes."""
-    found: dict[str, dict[str, list[str]]] = {}
-    nodes = ROOT / PACKAGE / 'nodes'
-    shared = _constants(ast.parse((nodes / 'node.py').read_text(encoding='utf-8')))
-    ways = {'publisher': ('from', 0), 'Publisher': ('from', 1), 'create_publisher': ('from', 1),
-            'listen': ('to', 0), 'follow': ('to', 0)}
-    for path in sorted((*nodes.glob('*_node.py'), *nodes.glob('*_nodes.py'), nodes / 'node.py')):
-        tree = ast.parse(path.read_text(encoding='utf-8'))
-        constants = {**shared, **_constants(tree)}
-        for kind in (item for item in tree.body if isinstance(item, ast.ClassDef)):
-            name = re.sub(r'(?<=[a-z])(?=[A-Z])', '_', kind.name).lower()
-            node = SHARED.get(kind.name, name if name.endswith('_node') else '')
-            for call in ast.walk(kind):
-                if not node or not isinstance(call, ast.Call) \
-                        or not isinstance(call.func, ast.Attribute) or call.func.attr not in ways:
-                    continue
-                way, place = ways[call.func.attr]
-                given = call.args[place] if len(call.args) > place else None
-                for topic in _topic(given, constants):
-                    entry = found.setdefault(topic, {'from': [], 'to': []})
-                    entry[way] += [one for one in node.split(', ') if one not in entry[way]]
-    # Read through the class that checks the publisher.
-    found['supervisor/identity']['to'] = list(found['command']['to'])
-    found['/tf']['from'].append('robot_state_publisher')
-    for topic in ('/tf_static', 'robot_description'):
-        found[topic] = {'from': ['robot_state_publisher'], 'to': []}
-    return found
-
-
 def _qos(qos) -> str:
     return ('reliable' if qos.reliable else 'best effort') + (
         ', latched' if qos.latched else f', depth {qos.depth}')
 
 
 def topics() -> str:
-    """Topics with types, quality of service, publishers and subscribers."""
+    """Topics with types and quality of service."""
     known = {}
     for topic in TABLE:
         name = '<controller>/command' if controller_of(topic.name) else topic.name
         known.setdefault(name, (topic.type.replace('/msg/', '/'), _qos(topic.qos), topic.meaning))
     for name, (kind, profile, meaning) in OTHERS.items():
         known[name] = kind, _qos(getattr(message_topics, profile)), meaning
-    nodes = _ends()
-    missing = sorted(set(nodes) ^ set(known))
-    if missing:
-        raise SystemExit(f'the table of topics and the nodes differ in {", ".join(missing)}')
-    said = [[f'`{topic}`', kind, meaning] for topic, (kind, _, meaning) in known.items()]
-    ends = [[f'`{topic}`', *(', '.join(f'`{node}`' if node != 'every node' else node
-                                       for node in nodes[topic][way]) for way in ('from', 'to')),
-             qos if nodes[topic]['from'] else ''] for topic, (_, qos, _) in known.items()]
-    return (f'# Topics\n\n{MADE}\n'
-            'Names are relative; a launch argument sets a namespace. On the robot, the drivers of '
-            'MoCap and IMU\npublish `mocap/pose` and `imu/data_raw` in place of `sim_node`. '
-            '`recorder_node` subscribes to every\ntopic of a bag except the frames, which it '
-            'computes from `odom` and `joint_states`.\n\n'
-            + table(['topic', 'type', 'meaning'], said)
-            + '\n## Publishers and subscribers\n\n'
-            + table(['topic', 'published by', 'subscribed by', 'quality of service'], ends)
-            + '\n## Frames and conventions\n\n'
-            '- Units are SI, angles are radians, times are seconds.\n'
-            '- Axes follow REP-103: x forward, y left, z up. `world` is the frame of the MoCap, '
-            'with z up.\n'
-            '- `base_link` is at the centre of gravity.\n'
-            '- Quaternions are (x, y, z, w).\n'
-            '- A command is one `sensor_msgs/JointState` with `name = [gimbal1..4, rotor1..4]`. '
-            '`position` holds\n  the four tilt targets [rad], then four NaN. `effort` holds four '
-            'NaN, then the four thrust targets\n  [N]. `velocity` is empty.\n'
-            '- The stamp of a command is the time of the state estimate from which it was '
-            'computed.\n')
-
-
-def _options(command) -> list[list[str]]:
-    rows = []
-    for option in command.params:
-        if 'help' in option.opts or '--help' in option.opts:
-            continue
-        names = '/'.join([', '.join(option.opts), *option.secondary_opts])
-        if option.param_type_name == 'argument':
-            names = (option.metavar or option.name.upper()) + ('...' if option.nargs != 1
-                                                               and not (option.metavar or '')
-                                                               .rstrip(']').endswith('...')
-                                                               else '')
-        is_flag = getattr(option, 'is_flag', False)     # an argument has none
-        if option.param_type_name != 'argument' and not is_flag:
-            names += f' {option.metavar or option.name.upper()}'
-        default = option.default
-        text = 'required' if option.required else ''
-        has_default = default is not None and str(default) not in ('', 'False', '()')
-        if not option.required and has_default and not callable(default) \
-                and not (is_flag and not option.secondary_opts):
-            text = (option.opts[0] if default else option.secondary_opts[0]) \
-                if is_flag else str(default)
-        rows.append([f'`{names}`', f'`{text}`' if text not in ('', 'required') else text,
-                     ' '.join((getattr(option, 'help', '') or '').split())])
-    return rows
-
-
-def _commands(command, name):
-    if hasattr(command, 'commands'):
-        for part, inner in command.commands.items():
-            yield from _commands(inner, f'{name} {part}')
-    else:
-        yield name, command
+    return (f'# Topics\n\n{MADE}\n{CONVENTIONS}\n'
+            + table(['topic', 'type', 'quality of service', 'meaning'],
+                    [[f'`{topic}`', *row] for topic, row in known.items()]))
 
 
 def command_line() -> str:
     """Every subcommand with its options."""
+    from typer import Context
+    from typer.cli import get_docs_for_click
     from typer.main import get_command
 
     from beetle_omni_ros.cli import app
-    text = [f'# Command line\n\n{MADE}\n'
-            '`beetle_omni` is also `ros2 run beetle_omni_ros beetle_omni`. Each subcommand has '
-            '`--help`.\n\n'
-            + table(['exit status', 'meaning'], [
-                ['0', 'success'], ['1', 'a flight failed or crashed, or a check failed'],
-                ['2', 'unusable input; one line on standard error'],
-                ['3', '`gap`: the verdict `bad_data`'], ['130', 'interrupted']])]
-    for name, command in _commands(get_command(app), 'beetle_omni'):
-        description = (command.help or '').replace('\b', '').strip()
-        paragraphs = [' '.join(part.split()) for part in description.split('\n\n')]
-        text.append(f'\n## {name}\n')
-        for paragraph in paragraphs:
-            sentences, _, example = paragraph.partition('Example: ')
-            text += [f'\n{_wrapped(sentences.strip())}\n'] if sentences.strip() else []
-            text += [f'\n```sh\n{example.strip()}\n```\n'] if example else []
-        text.append('\n' + table(['option', 'default', 'meaning'], _options(command)))
-    return ''.join(text)
+    command = get_command(app)
+    made = get_docs_for_click(obj=command, ctx=Context(command), name='beetle_omni')
+    return f'# Command line\n\n{MADE}\n{STATUS}\n' + re.sub('^#', '##', made, flags=re.M)
 
 
 def _wrapped(text: str) -> str:
-    from textwrap import fill
     return fill(text, 98, break_long_words=False, break_on_hyphens=False)
 
 
@@ -422,85 +315,27 @@ def python() -> str:
     import beetle_omni_ros as module
     from beetle_omni_ros.control import base
     from beetle_omni_ros.runs import log
-    text = [f'# Python\n\n{MADE}\n'
-            'The functions of `import beetle_omni_ros as bo`. They need no ROS. Short scripts are '
-            'in\n`examples/`; `examples/read_bag.py` reads a bag.\n\n'
-            + table(['function', ''], [
-                [f'[`bo.{name}`](#{name})', _sections(_documented(module, name))['']
-                 .partition('\n\n')[0]] for name in module.__all__])]
+    text = [f'# Python\n\n{MADE}\n{TIMES}']
     for name in module.__all__:
-        function = _documented(module, name)
-        parameters = [one.replace(annotation=inspect.Parameter.empty) for one in
-                      inspect.signature(function).parameters.values() if one.name != 'self']
-        call = f'bo.{name}{inspect.Signature(parameters)}'
-        text.append(f'\n## {name}\n\n```python\n{call}\n```\n{_described(function)}')
-    text.append(
-        '\n## Times of a flight\n\nThe times of a recorded flight (`bo.read_run`) are absolute, '
-        'in seconds since 1970-01-01 UTC. Those\nof `bo.simulate` begin at 0. `log.imu_t - '
-        'log.start` is the time since the start of either. The\ntimes of a `TrajectoryTarget`, '
-        'and the argument of `target.at(t)`, are on the same clock.\n')
+        found = getattr(module, name)
+        # `robot` is a subpackage that can be called.
+        function = found if inspect.isfunction(found) else type(found).__call__
+        given = [one.replace(annotation=inspect.Parameter.empty) for one in
+                 inspect.signature(function).parameters.values() if one.name != 'self']
+        text.append(_documented(name, f'bo.{name}{inspect.Signature(given)}', function))
     for kind in (log.FlightLog, log.Commands, base.PoseTarget, base.TrajectoryTarget,
                  base.Reference):
-        text.append(f'\n## {kind.__name__}\n{_described(kind)}')
-        methods = [[f'`{name}`' if isinstance(one, property) else f'`{name}()`',
-                    ' '.join(_sections(one)[''].split())]
-                   for name, one in vars(kind).items() if not name.startswith('_')
-                   and (isinstance(one, property) or inspect.isfunction(one))]
-        text.append('\n' + table(['property, method', ''], methods) if methods else '')
+        text.append(_documented(kind.__name__, kind.__name__, kind))
     return ''.join(text)
 
 
-def _documented(module, name):
-    """A public function; `robot` is a subpackage that can be called."""
-    found = getattr(module, name)
-    return found if inspect.isfunction(found) else type(found).__call__
-
-
-def _described(documented) -> str:
-    """A docstring as Markdown: text, a table of arguments or fields, results, errors."""
-    sections = _sections(documented)
-    parts = [_wrapped(' '.join(part.split())) for part in sections.pop('').split('\n\n')]
-    for title, content in sections.items():
-        if title in ('Args', 'Attributes'):
-            entries = re.findall(r'^(\w[^:\n]*):\s+(.*(?:\n +.*)*)', content, flags=re.M)
-            parts.append(table(['argument' if title == 'Args' else 'field', ''], [
-                [', '.join(f'`{name}`' for name in names.split(', ')), ' '.join(what.split())]
-                for names, what in entries]).rstrip())
-        else:
-            parts.append(_wrapped(f'*{title}*: ' + ' '.join(content.split())))
-    return ''.join(f'\n{part}\n' for part in parts)
-
-
-def _sections(documented) -> dict[str, str]:
-    """Title -> content of a docstring of Google style; '': the text before."""
-    text = re.sub(r':\w+:`~?([^`]*)`', r'`\1`', inspect.getdoc(documented)).replace('``', '`')
-    parts = re.split(r'^(Args|Attributes|Returns|Raises):\n', text, flags=re.M)
-    return {'': parts[0].strip(), **{title: inspect.cleandoc(content) for title, content
-                                     in zip(parts[1::2], parts[2::2], strict=True)}}
+def _documented(name, call, documented):
+    return f'\n## {name}\n\n```text\n{call}\n\n{inspect.getdoc(documented)}\n```\n'
 
 
 PAGES = {'parameters.md': parameters, 'topics.md': topics, 'command_line.md': command_line,
          'effects.md': effects, 'python.md': python}
 
 
-def out_of_date() -> list[str]:
-    """Names of pages that differ from those made from the code."""
-    return [name for name, make in PAGES.items() if not (REFERENCE / name).is_file()
-            or (REFERENCE / name).read_text(encoding='utf-8') != make()]
-
-
-def main(arguments: list[str]) -> int:
-    """Write the pages, or check them; returns the exit status."""
-    if '--check' in arguments:
-        old = out_of_date()
-        for name in old:
-            print(f'docs/reference/{name} is out of date: python docs/generate_reference.py')
-        return bool(old)
-    REFERENCE.mkdir(exist_ok=True)
-    for name, make in PAGES.items():
-        (REFERENCE / name).write_text(make(), encoding='utf-8')
-    return 0
-
-
 if __name__ == '__main__':
-    sys.exit(main(sys.argv[1:]))
+    (REFERENCE / 'effects.md').write_text(effects(), encoding='utf-8')

@@ -1,6 +1,21 @@
-"""Changes of the Markdown for the site."""
+"""Changes of the site: pages made from code, and bars in code of tables."""
 
+from pathlib import Path
 import re
+import sys
+
+from mkdocs.structure.files import File
+
+sys.path.insert(0, str(Path(__file__).parent))
+from generate_reference import PAGES
+
+
+def on_files(files, config):
+    """Add the pages that are not in the repository."""
+    for name, make in PAGES.items():
+        if files.get_file_from_path(f'reference/{name}') is None:
+            files.append(File.generated(config, f'reference/{name}', content=make()))
+    return files
 
 
 def on_page_markdown(markdown: str, **_) -> str:

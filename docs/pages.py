@@ -1,16 +1,10 @@
-"""
-Sentences, links and anchors of Markdown files.
-
-``python docs/pages.py [FILE...]`` prints the mean and the longest sentence of each page. The tests
-in test/docs hold the limits.
-"""
+"""Sentences and lines of Markdown files; the tests in test/docs hold the limits."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
 import re
-import sys
 from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -90,57 +84,8 @@ def too_wide(text: str) -> list[Line]:
             and not _TABLE.match(line.text) and not line.text.lstrip().startswith('![')]
 
 
-def links(text: str) -> Iterator[Line]:
-    """Targets of links and pictures, with their lines."""
-    for number, line in lines(text):
-        for found in _LINK.finditer(_CODE.sub(lambda code: 'x' * len(code[0]), line)):
-            yield Line(number, found[2])
-
-
-def anchors(text: str) -> set[str]:
-    """Anchors of a page's headings, as the site and the repository's pages make them."""
-    found: dict[str, int] = {}
-    for _, line in lines(text):
-        heading = _HEADING.match(line)
-        if heading:
-            plain = _CODE.sub(lambda code: code[2], _LINK.sub(lambda link: link[1], heading[2]))
-            name = re.sub(r'[^\w\- ]', '', plain.lower()).strip().replace(' ', '-')
-            found[name] = found.get(name, 0) + 1
-    return found.keys() | {f'{name}_{i}' for name, n in found.items() for i in range(1, n)}
-
-
-def broken_links(page: Path) -> list[str]:
-    """Relative links of a page that lead to no file or to no heading."""
-    text, broken = page.read_text(encoding='utf-8'), []
-    for number, target in links(text):
-        if re.match(r'[a-z]+:', target):
-            continue
-        path, _, anchor = target.partition('#')
-        file = (page.parent / path).resolve() if path else page
-        if not file.exists():
-            broken.append(f'{page}:{number}: {target}: no such file')
-        elif anchor and file.suffix == '.md' \
-                and anchor not in anchors(file.read_text(encoding='utf-8')):
-            broken.append(f'{page}:{number}: {target}: no such heading')
-    return broken
-
-
 def written() -> list[Path]:
     """Every page of the repository."""
     return sorted([ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', ROOT / 'policies' / 'README.md',
                    ROOT / 'benchmarks' / 'gap_data' / 'README.md',
                    *(ROOT / 'docs').rglob('*.md')])
-
-
-def main(files: list[str]) -> None:
-    """Print a table of the pages."""
-    for page in [Path(file) for file in files] or written():
-        text = page.read_text(encoding='utf-8')
-        lengths = [words(sentence.text) for sentence in sentences(text)] or [0]
-        print(f'{sum(lengths) / len(lengths):6.1f} words a sentence, longest {max(lengths):3d}, '
-              f'{sum(n > LONGEST for n in lengths):3d} over {LONGEST}; '
-              f'{len(too_wide(text)):3d} lines over {COLUMNS}: {page}')
-
-
-if __name__ == '__main__':
-    main(sys.argv[1:])

@@ -34,7 +34,7 @@ def refused(capsys, *arguments):
 
 
 @pytest.mark.parametrize('command', [
-    [], ['fly'], ['evaluate'], ['compare'], ['faults'], ['report'], ['film'], ['train'],
+    [], ['fly'], ['evaluate'], ['compare'], ['faults'], ['report'], ['train'],
     ['identify'], ['check'], ['controllers'], ['drive'], ['view']])
 def test_every_command_has_help(capsys, command):
     assert cli.main([*command, '--help']) == 0
@@ -64,13 +64,13 @@ def test_the_version_is_printed(capsys):
     assert capsys.readouterr().out.strip() == f'beetle_omni {__version__}'
 
 
-@pytest.mark.parametrize('command', ['report', 'film', 'view', 'gap', 'identify joint'])
+@pytest.mark.parametrize('command', ['report', 'view', 'gap', 'identify joint'])
 def test_each_command_reads_the_bags_in_a_folder(capsys, bag, tmp_path, command):
     for name, size in (('first', 300), ('second', 400)):
         (tmp_path / name).mkdir()
         (tmp_path / name / 'cut.mcap').write_bytes((bag / 'flight.mcap').read_bytes()[:size])
     given = [*command.split(), tmp_path / 'first' / '..']
-    if command in ('report', 'film'):
+    if command == 'report':
         given += ['-o', tmp_path / 'out.gif']
     assert 'first: cut.mcap: cut off after 0 readable messages' in refused(capsys, *given)
 
@@ -81,12 +81,11 @@ def test_report_writes_one_page_that_needs_no_network(capsys, bag, tmp_path):
                        '--json', str(result)])
     assert status == 0
     text = page.read_text()
-    # test/pages loads it in a browser, too. Libraries name addresses, and load none.
-    for part in (' src=', 'href="http', '<link rel="stylesheet', 'url(', '@import', 'fetch('):
-        assert part not in text.partition('<script>')[0]
+    # test/view loads it in a browser, too. Libraries name addresses, and load none.
     assert '<script src' not in text
     for part in ('flight (1)', 'flight (2)', 'Steady errors', 'Joint and thrust use',
-                 'one MoCap pose was no unit quaternion', 'Compute time', 'Estimate'):
+                 'one MoCap pose was no unit quaternion', 'CPU time of a step',
+                 'estimated position'):
         assert part in text
     judged = json.loads(result.read_text())
     assert judged['meta']['task'] == 'waypoints'

@@ -15,10 +15,10 @@ from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.bag import BagError, read_bag
 from beetle_omni_ros.runs.bag_writer import BagWriter
-from beetle_omni_ros.runs.report import make_page, make_runs, results_of
 from beetle_omni_ros.runs.targets import COLUMNS
 from beetle_omni_ros.runs.tasks import make_task, WAYPOINTS
 from beetle_omni_ros.sim.fault_lists import load_faults
+from beetle_omni_ros.view.report import make_page, make_runs, results_of
 
 LEVEL, ZERO = np.array([0, 0, 0, 1.0]), np.zeros(3)
 LONGEST_TEXT = 2000     # characters of a refusal

@@ -24,17 +24,16 @@ ALLOWED = {
     'runs': ('robot', 'control.base', 'control.registry', 'pages', 'messages'),
     'evaluation': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs', 'messages'),
     'faults': ('robot', 'pages', 'control', 'estimation', 'sim', 'safety', 'runs', 'evaluation'),
-    'film': ('robot', 'pages', 'control.base', 'runs', 'sim'),
     'comparison': ('robot', 'pages', 'control', 'runs', 'evaluation'),
     'identify': ('robot', 'pages', 'runs', 'messages'),
     'bringup': ('robot', 'drivers', 'runs.files'),
     'drive': ('robot',),
-    'view': ('robot', 'control.base', 'runs', 'messages'),
+    'view': ('robot', 'control.base', 'pages', 'runs', 'messages'),
     'nodes': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs', 'drivers', 'drive',
               'messages', 'view', 'bringup.findings'),
     'train': ('robot', 'control.policy_file', 'runs.files'),
     'cli': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs', 'evaluation', 'comparison',
-            'faults', 'film', 'nodes', 'train', 'identify', 'bringup', 'view'),
+            'faults', 'nodes', 'train', 'identify', 'bringup', 'view'),
 }
 
 # Library -> the only subpackage that imports it.

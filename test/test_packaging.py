@@ -133,10 +133,10 @@ def test_every_import_is_a_declared_requirement(setup_arguments):
             assert module in keys, f'{module}: not in package.xml'
             continue
         assert DISTRIBUTION.get(module, module) in declared, f'{module}: not in setup.py'
-        # rosdep has no key for the modules of the viewer. Without the last one
+        # rosdep has no key for the modules of pages. Without the last one
         # the code is slower.
-        if module not in ('torch', 'tensordict', 'onnx', 'rsl_rl', 'ray', 'viser', 'trimesh',
-                          'threadpoolctl'):
+        if module not in ('torch', 'tensordict', 'onnx', 'rsl_rl', 'ray', 'viser', 'plotly',
+                          'trimesh', 'threadpoolctl'):
             candidates = {KEY.get(module), f'python3-{module}', f'python3-{module}-pip', module}
             assert keys & candidates, f'{module}: no rosdep key in package.xml'
 

@@ -35,7 +35,7 @@ HELP = {'help_option_names': ['-h', '--help']}
 app = typer.Typer(no_args_is_help=True, context_settings=HELP,
                   help='Fly, evaluate and report on the tiltable quadrotor.')
 for command in (commands.fly, commands.evaluate, commands.compare, commands.faults,
-                commands.report, commands.film, live.view, commands.gap, commands.train,
+                commands.report, live.view, commands.gap, commands.train,
                 live.check, live.drive, commands.controllers):
     app.command()(command)
 identify = typer.Typer(no_args_is_help=True, context_settings=HELP,

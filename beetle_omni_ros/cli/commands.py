@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from datetime import datetime
-import os
 from pathlib import Path
 from typing import Annotated, Optional
 
@@ -272,33 +271,8 @@ def report(runs: Annotated[list[Path], typer.Argument(
     """
     check_writable(output, 'report')
     check_writable(json_path)
-    from beetle_omni_ros.runs.report import run_report
+    from beetle_omni_ros.view.report import run_report
     run_report(runs, output, json_path=json_path)
-
-
-def film(runs: Annotated[list[Path], typer.Argument(
-             metavar='RUN...', help='Recorded bags, side by side: rosbag2 folders, or one of '
-                                    'their files.')],
-         output: Annotated[Path, typer.Option('--output', '-o', metavar='FILE',
-                                              help='The film, a .gif.')],
-         model: Annotated[Optional[list[Path]], typer.Option(
-             '--model', metavar='FILE',
-             help='Robot file whose prediction is drawn over one RUN; it starts again from the '
-                  'recorded state each second; one panel for each --model.')] = None):
-    """
-    Render recorded flights as a film: robot, target, path, errors and thrusts.
-
-    Needs OpenGL for off-screen rendering; without it, a message names the packages to install.
-    Example: beetle_omni film my_run/rl my_run/nmpc --output flight.gif
-    """
-    check_writable(output, 'film')
-    os.environ.setdefault('MUJOCO_GL', 'egl')       # MuJoCo reads it when it is imported
-    try:
-        from beetle_omni_ros.film import run_film
-    except (AttributeError, ImportError, RuntimeError) as error:
-        raise ParameterError(f'no off-screen OpenGL ({error}); install libegl1, libgl1-mesa-dri '
-                             'and libopengl0 (apt)') from None
-    run_film(runs, output, models=model or [])
 
 
 def controllers(json_path: JsonOption = None):

@@ -319,17 +319,16 @@ class LiveGraph:
             if len(self._waiting[topic]) < MOST_EVENTS:
                 self._waiting[topic].append(data)
 
-    def take(self, sampler) -> None:
-        """Write the messages since the last call to a view.frames.Sampler."""
-        now = self._node.get_clock().now().nanoseconds * 1e-9
+    def take(self, newest) -> None:
+        """Write the messages since the last call to a view.live.Newest."""
         with self._lock:
-            newest, self._newest = self._newest, {}
+            latest, self._newest = self._newest, {}
             waiting, self._waiting = self._waiting, defaultdict(list)
-        for topic, data in (*newest.items(), *((topic, data) for topic, queue in waiting.items()
+        for topic, data in (*latest.items(), *((topic, data) for topic, queue in waiting.items()
                                                for data in queue)):
             known = topic_of(topic)
             with suppress(Exception):   # broken bytes raise anything; the nodes report refusals
-                sampler.write(topic, known.take(from_bytes(data, known.type)), now)
+                newest.write(topic, known.take(from_bytes(data, known.type)))
 
     def controllers(self) -> list[str]:
         """Return the names of the controllers whose command topic exists."""
@@ -375,18 +374,16 @@ def run_live(*, namespace: str = '', domain_id: int | None = None, discovery: st
     """
     from beetle_omni_ros.robot.urdf import Model
     from beetle_omni_ros.view.live import Live
-    from beetle_omni_ros.view.page import Page
-    from beetle_omni_ros.view.recording import announce
+    from beetle_omni_ros.view.recorded import announce
+    from beetle_omni_ros.view.scene import close, serve
     runner.end_with_parent()
     model, parameters = Model.load(urdf), RobotParameters.load(robot)
     with ExitStack() as stack:
-        listener = LiveGraph(namespace, domain_id, discovery, allow_targets)
-        stack.callback(listener.close)
+        graph = LiveGraph(namespace, domain_id, discovery, allow_targets)
+        stack.callback(graph.close)
         os.nice(NICENESS)
-        page = Page(['live'], model, parameters, title='Flight', host=host, port=port, dark=dark)
-        stack.callback(page.close)
-        page.look_at_room()
-        live = Live(page, listener, parameters, allow_targets)
-        announce(page.url, console or Console())
+        server = serve(host, port, dark)
+        stack.callback(close, server)
+        announce(host, server.get_port(), console or Console())
         with suppress(KeyboardInterrupt):       # the regular end
-            live.run()
+            Live(server, graph, model, parameters, allow_targets).run()

@@ -7,13 +7,11 @@ from typing import Any
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-import numpy as np
 
 COLOURS = ('#1f5fa8', '#d1432f', '#2f8f5b', '#d98a1c', '#7a52a3', '#5b6770')  # one for each run
 PARTS = ('#1f5fa8', '#d98a1c', '#2f8f5b', '#b0447a')  # one for each joint, rotor or axis
 INK, FAINT = '#22272e', '#8a939d'
 WIDTH = 9.6  # [in] of a page-wide figure
-POINTS = 1600  # of a drawn line; more would not be visible
 
 STYLE: dict[Any, Any] = {
     'font.family': 'sans-serif', 'font.size': 9, 'axes.titlesize': 9.5, 'axes.titleweight': 'bold',
@@ -22,7 +20,8 @@ STYLE: dict[Any, Any] = {
     'axes.grid': True, 'grid.color': '#e6e9ed', 'grid.linewidth': 0.6, 'axes.axisbelow': True,
     'xtick.color': INK, 'ytick.color': INK, 'xtick.major.size': 2.5, 'ytick.major.size': 2.5,
     'text.color': INK, 'legend.frameon': False, 'legend.fontsize': 8.5, 'lines.linewidth': 1.2,
-    'svg.hashsalt': 'beetle_omni', 'svg.fonttype': 'path', 'figure.dpi': 100}
+    'path.simplify_threshold': 1.0, 'svg.hashsalt': 'beetle_omni', 'svg.fonttype': 'path',
+    'figure.dpi': 100}
 
 
 def panels(rows: int, columns: int = 1, height: float = 1.5, **options):
@@ -36,29 +35,6 @@ def panels(rows: int, columns: int = 1, height: float = 1.5, **options):
     figure = Figure(figsize=(WIDTH, height * rows + 0.5), layout='constrained')
     axes = figure.subplots(rows, columns, squeeze=False, **options)
     return figure, axes
-
-
-def line(axes: Axes, t: np.ndarray, values: np.ndarray, **style) -> None:
-    """Draw a long series with few points, including its extremes."""
-    axes.plot(*thinned(t, values), **style)
-
-
-def thinned(t: np.ndarray, values: np.ndarray, points: int = POINTS):
-    """Return at most ``points`` samples of a series: minimum and maximum of each bin."""
-    if len(t) <= points:
-        return t, values
-    bins = points // 2
-    length = len(t) // bins
-    count = bins * length
-    table = values[:count].reshape(bins, length)
-    safe = np.where(np.isfinite(table), table, 0.0)
-    base = np.arange(bins)[:, None] * length
-    index = np.sort(np.concatenate(
-        [base + safe.argmin(axis=1)[:, None], base + safe.argmax(axis=1)[:, None],
-         np.where(np.isfinite(table), -1, base + np.arange(length)).max(axis=1)[:, None]],
-        axis=1), axis=1).ravel()
-    index = np.unique(np.concatenate([index[index >= 0], np.arange(count, len(t))]))
-    return t[index], values[index]
 
 
 def legend(figure: Figure, axes: Axes) -> None:

@@ -1,30 +1,30 @@
-"""Display of a running graph, with targets and controller selection by the user."""
+"""A running graph in 3D, with targets and controller selection by the user."""
 
 from collections.abc import Callable
 import threading
-import time
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
+import viser
 
 from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.urdf import Model
+from beetle_omni_ros.runs.log import FAULT_KEY, Recorder
 from beetle_omni_ros.runs.targets import TargetChecks
-from beetle_omni_ros.view.drawing import wxyz
-from beetle_omni_ros.view.frames import pose, Rows, Sampler, T
-from beetle_omni_ros.view.page import BEHIND, moments, Page, Shown
+from beetle_omni_ros.view.moments import Moment, target_at
+from beetle_omni_ros.view.scene import Room, wxyz
 
-KEPT = 60.0             # [s] of rows
-ANSWER_TIME = 3.0       # [s] to wait for a refusal of a target; diagnostics come every 1 s
-JUMP = 1.0              # [s] step back of the clock that indicates a new flight
+RATE = 30.0             # [Hz]
 WAITING = 'waiting for odom or ground_truth/odom'
+LOW, HIGH = np.array([-1.8, -1.8, 0.0]), np.array([1.8, 1.8, 2.0])      # [m] seen at the start
 
 
 class Graph(Protocol):
     """Interface of a running graph for the page."""
 
-    def take(self, sampler: Sampler) -> None:
+    def take(self, newest: 'Newest') -> None:
         """Pass on the messages since the last call."""
 
     def controllers(self) -> list[str]:
@@ -37,146 +37,150 @@ class Graph(Protocol):
         """Select a controller; calls ``answer`` with the reason of a refusal, or ''."""
 
 
+class Newest(Recorder):
+    """
+    Newest value of each topic.
+
+    Attributes:
+        values: topic -> value.
+        statuses: name -> newest diagnostic status.
+
+    """
+
+    def __init__(self):
+        self.values: dict[str, Any] = {}
+        self.statuses: dict[str, Any] = {}
+
+    def write(self, topic: str, value: Any, received: float | None = None) -> None:
+        """Keep one value."""
+        if topic == 'diagnostics':
+            self.statuses.update((status.name, status) for status in value)
+        else:
+            self.values[topic] = value
+
+    @property
+    def clock(self) -> float:
+        """Stamp of the newest pose [s]; 0 before the first."""
+        body = self._body()
+        return 0.0 if body is None else body.stamp
+
+    def _body(self):
+        return self.values.get('ground_truth/odom', self.values.get('odom'))
+
+    def moment(self) -> Moment | None:
+        """Return what is shown now; None before the first pose."""
+        body, values = self._body(), self.values
+        if body is None:
+            return None
+        made = Moment(body.position, body.quaternion, state=values.get('supervisor/state', ''))
+        if 'joint_states' in values:
+            made.tilt = values['joint_states'].position
+        if 'command' in values:
+            made.thrust = np.nan_to_num(values['command'].thrust)
+        if 'disturbance' in values:
+            made.force = values['disturbance'].force
+        targets = sorted((values[topic] for topic in ('target_pose', 'target_trajectory')
+                          if topic in values), key=lambda target: target.stamp)
+        if targets:
+            made.target = target_at(targets[-1:], max(self.clock, targets[-1].stamp))
+        return made
+
+    def text(self, moment: Moment) -> str:
+        """Return state, errors, battery, faults and warnings as Markdown."""
+        lines = [f'**{self.clock:.1f} s**', moment.text()]
+        estimate, battery = self.values.get('odom'), self.values.get('battery_state')
+        if estimate is not None and 'ground_truth/odom' in self.values:
+            away = np.linalg.norm(estimate.position - moment.position)
+            lines.append(f'estimate {1e3 * away:.0f} mm off')
+        if battery is not None:
+            lines.append(f'battery {battery.voltage:.1f} V')
+        for status in self.statuses.values():
+            lines += [f'**{key}**' for key in status.values if key.startswith(FAULT_KEY)]
+            if status.level:
+                lines.append(f'{status.name}: {status.message}')
+        return '\n\n'.join(lines)
+
+
 class Live:
     """
     Draws a graph as it runs.
 
     Args:
-        page: page for one run.
+        server: server of the page.
         graph: graph to display.
+        model: links and shapes of the robot.
         robot: robot parameters for the checks of targets.
         allow_targets: whether the page has controls for targets and the controller.
 
     """
 
-    def __init__(self, page: Page, graph: Graph, robot: RobotParameters, allow_targets: bool):
-        self._page, self._graph = page, graph
-        self._checks = TargetChecks(robot)
-        self._sampler, self._rows = Sampler(), Rows(KEPT)
-        self._begin: float | None = None
-        self._stop = threading.Event()
-        self._pending: tuple[float, PoseTarget | None] | None = None
-        self._requested: PoseTarget | None = None   # set by the page, published by the next step
-        self._dragging = False
-        self._gizmo = None
-        gui = page.server.gui
-        with page.controls:
-            self._text = gui.add_markdown(WAITING)
-            if allow_targets:
-                self._controller = gui.add_dropdown('controller', ('-',), initial_value='-')
-                self._controller.on_update(self._on_controller)
-                self._position = gui.add_vector3('target [m]', (0.0, 0.0, 1.0), step=0.05)
-                self._angles = gui.add_vector3('roll pitch yaw [deg]', (0.0, 0.0, 0.0), step=5.0)
-                gui.add_button('fly there').on_click(lambda _: self._send(
-                    np.array(self._position.value), rotations.from_rpy(
-                        *np.radians(self._angles.value))))
+    def __init__(self, server: viser.ViserServer, graph: Graph, model: Model,
+                 robot: RobotParameters, allow_targets: bool):
+        self._server, self._graph, self._newest = server, graph, Newest()
+        self._checks, self._stop = TargetChecks(robot), threading.Event()
+        self._room, self._dragging, self._gizmo = Room(server, model), False, None
+        self._room.look_at(LOW, HIGH)
+        self._text = server.gui.add_markdown(WAITING)
         if allow_targets:
-            self._gizmo = page.server.scene.add_transform_controls(
+            self._controller = server.gui.add_dropdown('controller', ('-',), initial_value='-')
+            self._controller.on_update(self._on_controller)
+            self._gizmo = server.scene.add_transform_controls(
                 '/wanted', scale=0.55, line_width=3.0, depth_test=False, visible=False)
             self._gizmo.on_update(self._on_gizmo)
 
     def run(self) -> None:
         """Draw until :meth:`stop`."""
-        for _, passed in moments(self._stop):
-            self.step(passed)
+        while not self._stop.wait(1 / RATE):
+            self.step()
 
     def stop(self) -> None:
         """End :meth:`run`."""
         self._stop.set()
 
-    def step(self, passed: float) -> None:
-        """Process new messages and draw; ``passed`` is the time since the last step [s]."""
-        sampler = self._sampler
-        self._publish()
-        self._graph.take(sampler)
-        self._check_refusal()
-        if not sampler.placed:
+    def step(self) -> None:
+        """Process new messages and draw."""
+        self._graph.take(self._newest)
+        moment = self._newest.moment()
+        if moment is None:
             return
-        if len(self._rows) and sampler.clock < self._rows.times[-1] - JUMP:
-            self._rows, self._begin = Rows(KEPT), None
-        row = sampler.row(sampler.clock)
-        self._rows.append(row[None])
-        if self._begin is None:
-            self._begin = sampler.clock
-        now = sampler.clock - self._begin
-        window = self._rows.window(sampler.clock - 2 * BEHIND, np.inf).copy()
-        window[:, T] -= self._begin
-        state = sampler.states[-1][1] if sampler.states else ''
-        self._page.show([Shown(row, window, state, sampler.faults)], now, passed,
-                        f'live: {now:.1f} s')
-        self._update_controls(state, row)
+        with self._server.atomic():
+            self._room.show([moment], [''])
+            text = self._newest.text(moment)
+            if self._text.content != text:
+                self._text.content = text
+            if self._gizmo is not None:
+                self._update_controls(moment)
 
-    def _update_controls(self, state, row):
-        text = 'live'
-        if self._gizmo is not None:
-            text = 'drag the target, or give numbers'
-            names = ('-', *self._graph.controllers())
-            flying = state.partition(':')[2] if state.startswith('flying:') else ''
-            if names != tuple(self._controller.options):
-                self._controller.options = names
-            if flying in names and self._controller.value != flying:
-                self._controller.value = flying
-            self._place_gizmo(pose(row, 'target_') or pose(row))
-        if self._text.content != text:
-            self._text.content = text
-
-    # -- controls --------------------------------------------------------------------------
-
-    def _place_gizmo(self, placed):
+    def _update_controls(self, moment):
+        names = ('-', *self._graph.controllers())
+        kind, _, flying = moment.state.partition(':')
+        if names != tuple(self._controller.options):
+            self._controller.options = names
+        if kind == 'flying' and flying in names and self._controller.value != flying:
+            self._controller.value = flying
         self._gizmo.visible = True
-        if not self._dragging and self._pending is None:
-            self._gizmo.position, self._gizmo.wxyz = placed[0], wxyz(placed[1])
+        if not self._dragging:
+            position, quaternion = moment.target or (moment.position, moment.quaternion)
+            self._gizmo.position, self._gizmo.wxyz = position, wxyz(quaternion)
 
     async def _on_gizmo(self, event):   # a coroutine: viser then keeps the order of events
         self._dragging = event.phase != 'end'
-        position = np.array(event.target.position)
-        quaternion = np.roll(np.array(event.target.wxyz), -1)
-        self._position.value = tuple(round(float(x), 3) for x in position)
-        self._angles.value = tuple(round(float(x), 1)
-                                   for x in np.degrees(rotations.to_rpy(quaternion)))
-        if event.phase == 'end':
-            self._send(position, quaternion)
-
-    def _send(self, position, quaternion):
-        """Request a target pose if it is valid; the nodes may still refuse it."""
+        if self._dragging:
+            return
         # Stamp by the flight's clock, so that the target is newer than previous ones.
-        target = PoseTarget(position, rotations.normalized(quaternion),
-                            float(np.nan_to_num(self._sampler.clock)))
+        target = PoseTarget(np.array(event.target.position), rotations.normalized(
+            np.roll(event.target.wxyz, -1)), self._newest.clock)
         if reason := self._checks.why_not(target, None):
-            self._page.notify('target not sent', reason)
-            return
-        self._requested = target
-
-    def _publish(self):
-        """Publish the requested target; in the drawing thread, which owns the sampler."""
-        target, self._requested = self._requested, None
-        if target is not None:
-            self._pending = (time.monotonic(), self._sampler.target)
-            self._sampler.input_warnings.clear()
-            self._sampler.target = target
+            self._notify('target not sent', reason)
+        else:
             self._graph.publish_target(target)
-
-    def _check_refusal(self):
-        if self._pending is None:
-            self._sampler.input_warnings.clear()
-            return
-        at, before = self._pending
-        for status, text in self._sampler.input_warnings:
-            if 'target_pose' in text and 'rejected' in text:
-                self._page.notify('target refused', f'{status}: {text}')
-                self._sampler.target, self._pending = before, None
-                return
-        if time.monotonic() - at > ANSWER_TIME:
-            self._pending = None
 
     def _on_controller(self, event):
         name = self._controller.value
-        if event.client is None or name == '-':     # set by this page itself
-            return
+        if event.client is not None and name != '-':    # not set by this page itself
+            self._graph.select(name, lambda reason: self._notify(
+                name, reason or 'the supervisor agrees'))
 
-        def answer(reason):
-            if reason:
-                self._page.notify(f'{name} refused', reason)
-            else:
-                self._page.notify(f'{name} selected', 'the supervisor agrees', 'green')
-        self._graph.select(name, answer)
+    def _notify(self, title, text):
+        for client in self._server.get_clients().values():
+            client.add_notification(title, text, auto_close_seconds=8.0)

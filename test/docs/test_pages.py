@@ -1,6 +1,5 @@
 """Pages: links exist, sentences and lines are short, and pages from code are up to date."""
 
-from dataclasses import fields
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 import re
@@ -9,13 +8,9 @@ import sys
 
 import pytest
 
-import beetle_omni_ros
-from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
-from beetle_omni_ros.runs.log import FlightLog
-
 ROOT = Path(__file__).resolve().parents[2]
 # Pages with a style of their own: made by a command.
-MADE = ('docs/comparison/', 'docs/reference/parameters.md', 'docs/reference/effects.md')
+MADE = ('docs/comparison/', 'docs/reference/effects.md')
 
 
 def module(name):
@@ -36,9 +31,10 @@ def read(page):
     return (ROOT / page).read_text(encoding='utf-8')
 
 
-@pytest.mark.parametrize('page', PAGES)
-def test_every_relative_link_has_an_existing_file_and_heading(page):
-    assert not pages.broken_links(ROOT / page)
+@pytest.mark.parametrize('page', [page for page in PAGES if not page.startswith('docs/')])
+def test_every_relative_link_outside_the_site_has_a_file(page):
+    for target in re.findall(r'\]\(([^():#]+)[^():]*\)', read(page)):
+        assert (ROOT / page).parent.joinpath(target).exists(), target
 
 
 @pytest.mark.parametrize('page', REWRITTEN)
@@ -64,20 +60,9 @@ def test_the_readme_has_150_lines_at_most():
     assert len(read('README.md').splitlines()) <= 150
 
 
-def test_the_pages_made_from_code_are_up_to_date():
-    old = module('generate_reference').out_of_date()
-    assert not old, f'{old}: run python docs/generate_reference.py'
-
-
-def test_the_page_of_python_has_every_public_function_and_every_array():
-    page = read('docs/reference/python.md')
-    for name in beetle_omni_ros.__all__:
-        assert f'## {name}\n\n```python\nbo.{name}(' in page
-    for kind in (FlightLog, PoseTarget, TrajectoryTarget):
-        part = page.split(f'\n## {kind.__name__}\n')[1].split('\n## ')[0]
-        missing = [one.name for one in fields(kind) if f'`{one.name}`' not in part]
-        assert not missing, kind
-    assert 'seconds since 1970' in page and 'log.imu_t - log.start' in page
+def test_the_page_of_effects_is_up_to_date():
+    assert read('docs/reference/effects.md') == module('generate_reference').effects(), \
+        'run python docs/generate_reference.py'
 
 
 @pytest.fixture(scope='module')
@@ -90,6 +75,13 @@ def site(tmp_path_factory):
         cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     return folder
+
+
+def test_the_site_has_the_pages_made_from_code(site):
+    for page, text in (('parameters', 'rotors.time_constant'), ('topics', 'mocap/pose'),
+                       ('command_line', '--controllers'), ('python', 'bo.simulate('),
+                       ('python', 'odom_quaternion')):
+        assert text in (site / 'reference' / f'{page}.html').read_text(encoding='utf-8'), page
 
 
 def test_the_site_loads_nothing_from_the_network(site):
@@ -128,15 +120,6 @@ def test_every_page_named_in_the_code_exists():
     ('See [the page of it](page.md), e.g. here.', [7])])
 def test_sentences_are_counted_as_a_reader_would(text, words):
     assert [pages.words(sentence.text) for sentence in pages.sentences(text)] == words
-
-
-def test_a_long_sentence_and_a_broken_link_are_found(tmp_path):
-    page = tmp_path / 'page.md'
-    page.write_text('# Title here\n\n' + 'word ' * 40 + '.\n\n[a](none.md) [b](#title-here) '
-                    '[c](#none) [d](page.md#title-here) `[e](not.md)`\n')
-    assert [line for line, _ in pages.too_long(page.read_text())] == [3]
-    assert pages.too_wide(page.read_text())
-    assert [broken.split(': ')[1] for broken in pages.broken_links(page)] == ['none.md', '#none']
 
 
 def test_bars_in_code_of_tables_are_plain_on_the_site():

@@ -8,7 +8,7 @@ from beetle_omni_ros.control.base import Command, PoseTarget
 from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.operator import LiveGraph
-from beetle_omni_ros.view.frames import COLUMNS, pose, Sampler
+from beetle_omni_ros.view.live import Newest
 
 pytestmark = pytest.mark.real_time
 TURNED = np.array([0.0, 0.0, np.sin(0.3), np.cos(0.3)])
@@ -27,28 +27,26 @@ def listener(bench, ros_domain):
     made.close()
 
 
-def test_messages_become_a_row(bench, listener):
+def test_messages_become_a_moment(bench, listener):
     odom, truth, command, target = (wire.Publisher(bench.user, topic) for topic in (
         'odom', 'ground_truth/odom', 'command', 'target_pose'))
     target.publish(PoseTarget(np.array([0, 0, 2.0]), TURNED, 6.0))
-    sampler = Sampler()
+    newest = Newest()
 
     def complete():
         for publisher, height in ((odom, 1.01), (truth, 1.0)):
             publisher.publish(Odom(7.0, np.array([0.5, 0, height]), np.zeros(3), TURNED,
                                    np.zeros(3), np.zeros((6, 6)), np.zeros((6, 6))))
         command.publish(Command(7.0, np.full(4, 0.2), np.array([1.0, 2, 3, 4])))
-        listener.take(sampler)
-        row = sampler.row(8.0)
-        return not np.isnan(row[COLUMNS['thrust']]).any() and \
-            pose(row, 'estimate_') and pose(row, 'target_')
+        listener.take(newest)
+        return len(newest.values) == 4
     assert bench.wait(complete)
-    row = sampler.row(8.0)
-    np.testing.assert_allclose(row[COLUMNS['position']], [0.5, 0, 1.0])
-    np.testing.assert_allclose(row[COLUMNS['estimate_position']], [0.5, 0, 1.01])
-    np.testing.assert_allclose(row[COLUMNS['target_position']], [0, 0, 2])
-    np.testing.assert_allclose(row[COLUMNS['thrust']], [1, 2, 3, 4])
-    assert sampler.clock == pytest.approx(7.0)
+    moment = newest.moment()
+    np.testing.assert_allclose(moment.position, [0.5, 0, 1.0])
+    np.testing.assert_allclose(moment.target[0], [0, 0, 2])
+    np.testing.assert_allclose(moment.thrust, [1, 2, 3, 4])
+    assert newest.clock == pytest.approx(7.0)
+    assert 'estimate 10 mm off' in newest.text(moment)
 
 
 def test_a_target_arrives_latched_and_unchanged(bench, listener):

@@ -33,7 +33,7 @@ def opened(chromium, file, width):
     page.set_default_timeout(60_000)
     wrong = []
     page.on('console', lambda message: wrong.append(message.text)
-            if message.type in ('error', 'warning') and 'GPU stall' not in message.text else None)
+            if message.type == 'error' else None)
     page.on('pageerror', lambda error: wrong.append(str(error)))
     page.on('request', lambda request: wrong.append(request.url)
             if not request.url.startswith(('file:', 'data:', 'blob:')) else None)
@@ -48,7 +48,7 @@ def opened(chromium, file, width):
 def cut_off(page):
     """Elements beyond the width of the page that cannot be scrolled to."""
     return page.evaluate("""() => [...document.querySelectorAll('main *')].filter(e => {
-        if (e.closest('.scroll, .strip, #scene, .u-wrap') || e.closest('[hidden]')) return false;
+        if (e.closest('.scroll, .plotly-graph-div') || e.closest('[hidden]')) return false;
         const box = e.getBoundingClientRect();
         return box.width > 0 && box.right > innerWidth + 1;
     }).map(e => e.outerHTML.slice(0, 80))""")

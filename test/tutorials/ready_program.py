@@ -14,7 +14,7 @@ import sys
 
 MODULES = ('beetle_omni_ros.cli', 'beetle_omni_ros.evaluation.command',
            'beetle_omni_ros.faults.command', 'beetle_omni_ros.identify.gap.command',
-           'beetle_omni_ros.runs.report')
+           'beetle_omni_ros.view.report')
 CLIENT = """#!{python} -IS
 import json, os, socket, sys
 with socket.socket(socket.AF_UNIX) as server:

@@ -29,7 +29,7 @@ def bag(tmp_path_factory):
 @pytest.mark.parametrize('arguments, message', [
     (['BAG', 'none'], 'none: no such bag'), (['text.mcap'], 'not an MCAP file'),
     (['BAG', '--allow-targets'], '--allow-targets'), (['BAG', '--domain-id', '3'], '--domain-id'),
-    (['BAG', '--urdf', 'text.mcap'], 'not a usable URDF'), (['--at', '3'], '--at'),
+    (['BAG', '--urdf', 'text.mcap'], 'not a usable URDF'), (['BAG', '--robot', 'r'], '--robot'),
     (['BAG', '--host', '300.1.1.1'], '--host 300.1.1.1')])
 def test_unusable_input_is_one_line_and_status_2(bag, tmp_path, monkeypatch, capfd, arguments,
                                                  message):
@@ -46,7 +46,7 @@ def test_unusable_input_is_one_line_and_status_2(bag, tmp_path, monkeypatch, cap
 def test_the_viewer_prints_its_address_and_ends_with_ctrl_c(bag):
     process = subprocess.Popen(
         [sys.executable, '-m', 'beetle_omni_ros.start', 'beetle_omni', 'view', str(bag),
-         '--port', '8420', '--paused'], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+         '--port', '8420'], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         env={**os.environ, 'PYTHONPATH': str(ROOT)})
     try:
         line = process.stdout.readline()

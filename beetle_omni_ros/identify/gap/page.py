@@ -9,15 +9,14 @@ from beetle_omni_ros.identify.gap.residual import CHANNELS
 from beetle_omni_ros.identify.gap.results import _evidence, CANDIDATES, grids, headline
 from beetle_omni_ros.identify.gap.rollouts import STATES
 from beetle_omni_ros.identify.gap.rollouts import UNITS as STATE_UNITS
-from beetle_omni_ros.identify.recording.picture import damage_figure
-from beetle_omni_ros.pages.figures import COLOURS, FAINT, legend, line, panels, STYLE, svg
+from beetle_omni_ros.identify.recording.clocks import begin_of
+from beetle_omni_ros.pages.figures import COLOURS, FAINT, legend, panels, STYLE, svg
 from beetle_omni_ros.pages.page import Grid, html, page, section, verdict_head
 
-BARS = 16
 BEFORE, AFTER = COLOURS[1], COLOURS[0]
 VERDICT_COLOURS = {'no_gap': '#2b7a3d', 'named': '#1f5fa8', 'named_set': '#1f5fa8',
                    'unknown': '#b06a00', 'not_decidable': '#b06a00', 'bad_data': '#b3261e'}
-SHOWN = ('position', 'orientation')     # states of the first picture
+APART = 5       # MoCap readings between two orientations of a finite difference
 
 
 def gap_page(a: Analysis, result: dict) -> str:
@@ -34,12 +33,8 @@ def gap_page(a: Analysis, result: dict) -> str:
                 section('Residuals', 'Whitened residual (measured minus expected) of the first '
                         'fitted flight, in standard deviations of the noise.',
                         svg(_residuals(a), 'residuals')),
-                section('Free runs', 'Error 0.5 s after each measured state, without and with '
-                        'the named effects, tolerances as fitted; dashed: noise floor.',
-                        svg(_runs(a), 'free runs')),
                 section('Evidence', 'Decrease of chi2 (squared residual over noise) by each entry '
-                        'beside the accepted ones; blue: accepted.', svg(_bars(a), 'evidence')
-                        + html(_evidence(result['candidates'], 60))),
+                        'beside the accepted ones.', html(_evidence(result['candidates'], 60))),
                 section('Detectability', 'Standard deviations that an effect of typical size '
                         'would show, alone and beside the most similar entry. Below '
                         f'{a.problem.p.decidable:g} it would not be named.',
@@ -78,13 +73,13 @@ def _picture(a):
     """Free runs before and after, or the damaged readings; '' if there are neither."""
     if a.damaged is not None:
         with matplotlib.rc_context(STYLE):
-            return svg(damage_figure(*a.damaged), 'damaged readings')
+            return svg(_damage(*a.damaged), 'damaged readings')
     if not a.runs:
         return ''
     with matplotlib.rc_context(STYLE):
-        figure, axes = panels(len(SHOWN), 1, height=1.6, sharex=True)
+        figure, axes = panels(len(STATES), 1, height=1.4, sharex=True)
         lines = _lines(a, 'robot file, tolerances fitted', 'with named effects')
-        for axis, state in zip(axes[:, 0], SHOWN, strict=True):
+        for axis, state in zip(axes[:, 0], STATES, strict=True):
             _errors(a, axis, state, lines)
         axes[-1, 0].set_xlabel('number of the free run, one every 0.5 s of flight')
         legend(figure, axes[0, 0])
@@ -111,36 +106,11 @@ def _residuals(a) -> Figure:
         rows = (problem.where == k) & (problem.flight == 0)
         t = problem.time[rows]
         for which, colour, text in _lines(a, 'without named effects', 'with them'):
-            line(axis, t, values[which][rows], color=colour, lw=0.7, label=text)
+            axis.plot(t, values[which][rows], color=colour, lw=0.7, label=text)
         axis.set_title(f'{name} [1]')
     for axis in axes[-1]:
         axis.set_xlabel('time [s]')
     legend(figure, axes[0, 0])
-    return figure
-
-
-def _runs(a) -> Figure:
-    figure, axes = panels(len(STATES), 1, height=1.4, sharex=True)
-    lines = _lines(a, 'without named effects', 'with them')
-    for axis, state in zip(axes[:, 0], STATES, strict=True):
-        _errors(a, axis, state, lines)
-    axes[-1, 0].set_xlabel('number of the free run, one every 0.5 s of flight')
-    legend(figure, axes[0, 0])
-    return figure
-
-
-def _bars(a) -> Figure:
-    best = sorted(a.found.trials.values(), key=lambda t: -t.gain)[:BARS]
-    taken = {t.candidate.label for t in a.found.accepted}
-    gains = {t.candidate.label: t.gain for t in best}
-    gains |= {t.candidate.label: t.gain for t in a.found.accepted}
-    figure, axes = panels(1, 1, height=0.24 * len(gains) + 0.6)
-    axis, names = axes[0, 0], sorted(gains, key=lambda n: gains[n])
-    axis.barh(names, [max(gains[n], 0.5) for n in names],
-              color=[AFTER if n in taken else FAINT for n in names], height=0.6)
-    axis.set_xscale('log')
-    axis.set_xlabel('gain of chi2')
-    axis.grid(axis='y', visible=False)
     return figure
 
 
@@ -164,3 +134,56 @@ def _tolerances(result):
     rows = [[name, f'{100 * e["deviation"]:.2f} %' if e['relative'] else f'{e["deviation"]:.2g}']
             for name, e in result['tolerances'].items()]
     return Grid('', ['number', 'deviation'], rows)
+
+
+def _damage(recording, damage):
+    """Figure of the damaged, uncorrected readings; a dashed line marks the onset."""
+    begin = begin_of(recording)
+    joints = damage.topic in ('joint_states', 'command')
+    figure, axes = panels(4 if joints else 3, 1, height=1.1, sharex=True)
+    draw = _joints if joints else _motion
+    draw(recording, axes[:, 0], begin)
+    for axis in axes[:, 0]:
+        if damage.at_s is not None:
+            axis.axvline(damage.at_s, color=COLOURS[1], ls='--', lw=1.0)
+    axes[-1, 0].set_xlabel('stamp [s], from the first IMU message on')
+    legend(figure, axes[0, 0])
+    return figure
+
+
+def _joints(recording, axes, begin):
+    for k, axis in enumerate(axes):
+        for topic, colour in (('command', FAINT), ('joint_states', COLOURS[0])):
+            values = recording.values[topic]
+            if len(values):
+                axis.plot(recording.times[topic] - begin, values[:, k], color=colour, lw=0.9,
+                     label=topic)
+        axis.set_ylabel(f'gimbal{k + 1} [rad]')
+
+
+def _motion(recording, axes, begin):
+    rate, force, place = axes
+    t, values = recording.times['imu/data_raw'] - begin, recording.values['imu/data_raw']
+    if len(t):
+        rate.plot(t, np.linalg.norm(values[:, 3:], axis=1), color=COLOURS[0], lw=0.8,
+             label='imu/data_raw')
+        force.plot(t, np.linalg.norm(values[:, :3], axis=1), color=COLOURS[0], lw=0.8)
+    t, pose = recording.times['mocap/pose'] - begin, recording.values['mocap/pose']
+    if len(t) > APART:
+        rate.plot(*_turning(t, pose[:, 3:]), color=COLOURS[1], lw=0.8, label='mocap/pose')
+        for k, axis in enumerate('xyz'):
+            place.plot(t, pose[:, k], lw=0.8, color=COLOURS[k], label=axis)
+        place.legend(loc='upper right', ncols=3)
+    rate.set_ylabel('rate [rad/s]')
+    force.set_ylabel('force [m/s^2]')
+    place.set_ylabel('position [m]')
+
+
+def _turning(t, quaternion):
+    """Times (n,) and magnitude of the rate (n,) [rad/s] of orientations (N, 4)."""
+    with np.errstate(all='ignore'):
+        unit = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
+        cosine = np.clip(np.abs((unit[APART:] * unit[:-APART]).sum(axis=1)), 0, 1)
+        steps = t[APART:] - t[:-APART]
+        rate = 2 * np.arccos(cosine) / np.where(steps > 0, steps, np.nan)
+    return 0.5 * (t[APART:] + t[:-APART]), rate

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import matplotlib
 from matplotlib.figure import Figure
-import numpy as np
 
 from beetle_omni_ros.identify.gap.page import head
 from beetle_omni_ros.identify.parameters import shipped
@@ -14,7 +13,7 @@ from beetle_omni_ros.identify.servo.fit import Found
 from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
 from beetle_omni_ros.identify.servo.model import simulate
 from beetle_omni_ros.identify.servo.robot import file_sets, held
-from beetle_omni_ros.pages.figures import COLOURS, FAINT, INK, legend, line, panels, STYLE, svg
+from beetle_omni_ros.pages.figures import COLOURS, FAINT, INK, legend, panels, STYLE, svg
 from beetle_omni_ros.pages.page import Grid, page, section
 from beetle_omni_ros.robot.parameters import RobotParameters
 
@@ -78,9 +77,6 @@ def joint_page(found: Found, validations: Sequence[JointLog], robot: RobotParame
                                     svg(_responses(other, models, robot, end), title)))
             sections.append(section(f'Errors, {other.name}', 'Model minus measurement.',
                                     svg(_errors(other, models, robot, end), 'errors')))
-        sections.append(section('Friction and lag', 'Position error over commanded speed: a line '
-                                'means lag, a gap between the branches means a dead band.',
-                                svg(_loops(log, models), 'position error over speed')))
     names = ', '.join(each.name for each in logs)
     return page('Tilt servos', f'identified from {names}', grids(results), results['text'],
                 sections)
@@ -111,11 +107,11 @@ def _responses(log, models, robot, end) -> Figure:
     for axis, (k, number) in zip(axes[:, 0], pairs, strict=True):
         t = log.t - log.t[0]
         _shade(axis, t, end)
-        line(axis, t, log.command[k], color=FAINT, lw=1.0, label='command')
-        line(axis, t, log.measured[k], color=INK, lw=1.4, label='measured')
-        line(axis, t, simulate(log, k, file[number - 1][None], is_held)[0], color=COLOURS[1],
+        axis.plot(t, log.command[k], color=FAINT, lw=1.0, label='command')
+        axis.plot(t, log.measured[k], color=INK, lw=1.4, label='measured')
+        axis.plot(t, simulate(log, k, file[number - 1][None], is_held)[0], color=COLOURS[1],
              lw=0.9, label='robot file')
-        line(axis, t, simulate(log, k, models[number][None])[0], color=COLOURS[0], lw=0.9,
+        axis.plot(t, simulate(log, k, models[number][None])[0], color=COLOURS[0], lw=0.9,
              label='identified')
         axis.set_ylabel(f'joint {number} [rad]')
     axes[-1, 0].set_xlabel('time [s]')
@@ -134,27 +130,11 @@ def _errors(log, models, robot, end) -> Figure:
                 (row[1], models[number], True, COLOURS[0], 'identified')):
             _shade(axis, t, end)
             error = MILLI * (simulate(log, k, values[None], hold)[0] - log.measured[k])
-            line(axis, t, error[log.fresh], color=colour, lw=0.8)
+            axis.plot(t, error[log.fresh], color=colour, lw=0.8)
             axis.set_title(f'joint {number}, {name}')
             axis.set_ylabel('error [mrad]')
     for axis in axes[-1]:
         axis.set_xlabel('time [s]')
-    return figure
-
-
-def _loops(log, models) -> Figure:
-    figure, axes = panels(1, len(models), height=2.8, sharey=True)
-    for axis, (k, number) in zip(axes[0], enumerate(log.joints), strict=True):
-        speed, fresh = np.gradient(log.command[k], log.t), log.fresh
-        axis.plot(speed[fresh], MILLI * (log.measured[k] - log.command[k])[fresh], color=INK,
-                  lw=0.8, label='measured')
-        predicted = simulate(log, k, models[number][None])[0]
-        axis.plot(speed[fresh], MILLI * (predicted - log.command[k])[fresh], color=COLOURS[0],
-                  lw=0.8, label='identified')
-        axis.set_title(f'joint {number}')
-        axis.set_xlabel('commanded speed [rad/s]')
-    axes[0, 0].set_ylabel('position error [mrad]')
-    legend(figure, axes[0, 0])
     return figure
 
 

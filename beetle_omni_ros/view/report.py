@@ -1,11 +1,9 @@
 """`beetle_omni report`: a self-contained HTML page with several runs side by side."""
 
-from collections.abc import Callable
 from html import escape
 from pathlib import Path
 import sys
 
-import numpy as np
 from rich.console import Console
 
 from beetle_omni_ros import __version__
@@ -13,21 +11,16 @@ from beetle_omni_ros.pages.figures import COLOURS
 from beetle_omni_ros.pages.page import frame, Grid, html, section, Terminal
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError, shortened
-from beetle_omni_ros.runs import charts, table
+from beetle_omni_ros.runs import table
 from beetle_omni_ros.runs.bag import no_pose, read_bag, runs_in
-from beetle_omni_ros.runs.charts import Run, target_poses, TimeAxis
 from beetle_omni_ros.runs.files import write_json, write_text
 from beetle_omni_ros.runs.log import FlightLog, motion
 from beetle_omni_ros.runs.metrics import metrics_by_controller, task_of
+from beetle_omni_ros.view import charts
+from beetle_omni_ros.view.charts import MAX_RUNS, Run
+from beetle_omni_ros.view.recorded import recorded_scene
 
-MAX_RUNS = len(COLOURS)  # each run has its own colour
 MOST_ROWS = 40      # of states, faults and warnings
-DISC_RADIUS = 0.4   # of the distance between neighbouring rotors
-BALL = 0.29         # [m] height of the end-effector if the robot file has none
-SPEEDS = (0.1, 0.25, 0.5, 1, 2, 4, 8)
-VIEWS = (('angle', 'Angle'), ('top', 'Top'), ('side', 'Side'), ('front', 'Front'))
-STATE_COLOURS = {'flying': '#9cc7a8', 'takeoff': '#b9cfe6', 'landing': '#f0d29a',
-                 'fallback': '#efb08a', 'emergency_stop': '#d9534f', 'disarmed': '#dfe3e8'}
 
 
 def run_report(paths: list[Path], output: Path, *, json_path: Path | None = None,
@@ -97,57 +90,24 @@ def results_of(runs: list[Run]) -> dict:
 
 def make_page(runs: list[Run], results: dict) -> str:
     """Return the HTML of the page."""
-    robot, axis = _robot(runs), TimeAxis.of(runs)
-    made: list[tuple[str, str, Callable]] = [
-        ('Errors', 'Position and orientation error; grey: L window, green: U window.',
-         lambda: charts.errors_over_time(runs, axis)),
-        ('Pose', 'Flown pose and target.', lambda: charts.pose(runs, axis)),
-        ('Errors of a pose', 'Median and 10 to 90 % band over all poses of a run.',
-         lambda: charts.errors_of_a_pose(runs)),
-        ('Steady errors', 'Share of the poses with a U error below the value.',
-         lambda: charts.steady_errors(runs)),
-        ('Disturbance', 'Largest error at each level.', lambda: charts.disturbance(runs)),
-        ('Payload', 'Height while payloads are attached.', lambda: charts.payload(runs, axis)),
-        ('Commands', 'Commands of joints and rotors 1 to 4.',
-         lambda: charts.commands(runs, axis)),
-        ('Joint and thrust use', 'Share of the flight at each value; dashed: limits.',
-         lambda: charts.use(runs, robot)),
-        ('Compute time', 'CPU time of one controller step since the start of the node.',
-         lambda: charts.compute(runs, axis)),
-        ('Estimate', 'Error of the state estimate against the truth.',
-         lambda: charts.estimate(runs, axis)),
-        ('Battery', '', lambda: charts.battery(runs, axis))]
-    specs: dict[str, dict] = {}
-    numbers = charts.Numbers()
-    sections = []
-    for title, text, draw in made:
-        places = []
-        for chart in draw():
-            name = f'chart{len(specs)}'
-            specs[name] = chart.spec(numbers)
-            places.append(charts.place(name, chart.wide))
-        if places:
-            sections.append(section(title, text,
-                                    f'<div class="charts">{"".join(places)}</div>'))
+    grouped = ''.join(section(title, text, '<div class="charts">' + ''.join(
+        map(charts.html, ([panel] for panel in panels))) + '</div>')
+        for title, text, panels in charts.distributions(runs, _robot(runs)) if panels)
     shown = table.grids(results, with_poses=True)
     tables = ''.join(html(grid) for grid in shown if grid.title != 'Poses')
     poses = ''.join(html(grid) for grid in shown if grid.title == 'Poses')
     folded = f'<section><details><summary>Every pose</summary>{poses}</details></section>'
-    faults = ''.join(f'<div data-of-run="{number}">{part}</div>'
-                     for number, run in enumerate(runs) for part in _faults(run))
-    content = f"""<div class="cards">{''.join(map(_card, range(len(runs)), runs))}</div>
-{_player()}
-<section><h2>Flight</h2><p>Solid: flown, ghost: target, arrows: thrust. Below: states of the
-supervisor, with faults. Drag to turn; tap a plot or a strip to go there, drag over a plot to
-zoom.</p>
-<div id="scene"><div id="errors"></div></div>
-<div class="views">{''.join(f'<button data-view="{name}">{text}</button>' for name, text in VIEWS)}
-</div>{''.join(_strip(number, run, axis) for number, run in enumerate(runs))}</section>
+    faults = ''.join(part for run in runs for part in _faults(run))
+    scene = recorded_scene({run.label: run.log for run in runs})
+    content = f"""<div class="cards">{''.join(map(_card, runs))}</div>
 <section>{tables}</section>
-{''.join(sections)}
-{folded if poses else ''}
-<section class="faults"><h2>Faults</h2>{faults}</section>
-{charts.data_block(_data(runs, robot, axis, specs, numbers), numbers)}{charts.scripts()}"""
+<section><h2>Flight</h2><p>Frame: target, arrows: thrust. Drag to turn.</p>
+<iframe title="3D" srcdoc="{escape(scene)}"></iframe></section>
+{charts.library()}
+{section('In time', 'Grey: L window, green: U window. Drag over a chart to zoom all, click twice '
+         'to see all; click in the legend to hide a run.', charts.html(charts.flight(runs)))}
+{grouped}{folded if poses else ''}
+<section class="faults"><h2>Faults</h2>{faults}</section>"""
     meta = results['meta']
     subtitle = ', '.join(filter(None, [table.title(meta), f"beetle_omni_ros {meta['version']}"]))
     return frame('Flight report', subtitle, content)
@@ -184,7 +144,7 @@ def outcome(run: Run) -> str:
     return '; '.join(sentences)
 
 
-def _card(number, run):
+def _card(run):
     log, meta = run.log, run.log.meta
     facts = [', '.join(log.controllers()), *(f'{key} {meta[key]}' for key in
              ('task', 'conditions', 'seed', 'robot', 'plant') if meta.get(key) is not None),
@@ -194,9 +154,9 @@ def _card(number, run):
     lines = ''.join(f'<span class="warning">{escape(text)}</span>'
                     for text in (*_injected(run), *named[:MOST_ROWS], *log.warnings))
     text = escape(' · '.join(fact for fact in facts if fact))
-    return (f'<label class="card" style="border-top-color: {run.colour}">'
-            f'<input type="checkbox" checked data-run="{number}"><strong>{escape(run.label)}'
-            f'</strong><em>{escape(outcome(run))}</em><span>{text}</span>{lines}</label>')
+    return (f'<div class="card" style="border-top-color: {run.colour}"><strong>'
+            f'{escape(run.label)}</strong><em>{escape(outcome(run))}</em><span>{text}</span>'
+            f'{lines}</div>')
 
 
 def _injected(run):
@@ -204,75 +164,6 @@ def _injected(run):
     faults = run.log.meta.get('faults') or []
     return [f'injected: {shortened(str(fault))}'
             for fault in (faults if isinstance(faults, list) else [faults])][:MOST_ROWS]
-
-
-def _player():
-    speeds = ''.join(f'<option{" selected" if speed == 1 else ""} value="{speed}">{speed}×'
-                     '</option>' for speed in SPEEDS)
-    return (f'<div class="player"><button id="play">Play</button>'
-            f'<input type="range" id="slider" aria-label="time"><output id="time"></output>'
-            f'<select id="speed" aria-label="speed">{speeds}</select>'
-            '<span class="zoom"><button id="nearer" title="zoom in">+</button>'
-            '<button id="further" title="zoom out">−</button>'
-            '<button id="all" title="the whole flight">all</button></span></div>')
-
-
-def _strip(number, run, axis):
-    """Strip of the supervisor's states over time, with its faults."""
-    length = axis.step * (axis.count - 1) or 1.0
-
-    def place(t):
-        return min(100.0, max(0.0, 100 * (t - run.start - axis.start) / length))
-
-    states: list[tuple[float, str]] = []
-    for t, state in zip(run.log.state_t, run.log.states, strict=True):
-        if not states or states[-1][1] != state:
-            states.append((float(t), state))
-    ends = [t for t, _ in states[1:]] + [run.log.end]
-    parts = []
-    for (t, state), end in zip(states[:MOST_ROWS], ends):
-        colour = STATE_COLOURS.get(state.partition(':')[0], '#dfe3e8')
-        text = escape(shortened(state))
-        parts.append(f'<i style="left:{place(t):.2f}%;width:{place(end) - place(t):.2f}%;'
-                     f'background:{colour}" title="{text}">{text}</i>')
-    faults = [(shortened(name), at) for name, at in run.log.named_faults().items()][:MOST_ROWS]
-    parts += [f'<b style="left:{place(at):.2f}%" title="{escape(name)} at {at - run.start:.2f} s">'
-              '</b>' for name, at in faults]
-    return (f'<div data-of-run="{number}" class="lane"><span style="color:{run.colour}">'
-            f'{escape(run.label)}</span><div class="strip">{"".join(parts)}'
-            '<u class="pin"></u></div></div>')
-
-
-def _data(runs, robot, axis, specs, numbers):
-    rotors = robot.rotors.positions
-    parts = robot.parts
-    ball = BALL if parts is None else parts.end_effector.height
-    apart = min(np.linalg.norm(a - b) for k, a in enumerate(rotors) for b in rotors[:k])
-    return {
-        'time': {'start': axis.start, 'step': axis.step, 'count': axis.count},
-        'charts': specs,
-        'robot': {'rotors': np.asarray(rotors).tolist(),
-                  'axes': np.asarray(robot.tilt_axes).tolist(),
-                  'radius': DISC_RADIUS * float(apart), 'ball': [0.0, 0.0, ball],
-                  'ball_radius': 0.035},
-        'runs': [_scene(run, axis, numbers) for run in runs]}
-
-
-def _scene(run, axis, numbers):
-    body, log = run.body, run.log
-    tilt_t, tilt = (log.joint_t, log.joint_position) if len(log.joint_t) else \
-        (log.command_t, log.command_tilt)
-
-    def columns(t, values):
-        return [numbers.add(column) for column in axis.sampled(run, t, values).T]
-
-    t, position, quaternion = target_poses(run)
-    return {'label': run.label, 'colour': run.colour,
-            'position': columns(body.t, body.position),
-            'quaternion': columns(body.t, body.quaternion),
-            'tilt': columns(tilt_t, tilt), 'thrust': columns(log.command_t, log.command_thrust),
-            'targets': {'t': np.round(t, 4).tolist(),
-                        'pose': np.round(np.hstack([position, quaternion]), 5).ravel().tolist()}}
 
 
 def _faults(run):

@@ -1,0 +1,178 @@
+"""The robot, its target and its thrusts in a scene of viser, live or recorded."""
+
+from collections.abc import Sequence
+import contextlib
+import io
+
+import numpy as np
+import viser
+
+from beetle_omni_ros.pages.figures import COLOURS
+from beetle_omni_ros.robot.parameters import JOINT_NAMES, ROTOR_NAMES
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.urdf import Model
+from beetle_omni_ros.view.moments import Moment
+
+NEWTON_PER_METRE = 40.0     # force that is drawn as one metre
+THRUST, FORCE = (240, 140, 30), (210, 40, 60)
+GHOST_OPACITY = 0.35
+SKY = 4.0               # brightness of the ambient light, in place of slow reflections
+FLOOR = 20.0            # [m] width, with a line at each metre
+TARGET_AXES = 0.28      # [m]
+LABEL_HEIGHT, LABEL_STEP = 0.38, 0.1    # [m] above base_link; for each further robot
+VIEW_FROM, SMALLEST_VIEW = np.array([-0.5, -0.8, 0.36]), 2.0     # [m]
+SIDES = 24
+
+
+def wxyz(quaternion: np.ndarray) -> np.ndarray:
+    """Return a quaternion in the order of viser."""
+    return np.roll(quaternion, 1)
+
+
+def serve(host: str, port: int, dark: bool = False) -> viser.ViserServer:
+    """
+    Start a server; if the port is in use, the next free one is taken.
+
+    Raises:
+        ParameterError: the address cannot be used.
+
+    """
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):     # viser prints its own addresses
+            server = viser.ViserServer(host, port, label='beetle_omni', verbose=False)
+    except (OSError, OverflowError, RuntimeError, UnicodeError) as error:
+        raise ParameterError(f'--host {host} --port {port}: cannot be served there '
+                             f'({error})') from None
+    server.gui.configure_theme(dark_mode=dark, show_logo=False, show_share_button=False)
+    return server
+
+
+def close(server: viser.ViserServer) -> None:
+    """Stop a server without its message."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        server.stop()
+
+
+class Robot:
+    """
+    A robot in the scene, with its target and a text above it.
+
+    Args:
+        scene: scene of the server.
+        model: links and shapes.
+        number: 0 for the robot in the colours of the model, the others are transparent.
+
+    """
+
+    def __init__(self, scene, model: Model, number: int):
+        tint = _colour(number) if number else None
+        name = f'/robot{number}'
+        self._root = scene.add_frame(name, show_axes=False, visible=False)
+        self._joints, self._arrows, paths = {}, {}, {}
+        for link in model.links.values():
+            above = name if link.joint is None else paths[link.joint.parent]
+            path = paths[link.name] = f'{above}/{link.name}'
+            node = scene.add_frame(path, show_axes=False, wxyz=wxyz(link.turned()), position=(
+                0.0, 0.0, 0.0) if link.joint is None else link.joint.position)
+            if link.moves in JOINT_NAMES:
+                self._joints[link.moves] = (link, node)
+            if link.name in ROTOR_NAMES:
+                self._arrows[link.name] = scene.add_arrows(
+                    f'{path}/thrust', np.zeros((1, 2, 3)), THRUST, shaft_radius=0.008,
+                    head_radius=0.02, head_length=0.04)
+            for k, visual in enumerate(link.visuals):
+                _add(scene, f'{path}/{k}', visual, tint)
+        self._target = scene.add_frame(f'/target{number}', axes_length=TARGET_AXES,
+                                       axes_radius=0.008, origin_radius=0.018, visible=False)
+        self._force = scene.add_arrows(f'/force{number}', np.zeros((1, 2, 3)), FORCE,
+                                       shaft_radius=0.012, head_radius=0.03, head_length=0.06)
+        self._label = scene.add_label(f'{name}/label', '', anchor='bottom-center', position=(
+            0.0, 0.0, LABEL_HEIGHT + LABEL_STEP * number))
+
+    def show(self, moment: Moment | None, text: str = '') -> None:
+        """Draw the robot at one moment, or hide it."""
+        self._root.visible = moment is not None
+        self._target.visible = moment is not None and moment.target is not None
+        if moment is None:
+            return
+        self._root.position, self._root.wxyz = moment.position, wxyz(moment.quaternion)
+        for name, tilt, rotor, thrust in zip(JOINT_NAMES, moment.tilt, ROTOR_NAMES, moment.thrust):
+            if name in self._joints:
+                link, node = self._joints[name]
+                node.wxyz = wxyz(link.turned(tilt))
+            if rotor in self._arrows:
+                self._arrows[rotor].points = _arrow(np.zeros(3), [0.0, 0.0, thrust])
+        if moment.target is not None:
+            self._target.position, self._target.wxyz = moment.target[0], wxyz(moment.target[1])
+        self._force.points = _arrow(moment.position, moment.force)
+        if self._label.text != text:
+            self._label.text = text
+
+
+def _colour(number):
+    return tuple(bytes.fromhex(COLOURS[number][1:]))
+
+
+def _arrow(begin, force):
+    """An arrow (1, 2, 3) of a force (3,) [N]."""
+    return np.array([[begin, begin + np.asarray(force) / NEWTON_PER_METRE]])
+
+
+class Room:
+    """Floor, light, camera and robots."""
+
+    def __init__(self, server: viser.ViserServer, model: Model, robots: int = 1):
+        scene = server.scene
+        # Shadows and reflections would dominate the rendering time without a graphics card.
+        scene.configure_default_lights(cast_shadow=False)
+        scene.configure_environment_map(None)
+        scene.add_light_ambient('/sky', intensity=SKY)
+        scene.add_grid('/floor', FLOOR, FLOOR, cell_size=1.0, section_size=FLOOR,
+                       infinite_grid=False, shadow_opacity=0.0)
+        self._server, self._scene = server, scene
+        self.robots = [Robot(scene, model, number) for number in range(robots)]
+
+    def show(self, moments: Sequence[Moment | None], texts: Sequence[str]) -> None:
+        """Draw all robots at one moment."""
+        for robot, moment, text in zip(self.robots, moments, texts, strict=True):
+            robot.show(moment, text)
+
+    def look_at(self, low: np.ndarray, high: np.ndarray) -> None:
+        """Set the initial camera, to see the region between two corners (3,) [m]."""
+        camera, centre = self._server.initial_camera, (low + high) / 2
+        camera.look_at = centre
+        camera.position = centre + VIEW_FROM * max(
+            SMALLEST_VIEW, float(np.linalg.norm(high - low)))
+
+    def draw_path(self, number: int, positions: np.ndarray) -> None:
+        """Draw the path (N, 3) [m] of a robot."""
+        self._scene.add_line_segments(
+            f'/path{number}', np.stack([positions[:-1], positions[1:]], axis=1),
+            _colour(number), thickness=1.5, thickness_units='screen')
+
+
+def _add(scene, name, visual, tint):
+    """Add a shape of the model."""
+    *colour, opacity = visual.colour
+    look = {'position': visual.position, 'wxyz': wxyz(visual.quaternion),
+            'color': tint or tuple(round(255 * part) for part in colour),
+            'opacity': GHOST_OPACITY * opacity if tint else opacity if opacity < 1 else None}
+    if visual.shape == 'box':
+        scene.add_box(name, dimensions=visual.size, **look)
+    elif visual.shape == 'cylinder':
+        scene.add_cylinder(name, *visual.size, radial_segments=SIDES, **look)
+    elif visual.shape == 'sphere':
+        scene.add_icosphere(name, visual.size[0], subdivisions=2, **look)
+    else:
+        mesh = _mesh(visual.file)
+        scene.add_mesh_simple(name, mesh.vertices, mesh.faces, scale=visual.size,
+                              flat_shading=True, **look)
+
+
+def _mesh(file):
+    """Read a mesh of the model; raises ParameterError if it is missing or broken."""
+    import trimesh  # takes 0.6 s, and not each model has meshes
+    try:
+        return trimesh.load_mesh(file)
+    except Exception as error:      # a missing or broken file raises anything in the library
+        raise ParameterError(f'{file}: not a usable mesh: {error}') from None
