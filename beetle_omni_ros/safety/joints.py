@@ -8,12 +8,16 @@ import numpy as np
 from beetle_omni_ros.robot.allocation import ROTORS
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.response import Responses
-from beetle_omni_ros.safety.watch.parameters import ServoLimits
 
 KEPT = 64               # commands, 0.3 s at 200 Hz
 LONGEST = 0.1           # [s] between two readings; after a longer gap the model is reset
 NO_JUMP = np.zeros(ROTORS)
+ERROR = 0.25            # [rad] beside both models, and the friction of the file
+TIME = 0.12             # [s] until it is a fault
 AT_REST = 0.05          # [rad] by which a jammed joint may move during the decision
+DELAY = 0.025           # [s] command 10 to 15 ms, feedback 5 to 10 ms
+SPREAD = 0.03           # [s] uncertainty of the delay: another 0.3 rad at 10 rad/s
+JUMP = 0.5              # [rad] between two readings, beyond the motion that is possible
 
 
 class JointWatch:
@@ -24,7 +28,6 @@ class JointWatch:
     between them, or within the noise and its friction beside them, follows its commands.
 
     Args:
-        limits: thresholds.
         robot: nominal robot.
 
     Attributes:
@@ -36,13 +39,12 @@ class JointWatch:
 
     """
 
-    def __init__(self, limits: ServoLimits, robot: RobotParameters):
+    def __init__(self, robot: RobotParameters):
         allowed = Responses.of(robot)
-        self._p, self._rate_limit = limits, robot.joints.velocity_limit
+        self._rate_limit = robot.joints.velocity_limit
         self._lags, (low, high) = allowed.servo_lag, allowed.servo_delay
-        self._delays = (max(0.0, limits.delay - limits.spread + low),
-                        limits.delay + limits.spread + high)
-        self._error = limits.error + allowed.friction
+        self._delays = max(0.0, DELAY - SPREAD + low), DELAY + SPREAD + high
+        self._error = ERROR + allowed.friction
         self.reset()
 
     def reset(self) -> None:
@@ -84,7 +86,7 @@ class JointWatch:
             self._change, self.jump = np.zeros(ROTORS), NO_JUMP
             return True
         change = tilt - before
-        furthest = self._rate_limit * dt + self._p.jump
+        furthest = self._rate_limit * dt + JUMP
         if max(map(abs, change.tolist())) > furthest:
             jumped = np.abs(change) > furthest
             self.jump = np.where(jumped, change - self._change, 0.0)
@@ -114,7 +116,7 @@ class JointWatch:
         return True
 
     def _judge(self, tilt, models, dt):
-        p, error = self._p, self._error
+        error = self._error
         each = [reading < min(pair) - error or reading > max(pair) + error
                 for reading, pair in zip(tilt.tolist(), models.T.tolist())]
         if not self._suspects and not any(each):
@@ -125,7 +127,7 @@ class JointWatch:
         self._high = np.where(began, tilt, np.maximum(self._high, tilt))
         self._for = np.where(off, self._for + dt, 0.0)
         self._suspects = bool(off.any())
-        named = self._for >= p.time
+        named = self._for >= TIME
         still = self._high - self._low < AT_REST
         self.jammed, self.astray = named & still, named & ~still
 

@@ -9,7 +9,6 @@ import numpy as np
 from beetle_omni_ros.robot.allocation import ROTORS
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.response import Responses
-from beetle_omni_ros.safety.watch.parameters import RotorLimits
 
 LEARNT = 1.0            # [s] time constant of the learnt factor between speed and thrust
 DELAY = 0.01            # [s] from a command's stamp until it acts
@@ -17,6 +16,17 @@ KEPT = 64               # commands, 0.3 s at 200 Hz
 LONGEST = 0.2           # [s] longest time between two reports of one sequence
 STALLED, SHORTEST = 2.5, 0.05   # [intervals], [s]: a longer pause of the reports is a stall
 SETTLED = 0.3           # [s] after a stall, three time constants of a rotor
+SHARE = 0.5             # [-] missing share of the thrust of a lost rotor
+NOTICED = 0.25          # [-] missing share that confirms a loss by the wrench
+LEAST_THRUST = 1.5      # [N] smallest thrust for a decision: a fifth of the hover thrust
+TIME = 0.06             # [s] until a lost rotor is named: three ESC reports of 50 Hz
+WINDOW = 0.5            # [s] of the regression: five time constants of a rotor
+VARIATION = 1.0         # [N] smallest standard deviation of the commanded thrust: 1 % of speed
+                        # noise is 0.15 N, so the error of the slope is 0.1
+SLOPE = 0.4             # [-] smallest: with 25 ms of unmodelled delay it is 0.8, with another lag
+                        # of 0.2 s about 0.3
+DEAF_TIME = 0.3         # [s] a sudden loss of thrust gives similar values while in the window
+EXCESS = 3.0            # [N] over the command: a lag longer by a third leaves 1 N after a step
 
 
 class SpeedWatch:
@@ -37,7 +47,6 @@ class SpeedWatch:
     seconds the thrusts then differ from the model, and no rotor is suspected.
 
     Args:
-        limits: thresholds.
         robot: nominal robot.
 
     Attributes:
@@ -48,8 +57,8 @@ class SpeedWatch:
 
     """
 
-    def __init__(self, limits: RotorLimits, robot: RobotParameters):
-        self._p, allowed = limits, Responses.of(robot)
+    def __init__(self, robot: RobotParameters):
+        allowed = Responses.of(robot)
         self._responses = [(lag, DELAY + delay)
                            for lag, delay in zip(allowed.rotor_lag, allowed.rotor_delay)]
         self.reset()
@@ -58,16 +67,13 @@ class SpeedWatch:
         """Reset all learnt factors."""
         self._stamp, self._interval, self._settled_at = -inf, inf, -inf
         self._commands: deque = deque(maxlen=KEPT)
-        self._rotors = [Rotor(self._p) for _ in range(ROTORS)]
-        self.lost: int | None = None
-        self.deaf: int | None = None
+        self._rotors = [Rotor() for _ in range(ROTORS)]
         self.thrust = np.full(ROTORS, np.nan)
-        self.slow = np.zeros(ROTORS, dtype=bool)
+        self.forget()
 
-    @property
-    def suspected(self) -> list[int]:
-        """Rotors whose speed at present does not follow their commands."""
-        return [i for i, rotor in enumerate(self._rotors) if rotor.suspected]
+    def suspects(self, rotor: int) -> bool:
+        """Whether the last reports of a rotor do not follow its commands."""
+        return self._rotors[rotor].deaf_for > 0
 
     def on_command(self, stamp: float, thrust: np.ndarray) -> None:
         """Receive the commanded thrusts (4,) [N] of the time ``stamp`` [s]."""
@@ -78,7 +84,8 @@ class SpeedWatch:
         for rotor in self._rotors:
             rotor.forget()
         self.slow = np.zeros(ROTORS, dtype=bool)
-        self.lost = self.deaf = None
+        self.lost: int | None = None
+        self.deaf: int | None = None
 
     def _follow(self, start, end):
         """Thrusts that the commands build up between two times [s]."""
@@ -119,13 +126,13 @@ class SpeedWatch:
         self._follow(before, stamp)
         if stamp < self._settled_at:
             return self.forget()
-        decay = exp(-dt / self._p.slope_window)
+        decay = exp(-dt / WINDOW)
         for rotor, value in zip(rotors, speed.tolist()):
             rotor.update(value * value, dt, decay)
         self.thrust = np.array([rotor.measured for rotor in rotors])
         self.slow = np.array([rotor.slow for rotor in rotors])
         longest = max(rotors, key=attrgetter('slow_for'))
-        self.lost = rotors.index(longest) if longest.slow_for >= self._p.speed_time else None
+        self.lost = rotors.index(longest) if longest.slow_for >= TIME else None
         self.deaf = next((i for i, rotor in enumerate(rotors) if rotor.deaf), None)
 
 
@@ -138,12 +145,11 @@ class Rotor:
         measured: thrust by the speed [N], nan if unknown.
         slow: whether it turns noticeably too slowly at the last report.
         slow_for: time for which it has turned too slowly [s].
-        deaf: whether its speed does not follow its commands.
+        deaf: whether its speed does not follow its commands; deaf_for: time of that [s].
 
     """
 
-    def __init__(self, limits: RotorLimits):
-        self._p = limits
+    def __init__(self):
         self.modelled = [0.0, 0.0]
         self._learnt_for = self._mean_thrust = self._mean_square = 0.0
         self.forget()
@@ -151,7 +157,7 @@ class Rotor:
     def forget(self) -> None:
         """Remove every suspicion."""
         self.measured, self.slow, self.slow_for, self.deaf = nan, False, 0.0, False
-        self._deaf_for = self._more_for = 0.0
+        self.deaf_for = self._more_for = 0.0
         # Moments of modelled (x) and measured (y) thrust, with fading memory.
         self._weight = self._x = self._y = self._xx = self._xy = 0.0
 
@@ -165,45 +171,35 @@ class Rotor:
             decay: factor of the moments in this time.
 
         """
-        p, y, slowest = self._p, nan, self.modelled[1]
+        y, slowest = nan, self.modelled[1]
         if self._learnt_for >= LEARNT:
             y = self._mean_thrust / self._mean_square * square
         # Of the lags between, the one nearest to the measurement; with nan the longest.
         x = min(max(y, min(self.modelled)), max(self.modelled)) if isfinite(y) else slowest
-        judged = isfinite(square) and x > p.least_thrust
-        known = judged and isfinite(y)
-        too_slow = known and y < (1 - p.share) * x
-        self.measured = y if known else nan
-        self.slow = known and y < (1 - p.noticed) * x
-        self.slow_for = self.slow_for + dt if too_slow else 0.0
-        if known:
+        judged = isfinite(square) and x > LEAST_THRUST
+        too_slow = judged and y < (1 - SHARE) * x       # nan is not
+        if judged and isfinite(y):
+            self.measured, self.slow = y, y < (1 - NOTICED) * x
+            self.slow_for = self.slow_for + dt if too_slow else 0.0
             self._regress(x, y, dt, decay)
         else:
-            self._weight = self._x = self._y = self._xx = self._xy = 0.0
-            self.deaf, self._deaf_for, self._more_for = False, 0.0, 0.0
+            self.forget()
         if judged and not too_slow and square > 0:
             gain = max(min(1.0, dt / max(self._learnt_for, dt)), min(1.0, dt / LEARNT))
             self._mean_thrust += gain * (slowest - self._mean_thrust)
             self._mean_square += gain * (square - self._mean_square)
             self._learnt_for += dt
 
-    @property
-    def suspected(self) -> bool:
-        """Whether the last reports do not follow the commands."""
-        return self._deaf_for > 0
-
     def _regress(self, x, y, dt, decay):
         """Whether the measured thrust ``y`` does not follow the modelled thrust ``x``."""
-        p = self._p
         self._weight = self._weight * decay + dt
         self._x, self._y = self._x * decay + dt * x, self._y * decay + dt * y
         self._xx, self._xy = self._xx * decay + dt * (x * x), self._xy * decay + dt * (x * y)
         w = self._weight
         variance = self._xx / w - (self._x / w) ** 2
         covariance = self._xy / w - self._x * self._y / w**2
-        deaf = w > 0.5 * p.slope_window and variance > p.least_variation**2 \
-            and covariance < p.least_slope * variance
-        self._deaf_for = self._deaf_for + dt if deaf else 0.0
-        more = y > (1 + p.share) * x and y - x > p.excess
+        deaf = w > 0.5 * WINDOW and variance > VARIATION**2 and covariance < SLOPE * variance
+        self.deaf_for = self.deaf_for + dt if deaf else 0.0
+        more = y > (1 + SHARE) * x and y - x > EXCESS
         self._more_for = self._more_for + dt if more else 0.0
-        self.deaf = self._deaf_for >= p.deaf_time or self._more_for >= p.speed_time
+        self.deaf = self.deaf_for >= DEAF_TIME or self._more_for >= TIME
