@@ -116,7 +116,7 @@ class FaultWatch:
         if lost is None or not self.health.rotors[lost] or self.health.held[lost] is not None:
             return
         # A rotor that holds its thrust also gives less than commanded, while more is asked.
-        if self._speeds.suspects(lost) and self._speeds.thrust[lost] > LEAST_THRUST:
+        if self._speeds.suspected[lost] and self._speeds.thrust[lost] > LEAST_THRUST:
             self._hold(lost, stamp)
         else:
             self._lose_rotor(lost, stamp, 'the wrench')
@@ -160,8 +160,8 @@ class FaultWatch:
 
         """
         watch = self._joints
-        if not watch.on_joints(stamp, tilt) or not trusted or \
-                watch.well and self.health.stuck == ALL_HEALTHY.stuck:
+        if not watch.on_joints(stamp, tilt) or not trusted or not watch.suspects \
+                and not watch.jump.any() and self.health.stuck == ALL_HEALTHY.stuck:
             return
         for joint in np.flatnonzero(watch.jump).tolist():
             self.name(f'joint{joint + 1}_encoder_jump', stamp, f'the encoder of '
@@ -172,21 +172,10 @@ class FaultWatch:
             stuck = self.health.stuck[joint]
             if stuck is not None and abs(stuck - angle) > MOVED:
                 self._set('stuck', joint, angle)
-            elif stuck is None and (watch.jammed[joint] or watch.astray[joint]):
-                kind, text = ('jammed', 'stands still beside') if watch.jammed[joint] else \
-                    ('astray', 'does not follow')
-                if self.name(f'joint{joint + 1}_{kind}', stamp, f'gimbal{joint + 1} {text} its '
-                             f'command, at {angle:.2f} rad'):
-                    self._set('stuck', joint, angle)
-
-    def advance_joints(self, now: float) -> None:
-        """Continue the servo models to ``now`` [s] without readings."""
-        self._joints.advance(now)
-
-    def silent_joints(self) -> np.ndarray | None:
-        """True tilts (4,) [rad] by the servo model, None before the first reading."""
-        model = self._joints.model
-        return None if model is None else self.health.true(model)
+            elif stuck is None and watch.astray[joint]:
+                self.name(f'joint{joint + 1}_astray', stamp, f'gimbal{joint + 1} does not follow '
+                          f'its command, at {angle:.2f} rad')
+                self._set('stuck', joint, angle)
 
     def on_mocap(self, stamp: float, position: np.ndarray, quaternion: np.ndarray,
                  state: State | None) -> bool:

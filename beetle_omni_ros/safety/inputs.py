@@ -299,14 +299,13 @@ class Inputs:
         return self.mocap.silent if self.backup.running else self.mocap.lost
 
     def seen(self, in_force: Command | None, state: State | None = None) -> State:
-        """A state for the hover controller; angles of silent, working joints are modelled."""
+        """A state for the hover controller; silent joints stand where they were asked to."""
         state = self.known if state is None else state
         tilt, velocity = self.tilt, self.tilt_velocity
         # Joints of a bridge that lost them keep their last angles.
         if self.joints.silent and in_force is not None and not self.bridges.get(
                 'joint', '').startswith('lost:'):
-            model = self.watch.silent_joints()
-            tilt, velocity = in_force.tilt if model is None else model, np.zeros(4)
+            tilt, velocity = in_force.tilt, np.zeros(4)
         return State(state.stamp, state.position, state.velocity, state.quaternion,
                      state.angular_velocity, tilt, velocity, self.tilt_stamp, in_force)
 

@@ -14,7 +14,6 @@ LONGEST = 0.1           # [s] between two readings; after a longer gap the model
 NO_JUMP = np.zeros(ROTORS)
 ERROR = 0.25            # [rad] beside both models, and the friction of the file
 TIME = 0.12             # [s] until it is a fault
-AT_REST = 0.05          # [rad] by which a jammed joint may move during the decision
 DELAY = 0.025           # [s] command 10 to 15 ms, feedback 5 to 10 ms
 SPREAD = 0.03           # [s] uncertainty of the delay: another 0.3 rad at 10 rad/s
 JUMP = 0.5              # [rad] between two readings, beyond the motion that is possible
@@ -31,11 +30,11 @@ class JointWatch:
         robot: nominal robot.
 
     Attributes:
-        jammed: joints (4,) bool that stand still away from their command.
-        astray: joints (4,) bool whose motion differs from the command.
+        astray: joints (4,) bool that do not follow their command.
         jump: (4,) [rad] jump of the last reading relative to the motion before it, if it is larger
             than a joint can turn, else 0.
-        stamp: time of the last reading, or of the models without readings [s].
+        stamp: time of the last reading [s].
+        suspects: whether a joint differed from its model at the last reading.
 
     """
 
@@ -53,21 +52,9 @@ class JointWatch:
         self.stamp, self._change = -np.inf, np.zeros(ROTORS)
         self._models: np.ndarray | None = None      # (2, 4) fastest and slowest [rad]
         self._for = np.zeros(ROTORS)
-        self._low = self._high = np.zeros(ROTORS)
-        self.jammed = np.zeros(ROTORS, dtype=bool)
         self.astray = np.zeros(ROTORS, dtype=bool)
         self.jump = NO_JUMP
-        self._suspects = False      # whether a joint differed from its model at the last reading
-
-    @property
-    def well(self) -> bool:
-        """Whether no joint jumped or differed from its model at the last reading."""
-        return self.jump is NO_JUMP and not self._suspects
-
-    @property
-    def model(self) -> np.ndarray | None:
-        """Readings (4,) midway between the models [rad], None before the first."""
-        return None if self._models is None else 0.5 * (self._models[0] + self._models[1])
+        self.suspects = False
 
     def on_command(self, stamp: float, tilt: np.ndarray) -> None:
         """Receive the joint targets (4,) [rad] of the time ``stamp`` [s]."""
@@ -97,12 +84,6 @@ class JointWatch:
         self._judge(tilt, self._models, dt)
         return True
 
-    def advance(self, stamp: float) -> None:
-        """Continue with the model to ``stamp`` [s], without readings."""
-        dt = stamp - self.stamp
-        if dt > 0 and self._follow(stamp, min(dt, LONGEST)):
-            self.stamp = stamp
-
     def _follow(self, stamp, dt):
         """Move both models by ``dt`` [s] to ``stamp``; False if they or commands are missing."""
         asked = [self._asked(stamp - delay) for delay in self._delays]
@@ -119,17 +100,12 @@ class JointWatch:
         error = self._error
         each = [reading < min(pair) - error or reading > max(pair) + error
                 for reading, pair in zip(tilt.tolist(), models.T.tolist())]
-        if not self._suspects and not any(each):
+        if not self.suspects and not any(each):
             return
         off = np.array(each)
-        began = off & (self._for == 0)
-        self._low = np.where(began, tilt, np.minimum(self._low, tilt))
-        self._high = np.where(began, tilt, np.maximum(self._high, tilt))
         self._for = np.where(off, self._for + dt, 0.0)
-        self._suspects = bool(off.any())
-        named = self._for >= TIME
-        still = self._high - self._low < AT_REST
-        self.jammed, self.astray = named & still, named & ~still
+        self.suspects = bool(off.any())
+        self.astray = self._for >= TIME
 
     def _asked(self, time):
         """The newest command given at ``time`` or before, or None."""

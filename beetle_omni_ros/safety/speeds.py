@@ -1,12 +1,11 @@
 """Detection of rotors whose ESC speed differs from the commanded thrust."""
 
 from collections import deque
-from math import exp, expm1, inf, isfinite, nan
-from operator import attrgetter
+from math import exp, expm1, inf
 
 import numpy as np
 
-from beetle_omni_ros.robot.allocation import ROTORS
+from beetle_omni_ros.robot.allocation import clipped, ROTORS
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.response import Responses
 
@@ -54,6 +53,7 @@ class SpeedWatch:
         deaf: the rotor (0 to 3) whose speed does not follow its commands, or None.
         thrust: (4,) computed from the speeds [N], nan where unknown.
         slow: (4,) bool, rotors that turn noticeably too slowly at the last report.
+        suspected: (4,) bool, rotors whose last reports do not follow their commands.
 
     """
 
@@ -67,39 +67,23 @@ class SpeedWatch:
         """Reset all learnt factors."""
         self._stamp, self._interval, self._settled_at = -inf, inf, -inf
         self._commands: deque = deque(maxlen=KEPT)
-        self._rotors = [Rotor() for _ in range(ROTORS)]
+        self._modelled = np.zeros((2, ROTORS))      # with the shortest and with the longest lag
+        self._learnt_for, self._mean_thrust, self._mean_square = np.zeros((3, ROTORS))
         self.thrust = np.full(ROTORS, np.nan)
         self.forget()
 
-    def suspects(self, rotor: int) -> bool:
-        """Whether the last reports of a rotor do not follow its commands."""
-        return self._rotors[rotor].deaf_for > 0
-
-    def on_command(self, stamp: float, thrust: np.ndarray) -> None:
-        """Receive the commanded thrusts (4,) [N] of the time ``stamp`` [s]."""
-        self._commands.append((stamp, thrust.tolist()))
-
     def forget(self) -> None:
         """Suspect no rotor."""
-        for rotor in self._rotors:
-            rotor.forget()
-        self.slow = np.zeros(ROTORS, dtype=bool)
+        self.slow = self.suspected = np.zeros(ROTORS, dtype=bool)
+        self._slow_for, self._deaf_for, self._more_for = np.zeros((3, ROTORS))
+        # Weight, x, y, x^2 and x y of modelled (x) and measured (y) thrust, with fading memory.
+        self._moments = np.zeros((5, ROTORS))
         self.lost: int | None = None
         self.deaf: int | None = None
 
-    def _follow(self, start, end):
-        """Thrusts that the commands build up between two times [s]."""
-        commands = self._commands
-        while len(commands) > 1 and commands[1][0] + self._responses[-1][1] <= start:
-            commands.popleft()
-        for which, (lag, delay) in enumerate(self._responses):
-            for k, (stamp, asked) in enumerate(commands):
-                until = commands[k + 1][0] + delay if k + 1 < len(commands) else end
-                span = min(until, end) - max(stamp + delay, start)
-                if span > 0:
-                    gain = -expm1(-span / lag)
-                    for rotor, thrust in zip(self._rotors, asked):
-                        rotor.modelled[which] += gain * (thrust - rotor.modelled[which])
+    def on_command(self, stamp: float, thrust: np.ndarray) -> None:
+        """Receive the commanded thrusts (4,) [N] of the time ``stamp`` [s]."""
+        self._commands.append((stamp, thrust))
 
     def on_speeds(self, stamp: float, speed: np.ndarray) -> None:
         """
@@ -117,89 +101,58 @@ class SpeedWatch:
         if dt > max(SHORTEST, STALLED * self._interval):
             self._settled_at = stamp + SETTLED
         self._interval = dt
-        rotors = self._rotors
         if dt > LONGEST:
             if self._commands:
-                for rotor, thrust in zip(rotors, self._commands[-1][1]):
-                    rotor.modelled = [thrust, thrust]
+                self._modelled[:] = self._commands[-1][1]
             return self.forget()
         self._follow(before, stamp)
         if stamp < self._settled_at:
             return self.forget()
-        decay = exp(-dt / WINDOW)
-        for rotor, value in zip(rotors, speed.tolist()):
-            rotor.update(value * value, dt, decay)
-        self.thrust = np.array([rotor.measured for rotor in rotors])
-        self.slow = np.array([rotor.slow for rotor in rotors])
-        longest = max(rotors, key=attrgetter('slow_for'))
-        self.lost = rotors.index(longest) if longest.slow_for >= TIME else None
-        self.deaf = next((i for i, rotor in enumerate(rotors) if rotor.deaf), None)
+        self._compare(speed * speed, dt)
 
+    def _follow(self, start, end):
+        """Thrusts that the commands build up between two times [s]."""
+        commands = self._commands
+        while len(commands) > 1 and commands[1][0] + self._responses[-1][1] <= start:
+            commands.popleft()
+        for modelled, (lag, delay) in zip(self._modelled, self._responses):
+            for k, (stamp, asked) in enumerate(commands):
+                until = commands[k + 1][0] + delay if k + 1 < len(commands) else end
+                span = min(until, end) - max(stamp + delay, start)
+                if span > 0:
+                    modelled -= expm1(-span / lag) * (asked - modelled)
 
-class Rotor:
-    """
-    One rotor of :class:`SpeedWatch`; plain floats, because numpy is slower for single numbers.
-
-    Attributes:
-        modelled: thrust by the commands with the shortest and with the longest lag [N].
-        measured: thrust by the speed [N], nan if unknown.
-        slow: whether it turns noticeably too slowly at the last report.
-        slow_for: time for which it has turned too slowly [s].
-        deaf: whether its speed does not follow its commands; deaf_for: time of that [s].
-
-    """
-
-    def __init__(self):
-        self.modelled = [0.0, 0.0]
-        self._learnt_for = self._mean_thrust = self._mean_square = 0.0
-        self.forget()
-
-    def forget(self) -> None:
-        """Remove every suspicion."""
-        self.measured, self.slow, self.slow_for, self.deaf = nan, False, 0.0, False
-        self.deaf_for = self._more_for = 0.0
-        # Moments of modelled (x) and measured (y) thrust, with fading memory.
-        self._weight = self._x = self._y = self._xx = self._xy = 0.0
-
-    def update(self, square: float, dt: float, decay: float) -> None:
-        """
-        Process one report.
-
-        Args:
-            square: squared speed [rad^2/s^2], nan if unknown.
-            dt: time since the report before [s].
-            decay: factor of the moments in this time.
-
-        """
-        y, slowest = nan, self.modelled[1]
-        if self._learnt_for >= LEARNT:
-            y = self._mean_thrust / self._mean_square * square
+    def _compare(self, square, dt):
+        """Judge squared speeds (4,) [rad^2/s^2], nan where unknown; nan is never suspect."""
+        modelled, slowest = self._modelled, self._modelled[1]
+        learnt = self._learnt_for >= LEARNT
+        y = np.where(learnt, self._mean_thrust / np.where(learnt, self._mean_square, 1.0) * square,
+                     np.nan)
         # Of the lags between, the one nearest to the measurement; with nan the longest.
-        x = min(max(y, min(self.modelled)), max(self.modelled)) if isfinite(y) else slowest
-        judged = isfinite(square) and x > LEAST_THRUST
-        too_slow = judged and y < (1 - SHARE) * x       # nan is not
-        if judged and isfinite(y):
-            self.measured, self.slow = y, y < (1 - NOTICED) * x
-            self.slow_for = self.slow_for + dt if too_slow else 0.0
-            self._regress(x, y, dt, decay)
-        else:
-            self.forget()
-        if judged and not too_slow and square > 0:
-            gain = max(min(1.0, dt / max(self._learnt_for, dt)), min(1.0, dt / LEARNT))
-            self._mean_thrust += gain * (slowest - self._mean_thrust)
-            self._mean_square += gain * (square - self._mean_square)
-            self._learnt_for += dt
-
-    def _regress(self, x, y, dt, decay):
-        """Whether the measured thrust ``y`` does not follow the modelled thrust ``x``."""
-        self._weight = self._weight * decay + dt
-        self._x, self._y = self._x * decay + dt * x, self._y * decay + dt * y
-        self._xx, self._xy = self._xx * decay + dt * (x * x), self._xy * decay + dt * (x * y)
-        w = self._weight
-        variance = self._xx / w - (self._x / w) ** 2
-        covariance = self._xy / w - self._x * self._y / w**2
-        deaf = w > 0.5 * WINDOW and variance > VARIATION**2 and covariance < SLOPE * variance
-        self.deaf_for = self.deaf_for + dt if deaf else 0.0
-        more = y > (1 + SHARE) * x and y - x > EXCESS
-        self._more_for = self._more_for + dt if more else 0.0
-        self.deaf = self.deaf_for >= DEAF_TIME or self._more_for >= TIME
+        x = np.where(np.isfinite(y), clipped(y, modelled.min(axis=0), modelled.max(axis=0)),
+                     slowest)
+        judged = np.isfinite(square) & (x > LEAST_THRUST)
+        known = judged & learnt
+        too_slow = known & (y < (1 - SHARE) * x)
+        self.thrust = np.where(known, y, np.nan)
+        self.slow = known & (y < (1 - NOTICED) * x)
+        good = judged & ~too_slow & (square > 0)
+        gain = np.where(good, dt / np.minimum(np.maximum(self._learnt_for, dt), LEARNT), 0.0)
+        self._mean_thrust += gain * (slowest - self._mean_thrust)
+        self._mean_square += gain * (np.nan_to_num(square) - self._mean_square)
+        self._learnt_for += np.where(good, dt, 0.0)
+        y = np.nan_to_num(y)
+        self._moments = np.where(known, self._moments * exp(-dt / WINDOW) + dt * np.array(
+            [np.ones(ROTORS), x, y, x * x, x * y]), 0.0)
+        weight = self._moments[0]
+        mean_x, mean_y, xx, xy = self._moments[1:] / np.maximum(weight, dt)
+        variance, covariance = xx - mean_x**2, xy - mean_x * mean_y
+        self.suspected = (weight > 0.5 * WINDOW) & (variance > VARIATION**2) \
+            & (covariance < SLOPE * variance)
+        more = known & (y > (1 + SHARE) * x) & (y - x > EXCESS)
+        self._slow_for, self._deaf_for, self._more_for = np.where(
+            [too_slow, self.suspected, more],
+            np.array([self._slow_for, self._deaf_for, self._more_for]) + dt, 0.0)
+        self.lost = int(self._slow_for.argmax()) if self._slow_for.max() >= TIME else None
+        deaf = (self._deaf_for >= DEAF_TIME) | (self._more_for >= TIME)
+        self.deaf = int(deaf.argmax()) if deaf.any() else None

@@ -20,13 +20,14 @@ from beetle_omni_ros.safety.inputs import ARM_TILT, Inputs
 from beetle_omni_ros.safety.landing import Landing, SupportGauge, Takeoff
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.way import inclination
+from beetle_omni_ros.safety.wrench import NEAR_GROUND
 
 DISARMED, TAKEOFF, FLYING = 'disarmed', 'takeoff', 'flying'
 FALLBACK, LANDING, STOPPED = 'fallback', 'landing', 'emergency_stop'
 IN_FLIGHT = (TAKEOFF, FLYING, FALLBACK, LANDING)
 AGE_LIMIT = 0.1         # [s] no older command is sent; the actuators have the same limit
 STOP_TIME = 0.3         # [s] zero thrust is sent for this time, then nothing
-FALLBACK_TIME = 0.1     # [s] at least: after a pause until every source has sent a message again
+RESUMING = 0.1          # [s] after a pause until every source has sent a message again
 RECOVERY_TIME = 1.0     # [s] in which a landing stops a tumble of 15 rad/s
 FENCE_MARGIN = 2.0      # [m] farther outside the fence a landing is a flyaway: motors off
 LANDING_LIMIT = 90.0    # [s] from the margin above the fence it takes 74 s, and levelling and
@@ -71,6 +72,7 @@ class Supervisor(Inputs):
         self._checked: Command | None = None    # the last command that was checked
         self._acted_on = ALL_HEALTHY    # health to which landing and hover are adapted
         self._before: float | None = None   # time of the update before [s]
+        self._resumed = -np.inf     # time of the last pause [s]
 
     # Requests ---------------------------------------------------------------------------------
 
@@ -142,8 +144,6 @@ class Supervisor(Inputs):
         """
         dt = self._tick(now)
         self._in_state += dt
-        if self.joints.silent:
-            self.watch.advance_joints(now)
         self._look_for_faults(now)
         if self.state in IN_FLIGHT:
             self._react(now)
@@ -191,6 +191,8 @@ class Supervisor(Inputs):
             return
         if before is not None and now - before > AGE_LIMIT:
             self._resume(now, now - before)
+        elif now - self._resumed < RESUMING:
+            self._look_down(now)
         if self.watch.contact.reason:
             self._crash(now, self.watch.contact.reason)
         elif self.health is not self._acted_on:
@@ -200,10 +202,17 @@ class Supervisor(Inputs):
         """React to a pause of this process, in which the actuators have stopped."""
         self.watch.name('supervisor_paused', now)
         self.watch.restart(now)
+        self._resumed = now
         self._say(ERROR, f'supervisor_node was not scheduled for {1000 * paused:.0f} ms: the '
                          'actuators had stopped')
         if self.state == FLYING:
             self._fall_back(now, ERROR, 'fallback to hover after the pause')
+
+    def _look_down(self, now):
+        """Whether the robot lies on the floor; messages queued during the pause are older."""
+        poses = self.backup.poses       # the estimate may be wrong after a fall, MoCap is not
+        if not self.mocap.silent and poses[-1][1][2] - self.floor < NEAR_GROUND:
+            self._crash(now, 'on the floor after the pause')
 
     def _crash(self, now, why):
         """Motors off after a crash; a soft and upright landing is no crash."""
@@ -294,7 +303,7 @@ class Supervisor(Inputs):
         A rotor that ignores its thrust command is turned so that it presses on the floor.
         """
         self.source = 'none'
-        if self._in_state >= STOP_TIME or self._in_force is None:
+        if self._in_state > STOP_TIME + 1e-9 or self._in_force is None:
             return None
         tilt = np.array([own if held is None else np.copysign(np.pi, own) for own, held in zip(
             self._in_force.tilt, self.health.held)])
@@ -331,7 +340,7 @@ class Supervisor(Inputs):
         return self._handover.limit(stream.accepted, self._in_force)
 
     def _hold(self, now, dt):
-        if self.streams[self.active].good and not self.lost and self._in_state >= FALLBACK_TIME:
+        if self.streams[self.active].good and not self.lost and self._in_state >= RESUMING:
             self._enter(FLYING, INFO, f'{self.active}_node good again: it flies')
             return self._fly(now, dt)
         self.source = 'hover'

@@ -6,13 +6,21 @@ import pytest
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.safety.levelling import LevellingParameters, plan, Way
-from beetle_omni_ros.safety.ramp import inclination
+from beetle_omni_ros.safety.way import (
+    climb,
+    inclination,
+    MARGIN,
+    plan,
+    Ramp,
+    Way,
+)
 
-ALLOCATOR = Allocator(RobotParameters.load())
-P = LevellingParameters()
+ROBOT = RobotParameters.load()
+ALLOCATOR = Allocator(ROBOT)
+RATE = 0.8      # [rad/s] of the body
 RANDOM = np.random.default_rng(5)
 ATTITUDES = [rotations.normalized(q) for q in RANDOM.normal(size=(20, 4))]
+LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 UPSIDE_DOWN = [rotations.from_rpy(np.pi, 0.0, yaw) for yaw in (0.0, 0.4, 1.6, 3.0)]
 
 
@@ -36,8 +44,8 @@ def followed(way, tilt):
 
 @pytest.mark.parametrize('attitude', ATTITUDES + UPSIDE_DOWN)
 def test_ends_level_and_no_loaded_joint_turns_over(attitude):
-    way = plan(attitude, held(attitude), ALLOCATOR, P)
-    assert inclination(way.goal) < 1e-6
+    way = plan(attitude, held(attitude), ALLOCATOR, RATE)
+    assert inclination(way.at(way.duration)[0]) < 1e-6
     np.testing.assert_allclose(np.abs(way.at(0.0)[0] @ attitude), 1, atol=1e-9)
     tilts, jumps = followed(way, held(attitude))
     np.testing.assert_allclose(tilts[-1], 0, atol=1e-3)
@@ -47,7 +55,7 @@ def test_ends_level_and_no_loaded_joint_turns_over(attitude):
 @pytest.mark.parametrize('signs', [(1, 1, -1, -1), (1, -1, -1, 1), (-1, -1, 1, 1), (-1, 1, 1, -1)])
 def test_from_an_inverted_attitude_the_joint_windings_choose_the_side(signs):
     tilt = np.pi * np.array(signs)
-    way = plan(UPSIDE_DOWN[0], tilt, ALLOCATOR, P)
+    way = plan(UPSIDE_DOWN[0], tilt, ALLOCATOR, RATE)
     tilts, jumps = followed(way, tilt)
     np.testing.assert_allclose(tilts[-1], 0, atol=1e-3)
     assert jumps.max() < 1.0
@@ -58,7 +66,7 @@ def test_from_an_inverted_attitude_the_joint_windings_choose_the_side(signs):
 def test_an_adversely_wound_joint_unwinds_while_its_arm_is_vertical(attitude, joint):
     tilt = held(attitude)
     tilt[joint] -= 2 * np.pi * np.sign(tilt[joint])
-    way = plan(attitude, tilt, ALLOCATOR, P)
+    way = plan(attitude, tilt, ALLOCATOR, RATE)
     tilts, jumps = followed(way, tilt)
     np.testing.assert_allclose(tilts[-1], 0, atol=1e-3)
     assert jumps.max() < 1.5        # of 7.5 N
@@ -66,30 +74,23 @@ def test_an_adversely_wound_joint_unwinds_while_its_arm_is_vertical(attitude, jo
 
 def test_levelling_respects_the_rate_limits_of_body_and_joints():
     for attitude in ATTITUDES:
-        way = plan(attitude, held(attitude), ALLOCATOR, P)
+        way = plan(attitude, held(attitude), ALLOCATOR, RATE)
         times = np.linspace(0, way.duration, 100)[:-1]
-        assert max(np.linalg.norm(way.at(t)[1]) for t in times) < P.rate + 1e-6
+        assert max(np.linalg.norm(way.at(t)[1]) for t in times) < RATE + 1e-6
 
 
 def test_the_rate_is_the_derivative_of_the_attitude():
-    way, h = plan(ATTITUDES[0], held(ATTITUDES[0]), ALLOCATOR, P), 1e-6
+    way, h = plan(ATTITUDES[0], held(ATTITUDES[0]), ALLOCATOR, RATE), 1e-6
     for t in np.linspace(0.01, way.duration - 0.01, 37):
         turn = rotations.log(rotations.multiply(rotations.conjugate(way.at(t - h)[0]),
                                                 way.at(t + h)[0]))
         np.testing.assert_allclose(turn / (2 * h), way.at(t)[1], atol=2e-2)
 
 
-def test_a_direct_route_is_the_shortest_rotation():
-    goal = rotations.from_rpy(0, 0, 0.3)
-    way = Way.straight(ATTITUDES[1], goal, 0.5)
-    assert way.duration == pytest.approx(rotations.geodesic_angle(goal, ATTITUDES[1]) / 0.5)
-    assert Way.straight(goal, goal, 0.5).duration == 0.0
-
-
 def test_the_attitude_is_held_while_a_joint_waits_at_the_start():
     tilt = held(ATTITUDES[0])
     tilt[0] -= 0.8
-    way = plan(ATTITUDES[0], tilt, ALLOCATOR, P)
+    way = plan(ATTITUDES[0], tilt, ALLOCATOR, RATE)
     attitude, rate = way.at(0.01)
     np.testing.assert_allclose(np.abs(attitude @ ATTITUDES[0]), 1, atol=1e-9)
     np.testing.assert_allclose(rate, 0)
@@ -101,12 +102,12 @@ def test_two_opposite_joints_at_their_stops_turn_back_without_loss_of_lift():
         attitude = rotations.normalized(attitude)
         tilt = held(attitude)
         other = tilt - 2 * np.pi * np.sign(tilt)
-        at_stop = (np.abs(other) < limit) & (np.abs(other) > limit - P.margin)
+        at_stop = (np.abs(other) < limit) & (np.abs(other) > limit - MARGIN)
         if at_stop.sum() != 2 or not (at_stop[:2] & at_stop[2:]).any():
             continue
         tried += 1
         tilt = np.where(at_stop, other, tilt)
-        way = plan(attitude, tilt, ALLOCATOR, P)
+        way = plan(attitude, tilt, ALLOCATOR, RATE)
         tilts, jumps = followed(way, tilt)
         assert way.lost < 0.1 and jumps.max() < 1.0
         np.testing.assert_allclose(tilts[-1], 0, atol=1e-3)
@@ -117,4 +118,32 @@ def test_a_path_that_stays_near_a_stop_counts_as_a_turnover():
     attitude = np.radians([-147.0, 2.0, -112.0])    # no path leads joint 2 away from its stop
     attitude, tilt = rotations.from_rpy(*attitude), np.array([-3.90, 3.95, 3.83, 2.40])
     np.testing.assert_allclose(ALLOCATOR.hover(attitude, tilt).tilt, tilt, atol=0.03)
-    assert plan(attitude, tilt, ALLOCATOR, P).lost > 0.3
+    assert plan(attitude, tilt, ALLOCATOR, RATE).lost > 0.3
+
+
+KNOTS = [climb(0.8, 0.4, 0.5), climb(0.1, 0.4, 0.5),
+         [(0.0, 0.0), (0.5, 0.0), (0.7, -1.0), (1.7, -1.0), (2.0, -0.3)]]
+
+
+@pytest.mark.parametrize('knots', KNOTS)
+def test_velocities_of_a_ramp_are_the_derivatives_of_its_pose(knots):
+    way, h = Way.straight(ATTITUDES[2], UPSIDE_DOWN[1], 0.8), 1e-5
+    ramp = Ramp(10.0, np.array([1.0, 2.0, 3.0]), way, knots)
+    for time in np.linspace(10.03, 16.03, 61):
+        before, now, after = (ramp.at(t) for t in (time - h, time, time + h))
+        np.testing.assert_allclose((after.position - before.position) / (2 * h), now.velocity,
+                                   atol=1e-4)
+        turn = rotations.log(rotations.multiply(rotations.conjugate(before.quaternion),
+                                                after.quaternion))
+        if abs(time - 10 - way.duration) > 2 * h:
+            np.testing.assert_allclose(turn / (2 * h), now.angular_velocity, atol=1e-4)
+
+
+@pytest.mark.parametrize('height', [0.1, 0.8, 3.0])
+def test_a_climb_ends_at_rest_at_its_height_within_its_limits(height):
+    ramp = Ramp(0.0, np.zeros(3), Way.straight(LEVEL, LEVEL, 1.0), climb(height, 0.4, 0.5))
+    end = ramp.at(ramp.duration)
+    assert end.position[2] == pytest.approx(height) and end.velocity[2] == 0.0
+    speeds = np.array([ramp.at(t).velocity[2] for t in np.linspace(0, ramp.duration, 500)])
+    assert speeds.max() <= 0.4 + 1e-9
+    assert np.abs(np.diff(speeds)).max() <= 0.5 * ramp.duration / 499 + 1e-9

@@ -1,0 +1,249 @@
+"""Every reason for the refusal of a command, accepted commands, and the handover."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from vehicle_rig import flown, TICK
+
+from beetle_omni_ros.control.base import Command
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.safety import commands
+from beetle_omni_ros.safety.commands import CommandStream, Handover, within_limits
+from beetle_omni_ros.safety.parameters import CommandLimits, SupervisorParameters
+
+ROBOT = RobotParameters.load()
+LIMITS = CommandLimits()
+NOW = 50.0
+
+
+def command(stamp=NOW, tilt=(0.1, 0.2, 0.3, 0.4), thrust=(7.0, 7.5, 8.0, 8.5)):
+    return Command(stamp, np.array(tilt), np.array(thrust))
+
+
+def noisy(stamp, *numbers):
+    """Commands with noise, like those of a controller that uses measurements."""
+    given = command(stamp, *numbers)
+    return Command(stamp, given.tilt + 1e-9 * np.sin(1e3 * stamp), given.thrust)
+
+
+def stream():
+    return CommandStream(LIMITS, ROBOT)
+
+
+@pytest.mark.parametrize('bad, reason', [
+    (command(tilt=[0, np.nan, 0, 0]), commands.NOT_FINITE),
+    (command(thrust=[7, 7, np.inf, 7]), commands.NOT_FINITE),
+    (command(stamp=np.nan), commands.NOT_FINITE),
+    (command(stamp=NOW - commands.STALE_AFTER - 0.001), commands.STALE),
+    (command(stamp=NOW + commands.AHEAD + 0.001), commands.FUTURE),
+    (command(thrust=[7, 7, 7, 760.0]), commands.THRUST),
+    (command(thrust=[7, -8.0, 7, 7]), commands.THRUST),
+    (command(tilt=[0, 57.3, 0, 0]), commands.TILT)])
+def test_bad_command_is_refused_with_its_reason_and_counted(bad, reason):
+    checked = stream()
+    assert checked.offer(bad, NOW) == reason
+    assert checked.refused == {reason: 1}
+    assert checked.accepted is None and checked.complaint.endswith(f'last refused: {reason}')
+
+
+def test_repeated_and_older_stamps_are_refused():
+    checked = stream()
+    assert checked.offer(command(), NOW) == ''
+    assert checked.offer(command(), NOW) == commands.REPEATED
+    assert checked.offer(command(stamp=NOW - 0.01), NOW) == commands.REPEATED
+    assert checked.offer(command(stamp=NOW + 0.01), NOW + 0.01) == ''
+
+
+def test_a_small_excess_is_clipped_and_counted():
+    checked, top = stream(), ROBOT.rotors.thrust_max
+    given = command(tilt=[0.1, 0.2, 0.3, 4.5], thrust=[7.0, -3.0, 7.0, top + 3.0])
+    assert checked.offer(given, NOW) == '' and checked.clipped == 1
+    assert checked.accepted.thrust.tolist() == [7.0, 0.0, 7.0, top]
+    assert checked.accepted.tilt[3] == ROBOT.joints.position_limit
+    assert given.tilt[3] == 4.5     # a copy
+
+
+def test_a_single_spike_is_refused_and_a_real_step_loses_one_command():
+    checked, far = stream(), (0.1 + commands.TILT_STEP + 0.1, 0.2, 0.3, 0.4)
+    checked.offer(command(), NOW)
+    assert checked.offer(command(NOW + 0.01, far), NOW + 0.01) == commands.JUMP
+    assert checked.offer(command(NOW + 0.02, far), NOW + 0.02) == ''
+    assert checked.offer(command(NOW + 0.03, far, (0, 0, 0, 0)), NOW + 0.03) == ''
+    assert checked.offer(command(NOW + 0.04, far, (16, 16, 16, 16)), NOW + 0.04) == commands.JUMP
+
+
+def test_a_step_to_a_new_target_keeps_the_controller_selectable():
+    checked, near, far = stream(), command(), (3.0, 0.2, 0.3, 0.4)
+    for k in range(200):
+        checked.tick(0.01)
+        now = NOW + 0.01 * k
+        checked.offer(noisy(now, near.tilt if k < 100 else far), now)
+        assert checked.good == (k >= 50)
+    assert checked.refused == {commands.JUMP: 1}
+
+
+def test_a_stream_that_always_jumps_is_silent_and_not_good():
+    checked, now = stream(), NOW
+    for k in range(100):
+        checked.tick(0.01)
+        now += 0.01
+        checked.offer(command(now, (3.0 * (-1) ** k, 0, 0, 0)), now)
+    assert checked.silence.silent and not checked.good
+
+
+def test_a_stream_of_repeated_numbers_is_refused_until_they_change():
+    checked = stream()
+    reasons = [checked.offer(command(NOW + 0.01 * k), NOW + 0.01 * k) for k in range(20)]
+    assert reasons[:commands.SAME] == [''] * commands.SAME
+    assert set(reasons[commands.SAME + 1:]) == {commands.FROZEN}
+    assert checked.offer(noisy(NOW + 0.2), NOW + 0.2) == ''
+
+
+def test_good_means_half_a_second_without_gap_or_refusal():
+    checked = stream()
+    assert not checked.good and 'silent since the start' in checked.complaint
+
+    def run(duration, spoil=False):
+        nonlocal now
+        for _ in range(round(duration / 0.01)):
+            now += 0.01
+            checked.tick(0.01)
+            checked.offer(command(now, thrust=(np.nan,) * 4) if spoil else noisy(now), now)
+
+    now = NOW
+    run(0.4)
+    assert not checked.good and 'good for only' in checked.complaint
+    run(0.2)
+    assert checked.good
+    run(0.01, spoil=True)
+    assert not checked.good
+    run(0.6)
+    assert checked.good
+    checked.tick(0.01)
+    checked.tick(LIMITS.timeout)
+    assert not checked.good and 'silent for' in checked.complaint
+
+
+def test_clock_set_back_does_not_block_a_stream():
+    checked = stream()
+    checked.offer(command(), NOW)
+    checked.forget()
+    assert checked.offer(command(NOW - 5), NOW - 5) == ''
+
+
+def test_the_final_check_clips_to_limits_and_refuses_non_finite_values():
+    out = within_limits(command(tilt=[9, -9, 0, 0], thrust=[-1, 99, 1, 1]), ROBOT)
+    assert np.abs(out.tilt).max() == ROBOT.joints.position_limit
+    assert out.thrust.min() == 0 and out.thrust.max() == ROBOT.rotors.thrust_max
+    assert within_limits(command(tilt=[np.nan, 0, 0, 0]), ROBOT) is None
+
+
+def test_the_shipped_file_contains_every_parameter_at_its_default():
+    from beetle_omni_ros.robot import schema
+    from beetle_omni_ros.robot.resources import share_path
+    leaves = {name for name, *_ in schema.flatten(SupervisorParameters())}
+
+    def names(mapping, prefix=''):
+        for key, value in mapping.items():
+            yield from names(value, f'{prefix}{key}.') if isinstance(value, dict) \
+                else (f'{prefix}{key}',)
+
+    assert set(names(schema.load_yaml(share_path('params/supervisor.yaml')))) == leaves
+    assert SupervisorParameters.load() == SupervisorParameters()
+
+
+def all_four(stamp, tilt, thrust):
+    return Command(stamp, np.full(4, float(tilt)), np.full(4, float(thrust)))
+
+
+def changes(handover, asked, start):
+    """Largest changes of tilt and thrust over a stream of (stamp, tilt, thrust), last command."""
+    in_force, changed = start, []
+    for requested in asked:
+        given = handover.limit(all_four(*requested), in_force)
+        changed.append((np.abs(given.tilt - in_force.tilt).max(),
+                        np.abs(given.thrust - in_force.thrust).max()))
+        in_force = given
+    return np.array(changed), in_force
+
+
+def test_commands_pass_unchanged_until_a_handover():
+    asked = all_four(1.01, 3.0, 20.0)
+    assert Handover().limit(asked, all_four(1.0, 0.0, 0.0)) is asked
+    handover = Handover()
+    handover.left = commands.HANDOVER_TIME
+    assert handover.limit(asked, None) is asked
+
+
+@pytest.mark.parametrize('period', [0.005, 0.01])
+def test_the_change_is_limited_and_the_requested_command_is_reached(period):
+    handover = Handover()
+    handover.left = commands.HANDOVER_TIME
+    stamps = 1.0 + period * np.arange(1, 61)
+    changed, last = changes(handover, [(t, 0.5, 2.0) for t in stamps], all_four(1.0, -0.5, 14.0))
+    assert changed[:, 0].max() <= commands.TILT_RATE * period * (1 + 1e-9)
+    assert changed[:, 1].max() <= commands.THRUST_RATE * period * (1 + 1e-9)
+    assert np.allclose(last.tilt, 0.5) and np.allclose(last.thrust, 2.0)
+
+
+def test_after_convergence_commands_may_jump_again():
+    handover = Handover()
+    handover.left = commands.HANDOVER_TIME
+    changed, _ = changes(handover, [(1.01, 0.05, 8.0), (1.02, 2.0, 18.0)], all_four(1.0, 0.0, 7.0))
+    assert np.allclose(changed, [[0.05, 1.0], [1.95, 10.0]])
+
+
+def test_the_handover_ends_at_its_time_limit_without_convergence():
+    handover = Handover()
+    handover.left = commands.HANDOVER_TIME
+    stamps = 1.0 + 0.01 * np.arange(1, 60)
+    changed, last = changes(handover, [(t, 50.0, 7.0) for t in stamps], all_four(1.0, 0.0, 7.0))
+    assert last.tilt[0] == 50.0
+    assert np.sum(changed[:, 0] > 0) == pytest.approx(commands.HANDOVER_TIME / 0.01 + 1, abs=1)
+
+
+def test_a_state_gets_one_command_only():
+    handover, before = Handover(), all_four(1.0, 0.0, 7.0)
+    handover.left = commands.HANDOVER_TIME
+    for stamp in (0.99, 1.0):
+        assert handover.limit(all_four(stamp, 1.0, 9.0), before) is before
+
+
+def switching(rig, far):
+    """Run with different commands of rl, select it, and return the commands after that."""
+    original = rig._publish
+
+    def publish():
+        rig.alive.discard('rl')
+        original()
+        lively = far.thrust + 1e-9 * np.sin(1e3 * rig.now)
+        rig.supervisor.on_command('rl', replace(far, stamp=rig.now, thrust=lively),
+                                  rig.now)
+
+    rig._publish = publish
+    rig.run(1.0)
+    before = rig.command
+    assert rig.supervisor.select('rl')
+    return [before, *rig.run(0.5)]
+
+
+def test_the_supervisor_hands_over_at_the_limited_rate():
+    rig = flown()
+    sent = switching(rig, all_four(0.0, 0.4, 3.0))
+    assert rig.supervisor.source == 'rl' and rig.supervisor.state == 'flying'
+    tilt = np.array([c.tilt for c in sent])
+    thrust = np.array([c.thrust for c in sent])
+    assert np.abs(np.diff(tilt, axis=0)).max() <= commands.TILT_RATE * TICK + 1e-9
+    assert np.abs(np.diff(thrust, axis=0)).max() <= commands.THRUST_RATE * TICK + 1e-9
+    assert np.allclose(tilt[-1], 0.4) and np.allclose(thrust[-1], 3.0)
+
+
+def test_a_clock_that_goes_back_does_not_hold_an_old_command():
+    rig = flown()
+    switching(rig, all_four(0.0, 0.4, 3.0))
+    assert rig.supervisor.select('nmpc')
+    rig.now -= 5.0
+    sent = rig.run(1.0)
+    assert rig.supervisor.state in ('flying', 'fallback')
+    assert max(abs(c.stamp - rig.now) for c in sent[-10:] if c is not None) < 0.2
