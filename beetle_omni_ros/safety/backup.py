@@ -4,10 +4,9 @@ The backup estimator, used when the EKF has failed.
 It starts from the last valid estimate and is deliberately simpler than the EKF, so that both do
 not fail for the same reason. It integrates gyroscope and accelerometer. MoCap poses correct
 position, velocity and attitude with fixed gains; each pose is compared with the state
-extrapolated back to its capture time. While the EKF works, the IMU biases are taken from it.
-Without MoCap, position and velocity are dead reckoning, and the velocity slowly decays to the
-desired velocity, so that a descent stays slow. Without IMU the rotor model is used between MoCap
-poses.
+extrapolated back to its capture time. Without MoCap, position and velocity are dead reckoning, and
+the velocity slowly decays to the desired velocity, so that a descent stays slow. Without IMU the
+rotor model is used between MoCap poses.
 """
 
 from collections import deque
@@ -23,11 +22,9 @@ KEPT_SAMPLES = 100      # IMU samples before the failure: 0.5 s at 200 Hz
 KEPT_POSES = 12         # MoCap poses from which the velocity is computed
 POSES_TIME = 0.1        # [s] older poses are not used for it
 LONGEST_STEP = 0.1      # [s] longest integrated gap in the samples
-LARGEST_BIASES = (1.0, 0.2)     # [m/s^2], [rad/s] largest learnt biases of an IMU
 POSITION_BANDWIDTH = 8.0    # [rad/s] MoCap of 1 mm and 100 Hz leaves 2 cm/s of velocity noise
 ATTITUDE_BANDWIDTH = 5.0    # [rad/s]
 WITHOUT_GYROSCOPE = 12.0    # [rad/s] bandwidth of attitude and rate without IMU
-BIAS_TIME = 2.0         # [s] with which IMU biases follow those of the EKF while it works
 LEAK_TIME = 3.0         # [s] 0.1 m/s^2 of unknown bias then costs at most 0.3 m/s
 LARGEST_ERROR = 0.2     # [m or rad] larger MoCap corrections are limited to this
 
@@ -50,7 +47,6 @@ class BackupEstimator:
 
     def __init__(self, gravity: float):
         self._gravity = np.array([0.0, 0.0, -gravity])
-        self._biases = np.zeros(3), np.zeros(3)
         self._stamp, self._position, self._velocity = -np.inf, np.zeros(3), np.zeros(3)
         self._quaternion, self._rate = np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3)
         self.imu_alive = True
@@ -64,13 +60,12 @@ class BackupEstimator:
         """Accept new stamps after the clock was set back by ``by`` [s]."""
         self.samples.clear()
         self.poses.clear()
-        self._learnt: State | None = None
         self._used_at = -np.inf
         if self.running:
             self._stamp -= by
 
     def stop(self) -> None:
-        """Reset the state; samples, poses and biases stay."""
+        """Reset the state; samples and poses stay."""
         self.running, self.specific_force_up = False, None
 
     def add(self, stamp: float, specific_force: np.ndarray, rate: np.ndarray) -> bool:
@@ -103,25 +98,6 @@ class BackupEstimator:
         self._quaternion = rotations.normalized(rotations.multiply(
             self._quaternion, rotations.exp(min(1.0, gain * dt) * turn)))
 
-    def learn(self, state: State) -> None:
-        """Update the biases from a valid estimate and the IMU sample of the same time."""
-        before, self._learnt = self._learnt, state
-        if before is None:
-            return
-        dt = state.stamp - before.stamp
-        sample = next((one for one in reversed(self.samples) if one[0] <= state.stamp + 1e-6),
-                      None)
-        if sample is None or not 0 < dt <= LONGEST_STEP or state.stamp - sample[0] > LONGEST_STEP:
-            return
-        acceleration = (state.velocity - before.velocity) / dt
-        expected = ((acceleration - self._gravity).dot(rotations.matrix(state.quaternion)),
-                    state.angular_velocity)
-        gain = min(1.0, dt / BIAS_TIME)
-        force, rate = (_shortened(bias + gain * (value - healthy - bias), largest)
-                       for bias, value, healthy, largest in zip(
-                           self._biases, sample[1:], expected, LARGEST_BIASES))
-        self._biases = force, rate
-
     def start(self, state: State) -> None:
         """Continue from the last valid estimate, with the samples since then."""
         self.stop()
@@ -139,7 +115,7 @@ class BackupEstimator:
         if velocity is None:
             return self.start(estimate)
         stamp, position, quaternion = self.poses[-1]
-        rate = self.samples[-1][2] - self._biases[1] if self.samples else np.zeros(3)
+        rate = self.samples[-1][2] if self.samples else np.zeros(3)
         self.start(replace(estimate, stamp=stamp, position=position, velocity=velocity,
                            quaternion=quaternion, angular_velocity=rate))
 
@@ -156,12 +132,8 @@ class BackupEstimator:
         """
         Advance to ``now`` without a sample.
 
-        Args:
-            now: [s].
-            desired_velocity: (3,) desired velocity in world, given while MoCap is lost [m/s].
-            motion: specific force (3,) [m/s^2] and angular acceleration (3,) [rad/s^2] in
-                base_link by the model, used while the IMU is gone.
-
+        While MoCap is lost, the velocity (3,) [m/s] decays to the desired one. While the IMU is
+        gone, specific force (3,) and angular acceleration (3,) of the model replace it.
         """
         dt = now - self._stamp
         if desired_velocity is not None and dt > 0:
@@ -186,8 +158,8 @@ class BackupEstimator:
     def _use(self, stamp, force, rate):
         if stamp <= self._stamp:
             return
-        self._rate = rate - self._biases[1]
-        in_world = rotations.matrix(self._quaternion).dot(force - self._biases[0])
+        self._rate = rate
+        in_world = rotations.matrix(self._quaternion).dot(force)
         self.specific_force_up = float(in_world[2])
         self._advance(stamp, in_world + self._gravity)
 

@@ -15,9 +15,8 @@ from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
 from beetle_omni_ros.robot.allocation import Allocator, clipped, ROTORS
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.thrust_map import ThrustMap
-from beetle_omni_ros.safety.joints import JointWatch
-from beetle_omni_ros.safety.mocap import MocapWatch
 from beetle_omni_ros.safety.pack import PackWatch
+from beetle_omni_ros.safety.readings import JointWatch, MocapWatch
 from beetle_omni_ros.safety.speeds import LEAST_THRUST, SpeedWatch
 from beetle_omni_ros.safety.wrench import ContactWatch, NEAR_GROUND, WrenchWatch
 
@@ -54,11 +53,12 @@ class FaultWatch:
         self._mocap = MocapWatch()
         self._map = ThrustMap(robot.rotors) if len(robot.rotors.map) > 1 else None
         self._pack = None if self._map is None else PackWatch(robot, allocator, self._map)
+        self.faults: dict[str, float] = {}
         self.reset()
 
     def reset(self) -> None:
         """Reset for a new flight without faults."""
-        self.faults: dict[str, float] = {}
+        self.faults.clear()
         self.health: ActuatorHealth = ALL_HEALTHY
         self.news: list[str] = []
         if self._pack is not None:
@@ -90,18 +90,7 @@ class FaultWatch:
 
     def on_imu(self, stamp: float, force: np.ndarray, rate: np.ndarray, tilt: np.ndarray | None,
                command: Command | None, height: float | None) -> None:
-        """
-        Receive an IMU sample of a robot in the air.
-
-        Args:
-            stamp: [s].
-            force: (3,) specific force in base_link [m/s^2].
-            rate: (3,) in base_link [rad/s].
-            tilt: (4,) measured [rad], None: unknown, and only an impact can be detected.
-            command: the executed command, None: rotors off.
-            height: of base_link above its height on the ground [m], None: unknown.
-
-        """
+        """Receive an IMU sample of a robot in the air, see the two detectors."""
         dt, self._stamp = stamp - self._stamp, stamp
         thrust = np.zeros(ROTORS) if command is None else \
             clipped(command.thrust, 0.0, self._limit_now)
@@ -149,19 +138,14 @@ class FaultWatch:
 
     def on_joints(self, stamp: float, tilt: np.ndarray, trusted: bool) -> None:
         """
-        Receive a complete reading.
+        Receive a complete reading (4,) [rad], which is judged only if ``trusted``, in the air.
 
         If an encoder jumps, the joint angle is assumed unchanged: the zero moves by the jump.
-
-        Args:
-            stamp: [s].
-            tilt: (4,) as read [rad].
-            trusted: whether the joints are driven and in the air.
-
         """
         watch = self._joints
-        if not watch.on_joints(stamp, tilt) or not trusted or not watch.suspects \
-                and not watch.jump.any() and self.health.stuck == ALL_HEALTHY.stuck:
+        watch.on_joints(stamp, tilt)
+        if not trusted or not watch.suspects and not watch.jump.any() \
+                and self.health.stuck == ALL_HEALTHY.stuck:
             return
         for joint in np.flatnonzero(watch.jump).tolist():
             self.name(f'joint{joint + 1}_encoder_jump', stamp, f'the encoder of '
@@ -179,13 +163,7 @@ class FaultWatch:
 
     def on_mocap(self, stamp: float, position: np.ndarray, quaternion: np.ndarray,
                  state: State | None) -> bool:
-        """
-        Receive a MoCap pose and the estimate of about its time, if there is one.
-
-        Returns:
-            whether it may be used.
-
-        """
+        """Receive a pose and the estimate of about its time; whether the pose may be used."""
         watch = self._mocap
         watch.on_pose(stamp, position, quaternion, state)
         if watch.frozen:

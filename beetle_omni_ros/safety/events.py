@@ -66,6 +66,7 @@ class Silence:
     Attributes:
         elapsed: [s], inf before the first message.
         silent: whether the silence is longer than ``limit`` [s].
+        lost: whether there were messages, and are none now.
 
     """
 
@@ -75,23 +76,19 @@ class Silence:
 
     def forget(self) -> None:
         """As if no message had arrived yet."""
-        self.elapsed, self.silent, self._fresh = inf, True, False
+        self.elapsed, self.silent, self.lost, self._fresh = inf, True, False, False
 
     def reset(self) -> None:
         """A message arrived within the present tick."""
-        self.elapsed, self.silent, self._fresh = 0.0, False, True
+        self.elapsed, self.silent, self.lost, self._fresh = 0.0, False, False, True
 
     def tick(self, dt: float) -> None:
         """``dt`` seconds passed; the tick with the message is not counted."""
         if not self._fresh:
             self.elapsed += dt
             self.silent = self.elapsed >= self.limit - 1e-9     # tolerance for rounding
+            self.lost = self.silent and self.elapsed < inf
         self._fresh = False
-
-    @property
-    def lost(self) -> bool:
-        """Whether there were messages, and are none now."""
-        return self.silent and self.elapsed < inf
 
     @property
     def text(self) -> str:

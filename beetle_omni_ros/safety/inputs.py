@@ -23,7 +23,6 @@ from beetle_omni_ros.safety.way import inclination
 
 NODES = {'joint': 'joint_bridge_node', 'rotor': 'rotor_bridge_node'}
 TRACKING = ('tracking', 'dead_reckoning')   # statuses with a usable estimate
-READY = 'ready'         # state of a bridge
 TICK_LIMIT = 0.02       # [s] a longer pause of the supervisor counts as this for the sources
 ESTIMATE_TIMEOUT = 0.05     # [s] 10 periods of 200 Hz
 STALE_AFTER = 0.05      # [s] older estimates are refused
@@ -60,7 +59,8 @@ class Inputs:
         robot, allocator: the model.
         floor: height of base_link on the ground before the flight [m].
         events: what happened, oldest first.
-        watch: the detectors, with the detected faults.
+        watch: the detectors.
+        faults: of this flight: name -> time of detection [s].
         streams: commands of each controller.
         active: name of the selected controller.
         estimate: the last valid one; status: of the estimator at that time.
@@ -69,6 +69,7 @@ class Inputs:
         voltage: of the pack [V], None before the first reading.
         bridges: bridge 'joint' or 'rotor' -> its reported state; a bridge that never reported has
             no influence, because without bridges the simulator gets the commands directly.
+        unready: bridge -> '' while it is ready or never reported, else its node and state.
         battery_low, battery_empty, lost: pack below its voltages, robot tumbling or falling, for
             long enough.
         refused: 'estimate: stale stamp' and the like -> count.
@@ -80,6 +81,7 @@ class Inputs:
         self._parameters, self.robot = parameters, robot
         self.allocator = Allocator(robot)
         self.events, self.watch = EventLog(), FaultWatch(robot, self.allocator)
+        self.faults = self.watch.faults
         self.streams = {name: CommandStream(parameters.commands, robot) for name in controllers}
         self.active = parameters.controller if parameters.controller in controllers \
             else controllers[0]
@@ -92,6 +94,7 @@ class Inputs:
         self.tilt, self.tilt_velocity, self.tilt_stamp = np.zeros(4), np.zeros(4), -np.inf
         self.voltage: float | None = None
         self.bridges: dict[str, str] = {}
+        self.unready = dict.fromkeys(NODES, '')
         self.battery_low = self.battery_empty = self.lost = False
         self._low_for = self._empty_for = self._lost_for = 0.0
         # stamp, position and quaternion of the estimate before, accepted or not
@@ -119,7 +122,6 @@ class Inputs:
             self._say(WARNING, f"ekf_node reports '{status}'")
         self.estimate, self.status, self.last_refusal = true, status, ''
         self.ekf.reset()
-        self.backup.learn(true)
         self.on_joints(state.tilt_stamp, state.tilt, state.tilt_velocity)
         return True
 
@@ -259,15 +261,11 @@ class Inputs:
         if name not in NODES:
             self._say(WARNING, f"unknown bridge '{name}'", 'unknown bridge')
             return False
-        self.bridges[name] = ' '.join(text.split()) or 'empty state'
+        state = self.bridges[name] = ' '.join(text.split()) or 'empty state'
+        self.unready[name] = '' if state == 'ready' else f'{NODES[name]} {state}'
         return True
 
     # What is known ----------------------------------------------------------------------------
-
-    def bridge_fault(self, name: str) -> str:
-        """'' while bridge ``name`` is ready or never reported, else its node and state."""
-        state = self.bridges.get(name, READY)
-        return '' if state == READY else f'{NODES[name]} {state}'
 
     @property
     def health(self) -> ActuatorHealth:
@@ -318,9 +316,9 @@ class Inputs:
 
     def why_not_arm(self) -> str:
         """'' when the motors may start, else the missing condition."""
-        bridges, state = list(filter(None, map(self.bridge_fault, NODES))), self.estimate
-        if bridges:
-            return '; '.join(bridges)
+        state = self.estimate
+        if any(self.unready.values()):
+            return '; '.join(filter(None, self.unready.values()))
         if state is None or self.ekf.silent:
             return f'no fresh state estimate (ekf_node {self.ekf.text})'
         if self.status != 'tracking':

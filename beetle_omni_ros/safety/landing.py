@@ -107,13 +107,7 @@ class SupportGauge:
             self._baseline += min(1.0, dt / BASELINE_TIME) * (ratio - self._baseline)
 
     def motion(self, tilt: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """
-        Accelerations of the body by the rotors at true tilts (4,) [rad], from the model.
-
-        Returns:
-            specific force (3,) [m/s^2] and angular acceleration (3,) [rad/s^2], in base_link.
-
-        """
+        """Specific force (3,) and angular acceleration (3,) by the rotors at true tilts (4,)."""
         force, torque = self._allocator.wrench(tilt, self._thrusts)
         return self._baseline * force / self._allocator.mass, torque / self._robot.inertia
 
@@ -126,12 +120,6 @@ class SupportGauge:
 class Takeoff:
     """
     Joints to their hover angles, then a climb by the hover controller.
-
-    Args:
-        parameters: height and speed.
-        allocator: for the joint angles to align to.
-        hover: the controller that climbs.
-        state: where it starts.
 
     Attributes:
         failure: '' or the reason of an abort.
@@ -197,12 +185,6 @@ class Landing:
     """
     One way down from any attitude, with any remaining estimate and actuators.
 
-    Args:
-        inputs: estimate, sensors and health.
-        hover: the controller.
-        gauge: share of the weight that the rotors carry.
-        speed: of the descent [m/s].
-
     Attributes:
         grounded: whether the robot is on the ground.
         given_up: '' or the reason why a controlled descent is no longer possible.
@@ -230,15 +212,7 @@ class Landing:
                                 np.array([one.angular_velocity for one in samples]), ramp.stamp)
 
     def start(self, now: float, in_force: Command | None, distrusted: bool = False) -> None:
-        """
-        Begin at the present pose, with the estimator or the backup.
-
-        Args:
-            now: [s].
-            in_force: the executed command.
-            distrusted: whether the estimator runs, but is wrong.
-
-        """
+        """Begin at the present pose, with the estimator, or the backup if it is distrusted."""
         inputs = self._inputs
         if distrusted:
             inputs.backup.start_from_poses(inputs.known)

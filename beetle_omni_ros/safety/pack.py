@@ -9,7 +9,7 @@ from beetle_omni_ros.robot.response import Responses
 from beetle_omni_ros.robot.thrust_map import ThrustMap
 
 DIRECTIONS = 200        # of up in the body, with a computed hover load, 14 deg apart
-BISECTIONS = 20
+STEPS = 500             # between no and full thrust, for the thrust of all rotors together
 SURPRISE = 3.0          # [-] standard deviations beyond which a reading means a fault
 LEAST = 1.0             # [V] a smaller reading is that of a disconnected sensor
 UNKNOWN = 1.0           # [ohm W/N^1.5] initial value; a good pack has 0.4
@@ -106,12 +106,8 @@ class PackWatch:
 
     def _together(self):
         """Thrust [N] that all rotors can give at the same time."""
-        low, high = 0.0, self._thrust_max
-        for _ in range(BISECTIONS):
-            middle = 0.5 * (low + high)
-            enough = self._allowed(ROTORS * middle ** 1.5) >= middle
-            low, high = (middle, high) if enough else (low, middle)
-        return low
+        thrusts = np.linspace(0.0, self._thrust_max, STEPS)
+        return float(thrusts[self._allowed(ROTORS * thrusts ** 1.5) >= thrusts].max())
 
 
 def _load(thrust):

@@ -240,7 +240,7 @@ class Supervisor(Inputs):
         """Faults that end or change a flight with any controller, the most urgent first."""
         if self.battery_low:
             self._say(WARNING, f'battery low: {self.voltage:.1f} V', 'battery')
-        no_rotors, no_joints = map(self.bridge_fault, ('rotor', 'joint'))
+        no_rotors, no_joints = self.unready['rotor'], self.unready['joint']
         if no_rotors and not self.bridges['rotor'].startswith('silent:'):
             if not self.airborne:
                 self._enter(DISARMED, ERROR, f'{no_rotors}; still on the ground: motors off')
@@ -249,39 +249,42 @@ class Supervisor(Inputs):
                 self.emergency_stop(now, no_rotors)
         elif self.state == LANDING:
             self._limit_landing(now)
-        elif self.state == FALLBACK and self._in_state > self._parameters.envelope.fallback_time:
-            self._land(now, ERROR, f'{self.active}_node not good for '
-                                   f'{self._in_state:.0f} s: landing', 'controller_lost')
-        elif no_rotors:
-            self._land(now, ERROR, f'{no_rotors}: landing while it may follow',
-                       'rotor_bridge_lost')
-        elif 'estimator_wrong' in self.faults and not self.backup.running:
-            self._land(now, ERROR, 'the estimate contradicts MoCap: controlled descent on raw '
-                                   'sensors')
-        elif self.ekf.silent:
-            why = f' (last refused: {self.last_refusal})' if self.last_refusal else ''
-            self._land(now, ERROR, f'ekf_node {self.ekf.text}{why}: controlled descent on raw '
-                                   'sensors', 'estimator_lost')
-        elif 'mocap_jumped' in self.faults:
-            self._land(now, ERROR, 'the position of MoCap jumped: landing')
-        elif self.mocap.lost and self.mocap.elapsed > self._parameters.envelope.mocap_patience:
-            self._land(now, ERROR, f'MoCap {self.mocap.text}: landing by dead reckoning',
-                       'mocap_lost')
-        elif no_joints:
-            self._land(now, ERROR, f'{no_joints}: landing with the joints as they are',
-                       'joint_bridge_lost')
-        elif self.joints.silent:
-            self._land(now, ERROR, f'joint_bridge_node {self.joints.text}: landing with the '
-                                   'joints assumed where they were commanded', 'joints_lost')
-        elif self.battery_empty:
-            self._land(now, ERROR, f'battery empty ({self.voltage:.1f} V): landing',
-                       'battery_empty')
-        elif self.outside(0.0):
-            self._land(now, ERROR, 'left the fence: landing', 'fence_left')
+        elif reason := self._why_land(no_rotors, no_joints):
+            name, text = reason
+            self._land(now, ERROR, text, name)
         elif self.lost and self.state == FLYING:
             self.watch.name('control_lost', now)
             self._fall_back(now, ERROR, f'tumbling or falling under {self.active}_node: fallback '
                                         'to hover')
+
+    def _why_land(self, no_rotors, no_joints):
+        """Name of the fault ('' for a detected one) and text of the most urgent reason."""
+        envelope = self._parameters.envelope
+        if self.state == FALLBACK and self._in_state > envelope.fallback_time:
+            return 'controller_lost', f'{self.active}_node not good for {self._in_state:.0f} s: ' \
+                                      'landing'
+        if no_rotors:
+            return 'rotor_bridge_lost', f'{no_rotors}: landing while it may follow'
+        if 'estimator_wrong' in self.faults and not self.backup.running:
+            return '', 'the estimate contradicts MoCap: controlled descent on raw sensors'
+        if self.ekf.silent:
+            why = f' (last refused: {self.last_refusal})' if self.last_refusal else ''
+            return 'estimator_lost', f'ekf_node {self.ekf.text}{why}: controlled descent on raw ' \
+                                     'sensors'
+        if 'mocap_jumped' in self.faults:
+            return '', 'the position of MoCap jumped: landing'
+        if self.mocap.lost and self.mocap.elapsed > envelope.mocap_patience:
+            return 'mocap_lost', f'MoCap {self.mocap.text}: landing by dead reckoning'
+        if no_joints:
+            return 'joint_bridge_lost', f'{no_joints}: landing with the joints as they are'
+        if self.joints.silent:
+            return 'joints_lost', f'joint_bridge_node {self.joints.text}: landing with the ' \
+                                  'joints assumed where they were commanded'
+        if self.battery_empty:
+            return 'battery_empty', f'battery empty ({self.voltage:.1f} V): landing'
+        if self.outside(0.0):
+            return 'fence_left', 'left the fence: landing'
+        return None
 
     def _limit_landing(self, now):
         """Limits of a landing, after it had time to recover the robot."""
@@ -399,11 +402,6 @@ class Supervisor(Inputs):
             self._landing.set_out(now, self._in_force)
 
     # Reports ----------------------------------------------------------------------------------
-
-    @property
-    def faults(self) -> dict[str, float]:
-        """Faults of this flight: name -> time of detection [s]."""
-        return self.watch.faults
 
     @property
     def reported_state(self) -> str:

@@ -40,8 +40,8 @@ UNLOADED = 0.3          # [-] of its hover thrust is the loss if a rotor without
                         # because its small thrust controls the attitude
 MISSING_THRUST = 20.0   # [s] of one second without one hover thrust of lift, as time: turning a
                         # joint over under load costs more than any detour
-LOST_LIFT = 0.3         # [s] times the hover thrust of a rotor; above it a joint turns over with its
-                        # rotor off: a full turn under load costs 1.2 s, without load 0.4 s
+LOST_LIFT = 0.3         # [s] times the hover thrust of a rotor; above it a joint turns over with
+                        # its rotor off: a full turn under load costs 1.2 s, without load 0.4 s
 ROOM = 0.3              # [rad] of all tilts from their stops meanwhile: control moves them by 0.2
 FARTHEST = 1.3          # [rad] turn to that attitude: upside down 0.3 is enough, on its side 1.3
 
@@ -131,19 +131,7 @@ def climb(height: float, speed: float, acceleration: float) -> list[tuple[float,
 
 
 def plan(quaternion: np.ndarray, tilt: np.ndarray, allocator: Allocator, rate: float) -> Way:
-    """
-    Plan the turn to level that the joints can follow best.
-
-    Args:
-        quaternion: (4,) present attitude, base_link to world, xyzw.
-        tilt: (4,) present tilt angles [rad].
-        allocator: of the robot.
-        rate: of the body [rad/s].
-
-    Returns:
-        the way, from the present attitude to a level one.
-
-    """
+    """Plan the turn to level that the joints, at ``tilt`` (4,) [rad], can follow best."""
     paths, times, lost = _compare(quaternion, tilt[None], allocator, rate)
     k = int(np.argmin(times[0].sum(axis=1) + MISSING_THRUST * lost[0]))
     path, attitudes = paths[k], [rotations.normalized(quaternion)]
@@ -240,17 +228,8 @@ def find_turnover(quaternion: np.ndarray, tilt: np.ndarray, robot: RobotParamete
     """
     Find the joint whose turnover saves most lift on the way to level, and where it can turn.
 
-    Args:
-        quaternion: (4,) present attitude, base_link to world, xyzw.
-        tilt: (4,) present tilt angles [rad].
-        robot: the robot.
-        allocator: of the robot.
-        rate: of the body [rad/s].
-
-    Returns:
-        the turnover at the nearest attitude that three rotors hold and where the joint angles
-        before and after are legal; None if none helps.
-
+    This is the firmest near attitude that three rotors hold and where the joint angles before and
+    after are legal. None if no turnover helps.
     """
     turned = tilt - np.copysign(TURN, tilt)
     tilts = np.array([tilt, *np.where(np.eye(ROTORS, dtype=bool), turned, tilt)])

@@ -97,16 +97,10 @@ class WrenchWatch:
     def on_imu(self, stamp: float, force: np.ndarray, rate: np.ndarray, tilt: np.ndarray | None,
                thrust: np.ndarray, health: ActuatorHealth) -> None:
         """
-        Receive one IMU sample.
+        Receive specific force (3,) [m/s^2] and rate (3,) [rad/s] in base_link.
 
-        Args:
-            stamp: [s].
-            force: (3,) specific force in base_link [m/s^2].
-            rate: (3,) angular rate in base_link [rad/s].
-            tilt: (4,) measured [rad], None: unknown, and only an impact can be detected.
-            thrust: (4,) commanded [N].
-            health: of the actuators, as known.
-
+        If the measured tilts (4,) [rad] are unknown, only an impact can be detected. The commanded
+        thrusts (4,) [N] of lost rotors count as zero.
         """
         dt = LONGEST + 1 if self._stamp is None else stamp - self._stamp
         if dt <= 0:
@@ -203,14 +197,9 @@ class ContactWatch:
         """
         Update with the result of one IMU sample.
 
-        Near the ground an impact or a push is sufficient. At other heights, which may be wrong,
-        both are required: after a collision in the air there is no further push.
-
-        Args:
-            dt: since the one before [s].
-            height: of base_link above its height on the ground [m], None if unknown.
-            wrench: of the same sample.
-
+        Near the ground, by the height of base_link above its height on the ground [m], an impact
+        or a push is sufficient. At other heights, which may be wrong, both are required: after a
+        collision in the air there is no further push.
         """
         push = sqrt(wrench.unexplained.dot(wrench.unexplained)) / self._gravity
         near = height is None or height <= NEAR_GROUND

@@ -23,14 +23,6 @@ def test_a_bridge_that_is_not_ready_prevents_arming_with_its_reason(name, text):
     assert rig.supervisor.arm(rig.now)
 
 
-def test_both_reasons_are_given_on_one_line():
-    rig = VehicleRig()
-    rig.supervisor.on_actuators('rotor', 'waiting: battery low', rig.now)
-    rig.supervisor.on_actuators('joint', 'waiting: gimbal2\nstands at -3.48 or +2.80 rad', rig.now)
-    assert rig.supervisor.why_not_arm() == ('joint_bridge_node waiting: gimbal2 stands at -3.48 or +2.80 '
-                                            'rad; rotor_bridge_node waiting: battery low')
-
-
 @pytest.mark.parametrize('text', ['lost: gimbal3 silent', 'waiting: deactivated'])
 def test_lost_servos_in_flight_lead_to_a_landing_that_names_them(text):
     rig = flown()

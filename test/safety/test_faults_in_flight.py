@@ -10,7 +10,6 @@ from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.actuator_health import ALL_HEALTHY
 from beetle_omni_ros.safety.inputs import MOCAP_TIMEOUT
 from beetle_omni_ros.safety.landing import FLARE_HEIGHT, GROUND_TIME, PLATFORM_TIME, SETTLING_TIME
-from beetle_omni_ros.safety.supervisor import AGE_LIMIT
 from beetle_omni_ros.safety.way import inclination
 
 
@@ -42,7 +41,7 @@ def test_without_mocap_an_inverted_robot_sinks_while_it_turns_and_is_level_for_t
     times = rig.now + np.arange(0.0, 6.0, 0.02)
     height = np.array([ramp.at(time).position[2] for time in times])
     tilted = np.array([inclination(ramp.at(time).quaternion) for time in times])
-    flare = height.min()
+    flare = ramp.at(ramp.stamp + ramp.end).position[2]
     assert flare == pytest.approx(0.16 + FLARE_HEIGHT, abs=0.05)
     assert tilted[height < 1.9].max() > 1.0         # sinks before it is level
     assert tilted[height < flare + 0.02].max() < 0.3
@@ -94,14 +93,6 @@ def test_high_above_the_floor_the_ground_must_be_felt_for_longer():
     assert durations[1] - durations[0] == pytest.approx(PLATFORM_TIME - GROUND_TIME, abs=0.05)
 
 
-def test_an_impact_high_above_the_floor_is_no_crash():
-    rig = flown()
-    for after in (0.001, 0.006):
-        rig.supervisor.on_imu(rig.now + after, np.array([0, 120.0, 0]), np.zeros(3))
-    rig.run(0.2)
-    assert rig.supervisor.state == 'flying'
-
-
 def test_a_pause_in_the_air_ends_in_fallback_and_on_the_floor_with_motors_off():
     rig = flown()
     rig.now += 0.4
@@ -130,27 +121,6 @@ def test_limits_hold_while_landing(spoil):
     assert rig.supervisor.state == 'emergency_stop'
 
 
-@pytest.mark.parametrize('reports', [False, True], ids=['reports stall, too', 'reports go on'])
-def test_no_rotor_is_suspected_after_two_stalls_in_which_the_actuators_stopped(reports):
-    rig = flown()
-
-    def fly(duration):
-        for _ in range(round(duration / 0.02)):
-            rig.run(0.02)
-            rig.supervisor.on_rotors(rig.now, 300.0 * np.sqrt(rig.thrust))
-
-    fly(2.0)
-    for _ in range(2):      # each is too short for a pause of the supervisor
-        rig.now += 0.8 * AGE_LIMIT
-        rig.command = rig.supervisor.update(rig.now)
-    assert rig.command is None      # too old
-    rig.thrust[:] = 0.0             # the motor board stopped the rotors
-    for ago in (0.06, 0.04, 0.02) if reports else ():
-        rig.supervisor.on_rotors(rig.now - ago, 200.0 * np.sqrt(np.full(4, 7.0)))
-    fly(0.6)
-    assert not any('rotor' in name for name in rig.supervisor.faults), rig.supervisor.faults
-
-
 def test_landing_and_fallback_end_in_time(monkeypatch):
     monkeypatch.setattr('beetle_omni_ros.safety.supervisor.LANDING_LIMIT', 10.0)
     rig = VehicleRig(replace(PARAMETERS, envelope=replace(PARAMETERS.envelope,
@@ -176,11 +146,3 @@ def test_a_flip_of_the_markers_leads_to_a_landing_without_mocap():
     rig.run(2.0)
     assert 'mocap_flipped' in rig.supervisor.faults
     assert rig.supervisor.state == 'landing'
-
-
-def test_a_silent_imu_is_named_and_not_the_controller_that_waits_for_the_estimate():
-    rig = flown()
-    rig.alive -= {'imu', 'estimate', 'nmpc'}
-    rig.run(0.1)
-    assert 'imu_lost' in rig.supervisor.faults
-    assert 'controller_silent' not in rig.supervisor.faults

@@ -90,11 +90,3 @@ def test_a_good_pack_is_not_weak_while_discharging(command, seed):
     # Four times the simulated current: a real pack of this size is empty after 12 minutes.
     while flight.battery.charge > 0.2:
         assert flight.fly(20.0, command, faster=4.0) is None
-
-
-def test_an_empty_pack_is_weak():
-    flight = Flight()
-    flight.battery.charge = 0.02
-    flight.fly(0.5, np.zeros(4))
-    flight.fly(3.0, hover)
-    assert flight.watch.limit is not None and flight.watch.limit < 15.0
