@@ -11,12 +11,6 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.events import Silence
 from beetle_omni_ros.safety.parameters import CommandLimits
 
-NOT_FINITE = 'not finite'
-STALE = 'stale stamp'
-FUTURE = 'stamp in the future'
-REPEATED = 'repeated or older stamp'
-THRUST = 'thrust out of range'
-TILT = 'tilt out of range'
 JUMP = 'implausible jump'
 FROZEN = 'the same numbers again'
 UNKNOWN = 'unknown controller'
@@ -113,20 +107,20 @@ class CommandStream:
         """Reason of a refusal and, without one, a copy within the limits."""
         stamp, tilt, thrust = command.stamp, command.tilt, command.thrust
         if not all(map(isfinite, [stamp, *tilt.tolist(), *thrust.tolist()])):
-            return NOT_FINITE, None
+            return 'not finite', None
         if now - stamp > STALE_AFTER:
-            return STALE, None
+            return 'stale stamp', None
         if stamp - now > AHEAD:
-            return FUTURE, None
+            return 'stamp in the future', None
         if self.accepted is not None and stamp <= self.accepted.stamp:
-            return REPEATED, None
+            return 'repeated or older stamp', None
         clean = Command(stamp, clipped(tilt, -self._tilt_limit, self._tilt_limit),
                         clipped(thrust, self._low, self._high))
         beyond = _farthest(tilt, clean.tilt), _farthest(thrust, clean.thrust)
         if beyond[0] > OVERSTEP * self._tilt_limit:
-            return TILT, None
+            return 'tilt out of range', None
         if beyond[1] > OVERSTEP * (self._high - self._low):
-            return THRUST, None
+            return 'thrust out of range', None
         self.clipped += max(beyond) > 0
         before, self._offered = self._offered, clean
         if before is None:

@@ -4,21 +4,12 @@ from dataclasses import dataclass
 from math import inf
 
 INFO, WARNING, ERROR = 'info', 'warning', 'error'
-KEPT = 1000         # events; a flight has tens
 QUIET_TIME = 1.0    # [s] the same message is logged once in this time
 
 
 @dataclass(frozen=True)
 class Event:
-    """
-    An event for the log of the operator.
-
-    Attributes:
-        stamp: when [s].
-        severity: 'info', 'warning' or 'error'.
-        text: one line that names the responsible node and the outcome.
-
-    """
+    """An event for the log: time [s], severity, and one line with node and outcome."""
 
     stamp: float
     severity: str
@@ -38,7 +29,7 @@ class Answer:
 
 
 class EventLog(list):
-    """A list of events that drops the oldest ones and does not repeat itself."""
+    """A list of events that does not repeat itself."""
 
     def __init__(self):
         super().__init__()
@@ -51,8 +42,6 @@ class EventLog(list):
                 return
             self._said[key] = stamp
         self.append(Event(stamp, severity, text))
-        if len(self) > KEPT:
-            del self[0]
 
 
 class Silence:

@@ -191,7 +191,8 @@ class Landing:
 
     """
 
-    def __init__(self, inputs: Inputs, hover: Fallback, gauge: SupportGauge, speed: float):
+    def __init__(self, inputs: Inputs, hover: Fallback, gauge: SupportGauge, speed: float,
+                 now: float, in_force: Command | None):
         self._inputs, self._hover, self._gauge, self._speed = inputs, hover, gauge, speed
         self.grounded, self.given_up = False, ''
         self._standing_for = self._still_for = self._blind_for = 0.0
@@ -199,6 +200,11 @@ class Landing:
         self._health = ALL_HEALTHY
         self._settled = False   # whether joints far from their hover angles had time to wind
         self._turnover: Turnover | None = None
+        if 'estimator_wrong' in inputs.faults:
+            inputs.backup.start_from_poses(inputs.known)
+        elif inputs.ekf.silent:
+            inputs.backup.start(inputs.known)
+        self.set_out(now, in_force)
 
     @property
     def way(self) -> TrajectoryTarget:
@@ -210,15 +216,6 @@ class Landing:
                                 np.array([one.quaternion for one in samples]),
                                 np.array([one.velocity for one in samples]),
                                 np.array([one.angular_velocity for one in samples]), ramp.stamp)
-
-    def start(self, now: float, in_force: Command | None, distrusted: bool = False) -> None:
-        """Begin at the present pose, with the estimator, or the backup if it is distrusted."""
-        inputs = self._inputs
-        if distrusted:
-            inputs.backup.start_from_poses(inputs.known)
-        elif inputs.ekf.silent:
-            inputs.backup.start(inputs.known)
-        self.set_out(now, in_force)
 
     def step(self, now: float, dt: float, in_force: Command | None) -> Command:
         """The command for the present time."""
@@ -299,11 +296,7 @@ class Landing:
         First to the attitude where control is regained soonest, then towards level.
 
         If only the pack is weak, an attitude at rest may be held, but not all attitudes on the
-        way. The robot then leaps first, to have speed and height for the fall in the turn.
-
-        Returns:
-            the way, and the knots of the leap.
-
+        way. The robot then leaps first (knots), to have speed and height for the fall in the turn.
         """
         holding = Holding(self._inputs.robot, self._health)
         p = holding.parameters

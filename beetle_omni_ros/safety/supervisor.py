@@ -379,10 +379,9 @@ class Supervisor(Inputs):
             self.watch.name(name, now)
         if not self.airborne:
             return self._enter(DISARMED, severity, f'{text}; still on the ground: motors off')
-        self._landing = Landing(self, self._hover, self._gauge, self._parameters.landing.speed)
-        answer = self._enter(LANDING, severity, text)
-        self._landing.start(now, self._in_force, 'estimator_wrong' in self.faults)
-        return answer
+        self._landing = Landing(self, self._hover, self._gauge, self._parameters.landing.speed,
+                                now, self._in_force)
+        return self._enter(LANDING, severity, text)
 
     def _enter(self, state, severity, text):
         self.state, self._in_state, self.target_override = state, 0.0, None

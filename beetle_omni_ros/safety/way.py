@@ -17,8 +17,8 @@ its joint, and continues with four rotors. If both pairs are wound so, this happ
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import sqrt
+from typing import NamedTuple
 
 import numpy as np
 
@@ -204,23 +204,13 @@ def _follow(tilts, ups, allocator):
     return waits, lost
 
 
-@dataclass(frozen=True)
-class Turnover:
-    """
-    A planned turn of a joint with its rotor off.
+class Turnover(NamedTuple):
+    """A planned turn of a joint with its rotor off."""
 
-    Attributes:
-        joint: index of the joint and its rotor.
-        quaternion: (4,) attitude in which its rotor is off.
-        tilt: angle at which the joint ends [rad].
-        health: of the actuators meanwhile.
-
-    """
-
-    joint: int
-    quaternion: np.ndarray
-    tilt: float
-    health: ActuatorHealth
+    joint: int                  # index of the joint and its rotor
+    quaternion: np.ndarray      # (4,) attitude in which its rotor is off
+    tilt: float                 # angle at which the joint ends [rad]
+    health: ActuatorHealth      # of the actuators meanwhile
 
 
 def find_turnover(quaternion: np.ndarray, tilt: np.ndarray, robot: RobotParameters,
