@@ -1,4 +1,4 @@
-"""Every reason for the refusal of a command, accepted commands, and the handover."""
+"""Every reason for the refusal of a command, and accepted commands."""
 
 
 import numpy as np
@@ -7,7 +7,7 @@ import pytest
 from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety import commands
-from beetle_omni_ros.safety.commands import CommandStream, Handover, within_limits
+from beetle_omni_ros.safety.commands import CommandStream, within_limits
 from beetle_omni_ros.safety.parameters import CommandLimits, SupervisorParameters
 
 ROBOT = RobotParameters.load()
@@ -133,38 +133,3 @@ def test_the_shipped_file_contains_every_parameter_at_its_default():
 
     assert set(names(schema.load_yaml(share_path('params/supervisor.yaml')))) == leaves
     assert SupervisorParameters.load() == SupervisorParameters()
-
-
-def all_four(stamp, tilt, thrust):
-    return Command(stamp, np.full(4, float(tilt)), np.full(4, float(thrust)))
-
-
-def changes(handover, asked, start):
-    """Largest changes of tilt and thrust over a stream of (stamp, tilt, thrust), last command."""
-    in_force, changed = start, []
-    for requested in asked:
-        given = handover.limit(all_four(*requested), in_force)
-        changed.append((np.abs(given.tilt - in_force.tilt).max(),
-                        np.abs(given.thrust - in_force.thrust).max()))
-        in_force = given
-    return np.array(changed), in_force
-
-
-@pytest.mark.parametrize('period', [0.005, 0.01])
-def test_the_change_is_limited_and_the_requested_command_is_reached(period):
-    handover = Handover()
-    handover.left = commands.HANDOVER_TIME
-    stamps = 1.0 + period * np.arange(1, 61)
-    changed, last = changes(handover, [(t, 0.5, 2.0) for t in stamps], all_four(1.0, -0.5, 14.0))
-    assert changed[:, 0].max() <= commands.TILT_RATE * period * (1 + 1e-9)
-    assert changed[:, 1].max() <= commands.THRUST_RATE * period * (1 + 1e-9)
-    assert np.allclose(last.tilt, 0.5) and np.allclose(last.thrust, 2.0)
-
-
-def test_the_handover_ends_at_its_time_limit_without_convergence():
-    handover = Handover()
-    handover.left = commands.HANDOVER_TIME
-    stamps = 1.0 + 0.01 * np.arange(1, 60)
-    changed, last = changes(handover, [(t, 50.0, 7.0) for t in stamps], all_four(1.0, 0.0, 7.0))
-    assert last.tilt[0] == 50.0
-    assert np.sum(changed[:, 0] > 0) == pytest.approx(commands.HANDOVER_TIME / 0.01 + 1, abs=1)
