@@ -219,7 +219,7 @@ def _absent(findings, topic, source, stream, graph):
                      'multicast and MTU of the network, BEETLE_OMNI_DISCOVERY')
     elif stream.other_types:
         findings.add(topic, f"published as {', '.join(stream.other_types)}",
-                     fail=f'{source} must publish the type of docs/reference/topics.md: '
+                     fail=f'{source} must publish another type: '
                      'set or remap it')
     else:
         findings.add(topic, f'no publisher in ROS domain {graph.domain}',

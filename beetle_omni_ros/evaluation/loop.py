@@ -252,7 +252,7 @@ class FlightLoop:
             if moment.target is not None:
                 self.aim(moment.target)
                 battery = self.simulator.battery
-                if battery.charge < SWAP_CHARGE or self.supervisor.vehicle.battery_low:
+                if battery.charge < SWAP_CHARGE or self.supervisor.battery_low:
                     battery.reset()
             if moment.changed:
                 self.simulator.set_wrench(moment.force_world, moment.torque_body)

@@ -338,7 +338,7 @@ class Flight:
                     raise RunError(f'supervisor_node refuses to arm: {answer[1]}')
                 self._spin()
             operator.states.clear()
-            # The state may name a fault: disarmed:joint1_jammed.
+            # The state may name a fault: disarmed:joint1_astray.
             self._await('taking off', lambda: operator.state.startswith('flying') or any(
                 state.partition(':')[0] == 'disarmed' for state in operator.states),
                         TAKEOFF_TIMEOUT)

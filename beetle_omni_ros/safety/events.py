@@ -4,20 +4,12 @@ from dataclasses import dataclass
 from math import inf
 
 INFO, WARNING, ERROR = 'info', 'warning', 'error'
-KEPT = 1000   # events; a flight has tens
+QUIET_TIME = 1.0    # [s] the same message is logged once in this time
 
 
 @dataclass(frozen=True)
 class Event:
-    """
-    An event for the log of the operator.
-
-    Attributes:
-        stamp: when [s].
-        severity: 'info', 'warning' or 'error'.
-        text: one line that names the responsible node and the outcome.
-
-    """
+    """An event for the log: time [s], severity, and one line with node and outcome."""
 
     stamp: float
     severity: str
@@ -37,64 +29,58 @@ class Answer:
 
 
 class EventLog(list):
-    """A list of events that drops the oldest ones and does not repeat itself."""
+    """A list of events that does not repeat itself."""
 
-    def __init__(self, quiet_time: float):
-        """``quiet_time``: a keyed event is added at most once in this time [s]."""
+    def __init__(self):
         super().__init__()
-        self._quiet_time = quiet_time
         self._said: dict[str, float] = {}
 
     def say(self, stamp: float, severity: str, text: str, key: str | None = None) -> None:
         """Add one event; with a ``key``, not again within the quiet time."""
         if key is not None:
-            if abs(stamp - self._said.get(key, -inf)) < self._quiet_time:
+            if abs(stamp - self._said.get(key, -inf)) < QUIET_TIME:
                 return
             self._said[key] = stamp
         self.append(Event(stamp, severity, text))
-        if len(self) > KEPT:
-            del self[0]
 
 
 class Silence:
     """
     Time since the last message of a source.
 
-    Time is counted in ticks of the supervisor, each at most ``tick`` long. After a stall of the
+    Time is counted in ticks of the supervisor, each of limited length. After a stall of the
     process or a change of the clock, messages in the queue are therefore processed before a source
     is treated as failed.
+
+    Attributes:
+        elapsed: [s], inf before the first message.
+        silent: whether the silence is longer than ``limit`` [s].
+        lost: whether there were messages, and are none now.
+
     """
 
     def __init__(self, limit: float):
-        """``limit``: longer silence is a fault [s]."""
         self.limit = limit
-        self.elapsed = inf   # no message yet
-        self._just_reset = False
+        self.forget()
+
+    def forget(self) -> None:
+        """As if no message had arrived yet."""
+        self.elapsed, self.silent, self.lost, self._fresh = inf, True, False, False
 
     def reset(self) -> None:
         """A message arrived within the present tick."""
-        self.elapsed = 0.0
-        self._just_reset = True
+        self.elapsed, self.silent, self.lost, self._fresh = 0.0, False, False, True
 
     def tick(self, dt: float) -> None:
         """``dt`` seconds passed; the tick with the message is not counted."""
-        if not self._just_reset:
+        if not self._fresh:
             self.elapsed += dt
-        self._just_reset = False
-
-    @property
-    def from_the_start(self) -> bool:
-        """Whether no message has arrived yet."""
-        return self.elapsed == inf
-
-    @property
-    def silent(self) -> bool:
-        """Whether the silence is a fault, with a tolerance for rounding."""
-        return self.elapsed >= self.limit - 1e-9
+            self.silent = self.elapsed >= self.limit - 1e-9     # tolerance for rounding
+            self.lost = self.silent and self.elapsed < inf
+        self._fresh = False
 
     @property
     def text(self) -> str:
         """For messages: 'silent for 52 ms', or 'silent since the start'."""
-        if self.from_the_start:
-            return 'silent since the start'
-        return f'silent for {1000 * self.elapsed:.0f} ms'
+        return 'silent since the start' if self.elapsed == inf else \
+            f'silent for {1000 * self.elapsed:.0f} ms'

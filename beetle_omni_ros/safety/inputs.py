@@ -1,220 +1,247 @@
-"""Inputs of the supervisor, and its time."""
+"""What the supervisor receives: checks, the latest data of each source, its silence and time."""
 
 from __future__ import annotations
 
-from math import isfinite
-from operator import eq
+from collections import Counter
+from dataclasses import replace
+from math import dist, isfinite
 
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, corrected, State
-from beetle_omni_ros.robot.allocation import Allocator
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.allocation import ActuatorHealth, Allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import SpikeFilter
-from beetle_omni_ros.safety.actuators import Actuators
-from beetle_omni_ros.safety.descent import checked_sample
-from beetle_omni_ros.safety.events import EventLog, INFO, WARNING
-from beetle_omni_ros.safety.limits import JUMP, MEANINGS
+from beetle_omni_ros.safety.backup import BackupEstimator
+from beetle_omni_ros.safety.commands import CommandStream, FROZEN, JUMP, MEANINGS, SAME, UNKNOWN
+from beetle_omni_ros.safety.detectors import FaultWatch
+from beetle_omni_ros.safety.events import EventLog, INFO, Silence, WARNING
 from beetle_omni_ros.safety.parameters import SupervisorParameters
-from beetle_omni_ros.safety.selection import Selection
-from beetle_omni_ros.safety.vehicle import numbers, Vehicle
-from beetle_omni_ros.safety.watch.faults import FaultWatch
+from beetle_omni_ros.safety.way import inclination
 
-TILT_AGE = 0.05     # [s] older joint angles are not used for thrust directions
+NODES = {'joint': 'joint_bridge_node', 'rotor': 'rotor_bridge_node'}
+TRACKING = ('tracking', 'dead_reckoning')   # statuses with a usable estimate
+TICK_LIMIT = 0.02       # [s] a longer pause of the supervisor counts as this for the sources
+ESTIMATE_TIMEOUT = 0.05     # [s] 10 periods of 200 Hz
+STALE_AFTER = 0.05      # [s] older estimates are refused
+JOINT_TIMEOUT = 0.2     # [s]
+IMU_TIMEOUT = 0.05      # [s]
+MOCAP_TIMEOUT = 0.2     # [s]
+ABSURD = 1e4            # [m, m/s, m/s^2, rad/s] beyond any robot and sensor; no overflow
 VOLTAGE_END = 1000.0    # [V] from which a reading is refused
-LATEST = 0.1    # [s] between a MoCap pose and the estimate for its check
-IMU_AXES = (*(f'specific force along {axis}' for axis in 'xyz'),
-            *(f'angular rate about {axis}' for axis in 'xyz'))
-NONE_SAME = [0] * len(IMU_AXES)
+UNIT_TOLERANCE = 0.02   # of a quaternion's squared length
+JUMP_POSITION, JUMP_ATTITUDE = 1.0, 1.0     # [m], [rad] a single larger jump of the estimate is
+                        # refused, a lasting one is accepted with the next. 20 m/s and 20 rad/s
+TILT_AGE = 0.05         # [s] older joint angles are not used for thrust directions
+POSE_AGE = 0.1          # [s] between a MoCap pose and the estimate for its check
+FORCE_SPIKE, RATE_SPIKE = 30.0, 3.0     # [m/s^2], [rad/s] within a sample; full thrust and torque
+                        # cause 1.4 and 0.5
+IMU_FROZEN = 10         # equal samples; noise never repeats exactly
+ARM_TILT, ARM_SPEED, ARM_RATE = 0.35, 0.3, 0.5  # [rad] 20 deg, on its side it cannot lift off;
+                        # [m/s] and [rad/s], a faster robot is being carried
+LOW_TIME = 2.0          # [s] of a low voltage, longer than the sag of one manoeuvre
+TUMBLING, FALLING = 15.0, 6.0   # [rad/s]; [m/s] after 1.8 m of free fall
+LOST_TIME = 0.3         # [s] of either
+
+
+def plausible(*arrays: np.ndarray) -> bool:
+    """Whether all numbers are finite and below ABSURD."""
+    return all(bool(np.abs(array).max() < ABSURD) for array in arrays)
 
 
 class Inputs:
     """
-    The inputs of the supervisor: checks and counts all messages.
+    Checks and counts all messages, and keeps the latest data of each source.
 
     Attributes:
+        robot, allocator: the model.
+        floor: height of base_link on the ground before the flight [m].
         events: what happened, oldest first.
-        vehicle: the latest of estimate, joints, sensors and battery.
-        actuators: reported states of the bridges to servos and motor board.
-        watch: the detectors, with the detected faults.
+        watch: the detectors.
+        faults: of this flight: name -> time of detection [s].
+        streams: commands of each controller.
+        active: name of the selected controller.
+        estimate: the last valid one; status: of the estimator at that time.
+        ekf, joints, imu, mocap: silence of each source.
+        tilt, tilt_velocity, tilt_stamp: latest joint feedback.
+        voltage: of the pack [V], None before the first reading.
+        bridges: bridge 'joint' or 'rotor' -> its reported state; a bridge that never reported has
+            no influence, because without bridges the simulator gets the commands directly.
+        unready: bridge -> '' while it is ready or never reported, else its node and state.
+        battery_low, battery_empty, lost: pack below its voltages, robot tumbling or falling, for
+            long enough.
+        refused: 'estimate: stale stamp' and the like -> count.
 
     """
 
     def __init__(self, parameters: SupervisorParameters, robot: RobotParameters,
                  controllers: tuple[str, ...]):
-        self._parameters, self._robot = parameters, robot
-        self._selection = Selection(controllers, parameters.controller, parameters.commands, robot)
-        self.vehicle = Vehicle(parameters, robot)
-        self.actuators = Actuators()
-        self._allocator = Allocator(robot)
-        self.watch = FaultWatch(parameters.detection, robot, self._allocator)
-        self._in_force: Command | None = None
-        imu = parameters.detection.imu
-        self._spikes = SpikeFilter(imu.force_change, imu.rate_change)
+        self._parameters, self.robot = parameters, robot
+        self.allocator = Allocator(robot)
+        self.events, self.watch = EventLog(), FaultWatch(robot, self.allocator)
+        self.faults = self.watch.faults
+        self.streams = {name: CommandStream(parameters.commands, robot) for name in controllers}
+        self.active = parameters.controller if parameters.controller in controllers \
+            else controllers[0]
+        self.backup = BackupEstimator(robot.gravity)
+        self.estimate: State | None = None
+        self.status = self.last_refusal = ''
+        self.refused = Counter[str]()
+        self.ekf, self.joints = Silence(ESTIMATE_TIMEOUT), Silence(JOINT_TIMEOUT)
+        self.imu, self.mocap = Silence(IMU_TIMEOUT), Silence(MOCAP_TIMEOUT)
+        self.tilt, self.tilt_velocity, self.tilt_stamp = np.zeros(4), np.zeros(4), -np.inf
+        self.voltage: float | None = None
+        self.bridges: dict[str, str] = {}
+        self.unready = dict.fromkeys(NODES, '')
+        self.battery_low = self.battery_empty = self.lost = False
+        self._low_for = self._empty_for = self._lost_for = 0.0
+        # stamp, position and quaternion of the estimate before, accepted or not
+        self._offered: tuple[float, list[float], list[float]] | None = None
+        self._same = self._same_samples = 0     # equal estimates and IMU samples in a row
         self._sample: list[float] = []
-        self._same = NONE_SAME      # samples for which each axis has kept its value
-        self._floor = 0.0       # height of base_link on the ground before the flight [m]
-        self.events = EventLog(parameters.quiet_time)
+        self._spikes = SpikeFilter(FORCE_SPIKE, RATE_SPIKE)
+        self._in_force: Command | None = None
+        self.floor = 0.0
         self._now: float | None = None
+        self.airborne = False   # set by the state machine
 
-    @property
-    def active(self) -> str:
-        """Name of the selected controller."""
-        return self._selection.active
+    # Messages ---------------------------------------------------------------------------------
 
     def on_state(self, state: State, status: str = 'tracking') -> bool:
         """Receive the estimator's state and status; False when it is refused."""
-        before = self.vehicle.status
-        reading = numbers(state.tilt, 4)
-        true = state if reading is None else corrected(state, self.watch.health)
-        reason = self.vehicle.on_state(true, status, self._now, self.airborne)
+        true = corrected(state, self.watch.health)
+        reason = self._why_not(true, status)
         if reason:
-            self._say(self._now, WARNING, f'ekf_node: estimate refused: {reason}', reason)
-        elif reading is not None:
-            self._watch_joints(state.tilt_stamp, reading)
-        if not reason and status != before and status != 'tracking':
-            self._say(self._now, WARNING, f"ekf_node reports '{status}'")
-        return not reason
+            self.refused[f'estimate: {reason}'] += 1
+            self.last_refusal = reason
+            self._say(WARNING, f'ekf_node: estimate refused: {reason}', reason)
+            return False
+        if status not in (self.status, 'tracking'):
+            self._say(WARNING, f"ekf_node reports '{status}'")
+        self.estimate, self.status, self.last_refusal = true, status, ''
+        self.ekf.reset()
+        self.on_joints(state.tilt_stamp, state.tilt, state.tilt_velocity)
+        return True
+
+    def _why_not(self, state, status):
+        now, position, quaternion = self._now, state.position.tolist(), state.quaternion.tolist()
+        if not (isfinite(state.stamp) and plausible(
+                state.position, state.velocity, state.quaternion, state.angular_velocity)):
+            return 'not finite'
+        if abs(state.quaternion.dot(state.quaternion) - 1) > UNIT_TOLERANCE:
+            return 'no unit quaternion'
+        if now is not None and now - state.stamp > STALE_AFTER:
+            return 'stale stamp'
+        if self._ahead(state.stamp):
+            return 'stamp in the future'
+        if self.estimate is not None and state.stamp <= self.estimate.stamp:
+            return 'repeated or older stamp'
+        if status not in TRACKING:
+            return f"status '{status}'"
+        before, self._offered = self._offered, (state.stamp, position, quaternion)
+        if before is None:
+            return ''
+        self._same = self._same + 1 if before[1:] == (position, quaternion) else 0
+        if self._same >= SAME and self.airborne:
+            return FROZEN
+        if 0 < state.stamp - before[0] <= ESTIMATE_TIMEOUT and (
+                dist(before[1], position) > JUMP_POSITION
+                or rotations.geodesic_angle(before[2], quaternion) > JUMP_ATTITUDE):
+            return JUMP
+        return ''
 
     def on_command(self, controller: str, command: Command, now: float) -> bool:
         """Check one command of one controller; False when it is refused (and counted)."""
-        reason = self._selection.offer(controller, command, now)
+        stream = self.streams.get(controller)
+        if stream is None:
+            self.refused[UNKNOWN] += 1
+        reason = UNKNOWN if stream is None else stream.offer(command, now)
         if reason:
             # A step to a new target causes one jump; repeated jumps end in the controller's
             # timeout.
-            self._say(now, INFO if reason == JUMP else WARNING,
+            self._say(INFO if reason == JUMP else WARNING,
                       f'{controller}_node: command refused: {reason}{MEANINGS.get(reason, "")}',
                       f'{controller}: {reason}')
         return not reason
 
-    def on_joints(self, stamp: float, position: np.ndarray, velocity: np.ndarray) -> bool:
-        """Receive raw joint feedback (4,), nan where unknown."""
-        reading = numbers(position, 4)
-        if reading is None or self._ahead(stamp):
-            return False
-        good = self.vehicle.on_joints(stamp, self.watch.health.true(reading), velocity)
-        if good:
-            self._watch_joints(stamp, reading)
-        return good
+    def on_joints(self, stamp: float, position: np.ndarray,
+                  velocity: np.ndarray | None) -> bool:
+        """
+        Receive raw joint feedback (4,), nan where unknown: there the last angle is kept.
 
-    def _watch_joints(self, stamp, reading):
-        """Pass a reading (4,) to the detectors; a changed zero also applies to this reading."""
-        if stamp <= self.watch.joint_stamp or not (
-                isfinite(stamp) and all(map(isfinite, reading.tolist()))):
-            return
-        before = self.watch.health
-        self.watch.on_joints(stamp, reading, self.airborne)
-        if self.watch.health is not before and self.watch.health.zeros != before.zeros:
-            self.vehicle.tilt = self.watch.health.true(reading)
+        Only complete feedback resets the timeout of the joints.
+        """
+        known = np.abs(position) < ABSURD
+        if not stamp > self.tilt_stamp or self._ahead(stamp) or not known.any():
+            return False
+        self.tilt = np.where(known, self.watch.health.true(position), self.tilt)
+        self.tilt_velocity = np.zeros(4) if velocity is None else \
+            np.where(known & np.isfinite(velocity), velocity, 0.0)
+        self.tilt_stamp = float(stamp)
+        if known.all():
+            self.joints.reset()
+            zeros = self.watch.health.zeros
+            self.watch.on_joints(stamp, position, self.airborne)
+            if self.watch.health.zeros != zeros:    # also of this reading
+                self.tilt = self.watch.health.true(position)
+        return True
 
     def on_imu(self, stamp: float, specific_force: np.ndarray,
                angular_velocity: np.ndarray) -> bool:
-        """Receive a raw IMU sample (3,), (3,) in base_link, for the descent without estimator."""
-        sample = checked_sample(stamp, specific_force, angular_velocity)
-        if sample is None or self._ahead(stamp):
+        """Receive a raw IMU sample (3,), (3,) in base_link."""
+        if not plausible(specific_force, angular_velocity) or self._ahead(stamp):
             return False
-        _, force, rate = sample
-        airborne = self.airborne
-        if not self._is_real(force, rate, airborne) or not self.vehicle.backup.add(sample):
-            return False
-        self.vehicle.imu.reset()
-        if airborne:
-            known = stamp - self.vehicle.tilt_stamp < TILT_AGE
-            self.watch.on_imu(stamp, force, rate, self.vehicle.tilt if known else None,
-                              self._in_force, self._height)
-        return True
-
-    def _is_real(self, force, rate, airborne):
-        """Whether a sample is neither a single spike nor one of many equal samples."""
-        values, before = force.tolist() + rate.tolist(), self._sample
+        values = specific_force.tolist() + angular_velocity.tolist()
+        self._same_samples = self._same_samples + 1 if values == self._sample else 0
         self._sample = values
-        if any(map(eq, values, before)):
-            self._same = [count + 1 if value == last else 0
-                          for count, value, last in zip(self._same, values, before)]
-            if airborne and self._is_frozen():
-                return False
-        else:
-            self._same = NONE_SAME
-        return self._spikes.passes(force, rate)
-
-    def _is_frozen(self):
-        """
-        Whether an IMU that repeats itself may not be used; names that.
-
-        With one frozen axis the estimator still has MoCap, but the descent on raw sensors is
-        better off without the IMU.
-        """
-        limits, now = self._parameters.detection.imu, self._now or 0.0
-        if min(self._same) >= limits.frozen:
-            self.watch.name('imu_frozen', now, 'the IMU repeats the same sample')
-            return True
-        longest = max(self._same)
-        if longest >= limits.axis_frozen:
-            axis = IMU_AXES[self._same.index(longest)]
-            self.watch.name('imu_axis_frozen', now, f'the IMU repeats the same {axis}')
-            return self.vehicle.backup.running
-        return False
+        if self._same_samples >= IMU_FROZEN and self.airborne:
+            self.watch.name('imu_frozen', stamp, 'the IMU repeats the same sample')
+            return False
+        if not self._spikes.passes(specific_force, angular_velocity) \
+                or not self.backup.add(stamp, specific_force, angular_velocity):
+            return False
+        self.imu.reset()
+        if self.airborne:
+            known = stamp - self.tilt_stamp < TILT_AGE
+            self.watch.on_imu(stamp, specific_force, angular_velocity,
+                              self.tilt if known else None, self._in_force, self.height)
+        return True
 
     def on_rotors(self, stamp: float, speed: np.ndarray) -> bool:
         """Receive the rotor speeds (4,) reported by the ESCs [rad/s], nan where unknown."""
-        speed = np.asarray(speed, dtype=float)
-        if self._ahead(stamp) or not isfinite(stamp) or speed.shape != (4,):
+        if self._ahead(stamp):
             return False
         if self.airborne:
             self.watch.on_speeds(stamp, speed)
         return True
 
-    @property
-    def airborne(self) -> bool:
-        """Whether the robot flies, as far as known."""
-        return False
-
-    @property
-    def _height(self):
-        """Height of base_link above its height on the ground [m]; None if unknown."""
-        vehicle = self.vehicle
-        blind = vehicle.mocap.silent if vehicle.backup.running else vehicle.mocap_lost
-        if blind or self._now is None:
-            return None
-        state = vehicle.backup_state(self._now) if vehicle.backup.running else vehicle.state
-        return None if state is None else float(state.position[2]) - self._floor
-
     def on_mocap(self, stamp: float, position: np.ndarray, quaternion: np.ndarray) -> bool:
-        """Receive a raw MoCap pose (3,), (4,) of base_link, for the descent without estimator."""
-        vehicle = self.vehicle
-        pose = vehicle.backup.checked_pose(stamp, position, quaternion)
-        if pose is None or self._ahead(stamp):
+        """Receive a raw MoCap pose (3,), (4,) of base_link."""
+        poses = self.backup.poses
+        if not plausible(position, quaternion) or self._ahead(stamp) \
+                or abs(quaternion.dot(quaternion) - 1) > UNIT_TOLERANCE \
+                or poses and not stamp > poses[-1][0]:
             return False
-        vehicle.backup.remember(pose)
-        airborne = self.airborne
-        if airborne and not self._agrees(*pose):
-            return False
-        vehicle.backup.use(pose)
-        if airborne and vehicle.imu.silent:
-            self.watch.without_imu(stamp, pose[1], self._height)
-        vehicle.mocap.reset()
+        quaternion = rotations.normalized(quaternion)
+        poses.append((stamp, position, quaternion))
+        if self.airborne:
+            state = self.best if self.estimate is not None else None
+            near = state is not None and abs(state.stamp - stamp) < POSE_AGE
+            good = self.watch.on_mocap(stamp, position, quaternion, state if near else None)
+            if not good and 'estimator_wrong' not in self.watch.faults:
+                return False
+        self.backup.correct(stamp, position, quaternion)
+        self.mocap.reset()
         return True
-
-    def _agrees(self, stamp, position, quaternion):
-        """Whether a MoCap pose is consistent with estimate and gyroscope."""
-        vehicle = self.vehicle
-        state = vehicle.backup_state(self._now) \
-            if vehicle.backup.running and self._now is not None else vehicle.state
-        known: tuple[np.ndarray | None, ...] = (None,) * 4
-        if state is not None and abs(state.stamp - stamp) < LATEST:
-            known = state.quaternion, state.angular_velocity, state.position, state.velocity
-        good = self.watch.on_mocap(stamp, position, quaternion, *known)
-        if good or 'estimator_wrong' in self.watch.faults:
-            return True
-        return False
 
     def on_battery(self, voltage: float) -> bool:
         """Receive the pack voltage under load [V]; refused if not finite, negative or absurd."""
         if not 0 <= voltage < VOLTAGE_END:
             return False
-        self.vehicle.voltage = float(voltage)
+        self.voltage = float(voltage)
         if self._now is not None:
-            self.watch.on_voltage(self._now, self.vehicle.voltage)
+            self.watch.on_voltage(self._now, self.voltage)
         return True
 
     def on_actuators(self, name: str, text: str, now: float) -> bool:
@@ -230,37 +257,139 @@ class Inputs:
             whether there is such a bridge.
 
         """
-        known = self.actuators.update(name, text)
-        self.vehicle.stuck = self.actuators.joints_lost
-        if not known:
-            self._say(now, WARNING, f"unknown bridge '{name}'", 'unknown bridge')
-        return known
+        if name not in NODES:
+            self._say(WARNING, f"unknown bridge '{name}'", 'unknown bridge')
+            return False
+        state = self.bridges[name] = ' '.join(text.split()) or 'empty state'
+        self.unready[name] = '' if state == 'ready' else f'{NODES[name]} {state}'
+        return True
 
-    def _tick(self, now):
+    # What is known ----------------------------------------------------------------------------
+
+    @property
+    def health(self) -> ActuatorHealth:
+        """Health of the actuators by the detectors."""
+        return self.watch.health
+
+    @property
+    def known(self) -> State:
+        """The last valid estimate, a condition for take-off."""
+        if self.estimate is None:
+            raise RuntimeError('no estimate received yet')
+        return self.estimate
+
+    @property
+    def best(self) -> State:
+        """The estimate, or the backup estimate while it is used."""
+        return self.known if not self.backup.running or self._now is None else \
+            self.backup.state(self._now, self.known)
+
+    @property
+    def height(self) -> float | None:
+        """Height of base_link above its height on the ground [m]; None if unknown."""
+        return None if self.estimate is None or self.blind else \
+            float(self.best.position[2]) - self.floor
+
+    @property
+    def blind(self) -> bool:
+        """Whether no MoCap pose corrects the estimate that is used."""
+        return self.mocap.silent if self.backup.running else self.mocap.lost
+
+    def seen(self, in_force: Command | None, state: State | None = None) -> State:
+        """A state for the hover controller; silent joints stand where they were asked to."""
+        state = self.known if state is None else state
+        tilt, velocity = self.tilt, self.tilt_velocity
+        # Joints of a bridge that lost them keep their last angles.
+        if self.joints.silent and in_force is not None and not self.bridges.get(
+                'joint', '').startswith('lost:'):
+            tilt, velocity = in_force.tilt, np.zeros(4)
+        return State(state.stamp, state.position, state.velocity, state.quaternion,
+                     state.angular_velocity, tilt, velocity, self.tilt_stamp, in_force)
+
+    @property
+    def specific_force_up(self) -> float | None:
+        """Latest specific force along world up by the estimator's attitude [m/s^2]."""
+        if not self.backup.samples or self.estimate is None or self.imu.silent:
+            return None
+        return float(rotations.up(self.estimate.quaternion).dot(self.backup.samples[-1][1]))
+
+    def why_not_arm(self) -> str:
+        """'' when the motors may start, else the missing condition."""
+        state = self.estimate
+        if any(self.unready.values()):
+            return '; '.join(filter(None, self.unready.values()))
+        if state is None or self.ekf.silent:
+            return f'no fresh state estimate (ekf_node {self.ekf.text})'
+        if self.status != 'tracking':
+            return f"the estimator reports '{self.status}', not 'tracking'"
+        if self.joints.silent:
+            return f'no fresh joint angles (joint_bridge_node {self.joints.text})'
+        angle = np.degrees(inclination(state.quaternion))
+        speed, rate = np.linalg.norm(state.velocity), np.linalg.norm(state.angular_velocity)
+        if angle > np.degrees(ARM_TILT):
+            return f'inclined by {angle:.0f} deg, at most {np.degrees(ARM_TILT):.0f} deg'
+        if speed > ARM_SPEED:
+            return f'moving at {speed:.2f} m/s, at most {ARM_SPEED:g} m/s'
+        if rate > ARM_RATE:
+            return f'turning at {rate:.2f} rad/s, at most {ARM_RATE:g} rad/s'
+        if self.outside(0.0):
+            return 'outside the fence'
+        least = self._parameters.battery.arm * self.robot.battery.cells
+        if self.voltage is not None and self.voltage < least:
+            return f'battery at {self.voltage:.1f} V, at least {least:.1f} V'
+        moved = [f'gimbal{k + 1}' for k, zero in enumerate(self.health.zeros) if zero]
+        return f"the encoder of {' and '.join(moved)} jumped in the last flight: check it, then " \
+               'restart supervisor_node' if moved else ''
+
+    def outside(self, margin: float) -> bool:
+        """Whether the robot is more than ``margin`` [m] outside the fence."""
+        fence = self._parameters.envelope
+        x, y, z = map(abs, self.best.position.tolist())
+        return max(x, y) > fence.half_width + margin or z > fence.height + margin
+
+    # Time -------------------------------------------------------------------------------------
+
+    def _tick(self, now: float) -> float:
         """Counted time since the last update; also after the clock was set back."""
-        if not isfinite(now):
-            return 0.0
         before, self._now = self._now, now
         if before is None:
             return 0.0
         if now < before:
-            self._say(now, WARNING, f'the clock went back by {before - now:.3f} s')
-            self.vehicle.clock_went_back(now, before - now)
-            self.watch.restart(now)
-            self._selection.clock_went_back(now)
-            self._clock_went_back(now, before - now)
+            self._say(WARNING, f'the clock went back by {before - now:.3f} s')
+            self._forget_stamps(now, before - now)
             return 0.0
-        dt = min(now - before, self._parameters.tick_limit)
-        self.vehicle.tick(dt)
-        self._selection.tick(dt)
+        dt = min(now - before, TICK_LIMIT)
+        for source in (self.ekf, self.joints, self.imu, self.mocap):
+            source.tick(dt)
+        for stream in self.streams.values():
+            stream.tick(dt)
+        self.backup.imu_alive = not self.imu.silent
+        cells, battery = self.robot.battery.cells, self._parameters.battery
+        cell = np.inf if self.voltage is None else self.voltage / cells
+        self._low_for = self._low_for + dt if cell < battery.warn else 0.0
+        self._empty_for = self._empty_for + dt if cell < battery.land else 0.0
+        self.battery_low, self.battery_empty = self._low_for >= LOW_TIME, \
+            self._empty_for >= LOW_TIME
+        if self.estimate is not None:
+            state = self.best
+            lost = state.angular_velocity.dot(state.angular_velocity) > TUMBLING**2 \
+                or state.velocity[2] < -FALLING
+            self._lost_for = self._lost_for + dt if lost else 0.0
+            self.lost = self._lost_for >= LOST_TIME
         return dt
 
-    def _clock_went_back(self, now, by):
-        """Implemented by the state machine."""
+    def _forget_stamps(self, now: float, by: float) -> None:
+        """Accept new stamps after the clock was set back by ``by`` [s]."""
+        if self.estimate is not None:
+            self.estimate = replace(self.estimate, stamp=min(self.estimate.stamp, now))
+        self.tilt_stamp = min(self.tilt_stamp, now)
+        self.backup.forget(by)
+        self.watch.restart(now)
+        for stream in self.streams.values():
+            stream.forget()
 
-    def _ahead(self, stamp):
-        return self._now is not None and stamp - self._now > self._parameters.state.timeout
+    def _ahead(self, stamp: float) -> bool:
+        return self._now is not None and stamp - self._now > ESTIMATE_TIMEOUT
 
-    def _say(self, now, severity, text, key=None):
-        stamp = now if now is not None and isfinite(now) else self._now or 0.0
-        self.events.say(stamp, severity, text, key)
+    def _say(self, severity: str, text: str, key: str | None = None) -> None:
+        self.events.say(self._now or 0.0, severity, text, key)

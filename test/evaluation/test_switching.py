@@ -19,12 +19,11 @@ from beetle_omni_ros.robot.schema import RunError
 from beetle_omni_ros.runs.log import LogRecorder
 from beetle_omni_ros.runs.metrics import metrics
 from beetle_omni_ros.runs.tasks import make_task
-from beetle_omni_ros.safety.parameters import SupervisorParameters
+from beetle_omni_ros.safety.commands import HANDOVER_TIME, THRUST_RATE, TILT_RATE
 
 ROBOT = RobotParameters.load()
 POSES, SWITCHES = 2, 20
 PERIOD = 0.01       # s between commands
-HANDOVER = SupervisorParameters.load().handover
 HEADER = 'x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg\n'
 
 
@@ -78,7 +77,7 @@ def test_twenty_switches_at_random_times_of_random_poses(flight):
     assert all(pose['reached'] for pose in metrics(log, task)['poses'])
     # After the handover the executed command is that of the selected controller. The time of a
     # handover is measured in stamps and ends with the first command beyond it.
-    settled = HANDOVER.time + 2 * PERIOD
+    settled = HANDOVER_TIME + 2 * PERIOD
     for (start, name), (end, _) in zip(flown, [*flown[1:], (log.end, '')]):
         asked = log.requests[name.partition(':')[2]]
         inside = (log.command_received > start + settled) & (log.command_received < end)
@@ -97,9 +96,9 @@ def test_no_switch_makes_the_command_jump(flight):
     for moment, name in recorder.switched:
         asked = log.requests[name]
         first = np.searchsorted(log.command_t[1:], moment - 1e-9)
-        for k in range(first, min(first + round(HANDOVER.time / PERIOD), len(step))):
-            assert tilt[k] <= HANDOVER.tilt_rate * step[k] + 1e-6
-            assert thrust[k] <= HANDOVER.thrust_rate * step[k] + 1e-6
+        for k in range(first, min(first + round(HANDOVER_TIME / PERIOD), len(step))):
+            assert tilt[k] <= TILT_RATE * step[k] + 1e-6
+            assert thrust[k] <= THRUST_RATE * step[k] + 1e-6
             own = np.searchsorted(asked.t, log.command_t[k + 1])
             if own == len(asked.t) or np.allclose(asked.tilt[own], log.command_tilt[k + 1]) \
                     and np.allclose(asked.thrust[own], log.command_thrust[k + 1]):

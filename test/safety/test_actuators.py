@@ -3,19 +3,11 @@
 import pytest
 from vehicle_rig import flown, TICK, VehicleRig
 
-from beetle_omni_ros.safety.actuators import Actuators
-
 
 def report(rig, name, text):
     """Give a bridge state to the supervisor, and one step."""
     assert rig.supervisor.on_actuators(name, text, rig.now)
     rig.run(TICK)
-
-
-def test_bridges_without_any_message_have_no_influence():
-    rig = flown()
-    assert rig.supervisor.actuators.why_not_arm == ''
-    assert rig.supervisor.actuators.diagnostics() == {}
 
 
 @pytest.mark.parametrize('name', ['joint', 'rotor'])
@@ -29,14 +21,6 @@ def test_a_bridge_that_is_not_ready_prevents_arming_with_its_reason(name, text):
     assert rig.supervisor.state == 'disarmed'
     report(rig, name, 'ready')
     assert rig.supervisor.arm(rig.now)
-
-
-def test_both_reasons_are_given_on_one_line():
-    actuators = Actuators()
-    actuators.update('rotor', 'waiting: battery low')
-    actuators.update('joint', 'waiting: gimbal2\nstands at -3.48 or +2.80 rad')
-    assert actuators.why_not_arm == ('joint_bridge_node waiting: gimbal2 stands at -3.48 or +2.80 '
-                                     'rad; rotor_bridge_node waiting: battery low')
 
 
 @pytest.mark.parametrize('text', ['lost: gimbal3 silent', 'waiting: deactivated'])
@@ -89,19 +73,3 @@ def test_a_bridge_lost_before_lift_off_stops_the_motors(name):
     assert rig.supervisor.state == 'disarmed'
     assert any('battery low' in event and 'still on the ground: motors off' in event
                for event in rig.texts('error'))
-
-
-def test_a_bridge_lost_while_disarmed_does_not_affect_the_next_flight():
-    rig = VehicleRig()
-    rig.run(0.6)
-    report(rig, 'rotor', 'lost: restarted')
-    assert rig.supervisor.state == 'disarmed' and not rig.texts('error')
-    assert rig.supervisor.diagnostics()['rotor_bridge_node'] == 'lost: restarted'
-
-
-def test_an_unknown_bridge_is_refused_and_reported():
-    rig = flown()
-    assert not rig.supervisor.on_actuators('wheel', 'lost: it', rig.now)
-    rig.run(0.1)
-    assert rig.supervisor.state == 'flying'
-    assert any("unknown bridge 'wheel'" in event for event in rig.texts('warning'))

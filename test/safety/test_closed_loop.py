@@ -1,5 +1,7 @@
 """Takeoff, fallback and descents on the simulated robot with its sensors, delays and ground."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -128,3 +130,28 @@ def test_emergency_stop_cuts_the_thrust_at_once():
     flight.run(4.5)
     assert flight.off() and flight.sim.truth.thrust.max() < 0.2
     assert not flight.supervisor.arm(flight.sim.time)
+
+
+@pytest.mark.parametrize('signs', [(1, 1, 1, 1), (-1, 1, -1, 1)])
+def test_lands_softly_from_inverted_attitude_with_all_joints_wound_adversely(signs):
+    flight = Flight().run(5.0)
+    flight.target = PoseTarget(np.array([0.0, 0.0, 1.5]), rotations.from_rpy(np.pi, 0.0, 0.0))
+    flight.run(11.0)
+    plant, supervisor, link = flight.sim._plant, flight.supervisor, flight.sim._actuate
+    plant._tilt += np.where(np.sign(plant._tilt) != signs, 2 * np.pi * np.array(signs), 0)
+
+    def nearest(tilt):
+        return tilt + 2 * np.pi * np.round((plant._tilt - tilt) / (2 * np.pi))
+
+    # Readings, commands and targets turn, too.
+    flight.sim._actuate = lambda tilt, *rest: link(
+        nearest(np.array(tilt)) if flight.sim.time < 11.15 else tilt, *rest)
+    while flight.sim.time < 11.12:
+        supervisor.watch.restart(flight.sim.time)
+        supervisor._in_force = flight.in_force = replace(
+            supervisor._in_force, tilt=nearest(supervisor._in_force.tilt))
+        flight.run(flight.sim.time + 0.01)
+    assert supervisor.land(flight.sim.time)
+    flight.run(36.0)
+    assert flight.off() and not flight.sim.truth.broken
+    assert flight.touchdown_speed < 0.6

@@ -4,24 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from vehicle_rig import flown, hover_command, PARAMETERS, TICK, VehicleRig
+from vehicle_rig import flown, PARAMETERS, TICK, VehicleRig
 
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY
-from beetle_omni_ros.safety.ramp import inclination
-
-
-@pytest.mark.parametrize('speed, stops', [(4.0, False), (8.0, True)])
-def test_a_robot_that_runs_away_in_a_landing_is_stopped(speed, stops):
-    rig, envelope = flown(), PARAMETERS.envelope
-    rig.velocity = np.array([0.8 * speed, 0.0, 0.6 * speed])
-    rig.run(2 * envelope.lost_time)
-    assert rig.supervisor.state == 'flying', 'in flight a target may be far away'
-    rig.supervisor.land(rig.now)
-    rig.run(envelope.recovery_time - 0.05)
-    assert rig.supervisor.state == 'landing'
-    rig.run(0.1)
-    assert rig.supervisor.state == ('emergency_stop' if stops else 'landing')
+from beetle_omni_ros.robot.allocation import ALL_HEALTHY
+from beetle_omni_ros.safety.inputs import MOCAP_TIMEOUT
+from beetle_omni_ros.safety.landing import FLARE_HEIGHT, GROUND_TIME, PLATFORM_TIME, SETTLING_TIME
+from beetle_omni_ros.safety.way import inclination
 
 
 def test_an_impact_near_the_floor_stops_the_motors_for_good():
@@ -40,33 +29,20 @@ def test_an_impact_near_the_floor_stops_the_motors_for_good():
     assert not rig.supervisor.arm(rig.now)
 
 
-@pytest.mark.parametrize('height, stops', [(0.2, True), (0.8, False)])
-def test_a_second_rotor_lost_at_the_floor_stops_the_motors_at_once(height, stops):
-    rig = VehicleRig().fly()
-    rig.supervisor.watch.health = ActuatorHealth(rotors=(True, False, True, True))
-    rig.run(TICK)
-    assert rig.supervisor.state == 'landing'
-    rig.position = np.array([0.3, -0.2, 0.16 + height])
-    rig.run(0.05)
-    assert rig.supervisor.state == 'landing'
-    rig.supervisor.watch.health = ActuatorHealth(rotors=(True, False, False, True))
-    rig.run(TICK)
-    assert (rig.supervisor.state in ('disarmed', 'emergency_stop')) == stops
-
-
 def test_without_mocap_an_inverted_robot_sinks_while_it_turns_and_is_level_for_the_flare():
     rig = flown()
     rig.position, rig.status = np.array([0.3, -0.2, 2.0]), 'dead_reckoning'
     rig.quaternion = rotations.from_rpy(np.pi, 0.0, 0.0)
     rig.alive.discard('mocap')
-    rig.run(PARAMETERS.state.mocap_timeout + 0.1)
+    rig.run(MOCAP_TIMEOUT + 0.1)
     rig.supervisor.land(rig.now)
+    rig.run(SETTLING_TIME + 2 * TICK)
     ramp = rig.supervisor._landing._ramp
     times = rig.now + np.arange(0.0, 6.0, 0.02)
     height = np.array([ramp.at(time).position[2] for time in times])
     tilted = np.array([inclination(ramp.at(time).quaternion) for time in times])
-    flare = height.min()
-    assert flare == pytest.approx(0.16 + PARAMETERS.landing.flare_height, abs=0.05)
+    flare = ramp.at(ramp.stamp + ramp.end).position[2]
+    assert flare == pytest.approx(0.16 + FLARE_HEIGHT, abs=0.05)
     assert tilted[height < 1.9].max() > 1.0         # sinks before it is level
     assert tilted[height < flare + 0.02].max() < 0.3
 
@@ -89,7 +65,7 @@ def test_with_a_weak_pack_an_inverted_robot_at_rest_leaps_before_it_turns(speed,
     assert np.abs(way.angular_velocities).max() < 10    # no sample in the step of the attitude
 
 
-def test_after_a_lost_rotor_the_escape_is_asked_at_once_and_its_first_command_obeyed():
+def test_after_a_lost_rotor_the_escape_is_asked_at_once():
     rig = flown()
     rig.position, rig.quaternion = np.array([0.3, -0.2, 1.5]), rotations.from_rpy(1.5, 0.0, 0.0)
     rig.run(0.6)
@@ -100,9 +76,6 @@ def test_after_a_lost_rotor_the_escape_is_asked_at_once_and_its_first_command_ob
     assert rotations.geodesic_angle(way.quaternions[0], rig.quaternion) > 0.5
     assert rotations.geodesic_angle(way.at(way.times[0] + 0.05).quaternion,
                                     way.quaternions[0]) < 1e-6
-    command = hover_command(rig.now + TICK, rig.quaternion)
-    far = replace(command, tilt=command.tilt + np.where(command.tilt > 0, -2.5, 2.5))
-    assert rig.supervisor.on_command('nmpc', far, rig.now + TICK)
 
 
 def test_high_above_the_floor_the_ground_must_be_felt_for_longer():
@@ -117,16 +90,7 @@ def test_high_above_the_floor_the_ground_must_be_felt_for_longer():
             rig.run(TICK)
         assert rig.supervisor.state == 'disarmed'
         durations.append(rig.now - start)
-    p = PARAMETERS.landing
-    assert durations[1] - durations[0] == pytest.approx(p.platform_time - p.ground_time, abs=0.05)
-
-
-def test_an_impact_high_above_the_floor_is_no_crash():
-    rig = flown()
-    for after in (0.001, 0.006):
-        rig.supervisor.on_imu(rig.now + after, np.array([0, 120.0, 0]), np.zeros(3))
-    rig.run(0.2)
-    assert rig.supervisor.state == 'flying'
+    assert durations[1] - durations[0] == pytest.approx(PLATFORM_TIME - GROUND_TIME, abs=0.05)
 
 
 def test_a_pause_in_the_air_ends_in_fallback_and_on_the_floor_with_motors_off():
@@ -157,37 +121,10 @@ def test_limits_hold_while_landing(spoil):
     assert rig.supervisor.state == 'emergency_stop'
 
 
-@pytest.mark.parametrize('reports', [False, True], ids=['reports stall, too', 'reports go on'])
-def test_no_rotor_is_suspected_after_two_stalls_in_which_the_actuators_stopped(reports):
-    rig = flown()
-
-    def fly(duration):
-        for _ in range(round(duration / 0.02)):
-            rig.run(0.02)
-            rig.supervisor.on_rotors(rig.now, 300.0 * np.sqrt(rig.thrust))
-
-    fly(2.0)
-    for _ in range(2):      # each is too short for a pause of the supervisor
-        rig.now += 0.8 * PARAMETERS.commands.age_limit
-        rig.command = rig.supervisor.update(rig.now)
-    assert rig.command is None      # too old
-    rig.thrust[:] = 0.0             # the motor board stopped the rotors
-    for ago in (0.06, 0.04, 0.02) if reports else ():
-        rig.supervisor.on_rotors(rig.now - ago, 200.0 * np.sqrt(np.full(4, 7.0)))
-    fly(0.6)
-    assert not any('rotor' in name for name in rig.supervisor.faults), rig.supervisor.faults
-
-
-def test_a_landing_from_the_highest_place_inside_the_limits_ends_before_its_time_limit():
-    envelope, landing = PARAMETERS.envelope, PARAMETERS.landing
-    turns = np.pi / landing.level.rate + landing.turnover.time_limit
-    sinking = (envelope.height + envelope.fence_margin) / landing.speed
-    assert sinking + turns < landing.time_limit
-
-
-def test_landing_and_fallback_end_in_time():
-    rig = VehicleRig(replace(PARAMETERS, envelope=replace(PARAMETERS.envelope, fallback_time=3.0),
-                             landing=replace(PARAMETERS.landing, time_limit=10.0))).fly()
+def test_landing_and_fallback_end_in_time(monkeypatch):
+    monkeypatch.setattr('beetle_omni_ros.safety.supervisor.LANDING_LIMIT', 10.0)
+    rig = VehicleRig(replace(PARAMETERS, envelope=replace(PARAMETERS.envelope,
+                                                          fallback_time=3.0))).fly()
     rig.alive -= {'nmpc', 'rl'}
     rig.run(2.9)
     assert rig.supervisor.state == 'fallback'
@@ -209,27 +146,3 @@ def test_a_flip_of_the_markers_leads_to_a_landing_without_mocap():
     rig.run(2.0)
     assert 'mocap_flipped' in rig.supervisor.faults
     assert rig.supervisor.state == 'landing'
-
-
-def test_a_silent_imu_is_named_and_not_the_controller_that_waits_for_the_estimate():
-    rig = flown()
-    rig.alive -= {'imu', 'estimate', 'nmpc'}
-    rig.run(0.1)
-    assert 'imu_lost' in rig.supervisor.faults
-    assert 'controller_silent' not in rig.supervisor.faults
-
-
-def test_one_frozen_axis_of_the_imu_is_named_and_the_flight_goes_on():
-    rig = flown()
-    limit = PARAMETERS.detection.imu.axis_frozen
-    original = rig.supervisor.on_imu
-    rig.supervisor.on_imu = lambda stamp, force, rate: original(stamp, force, [0.0, *rate[1:]])
-    rig.run((limit - 1) * TICK)
-    assert 'imu_axis_frozen' not in rig.supervisor.faults
-    rig.run(3 * TICK)
-    assert 'imu_axis_frozen' in rig.supervisor.faults
-    assert rig.supervisor.state == 'flying' and not rig.supervisor.vehicle.imu_lost
-    rig.alive.discard('estimate')    # the descent on raw sensors works without the IMU
-    rig.run(0.5)
-    assert rig.supervisor.state == 'landing' and rig.supervisor.vehicle.imu_lost
-    assert 'imu_lost' not in rig.supervisor.faults

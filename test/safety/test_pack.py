@@ -6,8 +6,7 @@ import pytest
 from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.thrust_map import ThrustMap
-from beetle_omni_ros.safety.parameters import SupervisorParameters
-from beetle_omni_ros.safety.watch.pack import PackWatch
+from beetle_omni_ros.safety.pack import PackWatch
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.simulator import Battery
 
@@ -22,8 +21,7 @@ class Flight:
 
     def __init__(self, seed=0):
         self.battery = Battery(ROBOT, PACK)
-        self.watch = PackWatch(SupervisorParameters.load().detection.battery, ROBOT,
-                               Allocator(ROBOT), ThrustMap(ROBOT.rotors))
+        self.watch = PackWatch(ROBOT, Allocator(ROBOT), ThrustMap(ROBOT.rotors))
         self.random, self.ticks = np.random.default_rng(seed), 0
         self.thrust, self.seen = np.zeros(4), ROBOT.battery.full_voltage
 
@@ -92,21 +90,3 @@ def test_a_good_pack_is_not_weak_while_discharging(command, seed):
     # Four times the simulated current: a real pack of this size is empty after 12 minutes.
     while flight.battery.charge > 0.2:
         assert flight.fly(20.0, command, faster=4.0) is None
-
-
-def test_an_empty_pack_is_weak():
-    flight = Flight()
-    flight.battery.charge = 0.02
-    flight.fly(0.5, np.zeros(4))
-    flight.fly(3.0, hover)
-    assert flight.watch.limit is not None and flight.watch.limit < 15.0
-
-
-def test_a_new_flight_starts_without_state_of_the_last():
-    flight = Flight()
-    flight.battery.extra_resistance = 0.3
-    flight.fly(0.5, np.zeros(4))
-    flight.fly(3.0, hover)
-    assert flight.watch.limit is not None
-    flight.watch.reset()
-    assert flight.watch.limit is None

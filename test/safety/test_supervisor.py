@@ -4,30 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from vehicle_rig import flown, hover_command, PARAMETERS, ROBOT, TICK, VehicleRig
+from vehicle_rig import flown, PARAMETERS, ROBOT, TICK, VehicleRig
 
 from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.safety.parameters import SupervisorParameters
+from beetle_omni_ros.safety.inputs import ESTIMATE_TIMEOUT, JOINT_TIMEOUT, LOST_TIME, LOW_TIME
+from beetle_omni_ros.safety.supervisor import STOP_TIME
 
 TIMEOUT = PARAMETERS.commands.timeout
-
-
-def test_nothing_is_sent_before_arming():
-    rig = VehicleRig()
-    assert set(rig.run(1.0)) == {None}
-    assert rig.supervisor.state == 'disarmed' and rig.supervisor.source == 'none'
-
-
-def test_takes_off_by_hover_and_hands_over():
-    rig = VehicleRig()
-    rig.run(0.6)
-    assert rig.supervisor.arm(rig.now)
-    rig.run(0.1)
-    assert rig.supervisor.state == 'takeoff' and rig.supervisor.source == 'hover'
-    rig.run(4.0)
-    assert rig.supervisor.state == 'flying' and rig.supervisor.source == 'nmpc'
-    np.testing.assert_allclose(rig.command.thrust, hover_command(0.0).thrust)
 
 
 @pytest.mark.parametrize('spoil, text', [
@@ -69,31 +53,6 @@ def test_silent_controller_falls_back_to_hover_without_a_jump_and_gets_control_b
     assert rig.supervisor.state == 'flying' and rig.supervisor.source == 'nmpc'
 
 
-def test_fallback_holds_the_pose_at_which_it_began():
-    rig = flown()
-    rig.quaternion = rotations.from_rpy(1.2, 0.4, -2.0)
-    rig.run(0.2)
-    rig.alive.discard('nmpc')
-    rig.run(0.2)
-    goal = rig.supervisor._target.at(rig.now)
-    np.testing.assert_allclose(goal.position, rig.position, atol=1e-8)
-    np.testing.assert_array_equal(goal.quaternion, rig.quaternion)
-
-
-def test_an_estimate_that_repeats_its_numbers_with_new_stamps_is_refused():
-    rig = flown()
-    rig.alive.discard('estimate')
-    state = rig.supervisor.vehicle.state
-    accepted = 0
-    while rig.supervisor.state == 'flying':
-        rig.run(TICK)
-        accepted += rig.supervisor.on_state(replace(state, stamp=rig.now))
-        assert accepted < 12
-    assert accepted > 5     # a short pause of the estimator's inputs is no fault
-    assert rig.supervisor.reported_state == 'landing:estimator_lost'
-    assert any('the same numbers again' in text for text in rig.texts())
-
-
 def test_a_controller_with_invalid_commands_only_counts_as_silent_with_the_reason():
     rig = flown()
     rig.alive.discard('nmpc')
@@ -104,32 +63,6 @@ def test_a_controller_with_invalid_commands_only_counts_as_silent_with_the_reaso
     assert rig.supervisor.state == 'fallback'
     assert any('last refused: not finite' in text for text in rig.texts('error'))
     assert rig.supervisor.diagnostics()['nmpc.refused.not finite'] == 20
-
-
-def test_a_controller_that_oscillates_at_the_limits_keeps_control():
-    rig = flown()
-    rig.alive.discard('nmpc')
-    top = ROBOT.rotors.thrust_max
-    for k in range(30):
-        rig.supervisor.on_command('nmpc', Command(
-            rig.now, 0.01 * np.arange(4) + 1e-6 * k, np.array([top + 2.0, 7.0, 7.0, -2.0])),
-            rig.now)
-        rig.run(TICK)
-        assert rig.supervisor.state == 'flying'
-    assert rig.command.thrust[0] == top and rig.command.thrust[3] == 0.0
-    assert rig.supervisor.diagnostics()['nmpc.refused.thrust out of range'] >= 29
-
-
-def test_hover_lasts_until_the_controller_is_present_for_the_handover():
-    rig = VehicleRig()
-    rig.alive.discard('nmpc')
-    rig.run(0.6)
-    rig.supervisor.arm(rig.now)
-    rig.run(5.0)
-    assert rig.supervisor.state == 'fallback'
-    rig.alive.add('nmpc')
-    rig.run(0.6)
-    assert rig.supervisor.state == 'flying'
 
 
 def test_selecting_in_flight_needs_a_good_controller():
@@ -150,18 +83,11 @@ def test_selecting_in_flight_needs_a_good_controller():
     assert not unknown and "unknown controller 'pid'" in unknown.text
 
 
-def test_on_the_ground_any_controller_can_be_selected():
-    rig = VehicleRig()
-    rig.alive -= {'rl', 'nmpc'}
-    rig.run(0.1)
-    assert rig.supervisor.select('rl') and rig.supervisor.active == 'rl'
-
-
 def test_emergency_stop_is_latched_until_disarmed():
     rig = flown()
     assert rig.supervisor.emergency_stop(rig.now)
     sent = rig.run(1.0)
-    stop_ticks = round(PARAMETERS.stop_time / TICK)
+    stop_ticks = round(STOP_TIME / TICK)
     assert all(not command.thrust.any() for command in sent[:stop_ticks])
     assert set(sent[stop_ticks + 1:]) == {None}
     assert not rig.supervisor.arm(rig.now) and not rig.supervisor.land(rig.now)
@@ -201,7 +127,7 @@ def test_joint_that_does_not_follow_stops_the_takeoff_before_the_rotors_start():
 
     def with_stuck_joint():
         publish()
-        rig.supervisor.vehicle.tilt = stuck
+        rig.supervisor.tilt = stuck
 
     rig._publish = with_stuck_joint
     rig.run(0.6)
@@ -212,26 +138,15 @@ def test_joint_that_does_not_follow_stops_the_takeoff_before_the_rotors_start():
 
 
 @pytest.mark.parametrize('source, name, delay', [
-    ('estimate', 'ekf_node', PARAMETERS.state.timeout),
-    ('joints', 'joint_bridge_node', PARAMETERS.state.joint_timeout)])
+    ('estimate', 'ekf_node', ESTIMATE_TIMEOUT),
+    ('joints', 'joint_bridge_node', JOINT_TIMEOUT)])
 def test_silent_estimator_or_joints_lead_to_a_landing_that_names_the_node(source, name, delay):
     rig = flown()
     rig.alive.discard(source)
     rig.run(delay + 2 * TICK)
     assert rig.supervisor.state == 'landing' and rig.supervisor.source == 'hover'
     assert any(text.startswith(f'{name} silent for') for text in rig.texts('error'))
-    assert rig.supervisor.vehicle.backup.running == (source == 'estimate')
-
-
-def test_estimator_that_reports_lost_counts_as_silent():
-    rig = flown()
-    rig.status = 'dead_reckoning'
-    rig.run(0.5)
-    assert rig.supervisor.state == 'flying'
-    rig.status = 'lost'
-    rig.run(0.1)
-    assert rig.supervisor.state == 'landing'
-    assert any("last refused: status 'lost'" in text for text in rig.texts('error'))
+    assert rig.supervisor.backup.running == (source == 'estimate')
 
 
 def test_loss_of_all_sensors_stops_the_motors():
@@ -242,34 +157,20 @@ def test_loss_of_all_sensors_stops_the_motors():
     assert any('no estimator, no MoCap, no IMU' in text for text in rig.texts('error'))
 
 
-def test_a_fault_before_lift_off_stops_the_motors():
-    rig = VehicleRig()
-    rig.lifts = False
-    rig.run(0.6)
-    rig.supervisor.arm(rig.now)
-    rig.run(0.1)
-    rig.alive.discard('estimate')
-    rig.run(0.1)
-    assert rig.supervisor.state == 'disarmed'
-    assert any('still on the ground: motors off' in text for text in rig.texts('error'))
-
-
 def test_low_battery_warns_then_lands():
-    # Without the resistance: only the voltage falls suddenly and recovers.
-    detection = replace(PARAMETERS.detection, battery=replace(
-        PARAMETERS.detection.battery, time=10.0))
-    rig = VehicleRig(replace(PARAMETERS, detection=detection)).fly()
+    rig = VehicleRig().fly()
+    rig.supervisor.watch._pack = None   # the voltage falls without a load
     full = rig.voltage
     rig.voltage = (PARAMETERS.battery.land - 0.05) * ROBOT.battery.cells
-    rig.run(PARAMETERS.battery.time / 2)     # the sag of a manoeuvre
+    rig.run(LOW_TIME / 2)     # the sag of a manoeuvre
     rig.voltage = full
-    rig.run(PARAMETERS.battery.time)
+    rig.run(LOW_TIME)
     assert not any('battery' in t for t in rig.texts())
     rig.voltage = (PARAMETERS.battery.warn - 0.05) * ROBOT.battery.cells
     rig.run(3.0)
     assert rig.supervisor.state == 'flying' and any('battery low' in t for t in rig.texts())
     rig.voltage = (PARAMETERS.battery.land - 0.05) * ROBOT.battery.cells
-    rig.run(PARAMETERS.battery.time - 0.1)
+    rig.run(LOW_TIME - 0.1)
     assert rig.supervisor.state == 'flying'
     rig.run(0.2)
     assert rig.supervisor.state == 'landing'
@@ -287,48 +188,22 @@ def test_a_pack_that_sags_under_the_same_load_leads_to_a_landing_within_half_a_s
     assert all(command.thrust.max() <= limit + 1e-9 for command in rig.run(0.5))
 
 
-@pytest.mark.parametrize('reaction, state', [
-    ('none', 'flying'), ('landing', 'landing'), ('emergency_stop', 'emergency_stop')])
-def test_fence_reaction_is_a_parameter(reaction, state):
-    rig = VehicleRig(replace(PARAMETERS, envelope=replace(PARAMETERS.envelope,
-                                                          fence_reaction=reaction))).fly()
+def test_outside_the_fence_the_robot_lands():
+    rig = flown()
     rig.position = np.array([0.0, 25.0, 1.0])
     rig.run(0.1)
-    assert rig.supervisor.state == state
+    assert rig.supervisor.reported_state == 'landing:fence_left'
 
 
-@pytest.mark.parametrize('reaction, state', [
-    ('none', 'flying'), ('fallback', 'fallback'), ('landing', 'landing'),
-    ('emergency_stop', 'emergency_stop')])
-@pytest.mark.parametrize('motion', ['tumbling', 'falling'])
-def test_lost_control_reaction_is_a_parameter(motion, reaction, state):
-    rig = VehicleRig(replace(PARAMETERS, envelope=replace(PARAMETERS.envelope,
-                                                          lost_reaction=reaction))).fly()
-    if motion == 'tumbling':
-        rig.rate = np.array([20.0, 0, 0])
-    else:
-        rig.velocity = np.array([0, 0, -8.0])
-    rig.run(PARAMETERS.envelope.lost_time - 0.02)
+@pytest.mark.parametrize('motion', [{'rate': np.array([20.0, 0, 0])},
+                                    {'velocity': np.array([0, 0, -8.0])}])
+def test_a_tumbling_or_falling_robot_falls_back(motion):
+    rig = flown()
+    vars(rig).update(motion)
+    rig.run(LOST_TIME - 0.02)
     assert rig.supervisor.state == 'flying'
     rig.run(0.6)
-    assert rig.supervisor.state == state
-
-
-def test_any_attitude_is_permitted():
-    rig = flown()
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        rig.quaternion = rotations.normalized(rng.normal(size=4))
-        rig.run(0.05)
-    assert rig.supervisor.state == 'flying'
-
-
-def test_a_delayed_supervisor_reports_no_silence_and_sends_no_old_command():
-    rig = flown()
-    rig.now += 3.0
-    assert rig.supervisor.update(rig.now) is None
-    rig.run(0.1)
-    assert rig.supervisor.state == 'flying' and rig.command is not None
+    assert rig.supervisor.reported_state == 'fallback:control_lost'
 
 
 def test_a_clock_set_back_in_flight_is_tolerated():
@@ -347,7 +222,7 @@ def test_a_clock_set_back_in_flight_is_tolerated():
 
 @pytest.mark.parametrize('change, reason', [
     ({'position': np.full(3, np.nan)}, 'not finite'),
-    ({'velocity': np.full(3, 1e300)}, 'absurdly large'),
+    ({'velocity': np.full(3, 1e300)}, 'not finite'),
     ({'quaternion': np.array([0, 0, 0, 2.0])}, 'no unit quaternion'),
     ({'stamp': 90.0}, 'stale stamp'), ({'stamp': 200.0}, 'stamp in the future'),
     ({'stamp': 0.0, '_repeat': True}, 'repeated or older stamp')])
@@ -355,11 +230,11 @@ def test_bad_estimates_are_refused_and_counted(change, reason):
     rig = VehicleRig()
     rig.run(0.1)
     repeat = change.pop('_repeat', False)
-    good = rig.supervisor.vehicle.state
+    good = rig.supervisor.estimate
     bad = good if repeat else replace(good, **{'stamp': rig.now + TICK, **change})
     assert not rig.supervisor.on_state(bad)
     assert rig.supervisor.diagnostics()[f'refused.estimate: {reason}'] == 1
-    assert rig.supervisor.vehicle.state is good
+    assert rig.supervisor.estimate is good
 
 
 @pytest.mark.parametrize('change, refused', [
@@ -369,50 +244,12 @@ def test_bad_estimates_are_refused_and_counted(change, reason):
 def test_a_single_jump_of_the_estimate_is_refused_and_a_lasting_one_accepted(change, refused):
     rig = VehicleRig()
     rig.run(0.1)
-    vehicle = rig.supervisor.vehicle
-    good = vehicle.state
+    supervisor = rig.supervisor
+    good = supervisor.estimate
     jumped = [replace(good, stamp=rig.now + k * TICK, **{
         name: good.position + value if name == 'position' else value
         for name, value in change.items()}) for k in (1, 2)]
     assert rig.supervisor.on_state(jumped[0]) is not refused
-    assert vehicle.state is (good if refused else jumped[0])
+    assert supervisor.estimate is (good if refused else jumped[0])
     assert rig.supervisor.on_state(jumped[1])
-    assert vehicle.state is jumped[1]
-
-
-def test_random_estimates_move_no_joint_before_the_descent_on_raw_sensors():
-    rig, random = flown(), np.random.default_rng(1)
-    before = rig.command
-    rig.alive.discard('estimate')
-    for _ in range(40):
-        row = random.standard_normal(13)
-        rig.supervisor.on_state(replace(
-            rig.supervisor.vehicle.state, stamp=rig.now, position=3 * row[:3],
-            velocity=3 * row[3:6], quaternion=rotations.normalized(row[6:10]),
-            angular_velocity=3 * row[10:]))
-        rig.run(TICK)
-        if rig.supervisor.state == 'landing':
-            break
-        assert np.max(np.abs(rig.command.tilt - before.tilt)) < 0.1
-    assert rig.supervisor.state == 'landing'
-    assert 'estimator_lost' in rig.supervisor.faults
-
-
-def test_command_of_an_unknown_controller_is_counted_and_not_executed():
-    rig = flown()
-    assert not rig.supervisor.on_command('pid', hover_command(rig.now), rig.now)
-    assert rig.supervisor.diagnostics()['refused.unknown controller'] == 1
-
-
-def test_untimely_requests_are_refused_with_the_reason():
-    rig = VehicleRig()
-    rig.run(0.1)
-    assert 'not in flight' in rig.supervisor.land(rig.now).text
-    rig.fly()
-    assert 'flying, not disarmed' in rig.supervisor.arm(rig.now).text
-
-
-def test_parameters_of_the_wrong_kind_are_named():
-    from beetle_omni_ros.robot import schema
-    with pytest.raises(schema.ParameterError, match='commands.timout.*timeout'):
-        schema.bind(SupervisorParameters, {'commands': {'timout': 0.1}})
+    assert supervisor.estimate is jumped[1]

@@ -7,13 +7,16 @@ from beetle_omni_ros.robot.degraded import sphere
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.servo import Responses
 from beetle_omni_ros.robot.thrust_map import ThrustMap
-from beetle_omni_ros.safety.watch.parameters import PackLimits
 
 DIRECTIONS = 200        # of up in the body, with a computed hover load, 14 deg apart
-BISECTIONS = 20
+STEPS = 500             # between no and full thrust, for the thrust of all rotors together
 SURPRISE = 3.0          # [-] standard deviations beyond which a reading means a fault
 LEAST = 1.0             # [V] a smaller reading is that of a disconnected sensor
 UNKNOWN = 1.0           # [ohm W/N^1.5] initial value; a good pack has 0.4
+NOISE = 0.02            # [V] twice that of the simulated sensor
+LOAD_ERROR = 0.1        # [-] of the voltage drop: transients of thrust, delays, another propeller
+DISCHARGE = 0.03        # [V/s^0.5] 0.25 V a minute: a pack that lasts 10 minutes
+TIME = 0.2              # [s] two readings after the first
 
 
 class PackWatch:
@@ -29,7 +32,6 @@ class PackWatch:
     under load is less than required.
 
     Args:
-        limits: noise and times.
         robot: nominal robot.
         allocator: of the robot.
         rotor_map: thrust limits by voltage.
@@ -40,10 +42,8 @@ class PackWatch:
 
     """
 
-    def __init__(self, limits: PackLimits, robot: RobotParameters, allocator: Allocator,
-                 rotor_map: ThrustMap):
-        """See the class."""
-        self._p, self._map = limits, rotor_map
+    def __init__(self, robot: RobotParameters, allocator: Allocator, rotor_map: ThrustMap):
+        self._map = rotor_map
         self._lags = np.array(Responses.of(robot).rotor_lag)[:, None]
         self._thrust_max = robot.rotors.thrust_max
         _, thrusts = allocator.upright(sphere(DIRECTIONS))
@@ -57,7 +57,7 @@ class PackWatch:
         # with the shortest and with the longest lag of the rotors
         self._thrusts, self._commanded_at = np.zeros((2, ROTORS)), -np.inf
         self._state = np.array([np.nan, 0.0])      # rest [V], drop [ohm W/N^1.5]
-        self._covariance = np.diag([self._p.noise ** 2, UNKNOWN ** 2])
+        self._covariance = np.diag([NOISE ** 2, UNKNOWN ** 2])
         self._read_at, self._weak_for = -np.inf, 0.0
 
     def on_command(self, stamp: float, thrust: np.ndarray) -> None:
@@ -77,7 +77,7 @@ class PackWatch:
         # A weak pack stays weak in the same flight, even if its voltage recovers.
         weak = bool(np.any(self._allowed(self._loads) < self._needs))
         self._weak_for = self._weak_for + since if weak else 0.0
-        if self.limit is not None or self._weak_for > self._p.time:
+        if self.limit is not None or self._weak_for > TIME:
             self.limit = self._together()
 
     def _estimate(self, voltage, since):
@@ -85,9 +85,9 @@ class PackWatch:
         one, other = (_load(self._thrusts) / voltage).tolist()
         load, unsure = 0.5 * (one + other), 0.5 * abs(one - other)
         sensitivity = np.array([1.0, -load])
-        self._covariance[0, 0] += self._p.discharge ** 2 * since
-        noise = self._p.noise ** 2 + self._state[1] ** 2 * (
-            (self._p.load_error * load) ** 2 + unsure ** 2)
+        self._covariance[0, 0] += DISCHARGE ** 2 * since
+        noise = NOISE ** 2 + self._state[1] ** 2 * (
+            (LOAD_ERROR * load) ** 2 + unsure ** 2)
         error = voltage - float(sensitivity @ self._state)
         variance = float(sensitivity @ self._covariance @ sensitivity) + noise
         if load > 0 and error ** 2 > SURPRISE ** 2 * variance:
@@ -106,12 +106,8 @@ class PackWatch:
 
     def _together(self):
         """Thrust [N] that all rotors can give at the same time."""
-        low, high = 0.0, self._thrust_max
-        for _ in range(BISECTIONS):
-            middle = 0.5 * (low + high)
-            enough = self._allowed(ROTORS * middle ** 1.5) >= middle
-            low, high = (middle, high) if enough else (low, middle)
-        return low
+        thrusts = np.linspace(0.0, self._thrust_max, STEPS)
+        return float(thrusts[self._allowed(ROTORS * thrusts ** 1.5) >= thrusts].max())
 
 
 def _load(thrust):

@@ -1,0 +1,192 @@
+"""Commands of the controllers: their checks, and the transition from one to another."""
+
+from collections import Counter
+from math import isfinite
+
+import numpy as np
+
+from beetle_omni_ros.control.base import Command, ROTORS
+from beetle_omni_ros.robot.allocation import clipped
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.safety.events import Silence
+from beetle_omni_ros.safety.parameters import CommandLimits
+
+JUMP = 'implausible jump'
+FROZEN = 'the same numbers again'
+UNKNOWN = 'unknown controller'
+
+STALE_AFTER = 0.05      # [s] a command computed from an older state is refused
+AHEAD = 0.02            # [s] a stamp farther in the future comes from another clock
+OVERSTEP = 0.25         # [-] of a range: 5 N, 1 rad. A wrong unit exceeds it by a factor of 3
+TILT_STEP = 2.0         # [rad] a single larger jump is a spike: the joint would need 0.2 s
+THRUST_STEP = 15.0      # [N] the same for thrust, three quarters of the range
+SAME = 10               # commands or estimates in a row that are equal to the last digit
+HANDOVER_TIME = 0.3     # [s] longest duration: half a turn of a joint
+TILT_RATE = 9.0         # [rad/s] as in hover.yaml: below the servos' 10
+THRUST_RATE = 300.0     # [N/s] as in hover.yaml: 3 N a period
+
+MEANINGS = {    # of reasons for refusals that do not explain themselves
+    FROZEN: f' (more than {SAME} equal commands in a row count as a frozen controller; compute '
+            'the command from the state, see docs/safety.md)'}
+
+
+class CommandStream:
+    """
+    Commands of one controller: the last accepted one, and refusals with reasons.
+
+    Args:
+        limits: thresholds.
+        robot: thrust and tilt ranges.
+
+    Attributes:
+        accepted: the last valid command, clipped to the ranges, or None.
+        clipped: number of accepted commands that were clipped.
+        refused: reason -> count.
+        silence: time since the last valid command.
+        good_for: time of valid commands without a gap or refusal [s].
+
+    """
+
+    def __init__(self, limits: CommandLimits, robot: RobotParameters):
+        self._return_after = limits.return_after
+        self._tilt_limit = robot.joints.position_limit
+        self._low, self._high = robot.rotors.thrust_min, robot.rotors.thrust_max
+        self.accepted: Command | None = None
+        self.clipped, self.refused = 0, Counter[str]()
+        self._last_refusal = ''
+        self.silence = Silence(limits.timeout)
+        self.good_for = 0.0
+        self._offered: Command | None = None
+        self._same = 0
+
+    @property
+    def good(self) -> bool:
+        """Whether the controller may get control."""
+        return not self.silence.silent and self.good_for >= self._return_after - 1e-9
+
+    @property
+    def complaint(self) -> str:
+        """Why the controller may not get control, for messages."""
+        if self.silence.silent:
+            last = f'; last refused: {self._last_refusal}' if self._last_refusal else ''
+            return self.silence.text + last
+        return f'good for only {self.good_for:.2f} s of {self._return_after:g} s'
+
+    def offer(self, command: Command, now: float) -> str:
+        """
+        Check one command; store a copy of a valid command.
+
+        Returns:
+            '' when accepted, else the reason.
+
+        """
+        reason, clean = self._check(command, now)
+        if reason:
+            self.refused[reason] += 1
+            self._last_refusal = reason
+            # A step to a new target looks like a jump for one period only. Repeated jumps end in
+            # the timeout.
+            if reason != JUMP:
+                self.good_for = 0.0
+            return reason
+        self.accepted, self._last_refusal = clean, ''
+        self.silence.reset()
+        return ''
+
+    def tick(self, dt: float) -> None:
+        """``dt`` seconds passed."""
+        self.silence.tick(dt)
+        self.good_for = 0.0 if self.silence.silent else self.good_for + dt
+
+    def forget(self) -> None:
+        """Accept any stamp, after a step of the clock."""
+        self.accepted = self._offered = None
+        self.silence.forget()
+
+    def _check(self, command, now):
+        """Reason of a refusal and, without one, a copy within the limits."""
+        stamp, tilt, thrust = command.stamp, command.tilt, command.thrust
+        if not all(map(isfinite, [stamp, *tilt.tolist(), *thrust.tolist()])):
+            return 'not finite', None
+        if now - stamp > STALE_AFTER:
+            return 'stale stamp', None
+        if stamp - now > AHEAD:
+            return 'stamp in the future', None
+        if self.accepted is not None and stamp <= self.accepted.stamp:
+            return 'repeated or older stamp', None
+        clean = Command(stamp, clipped(tilt, -self._tilt_limit, self._tilt_limit),
+                        clipped(thrust, self._low, self._high))
+        beyond = _farthest(tilt, clean.tilt), _farthest(thrust, clean.thrust)
+        if beyond[0] > OVERSTEP * self._tilt_limit:
+            return 'tilt out of range', None
+        if beyond[1] > OVERSTEP * (self._high - self._low):
+            return 'thrust out of range', None
+        self.clipped += max(beyond) > 0
+        before, self._offered = self._offered, clean
+        if before is None:
+            return '', clean
+        steps = _farthest(clean.tilt, before.tilt), _farthest(clean.thrust, before.thrust)
+        self._same = 0 if max(steps) > 0 else self._same + 1
+        if self._same >= SAME:
+            return FROZEN, None
+        # Compared with the previous command, accepted or not: a single spike is refused, a real
+        # step is delayed by one period.
+        if stamp - before.stamp <= self.silence.limit and (
+                steps[0] > TILT_STEP or steps[1] > THRUST_STEP):
+            return JUMP, None
+        return '', clean
+
+
+class Handover:
+    """
+    Limits the rate of the command after a change of the controller.
+
+    A controller on standby has similar commands, but in a large turn the commands may differ. The
+    limit ends when the new command is reached, or after HANDOVER_TIME.
+
+    Attributes:
+        left: remaining time, set to HANDOVER_TIME after a change of the controller [s].
+
+    """
+
+    left = 0.0
+
+    def limit(self, asked: Command, in_force: Command | None) -> Command:
+        """Return ``asked``, limited to the permitted change from ``in_force``."""
+        if self.left <= 0 or in_force is None:
+            return asked
+        step = asked.stamp - in_force.stamp
+        if step <= 0:       # a command for this state was already executed
+            return in_force
+        self.left -= step
+        change = np.concatenate([asked.tilt - in_force.tilt, asked.thrust - in_force.thrust])
+        reach = step * np.repeat([TILT_RATE, THRUST_RATE], ROTORS)
+        if (np.abs(change) <= reach).all():
+            self.left = 0.0
+            return asked
+        change = np.clip(change, -reach, reach)
+        return Command(asked.stamp, in_force.tilt + change[:ROTORS],
+                       in_force.thrust + change[ROTORS:])
+
+
+def within_limits(command: Command, robot: RobotParameters, stopped: bool = False) -> \
+        Command | None:
+    """
+    Final check of the output: finite and clipped to the limits, or None.
+
+    Args:
+        command: of any source.
+        robot: thrust and tilt ranges.
+        stopped: whether zero thrust is intended, below the smallest thrust in flight.
+
+    """
+    if not all(map(isfinite, [*command.tilt.tolist(), *command.thrust.tolist()])):
+        return None
+    limit = robot.joints.position_limit
+    low, high = 0.0 if stopped else robot.rotors.thrust_min, robot.rotors.thrust_max
+    return Command(command.stamp, clipped(command.tilt, -limit, limit),
+                   clipped(command.thrust, low, high))
+
+
+def _farthest(a, b):
+    return max(map(abs, (a - b).tolist()))

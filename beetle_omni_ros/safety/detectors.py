@@ -1,0 +1,203 @@
+"""
+All detectors of one vehicle: detected faults, and the health of the actuators.
+
+docs/safety.md has the table of detectors with signal, limit, persistence and reaction. The limits
+are constants beside each detector. They follow from the noise of healthy flights and from both
+ends of the lags that the robot file allows.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from beetle_omni_ros.control.base import Command, State
+from beetle_omni_ros.robot.allocation import (
+    ActuatorHealth,
+    ALL_HEALTHY,
+    Allocator,
+    clipped,
+    ROTORS,
+)
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.thrust_map import ThrustMap
+from beetle_omni_ros.safety.pack import PackWatch
+from beetle_omni_ros.safety.readings import JointWatch, MocapWatch
+from beetle_omni_ros.safety.speeds import LEAST_THRUST, SpeedWatch
+from beetle_omni_ros.safety.wrench import ContactWatch, NEAR_GROUND, WrenchWatch
+
+BUILD_UP = 0.5          # [s] five time constants of a rotor, without judgement after a pause
+NOTICEABLE = 0.3        # [N] change of a held thrust or of the pack's limit that is not reported
+MOVED = 0.02            # [rad] the same for the angle of a stuck joint
+
+
+class FaultWatch:
+    """
+    Runs the detectors and stores the detected faults.
+
+    A detected fault stays until :meth:`reset`: an actuator that has failed once is not used again
+    in the same flight.
+
+    Args:
+        robot: nominal robot.
+        allocator: of the robot.
+
+    Attributes:
+        faults: name -> time of detection [s].
+        health: which actuators work, and the zeros of encoders that jumped.
+        news: texts of faults, emptied by the reader.
+
+    """
+
+    def __init__(self, robot: RobotParameters, allocator: Allocator):
+        self._limit = robot.joints.position_limit
+        self._thrust_max = self._limit_now = robot.rotors.thrust_max
+        self._wrench = WrenchWatch(robot, allocator)
+        self.contact = ContactWatch(robot.gravity)
+        self._joints = JointWatch(robot)
+        self._speeds = SpeedWatch(robot)
+        self._mocap = MocapWatch()
+        self._map = ThrustMap(robot.rotors) if len(robot.rotors.map) > 1 else None
+        self._pack = None if self._map is None else PackWatch(robot, allocator, self._map)
+        self.faults: dict[str, float] = {}
+        self.reset()
+
+    def reset(self) -> None:
+        """Reset for a new flight without faults."""
+        self.faults.clear()
+        self.health: ActuatorHealth = ALL_HEALTHY
+        self.news: list[str] = []
+        if self._pack is not None:
+            self._pack.reset()
+        self.restart(-np.inf)
+
+    def restart(self, now: float) -> None:
+        """Restart the detectors after a pause or a step of the clock; detected faults stay."""
+        self._stamp, self._blind_until = -np.inf, now + BUILD_UP
+        for watch in (self._wrench, self.contact, self._joints, self._speeds, self._mocap):
+            watch.reset()
+
+    def name(self, name: str, stamp: float, text: str = '') -> bool:
+        """Add a fault; False if it is already known."""
+        if name in self.faults:
+            return False
+        self.faults[name] = float(stamp)
+        if text:
+            self.news.append(text)
+        return True
+
+    def on_command(self, command: Command) -> None:
+        """Receive the executed command."""
+        thrust = clipped(command.thrust, 0.0, self._limit_now)
+        self._joints.on_command(command.stamp, command.tilt)
+        self._speeds.on_command(command.stamp, thrust)
+        if self._pack is not None:
+            self._pack.on_command(command.stamp, thrust)
+
+    def on_imu(self, stamp: float, force: np.ndarray, rate: np.ndarray, tilt: np.ndarray | None,
+               command: Command | None, height: float | None) -> None:
+        """Receive an IMU sample of a robot in the air, see the two detectors."""
+        dt, self._stamp = stamp - self._stamp, stamp
+        thrust = np.zeros(ROTORS) if command is None else \
+            clipped(command.thrust, 0.0, self._limit_now)
+        self._wrench.supported = self._speeds.slow
+        self._wrench.on_imu(stamp, force, rate, tilt, thrust, self.health)
+        self.contact.update(min(max(dt, 0.0), 0.05), height, self._wrench)
+        if height is not None and height < NEAR_GROUND:
+            return      # the floor also exerts a force
+        if stamp < self._blind_until:
+            return self._wrench.forget()
+        lost = self._wrench.lost
+        if lost is None or not self.health.rotors[lost] or self.health.held[lost] is not None:
+            return
+        # A rotor that holds its thrust also gives less than commanded, while more is asked.
+        if self._speeds.suspected[lost] and self._speeds.thrust[lost] > LEAST_THRUST:
+            self._hold(lost, stamp)
+        else:
+            self._lose_rotor(lost, stamp, 'the wrench')
+
+    def on_speeds(self, stamp: float, speed: np.ndarray) -> None:
+        """Receive ESC speeds (4,) [rad/s], nan where unknown."""
+        self._speeds.on_speeds(stamp, speed)
+        if stamp < self._blind_until:
+            return self._speeds.forget()
+        lost, deaf, thrust = self._speeds.lost, self._speeds.deaf, self._speeds.thrust
+        if lost is not None:
+            self._lose_rotor(lost, stamp, 'its ESC')
+        if deaf is not None and self.health.rotors[deaf]:
+            self._hold(deaf, stamp)
+        for rotor, held in enumerate(self.health.held):
+            if held is not None and abs(thrust[rotor] - held) > NOTICEABLE:
+                self._set('held', rotor, min(max(float(thrust[rotor]), 0.0), self._thrust_max))
+
+    def _hold(self, rotor, stamp):
+        """The rotor keeps a thrust that does not depend on its command."""
+        thrust = float(self._speeds.thrust[rotor])
+        if self.name(f'rotor{rotor + 1}_deaf', stamp, f'rotor {rotor + 1} does not follow its '
+                     f'commands, by its ESC; it gives {thrust:.1f} N'):
+            self._set('held', rotor, min(max(thrust, 0.0), self._thrust_max))
+
+    def _lose_rotor(self, rotor, stamp, by):
+        if self.name(f'rotor{rotor + 1}_lost', stamp, f'rotor {rotor + 1} gives less thrust than '
+                     f'commanded, by {by}'):
+            self._set('rotors', rotor, False)
+
+    def on_joints(self, stamp: float, tilt: np.ndarray, trusted: bool) -> None:
+        """
+        Receive a complete reading (4,) [rad], which is judged only if ``trusted``, in the air.
+
+        If an encoder jumps, the joint angle is assumed unchanged: the zero moves by the jump.
+        """
+        watch = self._joints
+        watch.on_joints(stamp, tilt)
+        if not trusted or not watch.suspects and not watch.jump.any() \
+                and self.health.stuck == ALL_HEALTHY.stuck:
+            return
+        for joint in np.flatnonzero(watch.jump).tolist():
+            self.name(f'joint{joint + 1}_encoder_jump', stamp, f'the encoder of '
+                      f'gimbal{joint + 1} jumped by {watch.jump[joint]:+.2f} rad at once')
+            self._set('zeros', joint, self.health.zeros[joint] + float(watch.jump[joint]))
+        true = clipped(self.health.true(tilt), -self._limit, self._limit).tolist()
+        for joint, angle in enumerate(true):
+            stuck = self.health.stuck[joint]
+            if stuck is not None and abs(stuck - angle) > MOVED:
+                self._set('stuck', joint, angle)
+            elif stuck is None and watch.astray[joint]:
+                self.name(f'joint{joint + 1}_astray', stamp, f'gimbal{joint + 1} does not follow '
+                          f'its command, at {angle:.2f} rad')
+                self._set('stuck', joint, angle)
+
+    def on_mocap(self, stamp: float, position: np.ndarray, quaternion: np.ndarray,
+                 state: State | None) -> bool:
+        """Receive a pose and the estimate of about its time; whether the pose may be used."""
+        watch = self._mocap
+        watch.on_pose(stamp, position, quaternion, state)
+        if watch.frozen:
+            self.name('mocap_frozen', stamp, 'MoCap repeats the same pose')
+        elif watch.displaced:
+            self.name('mocap_jumped', stamp, 'the position of MoCap jumped, and the IMU does not '
+                      'show it')
+        elif watch.contradicts and watch.jumped:
+            self.name('mocap_flipped', stamp, 'the attitude of MoCap jumped, and the gyroscope '
+                      'does not show it')
+        elif watch.contradicts:
+            self.name('estimator_wrong', stamp, 'the estimate contradicts MoCap, which did not '
+                      'jump')
+        return watch.good
+
+    def on_voltage(self, stamp: float, voltage: float) -> None:
+        """Receive the pack's voltage [V]: a low voltage limits all rotors."""
+        if self._map is None or self._pack is None:
+            return
+        self._limit_now = self._map.thrust_limit_below(voltage)
+        self._pack.on_voltage(stamp, voltage)
+        limit, known = self._pack.limit, self.health.thrust_limit
+        if limit is not None and (known is None or abs(limit - known) > NOTICEABLE):
+            self.name('battery_weak', stamp, f'the pack sags to {voltage:.1f} V under load: it '
+                      f'allows {limit:.1f} N a rotor, too little for some attitudes')
+            self.health = replace(self.health, thrust_limit=limit)
+
+    def _set(self, field, index, value):
+        """Change one entry of the health."""
+        old = getattr(self.health, field)
+        self.health = replace(self.health, **{  # type: ignore[arg-type]
+            field: (*old[:index], value, *old[index + 1:])})

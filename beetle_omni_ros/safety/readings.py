@@ -1,0 +1,151 @@
+"""Detection of encoders and MoCap poses that contradict the models, and of joints that stick."""
+
+from collections import deque
+from math import expm1, sqrt
+
+import numpy as np
+
+from beetle_omni_ros.control.base import State
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.allocation import clipped, ROTORS
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.servo import Responses
+
+KEPT = 64               # commands, 0.3 s at 200 Hz
+LONGEST = 0.1           # [s] between two readings; after a longer gap no jump is detected
+NO_JUMP = np.zeros(ROTORS)
+ERROR = 0.25            # [rad] beside both models, and the friction of the file
+TIME = 0.12             # [s] until it is a fault
+DELAY = 0.025           # [s] command 10 to 15 ms, feedback 5 to 10 ms
+SPREAD = 0.03           # [s] uncertainty of the delay: another 0.3 rad at 10 rad/s
+JUMP = 0.5              # [rad] between two readings, beyond the motion that is possible
+
+AGE = 0.05              # [s] largest time between pose and estimate
+FASTEST = 6.0           # [m/s] largest speed of a robot in a hall
+ATTITUDE = 0.35         # [rad] from the estimate, or jump against the gyroscope
+DISTANCE = 0.3          # [m] the same; larger than the error of dead reckoning after 1 s
+LASTING = 10            # poses, 0.1 s, of a contradiction
+DISPLACED = 30          # poses after a jump; longer than a temporary confusion of markers
+FROZEN = 5              # equal poses; noise of 1 mm never repeats exactly
+
+
+class JointWatch:
+    """
+    Compares encoders with the fastest and the slowest servo that the robot file allows.
+
+    Both follow the commands with a first-order lag, at a limited rate and after a delay. A joint
+    between them, or within the noise and its friction beside them, follows its commands.
+
+    Args:
+        robot: nominal robot.
+
+    Attributes:
+        astray: joints (4,) bool that do not follow their command.
+        jump: (4,) [rad] jump of the last reading relative to the motion before it, if it is larger
+            than a joint can turn, else 0.
+        suspects: whether a joint differed from its model at the last reading.
+
+    """
+
+    def __init__(self, robot: RobotParameters):
+        allowed = Responses.of(robot)
+        self._rate_limit = robot.joints.velocity_limit
+        self._lags, (low, high) = allowed.servo_lag, allowed.servo_delay
+        self._delays = max(0.0, DELAY - SPREAD + low), DELAY + SPREAD + high
+        self._error = ERROR + allowed.friction
+        self.reset()
+
+    def reset(self) -> None:
+        """Start again at the next reading."""
+        self._commands: deque = deque(maxlen=KEPT)
+        self._stamp, self._tilt, self._models = -np.inf, np.zeros(ROTORS), np.zeros((2, ROTORS))
+        self._change, self._for = np.zeros(ROTORS), np.zeros(ROTORS)
+        self.astray, self.jump, self.suspects = np.zeros(ROTORS, dtype=bool), NO_JUMP, False
+
+    def on_command(self, stamp: float, tilt: np.ndarray) -> None:
+        """Receive the joint targets (4,) [rad] of the time ``stamp`` [s]."""
+        self._commands.append((stamp, tilt))
+
+    def on_joints(self, stamp: float, tilt: np.ndarray) -> None:
+        """Receive a complete reading (4,) [rad] of the time ``stamp`` [s]."""
+        dt, change, models = stamp - self._stamp, tilt - self._tilt, self._models
+        self._stamp, self._tilt, self.jump = stamp, tilt, NO_JUMP
+        if dt > LONGEST:
+            models[:], self._change, self._for = tilt, np.zeros(ROTORS), np.zeros(ROTORS)
+            return
+        reach = self._rate_limit * dt
+        for model, delay, lag in zip(models, self._delays, self._lags):
+            target = next((asked for at, asked in reversed(self._commands) if at <= stamp - delay),
+                          tilt)
+            model += clipped(-expm1(-dt / lag) * (target - model), -reach, reach)
+        jumped = np.abs(change) > reach + JUMP
+        if jumped.any():
+            self.jump = np.where(jumped, change - self._change, 0.0)
+            models[:] = np.where(jumped, tilt, models)
+        self._change = np.where(jumped, self._change, change)
+        off = (tilt < models.min(axis=0) - self._error) | (tilt > models.max(axis=0) + self._error)
+        self._for = np.where(off, self._for + dt, 0.0)
+        self.astray, self.suspects = self._for >= TIME, bool(off.any())
+
+
+class MocapWatch:
+    """
+    Detects impossible jumps, repeated values, and lasting contradictions.
+
+    Attributes:
+        good: whether the last pose may be used.
+        frozen: whether equal poses repeat.
+        jumped: whether the contradiction began with a jump of the attitude.
+        contradicts: whether pose and estimate have contradicted each other for long enough.
+        displaced: whether the position jumped and has contradicted the estimate for long enough.
+
+    """
+
+    def __init__(self):
+        self.reset()
+
+    def reset(self) -> None:
+        """Reset the detector."""
+        self._before: tuple[float, np.ndarray, np.ndarray] | None = None
+        self._moved = self.good = self.frozen = False
+        self._same = self._off = self._far = 0
+        self.jumped = self.contradicts = self.displaced = False
+
+    def on_pose(self, stamp: float, position: np.ndarray, quaternion: np.ndarray,
+                state: State | None) -> None:
+        """
+        Receive a pose.
+
+        Args:
+            stamp: of its capture [s].
+            position: (3,) in world [m].
+            quaternion: (4,) xyzw, unit.
+            state: estimate of about that time, None: there is none.
+
+        """
+        before, self._before = self._before, (stamp, position, quaternion)
+        turning = 0.0 if state is None else sqrt(state.angular_velocity.dot(
+            state.angular_velocity))
+        if before is not None:
+            dt, moved = stamp - before[0], position - before[1]
+            turn = rotations.geodesic_angle(before[2], quaternion)
+            self._same = self._same + 1 if not moved.any() and np.array_equal(
+                quaternion, before[2]) else 0
+            if dt < LONGEST:
+                self.jumped |= turn > ATTITUDE + turning * dt
+                self._moved |= sqrt(moved.dot(moved)) > DISTANCE + FASTEST * dt
+        self.frozen = self._same >= FROZEN
+        off = far = False
+        if state is not None:
+            error = position - state.position
+            speed = sqrt(state.velocity.dot(state.velocity))
+            off = rotations.geodesic_angle(state.quaternion, quaternion) \
+                > ATTITUDE + turning * AGE
+            far = sqrt(error.dot(error)) > DISTANCE + speed * AGE
+        self._moved &= far
+        self.jumped &= off
+        self._off = self._off + 1 if off or far else 0
+        self._far = self._far + 1 if far and self._moved else 0
+        self.displaced = self._far >= DISPLACED
+        self.contradicts = self._off >= LASTING and not self._moved
+        self.good = not off and not far and not self.frozen

@@ -1,1 +1,0 @@
-"""Detectors of faults in flight: pure functions of commands and measurements."""

@@ -1,0 +1,135 @@
+"""The route to level: joints stay within their stops, from any winding."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.allocation import Allocator
+from beetle_omni_ros.robot.degraded import Holding
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.safety.way import (
+    climb,
+    FARTHEST,
+    find_turnover,
+    inclination,
+    LOST_LIFT,
+    MARGIN,
+    plan,
+    Ramp,
+    ROOM,
+    Way,
+)
+
+ROBOT = RobotParameters.load()
+ALLOCATOR = Allocator(ROBOT)
+RATE = 0.8      # [rad/s] of the body
+RANDOM = np.random.default_rng(5)
+ATTITUDES = [rotations.normalized(q) for q in RANDOM.normal(size=(20, 4))]
+LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
+UPSIDE_DOWN = [rotations.from_rpy(np.pi, 0.0, yaw) for yaw in (0.0, 0.4, 1.6, 3.0)]
+
+
+def held(attitude):
+    """Tilts of hovering; inverted, those after a rotation from one side."""
+    beside = rotations.multiply(attitude, rotations.exp(np.array([2e-4, 5e-4, 0.0])))
+    return ALLOCATOR.upright(rotations.matrix(beside)[2][None])[0][0]
+
+
+def followed(way, tilt):
+    """Tilts (P, 4) of the allocation along a route, and the largest loss of thrust."""
+    present, tilts, jumps = np.array(tilt), [], []
+    for elapsed in np.linspace(0, way.duration, 200):
+        goal = ALLOCATOR.hover(way.at(elapsed)[0], present)
+        moved = np.abs(goal.tilt - present) > 1.0
+        jumps.append(float((goal.thrust * moved).sum()))
+        present = goal.tilt
+        tilts.append(present)
+    return np.array(tilts), np.array(jumps)
+
+
+@pytest.mark.parametrize('attitude', ATTITUDES + UPSIDE_DOWN)
+def test_ends_level_and_no_loaded_joint_turns_over(attitude):
+    way = plan(attitude, held(attitude), ALLOCATOR, RATE)
+    assert inclination(way.at(way.duration)[0]) < 1e-6
+    np.testing.assert_allclose(np.abs(way.at(0.0)[0] @ attitude), 1, atol=1e-9)
+    tilts, jumps = followed(way, held(attitude))
+    np.testing.assert_allclose(tilts[-1], 0, atol=1e-3)
+    assert jumps.max() < 1.0
+
+
+@pytest.mark.parametrize('attitude', UPSIDE_DOWN)
+@pytest.mark.parametrize('joint', range(4))
+def test_an_adversely_wound_joint_unwinds_while_its_arm_is_vertical(attitude, joint):
+    tilt = held(attitude)
+    tilt[joint] -= 2 * np.pi * np.sign(tilt[joint])
+    way = plan(attitude, tilt, ALLOCATOR, RATE)
+    tilts, jumps = followed(way, tilt)
+    np.testing.assert_allclose(tilts[-1], 0, atol=1e-3)
+    assert jumps.max() < 1.5        # of 7.5 N
+
+
+def test_two_opposite_joints_at_their_stops_turn_back_without_loss_of_lift():
+    limit, tried = ALLOCATOR.tilt_limit, 0
+    for attitude in np.random.default_rng(7).normal(size=(1500, 4)):
+        attitude = rotations.normalized(attitude)
+        tilt = held(attitude)
+        other = tilt - 2 * np.pi * np.sign(tilt)
+        at_stop = (np.abs(other) < limit) & (np.abs(other) > limit - MARGIN)
+        if at_stop.sum() != 2 or not (at_stop[:2] & at_stop[2:]).any():
+            continue
+        tried += 1
+        tilt = np.where(at_stop, other, tilt)
+        way = plan(attitude, tilt, ALLOCATOR, RATE)
+        tilts, jumps = followed(way, tilt)
+        assert way.lost < 0.1 and jumps.max() < 1.0
+        np.testing.assert_allclose(tilts[-1], 0, atol=1e-3)
+    assert tried > 10
+
+
+KNOTS = [climb(0.8, 0.4, 0.5), climb(0.1, 0.4, 0.5),
+         [(0.0, 0.0), (0.5, 0.0), (0.7, -1.0), (1.7, -1.0), (2.0, -0.3)]]
+
+
+@pytest.mark.parametrize('knots', KNOTS)
+def test_velocities_of_a_ramp_are_the_derivatives_of_its_pose(knots):
+    way, h = Way.straight(ATTITUDES[2], UPSIDE_DOWN[1], 0.8), 1e-5
+    ramp = Ramp(10.0, np.array([1.0, 2.0, 3.0]), way, knots)
+    for time in np.linspace(10.03, 16.03, 61):
+        before, now, after = (ramp.at(t) for t in (time - h, time, time + h))
+        np.testing.assert_allclose((after.position - before.position) / (2 * h), now.velocity,
+                                   atol=1e-4)
+        turn = rotations.log(rotations.multiply(rotations.conjugate(before.quaternion),
+                                                after.quaternion))
+        if abs(time - 10 - way.duration) > 2 * h:
+            np.testing.assert_allclose(turn / (2 * h), now.angular_velocity, atol=1e-4)
+
+
+@pytest.mark.parametrize('height', [0.1, 0.8, 3.0])
+def test_a_climb_ends_at_rest_at_its_height_within_its_limits(height):
+    ramp = Ramp(0.0, np.zeros(3), Way.straight(LEVEL, LEVEL, 1.0), climb(height, 0.4, 0.5))
+    end = ramp.at(ramp.duration)
+    assert end.position[2] == pytest.approx(height) and end.velocity[2] == 0.0
+    speeds = np.array([ramp.at(t).velocity[2] for t in np.linspace(0, ramp.duration, 500)])
+    assert speeds.max() <= 0.4 + 1e-9
+    assert np.abs(np.diff(speeds)).max() <= 0.5 * ramp.duration / 499 + 1e-9
+
+
+WINDINGS = [np.pi * np.array(signs) for signs in itertools.product((1.0, -1.0), repeat=4)]
+
+
+@pytest.mark.parametrize('tilt', [tilt for tilt in WINDINGS if (tilt[:2] == tilt[2:]).any()])
+def test_one_joint_turn_a_pair_permits_levelling_while_three_rotors_hold_the_position(tilt):
+    attitude = UPSIDE_DOWN[1]
+    for _ in range(np.sum(tilt[:2] == tilt[2:])):
+        assert plan(attitude, tilt, ALLOCATOR, RATE).lost > LOST_LIFT
+        found = find_turnover(attitude, tilt, ROBOT, ALLOCATOR, RATE)
+        holding = Holding(ROBOT, found.health)
+        assert holding.margin(found.quaternion) > holding.parameters.flying_margin
+        assert rotations.geodesic_angle(found.quaternion, attitude) < FARTHEST
+        assert abs(found.tilt) <= ALLOCATOR.tilt_limit - ROOM
+        assert np.sign(found.tilt) == -np.sign(tilt[found.joint])
+        tilt = np.where(np.arange(4) == found.joint, tilt - np.copysign(2 * np.pi, tilt), tilt)
+    assert plan(attitude, tilt, ALLOCATOR, RATE).lost <= LOST_LIFT
+    assert find_turnover(LEVEL, np.zeros(4), ROBOT, ALLOCATOR, RATE) is None
