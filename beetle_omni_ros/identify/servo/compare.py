@@ -157,7 +157,9 @@ def _candidates(found):
     return [{'name': name, 'accepted': name in found.chosen.entries,
              'evidence': _evidence(found, name), 'sigma_of_realistic_size': None,
              'sigma_beside_rivals': {},
-             'reason': '' if name in found.chosen.entries else 'the evidence does not need it'}
+             'reason': '' if name in found.chosen.entries else
+             'the evidence does not need it' if found.gains[name] < CERTAIN else
+             'less than an encoder count, or no better on left-out blocks'}
             for name in sorted(found.gains, key=lambda name: -found.gains[name])]
 
 
@@ -178,7 +180,7 @@ def _effects(found, robot):
             result.append(effect | {'parameters': parts})
             continue
         s = found.servos
-        moved = s.visible(found.chosen, name) & s.changed(found.chosen, name)
+        moved = s.visible(found.chosen, found.trials[name]) & s.changed(found.chosen, name)
         for unit in np.flatnonzero(moved):
             number = s.units[unit][2]
             own = {key: {'value': entry['each'][str(number)], 'unit': entry['unit'],
@@ -207,9 +209,9 @@ def _parameters(found, trial, name, robot):
     s, spec, joined = found.servos, CATALOGUE[name].parameters, {}
     file = file_sets(robot)
     # An entry that the log neither needs nor excludes widens the intervals of the others.
-    possible = [trial, *(found.trials[other] for other in CATALOGUE[name].confused_with
+    possible = [trial, *(found.trials[other] for other, gain in found.gains.items()
                          if trial is found.chosen and other not in trial.entries
-                         and found.gains.get(other, -np.inf) > -CERTAIN)]
+                         and gain > -CERTAIN)]
     for parameter in spec:
         each, ends, files = {}, {}, {}
         for unit, (*_, number) in enumerate(s.units):
