@@ -17,7 +17,7 @@ from beetle_omni_ros.identify.servo.compare import changes, compare, gap_of
 from beetle_omni_ros.identify.servo.joint import identify
 from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
 from beetle_omni_ros.identify.servo.model import INDEX, simulate
-from beetle_omni_ros.identify.servo.robot import file_sets
+from beetle_omni_ros.identify.servo.robot import file_sets, own_delay
 from beetle_omni_ros.robot import dynamics
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
@@ -26,7 +26,8 @@ REAL = sorted((Path(__file__).resolve().parents[3] / 'shared' / 'data').glob('jo
 SHIPPED = RobotParameters.load()
 INERTIA = SHIPPED.joints.inertia
 BANDS = (0.013, 0.035)      # [rad]
-FREQUENCY, DAMPING, DELAY = 47.0, 0.63, 0.015
+FREQUENCY, DAMPING = 47.0, 0.63
+DELAY = own_delay() + 0.004     # of which a file states the rest
 T, COMMAND = sweep(5.0, periods=(0.5, 0.9), amplitudes=(0.3, 0.6))
 
 
@@ -40,7 +41,7 @@ def robot(**effects):
     torque = tuple(kp * band for band in (*BANDS, 0.0, 0.0))
     own = {'joint_bandwidth': {'kp': kp, 'kd': 2 * DAMPING * FREQUENCY * INERTIA},
            'joint_friction': {'coulomb': torque, 'stiction': torque},
-           'joint_command_latency': {'delay': DELAY}}
+           'joint_command_latency': {'delay': DELAY - own_delay()}}
     return replace(SHIPPED, effects={**own, **effects})
 
 

@@ -96,6 +96,7 @@ class Servos:
                                                          < int(round(fitted * len(log.t)))))
             self.rows.append(rows)
             self.blocks.append(np.arange(len(rows)) * p.blocks // max(len(rows), 1))
+        self.low = LOW.copy()
         self.sigma = np.full(len(self.units), p.first_noise)
         self._blocks = [self.blocks[k] for k, *_ in self.units]
         self.inflation = 1.0
@@ -175,7 +176,7 @@ class Servos:
                     if active[p]:
                         target[:, p] = np.log(value) if LOGARITHMIC[p] else value
             x = self._nearest(s, target)
-            fits.append(solve(self, self.base, s, x, self.labels['log'], self._blocks, LOW, HIGH,
+            fits.append(solve(self, self.base, s, x, self.labels['log'], self._blocks, self.low, HIGH,
                               self.memory))
         return Trial(tuple(entries), min(fits, key=lambda fit: fit.chi2 + fit.x @ fit.x))
 
