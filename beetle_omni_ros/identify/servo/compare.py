@@ -111,7 +111,8 @@ def gap_of(found: Found, apart: Found, robot: RobotParameters) -> dict:
     numbers = [number for *_, number in found.servos.units]
     before, after, floor = (
         np.array([error_rms(log, u, sets[u], part=last) for u in units])
-        for sets in (file_sets(robot, flown=True)[np.array(numbers) - 1], found.values(), apart.values()))
+        for sets in (file_sets(robot, flown=True)[np.array(numbers) - 1], found.values(),
+                     apart.values()))
     floor = np.minimum(floor, after)
     allowed = np.hypot(shipped().servo.as_well * floor, log.quantum)
     effects = _effects(found, robot)

@@ -176,8 +176,8 @@ class Servos:
                     if active[p]:
                         target[:, p] = np.log(value) if LOGARITHMIC[p] else value
             x = self._nearest(s, target)
-            fits.append(solve(self, self.base, s, x, self.labels['log'], self._blocks, self.low, HIGH,
-                              self.memory))
+            fits.append(solve(self, self.base, s, x, self.labels['log'], self._blocks, self.low,
+                              HIGH, self.memory))
         return Trial(tuple(entries), min(fits, key=lambda fit: fit.chi2 + fit.x @ fit.x))
 
     def evidence(self, trial: Trial) -> float:
