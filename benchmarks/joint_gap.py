@@ -121,7 +121,8 @@ def made_log(log: JointLog, before: np.ndarray, after: np.ndarray, way: str, rng
 def judged(log: JointLog, sets: np.ndarray, robot: RobotParameters) -> dict:
     """Verdict and effects of a log against parameter sets of gimbal1 to gimbal4."""
     apart = identify([log], robot)
-    with patch.object(servo_compare, 'file_sets', return_value=sets):
+    with patch.object(servo_compare, 'file_sets', return_value=sets), \
+            patch.object(servo_compare, 'own_delay', return_value=0.0):
         return gap_of(compare(log, robot), apart, robot)
 
 

@@ -20,11 +20,9 @@ from beetle_omni_ros.identify.rotor.log import COLUMNS, EXPECTED, read_rotor_log
 from beetle_omni_ros.identify.servo.fit import decoded, Found, HIGH, LOW, STARTS, Trial
 from beetle_omni_ros.identify.servo.log import HEADER, is_bag, read_joint_log
 from beetle_omni_ros.identify.servo.model import INDEX
-from beetle_omni_ros.identify.servo.robot import catalogue_values, JOINTS
+from beetle_omni_ros.identify.servo.robot import catalogue_values, JOINTS, own_delay
 from beetle_omni_ros.robot.effects import CATALOGUE, settings
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import load_yaml
 from beetle_omni_ros.runs.files import LogError
 
 MILLI = 1e3
@@ -78,12 +76,6 @@ def _names(path, pattern):
     except OSError:
         return False        # its reader states the reason
     return any(re.fullmatch(pattern, cell.strip(' \ufeff\n')) for cell in line.split(','))
-
-
-def own_delay() -> float:
-    """Delay [s] from a command to its reading that the simulator has for every robot."""
-    simulator = load_yaml(share_path('params/simulator.yaml'))
-    return simulator['actuators']['command_delay'] + simulator['encoders']['latency']
 
 
 def servo_values(found: Found, robot: RobotParameters) -> tuple[dict, dict, dict]:
@@ -163,7 +155,7 @@ def _entries(found: Found, trial: Trial, log: int | None, robot: RobotParameters
             parameter = CATALOGUE[entry].parameters[name]
             value = np.broadcast_to(given, logs.shape[:2])
             if entry == 'joint_command_latency':
-                value = np.maximum(value.mean(axis=0, keepdims=True) - own_delay(), 0)
+                value = np.maximum(value.mean(axis=0, keepdims=True), 0)
             elif not (parameter.of_each or isinstance(parameter.neutral, tuple)):
                 value = value.mean(axis=0, keepdims=True)
             elif len(value) < JOINTS:

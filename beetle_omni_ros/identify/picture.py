@@ -6,10 +6,9 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 
-from beetle_omni_ros.identify.measured import own_delay
 from beetle_omni_ros.identify.rotor.results import RotorModel
 from beetle_omni_ros.identify.servo.log import JointLog
-from beetle_omni_ros.identify.servo.model import INDEX, simulate
+from beetle_omni_ros.identify.servo.model import simulate
 from beetle_omni_ros.identify.servo.robot import file_sets
 from beetle_omni_ros.pages.figures import COLOURS, FAINT, INK, legend, panels, STYLE
 from beetle_omni_ros.pages.page import Grid
@@ -22,8 +21,7 @@ MILLI = 1e3
 
 def flown(log: JointLog, robot: RobotParameters) -> np.ndarray:
     """(n, N) readings of a robot's servos behind the simulator's delays, with the log's zeros."""
-    sets = file_sets(robot)[np.array(log.joints) - 1]
-    sets[:, INDEX['delay']] += own_delay()
+    sets = file_sets(robot, flown=True)[np.array(log.joints) - 1]
     read = simulate(log, np.arange(len(sets)), sets)
     error = (read - log.measured)[:, log.fresh]
     return read - error.mean(axis=1, keepdims=True)

@@ -17,7 +17,7 @@ from beetle_omni_ros.identify.servo.compare import changes, compare, gap_of
 from beetle_omni_ros.identify.servo.joint import identify
 from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
 from beetle_omni_ros.identify.servo.model import INDEX, simulate
-from beetle_omni_ros.identify.servo.robot import file_sets
+from beetle_omni_ros.identify.servo.robot import catalogue_values, file_sets, own_delay
 from beetle_omni_ros.robot import dynamics
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
@@ -26,7 +26,8 @@ REAL = sorted((Path(__file__).resolve().parents[3] / 'shared' / 'data').glob('jo
 SHIPPED = RobotParameters.load()
 INERTIA = SHIPPED.joints.inertia
 BANDS = (0.013, 0.035)      # [rad]
-FREQUENCY, DAMPING, DELAY = 47.0, 0.63, 0.015
+FREQUENCY, DAMPING = 47.0, 0.63
+DELAY = own_delay() + 0.004     # of which a file states the rest
 T, COMMAND = sweep(5.0, periods=(0.5, 0.9), amplitudes=(0.3, 0.6))
 
 
@@ -40,7 +41,7 @@ def robot(**effects):
     torque = tuple(kp * band for band in (*BANDS, 0.0, 0.0))
     own = {'joint_bandwidth': {'kp': kp, 'kd': 2 * DAMPING * FREQUENCY * INERTIA},
            'joint_friction': {'coulomb': torque, 'stiction': torque},
-           'joint_command_latency': {'delay': DELAY}}
+           'joint_command_latency': {'delay': DELAY - own_delay()}}
     return replace(SHIPPED, effects={**own, **effects})
 
 
@@ -87,6 +88,16 @@ def test_servos_of_the_robot_file_agree_with_a_plain_simulation():
     log = JointLog('made.csv', T, (1, 2), shown, np.tile(COMMAND, (2, 1)))
     error = simulate(log, np.arange(2), file_sets(file_robot)[:2]) - shown
     assert np.sqrt(np.mean(error[:, 25:]**2)) < 5e-4 and np.abs(error[:, 25:]).max() < 2e-3
+
+
+def test_a_robot_file_states_the_delay_beyond_that_of_the_simulator():
+    stated = catalogue_values(file_sets(robot())[0], robot())['joint_command_latency']['delay']
+    assert stated == pytest.approx(robot().effects['joint_command_latency']['delay'])
+    later = made(2, delay=DELAY + 0.012)
+    named, = judged(later)['effects']
+    assert named['names'] == ['joint_command_latency']
+    assert named['parameters']['delay']['value'] == pytest.approx(
+        DELAY + 0.012 - own_delay(), abs=0.002)
 
 
 def test_an_offset_servo_turns_its_thrust_to_the_commanded_tilt():

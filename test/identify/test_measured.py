@@ -13,7 +13,7 @@ import yaml
 from beetle_omni_ros import cli
 from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.faults.flight import Flight
-from beetle_omni_ros.identify.measured import own_delay
+from beetle_omni_ros.identify.servo.robot import own_delay
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.dynamics import (
     DISTURBANCE_SIZE,

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import t
 
 HUBER = 3.0         # standard deviations from which the loss is linear
 CONVERGED = 1e-4    # decrease of the cost, relative to the number of samples
@@ -83,7 +84,7 @@ class Fit:
         held: (blocks,) chi2 of each block, predicted from the others.
         deviations: (blocks, X) change of x without each block.
         inflation: variance of the gradient over that of independent residuals, >= 1.
-        correlated: (X,) variances of x by the gradient's variance (sandwich estimator).
+        slow: (X, X) variance of the gradient by its slowest change over each recording.
 
     """
 
@@ -95,7 +96,7 @@ class Fit:
     held: np.ndarray
     deviations: np.ndarray
     inflation: float
-    correlated: np.ndarray
+    slow: np.ndarray
 
     def evidence(self, inflation: float) -> float:
         """Logarithm of the evidence [nat], without constants, for an inflated noise."""
@@ -106,19 +107,22 @@ class Fit:
 
     def covariance(self) -> np.ndarray:
         """
-        (X, X) covariance of x, from curvature and from the scatter between blocks.
+        (X, X) covariance of x, from curvature and from the slowest change of the residuals.
 
-        The curvature holds for noise inflated by :attr:`inflation`. Where leaving out blocks
-        moves a value further, or slow noise does, the larger standard deviation applies.
+        The curvature holds for noise inflated by :attr:`inflation`, which is that of short
+        memory. Noise that drifts over the whole recording moves some parameters further, as a
+        zero. So each parameter is widened by the mean over the units of its variance by
+        :attr:`slow`, with the quantile of Student's t for as many terms (Lazarus et al. 2018).
         """
-        size = len(self.x)
-        inner = (self.information - np.eye(size)) / self.inflation + np.eye(size)
-        curvature = np.linalg.inv(inner)
-        blocks = len(self.deviations)
-        about = self.deviations - self.deviations.mean(axis=0)
-        jackknife = (blocks - 1) / blocks * (about**2).sum(axis=0)
-        widen = np.sqrt(np.maximum(1.0, np.maximum(jackknife, self.correlated)
-                                   / np.diag(curvature)))
+        size, units = len(self.x), len(self.s)
+        curvature = np.linalg.inv((self.information - np.eye(size)) / self.inflation
+                                  + np.eye(size))
+        inverse = np.linalg.inv(self.information)
+        slow, own = (np.einsum('upx,xy,upy->up', self.s, c, self.s) for c in (
+            inverse @ (self.slow + np.eye(size)) @ inverse, curvature))
+        ratio = (slow / np.where(own > 0, own, 1.0)).mean(axis=0)
+        ratio *= (t.isf(0.025, units * slowest(units)) / WIDTH)**2
+        widen = np.sqrt(np.maximum(ratio, 1.0)) @ (self.s != 0).any(axis=0)
         return curvature * widen[:, None] * widen
 
     def spread(self) -> np.ndarray:
@@ -207,16 +211,16 @@ def _judged(x, s, theta, residuals, slopes, groups, blocks, memory):
         moved = j.T @ (part @ deviations.T) if size else np.zeros((len(r), count))
         for b in range(count):
             held[b] += (robust(r[block == b] + moved[block == b, b])[0]**2).sum()
-    ratio, correlated = 1.0, np.zeros(size)
+    ratio, slow = 1.0, np.zeros((size, size))
     if size:
         inverse = np.linalg.inv(information)
         spread = sum(_long_run(g, memory[group] if isinstance(memory, dict) else memory)
                      for group, g in series.items())
         ratio = np.trace(inverse @ spread) / max(np.trace(inverse @ (information - np.eye(size))),
                                                  1e-9)
-        correlated = np.diag(inverse @ spread @ inverse)
+        slow = sum(_slow(g, slowest(len(s))) for g in series.values())
     return Fit(x, s, theta, float(sum(r @ r for r in residuals)), information, held, deviations,
-               float(max(ratio, 1.0)), correlated)
+               float(max(ratio, 1.0)), slow)
 
 
 def _long_run(scores, memory):
@@ -226,3 +230,16 @@ def _long_run(scores, memory):
         part = scores[lag:].T @ scores[:-lag]
         total += (1 - lag / (memory + 1)) * (part + part.T)
     return total
+
+
+def slowest(units: int) -> int:
+    """Number of cosines of each recording, for at least four in all units."""
+    return max(1, -(-4 // units))
+
+
+def _slow(scores, count):
+    """Variance (X, X) of the sum of scores (n, X), by their first cosine transforms."""
+    n = len(scores)
+    waves = np.cos(np.pi * np.arange(1, count + 1)[:, None] * (np.arange(n) + 0.5) / n)
+    made = np.sqrt(2 / count) * waves @ scores
+    return made.T @ made

@@ -24,7 +24,7 @@ from beetle_omni_ros.identify.servo.fit import (
 from beetle_omni_ros.identify.servo.joint import ALWAYS, identify, joint_results
 from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
 from beetle_omni_ros.identify.servo.model import INDEX
-from beetle_omni_ros.identify.servo.robot import catalogue_values, file_sets
+from beetle_omni_ros.identify.servo.robot import catalogue_values, file_sets, own_delay
 from beetle_omni_ros.robot.effects import CATALOGUE, separating_experiment
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.bag import BagError, read_messages
@@ -86,8 +86,14 @@ def is_joint_log(path: Path) -> bool:
 
 
 def compare(log: JointLog, robot: RobotParameters) -> Found:
-    """The entries by which a log differs from the servos of a robot file."""
-    return select(Servos([log], file_sets(robot), one_delay=True), (), NAMED, CERTAIN, named=True)
+    """
+    The entries by which a log differs from the servos of a robot file as the simulator flies them.
+
+    No file can state a delay below that of the simulator, so that the fits have none.
+    """
+    servos = Servos([log], file_sets(robot, flown=True), one_delay=True)
+    servos.low[INDEX['delay']] = own_delay()
+    return select(servos, (), NAMED, CERTAIN, named=True)
 
 
 def gap_of(found: Found, apart: Found, robot: RobotParameters) -> dict:
@@ -105,7 +111,8 @@ def gap_of(found: Found, apart: Found, robot: RobotParameters) -> dict:
     numbers = [number for *_, number in found.servos.units]
     before, after, floor = (
         np.array([error_rms(log, u, sets[u], part=last) for u in units])
-        for sets in (file_sets(robot)[np.array(numbers) - 1], found.values(), apart.values()))
+        for sets in (file_sets(robot, flown=True)[np.array(numbers) - 1], found.values(),
+                     apart.values()))
     floor = np.minimum(floor, after)
     allowed = np.hypot(shipped().servo.as_well * floor, log.quantum)
     effects = _effects(found, robot)
@@ -157,7 +164,9 @@ def _candidates(found):
     return [{'name': name, 'accepted': name in found.chosen.entries,
              'evidence': _evidence(found, name), 'sigma_of_realistic_size': None,
              'sigma_beside_rivals': {},
-             'reason': '' if name in found.chosen.entries else 'the evidence does not need it'}
+             'reason': '' if name in found.chosen.entries else
+             'the evidence does not need it' if found.gains[name] < CERTAIN else
+             'less than an encoder count, or no better on left-out blocks'}
             for name in sorted(found.gains, key=lambda name: -found.gains[name])]
 
 
@@ -178,7 +187,7 @@ def _effects(found, robot):
             result.append(effect | {'parameters': parts})
             continue
         s = found.servos
-        moved = s.visible(found.chosen, name) & s.changed(found.chosen, name)
+        moved = s.visible(found.chosen, found.trials[name]) & s.changed(found.chosen, name)
         for unit in np.flatnonzero(moved):
             number = s.units[unit][2]
             own = {key: {'value': entry['each'][str(number)], 'unit': entry['unit'],
@@ -205,11 +214,11 @@ def _rivals(found, name):
 def _parameters(found, trial, name, robot):
     """Parameter -> value (median joint), unit, 95 % interval, value in the file, each joint's."""
     s, spec, joined = found.servos, CATALOGUE[name].parameters, {}
-    file = file_sets(robot)
+    file = file_sets(robot, flown=True)
     # An entry that the log neither needs nor excludes widens the intervals of the others.
-    possible = [trial, *(found.trials[other] for other in CATALOGUE[name].confused_with
+    possible = [trial, *(found.trials[other] for other, gain in found.gains.items()
                          if trial is found.chosen and other not in trial.entries
-                         and found.gains.get(other, -np.inf) > -CERTAIN)]
+                         and gain > -CERTAIN)]
     for parameter in spec:
         each, ends, files = {}, {}, {}
         for unit, (*_, number) in enumerate(s.units):
@@ -280,8 +289,10 @@ def row_value(values: np.ndarray, robot: RobotParameters, name: str, parameter: 
     """A parameter of ``ROWS`` for one parameter set (P,)."""
     if parameter == 'dead_band':
         return float(values[INDEX['coulomb_friction']])
+    if parameter == 'delay':        # all of it, not only what a file states
+        return float(values[INDEX['delay']])
     own = catalogue_values(values, robot)
     if parameter == 'ramp_lag':
-        return float(own[name]['delay'] + 2 * values[INDEX['damping_ratio']]
+        return float(values[INDEX['delay']] + 2 * values[INDEX['damping_ratio']]
                      / values[INDEX['natural_frequency']])
     return float(own[name][parameter])

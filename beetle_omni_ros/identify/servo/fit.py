@@ -96,6 +96,7 @@ class Servos:
                                                          < int(round(fitted * len(log.t)))))
             self.rows.append(rows)
             self.blocks.append(np.arange(len(rows)) * p.blocks // max(len(rows), 1))
+        self.low = LOW.copy()
         self.sigma = np.full(len(self.units), p.first_noise)
         self._blocks = [self.blocks[k] for k, *_ in self.units]
         self.inflation = 1.0
@@ -175,19 +176,23 @@ class Servos:
                     if active[p]:
                         target[:, p] = np.log(value) if LOGARITHMIC[p] else value
             x = self._nearest(s, target)
-            fits.append(solve(self, self.base, s, x, self.labels['log'], self._blocks, LOW, HIGH,
-                              self.memory))
+            fits.append(solve(self, self.base, s, x, self.labels['log'], self._blocks, self.low,
+                              HIGH, self.memory))
         return Trial(tuple(entries), min(fits, key=lambda fit: fit.chi2 + fit.x @ fit.x))
 
     def evidence(self, trial: Trial) -> float:
         """Logarithm of the evidence [nat] of a trial."""
         return trial.fit.evidence(self.inflation)
 
-    def visible(self, trial: Trial, entry: str) -> np.ndarray:
-        """(U,) whether an entry moves the readings of a unit by an encoder count (RMS)."""
-        none, without = np.zeros(len(NAMES), dtype=bool), trial.fit.theta.copy()
-        without[:, mask([entry])] = self.base[:, mask([entry])]
-        reads = [self(theta, none)[0] for theta in (trial.fit.theta, without)]
+    def visible(self, one: Trial, other: Trial) -> np.ndarray:
+        """
+        (U,) whether two fits differ in the readings of a unit by an encoder count (RMS).
+
+        An entry whose effect the other entries take up, as a zero that of a harmonic of the
+        encoder at small angles, makes no difference.
+        """
+        none = np.zeros(len(NAMES), dtype=bool)
+        reads = [self(trial.fit.theta, none)[0] for trial in (one, other)]
         return np.array([np.sqrt(np.mean((a - b)**2)) * sigma > self.logs[k].quantum
                          for a, b, sigma, (k, *_) in zip(*reads, self.sigma, self.units,
                                                          strict=True)])
@@ -262,7 +267,7 @@ def select(servos: Servos, always: Sequence[str], allowed: Sequence[str], least:
         always: entries of every model.
         allowed: further entries.
         least: least gain of evidence [nat] of an entry.
-        named: whether an entry must also move some joint's readings by an encoder count (RMS) and
+        named: whether an entry must also change some joint's fit by an encoder count (RMS) and
             improve the prediction of left-out blocks in total.
 
     """
@@ -270,14 +275,15 @@ def select(servos: Servos, always: Sequence[str], allowed: Sequence[str], least:
     full = servos.estimate_noise(candidates)
     gain = servos.evidence
     chosen = servos.fit(always, starts=(full, *STARTS) if always else (full,))
-    def worth(name, more, fewer):
-        return gain(more) >= gain(fewer) + least and (not named or (
-            more.fit.held.sum() < fewer.fit.held.sum() and servos.visible(more, name).any()))
+
+    def worth(more, fewer):
+        return gain(more) >= gain(fewer) + least and (
+            not named or more.fit.held.sum() < fewer.fit.held.sum())
 
     while True:
         trials = {name: servos.fit([*chosen.entries, name], starts=(chosen, full))
                   for name in candidates if name not in chosen.entries}
-        better = [trial for name, trial in trials.items() if worth(name, trial, chosen)]
+        better = [trial for trial in trials.values() if worth(trial, chosen)]
         if not better:
             break
         chosen = max(better, key=gain)
@@ -285,12 +291,15 @@ def select(servos: Servos, always: Sequence[str], allowed: Sequence[str], least:
         without = {name: servos.fit([other for other in chosen.entries if other != name],
                                     starts=(chosen, full))
                    for name in chosen.entries if name not in always}
-        useless = [name for name, fewer in without.items() if not worth(name, chosen, fewer)]
+        useless = [name for name, fewer in without.items() if not worth(chosen, fewer)
+                   or named and not servos.visible(chosen, fewer).any()]
         if not useless:
             break
         name = max(useless, key=lambda name: gain(without[name]))
-        chosen, trials[name] = without[name], chosen
-    trials |= without
+        chosen = without[name]
+    rejected = [name for name in candidates if name not in chosen.entries]
+    trials = without | {name: servos.fit([*chosen.entries, name], starts=(chosen, full))
+                        for name in rejected}
     gains = {name: (gain(chosen) - gain(trial)) * (1 if name in chosen.entries else -1)
              for name, trial in trials.items()}
     return Found(servos, full, chosen, trials, gains)

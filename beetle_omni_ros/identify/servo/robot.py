@@ -7,6 +7,8 @@ import numpy as np
 from beetle_omni_ros.identify.servo.model import INDEX, NAMES, OFF, TERMS
 from beetle_omni_ros.robot.effects import delaying, per_joint
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.resources import share_path
+from beetle_omni_ros.robot.schema import load_yaml
 
 # Catalogue entry -> the terms that it changes.
 ENTRIES = {
@@ -26,6 +28,12 @@ JOINTS = 4
 OTHER_DELAYS = tuple(name for name in delaying('tilt', 'encoders') if name not in ENTRIES)
 
 
+def own_delay() -> float:
+    """Delay [s] from a command to its reading that the simulator has for every robot."""
+    simulator = load_yaml(share_path('params/simulator.yaml'))
+    return simulator['actuators']['command_delay'] + simulator['encoders']['latency']
+
+
 def other_delays(robot: RobotParameters) -> float:
     """Sum of the file's ``OTHER_DELAYS`` [s]."""
     return sum(robot.effects.get(name, {}).get('delay', 0.0) for name in OTHER_DELAYS)
@@ -37,9 +45,12 @@ def held(robot: RobotParameters) -> bool:
     return any(name in robot.effects for name in (*ENTRIES, *OTHER_DELAYS))
 
 
-def file_sets(robot: RobotParameters) -> np.ndarray:
+def file_sets(robot: RobotParameters, flown: bool = False) -> np.ndarray:
     """
     Parameter sets (4, P) of the servos of a robot file with effects.
+
+    Their delay is that of the simulator and of the file. The published servos have none unless
+    ``flown``, because their gains come from a replay without it.
 
     Sign of the zero: the true tilt is the encoder's plus ``joint_offset``. A servo at rest has the
     commanded true tilt, so its encoder reads the command minus ``joint_offset``. Deflection is not
@@ -56,7 +67,7 @@ def file_sets(robot: RobotParameters) -> np.ndarray:
             'natural_frequency': np.sqrt(kp / joint.inertia),
             'damping_ratio': kd / (2 * np.sqrt(kp * joint.inertia)),
             'delay': effects.get('joint_command_latency', {}).get('delay', 0.0)
-            + other_delays(robot),
+            + other_delays(robot) + (own_delay() if flown or held(robot) else 0.0),
             'offset': -effects.get('joint_offset', {}).get('offset', (0.0,) * JOINTS)[j],
             'coulomb_friction': coulomb / kp, 'stiction': max(stiction - coulomb, 0.0) / kp,
             'backlash': per_joint(effects.get('joint_backlash', {}).get('gap', 0.0), j) / 2,
@@ -79,7 +90,8 @@ def catalogue_values(values: np.ndarray, robot: RobotParameters) -> dict[str, di
     return {
         'joint_bandwidth': {
             'kp': kp, 'kd': 2 * value['damping_ratio'] * kp / value['natural_frequency']},
-        'joint_command_latency': {'delay': value['delay'] - other_delays(robot)},
+        'joint_command_latency': {
+            'delay': value['delay'] - other_delays(robot) - own_delay()},
         'joint_friction': {'coulomb': kp * band, 'stiction': kp * (band + value['stiction'])},
         # A log shows the play before the encoder only.
         'joint_backlash': {'gap': 2 * value['backlash'], 'at_encoder': 1.0},
