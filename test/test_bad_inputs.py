@@ -106,7 +106,7 @@ def rows():
         yield [*base, controller, 'none.py:Mine'], 'none.py'
         yield [*base, controller, 'no_module:Mine'], 'no_module'
         yield [*base, controller, 'rl', '--policy', 'none.onnx'], 'none.onnx: no such file'
-        yield [*base, controller, 'rl', '--policy', 'policy.onnx'], 'not a readable ONNX file'
+        yield [*base, controller, 'rl', '--policy', 'policy.onnx'], 'no policy'
         yield [*base, '--bag', 'folder'], 'folder: exists already; a bag needs a new folder'
         yield [*base, '--bag', 'notes.txt/bag'], 'is not a folder'
     for value in ('', ' , ', 'nmpc,nmpc'):

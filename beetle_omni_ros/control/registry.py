@@ -419,11 +419,15 @@ def loaded(reference: str) -> Any:
     place, _, name = reference.rpartition(':')
     if not place or not name.isidentifier():
         raise ParameterError(f"controller '{reference}': expected {CLASS}")
+    if place.endswith('.py') and not Path(place).is_file():
+        raise ParameterError(f"controller '{reference}': no such file")
     folder = str(Path(place).parent if place.endswith('.py') else Path.cwd())
     if folder not in sys.path:
         sys.path.append(folder)
     try:
         module = _executed(Path(place)) if place.endswith('.py') else import_module(place)
+    except ModuleNotFoundError as error:
+        raise ParameterError(f"controller '{reference}': no module '{error.name}'") from None
     except Exception as error:
         raise ParameterError(f"controller '{reference}': importing {place} raised "
                              f'{error_text(error)}') from error

@@ -118,11 +118,11 @@ def lands(operator, name, value, mended, text, reboot):
     """Land softly with a fault that the bridge names, and mend it."""
     states, sinking = [], []
     operator.set(name, value)
+    assert operator.wait(lambda: operator.state == 'landing', 5), (name, operator.states)
     assert operator.wait(lambda: states.extend(operator.bridges.values())
-                         or operator.state == 'landing', 5), (name, operator.states)
-    assert any(line.startswith(text) for line in states), (name, set(states))
-    assert operator.wait(lambda: sinking.append(operator.truth.velocity[2])
+                         or sinking.append(operator.truth.velocity[2])
                          or operator.state in ('disarmed', 'emergency_stop'), 30), name
+    assert any(line.startswith(text) for line in states), (name, set(states))
     assert operator.state == 'disarmed' and min(sinking) > -1.0, (name, min(sinking))
     assert operator.wait(lambda: operator.device('armed') == 'False', 5), name
     operator.set(name, mended)

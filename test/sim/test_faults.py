@@ -287,7 +287,7 @@ def test_an_unknown_fault_kind_is_refused(arguments, named):
     ({'rotor': 5}, '1 to 4'), ({'rotor': 1.5}, 'whole'), ({'rotor': True}, 'whole'),
     ({'rotor': 'x'}, 'whole'), ({'rotor': 1, 'servo': 1}, "'servo' is unknown"),
     ({'rotor': 10 ** 400}, '1 to 4'), ({'rotor': float('nan')}, 'whole'),
-    ({'rotor': 16 ** 9000}, 'an integer of 36001 bits'), ({'x' * 9000: 1}, 'xxx... is unknown')])
+    ({'x' * 9000: 1}, 'xxx... is unknown')])
 def test_numbers_are_checked_by_name(numbers, named):
     with pytest.raises(ParameterError, match=named):
         Fault('rotor_stops', **numbers)

@@ -13,6 +13,7 @@ from synthetic_flights import (
 
 from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.urdf import Model
 from beetle_omni_ros.runs.log import LogRecorder
 from beetle_omni_ros.runs.tasks import make_task
@@ -64,17 +65,18 @@ def test_the_newest_messages_become_a_moment():
 def test_the_drawn_robot_tilts_and_its_arrows_are_as_long_as_the_thrusts(log):
     server = serve('127.0.0.1', 8300)
     try:
-        room, model = Room(server, Model.load(), 2), Model.load()
+        room = Room(server, Model.load(), 2)
         moment, = moments(log, np.array([55.0]))
         moment.tilt, moment.thrust = np.array([0.3, -1.2, 2.5, 0.0]), np.array([8.0, 4.0, 0.0, 1])
         room.show([moment, None], ['here', ''])
         drawn, hidden = room.robots
         assert drawn._root.visible and not hidden._root.visible
-        poses = model.poses({f'gimbal{k + 1}': angle for k, angle in enumerate(moment.tilt)})
+        axes = RobotParameters.load().tilt_axes
         for k, name in enumerate(('gimbal1', 'gimbal2', 'gimbal3', 'gimbal4')):
-            link, node = drawn._joints[name]
-            np.testing.assert_allclose(rotations.geodesic_angle(
-                np.roll(node.wxyz, -1), poses[link.name][1]), 0, atol=1e-6)
+            _, node = drawn._joints[name]
+            turned = rotations.matrix(rotations.exp(axes[k] * moment.tilt[k]))
+            np.testing.assert_allclose(
+                rotations.matrix(np.roll(node.wxyz, -1))[:, 2], turned[:, 2], atol=1e-6)
             begin, end = drawn._arrows[f'rotor{k + 1}'].points[0]
             np.testing.assert_allclose(NEWTON_PER_METRE * (end - begin), [0, 0, moment.thrust[k]],
                                        atol=1e-5)
