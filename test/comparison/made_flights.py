@@ -1,5 +1,6 @@
 """Results of a sweep with artificial motions instead of flights."""
 
+from itertools import product
 import json
 
 from synthetic_flights import fly
@@ -26,28 +27,23 @@ def made(task, duration=None):
             'cpu_s': 12.5, 'host': 'here'}
 
 
-def scaled(result, factor):
-    """Return the same result with every measured float multiplied, so that no two are equal."""
-    def scale(value, key=''):
-        if isinstance(value, dict):
-            return {name: scale(entry, name) for name, entry in value.items()}
-        if isinstance(value, list) and key != 'target':
-            return [scale(entry) for entry in value]
-        fixed = key == 'target' or key.startswith(('level', 'lost', 'withstood', 'payload'))
-        return value * factor if isinstance(value, float) and not fixed else value
-
-    return {**result, 'metrics': scale(result['metrics'])}
+def scaled(value, factor, key=''):
+    """Return the same metrics with every measured float multiplied, so that no two are equal."""
+    if isinstance(value, dict):
+        return {name: scaled(entry, factor, name) for name, entry in value.items()}
+    if isinstance(value, list) and key != 'target':
+        return [scaled(entry, factor) for entry in value]
+    fixed = key == 'target' or key.startswith(('level', 'lost', 'withstood', 'payload'))
+    return value * factor if isinstance(value, float) and not fixed else value
 
 
-def made_sweep(controllers=('rl', 'nmpc', 'nmpc_published'), tasks=TASKS,
-               conditions=('nominal', 'published'), seeds=(0, 4)):
+def made_sweep(controllers):
     """Results of a whole comparison, all numbers different."""
     flown, factor = {}, 1.0
-    for task in tasks:
+    for task in TASKS:
         result = made(task)
-        for condition in conditions:
-            for controller in controllers:
-                for seed in seeds:
-                    factor += 0.013
-                    flown[Flight(task, condition, controller, seed)] = scaled(result, factor)
+        for condition, controller, seed in product(('nominal', 'published'), controllers, (0, 4)):
+            factor += 0.013
+            flown[Flight(task, condition, controller, seed)] = {
+                **result, 'metrics': scaled(result['metrics'], factor)}
     return flown

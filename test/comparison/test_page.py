@@ -9,20 +9,18 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from beetle_omni_ros.comparison import command, page, summary
+from beetle_omni_ros.comparison import command, page
 from beetle_omni_ros.comparison.flights import Flight
 from beetle_omni_ros.runs import table as published
 
 CONTROLLERS = ('rl', 'nmpc', 'nmpc_published')
-TITLES = {'random3': '3 random', 'waypoints': 'Five way', 'lemniscate': '3D lem',
-               'force': 'Force', 'torque': 'Torque', 'payload': 'Payload', 'hover': 'Steady hover'}
 
 
-def written(folder, flown, tasks=TASKS, controllers=CONTROLLERS, skipped=()):
+def written(folder, flown, tasks=TASKS, skipped=()):
     """Write the page of ``flown`` and read back page, JSON and Markdown."""
     conditions = list(dict.fromkeys(flight.conditions for flight in flown))
     seeds = sorted({flight.seed for flight in flown})
-    results = command.results_of(flown, (controllers, tasks, conditions, seeds), list(controllers),
+    results = command.results_of(flown, (CONTROLLERS, tasks, conditions, seeds), CONTROLLERS,
                                dict(skipped), None)
     folder.mkdir(exist_ok=True)
     command.write(results, flown, folder, Console(file=io.StringIO(), width=160))
@@ -36,7 +34,7 @@ def whole(tmp_path_factory):
     folder = tmp_path_factory.mktemp('comparison')
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(page, 'DOTS', 50)
-        return folder, *written(folder, made_sweep())
+        return folder, *written(folder, made_sweep(CONTROLLERS))
 
 
 def table_of(results, title):
@@ -67,19 +65,6 @@ def test_the_page_needs_no_network(whole):
     for part in ('http://', 'https://', '<script', '<link', 'url(', '@import'):
         assert part not in html
     assert set(re.findall(r'src="(\w+:)', html)) == {'data:'}
-
-
-def test_each_table_states_seeds_and_source(whole):
-    _, _, numbers, _ = whole
-    sources = {}
-    for task in TASKS:
-        table = table_of(numbers, TITLES[task])
-        assert 'Seeds 0, 4.' in table.note
-        sources[task] = sorted({name.partition(' (published, ')[2] for name in table.header}
-                               - {''})
-    assert sources == {'random3': ['simulated (Gazebo))'], 'force': ['simulated (Gazebo))'],
-                       'torque': ['simulated (Gazebo))'], 'waypoints': ['real robot)'],
-                       'lemniscate': ['real robot)'], 'payload': [], 'hover': []}
 
 
 def test_published_numbers_keep_their_printed_form(whole):
@@ -121,28 +106,3 @@ def test_failed_and_crashed_flights_are_reported_and_affect_no_other(tmp_path):
     assert (waypoints['nmpc']['flown'], waypoints['nmpc_published']['flown']) == (2, 15)
     force = numbers['summary']['tasks']['force']['nominal']['rl']['force']
     assert force['lost_at'] == [30.0] and force['withstood_min'] == 20.0
-
-
-def test_a_page_without_flights_is_written(tmp_path):
-    flown = {Flight(task, 'nominal', controller, 0): FAILED for task in TASKS
-             for controller in CONTROLLERS}
-    html, numbers, _ = written(tmp_path, flown)
-    assert all(flight['failure'] for flight in numbers['flights'])
-    assert 'no take-off' in html
-
-
-def test_the_level_of_lost_control_is_a_range_over_the_seeds():
-    def flight(level):
-        return {'metrics': {'levels': [], 'lost_at_N': level, 'withstood_N': (level or 110) - 10}}
-
-    for levels, expected in (((80.0, 100.0), (80.0, 100.0)), ((80.0, None), (80.0, None)),
-                             ((None, None), (None, None))):
-        made_levels = summary._levels([flight(level)['metrics'] for level in levels], 'N')
-        assert (made_levels['lost_min'], made_levels['lost_max']) == expected
-    assert made_levels['withstood_min'] == 100.0
-
-
-def test_pooled_mean_and_deviation_are_those_of_all_samples():
-    samples = np.random.default_rng(0).normal(size=(3, 50)) + [[0.0], [2.0], [-1.0]]
-    pooled = summary._pooled([{'m': part.mean(), 's': part.std()} for part in samples], 'm', 's')
-    assert pooled == {'mean': pytest.approx(samples.mean()), 'std': pytest.approx(samples.std())}

@@ -10,7 +10,7 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 
 def write(path, *, robot=None, memory=False, metadata=None, drop=(), weights=None, bias=None,
           hidden=None, seed=0, inputs=None, outputs=8, names=('observation', 'action'),
-          dtype=TensorProto.FLOAT, poison=False, checksum=True):
+          dtype=TensorProto.FLOAT):
     """
     Write one policy: affine, or a random network with ``hidden`` layers.
 
@@ -28,8 +28,6 @@ def write(path, *, robot=None, memory=False, metadata=None, drop=(), weights=Non
         outputs: output size.
         names: names of input and output.
         dtype: type of input and output.
-        checksum: whether the file has one.
-        poison: whether the first action becomes NaN when the reference is above 1.2 m.
 
     """
     contract = PolicyContract.default(robot or RobotParameters.load(), memory)
@@ -47,35 +45,19 @@ def write(path, *, robot=None, memory=False, metadata=None, drop=(), weights=Non
         kind = helper.tensor_dtype_to_np_dtype(dtype)
         constants += [numpy_helper.from_array(np.asarray(matrix, dtype=kind), f'w{k}'),
                       numpy_helper.from_array(np.asarray(offset, dtype=kind), f'b{k}')]
-        result = names[1] if final and not poison else f'y{k}'
+        result = names[1] if final else f'y{k}'
         nodes.append(helper.make_node('Gemm', [last, f'w{k}', f'b{k}'], [result]))
         last = result
         if not final:
             nodes.append(helper.make_node('Elu', [last], [f'h{k}']))
             last = f'h{k}'
-    if poison:      # 0 / 0 where target_position's z exceeds 0.2 m, else 0
-        constants += [numpy_helper.from_array(np.array([8]), 'eight'),
-                      numpy_helper.from_array(np.array([[0.2]], dtype=kind), 'high'),
-                      numpy_helper.from_array(np.array([[np.nan]], dtype=kind), 'nan'),
-                      numpy_helper.from_array(np.array([[0.0]], dtype=kind), 'zero')]
-        nodes += [helper.make_node('Gather', [names[0], 'eight'], ['z'], axis=1),
-                  helper.make_node('Greater', ['z', 'high'], ['above']),
-                  helper.make_node('Where', ['above', 'nan', 'zero'], ['spoilt']),
-                  helper.make_node('Add', [last, 'spoilt'], [names[1]])]
-    save(path, nodes, constants, size, outputs, names, dtype,
-         {k: v for k, v in {**contract.to_metadata(), **(metadata or {})}.items()
-          if k not in drop}, checksum)
-    return path
-
-
-def save(path, nodes, constants, inputs, outputs, names, dtype, metadata, checksum=True):
-    """Write a graph with its metadata."""
     graph = helper.make_graph(
-        nodes, 'policy', [helper.make_tensor_value_info(names[0], dtype, [1, inputs])],
+        nodes, 'policy', [helper.make_tensor_value_info(names[0], dtype, [1, size])],
         [helper.make_tensor_value_info(names[1], dtype, [1, outputs])], constants)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid('', 17)])
     model.ir_version = 8        # read by every onnxruntime that the package admits
-    helper.set_model_props(model, metadata)
+    helper.set_model_props(model, {
+        k: v for k, v in {**contract.to_metadata(), **(metadata or {})}.items() if k not in drop})
     onnx.save(model, str(path))
-    if checksum:
-        add_checksum(path)
+    add_checksum(path)
+    return path

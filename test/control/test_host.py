@@ -4,7 +4,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.control.base import Command, PoseTarget, State, TrajectoryTarget
 from beetle_omni_ros.control.host import checked, ControllerHost
@@ -119,17 +118,3 @@ def test_the_return_value_of_step_is_checked():
                            (Command(0.0, np.zeros(4), np.ones(3)), r'thrust is of shape \(3,\)')):
         with pytest.raises(ParameterError, match=message):
             checked(wrong)
-
-
-@pytest.mark.parametrize('seed', range(3))
-def test_a_trajectory_at_one_time_is_a_sample_of_length_one(seed):
-    rng = np.random.default_rng(seed)
-    times = np.sort(rng.uniform(0, 10, 200))
-    turns = Rotation.from_euler('xyz', np.cumsum(0.2 * rng.normal(size=(200, 3)), axis=0))
-    path = TrajectoryTarget(times, rng.normal(size=(200, 3)),
-                            turns.as_quat() * rng.choice([-1, 1], 200)[:, None],
-                            rng.normal(size=(200, 3)), rng.normal(size=(200, 3)))
-    for moment in (-1.0, *times[[0, 1, 100, -2, -1]], 11.0, *rng.uniform(0, 10, 50)):
-        one, many = path.at(moment), path.sample(np.array([moment]))
-        for name in ('position', 'quaternion', 'velocity', 'angular_velocity'):
-            assert np.allclose(getattr(one, name), getattr(many, name)[0], atol=1e-12), name

@@ -1,31 +1,20 @@
 """The policy as a controller: observation, commands, bad numbers."""
 
 from dataclasses import replace
-import os
-import subprocess
-import sys
 
 import numpy as np
 from policy_files import write
 import pytest
 from scipy.spatial.transform import Rotation
 
-from beetle_omni_ros.control.base import Command, PoseTarget, Reference, State, TrajectoryTarget
-from beetle_omni_ros.control.policy import (
-    disturbed,
-    observed,
-    PolicyController,
-    PolicyParameters,
-)
+from beetle_omni_ros.control.base import Command, PoseTarget, Reference, State
+from beetle_omni_ros.control.policy import disturbed, observed, PolicyController, PolicyParameters
 from beetle_omni_ros.control.policy_file import PolicyContract
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import ParameterError
 
 ROBOT = RobotParameters.load()
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 TARGET = PoseTarget(np.array([0.0, 0.0, 1.0]), LEVEL)
-PREVIOUS = slice(25, 33)
 
 
 def controller(path, robot=ROBOT, **changed):
@@ -40,13 +29,6 @@ def state(stamp=1.0, command=None, **changed):
     return State(stamp, **values, tilt_stamp=stamp - 0.01, command=command)
 
 
-def selecting(rows):
-    """Weights (33, 8) of a policy whose action is these rows of the observation."""
-    weights = np.zeros((33, 8))
-    weights[np.arange(33)[rows], np.arange(8)] = 1.0
-    return weights
-
-
 def drawn(seed):
     """Random state, reference, previous action and disturbance (10,)."""
     rng = np.random.default_rng(seed)
@@ -57,7 +39,7 @@ def drawn(seed):
     return state, reference, rng.normal(size=8).tolist(), rng.normal(size=10)
 
 
-@pytest.mark.parametrize('seed', range(20))
+@pytest.mark.parametrize('seed', range(5))
 def test_each_block_contains_the_quantity_of_its_name(seed):
     state, reference, previous, disturbance = drawn(seed)
     values = observed(state, reference, previous) + disturbed(state, disturbance)
@@ -99,13 +81,6 @@ def test_targets_follow_from_the_observation_by_scale_and_offset(tmp_path, memor
     assert np.allclose(np.r_[command.tilt, command.thrust], expected, atol=1e-5)
 
 
-def test_before_the_first_command_measured_tilts_and_hover_thrust_are_the_last_action(tmp_path):
-    policy = controller(write(tmp_path / 'p.onnx', weights=selecting(PREVIOUS)))
-    command = policy.step(state(), TARGET)
-    assert np.allclose(command.tilt, state().tilt, atol=1e-6)
-    assert np.allclose(command.thrust, ROBOT.hover_thrust, atol=1e-5)
-
-
 def test_targets_are_cut_to_the_limits_of_the_actuators(tmp_path):
     bias = np.array([50.0, -50, 0, 0, 50, -50, 0, 0])
     policy = controller(write(tmp_path / 'p.onnx', bias=bias))
@@ -117,31 +92,22 @@ def test_targets_are_cut_to_the_limits_of_the_actuators(tmp_path):
     assert policy.diagnostics()['steps_at_a_limit'] == 1
 
 
-def test_an_action_far_outside_its_range_is_left_to_the_supervisor(tmp_path):
-    policy = controller(write(tmp_path / 'p.onnx', bias=np.r_[np.zeros(7), 1e6]))
-    command = policy.step(state(), TARGET)
-    assert command.thrust[3] > 1e5
+def test_an_action_that_is_not_finite_is_left_to_the_supervisor(tmp_path):
+    weights = np.zeros((33, 8))
+    weights[8] = 1e38       # z of target_position, in float32: infinite 4 m away
+    policy = controller(write(tmp_path / 'p.onnx', weights=weights))
+    far = PoseTarget(np.array([0.0, 0.0, 5.0]), LEVEL)
+    assert not np.isfinite(policy.step(state(), far).thrust).any()
     assert policy.diagnostics()['faulty_actions'] == 1
 
 
-def test_a_nan_action_is_left_to_the_supervisor(tmp_path):
-    policy = controller(write(tmp_path / 'p.onnx', poison=True))
-    far = PoseTarget(np.array([0.0, 0.0, 5.0]), LEVEL)
-    assert np.isfinite(policy.step(state(), TARGET).thrust).all()
-    assert np.isnan(policy.step(state(1.01), far).thrust).all()
-    assert np.isfinite(policy.step(state(1.02), TARGET).thrust).all()
-
-
-@pytest.mark.parametrize('memory', [False, True])
-@pytest.mark.parametrize('field', ['position', 'velocity', 'quaternion', 'angular_velocity',
-                                   'tilt'])
-@pytest.mark.parametrize('bad', [np.nan, np.inf])
-def test_a_state_that_is_not_finite_repeats_the_last_command(tmp_path, memory, field, bad):
-    path = write(tmp_path / 'p.onnx', memory=memory, hidden=(16,))
+@pytest.mark.parametrize('field', ['velocity', 'tilt'])
+def test_a_state_that_is_not_finite_repeats_the_last_command(tmp_path, field):
+    path = write(tmp_path / 'p.onnx', memory=True, hidden=(16,))
     policy = controller(path)
     last = policy.step(state(1.0), TARGET)
     broken = getattr(state(), field).copy()
-    broken[1] = bad
+    broken[1] = np.nan
     command = policy.step(state(1.01, command=last, **{field: broken}), TARGET)
     assert command.stamp == 1.01
     assert np.array_equal(command.tilt, last.tilt)
@@ -152,31 +118,6 @@ def test_a_state_that_is_not_finite_repeats_the_last_command(tmp_path, memory, f
     fresh.step(state(1.0), TARGET)
     after, expected = (p.step(state(1.02, command=last), TARGET) for p in (policy, fresh))
     assert np.allclose(after.tilt, expected.tilt, atol=1e-9)
-
-
-def test_a_first_state_that_is_not_finite_gives_a_finite_command(tmp_path):
-    policy = controller(write(tmp_path / 'p.onnx'))
-    command = policy.step(state(tilt=np.full(4, np.nan)), TARGET)
-    assert np.isfinite(command.tilt).all()
-    assert np.allclose(command.thrust, ROBOT.hover_thrust)
-
-
-@pytest.mark.parametrize('memory', [False, True])
-def test_the_same_states_give_the_same_commands_after_reset(tmp_path, memory):
-    policy = controller(write(tmp_path / 'p.onnx', memory=memory, hidden=(32, 16), seed=4))
-
-    def flight():
-        rng, command, commands = np.random.default_rng(0), None, []
-        for k in range(30):
-            command = policy.step(state(1 + 0.01 * k, command, velocity=rng.normal(size=3)),
-                                  TARGET)
-            commands.append(np.r_[command.tilt, command.thrust])
-        return np.array(commands)
-
-    first = flight()
-    policy.reset()
-    assert policy.diagnostics()['steps'] == 0
-    assert np.array_equal(flight(), first)
 
 
 def test_the_policy_with_memory_observes_a_push_in_body_axes(tmp_path):
@@ -195,49 +136,3 @@ def test_the_policy_with_memory_observes_a_push_in_body_axes(tmp_path):
     force = (command.thrust[:3] - ROBOT.hover_thrust) / 0.5 / 0.05
     assert np.allclose(force, [6.0, 0.0, 0.0], atol=0.3)
     assert policy.diagnostics()['force_estimate_N'] == pytest.approx(6.0, abs=0.3)
-
-
-def test_a_policy_of_another_robot_needs_permission(tmp_path, caplog):
-    other = RobotParameters.load(share_path('params/robot_weak_and_heavy.yaml'))
-    path = write(tmp_path / 'p.onnx')
-    with pytest.raises(ParameterError, match='mass'):
-        controller(path, robot=other)
-    policy = controller(path, robot=other, allow_other_robot=True)
-    assert 'mass' in caplog.text
-    # The offset of training is kept, because the network was trained with it.
-    assert np.allclose(policy.step(state(), TARGET).thrust, ROBOT.hover_thrust)
-
-
-def test_wound_joints_lead_through_level_for_a_pose_but_not_for_a_trajectory(
-        tmp_path):
-    # the last two tilt commands are z of the target's x and z axes in world
-    policy = controller(write(tmp_path / 'p.onnx', weights=selecting([0, 1, 17, 20, 4, 5, 6, 7])),
-                        without='routing')
-    scale = policy.contract.action_scale[3]
-    on_its_head = PoseTarget(np.array([0.0, 0.0, 1.5]), np.array([1.0, 0.0, 0.0, 0.0]))
-    times = np.array([0.0, 10.0])
-    trajectory = TrajectoryTarget(
-        times, np.tile(on_its_head.position, (2, 1)), np.tile(on_its_head.quaternion, (2, 1)),
-        np.zeros((2, 3)), np.zeros((2, 3)))
-
-    def seen(target):
-        policy.reset()
-        commands = [policy.step(state(0.01 * k, tilt=np.array([1.5, 3.0, -1.5, -3.0])), target)
-                    for k in range(200)]
-        return [command.tilt[3] / scale for command in commands]
-
-    up = seen(on_its_head)
-    assert up[0] == pytest.approx(-1.0) and max(up) == pytest.approx(1.0)
-    assert policy.diagnostics()['unwound'] == 1
-    assert seen(trajectory) == pytest.approx([-1.0] * 200)
-
-
-def test_a_policy_leaves_nothing_in_the_temporary_folder(tmp_path):
-    script = ('from beetle_omni_ros.control.policy import PolicyController\n'
-              'from beetle_omni_ros.robot.parameters import RobotParameters\n'
-              'PolicyController(RobotParameters.load())')
-    environment = {name: value for name, value in os.environ.items()
-                   if name != 'ORT_DISABLE_TELEMETRY'}
-    subprocess.run([sys.executable, '-c', script], check=True, timeout=60,
-                   env={**environment, 'TMPDIR': str(tmp_path)})
-    assert not list(tmp_path.iterdir())

@@ -1,6 +1,5 @@
 """The reference over the horizon: held poses, unwinding joints, lead of commands."""
 
-import casadi as ca
 import numpy as np
 import pytest
 
@@ -13,7 +12,7 @@ from beetle_omni_ros.control.references import (
     TILT_LEAD,
 )
 from beetle_omni_ros.robot import dynamics as model
-from beetle_omni_ros.robot import rotations, schema
+from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.tasks import lemniscate_target
 
@@ -43,26 +42,7 @@ def test_a_pose_is_held_against_the_estimated_disturbance(seed):
     assert np.allclose(np.array(model.full_model(ROBOT)(x, u, disturbance)), 0, atol=1e-9)
 
 
-@pytest.mark.parametrize('effects', [
-    {'tilt_thrust_loss': {'loss_at_60deg': 0.1}},
-    {'ground_effect': {'gain_at_0.25m': 0.1}},
-    {'centre_of_mass': {'offset': [0.005, -0.004, 0.003]}},
-    {'wind': {'force': [1.0, -0.5, 0.3]}, 'thrust_coefficient': {'scale': 0.9}}], ids=str)
-def test_a_pose_is_held_under_the_effects_of_the_robot_file(effects):
-    robot = schema.bind(RobotParameters, {**ROBOT.as_dict(), 'effects': effects})
-    rng = np.random.default_rng(3)
-    quaternion = rotations.normalized(rng.normal(size=4))
-    plan = ReferencePlanner(robot, TIMES, 4.0, LAG)
-    target = PoseTarget(np.array([0.0, 0.0, 0.6]), quaternion)
-    for _ in range(3):
-        reference = plan.plan(target, 5.0, LEVEL, np.zeros(4), np.zeros(10))
-    acceleration, angular = model.rigid_body(
-        robot, np.zeros(3), quaternion, np.zeros(3), reference[0, TILT], reference[0, THRUST],
-        position=target.position)
-    assert np.allclose(np.array(ca.DM(ca.vertcat(acceleration, angular))), 0, atol=2e-3)
-
-
-@pytest.mark.parametrize('seed', range(20))
+@pytest.mark.parametrize('seed', range(8))
 def test_joint_references_are_within_half_a_turn_unless_that_is_far(seed):
     rng = np.random.default_rng(seed)
     target = PoseTarget(np.zeros(3), rotations.normalized(rng.normal(size=4)))
@@ -80,7 +60,7 @@ def test_joint_references_are_within_half_a_turn_unless_that_is_far(seed):
 
 
 @pytest.mark.parametrize('axis', [(1, 0, 0), (0, 1, 0), (0.6, 0.8, 0)])
-@pytest.mark.parametrize('seed', range(5))
+@pytest.mark.parametrize('seed', range(3))
 @pytest.mark.parametrize('encoder', [0.0, 0.3])
 def test_joints_with_half_a_turn_to_go_turn_with_the_body_in_spite_of_noise(axis, seed, encoder):
     """``encoder`` [rad]: largest error of the encoders and of the hover before the turn."""

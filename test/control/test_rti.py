@@ -7,7 +7,6 @@ import pytest
 from beetle_omni_ros.control import ocp
 from beetle_omni_ros.control.nmpc_parameters import NmpcWeights
 from beetle_omni_ros.control.rti import Rti
-from beetle_omni_ros.robot import native
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 ROBOT = RobotParameters.load()
@@ -109,18 +108,6 @@ def test_a_plan_sinks_below_the_smallest_height_only_while_it_cannot_help_it(pro
     assert heights[1].min() > 0.91
 
 
-def test_a_compiled_solver_is_built_once_and_cached(problem, tmp_path, monkeypatch):
-    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
-    quick = tuple('-O0' if flag == '-O2' else flag for flag in native.FLAGS)
-    monkeypatch.setattr(native, 'FLAGS', quick)
-    Rti(problem, INTERVALS, SOFT, 1e-6, 50, REACHES)
-    built = {p: p.stat().st_mtime_ns for p in native.cache_folder().iterdir()}
-    Rti(problem, INTERVALS[:2], None, 1e-6, 50)
-    assert {p: p.stat().st_mtime_ns for p in native.cache_folder().iterdir()} == built
-    Rti(ocp.build(ROBOT, 0.05, True), INTERVALS, SOFT, 1e-6, 50, REACHES)
-    assert len(list(native.cache_folder().iterdir())) == 2
-
-
 def test_an_unsolved_qp_leaves_the_plan_unchanged(problem):
     x0, references, disturbance, bounds = setting()
     rti = Rti(problem, INTERVALS, SOFT, 1e-6, 50, REACHES)
@@ -133,12 +120,3 @@ def test_an_unsolved_qp_leaves_the_plan_unchanged(problem):
     assert status > 1
     assert np.array_equal(before[0], rti.states)
     assert np.array_equal(before[1], rti.inputs)
-
-
-@pytest.mark.parametrize('compilers, expected', [
-    ('no-such-cc', 'no C compiler'), ('false', 'failed')])
-def test_an_unusable_compiler_is_named(problem, tmp_path, monkeypatch, compilers, expected):
-    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
-    monkeypatch.setenv('CC', compilers)
-    with pytest.raises(native.CompilerError, match=expected):
-        Rti(problem, INTERVALS, SOFT, 1e-6, 50, REACHES)

@@ -71,11 +71,3 @@ def test_the_target_waits_for_a_robot_that_lags(p):
     assert np.linalg.norm(driven.position - START) <= p.leash and not driven.arrived
     driven.update(DT, np.array([3.0, 0.0, 1.0]))
     assert driven.position[0] > p.leash - 2 * p.speed * DT
-
-
-def test_hold_stays_where_the_target_is(p):
-    driven = steering(p)
-    driven.go([5.0, 0.0, 1.0], LEVEL)
-    driven.update(1.0)
-    driven.hold()
-    assert driven.arrived and driven.position == pytest.approx([p.speed, 0, 1])

@@ -143,17 +143,16 @@ class Flight:
             yield time, sample
 
 
-def fly(seed, duration, sensors=None, agility=1.0, start=0.0, delay=MOCAP_DELAY,
-        imu_period=IMU_PERIOD):
+def fly(seed, duration, sensors=None, agility=1.0):
     """Measure one random flight."""
     sensors = sensors or Sensors()
     rng = np.random.default_rng([seed, 1])
     trajectory = Trajectory(seed, agility)
-    imu_times = start + imu_period * np.arange(round(duration / imu_period) + 1)
-    pose_times = start + MOCAP_PERIOD * np.arange(round(duration / MOCAP_PERIOD) + 1)
+    imu_times = IMU_PERIOD * np.arange(round(duration / IMU_PERIOD) + 1)
+    pose_times = MOCAP_PERIOD * np.arange(round(duration / MOCAP_PERIOD) + 1)
     biases = sensors.biases(imu_times, rng)
     return Flight(trajectory, sensors.imu(trajectory, imu_times, biases, rng),
-                  sensors.mocap(trajectory, pose_times, rng), biases, delay)
+                  sensors.mocap(trajectory, pose_times, rng), biases)
 
 
 def feed(ekf, sample):

@@ -8,17 +8,14 @@ import re
 import numpy as np
 import pytest
 from rich.console import Console
-import yaml
 
 from beetle_omni_ros import cli
 from beetle_omni_ros.evaluation import command, loop
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import ParameterError, RunError
+from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.bag import read_bag
 from beetle_omni_ros.runs.metrics import metrics
 from beetle_omni_ros.runs.tasks import make_task, Task
-from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 
 ROBOT = RobotParameters.load()
@@ -77,15 +74,6 @@ def test_each_controller_has_a_bag_that_gives_the_numbers_of_its_flight(poses, f
     assert again['success_rate'] == results['nmpc']['success_rate'] == 1.0
 
 
-def test_a_failed_lift_off_is_reported(poses, tmp_path):
-    content = yaml.safe_load(share_path('params/robot.yaml').read_text())
-    content['effects'] = {'thrust_coefficient': {'scale': 0.2}}
-    plant = tmp_path / 'plant.yaml'
-    plant.write_text(yaml.safe_dump(content))
-    with pytest.raises(RunError, match='(?i)take-?off'):
-        evaluate(poses, plant=plant)
-
-
 def test_a_flight_ended_by_the_supervisor_is_reported_with_time_and_reason(poses, monkeypatch):
     small = SimulatorParameters.load()
     small = replace(small, battery=replace(small.battery, capacity=0.04))
@@ -108,44 +96,20 @@ class Own:
     period = 0.01
     def __init__(self, robot): self.thrust = np.full(4, robot.hover_thrust)
     def reset(self): pass
-    def step(self, state, target): return Command(state.stamp, np.zeros(4), self.thrust%s)
+    def step(self, state, target): return Command(state.stamp, np.zeros(4),
+        self.thrust * (0.5 + 1e-3 * (state.stamp % 1)))
 """
 
 
 def test_a_crash_ends_the_command_with_status_1_after_the_results(poses, tmp_path):
     own, result = tmp_path / 'own.py', tmp_path / 'result.json'
-    own.write_text(OPEN_LOOP % ' * (0.5 + 1e-3 * (state.stamp % 1))')
+    own.write_text(OPEN_LOOP)
     assert cli.main(['evaluate', '--controllers', f'{own}:Own', '--task', str(poses), '--json',
                      str(result)]) == 1
     assert json.loads(result.read_text())['own']['crashed']
 
 
-def test_a_constant_controller_is_refused_once_with_the_rule(poses, tmp_path, monkeypatch):
-    monkeypatch.setattr(loop, 'TAKEOFF_TIMEOUT', 6.0)
-    own = tmp_path / 'own.py'
-    own.write_text(OPEN_LOOP % '')
-    with pytest.raises(RunError) as error:
-        evaluate(poses, [f'{own}:Own'])
-    assert str(error.value).count('more than 10 equal commands in a row') == 1
-
-
-def test_an_exception_of_step_ends_the_command_with_one_line(poses, tmp_path, capsys):
-    own = tmp_path / 'bad.py'
-    own.write_text('from beetle_omni_ros.control.hover import HoverController\n'
-                   'class Bad(HoverController):\n'
-                   '    def step(self, state, target):\n'
-                   '        return self.absent\n')
-    assert cli.main(['evaluate', '--controllers', f'{own}:Bad', '--task', str(poses)]) == 2
-    line, = capsys.readouterr().err.splitlines()
-    assert line == "beetle_omni: error: controller 'bad': step raised AttributeError: " \
-                   "'Bad' object has no attribute 'absent' (bad.py:4)"
-
-
-@pytest.mark.parametrize('until', [0.2, 100.0])
-def test_an_exception_in_flight_falls_back_and_is_in_the_results(until, tmp_path, monkeypatch):
-    limits = SupervisorParameters.load()
-    limits = replace(limits, envelope=replace(limits.envelope, fallback_time=1.0))
-    monkeypatch.setattr(SupervisorParameters, 'load', lambda: limits)
+def test_an_exception_in_flight_falls_back_and_is_in_the_results(tmp_path):
     own, task = tmp_path / 'bad.py', make_task('hover')
     own.write_text('from beetle_omni_ros.control.hover import HoverController\n'
                    'class Bad(HoverController):\n'
@@ -153,22 +117,18 @@ def test_an_exception_in_flight_falls_back_and_is_in_the_results(until, tmp_path
                    '    def step(self, state, target):\n'
                    '        if target.position[2] == 1.0:       # of the task\n'
                    '            self.high = self.high or state.stamp\n'
-                   f'            if 1.0 < state.stamp - self.high < {1.0 + until}:\n'
+                   '            if 1.0 < state.stamp - self.high < 1.2:\n'
                    '                return self.absent\n'
                    '        return super().step(state, target)\n')
     task = replace(task, segments=(replace(task.segments[0], duration=4.0),))
-    text = io.StringIO()
-    results = command.run_evaluate(controllers=[f'{own}:Bad'], task=task, bag=tmp_path / 'bag',
-                                   console=Console(file=text, width=300))['bad']
+    results = evaluate(task, [f'{own}:Bad'], bag=tmp_path / 'bag')['bad']
     states = read_bag(tmp_path / 'bag').states
     at = states.index('fallback:controller_silent')
-    assert states[at - 1] == 'flying:bad'
-    transient = until < 1.0
-    assert states[at + 1] == ('flying:bad' if transient else 'landing:controller_lost')
-    assert ('ended' in results) != transient and not results['crashed']
-    error = results['controller_error']
-    assert "controller 'bad': step raised AttributeError: 'Bad' object has no attribute" in error
-    assert '(bad.py:8)' in error and error in text.getvalue()
+    assert states[at - 1] == states[at + 1] == 'flying:bad'
+    assert 'ended' not in results and not results['crashed']
+    assert results['controller_error'].startswith(
+        "controller 'bad': step raised AttributeError: 'Bad' object has no attribute 'absent' "
+        '(bad.py:8)')
 
 
 def test_an_empty_pack_is_swapped_at_the_next_target(monkeypatch):

@@ -46,17 +46,6 @@ def command(stamp):
     return Command(stamp, np.full(4, 0.1), np.full(4, 8.0))
 
 
-def test_without_a_fault_all_messages_pass_unchanged(make_faulty):
-    processes, stub = make_faulty()
-    one, state = frame(1.0), command(1.0)
-    assert processes.frame(one) is one
-    assert processes.estimate(STATE) is STATE
-    assert processes.requests(state, 1.0) == [state] and processes.requests(None, 1.0) == []
-    assert processes.target(PoseTarget(np.zeros(3), STATE.quaternion)) is None
-    processes.send('on_battery', 24.0)
-    assert stub.received == [('on_battery', 24.0)]
-
-
 def test_a_paused_supervisor_receives_the_newest_messages_of_its_queues(make_faulty):
     processes, stub = make_faulty(Fault('supervisor_waits', duration=0.1))
     assert processes.supervisor_waits
@@ -77,18 +66,6 @@ def test_a_clock_step_shifts_every_stamp_and_is_reversible(make_faulty):
         shifted = processes.frame(frame(time))
         assert processes.clock_step == step
         assert shifted.time == time + step == shifted.imu.stamp == shifted.battery.stamp
-
-
-@pytest.mark.parametrize(('kind', 'numbers'), [
-    ('controller_nan', {}), ('controller_rubbish', {}), ('controller_noisy', {'tilt': 0.1}),
-    ('controller_constant', {})])
-def test_a_controller_with_invalid_numbers_keeps_its_stamps(make_faulty, kind, numbers):
-    processes, _ = make_faulty(Fault(kind, **numbers))
-    first, = processes.requests(command(1.0), 1.0)
-    second, = processes.requests(Command(1.01, np.zeros(4), np.ones(4)), 1.01)
-    assert (first.stamp, second.stamp) == (1.0, 1.01)
-    same = np.array_equal(first.tilt, second.tilt) and np.array_equal(first.thrust, second.thrust)
-    assert same == (kind == 'controller_constant')
 
 
 def test_a_silent_controller_sends_nothing_and_a_slow_one_sends_late(make_faulty):

@@ -5,28 +5,12 @@ import io
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 from rich.console import Console
 
-from beetle_omni_ros import cli
 from beetle_omni_ros.evaluation import campaign
 from beetle_omni_ros.faults import command, page
-from beetle_omni_ros.faults.flight import (
-    attitude,
-    BETTER,
-    drawn,
-    Flight,
-    fly_to_start,
-    fly_trial,
-    HEALTHY,
-    LANDING,
-    LANDING_BLIND,
-    Trial,
-)
-from beetle_omni_ros.pages.page import print_grids
-
-ROOT = Path(__file__).parents[2]
+from beetle_omni_ros.faults.flight import fly_trial, HEALTHY, LANDING, LANDING_BLIND, Trial
 
 
 @pytest.fixture(scope='module')
@@ -62,6 +46,15 @@ def test_a_landing_and_a_healthy_flight(quick):
     assert flown['state'] == 'disarmed' and flown['alarms'] == [] and flown['good']
 
 
+@pytest.mark.parametrize(('case', 'start'), [
+    ('estimator_dead', 'hover'), ('mocap_lost', 'upside_down'), ('joints_lost', 'hover'),
+    ('rotor_1_stops', 'moving'), ('servo_jammed', 'hover')])
+def test_the_robot_lands_in_spite_of_a_fault(listed, case, start):
+    plan = replace(listed.flight, hover_time=1.0, turn_time=4.5, jitter=0.2, watch_time=3.0)
+    landed = fly_trial(Trial(case, start), replace(listed, flight=plan))
+    assert landed['good'] and landed['state'] == 'disarmed' and not landed['broken'], landed
+
+
 def test_the_ground_is_detected_although_the_accelerometer_jitters_on_it(listed):
     # Without motion capture the velocity drifts; once this robot stood with idle rotors for 6 s,
     # took off again and fell.
@@ -69,12 +62,6 @@ def test_the_ground_is_detected_although_the_accelerometer_jitters_on_it(listed)
     assert landed['state'] == 'disarmed' and landed['takeoffs'] == 0
     # The drift decides the speed of this touchdown, but the robot must not fall again.
     assert landed['impact_m_s'] < listed.limits.impact_speed and not landed['broken'], landed
-
-
-def test_every_fourth_landing_begins_upside_down():
-    found = np.array([attitude(seed) for seed in range(40)])
-    np.testing.assert_array_equal(found[3::4, :2], np.tile([np.pi, 0.0], (10, 1)))
-    assert np.ptp(found[::4], axis=0).min() > 3 and np.abs(found).max() <= np.pi
 
 
 def result(case, **values):
@@ -109,34 +96,17 @@ def test_summary_counts_add_up(listed):
     assert 'bag' not in page.total_text(results_of(flown[:1], listed))
 
 
-def test_no_name_and_no_header_is_cut_at_80_columns(listed):
-    flights = [result(name, expected=case.expected, outcome=outcome, named_s=12.34, named='x',
-                      impact_m_s=12.34) for name, case in listed.cases.items()
-               for outcome in ('flies_on', 'crash, motors on', 'does not land')]
-    console = Console(file=io.StringIO(), width=80)
-    print_grids([page.grid(results_of(flights, listed), narrow=True)], console)
-    printed = console.file.getvalue()
-    assert {*listed.cases, 'expected', 'good', 'outcomes', 'impact', '[m/s]', 'named', '[s]',
-            'flies_on', '12.34'} <= {*printed.split()}
-    assert '…' not in printed and max(map(len, printed.splitlines())) <= 80
-
-
-def test_the_page_explains_its_columns_and_outcomes_and_shows_each_flight(listed):
-    said = 'rotor 1 gives less thrust than asked'
-    flights = [result('rotor_1_stops', start=start, said=said, bag_lost=False)
+def test_the_page_explains_its_outcomes_and_shows_each_flight(listed):
+    flights = [result('rotor_1_stops', start=start, bag_lost=False)
                for start in ('hover', 'moving')]
     flights.append(result('gust', seed=4, outcome='crash, motors on', good=False, bag_lost=True,
                           impact_m_s=None, error='<b>'))
     html = page.as_page(results_of(flights, listed), Path('runs_out/faults'))
-    for text in ('2026-11-25', 'version 0.1.0, commit abcdef0123', 'as expected: ',
-                 'named after: ', '2 of 3 as expected', 'below 1 m/s and 30 deg', '&lt;b&gt;'):
-        assert text in html
-    assert {outcome for better in BETTER.values() for outcome in better} < {*page.OUTCOMES}
+    for text in ('commit abcdef0123', '2 of 3 as expected', 'below 1 m/s and 30 deg', '&lt;b&gt;',
+                 '<summary>3 flights</summary>', 'rotor_1_stops_moving_nominal_nmpc_0',
+                 '<td>lost</td>', 'beetle_omni report runs_out/faults/bags/BAG'):
+        assert text in html, text
     assert all(f'<dt>{name}</dt>' in html for name in page.OUTCOMES) and 'http' not in html
-    each = html.split('<h2>Each flight</h2>')[1]
-    assert '<summary>3 flights</summary>' in each and each.count(said) == 2
-    assert 'rotor_1_stops_moving_nominal_nmpc_0' in each and '<td>lost</td>' in each
-    assert 'beetle_omni report runs_out/faults/bags/BAG' in each
 
 
 def test_the_command_writes_its_files_and_a_campaign_continues(listed, tmp_path, monkeypatch):
@@ -167,53 +137,3 @@ def test_the_command_writes_its_files_and_a_campaign_continues(listed, tmp_path,
     assert json.loads((tmp_path / 'faults.json').read_text())['summary']['total']['good'] == 2
     assert '| gust |' in (tmp_path / 'faults.md').read_text()
     assert f"page: {tmp_path / 'faults.html'}\n" in console.file.getvalue()
-
-
-def test_the_table_in_the_docs_agrees_with_the_list(listed):
-    table = (ROOT / 'docs' / 'safety.md').read_text().split('<!-- faults: begin -->')[1]
-    rows = [[cell.strip() for cell in line.strip('| ').split(' | ')[:3]]
-            for line in table.split('<!-- faults: end -->')[0].strip().splitlines()[2:]]
-    assert rows == [[case.name, case.what, case.expected] for case in listed.cases.values()]
-
-
-@pytest.mark.parametrize(('arguments', 'named'), [
-    (['--only', 'gust,gost'], "'gost' is unknown, a name of the list is expected; near: gust"),
-    (['--only', '7'], 'for example rotor_1'), (['--without-mocap'], '--landings')])
-def test_unusable_input_is_refused_in_one_line(capsys, arguments, named):
-    assert cli.main(['faults', *arguments]) == 2
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1 and named in lines[0]
-
-
-class Planned(Flight):
-    """The plan of a flight without its robot."""
-
-    def __init__(self, seed, case):
-        self.random, self.asked = drawn(seed, case), []
-
-    def aim(self, position, quaternion=None):
-        self.asked.append(tuple(position))
-
-    def fly(self, duration, over=None):
-        self.asked.append(duration)
-
-
-def test_each_fault_of_a_seed_has_its_own_move_which_repeats(listed):
-    def move(case, seed=3):
-        flight = Planned(seed, case)
-        fly_to_start(flight, 'moving', listed.flight)
-        return tuple(flight.asked)
-
-    moves = [move(case) for case in listed.cases]
-    assert len(set(moves)) == len(listed.cases) and moves == [move(case) for case in listed.cases]
-    assert move('gust', 4) not in moves
-
-
-def test_random_fault_times_cover_the_time_of_a_pose(listed):
-    flights = [Planned(seed, 'gust') for seed in range(40)]
-    for flight in flights:
-        fly_to_start(flight, 'random', listed.flight)
-    whole = listed.flight.pose_time
-    assert all(flight.asked[1] == whole for flight in flights)
-    moments = np.array([flight.asked[3] for flight in flights]) / whole
-    assert 0 <= moments.min() < 0.2 and 0.8 < moments.max() <= 1

@@ -25,15 +25,6 @@ def test_a_printed_table_breaks_no_name_and_no_number(width):
     assert max(map(len, text.getvalue().splitlines())) <= max(width, 68)
 
 
-def test_headers_are_broken_before_cells():
-    text = io.StringIO()
-    header = ['', 'nmpc', 'published NMPC, real robot', 'published RL, real robot']
-    print_grids([Grid('', header, [['lowest point [m]', '0.75 (pose 1)', '-', '-']])],
-                Console(file=text, width=60))
-    assert '0.75 (pose 1)' in text.getvalue()
-    assert max(map(len, text.getvalue().splitlines())) <= 60
-
-
 def test_a_command_whose_reader_has_ended_still_writes_its_files(tmp_path):
     reader, writer = os.pipe()
     os.close(reader)

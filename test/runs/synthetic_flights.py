@@ -63,11 +63,11 @@ def _record(recorder, t, k, rng, position, quaternion, reference, controller):
     write_joints(recorder, t - 0.01, tilt - 0.005, np.zeros(4), np.full(4, 0.01), received=t)
     if k % 2 == 0:
         thrust = 7.45 + 0.1 * rng.normal(size=4)
-        write_mocap(recorder, t - 0.01, position, quaternion, received=t)
+        recorder.write('mocap/pose', PoseReading(t - 0.01, position, quaternion), t)
         write_request(recorder, controller, t, tilt, thrust, received=t + 0.002)
         write_command(recorder, t, tilt, thrust, received=t + 0.003)
     if k % 20 == 0:
-        write_battery(recorder, t, 25.0 - 0.001 * k * TICK, -20.0)
+        recorder.write('battery_state', BatteryReading(t, 25.0 - 0.001 * k * TICK, -20.0))
     if k % 200 == 0:
         recorder.write_compute(t, controller, median=0.2, p99=0.4, max=0.9, deadline_misses=0,
                                count=max(0, k // 2))
@@ -91,19 +91,9 @@ def write_imu(recorder, t, specific_force, angular_velocity):
     recorder.write('imu/data_raw', ImuReading(t, specific_force, angular_velocity))
 
 
-def write_mocap(recorder, t, position, quaternion, received=None):
-    """One MoCap pose, captured at ``t``, available at ``received``."""
-    recorder.write('mocap/pose', PoseReading(t, position, quaternion), received)
-
-
 def write_joints(recorder, t, position, velocity, effort=None, received=None):
     """One joint feedback, captured at ``t``, available at ``received``."""
     recorder.write('joint_states', JointReading(t, position, velocity, effort), received)
-
-
-def write_battery(recorder, t, voltage, current):
-    """Pack voltage [V] and current [A, negative when discharging]."""
-    recorder.write('battery_state', BatteryReading(t, voltage, current))
 
 
 def write_command(recorder, t, tilt, thrust, received=None):

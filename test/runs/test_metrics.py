@@ -1,5 +1,6 @@
 """Metrics against cases with known results, and bag against memory."""
 
+
 import json
 
 import numpy as np
@@ -16,11 +17,9 @@ from synthetic_flights import (
 
 from beetle_omni_ros.control.base import TrajectoryTarget
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.runs.bag import read_bag
-from beetle_omni_ros.runs.bag_writer import BagWriter
 from beetle_omni_ros.runs.files import write_json
-from beetle_omni_ros.runs.log import geodesic_angles, LogRecorder, roll_pitch_yaw, Tee
-from beetle_omni_ros.runs.metrics import metrics, metrics_by_controller, task_of
+from beetle_omni_ros.runs.log import geodesic_angles, LogRecorder, roll_pitch_yaw
+from beetle_omni_ros.runs.metrics import metrics, metrics_by_controller
 from beetle_omni_ros.runs.tasks import make_task, pose_target
 
 LEVEL = np.array([0, 0, 0, 1.0])
@@ -90,15 +89,6 @@ def steady(task, position, write=write_truth, recorder=None):
 HOVER = np.array([0, 0, 1, 0, 0, 0.0])
 
 
-def test_mean_median_and_max_are_over_the_poses():
-    task = make_task('random3')
-    result = metrics(steady(task, lambda k, t: [0.01 * (k + 1) ** 2, 0, 0]), task)
-    assert result['mean']['U_position_m'] == pytest.approx((0.01 + 0.04 + 0.09) / 3)
-    assert result['median']['U_position_m'] == pytest.approx(0.04)
-    assert result['max']['U_position_m'] == pytest.approx(0.09)
-    assert [pose['target'] for pose in result['poses']] == [list(p) for p in task.poses]
-
-
 def test_the_lowest_point_is_reported_with_its_pose():
     task, recorder = make_task('random3'), LogRecorder()
     height = [target.position[2] for target in task.targets(1.0)]
@@ -150,38 +140,16 @@ def test_reached_means_within_10_cm_and_10_deg(offset, angle, reached):
     assert result['success_rate'] == float(reached)
 
 
-def flatten(value, at=''):
-    """Numbers and texts of nested results by their path."""
-    items = value.items() if isinstance(value, dict) else enumerate(value) \
-        if isinstance(value, list) else None
-    if items is None:
-        return {at: value}
-    return {path: one for key, inner in items
-            for path, one in flatten(inner, f'{at}.{key}').items()}
-
-
-def test_a_bag_gives_the_metrics_of_the_flight_in_memory(tmp_path):
-    task, meta = make_task('waypoints'), {'task': 'waypoints', 'seed': 0}
-    memory = LogRecorder(meta)
-    with BagWriter(tmp_path / 'bag', meta) as bag:
-        fly(Tee(memory, bag), task, duration=16.5, start=1.7e9 + 0.123456789)
-    mine, theirs = metrics(memory.log(), task), metrics(read_bag(tmp_path / 'bag'))
-    assert flatten(mine) == pytest.approx(flatten(theirs), abs=1e-6, nan_ok=True)
-    assert mine['poses'][0]['U_position_m'] == pytest.approx(0.02, abs=1e-4)
-
-
-@pytest.mark.parametrize('how', ['fall', 'stop', 'nan'])
-def test_a_crash_is_detected_in_the_flight(how):
+@pytest.mark.parametrize('height', [None, 0.16, np.nan])
+def test_a_crash_is_detected_in_the_flight(height):
     recorder = LogRecorder()
     fly(recorder, make_task('waypoints'), duration=20.0)
-    if how == 'fall':
-        write_truth(recorder, 15.001, np.array([0, 0, 0.16]), LEVEL, np.zeros(3), np.zeros(3))
-    elif how == 'nan':
-        write_truth(recorder, 15.001, np.full(3, np.nan), LEVEL, np.zeros(3), np.zeros(3))
-    else:
+    assert metrics(recorder.log())['crashed'] is False
+    if height is None:
         write_state(recorder, 15.0, 'emergency_stop')
+    else:
+        write_truth(recorder, 15.001, np.array([0, 0, height]), LEVEL, np.zeros(3), np.zeros(3))
     assert metrics(recorder.log())['crashed'] is True
-    assert metrics(flown(make_task('waypoints'), duration=20.0))['crashed'] is False
 
 
 def test_poses_after_an_early_landing_have_no_errors_and_the_end_is_stated():
@@ -194,12 +162,6 @@ def test_poses_after_an_early_landing_have_no_errors_and_the_end_is_stated():
     assert result['poses'][1]['L_position_m'] is None and result['success_rate'] == 1 / 15
     assert result['hover_speed_mean_m_s'] is not None    # of the first pose
     assert metrics(recorder.log())['ended'] == result['ended']      # by the task of the metadata
-
-
-def test_a_landing_after_the_task_or_after_the_loss_of_control_is_no_early_end():
-    for name, duration in (('random2', None), ('force', 20.0)):
-        task = make_task(name)
-        assert 'ended' not in metrics(flown(task, duration=duration), task)
 
 
 def test_each_controller_has_the_metrics_of_its_poses():
@@ -243,13 +205,6 @@ def test_the_level_at_which_control_was_lost_is_reported():
     complete = metrics(flown(task), task)['force']
     assert complete['lost_at_N'] is None
     assert complete['withstood_N'] == 100
-
-
-def test_a_task_is_rebuilt_from_the_meta_data_of_a_bag():
-    recorder = LogRecorder({'task': 'random7', 'seed': 5})
-    np.testing.assert_array_equal(task_of(recorder.log()).poses, make_task('random7', 5).poses)
-    for meta in ({}, {'task': 'my/poses.csv'}, {'task': 'nonsense'}):
-        assert task_of(LogRecorder(meta).log()) is None
 
 
 def test_metrics_of_an_empty_flight_are_empty_and_strict_json(tmp_path):

@@ -35,12 +35,6 @@ def test_stamps_of_another_time_are_refused_and_zero_is_now():
         assert why((0, 0, 1), stamp=stamp, now=1e9) == ''
 
 
-def test_a_trajectory_is_checked_point_by_point():
-    target = TrajectoryTarget(np.array([0.0, 1.0]), np.array([[0, 0, 1.0], [0, 0, -1.0]]),
-                              np.tile(LEVEL, (2, 1)), np.zeros((2, 3)), np.zeros((2, 3)))
-    assert CHECKS.why_not(target).startswith('point 2: z = -1 m')
-
-
 def test_points_that_lie_too_far_apart_for_their_times_are_refused():
     def path(x, turn=0.0):
         return TrajectoryTarget(
@@ -52,7 +46,7 @@ def test_points_that_lie_too_far_apart_for_their_times_are_refused():
     assert CHECKS.why_not(path(0.0, 3.1)) == ''     # 34.6 rad/s about a diagonal
 
 
-@pytest.mark.parametrize('reach, row', [(6.5, 4), (2.0, 3), (0.4, 2)])
+@pytest.mark.parametrize('reach, row', [(6.5, 4), (2.0, 3)])
 def test_a_row_beyond_the_reach_of_the_controller_is_named(tmp_path, reach, row):
     file = tmp_path / 'far.csv'
     file.write_text(f'{",".join(COLUMNS)}\n0.5,0,1,0,0,0\n3,0,1,0,0,0\n17.9,0,1,0,0,0\n')

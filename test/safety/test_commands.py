@@ -7,8 +7,8 @@ import pytest
 from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety import commands
-from beetle_omni_ros.safety.commands import CommandStream, within_limits
-from beetle_omni_ros.safety.parameters import CommandLimits, SupervisorParameters
+from beetle_omni_ros.safety.commands import CommandStream
+from beetle_omni_ros.safety.parameters import CommandLimits
 
 ROBOT = RobotParameters.load()
 LIMITS = CommandLimits()
@@ -45,14 +45,6 @@ def test_bad_command_is_refused_with_its_reason_and_counted(bad, reason):
     assert checked.accepted is None and checked.complaint.endswith(f'last refused: {reason}')
 
 
-def test_repeated_and_older_stamps_are_refused():
-    checked = stream()
-    assert checked.offer(command(), NOW) == ''
-    assert checked.offer(command(), NOW) == 'repeated or older stamp'
-    assert checked.offer(command(stamp=NOW - 0.01), NOW) == 'repeated or older stamp'
-    assert checked.offer(command(stamp=NOW + 0.01), NOW + 0.01) == ''
-
-
 def test_a_small_excess_is_clipped_and_counted():
     checked, top = stream(), ROBOT.rotors.thrust_max
     given = command(tilt=[0.1, 0.2, 0.3, 4.5], thrust=[7.0, -3.0, 7.0, top + 3.0])
@@ -64,21 +56,13 @@ def test_a_small_excess_is_clipped_and_counted():
 
 def test_a_single_spike_is_refused_and_a_real_step_loses_one_command():
     checked, far = stream(), (0.1 + commands.TILT_STEP + 0.1, 0.2, 0.3, 0.4)
-    checked.offer(command(), NOW)
+    assert checked.offer(command(), NOW) == ''
+    for stamp in (NOW, NOW - 0.01):
+        assert checked.offer(command(stamp), NOW) == 'repeated or older stamp'
     assert checked.offer(command(NOW + 0.01, far), NOW + 0.01) == commands.JUMP
     assert checked.offer(command(NOW + 0.02, far), NOW + 0.02) == ''
     assert checked.offer(command(NOW + 0.03, far, (0, 0, 0, 0)), NOW + 0.03) == ''
     assert checked.offer(command(NOW + 0.04, far, (16, 16, 16, 16)), NOW + 0.04) == commands.JUMP
-
-
-def test_a_step_to_a_new_target_keeps_the_controller_selectable():
-    checked, near, far = stream(), command(), (3.0, 0.2, 0.3, 0.4)
-    for k in range(200):
-        checked.tick(0.01)
-        now = NOW + 0.01 * k
-        checked.offer(noisy(now, near.tilt if k < 100 else far), now)
-        assert checked.good == (k >= 50)
-    assert checked.refused == {commands.JUMP: 1}
 
 
 def test_a_stream_of_repeated_numbers_is_refused_until_they_change():
@@ -112,24 +96,3 @@ def test_good_means_half_a_second_without_gap_or_refusal():
     checked.tick(0.01)
     checked.tick(LIMITS.timeout)
     assert not checked.good and 'silent for' in checked.complaint
-
-
-def test_the_final_check_clips_to_limits_and_refuses_non_finite_values():
-    out = within_limits(command(tilt=[9, -9, 0, 0], thrust=[-1, 99, 1, 1]), ROBOT)
-    assert np.abs(out.tilt).max() == ROBOT.joints.position_limit
-    assert out.thrust.min() == 0 and out.thrust.max() == ROBOT.rotors.thrust_max
-    assert within_limits(command(tilt=[np.nan, 0, 0, 0]), ROBOT) is None
-
-
-def test_the_shipped_file_contains_every_parameter_at_its_default():
-    from beetle_omni_ros.robot import schema
-    from beetle_omni_ros.robot.resources import share_path
-    leaves = {name for name, *_ in schema.flatten(SupervisorParameters())}
-
-    def names(mapping, prefix=''):
-        for key, value in mapping.items():
-            yield from names(value, f'{prefix}{key}.') if isinstance(value, dict) \
-                else (f'{prefix}{key}',)
-
-    assert set(names(schema.load_yaml(share_path('params/supervisor.yaml')))) == leaves
-    assert SupervisorParameters.load() == SupervisorParameters()

@@ -1,11 +1,9 @@
 """The robot model of the URDF."""
 
 import numpy as np
-import pytest
 
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters, ROTOR_NAMES
-from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.robot.urdf import Model
 
 SMALL = """<robot name="r">
@@ -57,14 +55,3 @@ def test_shapes_colours_and_joints_are_read(tmp_path):
     np.testing.assert_allclose(position, [0, 0, 1])
     # About the joint's own y, which its origin has turned to world -x.
     np.testing.assert_allclose(rotations.matrix(quaternion) @ [0, 0, 1], [0, 1, 0], atol=1e-12)
-
-
-@pytest.mark.parametrize('text, message', [
-    ('<robot', 'not a usable URDF'), ('<world/>', 'expected <robot>'),
-    ('<robot><link name="a"/><link name="b"/></robot>', 'one root link'),
-    (SMALL.replace('0 0 1"', '0 0"'), 'expected 3'),
-    (SMALL.replace('1 2 3"/>', '1 2"/>', 1), 'expected 3 numbers')])
-def test_an_unusable_description_is_refused_in_one_line(tmp_path, text, message):
-    with pytest.raises(ParameterError, match=message) as error:
-        loaded(tmp_path, text)
-    assert 'robot.urdf' in str(error.value) and '\n' not in str(error.value)

@@ -1,28 +1,21 @@
 """What a picture shows agrees with the recording, and with the newest messages."""
 
+import asyncio
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
-from synthetic_flights import (
-    fly,
-    write_command,
-    write_joints,
-    write_odom,
-    write_state,
-    write_truth,
-)
+from synthetic_flights import fly, write_truth
 
-from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters
 from beetle_omni_ros.robot.urdf import Model
 from beetle_omni_ros.runs.log import LogRecorder
 from beetle_omni_ros.runs.tasks import make_task
-from beetle_omni_ros.view.live import Newest
+from beetle_omni_ros.view.live import Live
 from beetle_omni_ros.view.moments import moments
 from beetle_omni_ros.view.recorded import recorded_scene
 from beetle_omni_ros.view.scene import close, NEWTON_PER_METRE, Room, serve
-
-UP, ZERO = np.array([0.0, 0, 0, 1]), np.zeros(3)
 
 
 @pytest.fixture(scope='module')
@@ -44,24 +37,6 @@ def test_moments_agree_with_the_log(log):
     assert later.text() == f'flying:nmpc, {away:.0f} mm, 3.0° off target'
 
 
-def test_the_newest_messages_become_a_moment():
-    newest = Newest()
-    assert newest.moment() is None
-    write_odom(newest, 7.0, np.array([0.0, 0, 1.01]), UP, ZERO, ZERO)
-    assert newest.moment().position[2] == 1.01
-    write_truth(newest, 7.0, np.array([0.0, 0, 1.0]), UP, ZERO, ZERO)
-    write_joints(newest, 7.0, np.full(4, 0.2), np.zeros(4))
-    write_command(newest, 7.0, np.zeros(4), np.array([1.0, 2, 3, 4]))
-    write_state(newest, 7.0, 'flying:rl')
-    newest.write_target(PoseTarget(np.array([0.0, 0, 3.0]), UP, 8.0))
-    newest.write_diagnostic(7.0, 'nmpc_node: inputs', {}, 1, 'target_pose: 1 rejected')
-    moment = newest.moment()
-    assert (moment.position[2], moment.target[0][2], moment.state) == (1.0, 3.0, 'flying:rl')
-    np.testing.assert_allclose(moment.thrust, [1, 2, 3, 4])
-    text = newest.text(moment)
-    assert '2000 mm' in text and 'estimate 10 mm off' in text and '1 rejected' in text
-
-
 def test_the_drawn_robot_tilts_and_its_arrows_are_as_long_as_the_thrusts(log):
     server = serve('127.0.0.1', 8300)
     try:
@@ -71,12 +46,10 @@ def test_the_drawn_robot_tilts_and_its_arrows_are_as_long_as_the_thrusts(log):
         room.show([moment, None], ['here', ''])
         drawn, hidden = room.robots
         assert drawn._root.visible and not hidden._root.visible
-        axes = RobotParameters.load().tilt_axes
-        for k, name in enumerate(('gimbal1', 'gimbal2', 'gimbal3', 'gimbal4')):
-            _, node = drawn._joints[name]
-            turned = rotations.matrix(rotations.exp(axes[k] * moment.tilt[k]))
-            np.testing.assert_allclose(
-                rotations.matrix(np.roll(node.wxyz, -1))[:, 2], turned[:, 2], atol=1e-6)
+        for k, name in enumerate(JOINT_NAMES):
+            link, node = drawn._joints[name]
+            np.testing.assert_allclose(rotations.geodesic_angle(
+                np.roll(node.wxyz, -1), link.turned(moment.tilt[k])), 0, atol=1e-6)
             begin, end = drawn._arrows[f'rotor{k + 1}'].points[0]
             np.testing.assert_allclose(NEWTON_PER_METRE * (end - begin), [0, 0, moment.thrust[k]],
                                        atol=1e-5)
@@ -88,3 +61,22 @@ def test_a_recorded_scene_refers_to_nothing_outside(log):
     scene = recorded_scene({'a</script>': log})
     assert '__VISER_EMBED_DATA__="' in scene and 'a</script>' not in scene
     assert len(scene) < 2e6
+
+
+def test_a_dragged_target_is_sent_when_it_is_released_unless_it_is_refused():
+    sent, server = [], serve('127.0.0.1', 8320)
+    graph = SimpleNamespace(take=lambda newest: write_truth(
+        newest, 7.0, np.array([0.0, 0, 1]), np.array([0.0, 0, 0, 1]), np.zeros(3), np.zeros(3)),
+        controllers=lambda: ['nmpc'], publish_target=sent.append)
+    try:
+        live = Live(server, graph, Model.load(), RobotParameters.load(), True)
+        live.step()
+        for phase, height in (('update', 2.0), ('end', -5.0), ('end', 1.5)):
+            live._gizmo.position = 0.5, 0.0, height
+            asyncio.run(live._on_gizmo(SimpleNamespace(phase=phase, target=live._gizmo)))
+    finally:
+        close(server)
+    target, = sent
+    np.testing.assert_allclose(target.position, [0.5, 0.0, 1.5])
+    np.testing.assert_allclose(target.quaternion, [0, 0, 0, 1], atol=1e-9)
+    assert target.stamp == 7.0
