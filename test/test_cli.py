@@ -9,7 +9,7 @@ import sys
 import pytest
 from synthetic_flights import fly
 
-from beetle_omni_ros import __version__, cli
+from beetle_omni_ros import cli
 from beetle_omni_ros.runs.bag_writer import BagWriter
 from beetle_omni_ros.runs.tasks import make_task
 
@@ -57,11 +57,6 @@ def test_controllers_are_listed_with_their_properties(capsys, tmp_path):
     assert list(listed)[:2] == ['nmpc', 'rl'] and 'rl_memory' in capsys.readouterr().out
     assert listed['rl']['policy_file'] == 'policies/rl.onnx' and listed['rl']['rate_hz'] == 100
     assert listed['nmpc']['guidance'] == 'none' and listed['nmpc']['flies_degraded']
-
-
-def test_the_version_is_printed(capsys):
-    assert cli.main(['--version']) == 0
-    assert capsys.readouterr().out.strip() == f'beetle_omni {__version__}'
 
 
 @pytest.mark.parametrize('command', ['report', 'view', 'gap', 'identify joint'])

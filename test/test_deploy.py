@@ -91,12 +91,6 @@ def test_the_service_starts_the_bridges_without_arming(tmp_path):
         assert not re.search(r'Unknown|Invalid|Failed to parse|ignoring', output), output
 
 
-def test_without_service_only_rules_and_limits_are_installed(tmp_path):
-    assert install(tmp_path).returncode == 0
-    assert install(tmp_path, '--no-service').returncode == 0
-    assert set(files(tmp_path)) == {RULES, LIMITS}
-
-
 @pytest.mark.parametrize('options', [
     ['--user', 'x;reboot'], ['--servo-serial', '"'], ['--workspace', '$HOME'],
     ['--board-serial', 'a\nb'], ['--robot', '/does/not/exist'], ['--robot', 'r.yaml'],

@@ -42,28 +42,6 @@ def test_numpy_casadi_torch_and_c_take_the_same_step(kind):
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize('kind', KINDS)
-def test_numpy_and_casadi_have_the_same_acceleration(kind):
-    target, tilt, rate, load = states(seed=1)
-    expected = KINDS[kind].acceleration(NUMPY, target, tilt, rate, load)
-    x = ca.SX.sym('x', 4)
-    found = ca.Function('a', [x], [KINDS[kind].acceleration(CASADI, *ca.vertsplit(x))]).map(200)
-    np.testing.assert_allclose(np.array(found(np.stack([target, tilt, rate, load])))[0], expected,
-                               rtol=1e-12)
-
-
-def test_small_steps_agree_with_the_acceleration():
-    target, tilt, rate, load = states(seed=2)
-    inside = np.abs(rate) < 9
-    h = 1e-7
-    for kind in ('plain', 'friction'):
-        _, after = Step(NUMPY, KINDS[kind], h)(target, tilt, rate, load)
-        change = KINDS[kind].acceleration(NUMPY, target, tilt, rate, load)
-        sliding = inside & (np.abs(rate) > 1.0)     # the smooth friction is full there
-        np.testing.assert_allclose(((after - rate) / h)[sliding], change[sliding], rtol=3e-3,
-                                   atol=1.0)
-
-
 def test_a_step_is_of_second_order():
     kp, kd, inertia = ROBOT.joints.kp, ROBOT.joints.kd, ROBOT.joints.inertia
     servo = Servo(inertia, kp, kd)

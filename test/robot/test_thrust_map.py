@@ -8,7 +8,7 @@ import pytest
 
 from beetle_omni_ros.robot.parameters import RobotParameters, RotorMapRow
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.robot.thrust_map import duty_of_command, FULL_DUTY, STOP_DUTY, ThrustMap
+from beetle_omni_ros.robot.thrust_map import duty_of_command, FULL_DUTY, ThrustMap
 
 ROTORS = RobotParameters.load().rotors
 MAP = ThrustMap(ROTORS)
@@ -65,25 +65,6 @@ def test_saturation_is_reported_and_limited():
     assert MAP.saturated(thrust, 25.09).tolist() == [False, False, False, True]
     assert MAP.duty(30.0, 21.4) == MAP.duty(MAP.thrust_limit(21.4), 21.4) < FULL_DUTY
     assert MAP.thrust(FULL_DUTY, 21.4) == MAP.thrust_limit(21.4)
-
-
-def test_zero_thrust_stops_and_the_least_thrust_turns():
-    assert MAP.duty(0.0, 23.0) == STOP_DUTY
-    assert MAP.duty(-3.0, 23.0) == STOP_DUTY
-    assert MAP.duty(1e-6, 23.0) > 51.5
-    assert MAP.thrust(STOP_DUTY, 23.0) == 0
-
-
-def test_arrays_and_scalars_give_equal_results():
-    rng = np.random.default_rng(0)
-    voltage = rng.uniform(20, 26, (50, 1))
-    thrust = rng.uniform(0, 26, (50, 4))
-    duty = MAP.duty(thrust, voltage)
-    for k in range(50):
-        np.testing.assert_allclose(duty[k], MAP.duty(thrust[k], voltage[k, 0]), rtol=1e-12)
-        np.testing.assert_allclose(
-            MAP.thrust(duty[k], voltage[k, 0]),
-            np.minimum(thrust[k], MAP.thrust_limit(voltage[k, 0])), atol=1e-9)
 
 
 def bent(peak=False):

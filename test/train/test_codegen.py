@@ -1,6 +1,5 @@
 """The generated functions agree with the CasADi functions."""
 
-import ast
 from dataclasses import replace
 import sys
 from types import ModuleType, SimpleNamespace
@@ -61,15 +60,6 @@ def test_torch_agrees_with_casadi(robot):
     np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-10)
 
 
-def test_the_precision_is_that_of_the_inputs():
-    step = codegen.torch_function(model.substep(ROBOT, 0.0025))
-    inputs = states(50)
-    inputs[0][:, 13:17] *= 0.95     # away from the stops, where rounding decides
-    single = step(*(value.float() for value in inputs))
-    assert single.dtype == torch.float32
-    np.testing.assert_allclose(single.numpy(), step(*inputs).numpy(), atol=1e-5)
-
-
 def test_every_operation_of_the_tables_is_correct_with_constants_too():
     x, y = ca.SX.sym('x', 2), ca.SX.sym('y', 2)
     a, b = x[0], y[1]
@@ -90,19 +80,6 @@ def test_an_unknown_operation_is_refused_by_name():
     function = ca.Function('turning', [x], [ca.atan2(x[0], x[1])], ['x'], ['y'])
     with pytest.raises(NotImplementedError, match='turning'):
         codegen.torch_function(function)
-
-
-def test_the_kernel_loads_uses_and_stores_each_number():
-    source = physics._kernel_source(model.substep(EVERYTHING, 0.0025))
-    ast.parse(source)
-    for name, array, size in (('x', 'x_in', 25), ('wrench', 'wrench', 6), ('body', 'body', 28),
-                              ('newest', 'newest', 8), ('previous', 'previous', 8),
-                              ('oldest', 'oldest', 8)):
-        for k in range(size):
-            assert f'{name}_{k} = tl.load({array} + {size} * i + {k}, mask' in source
-    for k in range(25):
-        assert f'        x_{k} = x_next_{k}\n' in source
-        assert f'tl.store(x_out + 25 * i + {k}, x_{k}, mask=mask)' in source
 
 
 class Pointer:
@@ -165,26 +142,20 @@ def triton(monkeypatch):
     monkeypatch.setitem(sys.modules, 'triton.language', words)
 
 
-@pytest.mark.parametrize('count', [1, physics.BLOCK, 150])
-def test_the_kernel_agrees_with_torch(triton, count):
-    made = physics.Physics(EVERYTHING, 0.01, 4, 'cpu', kernel=True)
-    assert made.has_kernel
-    x, _, wrench, body = states(count, 3, torch.float32)
-    commands = [states(count, seed, torch.float32)[1] for seed in (4, 5, 6)]
-    delays = uniform(torch.Generator().manual_seed(7), 0.0, 0.02, count, 2)
-    ours = made.advance(x, commands, delays, wrench, body)
-    theirs = made.advance_torch(x, commands, delays, wrench, body)
-    np.testing.assert_allclose(ours.numpy(), theirs.numpy(), atol=1e-5)
+def difference(count, device):
+    """Largest difference of the kernel and torch."""
+    made = physics.Physics(EVERYTHING, 0.01, 4, device, kernel=True)
+    x, _, wrench, body = (value.to(device) for value in states(count, 3, torch.float32))
+    commands = [states(count, seed, torch.float32)[1].to(device) for seed in (4, 5, 6)]
+    delays = uniform(torch.Generator().manual_seed(7), 0.0, 0.02, count, 2).to(device)
+    return (made.advance(x, commands, delays, wrench, body)
+            - made.advance_torch(x, commands, delays, wrench, body)).abs().max()
 
 
-def test_triton_agrees_if_available():
-    pytest.importorskip('triton', reason='triton is not installed')
-    if not torch.cuda.is_available():
-        pytest.skip('triton compiles for a GPU, and here is none')
-    made = physics.Physics(EVERYTHING, 0.01, 4, 'cuda', kernel=True)
-    x, _, wrench, body = (value.cuda() for value in states(1000, 3, torch.float32))
-    commands = [states(1000, seed, torch.float32)[1].cuda() for seed in (4, 5, 6)]
-    delays = uniform(torch.Generator().manual_seed(7), 0.0, 0.02, 1000, 2).cuda()
-    ours = made.advance(x, commands, delays, wrench, body)
-    theirs = made.advance_torch(x, commands, delays, wrench, body)
-    np.testing.assert_allclose(ours.cpu().numpy(), theirs.cpu().numpy(), atol=1e-3)
+def test_the_kernel_agrees_with_torch(triton):
+    assert difference(150, 'cpu') < 1e-5
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason='triton compiles for a GPU')
+def test_triton_agrees():
+    assert difference(1000, 'cuda') < 1e-3

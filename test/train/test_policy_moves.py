@@ -1,52 +1,21 @@
-"""The benchmark of rare losses of height: batches, counts, guidance."""
+"""The benchmark of rare losses of height flies."""
 
 import importlib.util
 from pathlib import Path
 
+from learning import ROBOT
 import numpy as np
-import pytest
-
-pytest.importorskip('onnx')
-pytest.importorskip('torch')
 
 from beetle_omni_ros.control.policy import PolicyParameters
-from beetle_omni_ros.control.policy_file import find, PolicyNetwork
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.control.policy_file import find
 
 FILE = Path(__file__).resolve().parents[2] / 'benchmarks' / 'policy_moves.py'
-ROBOT = RobotParameters.load()
 
 
-@pytest.fixture(scope='module')
-def moves():
+def test_hovering_robots_hold_their_target(monkeypatch):
     spec = importlib.util.spec_from_file_location('policy_moves', FILE)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-@pytest.mark.parametrize('name', ['rl', 'rl_memory'])
-def test_batched_and_single_observations_give_equal_actions(moves, name):
-    path = find(f'policies/{name}.onnx')
-    network = PolicyNetwork(path, ROBOT)
-    rng = np.random.default_rng(0)
-    rows = rng.normal(size=(5, network.contract.observation_size)).astype(np.float32)
-    expected = [network(row.tolist()) for row in rows]
-    np.testing.assert_allclose(moves.Batched(path)(rows), expected, rtol=1e-4, atol=1e-4)
-
-
-def test_a_lost_robot_counts_as_lost_only(moves):
-    flown = {name: np.array([[value, 9.0], [value, 9.0]]) for name, value in (
-        ('U_position', 0.01), ('U_attitude', 0.01), ('L_position', 0.02), ('L_attitude', 0.02),
-        ('depth', 0.3), ('lowest', 0.25))}
-    flown['U_attitude'][1, 0] = 0.2     # 11 degrees
-    totals = moves.summary({**flown, 'lost': np.array([False, True])})
-    assert totals['moves'] == 2 and totals['robots_lost'] == 1 and totals['missed'] == 1
-    assert totals['deeper_than_0.25_m'] == 2 and totals['deeper_than_0.4_m'] == 0
-    assert totals['below_0.3_m'] == 2 and totals['L_position_m'] == pytest.approx(0.02)
-
-
-def test_hovering_robots_hold_their_target(moves, monkeypatch):
+    moves = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(moves)
     monkeypatch.setattr(moves, 'SEGMENT', 30)
     monkeypatch.setattr(moves, 'ON_THE_WAY', (0, 15))
     monkeypatch.setattr(moves, 'AT_TARGET', (15, 30))

@@ -1,6 +1,5 @@
 """Missed situations are stored, repeated unchanged, and dropped when reached."""
 
-from dataclasses import replace
 
 from learning import only, quiet
 import pytest
@@ -68,17 +67,6 @@ def test_an_episode_begins_with_a_stored_situation_and_the_longest_time():
     assert after['source'][1] == -1
 
 
-@pytest.mark.parametrize('case', ['nothing stored', 'no share'])
-def test_without_store_or_share_episodes_begin_as_drawn(case):
-    replays, s, _ = store(share=0.0 if case == 'no share' else 1.0)
-    if case == 'nothing stored':
-        s['filled'] = torch.zeros(COUNT)
-    after = step(replays, s, states(3), states(4), flags(done=[0]),
-                 numbers=torch.zeros(COUNT, 3))
-    torch.testing.assert_close(after['x'][0], states(4)['x'][0])
-    assert after['source'][0] == -1
-
-
 def test_samples_cover_the_stored_situations_only():
     replays, s, _ = store()
     s['filled'] = torch.tensor([0.0, 1, 0, 0, 1, 1, 0, 0])
@@ -99,14 +87,6 @@ def test_reached_situations_are_dropped_before_missed_ones(missed, chance, left)
     assert after['filled'][2] == left
     # a replay is not stored a second time
     assert after['filled'][0] == 0 and after['source'][0] == -1
-
-
-def test_a_truncated_replay_changes_no_situation():
-    replays, s, _ = store()
-    s = step(replays, s, states(3), states(4), flags(done=[0]))
-    s['filled'][2] = 1.0
-    after = step(replays, s, states(5), states(6), flags(done=[0]), torch.zeros(COUNT, 3))
-    assert after['filled'][2] == 1
 
 
 def test_the_environment_replays_missed_situations():
@@ -135,14 +115,6 @@ def test_the_environment_replays_missed_situations():
     assert (env.state['target_left'][again] == 100).all()
 
 
-def test_the_tally_counts_no_replays():
-    env = quiet({**only('hover'), 'episode.target_time': [1.0, 1.0]}, robots=16)
-    env.state['target_left'].fill_(1.0)
-    env.state['source'][:10] = 3.0
-    env.advance(torch.zeros(16, 8))
-    assert env.read_tally()['targets'] == 6
-
-
 def test_disturbed_robots_are_not_stored():
     env = quiet({**only('hover'), 'episode.target_time': [1.0, 1.0]}, robots=16)
     env.state['target_left'].fill_(1.0)
@@ -160,22 +132,3 @@ def test_a_large_loss_of_height_counts_as_missed():
     env.advance((env.state['previous'] - env.offset) / env.scale)
     assert env.state['filled'].tolist() == [0, 1, 0, 0]
     assert not env.state['deepest'].any()
-
-
-def test_assessments_replay_nothing():
-    from beetle_omni_ros.train import assess
-    seen = []
-    original = assess.TiltableQuadrotorEnv
-
-    class Watched(original):
-        def __init__(self, parameters, *rest, **more):
-            seen.append(parameters.episode.replay_share)
-            super().__init__(parameters, *rest, **more)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(assess, 'TiltableQuadrotorEnv', Watched)
-        patch.setattr(assess, 'SEGMENT', 1.0)
-        env = quiet(robots=2)
-        assess.assess(lambda seen: torch.zeros(2, 8),
-                      replace(env.cfg), env.robot, 'cpu', 'nominal', robots=2, segments=1)
-    assert seen == [0.0]
