@@ -45,12 +45,11 @@ def conditions(name: str, random: RandomParameters) -> RandomParameters:
 
 def assess(mean: Callable[[torch.Tensor], torch.Tensor], parameters: TrainParameters,
            robot: RobotParameters, device='cpu', name: str = 'nominal', robots: int = 1024,
-           segments: int = 3, random: RandomParameters | None = None) -> dict[str, float]:
+           segments: int = 3) -> dict[str, float]:
     """
     Fly a policy from pose to pose.
 
     Args:
-        mean: (N, 33 or 39) observations to (N, 8) actions.
         mean: function from (N, 33 or 39) observations to (N, 8) actions.
         parameters: parameters of its training.
         robot: nominal robot.
@@ -58,13 +57,11 @@ def assess(mean: Callable[[torch.Tensor], torch.Tensor], parameters: TrainParame
         name: 'nominal', 'published' or 'measured'.
         robots: N.
         segments: poses for each robot, after a first one that does not count.
-        random: randomisation in place of the named one.
 
     Returns:
         means U_*, L_* of robots never lost, fraction of poses reached, fraction of robots lost,
         command change in the U windows, fraction of joints at a stop there, mean thrust, and the
         99 and 99.9 % quantiles of the depth of moves below start and target.
-        the worst hundredth and thousandth of the moves sank below start and target.
 
     """
     start = {entry.name: 0.0 for entry in fields(StartParameters)}
@@ -77,15 +74,17 @@ def assess(mean: Callable[[torch.Tensor], torch.Tensor], parameters: TrainParame
         start=StartParameters(**start),
         estimate=replace(parameters.estimate, **SILENT) if name != 'published'
         else parameters.estimate,
-        random=random if random is not None else conditions(name, parameters.random)),
+        random=conditions(name, parameters.random)),
         robot, device, compiled=False)
     env.state['age'].zero_()
     env.state['target_left'].fill_(round(SEGMENT / episode.period))
-    return _fly(mean, env, round(SEGMENT / episode.period), segments, episode.period)
+    return _fly(mean, env, segments)
 
 
 @torch.no_grad()
-def _fly(mean, env, length, segments, period):
+def _fly(mean, env, segments):
+    period = env.cfg.episode.period
+    length = round(SEGMENT / period)
     windows = {'U': tuple(round(t / period) for t in AT_TARGET),
                'L': tuple(round(t / period) for t in ON_THE_WAY)}
     shape = (segments + 1, env.num_envs)
@@ -122,16 +121,10 @@ def _fly(mean, env, length, segments, period):
               'tilt_change_rad': float((change[0] / count).sqrt()),
               'thrust_change_N': float((change[1] / count).sqrt()),
               'at_stop': float(stopped / count), 'thrust_N': float(thrust),
-              'depth_p99_m': _quantile(depth[1:], 0.99),
-              'depth_p999_m': _quantile(depth[1:], 0.999)}
+              'depth_p99_m': float(depth[1:].quantile(0.99, interpolation='nearest')),
+              'depth_p999_m': float(depth[1:].quantile(0.999, interpolation='nearest'))}
     for key, value in kept.items():
-        angle = key.endswith('attitude')
-        result[f'{key}_deg' if angle else f'{key}_m'] = float(
-            torch.rad2deg(value.mean()) if angle else value.mean())
+        mean = float(value.mean())
+        result |= {f'{key}_deg': float(np.degrees(mean))} if key.endswith('attitude') \
+            else {f'{key}_m': mean}
     return {key: value for key, value in result.items() if np.isfinite(value)}
-
-
-def _quantile(values, share):
-    """As torch.quantile without interpolation, for any number of values."""
-    ordered = values.flatten().sort().values
-    return float(ordered[round(share * (len(ordered) - 1))])

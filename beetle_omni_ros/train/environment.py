@@ -15,22 +15,17 @@ from beetle_omni_ros.control import guidance
 from beetle_omni_ros.control.policy_file import PolicyContract
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.train import batch, rewards, starts
+from beetle_omni_ros.train import batch, rewards
 from beetle_omni_ros.train.model import CENTRE, INERTIA, MASS, module_reaction, nominal_body
-from beetle_omni_ros.train.observations import (
-    actor_observation,
-    critic_observation,
-    extrapolated,
-    Signals,
-)
 from beetle_omni_ros.train.parameters import TrainParameters
 from beetle_omni_ros.train.physics import Physics
-from beetle_omni_ros.train.replays import (
+from beetle_omni_ros.train.starts import (
     MISSED_ATTITUDE,
     MISSED_DEPTH,
     MISSED_POSITION,
     Replays,
     spread,
+    Starts,
 )
 
 NUMBERS = 167       # random numbers for each robot and step
@@ -74,7 +69,7 @@ class TiltableQuadrotorEnv(VecEnv):
         self._low = self._tensor([-limit] * 4 + [rotors.thrust_min] * 4)
         self._high = self._tensor([limit] * 4 + [rotors.thrust_max] * 4)
         self._torque_ratio = self._tensor(-np.array(rotors.spin) * rotors.torque_to_thrust_ratio)
-        self._starts = starts.Starts(parameters, robot, self.num_envs, self.device)
+        self._starts = Starts(parameters, robot, self.num_envs, self.device)
         self.severity = self._starts.severity
         self.depth_limit = torch.full((), np.inf, device=self.device)
         self._module_moment = module_reaction(robot)['mass_moment'] if robot.multibody else 0.0
@@ -153,7 +148,8 @@ class TiltableQuadrotorEnv(VecEnv):
         x = self._push(s, x, draw)
         rotation, target = batch.matrix(x[:, model.QUATERNION]), batch.matrix(s['target_attitude'])
         inputs = self._reward_inputs(s, x, requested, rotation, target)
-        terms = rewards.terms(inputs)
+        made = rewards.terms(inputs)
+        terms = torch.stack([made[name] for name in rewards.TERMS], -1)
         broken = ~torch.isfinite(x).all(-1)
         calm = s['disturbed'][:, 0] < 0.5
         died = broken | (inputs.position_error > limits.position_limit) \
@@ -272,7 +268,7 @@ class TiltableQuadrotorEnv(VecEnv):
                            s['past_motion'][:, :, 3:]), 1)
         changes = rates[:, :-1] - rates[:, 1:]
         delay = s['delays'][:, 2:3]
-        return extrapolated(changes, delay, s['extrapolated'] * delay) - changes[:, 0]
+        return batch.extrapolated(changes, delay, s['extrapolated'] * delay) - changes[:, 0]
 
     def _retarget(self, new, due, rotation, draw):
         target = self._starts.target(draw, new['x'][:, model.POSITION],
@@ -289,11 +285,11 @@ class TiltableQuadrotorEnv(VecEnv):
         return changed
 
     def _observe(self, s, draw):
-        signals = Signals(self.cfg.random, s, draw)
+        signals = batch.Signals(self.cfg.random, s, draw)
         previous_action = (s['previous'] - self.offset) / self.scale
-        observation = actor_observation(signals, s, previous_action,
+        observation = batch.actor_observation(signals, s, previous_action,
                                         self.cfg.estimate if self.cfg.memory else None, draw)
-        return observation, critic_observation(s, previous_action, self._torque_ratio,
+        return observation, batch.critic_observation(s, previous_action, self._torque_ratio,
                                                self.cfg.memory)
 
     def read_tally(self) -> dict[str, float]:

@@ -1,5 +1,5 @@
 """
-Actor and critic: rsl-rl's MLP models on features of the raw observation.
+Actor and critic, rsl-rl's MLP models on features of the raw observation, and their ONNX file.
 
 The features are functions of the 33 (or 39) observed numbers and part of the exported graph. The
 interface is therefore the raw observation. The features are the target attitude in the body
@@ -8,12 +8,35 @@ centimetres. They do not depend on the heading of the world frame.
 """
 
 import copy
+from dataclasses import replace
+from datetime import datetime, timezone
+import logging
+from pathlib import Path
+import subprocess
+import warnings
 
+import numpy as np
+import onnx
 from rsl_rl.models import MLPModel
 from rsl_rl.modules import MLP
 from rsl_rl.modules.distribution import GaussianDistribution
 import torch
 
+from beetle_omni_ros import __version__
+from beetle_omni_ros.control.policy_file import (
+    add_checksum,
+    INPUT,
+    OUTPUT,
+    PolicyContract,
+    session,
+)
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import RunError
+from beetle_omni_ros.train.parameters import TrainParameters
+
+OPSET = 18
+AGREEMENT = 1e-5     # largest difference of torch and onnxruntime, relative to the largest action
+PROBES = 256         # compared observations
 NEAR = 0.1           # [m or rad] below which the normalised error is linear
 # Scales that bring the features to about one.
 RATE, FORCE, TORQUE, THRUST, TILT_ACTION, THRUST_ACTION = 0.5, 0.1, 2.0, 0.1, 0.25, 0.1
@@ -227,3 +250,83 @@ def _linear(known):
         *(axis[:, 2:] for axis in (*body, *goals)), tilt,
         TILT_ACTION * action[:, :4], THRUST_ACTION * action[:, 4:],
         *_disturbance(o[:, ACTOR_SIZE:-12]), target, turn, tilt, tilt), -1)
+
+
+def export_policy(actor: ActorModel, path: Path, robot: RobotParameters,
+                  parameters: TrainParameters, training: dict | None = None,
+                  metrics: dict | None = None) -> float:
+    """
+    Write an actor as ONNX and compare the file with it.
+
+    Args:
+        actor: trained network.
+        path: path of the file.
+        robot: robot of the training.
+        parameters: parameters of the training.
+        training: further facts of the training for the file, e.g. its duration.
+        metrics: results of the policy for the file.
+
+    Returns:
+        largest difference of torch and onnxruntime, relative to the largest action.
+
+    Raises:
+        RunError: the difference exceeds ``AGREEMENT``.
+
+    """
+    actor = copy.deepcopy(actor).cpu().eval()
+    network, size = ExportedPolicy(actor).eval(), actor.obs_dim
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore')
+        logging.getLogger('torch.onnx').setLevel(logging.ERROR)
+        program = torch.onnx.export(
+            network, (torch.zeros(1, size),), input_names=[INPUT], output_names=[OUTPUT],
+            opset_version=OPSET, dynamo=True, verbose=False)
+    written = program.model_proto
+    contract = PolicyContract.default(robot, parameters.memory)
+    contract = replace(
+        contract, training={**parameters.plain(), **(training or {})}, metrics=metrics or {},
+        commit=_commit(), version=__version__,
+        created=datetime.now(timezone.utc).isoformat(timespec='seconds'))
+    _strip_paths(written)
+    for key, value in contract.to_metadata().items():
+        written.metadata_props.add(key=key, value=value)
+    part = path.with_suffix('.part')
+    onnx.save(written, str(part))
+    add_checksum(part)
+    difference = _difference(actor.mean, part, size)
+    if not difference <= AGREEMENT:
+        part.unlink()
+        raise RunError(f'{path}: torch and onnxruntime differ by {difference:.2g}, more than '
+                       f'{AGREEMENT:g}')
+    part.replace(path)
+    return difference
+
+
+def _difference(mean, path, size):
+    """Largest relative difference of torch and onnxruntime on random observations."""
+    network = session(path.read_bytes())
+    probes = torch.randn(PROBES, size, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        expected = mean(probes).numpy()
+    found = np.concatenate([network.run([OUTPUT], {INPUT: row[None].numpy()})[0]
+                            for row in probes])
+    return float(np.abs(found - expected).max() / max(np.abs(expected).max(), 1.0))
+
+
+def _strip_paths(proto):
+    """Remove the exporter's notes on the origin of nodes, because they contain local paths."""
+    for part in (proto, proto.graph, *proto.graph.node, *proto.graph.input, *proto.graph.output,
+                 *proto.graph.value_info, *proto.functions):
+        del part.metadata_props[:]
+        part.doc_string = ''
+
+
+def _commit() -> str:
+    """Commit of the working tree of this package, '' outside of one."""
+    try:
+        done = subprocess.run(['git', 'describe', '--always', '--dirty', '--abbrev=12'],
+                              cwd=Path(__file__).parent, capture_output=True, text=True,
+                              timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return ''
+    return done.stdout.strip()

@@ -1,11 +1,20 @@
 """Parameters of the training."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from beetle_omni_ros.robot.schema import flatten, group, parameter, ParameterError, ParameterFile
+from beetle_omni_ros.robot.schema import (
+    bind,
+    flatten,
+    group,
+    nest,
+    parameter,
+    ParameterError,
+    ParameterFile,
+)
 
 
 def _check_ranges(parameters, *names):
@@ -286,3 +295,25 @@ class TrainParameters(ParameterFile, file='train.yaml'):
         """Dotted key -> value as a plain number, text or list."""
         return {name: value.tolist() if isinstance(value, np.ndarray) else value
                 for name, _, _, value in flatten(self)}
+
+
+def read_parameters(file: Path | None, changes: dict) -> TrainParameters:
+    """
+    Read a parameter file and replace single values.
+
+    Args:
+        file: YAML; None: the shipped one.
+        changes: dotted name -> value.
+
+    Raises:
+        ParameterError: unusable file or value.
+
+    """
+    parameters = TrainParameters.load(file)
+    flat = parameters.plain()
+    for key, value in changes.items():
+        if key not in flat:
+            raise ParameterError(f'--set {key}: unknown; keys are those of params/train.yaml, '
+                                 'e.g. ppo.robots')
+        flat[key] = value
+    return bind(TrainParameters, nest(flat), '--set' if changes else str(file or ''))

@@ -171,8 +171,8 @@ def test_the_reward_is_the_weighted_sum_of_the_terms():
         depth=(torch.minimum(before['x'][:, 2], before['target_position'][:, 2])
                - x[:, 2]).clamp(min=0),
         tilt_limit=ROBOT.joints.position_limit, thrust_limit=ROBOT.rotors.thrust_max)
-    expected = sum(getattr(env.cfg.reward, name) * term(made)
-                   for name, term in rewards.TERMS.items()) * env.cfg.reward.scale
+    expected = sum(getattr(env.cfg.reward, name) * term
+                   for name, term in rewards.terms(made).items()) * env.cfg.reward.scale
     torch.testing.assert_close(env.reward, expected, atol=1e-5, rtol=1e-4)
 
 

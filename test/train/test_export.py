@@ -13,9 +13,8 @@ import torch
 import beetle_omni_ros
 from beetle_omni_ros.control.policy_file import PolicyContract, PolicyNetwork, verify
 from beetle_omni_ros.robot.schema import RunError
-from beetle_omni_ros.train import export
-from beetle_omni_ros.train.export import export_policy
-from beetle_omni_ros.train.network import ExportedPolicy
+from beetle_omni_ros.train import network as module
+from beetle_omni_ros.train.network import export_policy, ExportedPolicy
 from beetle_omni_ros.train.runner import Runner
 
 
@@ -81,7 +80,7 @@ def test_a_wrong_export_is_detected_and_removed(tmp_path, monkeypatch):
     wrong = copy.deepcopy(network)
     with torch.no_grad():
         wrong.mlp[-1].bias.add_(0.01)
-    monkeypatch.setattr(export, 'ExportedPolicy', lambda _: ExportedPolicy(wrong))
+    monkeypatch.setattr(module, 'ExportedPolicy', lambda _: ExportedPolicy(wrong))
     (tmp_path / 'policy.onnx').write_text('the one before')
     with pytest.raises(RunError, match=r'policy.onnx: torch and onnxruntime differ by'):
         export_policy(network, tmp_path / 'policy.onnx', ROBOT, parameters)

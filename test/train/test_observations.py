@@ -11,7 +11,7 @@ from beetle_omni_ros.control.guidance import Trimming
 from beetle_omni_ros.control.policy import disturbed, observed
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.train import batch
-from beetle_omni_ros.train.observations import delayed, extrapolated, Signals
+from beetle_omni_ros.train.batch import delayed, extrapolated, Signals
 
 SEEN = {'velocity': slice(0, 3), 'rate': slice(3, 6), 'tilt': slice(21, 25)}
 

@@ -7,7 +7,7 @@ import torch
 
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.train import batch
-from beetle_omni_ros.train.replays import Replays
+from beetle_omni_ros.train.starts import Replays
 
 COUNT = 8
 

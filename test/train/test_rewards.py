@@ -1,6 +1,5 @@
 """Each reward term for prescribed states; the published ones against the paper's table."""
 
-from dataclasses import fields
 
 import learning  # noqa: F401
 import numpy as np
@@ -11,7 +10,6 @@ from beetle_omni_ros.train import rewards
 from beetle_omni_ros.train.parameters import RewardWeights, TrainParameters
 
 TILT_LIMIT, THRUST_LIMIT, HOVER = 3.96, 20.0, 7.2
-NOT_TERMS = {'termination', 'scale'}
 
 
 def moment(**changes):
@@ -84,9 +82,9 @@ def test_the_published_terms_are_those_of_the_table():
     made = moments(400, 0)
     rows = [{key: value[k].numpy() for key, value in made._asdict().items()
              if torch.is_tensor(value)} for k in range(400)]
-    expected = [published(row) for row in rows]
+    expected, found = [published(row) for row in rows], rewards.terms(made)
     for name in expected[0]:
-        ours = rewards.TERMS[name](made).double().numpy()
+        ours = found[name].double().numpy()
         theirs = np.array([float(row[name]) for row in expected])
         np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-12, err_msg=name)
         assert theirs.any() or name == 'reach_pose', f'{name}: never anything but zero'
@@ -94,7 +92,7 @@ def test_the_published_terms_are_those_of_the_table():
 
 def test_at_rest_at_the_target_only_thrust_is_penalised():
     at_target = moment()
-    costs = {name: float(term(at_target)) for name, term in rewards.TERMS.items()
+    costs = {name: float(term) for name, term in rewards.terms(at_target).items()
              if getattr(RewardWeights(), name) < 0}
     assert costs.pop('thrust_power') == pytest.approx(4 * HOVER ** 2)
     assert set(costs.values()) == {0.0}
@@ -103,27 +101,26 @@ def test_at_rest_at_the_target_only_thrust_is_penalised():
 def test_at_rest_at_the_target_every_bonus_is_the_largest_and_falls_with_distance():
     best = {'pose': 1, 'reach_position': 2, 'reach_pose': 4, 'near_position': 1,
             'near_attitude': 1, 'near_pose': 1, 'exact_pose': 1}
-    near, far = (moment(position_error=distance, attitude_error=distance)
+    near, far = (rewards.terms(moment(position_error=distance, attitude_error=distance))
                  for distance in (0.0, 0.015))
-    assert {name: float(rewards.TERMS[name](near)) for name in best} == best
-    assert all(float(rewards.TERMS[name](far)) < value for name, value in best.items())
+    assert {name: float(near[name]) for name in best} == best
+    assert all(float(far[name]) < value for name, value in best.items())
     assert set(best) == {name for name in rewards.TERMS if getattr(RewardWeights(), name) > 0}
 
 
-
-
 def test_command_changes_count_at_the_target_only():
-    for term in (rewards.hover_tilt_rate, rewards.hover_thrust_rate):
-        here, there = term(moment(position_error=[0.0, 1.0], tilt_command=np.full((2, 4), 0.1),
-                                  thrust_command=np.full((2, 4), 9.0)))
+    found = rewards.terms(moment(position_error=[0.0, 1.0], tilt_command=np.full((2, 4), 0.1),
+                                 thrust_command=np.full((2, 4), 9.0)))
+    for name in ('hover_tilt_rate', 'hover_thrust_rate'):
+        here, there = found[name]
         assert here > 0 and there < 1e-3 * here
 
 
 def test_a_loss_of_height_costs_less_than_a_termination():
     p = TrainParameters.load()
-    deepest = float(rewards.sinking(moment(depth=1e3)))
+    deepest = float(rewards.terms(moment(depth=1e3))['sinking'])
     assert -p.reward.sinking * deepest / (1 - p.ppo.discount) < -p.reward.termination
 
 
 def test_every_weight_has_a_term_and_every_term_a_weight():
-    assert {entry.name for entry in fields(RewardWeights)} - NOT_TERMS == set(rewards.TERMS)
+    assert tuple(rewards.terms(moment())) == rewards.TERMS

@@ -8,7 +8,7 @@ import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 import torch
 
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.schema import ParameterError, RunError
 from beetle_omni_ros.train import rewards
 from beetle_omni_ros.train.runner import Runner
 
@@ -41,24 +41,20 @@ def test_the_schedule_is_linear_between_its_ends():
                      'schedule.thrust_std_limit': [3.0, 1.0], 'schedule.severity': [0.0, 1.0],
                      'schedule.smooth': [0.1, 1.0], 'schedule.near': [0.5, 1.0],
                      'schedule.sinking': [0.1, 1.0], 'schedule.depth_limit': [5.0, 1.0]})
-    begin, middle, end = ([0.01, 4e-4, 0.8, 3.0, 0.0, 5.0], [0.0075, 2e-4, 0.5, 2.0, 0.5, 3.0],
-                          [0.005, 0.0, 0.2, 1.0, 1.0, 1.0])
-    for part, knobs, smooth, near in ((0.0, begin, 0.1, 0.5), (0.25, begin, 0.1, 0.5),
-                                      (0.5, middle, 0.55, 0.75), (0.75, end, 1.0, 1.0),
-                                      (1.0, end, 1.0, 1.0)):
-        found, factors = made.scheduled(part)
-        assert found == pytest.approx(knobs)
-        assert factors == pytest.approx({
-            **dict.fromkeys(('joint_action_rate', 'thrust_action_rate', 'hover_tilt_rate',
-                             'hover_thrust_rate', 'sinking'), smooth),
-            **dict.fromkeys(('near_position', 'near_attitude', 'near_pose'), near)})
+    reward = made.parameters.reward
+    for part, knobs, severity, depth, smooth, near in (
+            (0.1, [0.01, 4e-4, 0.8, 3.0], 0.0, 5.0, 0.1, 0.5),
+            (0.5, [0.0075, 2e-4, 0.5, 2.0], 0.5, 3.0, 0.55, 0.75),
+            (1.0, [0.005, 0.0, 0.2, 1.0], 1.0, 1.0, 1.0, 1.0)):
         made.apply_schedule(part)
-        np.testing.assert_allclose(made.alg.scheduled, knobs[:4], rtol=1e-6)
-        assert float(made.env.severity) == pytest.approx(knobs[4])
-        assert float(made.env.depth_limit) == pytest.approx(knobs[5])
-        for name, weight in zip(rewards.TERMS, made.env.weights.tolist()):
-            full = getattr(made.parameters.reward, name) * made.parameters.reward.scale
-            assert weight == pytest.approx(full * factors.get(name, 1.0), rel=1e-5), name
+        np.testing.assert_allclose(made.alg.scheduled, knobs, rtol=1e-6)
+        assert float(made.env._starts.severity) == pytest.approx(severity)
+        assert float(made.env.depth_limit) == pytest.approx(depth)
+        weights = dict(zip(rewards.TERMS, made.env.weights.tolist()))
+        for name, factor in (('hover_tilt_rate', smooth), ('sinking', smooth),
+                             ('near_pose', near), ('position', 1.0)):
+            assert weights[name] == pytest.approx(
+                factor * getattr(reward, name) * reward.scale, rel=1e-5), name
 
 
 def test_rows_and_checkpoints_appear_at_their_intervals_with_finite_numbers(tmp_path):
@@ -162,6 +158,6 @@ def test_a_loss_that_is_not_finite_stops_the_training_before_it_is_saved(tmp_pat
             made.alg.learn_batch = lambda: None
 
     made.alg.learn_batch = poisoned
-    with pytest.raises(FloatingPointError, match=r'iteration \d: the loss is not finite'):
+    with pytest.raises(RunError, match=r'iteration \d: the loss is not finite'):
         made.train()
     assert {path.name for path in tmp_path.glob('model_*')} == {'model_3.pt'}

@@ -15,9 +15,9 @@ from beetle_omni_ros.control.policy import PolicyController, PolicyParameters
 from beetle_omni_ros.control.policy_file import PolicyNetwork
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.train import command
-from beetle_omni_ros.train.parameters import TrainParameters
+from beetle_omni_ros.train.command import parse_changes
+from beetle_omni_ros.train.parameters import read_parameters, TrainParameters
 from beetle_omni_ros.train.ppo import GraphPpo
-from beetle_omni_ros.train.run_folder import parse_changes, read_parameters
 
 ROBOT = RobotParameters.load()
 TINY = ['--smoke', '--device', 'cpu', '--set', 'ppo.robots=8', '--set', 'ppo.steps=4']

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from beetle_omni_ros.robot.effects import CATALOGUE, validated
-from beetle_omni_ros.train import codegen, model, physics
+from beetle_omni_ros.train import model, physics
 
 EFFECTS = validated({
     'mass': {'mass': 3.3}, 'inertia': {'inertia': [0.08, 0.07, 0.11]},
@@ -54,7 +54,7 @@ def test_torch_agrees_with_casadi(robot):
                             if effect.apply and name != 'voltage_sag'}   # needs a voltage
     function = model.substep(robot, 0.0025)
     inputs = states(200)
-    ours = codegen.torch_function(function)(*inputs).numpy()
+    ours = physics.torch_function(function)(*inputs).numpy()
     theirs = np.array(function.map(200)(*(value.numpy().T for value in inputs))).T
     assert ours.dtype == np.float64
     np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-10)
@@ -71,7 +71,7 @@ def test_every_operation_of_the_tables_is_correct_with_constants_too():
     function = ca.Function('sample', [x, y], [out], ['x', 'y'], ['z'])
     rng = np.random.default_rng(1)
     x, y = rng.normal(size=(60, 2)), rng.uniform(0.1, 2, (60, 2))
-    ours = codegen.torch_function(function)(torch.tensor(x), torch.tensor(y)).numpy()
+    ours = physics.torch_function(function)(torch.tensor(x), torch.tensor(y)).numpy()
     np.testing.assert_allclose(ours, np.array(function.map(60)(x.T, y.T)).T, atol=1e-14)
 
 
@@ -79,7 +79,7 @@ def test_an_unknown_operation_is_refused_by_name():
     x = ca.SX.sym('x', 2)
     function = ca.Function('turning', [x], [ca.atan2(x[0], x[1])], ['x'], ['y'])
     with pytest.raises(NotImplementedError, match='turning'):
-        codegen.torch_function(function)
+        physics.torch_function(function)
 
 
 class Pointer:
