@@ -43,16 +43,6 @@ def test_the_first_call_writes_three_files_and_the_second_none(tmp_path):
     assert 'pilot - rtprio' in written[LIMITS]
 
 
-def test_uninstalling_removes_exactly_the_installed_files(tmp_path):
-    other = tmp_path / 'etc/udev/rules.d/10-other.rules'
-    other.parent.mkdir(parents=True)
-    other.write_text('# another\n')
-    assert install(tmp_path).returncode == 0
-    for _ in range(2):
-        assert install(tmp_path, '--uninstall').returncode == 0
-        assert files(tmp_path) == {'etc/udev/rules.d/10-other.rules': '# another\n'}
-
-
 def test_the_rules_name_both_ports_and_set_the_latency_timer(tmp_path):
     assert install(tmp_path, '--servo-serial', 'FT2N08', '--board-serial', '3276').returncode == 0
     rules = files(tmp_path)[RULES]

@@ -109,18 +109,8 @@ class Signals:
     """
     Estimated state as observed by the policy: delayed, biased and noisy.
 
-    Args:
-        random: :class:`train.parameters.RandomParameters`.
-        s: environment state.
-        draw: source of random numbers.
-
-    Attributes:
-        position: (N, 3) [m].
-        rotation: (N, 3, 3).
-        velocity: (N, 3) in base_link [m/s].
-        rate: (N, 3) [rad/s].
-        tilt: (N, 4) [rad].
-
+    The velocity is in base_link, as rate and tilt in the units of :mod:`robot.dynamics`. The
+    rotations are matrices (N, 3, 3).
     """
 
     def __init__(self, random, s, draw):

@@ -38,12 +38,9 @@ class TiltableQuadrotorEnv(VecEnv):
 
     Args:
         parameters: training parameters (params/train.yaml).
-        robot: nominal robot.
+        robot: nominal robot; ParameterError if it has an effect that training refuses.
         device: torch device.
         compiled: whether to compile the step; by default on a GPU only.
-
-    Raises:
-        ParameterError: the robot file has an effect that training refuses.
 
     Attributes:
         state: name -> (N, ...) tensor, all quantities that persist between steps.
@@ -87,7 +84,6 @@ class TiltableQuadrotorEnv(VecEnv):
         self.state['age'] = age.floor()
         self._replays = Replays(self.state, parameters.episode.replay_share,
                                 parameters.episode.target_time[1] / parameters.episode.period)
-        self.state.update(self._replays.state(self.state))
         # sums since the last reading: targets finished, reached, errors, rewards, ends
         self.tally = torch.zeros(8 + len(rewards.TERMS), device=self.device)
         self._finish = self._after_physics
@@ -95,8 +91,7 @@ class TiltableQuadrotorEnv(VecEnv):
             self._finish = torch.compile(self._after_physics, fullgraph=True, dynamic=False)
         self.observation, self.critic = self._observe(self.state, batch.Draw(numbers[:, 130:]))
         self.reward = torch.zeros(self.num_envs, device=self.device)
-        self.done = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
-        self.timeout = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+        self.done, self.timeout = self.reward > 0, self.reward > 0
 
     def _tensor(self, values):
         return torch.tensor(np.asarray(values, dtype=float), dtype=torch.float32,
@@ -126,14 +121,12 @@ class TiltableQuadrotorEnv(VecEnv):
         given = tuple(torch.cat((c[:, :4], torch.minimum(c[:, 4:], limit)), -1)
                       for c in (command, s['previous'], s['older']))
         x = self.physics.advance(s['x'], given, s['delays'][:, :2], s['wrench'], s['body'])
-        results = self._finish(s, x, requested, command, self._numbers(), self.weights)
-        new, observation, critic, reward, done, timeout, tally = results
+        new, *results, tally = self._finish(s, x, requested, command, self._numbers(),
+                                            self.weights)
         torch._foreach_copy_([s[name] for name in new], list(new.values()))
-        self.observation.copy_(observation)
-        self.critic.copy_(critic)
-        self.reward.copy_(reward)
-        self.done.copy_(done)
-        self.timeout.copy_(timeout)
+        for own, result in zip((self.observation, self.critic, self.reward, self.done,
+                                self.timeout), results):
+            own.copy_(result)
         self.tally.add_(tally)
 
     def _thrust_limit(self):
@@ -174,8 +167,8 @@ class TiltableQuadrotorEnv(VecEnv):
             (inputs.position_error > MISSED_POSITION) | (inputs.attitude_error > MISSED_ATTITUDE)
             | (new['deepest'] > MISSED_DEPTH)))
         new = self._retarget(new, due, rotation, draw)
-        new = self._replays.step(s, new, self._starts.draw(draw),
-                                 {'due': due, 'done': done, 'missed': missed}, draw)
+        self._replays.step(s, new, self._starts.draw(draw),
+                           {'due': due, 'done': done, 'missed': missed}, draw)
         observation, critic = self._observe(new, draw)
         return new, observation, critic, reward, done, timeout, tally
 

@@ -263,7 +263,7 @@ def export_policy(actor: ActorModel, path: Path, robot: RobotParameters,
         path: path of the file.
         robot: robot of the training.
         parameters: parameters of the training.
-        training: further facts of the training for the file, e.g. its duration.
+        training: further facts, e.g. its duration.
         metrics: results of the policy for the file.
 
     Returns:

@@ -161,17 +161,7 @@ def _load_kernel(source: str):
 
 
 class Physics:
-    """
-    Time steps of a batch of robots.
-
-    Args:
-        robot: nominal parameters and effects.
-        period: control period [s].
-        substeps: integration steps in a period.
-        device: torch device.
-        kernel: whether to use the Triton kernel; None: if it can run.
-
-    """
+    """Control periods [s] of a batch of robots; ``kernel`` None: the Triton one if it can run."""
 
     def __init__(self, robot: RobotParameters, period: float, substeps: int,
                  device: torch.device | str, kernel: bool | None = None):
@@ -197,9 +187,8 @@ class Physics:
             body: (N, 28) quantities of each robot, slices of :mod:`train.model`.
 
         """
-        if self.has_kernel:
-            return self._launch(x, commands, delays, wrench, body)
-        return self.advance_torch(x, commands, delays, wrench, body)
+        advance = self._launch if self.has_kernel else self.advance_torch
+        return advance(x, commands, delays, wrench, body)
 
     def advance_torch(self, x, commands, delays, wrench, body):
         """:meth:`advance` in plain torch."""

@@ -57,13 +57,7 @@ def latencies(parameters: TrainParameters, robot: RobotParameters) -> list[list[
 
 class Starts:
     """
-    Random initial states of robots; the stratum of a robot follows from its index.
-
-    Args:
-        parameters: training parameters.
-        robot: nominal robot.
-        count: N robots.
-        device: torch device.
+    Random initial states of N robots; the stratum of a robot follows from its index.
 
     Attributes:
         severity: () factor on forces and payloads of new robots, set by the schedule.
@@ -214,26 +208,23 @@ class Replays:
     Store with one place for each robot; its content is in the environment's state.
 
     Args:
-        example: state of N robots, (N, ...) floating point tensors by name.
+        state: (N, ...) tensors by name, to which the entries of the store are added:
+            'target_start' and 'stored' (N, K), 'filled' and 'source' (N,).
         share: largest fraction of the new episodes that begin with a stored state.
         steps: duration of a replayed target in steps.
 
     """
 
-    def __init__(self, example: dict[str, torch.Tensor], share: float, steps: float):
-        self._parts = {name: value.shape[1:] for name, value in example.items()}
+    def __init__(self, state: dict[str, torch.Tensor], share: float, steps: float):
+        self._parts = {name: value.shape[1:] for name, value in state.items()}
         self._share, self._steps = share, steps
-
-    def state(self, example: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """Entries of an empty store: 'target_start', 'stored' (N, K), 'filled', 'source' (N,)."""
-        packed = self._packed(example)
-        return {'target_start': packed, 'stored': packed.clone(),
+        packed = self._packed(state)
+        state |= {'target_start': packed, 'stored': packed.clone(),
                 'filled': torch.zeros_like(packed[:, 0]),
                 'source': torch.full_like(packed[:, 0], -1.0)}
 
     def _packed(self, state):
-        return torch.cat([state[name].flatten(1) if state[name].dim() > 1 else
-                          state[name][:, None] for name in self._parts], -1)
+        return torch.cat([state[name].reshape(len(state[name]), -1) for name in self._parts], -1)
 
     def unpacked(self, packed: torch.Tensor) -> dict[str, torch.Tensor]:
         """States (N, ...) by name, from stored ones (N, K)."""
@@ -241,20 +232,17 @@ class Replays:
         return {name: part.reshape(-1, *shape)
                 for (name, shape), part in zip(self._parts.items(), packed.split(sizes, -1))}
 
-    def step(self, s: dict, new: dict, fresh: dict, ends: dict, draw: batch.Draw) -> tuple:
+    def step(self, s: dict, new: dict, fresh: dict, ends: dict, draw: batch.Draw) -> None:
         """
         Store missed states, delete flown ones, and choose the robots that begin with a stored one.
 
         Args:
-            s: state before the step, with the entries of :meth:`state`.
-            new: state after the step, with new targets, before the reset of robots.
+            s: state before the step.
+            new: state after the step, with new targets; completed, with robots reset.
             fresh: new robots.
             ends: (N,) bool 'due' (time of the target is over), 'done' (end of the episode),
                 'missed' (target or robot lost, if this can be judged).
             draw: source of random numbers, three for each robot.
-
-        Returns:
-            complete state with robots reset, and the new entries.
 
         """
         over, replayed = ends['due'] | ends['done'], s['source'] >= 0
@@ -280,7 +268,6 @@ class Replays:
         source = torch.where(chosen, place.float(), torch.where(over, -1.0, s['source']))
         new.update(stored=stored, filled=filled, source=source, target_start=torch.where(
             over[:, None], self._packed(new), s['target_start']))
-        return new
 
 
 def spread(mask: torch.Tensor, like: torch.Tensor) -> torch.Tensor:

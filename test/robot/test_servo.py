@@ -8,7 +8,7 @@ import pytest
 
 from beetle_omni_ros.robot import native
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.servo import CASADI, NUMPY, play, Responses, Servo, Step
+from beetle_omni_ros.robot.servo import CASADI, NUMPY, Responses, Servo, Step
 
 torch = pytest.importorskip('torch')
 
@@ -75,11 +75,6 @@ def test_a_load_beyond_the_motor_torque_moves_the_joint():
     assert rate == pytest.approx(-0.03 / servo.inertia * 1e-5)
 
 
-def test_backlash_follows_only_when_pushed():
-    driving = np.array([0.0, 0.05, 0.2, 0.15, -0.05])
-    np.testing.assert_allclose(play(driving, 0.1), [0.0, 0.0, 0.1, 0.1, 0.05])
-
-
 @pytest.mark.parametrize('name', ['measured', None])
 def test_a_drawn_robot_responds_within_the_limits_of_its_file(name):
     robot = RobotParameters.load(name)
@@ -90,16 +85,3 @@ def test_a_drawn_robot_responds_within_the_limits_of_its_file(name):
             (low, high), (least, most) = getattr(own, key), getattr(allowed, key)
             assert least - 1e-12 <= low <= high <= most + 1e-12, key
         assert own.friction <= allowed.friction
-
-
-def test_without_intervals_the_limits_are_the_numbers_of_file_and_effects():
-    robot = replace(RobotParameters.load(), intervals={}, effects={
-        'command_latency': {'delay': 0.01}, 'joint_command_latency': {'delay': 0.02},
-        'joint_feedback_delay': {'delay': 0.005}, 'rotor_lag': {'time_constant': 0.2},
-        'joint_friction': {'coulomb': 0.01, 'stiction': 0.02}})
-    found = Responses.of(robot)
-    expected = {'servo_lag': robot.joints.time_constant, 'servo_delay': 0.035, 'rotor_lag': 0.2,
-                'rotor_delay': 0.01}
-    for key, value in expected.items():
-        assert getattr(found, key) == pytest.approx((value, value))
-    assert found.friction == pytest.approx(0.02 / robot.joints.kp)

@@ -53,12 +53,6 @@ def test_interpolation_between_voltages_predicts_an_omitted_row():
                       - thrust).max() < 0.15
 
 
-def test_beyond_the_rows_voltage_is_clamped():
-    for outside, end in ((15.0, 21.4), (30.0, 25.09)):
-        assert MAP.duty(7.0, outside) == MAP.duty(7.0, end)
-        assert MAP.thrust_limit(outside) == MAP.thrust_limit(end)
-
-
 def test_saturation_is_reported_and_limited():
     thrust = np.array([0.0, 5.0, 21.0, 30.0])
     assert MAP.saturated(thrust, 21.4).tolist() == [False, False, True, True]

@@ -97,14 +97,6 @@ def test_the_pack_sags_under_load_as_in_the_simulator(charge):
     np.testing.assert_allclose(env._thrust_limit(), limit(ROBOT.hover_thrust), rtol=1e-6)
 
 
-def test_actions_beyond_the_actuators_act_and_are_observed_as_their_limits():
-    env = quiet(only('hover'))
-    env.advance(torch.full((env.num_envs, 8), 1e3))
-    limits = [ROBOT.joints.position_limit] * 4 + [ROBOT.rotors.thrust_max] * 4
-    torch.testing.assert_close(env.state['previous'],
-                               torch.tensor(limits).expand(env.num_envs, 8))
-
-
 # ---- ends
 
 
@@ -226,23 +218,6 @@ def test_the_estimate_approaches_the_disturbance():
     torch.testing.assert_close(env.state['estimate'][:, :3], lag * force, atol=1e-3, rtol=1e-3)
 
 
-def test_a_late_rate_enters_the_estimate_as_a_torque():
-    """The estimator compares the change of the rate two steps ago with that of now."""
-    env = quiet({**only('hold'), 'memory': True}, robots=2)
-    s, n = env.state, env.num_envs
-    history = torch.randn(n, 6, 3, generator=torch.Generator().manual_seed(0))    # newest first
-    x = s['x'].clone()
-    x[:, model.RATE], s['x'][:, model.RATE] = history[:, 0], history[:, 1]
-    s['past_motion'][:, :, 3:] = history[:, 2:]
-    s['delays'][:, 2] = torch.tensor([0.0, 0.02])
-    change = env._delay_error(s, x)
-    assert not change[0].any()
-    steps = history[1, :-1] - history[1, 1:]
-    torch.testing.assert_close(change[1], steps[2] - steps[0])
-    s['extrapolated'].fill_(1.0)
-    torch.testing.assert_close(env._delay_error(s, x)[1], 3 * steps[2] - 2 * steps[3] - steps[0])
-
-
 # ---- all of it
 
 def test_the_same_seed_is_the_same_flight_and_another_is_not():
@@ -267,6 +242,22 @@ def test_extreme_actions_never_give_nan():
     assert tally['steps'] == 250 * 256 and tally['deaths'] > 0
     assert all(np.isfinite(value) for value in tally.values())
     assert env.read_tally()['deaths'] == 0     # it is reset
+
+
+def test_a_late_rate_enters_the_estimate_as_a_torque():
+    env = quiet({**only('hold'), 'memory': True}, robots=2)
+    s, n = env.state, env.num_envs
+    history = torch.randn(n, 6, 3, generator=torch.Generator().manual_seed(0))    # newest first
+    x = s['x'].clone()
+    x[:, model.RATE], s['x'][:, model.RATE] = history[:, 0], history[:, 1]
+    s['past_motion'][:, :, 3:] = history[:, 2:]
+    s['delays'][:, 2] = torch.tensor([0.0, 0.02])
+    change = env._delay_error(s, x)
+    assert not change[0].any()
+    steps = history[1, :-1] - history[1, 1:]
+    torch.testing.assert_close(change[1], steps[2] - steps[0])
+    s['extrapolated'].fill_(1.0)
+    torch.testing.assert_close(env._delay_error(s, x)[1], 3 * steps[2] - 2 * steps[3] - steps[0])
 
 
 def test_the_tally_counts_targets_and_reached_targets():

@@ -56,16 +56,6 @@ def test_one_period_agrees_with_the_dynamics_away_from_servo_limits():
                  rate=4e-3, tilt=1e-3, tilt_rate=0.1, thrust=1e-9)
 
 
-def test_servos_keep_their_rate_limit_and_stops():
-    x, u = states(50, 3, tilt_step=20.0, joint_rate=10)
-    for _ in range(40):
-        x = trained(ROBOT, x, u)
-        assert np.abs(x[:, UNITS['tilt_rate']]).max() <= ROBOT.joints.velocity_limit * (1 + 1e-12)
-        assert np.abs(x[:, UNITS['tilt']]).max() <= ROBOT.joints.position_limit * (1 + 1e-12)
-    held = np.isclose(np.abs(x[:, UNITS['tilt']]), ROBOT.joints.position_limit)
-    assert held.any()
-
-
 def test_the_rotors_lag_is_exact():
     x, u = states(30, 4, tilt_step=0.0)
     low, high = ROBOT.rotors.thrust_min, ROBOT.rotors.thrust_max
@@ -107,13 +97,6 @@ def test_reaction_parameters_are_those_of_the_modules():
     found = model.module_reaction(robot)
     assert found['module_inertia'] == pytest.approx(2e-4 + 0.4 * 0.03 ** 2)    # Steiner
     assert found['mass_moment'] == pytest.approx(0.4 * 0.03)
-
-
-def test_effects_of_the_robot_file_are_the_initial_body_parameters():
-    robot = replace(ROBOT, effects={'mass': {'mass': 3.5}, 'centre_of_mass': {
-        'offset': (0.01, 0.0, -0.01)}})
-    assert model.nominal_body(ROBOT)[:7] == [ROBOT.mass, *ROBOT.inertia, 0.0, 0.0, 0.0]
-    assert model.nominal_body(robot)[:7] == [3.5, *ROBOT.inertia, 0.01, 0.0, -0.01]
 
 
 def hovering(count, seed, tilt_step, thrust_step):

@@ -168,7 +168,6 @@ def test_the_estimate_is_observed_with_its_noise_and_bias():
 
 
 def test_the_trimming_of_the_batch_is_that_of_the_controller():
-    """Steady and moving robots near and far from their targets, for 2 s."""
     env = quiet({'episode.trim_share': 0.5})
     s = scattered(env)
     near = torch.arange(env.num_envs) % 3 > 0
