@@ -65,23 +65,20 @@ def choose_device(name: str) -> str:
 def run_train(*, output: Path | None, config: Path | None = None, robot: Path | None = None,
               changes: dict | None = None, device: str = 'auto', resume: Path | None = None,
               smoke: bool = False, stop_after: float | None = None,
-              json_path: Path | None = None, console: Console | None = None) -> dict:
+              json_path: Path | None = None) -> None:
     """
     Train, assess and export a policy.
 
     Arguments are the options of `beetle_omni train`; ``changes`` maps dotted parameter names to
     values that override the file.
 
-    Returns:
-        ``policy`` (path), ``iterations``, ``seconds``, ``metrics`` by conditions.
-
     Raises:
-        ParameterError: unusable input, one line.
-        RunError: the loss is not finite, or the exported file is wrong; one line.
+        ParameterError: unusable input.
+        RunError: the loss is not finite, or the exported file is wrong.
         KeyboardInterrupt: raised again after a checkpoint.
 
     """
-    console = console or Console(quiet=not is_rank_zero())
+    console = Console(quiet=not is_rank_zero())
     check_writable(json_path)
     if output is None and resume is None:
         raise ParameterError('--output: missing; expected a folder for the training')
@@ -118,8 +115,8 @@ def run_train(*, output: Path | None, config: Path | None = None, robot: Path | 
         runner.train(progress_table(console), stop_after)
         if runner.is_distributed:
             torch.distributed.destroy_process_group()
-        return _finish(runner, nominal, output, where, smoke, json_path, console) \
-            if is_rank_zero() else {}
+        if is_rank_zero():
+            _finish(runner, nominal, output, where, smoke, json_path, console)
     except KeyboardInterrupt:
         if is_rank_zero():
             path = runner.checkpoint()
@@ -147,10 +144,9 @@ def _finish(runner, robot, output, device, smoke, json_path, console):
             f'{key} {value:.4g}' for key, value in values.items()), soft_wrap=True)
     console.print(f'{path}: agrees with torch to {difference:.1e}; fly it with beetle_omni '
                   f'evaluate --controllers rl --policy {path} --task random100', soft_wrap=True)
-    result = {'policy': str(path), 'iterations': runner.current_learning_iteration,
-              'seconds': runner.trained_seconds, 'metrics': metrics, 'onnx_difference': difference}
-    write_json(json_path, result)
-    return result
+    write_json(json_path, {
+        'policy': str(path), 'iterations': runner.current_learning_iteration,
+        'seconds': runner.trained_seconds, 'metrics': metrics, 'onnx_difference': difference})
 
 
 def progress_table(console: Console) -> Callable[[dict], None]:

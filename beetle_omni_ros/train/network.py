@@ -88,15 +88,7 @@ def _disturbance(block):
 
 
 class ActorModel(MLPModel):
-    """
-    Actor with the mean action scale * mlp(features) + carry * previous action.
-
-    Args:
-        output_scale: action for each unit of the last layer.
-        carry: factor of the previous action in the output.
-        last_gain: initial gain of the last layer.
-
-    """
+    """Actor with the mean action output_scale * mlp(features) + carry * previous action."""
 
     def __init__(self, obs, obs_groups, obs_set, output_dim, *, output_scale: float, carry: float,
                  last_gain: float, **keywords):
@@ -256,15 +248,7 @@ def export_policy(actor: ActorModel, path: Path, robot: RobotParameters,
                   parameters: TrainParameters, training: dict | None = None,
                   metrics: dict | None = None) -> float:
     """
-    Write an actor as ONNX and compare the file with it.
-
-    Args:
-        actor: trained network.
-        path: path of the file.
-        robot: robot of the training.
-        parameters: parameters of the training.
-        training: further facts, e.g. its duration.
-        metrics: results of the policy for the file.
+    Write an actor as ONNX with further facts of its training, and compare the file with it.
 
     Returns:
         largest difference of torch and onnxruntime, relative to the largest action.

@@ -87,7 +87,7 @@ class Runner(OnPolicyRunner):
             torch.manual_seed(parameters.seed + 1000 * self.gpu_global_rank)
         if graphs is None:
             graphs = torch.device(device).type == 'cuda' and not self.is_distributed
-        self.alg.prepare(env, parameters.ppo.learning_rate_limits, graphs, graphs)
+        self.alg.prepare(env, parameters.ppo.learning_rate_limits, graphs)
         self.trained_seconds = 0.0
 
     def apply_schedule(self, part: float) -> None:

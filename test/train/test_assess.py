@@ -77,18 +77,13 @@ def test_the_windows_are_7_0_to_7_5_s_and_1_to_7_s(held):
     assert found['reached'] == 1 and found['lost'] == 0
 
 
-def test_reached_means_within_10_cm_and_10_deg(held):
-    distance = torch.tensor([0.05, 0.099, 0.101, 0.3, 0.05])
-    angle = torch.tensor([0.0, 0.0, 0.0, 0.0, np.radians(11)]).float()
-    assert held(lambda step: (distance, angle), robots=5)['reached'] == pytest.approx(2 / 5)
-
-
 def test_lost_robots_count_as_missed_and_not_in_the_means(held):
-    distance = torch.tensor([5.0] * 3 + [0.02] * 7)
-    found = held(lambda step: (distance, 0.0), robots=10, lost=3)
+    distance = torch.tensor([5.0] * 3 + [0.02] * 5 + [0.099, 0.101])
+    angle = torch.tensor([0.0] * 3 + [np.radians(11)] + [0.0] * 6).float()
+    found = held(lambda step: (distance, angle), robots=10, lost=3)
     assert found['lost'] == pytest.approx(0.3)
-    assert found['reached'] == pytest.approx(0.7)
-    assert found['U_position_m'] == pytest.approx(0.02, rel=1e-3)
+    assert found['reached'] == pytest.approx(0.5)    # within 10 cm and 10 degrees
+    assert found['U_position_m'] == pytest.approx((5 * 0.02 + 0.2) / 7, rel=1e-3)
     # a mean over no robot is left out, because JSON has no NaN
     assert not any(key.startswith(('U_', 'L_')) for key in held(
         lambda step: (5.0, 0.0), robots=10, lost=10))
