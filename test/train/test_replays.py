@@ -86,7 +86,8 @@ def test_reached_situations_are_dropped_before_missed_ones(missed, chance, left)
 def test_the_environment_replays_missed_situations():
     env = quiet({**only('hover'), 'episode.replay_share': 0.9, 'episode.hold_targets': 0.0,
                  'episode.target_time': [1.0, 1.0], 'episode.duration': 2.0,
-                 'episode.rate_limit': 200.0, 'episode.velocity_limit': 100.0}, robots=16)
+                 'episode.rate_limit': 200.0, 'episode.velocity_limit': 100.0,
+                 'episode.position_limit': 100.0}, robots=16)
     initial = {name: value.clone() for name, value in env.state.items()}
     still = torch.zeros(16, 8)
     for _ in range(99):
