@@ -12,6 +12,7 @@ import importlib.util
 from pathlib import Path
 import shutil
 import tempfile
+from types import SimpleNamespace
 
 import casadi as ca
 import torch
@@ -21,14 +22,16 @@ from beetle_omni_ros.train import model
 
 BLOCK = 64    # robots in one program; small blocks use the GPU well with a few thousand robots
 
+# Text in the language of Triton; ``tl`` and ``number`` are torch's elsewhere.
 _OPERATIONS = {
     ca.OP_ADD: '{} + {}', ca.OP_SUB: '{} - {}', ca.OP_MUL: '{} * {}', ca.OP_DIV: '{} / {}',
-    ca.OP_FMIN: 'minimum({}, {})', ca.OP_FMAX: 'maximum({}, {})', ca.OP_LT: 'number({} < {})',
-    ca.OP_LE: 'number({} <= {})', ca.OP_EQ: 'number({} == {})', ca.OP_NE: 'number({} != {})',
-    ca.OP_AND: '{} * {}', ca.OP_OR: 'maximum({}, {})', ca.OP_IF_ELSE_ZERO: '{} * {}',
-    ca.OP_NOT: '(1.0 - {})', ca.OP_ASSIGN: '{}', ca.OP_NEG: '-{}', ca.OP_SQ: '{0} * {0}',
-    ca.OP_TWICE: '2.0 * {}', ca.OP_INV: '1.0 / {}', ca.OP_SQRT: 'sqrt({})', ca.OP_SIN: 'sin({})',
-    ca.OP_COS: 'cos({})', ca.OP_EXP: 'exp({})', ca.OP_FABS: 'fabs({})'}
+    ca.OP_FMIN: 'tl.minimum({}, {})', ca.OP_FMAX: 'tl.maximum({}, {})',
+    ca.OP_LT: 'number({} < {})', ca.OP_LE: 'number({} <= {})', ca.OP_EQ: 'number({} == {})',
+    ca.OP_NE: 'number({} != {})', ca.OP_AND: '{} * {}', ca.OP_OR: 'tl.maximum({}, {})',
+    ca.OP_IF_ELSE_ZERO: '{} * {}', ca.OP_NOT: '(1.0 - {})', ca.OP_ASSIGN: '{}', ca.OP_NEG: '-{}',
+    ca.OP_SQ: '{0} * {0}', ca.OP_TWICE: '2.0 * {}', ca.OP_INV: '1.0 / {}',
+    ca.OP_SQRT: 'tl.sqrt({})', ca.OP_SIN: 'tl.sin({})', ca.OP_COS: 'tl.cos({})',
+    ca.OP_EXP: 'tl.exp({})', ca.OP_FABS: 'tl.abs({})'}
 
 
 def _statements(function: ca.Function) -> list[str]:
@@ -83,9 +86,9 @@ def torch_function(function: ca.Function) -> Callable:
     lines += ['    ' + line for line in _statements(function)]
     parts = ', '.join(f'like({out}_{k}, {names[0]}_0)' for k in range(function.numel_out(0)))
     lines.append(f'    return stack([{parts}], -1)')
-    space = {'minimum': minimum, 'maximum': maximum, 'number': number, 'like': like,
-             'sqrt': torch.sqrt, 'sin': torch.sin, 'cos': torch.cos, 'exp': torch.exp,
-             'fabs': torch.abs, 'stack': torch.stack}
+    words = SimpleNamespace(minimum=minimum, maximum=maximum, sqrt=torch.sqrt, sin=torch.sin,
+                            cos=torch.cos, exp=torch.exp, abs=torch.abs)
+    space = {'tl': words, 'number': number, 'like': like, 'stack': torch.stack}
     exec(compile('\n'.join(lines), f'<{function.name()}>', 'exec'), space)
     return space[function.name()]
 
@@ -94,7 +97,6 @@ _KERNEL = '''\
 """Written by beetle_omni_ros.train.physics; do not edit."""
 import triton
 import triton.language as tl
-from triton.language import abs as fabs, cos, exp, maximum, minimum, sin, sqrt
 
 
 @triton.jit
