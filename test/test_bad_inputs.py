@@ -83,7 +83,7 @@ CASES = {
         ('nmpc,nmpc', "--controllers '"),
         ('npmc', "controller 'npmc': expected one of nmpc"), ('none.py:Mine', 'none.py'),
         ('no_module:Mine', 'no_module'), ('rl --policy none.onnx', 'none.onnx: no such file'),
-        ('rl --policy policy.onnx', 'not a readable ONNX file'),
+        ('rl --policy policy.onnx', "metadata 'checksum' is missing"),
         ('hover --nmpc horizon.yaml', '--nmpc horizon.yaml'),
         ('hover --policy policy.onnx', '--policy policy.onnx')],
     EVALUATE: [
@@ -147,7 +147,7 @@ ROWS = [(f'{before} {value}', fragment) for before, cases in CASES.items()
         for value, fragment in cases]
 EXPECTATIONS = ('expected', 'See beetle_omni', 'no such', 'known', 'needs', 'there is no folder',
                 'it is a folder', 'not a', 'no .mcap', 'ros2 bag', 'at most', 'cannot',
-                'no module', 'missing', 'outside', 'beside it or among')
+                'No module', 'No such file', 'missing', 'outside', 'beside it or among')
 
 
 @pytest.fixture(scope='module')

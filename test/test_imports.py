@@ -31,7 +31,7 @@ ALLOWED = {
     'view': ('robot', 'control.base', 'pages', 'runs', 'messages'),
     'nodes': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs', 'drivers', 'drive',
               'messages', 'view', 'bringup.findings'),
-    'train': ('robot', 'control.policy_file', 'runs.files'),
+    'train': ('robot', 'control.guidance', 'control.policy_file', 'runs.files'),
     'cli': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs', 'evaluation', 'comparison',
             'faults', 'nodes', 'train', 'identify', 'bringup', 'view'),
 }
