@@ -91,26 +91,6 @@ def test_unusable_options_are_refused_in_one_line_and_write_nothing(tmp_path, op
     assert not files(tmp_path)
 
 
-def commands(dockerfile):
-    """The text of all RUN lines, continued lines joined."""
-    text = dockerfile.read_text().replace('\\\n', ' ')
-    return ' '.join(' '.join(line.split()) for line in text.splitlines()
-                    if line.startswith('RUN '))
-
-
-def test_the_image_with_ros_contains_the_commands_of_the_page():
-    run = commands(DEPLOY / 'Dockerfile').replace(' --no-cache-dir', '')
-    page = (ROOT / 'docs/how-to/install.md').read_text()
-    block = re.search(r'```sh\n(sudo apt install python3-venv.*?)```', page, re.S)[1]
-    for line in block.splitlines():
-        if line.startswith(('sudo', 'mkdir', '. install', 'ros2')):
-            continue
-        for command in line.split(' && '):
-            assert command in run, command
-    wanted = re.search(r'sudo apt install (.*)', block)[1].split()
-    assert set(wanted) <= set(run.split())
-
-
 def test_the_entry_point_finds_what_colcon_installed(tmp_path):
     place = tmp_path / 'ws/install/beetle_omni_ros/lib/beetle_omni_ros'
     for setup in ('opt/ros/jazzy/setup.bash', 'ws/.venv/bin/activate', 'ws/install/setup.bash'):

@@ -1,6 +1,5 @@
 """Damaged input files are read, or refused in one line; nothing else is raised."""
 
-import io
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +12,6 @@ from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.bag import BagError, read_bag
 from beetle_omni_ros.runs.bag_writer import BagWriter
-from beetle_omni_ros.runs.targets import COLUMNS
-from beetle_omni_ros.runs.tasks import make_task, WAYPOINTS
 from beetle_omni_ros.view.report import make_page, make_runs, results_of
 
 LEVEL, ZERO = np.array([0, 0, 0, 1.0]), np.zeros(3)
@@ -66,17 +63,6 @@ def mutate_yaml(rng, data):
         case 6:
             return mutate_bytes(rng, data)
     return '\n'.join([*lines, '']).encode()
-
-
-def mutate_csv(rng, data):
-    """Replace a cell by a hostile one, or mutate bytes."""
-    if rng.random() < 0.4:
-        return mutate_bytes(rng, data)
-    rows = [line.split(',') for line in data.decode().splitlines()]
-    row = rows[rng.integers(len(rows))]
-    cells = ('nan', 'inf', '-5', '1e308', '1e400', '', '"', 'x' * 200_000, '9' * 5000, '\0', '١')
-    row[rng.integers(len(row))] = cells[rng.integers(len(cells))]
-    return '\n'.join(','.join(row) for row in rows).encode()
 
 
 def write_bag(folder):
@@ -137,19 +123,12 @@ def test_a_damaged_parameter_file_is_refused_in_one_line(tmp_path):
                     lambda path, name: classes[name].load(path))
 
 
-def test_a_damaged_task_is_refused_in_one_line(tmp_path):
-    text = io.StringIO()
-    np.savetxt(text, WAYPOINTS, delimiter=',', header=','.join(COLUMNS), comments='')
-    assert refusals(60, tmp_path, '.csv', {'waypoints': text.getvalue().encode()}, mutate_csv,
-                    lambda path, _: make_task(str(path)))
-
-
 def test_a_damaged_bag_is_read_up_to_the_damage(tmp_path):
     bag = write_bag(tmp_path)
-    refusals(25, tmp_path, '.mcap', {'bag': bag}, mutate_bytes,
+    refusals(8, tmp_path, '.mcap', {'bag': bag}, mutate_bytes,
              lambda path, _: make_page(*read_flight(path)))
     metadata = tmp_path / 'bag' / 'metadata.yaml'
     sound = metadata.read_bytes()
-    for k in range(15):
+    for k in range(6):
         metadata.write_bytes(mutate_yaml(np.random.default_rng([1, k]), sound))
         check(tmp_path / 'bag', read_flight)

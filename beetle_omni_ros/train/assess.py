@@ -15,14 +15,18 @@ from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.train import batch
 from beetle_omni_ros.train.environment import TiltableQuadrotorEnv
-from beetle_omni_ros.train.parameters import RandomParameters, StartParameters, TrainParameters
+from beetle_omni_ros.train.parameters import (
+    RandomParameters,
+    StartParameters,
+    STRATA,
+    TrainParameters,
+)
 
 SEGMENT = 8.0                       # [s] duration of a pose; windows of the task metrics [s]
 AT_TARGET, ON_THE_WAY = (7.0, 7.5), (1.0, 7.0)
 # Latencies of the simulated robot, and the conditions of the publication's table.
 NOMINAL = {'command_latency': [0.010, 0.010], 'velocity_latency': [0.0, 0.0],
            'tilt_latency': [0.010, 0.010], 'actuator_spread': [0.0, 0.0]}
-MEASURED = {**NOMINAL, 'actuator_spread': [1.0, 1.0]}
 PUBLISHED = {'command_latency': [0.005, 0.015], 'velocity_latency': [0.015, 0.025],
              'tilt_latency': [0.005, 0.010], 'carried_share': 1.0, 'noise_power': 0.0,
              'actuator_spread': [0.0, 0.0]}
@@ -39,8 +43,10 @@ def conditions(name: str, random: RandomParameters) -> RandomParameters:
     zero = {entry.name: 0.0 for entry in fields(RandomParameters)
             if isinstance(getattr(random, entry.name), float)}
     zero.update(push_period=1.0, thrust_sag=random.thrust_sag)
-    own = MEASURED if name == 'measured' else NOMINAL
-    return replace(random, **zero, **{key: np.array(value) for key, value in own.items()})
+    own = {key: np.array(value) for key, value in NOMINAL.items()}
+    if name == 'measured':
+        own['actuator_spread'] = np.array([1.0, 1.0])
+    return replace(random, **zero, **own)
 
 
 def assess(mean: Callable[[torch.Tensor], torch.Tensor], parameters: TrainParameters,
@@ -54,7 +60,7 @@ def assess(mean: Callable[[torch.Tensor], torch.Tensor], parameters: TrainParame
         parameters: parameters of its training.
         robot: nominal robot.
         device: torch device.
-        name: 'nominal', 'published' or 'measured'.
+        name: of :func:`conditions`.
         robots: N.
         segments: poses for each robot, after a first one that does not count.
 
@@ -64,14 +70,13 @@ def assess(mean: Callable[[torch.Tensor], torch.Tensor], parameters: TrainParame
         99 and 99.9 % quantiles of the depth of moves below start and target.
 
     """
-    start = {entry.name: 0.0 for entry in fields(StartParameters)}
-    start.update(hold=1.0)
+    start = StartParameters(**{**dict.fromkeys(STRATA, 0.0), 'hold': 1.0}, other_branch=0.0)
     episode = replace(
         parameters.episode, duration=1e6, hold_targets=0.0, replay_share=0.0, trim_share=1.0,
         target_time=np.array([SEGMENT, SEGMENT]), region=np.array([4.0, 4.0, 1.4]))
     env = TiltableQuadrotorEnv(replace(
         parameters, ppo=replace(parameters.ppo, robots=robots), episode=episode,
-        start=StartParameters(**start),
+        start=start,
         estimate=replace(parameters.estimate, **SILENT) if name != 'published'
         else parameters.estimate,
         random=conditions(name, parameters.random)),

@@ -1,6 +1,5 @@
 """`beetle_omni train`: trains a policy from a parameter file and exports it to ONNX."""
 
-from collections.abc import Callable
 from contextlib import redirect_stdout, suppress
 import io
 import itertools
@@ -42,13 +41,7 @@ OF_TARGETS = ('success_rate', 'position_error_m', 'attitude_error_deg')  # avera
 
 
 def choose_device(name: str) -> str:
-    """
-    Torch device for a name; 'auto' is a GPU if available.
-
-    Raises:
-        ParameterError: a requested GPU is not available.
-
-    """
+    """Torch device for a name; 'auto' is a GPU if available."""
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if name == 'cpu' or (name == 'auto' and not count):
         return 'cpu'
@@ -83,14 +76,14 @@ def run_train(*, output: Path | None, config: Path | None = None, robot: Path | 
     if output is None and resume is None:
         raise ParameterError('--output: missing; expected a folder for the training')
     where = choose_device(device)
-    checkpoint = last_checkpoint(resume) if resume else None
+    checkpoint = _last_checkpoint(resume) if resume else None
     output = output or checkpoint.parent
     if checkpoint and config is None and (checkpoint.parent / PARAMETER_FILE).is_file():
         config = checkpoint.parent / PARAMETER_FILE
     changes = {**(SMOKE if smoke and not checkpoint else {}), **(changes or {})}
     parameters = read_parameters(config, changes)
     nominal = RobotParameters.load(robot)
-    new = is_rank_zero() and make_folder(output, checkpoint)
+    new = is_rank_zero() and _make_folder(output, checkpoint)
     torch.set_float32_matmul_precision('high')
     if smoke:
         torch.set_num_threads(1)    # on a loaded machine several threads wait for each other
@@ -112,7 +105,7 @@ def run_train(*, output: Path | None, config: Path | None = None, robot: Path | 
                   f'{parameters.seed}, iterations {runner.current_learning_iteration} to '
                   f'{parameters.iterations}; all files are in {output}', soft_wrap=True)
     try:
-        runner.train(progress_table(console), stop_after)
+        runner.train(_progress_table(console), stop_after)
         if runner.is_distributed:
             torch.distributed.destroy_process_group()
         if is_rank_zero():
@@ -149,7 +142,7 @@ def _finish(runner, robot, output, device, smoke, json_path, console):
         'seconds': runner.trained_seconds, 'metrics': metrics, 'onnx_difference': difference})
 
 
-def progress_table(console: Console) -> Callable[[dict], None]:
+def _progress_table(console):
     """Printer of rows of progress, with a header every ``HEADER_EVERY`` rows."""
     widths, count = [max(len(title), 9) for _, title, _ in COLUMNS], itertools.count()
 
@@ -164,57 +157,39 @@ def progress_table(console: Console) -> Callable[[dict], None]:
     return show
 
 
-def last_checkpoint(folder: Path) -> Path:
-    """
-    Latest checkpoint of a run.
-
-    Raises:
-        ParameterError: no checkpoint.
-
-    """
+def _last_checkpoint(folder):
+    """Latest checkpoint of a run."""
     if folder.is_file():
         return folder
-    numbered = checkpoints(folder)
-    if not numbered:
+    found = _checkpoints(folder)
+    if not found:
         raise ParameterError(f'--resume {folder}: no model_N.pt there; expected the folder of a '
                              'training')
-    return numbered[max(numbered)]
+    return found[-1]
 
 
-def checkpoints(folder: Path) -> dict[int, Path]:
-    """Iteration -> its checkpoint."""
-    return {int(match[1]): path for path in folder.glob('model_*.pt')
-            if (match := re.fullmatch(r'model_(\d+)\.pt', path.name))}
+def _checkpoints(folder):
+    """Checkpoints in the order of their iterations."""
+    return sorted((path for path in folder.glob('model_*.pt') if path.stem[6:].isdigit()),
+                  key=lambda path: int(path.stem[6:]))
 
 
-def make_folder(output: Path, checkpoint: Path | None) -> bool:
-    """
-    Create the folder of a run; return whether it is new.
-
-    Raises:
-        ParameterError: it cannot be created, or contains another run.
-
-    """
+def _make_folder(output, checkpoint):
+    """Create the folder of a run; return whether it is new."""
     new = not output.exists()
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ParameterError(f'--output {output}: cannot be made ({error.strerror})') from None
     resumed = checkpoint is not None and output.resolve() == checkpoint.parent.resolve()
-    if checkpoints(output) and not resumed:
+    if _checkpoints(output) and not resumed:
         raise ParameterError(f'--output {output}: holds the checkpoints of another run; '
                              f'--resume {output} continues it')
     return new
 
 
 def parse_changes(texts: list[str], **others) -> dict:
-    """
-    Parse ``key=value`` texts of the command line; add other keys whose value is not None.
-
-    Raises:
-        ParameterError: no '=', or an invalid YAML value.
-
-    """
+    """Parse ``key=value`` texts of the command line; add other keys whose value is not None."""
     changes = {}
     for text in texts:
         key, sign, value = text.partition('=')

@@ -238,8 +238,7 @@ class TiltableQuadrotorEnv(VecEnv):
         and the present change.
         """
         e, period = self.cfg.estimate, self.cfg.episode.period
-        mass = s['body'][:, MASS]
-        weight = torch.zeros_like(s['wrench'][:, :3])
+        mass, weight = s['body'][:, MASS], torch.zeros_like(s['wrench'][:, :3])
         weight[:, 2] = -self.robot.gravity
         tilt = x[:, model.TILT]
         thrusts = torch.sin(tilt) @ self._sideways

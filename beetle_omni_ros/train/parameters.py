@@ -16,9 +16,10 @@ from beetle_omni_ros.robot.schema import (
     ParameterFile,
 )
 
+STRATA = ('wound_back', 'level', 'wound', 'mixed', 'hover', 'hold', 'moving')
+
 
 def _check_ranges(parameters, *names):
-    """Check that ranges are in ascending order."""
     for name in names:
         low, high = getattr(parameters, name)
         if low > high:
@@ -55,7 +56,6 @@ class EpisodeParameters:
         low=0, high=0.9)
 
     def __post_init__(self):
-        """Check the ranges."""
         _check_ranges(self, 'target_time')
 
 
@@ -79,9 +79,7 @@ class StartParameters:
                             unit='rad/s', low=0, high=20)
 
     def __post_init__(self):
-        """Check that a stratum has a share."""
-        if not any((self.wound_back, self.level, self.wound, self.mixed, self.hover, self.hold,
-                    self.moving)):
+        if not any(getattr(self, name) for name in STRATA):
             raise ParameterError('all shares are zero')
 
 
@@ -148,7 +146,6 @@ class RandomParameters:
                                  unit='rad/s', low=0, high=30)
 
     def __post_init__(self):
-        """Check the ranges."""
         _check_ranges(self, 'velocity_latency', 'tilt_latency', 'command_latency',
                       'actuator_spread', 'thrust_limit')
 
@@ -215,7 +212,6 @@ class NetworkParameters:
                                   low=0, high=10)
 
     def __post_init__(self):
-        """Check the sizes of the layers."""
         sizes = self.hidden
         if sizes.ndim != 1 or not sizes.size or (sizes < 1).any() or (sizes % 1).any():
             raise ParameterError("key 'hidden': expected the sizes of the hidden layers, found "
@@ -240,7 +236,6 @@ class PpoParameters:
                                                  shape=(2,))
 
     def __post_init__(self):
-        """Check the range and the size of the minibatches."""
         _check_ranges(self, 'learning_rate_limits')
         if self.minibatches > self.robots * self.steps:
             raise ParameterError(f"key 'minibatches': {self.minibatches} are more than the "
@@ -298,17 +293,7 @@ class TrainParameters(ParameterFile, file='train.yaml'):
 
 
 def read_parameters(file: Path | None, changes: dict) -> TrainParameters:
-    """
-    Read a parameter file and replace single values.
-
-    Args:
-        file: YAML; None: the shipped one.
-        changes: dotted name -> value.
-
-    Raises:
-        ParameterError: unusable file or value.
-
-    """
+    """Read a parameter file (None: the shipped one) and replace values by dotted names."""
     parameters = TrainParameters.load(file)
     flat = parameters.plain()
     for key, value in changes.items():

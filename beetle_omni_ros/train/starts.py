@@ -21,9 +21,8 @@ from beetle_omni_ros.train.model import (
     delay_intervals,
     nominal_body,
 )
-from beetle_omni_ros.train.parameters import TrainParameters
+from beetle_omni_ros.train.parameters import STRATA, TrainParameters
 
-STRATA = ('wound_back', 'level', 'wound', 'mixed', 'hover', 'hold', 'moving')
 NEAR_POSITION, NEAR_ANGLE = 0.3, 0.6   # [m], [rad] of a target near the present pose
 HISTORY = 2     # stored periods of commands and tilts
 LEAST = 0.2     # smallest drawn quantity of an actuator, as a fraction of the smallest measured

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.robot.parameters import RobotParameters, RotorMapRow
-from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.robot.thrust_map import duty_of_command, FULL_DUTY, ThrustMap
 
 ROTORS = RobotParameters.load().rotors
@@ -79,13 +78,3 @@ def test_a_falling_cubic_is_made_monotonic(peak):
     np.testing.assert_allclose(thrust_map.thrust(duty, 23.0), thrust, rtol=1e-6)
     cubic = np.polynomial.polynomial.polyval(thrust / 10, row.coefficients)
     assert np.all(np.abs(duty - np.maximum.accumulate(cubic)) < 2e-3)
-
-
-def test_an_unusable_map_is_refused():
-    with pytest.raises(ParameterError, match='at least one row'):
-        ThrustMap(replace(ROTORS, map=()))
-    with pytest.raises(ParameterError, match='two rows at one voltage'):
-        ThrustMap(replace(ROTORS, map=(ROTORS.map[0], ROTORS.map[0])))
-    steep = replace(ROTORS.map[0], thrust_max=60.0)
-    with pytest.raises(ParameterError, match='25.09 V: duty'):
-        ThrustMap(replace(ROTORS, map=(steep,)))

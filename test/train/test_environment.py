@@ -220,17 +220,6 @@ def test_the_estimate_approaches_the_disturbance():
 
 # ---- all of it
 
-def test_the_same_seed_is_the_same_flight_and_another_is_not():
-    rollouts = []
-    for seed in (5, 5, 6):
-        env = environment(seed=seed)
-        for action in actions(env, 0, 30):
-            env.advance(action)
-        rollouts.append((env.state['x'].clone(), env.observation.clone(), env.reward.clone()))
-    for same, repeated, other in zip(*rollouts):
-        assert torch.equal(same, repeated)
-        assert not torch.equal(same, other)
-
 
 def test_extreme_actions_never_give_nan():
     env = environment({'memory': True, **DISTURBED}, robots=256)

@@ -1,6 +1,6 @@
 """Observations of actor and critic for known states, with and without delay and noise."""
 
-from learning import environment, only, QUIET, quiet, ROBOT, uniform
+from learning import environment, only, quiet, ROBOT, uniform
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -148,12 +148,6 @@ def test_noise_and_bias_fill_their_half_width_in_their_entries_only(name, kind):
             assert np.allclose(first, second, atol=1e-5) == (kind == 'bias')
         else:
             assert np.abs(error).max() < 1e-5
-
-
-def test_a_robots_noise_scale_is_a_power_of_a_uniform_number():
-    scale = quiet(QUIET | {'random.noise_power': 2.0}, robots=4000).state['noise']
-    assert float(scale.mean()) == pytest.approx(1 / 3, abs=0.02)     # of u^2
-    assert float(scale.sqrt().mean()) == pytest.approx(1 / 2, abs=0.02)
 
 
 def test_the_estimate_is_observed_with_its_noise_and_bias():

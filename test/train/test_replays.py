@@ -41,14 +41,6 @@ def store():
     return replays, s, first
 
 
-def test_the_initial_state_of_a_missed_target_is_stored():
-    replays, s, first = store()
-    assert s['filled'].tolist() == [0, 0, 1, 0, 0, 0, 0, 0]
-    for name, value in replays.unpacked(s['stored']).items():
-        torch.testing.assert_close(value[2], first[name][2])
-        assert value.shape == first[name].shape
-
-
 def test_an_episode_begins_with_a_stored_situation_and_the_longest_time():
     replays, s, first = store()
     after = step(replays, s, states(3), states(4), flags(done=[0, 5]))
