@@ -158,9 +158,11 @@ class ExportedPolicy(torch.nn.Module):
         size = actor.obs_dim
         self.mlp: MLP = copy.deepcopy(actor.mlp).cpu()
         known = size + len(CROSSED[0])
-        self.register_buffer('left', _matrix(_left, known))
-        self.register_buffer('right', _matrix(_right, known))
-        self.register_buffer('linear', _matrix(_linear, known + self.left.shape[1]).T)
+        # matrices of linear functions of rows
+        left, right = _factors(torch.eye(known))
+        self.register_buffer('left', left)
+        self.register_buffer('right', right)
+        self.register_buffer('linear', _linear(torch.eye(known + left.shape[1])).T)
         self.splits = [self.linear.shape[0] - 14, 6, 8]
         self.register_buffer('offset', torch.zeros(self.linear.shape[0]))
         self.offset[-4:] = 0.5 * torch.pi       # cosines are sines
@@ -206,11 +208,6 @@ CROSSED = ((13, 14, 12, 19, 20, 18, 14, 12, 13, 20, 18, 19),
            (11, 9, 10, 17, 15, 16, 10, 11, 9, 16, 17, 15))
 
 
-def _matrix(function, size):
-    """Matrix (size, m) of a linear function of rows."""
-    return function(torch.eye(size))
-
-
 def _axes(known):
     """Axes of body and target from the observation and the subsequent products."""
     x, z, x_goal, z_goal = known[:, ATTITUDES].split(3, -1)
@@ -218,16 +215,11 @@ def _axes(known):
     return (x, y, z), (x_goal, y_goal, z_goal)
 
 
-def _left(known):
-    """Left factors of the products of the body's axes with the target's axes."""
+def _factors(known):
+    """Left and right factors of the products of the body's axes with the target's axes."""
     body, goals = _axes(known)
-    return torch.cat([axis for axis in body for _ in goals], -1)
-
-
-def _right(known):
-    """Right factors of the products of the body's axes with the target's axes."""
-    body, goals = _axes(known)
-    return torch.cat([goal for _ in body for goal in goals], -1)
+    return (torch.cat([axis for axis in body for _ in goals], -1),
+            torch.cat([goal for _ in body for goal in goals], -1))
 
 
 def _linear(known):

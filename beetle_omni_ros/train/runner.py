@@ -57,12 +57,12 @@ class Runner(OnPolicyRunner):
     """
     rsl-rl's runner with a training loop that does not wait for the GPU.
 
-    Under torchrun each process simulates its own robots on its own GPU, and rsl-rl's update
-    averages gradients and divergence over all processes. Only the process of rank 0 reports and
-    writes.
+    Under torchrun each process simulates its own ``ppo.robots`` on its own GPU, and rsl-rl's
+    update averages gradients and divergence over all processes. Only the process of rank 0
+    reports and writes.
 
     Args:
-        parameters: training parameters; ``ppo.robots`` is the number of each process.
+        parameters: training parameters.
         robot: nominal robot.
         folder: folder of checkpoints and TensorBoard log; None: nothing is written.
         device: torch device.
@@ -109,14 +109,7 @@ class Runner(OnPolicyRunner):
 
     def train(self, progress: Callable[[dict], None] = lambda row: None,
               stop_after: float | None = None) -> None:
-        """
-        Run the remaining iterations.
-
-        Args:
-            progress: called with a row of numbers every ``log_every`` iterations.
-            stop_after: duration after which training stops early [s].
-
-        """
+        """Run the remaining iterations, or stop after a time [s]; report rows of numbers."""
         p = self.parameters
         writer = SummaryWriter(str(self.folder)) if self.folder else None
         if self.is_distributed:
@@ -161,13 +154,7 @@ class Runner(OnPolicyRunner):
         return path
 
     def resume(self, path: Path) -> None:
-        """
-        Continue from a checkpoint.
-
-        Raises:
-            ParameterError: unreadable file, or a checkpoint of another network or robot.
-
-        """
+        """Continue from a checkpoint; ParameterError if it is another network's or robot's."""
         try:
             saved = torch.load(str(path), map_location=str(self.env.device), weights_only=True)
             group, ours = (optimizer['param_groups'][0] for optimizer in (
@@ -209,7 +196,7 @@ class Runner(OnPolicyRunner):
         std = self.alg.std.tolist()
         samples = iterations * self.parameters.ppo.steps * self.env.num_envs * self.gpu_world_size
         return {'iteration': self.current_learning_iteration, 'seconds': seconds,
-                'samples_per_second': samples / max(seconds, 1e-9), **tally,
+                'samples_per_second': samples / seconds, **tally,
                 'value_loss': value, 'surrogate_loss': surrogate, 'entropy': entropy,
                 'divergence': divergence, 'learning_rate': float(self.alg.rate),
                 'tilt_std': sum(std[:4]) / 4, 'thrust_std': sum(std[4:]) / 4}

@@ -34,13 +34,7 @@ FORGET_FLOWN, FORGET_MISSED = 0.5, 0.1            # probability of deletion afte
 
 
 def latencies(parameters: TrainParameters, robot: RobotParameters) -> list[list[float]]:
-    """
-    Ranges of the delays of tilt and thrust commands, of the velocity and of the tilts [s].
-
-    Raises:
-        ParameterError: a delay with the robot file's effects exceeds the stored history.
-
-    """
+    """Ranges of the delays of tilt and thrust commands, of the velocity and of the tilts [s]."""
     r, (tilt, thrust) = parameters.random, robot.command_delays
     made, most = [], HISTORY * parameters.episode.period
     for name, span, more in (('tilt commands', r.command_latency, tilt),
