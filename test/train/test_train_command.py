@@ -49,9 +49,6 @@ def test_a_run_writes_all_documented_files(run):
     result = json.loads((run.parent / 'result.json').read_text())
     assert result['policy'] == str(run / 'policy.onnx') and result['iterations'] == 3
     assert result['onnx_difference'] <= 1e-5 and result['seconds'] > 0
-
-
-def test_the_parameter_file_of_a_run_loads_back_equal(run):
     expected = read_parameters(None, {**command.SMOKE, 'seed': 5})
     assert TrainParameters.load(run / 'train.yaml').plain() == expected.plain()
 
