@@ -1,23 +1,17 @@
 """Damaged input files are read, or refused in one line; nothing else is raised."""
 
-import io
 from pathlib import Path
 
 import numpy as np
 from test_packaging import parameter_classes
 
 from beetle_omni_ros.control.base import Command, PoseTarget
-from beetle_omni_ros.control.policy_file import PolicyNetwork
 from beetle_omni_ros.messages.values import Odom
-from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import BatteryReading, ImuReading, JointReading, PoseReading
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.bag import BagError, read_bag
 from beetle_omni_ros.runs.bag_writer import BagWriter
-from beetle_omni_ros.runs.targets import COLUMNS
-from beetle_omni_ros.runs.tasks import make_task, WAYPOINTS
-from beetle_omni_ros.sim.fault_lists import load_faults
 from beetle_omni_ros.view.report import make_page, make_runs, results_of
 
 LEVEL, ZERO = np.array([0, 0, 0, 1.0]), np.zeros(3)
@@ -69,27 +63,6 @@ def mutate_yaml(rng, data):
         case 6:
             return mutate_bytes(rng, data)
     return '\n'.join([*lines, '']).encode()
-
-
-def mutate_csv(rng, data):
-    """Replace a cell by a hostile one, or mutate bytes."""
-    if rng.random() < 0.4:
-        return mutate_bytes(rng, data)
-    rows = [line.split(',') for line in data.decode().splitlines()]
-    row = rows[rng.integers(len(rows))]
-    cells = ('nan', 'inf', '-5', '1e308', '1e400', '', '"', 'x' * 200_000, '9' * 5000, '\0', '١')
-    row[rng.integers(len(row))] = cells[rng.integers(len(cells))]
-    return '\n'.join(','.join(row) for row in rows).encode()
-
-
-def mutate_onnx(rng, data):
-    """Corrupt one entry of the metadata, or mutate bytes anywhere."""
-    keys = [key for key in (b'observations', b'action_scale', b'robot_hash', b'rate_hz',
-                            b'training', b'format') if key in data]
-    if not keys or rng.random() < 0.5:
-        return mutate_bytes(rng, data)
-    at = data.rindex(keys[rng.integers(len(keys))]) + int(rng.integers(40))
-    return data[:at] + rng.bytes(int(rng.integers(1, 4))) + data[at + 1:]
 
 
 def write_bag(folder):
@@ -150,34 +123,12 @@ def test_a_damaged_parameter_file_is_refused_in_one_line(tmp_path):
                     lambda path, name: classes[name].load(path))
 
 
-def test_a_damaged_list_of_faults_is_refused_in_one_line(tmp_path):
-    faults = (b'faults:\n  - {what: rotor_stops, at: 3.0, duration: 2.0, rotor: 2}\n'
-              b'  - what: mocap_jumps\n    at: 10\n    x: 1.5\n'
-              b'  - {what: mocap_lost_for_1_s, at: 10}\n')
-    assert refusals(40, tmp_path, '.yaml', {'faults': faults}, mutate_yaml,
-                    lambda path, _: load_faults(path))
-
-
-def test_a_damaged_task_is_refused_in_one_line(tmp_path):
-    text = io.StringIO()
-    np.savetxt(text, WAYPOINTS, delimiter=',', header=','.join(COLUMNS), comments='')
-    assert refusals(60, tmp_path, '.csv', {'waypoints': text.getvalue().encode()}, mutate_csv,
-                    lambda path, _: make_task(str(path)))
-
-
-def test_a_damaged_policy_is_refused_in_one_line(tmp_path):
-    sources = {name: share_path(f'policies/{name}').read_bytes()
-               for name in ('rl.onnx', 'rl_memory.onnx')}
-    assert refusals(15, tmp_path, '.onnx', sources, mutate_onnx,
-                    lambda path, _: PolicyNetwork(path, RobotParameters.load()))
-
-
 def test_a_damaged_bag_is_read_up_to_the_damage(tmp_path):
     bag = write_bag(tmp_path)
-    refusals(25, tmp_path, '.mcap', {'bag': bag}, mutate_bytes,
+    refusals(8, tmp_path, '.mcap', {'bag': bag}, mutate_bytes,
              lambda path, _: make_page(*read_flight(path)))
     metadata = tmp_path / 'bag' / 'metadata.yaml'
     sound = metadata.read_bytes()
-    for k in range(15):
+    for k in range(6):
         metadata.write_bytes(mutate_yaml(np.random.default_rng([1, k]), sound))
         check(tmp_path / 'bag', read_flight)

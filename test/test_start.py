@@ -7,21 +7,7 @@ import subprocess
 import sys
 import time
 
-from beetle_omni_ros import cli, start
-
 ROOT = Path(__file__).resolve().parents[1]
-INTERRUPTED = 'def main():\n    raise KeyboardInterrupt\n'
-
-
-def launch(tmp_path, text, before=''):
-    """Start a process that runs a module with this text."""
-    (tmp_path / 'program.py').write_text(text)
-    return subprocess.Popen(
-        [sys.executable, '-c', f'import sys, signal\n{before}\nsys.path.insert(0, "{tmp_path}")\n'
-         'from beetle_omni_ros import start\nstart.PROGRAMS["program"] = "program:main"\n'
-         'sys.exit(start.run("program"))'],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler))
 
 
 def test_an_interrupt_at_a_random_moment_shows_no_traceback():
@@ -50,12 +36,3 @@ def test_few_modules_are_loaded_before_interrupts_are_handled():
         capture_output=True, text=True, timeout=60, check=True, cwd=ROOT).stdout.split()
     assert {'numpy', 'typing', 'pathlib', 'logging'}.isdisjoint(loaded)
     assert len(loaded) < 30, loaded
-
-
-def test_an_unhandled_interrupt_gives_status_130(tmp_path):
-    process = launch(tmp_path, INTERRUPTED)
-    assert process.communicate(timeout=10) == ('', '') and process.returncode == 130
-
-
-def test_a_program_is_the_main_of_its_module():
-    assert start.beetle_omni.args == ('beetle_omni',) and start.load('beetle_omni') is cli.main

@@ -462,8 +462,7 @@ def train(output: Annotated[Path, typer.Option(
 
     Several GPUs: torchrun --nproc-per-node N -m beetle_omni_ros.cli train --output DIR
     """
-    from beetle_omni_ros.train.command import run_train
-    from beetle_omni_ros.train.run_folder import parse_changes
+    from beetle_omni_ros.train.command import parse_changes, run_train
     run_train(output=output, config=config, robot=robot, device=device, resume=resume,
               changes=parse_changes(changes or [], seed=seed, memory=memory),
               smoke=smoke, stop_after=stop_after, json_path=json_path)

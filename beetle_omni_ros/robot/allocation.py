@@ -15,11 +15,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from math import atan2, copysign, cos, hypot, pi, sin
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.parameters import RobotParameters
+
+if TYPE_CHECKING:       # imports CasADi, which the help of the command line does not need
+    from beetle_omni_ros.robot.parameters import RobotParameters
 
 ROTORS = 4
 NEGLIGIBLE = 1e-6   # of the hover thrust: below it the direction of a rotor is rounding noise

@@ -15,14 +15,18 @@ from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.train import batch
 from beetle_omni_ros.train.environment import TiltableQuadrotorEnv
-from beetle_omni_ros.train.parameters import RandomParameters, StartParameters, TrainParameters
+from beetle_omni_ros.train.parameters import (
+    RandomParameters,
+    StartParameters,
+    STRATA,
+    TrainParameters,
+)
 
 SEGMENT = 8.0                       # [s] duration of a pose; windows of the task metrics [s]
 AT_TARGET, ON_THE_WAY = (7.0, 7.5), (1.0, 7.0)
 # Latencies of the simulated robot, and the conditions of the publication's table.
 NOMINAL = {'command_latency': [0.010, 0.010], 'velocity_latency': [0.0, 0.0],
            'tilt_latency': [0.010, 0.010], 'actuator_spread': [0.0, 0.0]}
-MEASURED = {**NOMINAL, 'actuator_spread': [1.0, 1.0]}
 PUBLISHED = {'command_latency': [0.005, 0.015], 'velocity_latency': [0.015, 0.025],
              'tilt_latency': [0.005, 0.010], 'carried_share': 1.0, 'noise_power': 0.0,
              'actuator_spread': [0.0, 0.0]}
@@ -39,53 +43,53 @@ def conditions(name: str, random: RandomParameters) -> RandomParameters:
     zero = {entry.name: 0.0 for entry in fields(RandomParameters)
             if isinstance(getattr(random, entry.name), float)}
     zero.update(push_period=1.0, thrust_sag=random.thrust_sag)
-    own = MEASURED if name == 'measured' else NOMINAL
-    return replace(random, **zero, **{key: np.array(value) for key, value in own.items()})
+    own = {key: np.array(value) for key, value in NOMINAL.items()}
+    if name == 'measured':
+        own['actuator_spread'] = np.array([1.0, 1.0])
+    return replace(random, **zero, **own)
 
 
 def assess(mean: Callable[[torch.Tensor], torch.Tensor], parameters: TrainParameters,
            robot: RobotParameters, device='cpu', name: str = 'nominal', robots: int = 1024,
-           segments: int = 3, random: RandomParameters | None = None) -> dict[str, float]:
+           segments: int = 3) -> dict[str, float]:
     """
     Fly a policy from pose to pose.
 
     Args:
-        mean: (N, 33 or 39) observations to (N, 8) actions.
         mean: function from (N, 33 or 39) observations to (N, 8) actions.
         parameters: parameters of its training.
         robot: nominal robot.
         device: torch device.
-        name: 'nominal', 'published' or 'measured'.
+        name: of :func:`conditions`.
         robots: N.
         segments: poses for each robot, after a first one that does not count.
-        random: randomisation in place of the named one.
 
     Returns:
         means U_*, L_* of robots never lost, fraction of poses reached, fraction of robots lost,
         command change in the U windows, fraction of joints at a stop there, mean thrust, and the
         99 and 99.9 % quantiles of the depth of moves below start and target.
-        the worst hundredth and thousandth of the moves sank below start and target.
 
     """
-    start = {entry.name: 0.0 for entry in fields(StartParameters)}
-    start.update(hold=1.0)
+    start = StartParameters(**{**dict.fromkeys(STRATA, 0.0), 'hold': 1.0}, other_branch=0.0)
     episode = replace(
         parameters.episode, duration=1e6, hold_targets=0.0, replay_share=0.0, trim_share=1.0,
         target_time=np.array([SEGMENT, SEGMENT]), region=np.array([4.0, 4.0, 1.4]))
     env = TiltableQuadrotorEnv(replace(
         parameters, ppo=replace(parameters.ppo, robots=robots), episode=episode,
-        start=StartParameters(**start),
+        start=start,
         estimate=replace(parameters.estimate, **SILENT) if name != 'published'
         else parameters.estimate,
-        random=random if random is not None else conditions(name, parameters.random)),
+        random=conditions(name, parameters.random)),
         robot, device, compiled=False)
     env.state['age'].zero_()
     env.state['target_left'].fill_(round(SEGMENT / episode.period))
-    return _fly(mean, env, round(SEGMENT / episode.period), segments, episode.period)
+    return _fly(mean, env, segments)
 
 
 @torch.no_grad()
-def _fly(mean, env, length, segments, period):
+def _fly(mean, env, segments):
+    period = env.cfg.episode.period
+    length = round(SEGMENT / period)
     windows = {'U': tuple(round(t / period) for t in AT_TARGET),
                'L': tuple(round(t / period) for t in ON_THE_WAY)}
     shape = (segments + 1, env.num_envs)
@@ -122,16 +126,10 @@ def _fly(mean, env, length, segments, period):
               'tilt_change_rad': float((change[0] / count).sqrt()),
               'thrust_change_N': float((change[1] / count).sqrt()),
               'at_stop': float(stopped / count), 'thrust_N': float(thrust),
-              'depth_p99_m': _quantile(depth[1:], 0.99),
-              'depth_p999_m': _quantile(depth[1:], 0.999)}
+              'depth_p99_m': float(depth[1:].quantile(0.99, interpolation='nearest')),
+              'depth_p999_m': float(depth[1:].quantile(0.999, interpolation='nearest'))}
     for key, value in kept.items():
-        angle = key.endswith('attitude')
-        result[f'{key}_deg' if angle else f'{key}_m'] = float(
-            torch.rad2deg(value.mean()) if angle else value.mean())
+        mean = float(value.mean())
+        result |= {f'{key}_deg': float(np.degrees(mean))} if key.endswith('attitude') \
+            else {f'{key}_m': mean}
     return {key: value for key, value in result.items() if np.isfinite(value)}
-
-
-def _quantile(values, share):
-    """As torch.quantile without interpolation, for any number of values."""
-    ordered = values.flatten().sort().values
-    return float(ordered[round(share * (len(ordered) - 1))])

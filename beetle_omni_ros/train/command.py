@@ -2,27 +2,30 @@
 
 from contextlib import redirect_stdout, suppress
 import io
+import itertools
 import os
 from pathlib import Path
+import re
 
 from rich.console import Console
 import torch
+import yaml
 
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import ParameterError, RunError
+from beetle_omni_ros.robot.schema import (
+    nest,
+    ParameterError,
+    parse_yaml,
+    quoted,
+    YamlError,
+)
 from beetle_omni_ros.runs.files import check_writable, write_json
 from beetle_omni_ros.train.assess import assess
-from beetle_omni_ros.train.export import export_policy
-from beetle_omni_ros.train.run_folder import (
-    last_checkpoint,
-    make_folder,
-    PARAMETER_FILE,
-    read_parameters,
-    write_parameters,
-)
+from beetle_omni_ros.train.network import export_policy
+from beetle_omni_ros.train.parameters import read_parameters
 from beetle_omni_ros.train.runner import is_rank_zero, Runner
 
-POLICY_FILE = 'policy.onnx'
+PARAMETER_FILE, POLICY_FILE = 'train.yaml', 'policy.onnx'
 # A run of less than a minute on a CPU that executes every part; the policy learns nothing.
 SMOKE = {'iterations': 3, 'log_every': 1, 'save_every': 2, 'ppo.robots': 32, 'ppo.steps': 8,
          'ppo.epochs': 2, 'ppo.minibatches': 2, 'network.hidden': [32, 16, 16]}
@@ -33,70 +36,54 @@ COLUMNS = (('iteration', 'iteration', '{:.0f}'), ('seconds', 'time s', '{:.0f}')
            ('attitude_error_deg', 'error deg', '{:.1f}'), ('deaths', 'lost', '{:.0f}'),
            ('tilt_std', 'std tilt', '{:.2f}'), ('thrust_std', 'std thrust', '{:.2f}'),
            ('learning_rate', 'rate', '{:.0e}'))
-
+HEADER_EVERY = 20
 OF_TARGETS = ('success_rate', 'position_error_m', 'attitude_error_deg')  # averages over targets
 
 
 def choose_device(name: str) -> str:
-    """
-    Torch device for a name; 'auto' is a GPU if available.
-
-    Raises:
-        ParameterError: a requested GPU is not available.
-
-    """
-    local = os.environ.get('LOCAL_RANK')
-    if name == 'auto':
-        name = 'cuda' if torch.cuda.is_available() else 'cpu'
-    try:
-        device = torch.device(name)
-    except RuntimeError:
-        raise ParameterError(f"--device '{name}': expected auto, cpu, cuda or cuda:N") from None
-    if device.type not in ('cpu', 'cuda'):
+    """Torch device for a name; 'auto' is a GPU if available."""
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if name == 'cpu' or (name == 'auto' and not count):
+        return 'cpu'
+    if name != 'auto' and not re.fullmatch(r'cuda(:\d+)?', name):
         raise ParameterError(f"--device '{name}': expected auto, cpu, cuda or cuda:N")
-    if device.type == 'cuda':
-        count = torch.cuda.device_count() if torch.cuda.is_available() else 0
-        index = int(local) if local is not None else device.index or 0
-        if index >= count:
-            raise ParameterError(f"--device '{name}': this machine has {count or 'no'} CUDA "
-                                 f'device{"s" if count > 1 else ""} that torch {torch.__version__}'
-                                 ' can use; --device cpu trains slowly anywhere')
-        return f'cuda:{index}'
-    return 'cpu'
+    index = int(os.environ.get('LOCAL_RANK') or name.partition(':')[2] or 0)
+    if index >= count:
+        raise ParameterError(f"--device '{name}': this machine has {count or 'no'} CUDA "
+                             f'device{"s" if count > 1 else ""} that torch {torch.__version__}'
+                             ' can use; --device cpu trains slowly anywhere')
+    return f'cuda:{index}'
 
 
 def run_train(*, output: Path | None, config: Path | None = None, robot: Path | None = None,
               changes: dict | None = None, device: str = 'auto', resume: Path | None = None,
               smoke: bool = False, stop_after: float | None = None,
-              json_path: Path | None = None, console: Console | None = None) -> dict:
+              json_path: Path | None = None) -> None:
     """
     Train, assess and export a policy.
 
     Arguments are the options of `beetle_omni train`; ``changes`` maps dotted parameter names to
     values that override the file.
 
-    Returns:
-        ``policy`` (path), ``iterations``, ``seconds``, ``metrics`` by conditions.
-
     Raises:
-        ParameterError: unusable input, one line.
-        RunError: the loss is not finite, or the exported file is wrong; one line.
+        ParameterError: unusable input.
+        RunError: the loss is not finite, or the exported file is wrong.
         KeyboardInterrupt: raised again after a checkpoint.
 
     """
-    console = console or Console(quiet=not is_rank_zero())
+    console = Console(quiet=not is_rank_zero())
     check_writable(json_path)
     if output is None and resume is None:
         raise ParameterError('--output: missing; expected a folder for the training')
     where = choose_device(device)
-    checkpoint = last_checkpoint(resume) if resume else None
+    checkpoint = _last_checkpoint(resume) if resume else None
     output = output or checkpoint.parent
     if checkpoint and config is None and (checkpoint.parent / PARAMETER_FILE).is_file():
         config = checkpoint.parent / PARAMETER_FILE
     changes = {**(SMOKE if smoke and not checkpoint else {}), **(changes or {})}
     parameters = read_parameters(config, changes)
     nominal = RobotParameters.load(robot)
-    new = is_rank_zero() and make_folder(output, checkpoint)
+    new = is_rank_zero() and _make_folder(output, checkpoint)
     torch.set_float32_matmul_precision('high')
     if smoke:
         torch.set_num_threads(1)    # on a loaded machine several threads wait for each other
@@ -111,24 +98,24 @@ def run_train(*, output: Path | None, config: Path | None = None, robot: Path | 
                 output.rmdir()
         raise
     if is_rank_zero():
-        write_parameters(parameters, output / PARAMETER_FILE)
+        (output / PARAMETER_FILE).write_text(
+            yaml.safe_dump(nest(parameters.plain()), sort_keys=False))
     processes = f'{runner.gpu_world_size} x ' if runner.is_distributed else ''
     console.print(f'{processes}{parameters.ppo.robots} robots on {where}, seed '
                   f'{parameters.seed}, iterations {runner.current_learning_iteration} to '
                   f'{parameters.iterations}; all files are in {output}', soft_wrap=True)
     try:
-        runner.train(ProgressTable(console), stop_after)
-        runner.close()
-        return _finish(runner, nominal, output, where, smoke, json_path, console) \
-            if is_rank_zero() else {}
+        runner.train(_progress_table(console), stop_after)
+        if runner.is_distributed:
+            torch.distributed.destroy_process_group()
+        if is_rank_zero():
+            _finish(runner, nominal, output, where, smoke, json_path, console)
     except KeyboardInterrupt:
         if is_rank_zero():
             path = runner.checkpoint()
             console.print(f'interrupted; continue with: beetle_omni train --resume {path.parent}',
                           soft_wrap=True)
         raise
-    except FloatingPointError as error:
-        raise RunError(str(error)) from None
 
 
 def _finish(runner, robot, output, device, smoke, json_path, console):
@@ -150,28 +137,74 @@ def _finish(runner, robot, output, device, smoke, json_path, console):
             f'{key} {value:.4g}' for key, value in values.items()), soft_wrap=True)
     console.print(f'{path}: agrees with torch to {difference:.1e}; fly it with beetle_omni '
                   f'evaluate --controllers rl --policy {path} --task random100', soft_wrap=True)
-    result = {'policy': str(path), 'iterations': runner.current_learning_iteration,
-              'seconds': runner.trained_seconds, 'metrics': metrics, 'onnx_difference': difference}
-    write_json(json_path, result)
-    return result
+    write_json(json_path, {
+        'policy': str(path), 'iterations': runner.current_learning_iteration,
+        'seconds': runner.trained_seconds, 'metrics': metrics, 'onnx_difference': difference})
 
 
-class ProgressTable:
-    """Prints progress as rows of a table, with a header every ``EVERY`` rows."""
+def _progress_table(console):
+    """Printer of rows of progress, with a header every ``HEADER_EVERY`` rows."""
+    widths, count = [max(len(title), 9) for _, title, _ in COLUMNS], itertools.count()
 
-    EVERY = 20
-
-    def __init__(self, console: Console):
-        self._console, self._count = console, 0
-
-    def __call__(self, row: dict) -> None:
-        """Print one row."""
-        widths = [max(len(title), 9) for _, title, _ in COLUMNS]
-        if self._count % self.EVERY == 0:
-            self._console.print(' '.join(title.rjust(width) for (_, title, _), width
-                                         in zip(COLUMNS, widths)), style='bold', soft_wrap=True)
-        self._count += 1
+    def show(row):
+        if next(count) % HEADER_EVERY == 0:
+            console.print(' '.join(title.rjust(width) for (_, title, _), width
+                                   in zip(COLUMNS, widths)), style='bold', soft_wrap=True)
         cells = ['–' if key in OF_TARGETS and not row['targets'] else pattern.format(row[key])
                  for key, _, pattern in COLUMNS]
-        self._console.print(' '.join(map(str.rjust, cells, widths)), soft_wrap=True,
-                            highlight=False)
+        console.print(' '.join(map(str.rjust, cells, widths)), soft_wrap=True, highlight=False)
+
+    return show
+
+
+def _last_checkpoint(folder):
+    """Latest checkpoint of a run."""
+    if folder.is_file():
+        return folder
+    found = _checkpoints(folder)
+    if not found:
+        raise ParameterError(f'--resume {folder}: no model_N.pt there; expected the folder of a '
+                             'training')
+    return found[-1]
+
+
+def _checkpoints(folder):
+    """Checkpoints in the order of their iterations."""
+    return sorted((path for path in folder.glob('model_*.pt') if path.stem[6:].isdigit()),
+                  key=lambda path: int(path.stem[6:]))
+
+
+def _make_folder(output, checkpoint):
+    """Create the folder of a run; return whether it is new."""
+    new = not output.exists()
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ParameterError(f'--output {output}: cannot be made ({error.strerror})') from None
+    resumed = checkpoint is not None and output.resolve() == checkpoint.parent.resolve()
+    if _checkpoints(output) and not resumed:
+        raise ParameterError(f'--output {output}: holds the checkpoints of another run; '
+                             f'--resume {output} continues it')
+    return new
+
+
+def parse_changes(texts: list[str], **others) -> dict:
+    """Parse ``key=value`` texts of the command line; add other keys whose value is not None."""
+    changes = {}
+    for text in texts:
+        key, sign, value = text.partition('=')
+        if not sign:
+            raise ParameterError(f"--set '{text}': expected key=value")
+        try:
+            changes[key.strip()] = _number(parse_yaml(value))
+        except YamlError as error:
+            raise ParameterError(f'--set {quoted(text)}: the value is {error}') from None
+    return changes | {key: value for key, value in others.items() if value is not None}
+
+
+def _number(value):
+    """Number of a text such as 1e-3, which is not a number in YAML 1.1."""
+    try:
+        return float(value) if isinstance(value, str) else value
+    except ValueError:
+        return value

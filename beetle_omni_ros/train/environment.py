@@ -15,22 +15,17 @@ from beetle_omni_ros.control import guidance
 from beetle_omni_ros.control.policy_file import PolicyContract
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.train import batch, rewards, starts
+from beetle_omni_ros.train import batch, rewards
 from beetle_omni_ros.train.model import CENTRE, INERTIA, MASS, module_reaction, nominal_body
-from beetle_omni_ros.train.observations import (
-    actor_observation,
-    critic_observation,
-    extrapolated,
-    Signals,
-)
 from beetle_omni_ros.train.parameters import TrainParameters
 from beetle_omni_ros.train.physics import Physics
-from beetle_omni_ros.train.replays import (
+from beetle_omni_ros.train.starts import (
     MISSED_ATTITUDE,
     MISSED_DEPTH,
     MISSED_POSITION,
     Replays,
     spread,
+    Starts,
 )
 
 NUMBERS = 167       # random numbers for each robot and step
@@ -43,12 +38,9 @@ class TiltableQuadrotorEnv(VecEnv):
 
     Args:
         parameters: training parameters (params/train.yaml).
-        robot: nominal robot.
+        robot: nominal robot; ParameterError if it has an effect that training refuses.
         device: torch device.
         compiled: whether to compile the step; by default on a GPU only.
-
-    Raises:
-        ParameterError: the robot file has an effect that training refuses.
 
     Attributes:
         state: name -> (N, ...) tensor, all quantities that persist between steps.
@@ -74,7 +66,7 @@ class TiltableQuadrotorEnv(VecEnv):
         self._low = self._tensor([-limit] * 4 + [rotors.thrust_min] * 4)
         self._high = self._tensor([limit] * 4 + [rotors.thrust_max] * 4)
         self._torque_ratio = self._tensor(-np.array(rotors.spin) * rotors.torque_to_thrust_ratio)
-        self._starts = starts.Starts(parameters, robot, self.num_envs, self.device)
+        self._starts = Starts(parameters, robot, self.num_envs, self.device)
         self.severity = self._starts.severity
         self.depth_limit = torch.full((), np.inf, device=self.device)
         self._module_moment = module_reaction(robot)['mass_moment'] if robot.multibody else 0.0
@@ -92,7 +84,6 @@ class TiltableQuadrotorEnv(VecEnv):
         self.state['age'] = age.floor()
         self._replays = Replays(self.state, parameters.episode.replay_share,
                                 parameters.episode.target_time[1] / parameters.episode.period)
-        self.state.update(self._replays.state(self.state))
         # sums since the last reading: targets finished, reached, errors, rewards, ends
         self.tally = torch.zeros(8 + len(rewards.TERMS), device=self.device)
         self._finish = self._after_physics
@@ -100,8 +91,7 @@ class TiltableQuadrotorEnv(VecEnv):
             self._finish = torch.compile(self._after_physics, fullgraph=True, dynamic=False)
         self.observation, self.critic = self._observe(self.state, batch.Draw(numbers[:, 130:]))
         self.reward = torch.zeros(self.num_envs, device=self.device)
-        self.done = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
-        self.timeout = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+        self.done, self.timeout = self.reward > 0, self.reward > 0
 
     def _tensor(self, values):
         return torch.tensor(np.asarray(values, dtype=float), dtype=torch.float32,
@@ -131,14 +121,12 @@ class TiltableQuadrotorEnv(VecEnv):
         given = tuple(torch.cat((c[:, :4], torch.minimum(c[:, 4:], limit)), -1)
                       for c in (command, s['previous'], s['older']))
         x = self.physics.advance(s['x'], given, s['delays'][:, :2], s['wrench'], s['body'])
-        results = self._finish(s, x, requested, command, self._numbers(), self.weights)
-        new, observation, critic, reward, done, timeout, tally = results
+        new, *results, tally = self._finish(s, x, requested, command, self._numbers(),
+                                            self.weights)
         torch._foreach_copy_([s[name] for name in new], list(new.values()))
-        self.observation.copy_(observation)
-        self.critic.copy_(critic)
-        self.reward.copy_(reward)
-        self.done.copy_(done)
-        self.timeout.copy_(timeout)
+        for own, result in zip((self.observation, self.critic, self.reward, self.done,
+                                self.timeout), results):
+            own.copy_(result)
         self.tally.add_(tally)
 
     def _thrust_limit(self):
@@ -153,7 +141,8 @@ class TiltableQuadrotorEnv(VecEnv):
         x = self._push(s, x, draw)
         rotation, target = batch.matrix(x[:, model.QUATERNION]), batch.matrix(s['target_attitude'])
         inputs = self._reward_inputs(s, x, requested, rotation, target)
-        terms = rewards.terms(inputs)
+        made = rewards.terms(inputs)
+        terms = torch.stack([made[name] for name in rewards.TERMS], -1)
         broken = ~torch.isfinite(x).all(-1)
         calm = s['disturbed'][:, 0] < 0.5
         died = broken | (inputs.position_error > limits.position_limit) \
@@ -178,8 +167,8 @@ class TiltableQuadrotorEnv(VecEnv):
             (inputs.position_error > MISSED_POSITION) | (inputs.attitude_error > MISSED_ATTITUDE)
             | (new['deepest'] > MISSED_DEPTH)))
         new = self._retarget(new, due, rotation, draw)
-        new = self._replays.step(s, new, self._starts.draw(draw),
-                                 {'due': due, 'done': done, 'missed': missed}, draw)
+        self._replays.step(s, new, self._starts.draw(draw),
+                           {'due': due, 'done': done, 'missed': missed}, draw)
         observation, critic = self._observe(new, draw)
         return new, observation, critic, reward, done, timeout, tally
 
@@ -249,8 +238,7 @@ class TiltableQuadrotorEnv(VecEnv):
         and the present change.
         """
         e, period = self.cfg.estimate, self.cfg.episode.period
-        mass = s['body'][:, MASS]
-        weight = torch.zeros_like(s['wrench'][:, :3])
+        mass, weight = s['body'][:, MASS], torch.zeros_like(s['wrench'][:, :3])
         weight[:, 2] = -self.robot.gravity
         tilt = x[:, model.TILT]
         thrusts = torch.sin(tilt) @ self._sideways
@@ -272,7 +260,7 @@ class TiltableQuadrotorEnv(VecEnv):
                            s['past_motion'][:, :, 3:]), 1)
         changes = rates[:, :-1] - rates[:, 1:]
         delay = s['delays'][:, 2:3]
-        return extrapolated(changes, delay, s['extrapolated'] * delay) - changes[:, 0]
+        return batch.extrapolated(changes, delay, s['extrapolated'] * delay) - changes[:, 0]
 
     def _retarget(self, new, due, rotation, draw):
         target = self._starts.target(draw, new['x'][:, model.POSITION],
@@ -289,11 +277,11 @@ class TiltableQuadrotorEnv(VecEnv):
         return changed
 
     def _observe(self, s, draw):
-        signals = Signals(self.cfg.random, s, draw)
+        signals = batch.Signals(self.cfg.random, s, draw)
         previous_action = (s['previous'] - self.offset) / self.scale
-        observation = actor_observation(signals, s, previous_action,
+        observation = batch.actor_observation(signals, s, previous_action,
                                         self.cfg.estimate if self.cfg.memory else None, draw)
-        return observation, critic_observation(s, previous_action, self._torque_ratio,
+        return observation, batch.critic_observation(s, previous_action, self._torque_ratio,
                                                self.cfg.memory)
 
     def read_tally(self) -> dict[str, float]:

@@ -1,5 +1,5 @@
 """
-Actor and critic: rsl-rl's MLP models on features of the raw observation.
+Actor and critic, rsl-rl's MLP models on features of the raw observation, and their ONNX file.
 
 The features are functions of the 33 (or 39) observed numbers and part of the exported graph. The
 interface is therefore the raw observation. The features are the target attitude in the body
@@ -8,12 +8,35 @@ centimetres. They do not depend on the heading of the world frame.
 """
 
 import copy
+from dataclasses import replace
+from datetime import datetime, timezone
+import logging
+from pathlib import Path
+import subprocess
+import warnings
 
+import numpy as np
+import onnx
 from rsl_rl.models import MLPModel
 from rsl_rl.modules import MLP
 from rsl_rl.modules.distribution import GaussianDistribution
 import torch
 
+from beetle_omni_ros import __version__
+from beetle_omni_ros.control.policy_file import (
+    add_checksum,
+    INPUT,
+    OUTPUT,
+    PolicyContract,
+    session,
+)
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import RunError
+from beetle_omni_ros.train.parameters import TrainParameters
+
+OPSET = 18
+AGREEMENT = 1e-5     # largest difference of torch and onnxruntime, relative to the largest action
+PROBES = 256         # compared observations
 NEAR = 0.1           # [m or rad] below which the normalised error is linear
 # Scales that bring the features to about one.
 RATE, FORCE, TORQUE, THRUST, TILT_ACTION, THRUST_ACTION = 0.5, 0.1, 2.0, 0.1, 0.25, 0.1
@@ -65,15 +88,7 @@ def _disturbance(block):
 
 
 class ActorModel(MLPModel):
-    """
-    Actor with the mean action scale * mlp(features) + carry * previous action.
-
-    Args:
-        output_scale: action for each unit of the last layer.
-        carry: factor of the previous action in the output.
-        last_gain: initial gain of the last layer.
-
-    """
+    """Actor with the mean action output_scale * mlp(features) + carry * previous action."""
 
     def __init__(self, obs, obs_groups, obs_set, output_dim, *, output_scale: float, carry: float,
                  last_gain: float, **keywords):
@@ -143,9 +158,11 @@ class ExportedPolicy(torch.nn.Module):
         size = actor.obs_dim
         self.mlp: MLP = copy.deepcopy(actor.mlp).cpu()
         known = size + len(CROSSED[0])
-        self.register_buffer('left', _matrix(_left, known))
-        self.register_buffer('right', _matrix(_right, known))
-        self.register_buffer('linear', _matrix(_linear, known + self.left.shape[1]).T)
+        # matrices of linear functions of rows
+        left, right = _factors(torch.eye(known))
+        self.register_buffer('left', left)
+        self.register_buffer('right', right)
+        self.register_buffer('linear', _linear(torch.eye(known + left.shape[1])).T)
         self.splits = [self.linear.shape[0] - 14, 6, 8]
         self.register_buffer('offset', torch.zeros(self.linear.shape[0]))
         self.offset[-4:] = 0.5 * torch.pi       # cosines are sines
@@ -191,11 +208,6 @@ CROSSED = ((13, 14, 12, 19, 20, 18, 14, 12, 13, 20, 18, 19),
            (11, 9, 10, 17, 15, 16, 10, 11, 9, 16, 17, 15))
 
 
-def _matrix(function, size):
-    """Matrix (size, m) of a linear function of rows."""
-    return function(torch.eye(size))
-
-
 def _axes(known):
     """Axes of body and target from the observation and the subsequent products."""
     x, z, x_goal, z_goal = known[:, ATTITUDES].split(3, -1)
@@ -203,16 +215,11 @@ def _axes(known):
     return (x, y, z), (x_goal, y_goal, z_goal)
 
 
-def _left(known):
-    """Left factors of the products of the body's axes with the target's axes."""
+def _factors(known):
+    """Left and right factors of the products of the body's axes with the target's axes."""
     body, goals = _axes(known)
-    return torch.cat([axis for axis in body for _ in goals], -1)
-
-
-def _right(known):
-    """Right factors of the products of the body's axes with the target's axes."""
-    body, goals = _axes(known)
-    return torch.cat([goal for _ in body for goal in goals], -1)
+    return (torch.cat([axis for axis in body for _ in goals], -1),
+            torch.cat([goal for _ in body for goal in goals], -1))
 
 
 def _linear(known):
@@ -227,3 +234,75 @@ def _linear(known):
         *(axis[:, 2:] for axis in (*body, *goals)), tilt,
         TILT_ACTION * action[:, :4], THRUST_ACTION * action[:, 4:],
         *_disturbance(o[:, ACTOR_SIZE:-12]), target, turn, tilt, tilt), -1)
+
+
+def export_policy(actor: ActorModel, path: Path, robot: RobotParameters,
+                  parameters: TrainParameters, training: dict | None = None,
+                  metrics: dict | None = None) -> float:
+    """
+    Write an actor as ONNX with further facts of its training, and compare the file with it.
+
+    Returns:
+        largest difference of torch and onnxruntime, relative to the largest action.
+
+    Raises:
+        RunError: the difference exceeds ``AGREEMENT``.
+
+    """
+    actor = copy.deepcopy(actor).cpu().eval()
+    network, size = ExportedPolicy(actor).eval(), actor.obs_dim
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore')
+        logging.getLogger('torch.onnx').setLevel(logging.ERROR)
+        program = torch.onnx.export(
+            network, (torch.zeros(1, size),), input_names=[INPUT], output_names=[OUTPUT],
+            opset_version=OPSET, dynamo=True, verbose=False)
+    written = program.model_proto
+    contract = PolicyContract.default(robot, parameters.memory)
+    contract = replace(
+        contract, training={**parameters.plain(), **(training or {})}, metrics=metrics or {},
+        commit=_commit(), version=__version__,
+        created=datetime.now(timezone.utc).isoformat(timespec='seconds'))
+    _strip_paths(written)
+    for key, value in contract.to_metadata().items():
+        written.metadata_props.add(key=key, value=value)
+    part = path.with_suffix('.part')
+    onnx.save(written, str(part))
+    add_checksum(part)
+    difference = _difference(actor.mean, part, size)
+    if not difference <= AGREEMENT:
+        part.unlink()
+        raise RunError(f'{path}: torch and onnxruntime differ by {difference:.2g}, more than '
+                       f'{AGREEMENT:g}')
+    part.replace(path)
+    return difference
+
+
+def _difference(mean, path, size):
+    """Largest relative difference of torch and onnxruntime on random observations."""
+    network = session(path.read_bytes())
+    probes = torch.randn(PROBES, size, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        expected = mean(probes).numpy()
+    found = np.concatenate([network.run([OUTPUT], {INPUT: row[None].numpy()})[0]
+                            for row in probes])
+    return float(np.abs(found - expected).max() / max(np.abs(expected).max(), 1.0))
+
+
+def _strip_paths(proto):
+    """Remove the exporter's notes on the origin of nodes, because they contain local paths."""
+    for part in (proto, proto.graph, *proto.graph.node, *proto.graph.input, *proto.graph.output,
+                 *proto.graph.value_info, *proto.functions):
+        del part.metadata_props[:]
+        part.doc_string = ''
+
+
+def _commit() -> str:
+    """Commit of the working tree of this package, '' outside of one."""
+    try:
+        done = subprocess.run(['git', 'describe', '--always', '--dirty', '--abbrev=12'],
+                              cwd=Path(__file__).parent, capture_output=True, text=True,
+                              timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return ''
+    return done.stdout.strip()

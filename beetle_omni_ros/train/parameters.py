@@ -1,15 +1,25 @@
 """Parameters of the training."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from beetle_omni_ros.robot.schema import flatten, group, parameter, ParameterError, ParameterFile
+from beetle_omni_ros.robot.schema import (
+    bind,
+    flatten,
+    group,
+    nest,
+    parameter,
+    ParameterError,
+    ParameterFile,
+)
+
+STRATA = ('wound_back', 'level', 'wound', 'mixed', 'hover', 'hold', 'moving')
 
 
 def _check_ranges(parameters, *names):
-    """Check that ranges are in ascending order."""
     for name in names:
         low, high = getattr(parameters, name)
         if low > high:
@@ -46,7 +56,6 @@ class EpisodeParameters:
         low=0, high=0.9)
 
     def __post_init__(self):
-        """Check the ranges."""
         _check_ranges(self, 'target_time')
 
 
@@ -70,9 +79,7 @@ class StartParameters:
                             unit='rad/s', low=0, high=20)
 
     def __post_init__(self):
-        """Check that a stratum has a share."""
-        if not any((self.wound_back, self.level, self.wound, self.mixed, self.hover, self.hold,
-                    self.moving)):
+        if not any(getattr(self, name) for name in STRATA):
             raise ParameterError('all shares are zero')
 
 
@@ -139,7 +146,6 @@ class RandomParameters:
                                  unit='rad/s', low=0, high=30)
 
     def __post_init__(self):
-        """Check the ranges."""
         _check_ranges(self, 'velocity_latency', 'tilt_latency', 'command_latency',
                       'actuator_spread', 'thrust_limit')
 
@@ -206,7 +212,6 @@ class NetworkParameters:
                                   low=0, high=10)
 
     def __post_init__(self):
-        """Check the sizes of the layers."""
         sizes = self.hidden
         if sizes.ndim != 1 or not sizes.size or (sizes < 1).any() or (sizes % 1).any():
             raise ParameterError("key 'hidden': expected the sizes of the hidden layers, found "
@@ -231,7 +236,6 @@ class PpoParameters:
                                                  shape=(2,))
 
     def __post_init__(self):
-        """Check the range and the size of the minibatches."""
         _check_ranges(self, 'learning_rate_limits')
         if self.minibatches > self.robots * self.steps:
             raise ParameterError(f"key 'minibatches': {self.minibatches} are more than the "
@@ -286,3 +290,15 @@ class TrainParameters(ParameterFile, file='train.yaml'):
         """Dotted key -> value as a plain number, text or list."""
         return {name: value.tolist() if isinstance(value, np.ndarray) else value
                 for name, _, _, value in flatten(self)}
+
+
+def read_parameters(file: Path | None, changes: dict) -> TrainParameters:
+    """Read a parameter file (None: the shipped one) and replace values by dotted names."""
+    parameters = TrainParameters.load(file)
+    flat = parameters.plain()
+    for key, value in changes.items():
+        if key not in flat:
+            raise ParameterError(f'--set {key}: unknown; keys are those of params/train.yaml, '
+                                 'e.g. ppo.robots')
+        flat[key] = value
+    return bind(TrainParameters, nest(flat), '--set' if changes else str(file or ''))

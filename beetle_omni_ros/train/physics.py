@@ -1,8 +1,9 @@
 """
 One control period of many robots: delayed commands and substeps of the robot's model.
 
-On a GPU with Triton all substeps run in one kernel, elsewhere in plain torch. Both are generated
-from the same CasADi function (:mod:`codegen`).
+The substep is a scalar CasADi function (SX), a list of elementary operations on numbers. With
+tensors in place of the numbers it steps a whole batch: in plain torch on any device, or in one
+Triton kernel, in which each GPU thread keeps its robot in registers.
 """
 
 import atexit
@@ -11,13 +12,86 @@ import importlib.util
 from pathlib import Path
 import shutil
 import tempfile
+from types import SimpleNamespace
 
+import casadi as ca
 import torch
 
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.train import codegen, model
+from beetle_omni_ros.train import model
 
 BLOCK = 64    # robots in one program; small blocks use the GPU well with a few thousand robots
+
+# Text in the language of Triton; ``tl`` and ``number`` are torch's elsewhere.
+_OPERATIONS = {
+    ca.OP_ADD: '{} + {}', ca.OP_SUB: '{} - {}', ca.OP_MUL: '{} * {}', ca.OP_DIV: '{} / {}',
+    ca.OP_FMIN: 'tl.minimum({}, {})', ca.OP_FMAX: 'tl.maximum({}, {})',
+    ca.OP_LT: 'number({} < {})', ca.OP_LE: 'number({} <= {})', ca.OP_EQ: 'number({} == {})',
+    ca.OP_NE: 'number({} != {})', ca.OP_AND: '{} * {}', ca.OP_OR: 'tl.maximum({}, {})',
+    ca.OP_IF_ELSE_ZERO: '{} * {}', ca.OP_NOT: '(1.0 - {})', ca.OP_ASSIGN: '{}', ca.OP_NEG: '-{}',
+    ca.OP_SQ: '{0} * {0}', ca.OP_TWICE: '2.0 * {}', ca.OP_INV: '1.0 / {}',
+    ca.OP_SQRT: 'tl.sqrt({})', ca.OP_SIN: 'tl.sin({})', ca.OP_COS: 'tl.cos({})',
+    ca.OP_EXP: 'tl.exp({})', ca.OP_FABS: 'tl.abs({})'}
+
+
+def _statements(function: ca.Function) -> list[str]:
+    """
+    Translate a scalar function with dense inputs to assignments.
+
+    Inputs are read from ``NAME_K`` and outputs assigned to ``NAME_K``, with the function's own
+    names of inputs and outputs and the index K of the entry.
+    """
+    lines = []
+    for k in range(function.n_instructions()):
+        operation = function.instruction_id(k)
+        inputs, outputs = function.instruction_input(k), function.instruction_output(k)
+        if operation == ca.OP_OUTPUT:
+            row = function.sparsity_out(outputs[0]).get_triplet()[0][outputs[1]]
+            lines.append(f'{function.name_out(outputs[0])}_{row} = w{inputs[0]}')
+            continue
+        if operation == ca.OP_INPUT:
+            right = f'{function.name_in(inputs[0])}_{inputs[1]}'
+        elif operation == ca.OP_CONST:
+            right = repr(float(function.instruction_constant(k)))
+        elif operation in _OPERATIONS:
+            right = _OPERATIONS[operation].format(*(f'w{i}' for i in inputs))
+        else:
+            raise NotImplementedError(f'CasADi operation {operation} in {function.name()}')
+        lines.append(f'w{outputs[0]} = {right}')
+    return lines
+
+
+def torch_function(function: ca.Function) -> Callable:
+    """Translate a one-output function to torch, on tensors (..., number of entries)."""
+    def minimum(a, b):
+        return torch.clamp(a, max=b) if not torch.is_tensor(b) else \
+            torch.clamp(b, max=a) if not torch.is_tensor(a) else torch.minimum(a, b)
+
+    def maximum(a, b):
+        return torch.clamp(a, min=b) if not torch.is_tensor(b) else \
+            torch.clamp(b, min=a) if not torch.is_tensor(a) else torch.maximum(a, b)
+
+    def number(condition):
+        return condition.to(torch.get_default_dtype()) if torch.is_tensor(condition) \
+            else float(condition)
+
+    def like(value, other):
+        return value if torch.is_tensor(value) else torch.full_like(other, value)
+
+    names, out = function.name_in(), function.name_out(0)
+    lines = [f'def {function.name()}({", ".join(names)}):']
+    for i, name in enumerate(names):
+        parts = ', '.join(f'{name}_{k}' for k in range(function.numel_in(i)))
+        lines.append(f'    {parts}, = {name}.unbind(-1)')
+    lines += ['    ' + line for line in _statements(function)]
+    parts = ', '.join(f'like({out}_{k}, {names[0]}_0)' for k in range(function.numel_out(0)))
+    lines.append(f'    return stack([{parts}], -1)')
+    words = SimpleNamespace(minimum=minimum, maximum=maximum, sqrt=torch.sqrt, sin=torch.sin,
+                            cos=torch.cos, exp=torch.exp, abs=torch.abs)
+    space = {'tl': words, 'number': number, 'like': like, 'stack': torch.stack}
+    exec(compile('\n'.join(lines), f'<{function.name()}>', 'exec'), space)
+    return space[function.name()]
+
 
 _KERNEL = '''\
 """Written by beetle_omni_ros.train.physics; do not edit."""
@@ -26,7 +100,7 @@ import triton.language as tl
 
 
 @triton.jit
-def _number(condition):
+def number(condition):
     return condition.to(tl.float32)
 
 
@@ -70,7 +144,7 @@ def _kernel_source(function) -> str:
     out = function.name_out(0)
     return _KERNEL.format(
         loads=lines(4, loads), commands=lines(8, commands),
-        step=lines(8, codegen.statements(function, codegen.TRITON)),
+        step=lines(8, _statements(function)),
         update=lines(8, [f'x_{k} = {out}_{k}' for k in range(states)]),
         stores=lines(4, [f'tl.store(x_out + {states} * i + {k}, x_{k}, mask=mask)'
                          for k in range(states)]))
@@ -89,17 +163,7 @@ def _load_kernel(source: str):
 
 
 class Physics:
-    """
-    Time steps of a batch of robots.
-
-    Args:
-        robot: nominal parameters and effects.
-        period: control period [s].
-        substeps: integration steps in a period.
-        device: torch device.
-        kernel: whether to use the Triton kernel; None: if it can run.
-
-    """
+    """Control periods [s] of a batch of robots; ``kernel`` None: the Triton one if it can run."""
 
     def __init__(self, robot: RobotParameters, period: float, substeps: int,
                  device: torch.device | str, kernel: bool | None = None):
@@ -111,10 +175,9 @@ class Physics:
         self.has_kernel = kernel
         if kernel:
             self._kernel = _load_kernel(_kernel_source(function))
-        self._substep: Callable = codegen.torch_function(function)
+        self._substep = torch_function(function)
 
-    def advance(self, x: torch.Tensor, commands: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
-                delays: torch.Tensor, wrench: torch.Tensor, body: torch.Tensor) -> torch.Tensor:
+    def advance(self, x, commands, delays, wrench, body) -> torch.Tensor:
         """
         States one control period later.
 
@@ -126,9 +189,8 @@ class Physics:
             body: (N, 28) quantities of each robot, slices of :mod:`train.model`.
 
         """
-        if self.has_kernel:
-            return self._launch(x, commands, delays, wrench, body)
-        return self.advance_torch(x, commands, delays, wrench, body)
+        advance = self._launch if self.has_kernel else self.advance_torch
+        return advance(x, commands, delays, wrench, body)
 
     def advance_torch(self, x, commands, delays, wrench, body):
         """:meth:`advance` in plain torch."""

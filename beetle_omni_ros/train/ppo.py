@@ -28,30 +28,19 @@ class GraphPpo(PPO):
 
     """
 
-    def prepare(self, env, learning_rate_limits, graphs: bool, compiled: bool) -> None:
-        """
-        Prepare buffers, optimiser and graphs.
-
-        Args:
-            env: environment, stepped in place.
-            learning_rate_limits: lowest and highest learning rate.
-            graphs: whether to capture CUDA graphs.
-            compiled: whether to compile the loss.
-
-        """
+    def prepare(self, env, learning_rate_limits, graphs: bool) -> None:
+        """Prepare buffers and optimiser, and graphs and compiled functions if ``graphs``."""
         self.env, self._graphs = env, graphs
         self._limits = tuple(float(limit) for limit in learning_rate_limits)
-        self._capturable = graphs
         self.rate = torch.tensor(float(self.learning_rate), device=self.device)
         self.optimizer = torch.optim.Adam(
             [*self.actor.parameters(), *self.critic.parameters()],
-            lr=self.rate if self._capturable else float(self.learning_rate), eps=ADAM_EPSILON,
-            capturable=self._capturable, fused=self._capturable or None)
+            lr=self.rate if graphs else float(self.learning_rate), eps=ADAM_EPSILON,
+            capturable=graphs, fused=graphs or None)
         self.scheduled = torch.tensor([self.desired_kl, self.entropy_coef, 10.0, 10.0],
                                       device=self.device)
-        self._loss: Callable = torch.compile(self._losses, dynamic=False) if compiled \
-            else self._losses
-        self._mean = torch.compile(self.actor.mean, dynamic=False) if compiled else self.actor.mean
+        self._loss, self._mean = (torch.compile(function, dynamic=False) if graphs else function
+                                  for function in (self._losses, self.actor.mean))
         s = self.storage
         shape = (s.num_transitions_per_env, s.num_envs)
         width = self.actor.distribution.output_dim
@@ -94,17 +83,14 @@ class GraphPpo(PPO):
         """Set the learning rate."""
         self.learning_rate = rate
         self.rate.fill_(rate)
-        self.optimizer.param_groups[0]['lr'] = self.rate if self._capturable else rate
+        self.optimizer.param_groups[0]['lr'] = self.rate if self._graphs else rate
 
     def _run(self, name, function):
-        if not self._graphs:
-            function()
-            return
         if name not in self._replay:
-            self._capture(name, function)
+            self._replay[name] = self._captured(function) if self._graphs else function
         self._replay[name]()
 
-    def _capture(self, name, function):
+    def _captured(self, function):
         """Run once to initialise compilers and workspaces, then record."""
         stream = torch.cuda.Stream()
         stream.wait_stream(torch.cuda.current_stream())
@@ -114,7 +100,7 @@ class GraphPpo(PPO):
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(graph):
             function()
-        self._replay[name] = graph.replay
+        return graph.replay
 
     @torch.no_grad()
     def _collect(self):
@@ -163,8 +149,7 @@ class GraphPpo(PPO):
             for k in range(self.num_mini_batches):
                 self._step([column[k * size:(k + 1) * size] for column in shuffled], old_std)
         self.losses.div_(self.num_learning_epochs * self.num_mini_batches)
-        limits = self.scheduled[2:].repeat_interleave(4)
-        self.actor.distribution.bound(limits)
+        self.actor.distribution.bound(self.scheduled[2:].repeat_interleave(4))
 
     def _step(self, batch, old_std):
         self.optimizer.zero_grad(set_to_none=True)
@@ -196,7 +181,7 @@ class GraphPpo(PPO):
         factor = torch.where(divergence > 2 * desired, 1 / LEARNING_RATE_STEP, torch.where(
             (divergence < desired / 2) & (divergence > 0), LEARNING_RATE_STEP, 1.0))
         self.rate.copy_((self.rate * factor).clamp(low, high))
-        if not self._capturable:
+        if not self._graphs:
             self.optimizer.param_groups[0]['lr'] = float(self.rate)
 
 

@@ -9,9 +9,10 @@ import time
 import numpy as np
 from rsl_rl.runners import OnPolicyRunner
 import torch
+from torch.utils.tensorboard import SummaryWriter
 
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.schema import ParameterError, RunError
 from beetle_omni_ros.train import rewards
 from beetle_omni_ros.train.environment import TiltableQuadrotorEnv
 from beetle_omni_ros.train.parameters import TrainParameters
@@ -56,12 +57,12 @@ class Runner(OnPolicyRunner):
     """
     rsl-rl's runner with a training loop that does not wait for the GPU.
 
-    Under torchrun each process simulates its own robots on its own GPU, and rsl-rl's update
-    averages gradients and divergence over all processes. Only the process of rank 0 reports and
-    writes.
+    Under torchrun each process simulates its own ``ppo.robots`` on its own GPU, and rsl-rl's
+    update averages gradients and divergence over all processes. Only the process of rank 0
+    reports and writes.
 
     Args:
-        parameters: training parameters; ``ppo.robots`` is the number of each process.
+        parameters: training parameters.
         robot: nominal robot.
         folder: folder of checkpoints and TensorBoard log; None: nothing is written.
         device: torch device.
@@ -86,51 +87,31 @@ class Runner(OnPolicyRunner):
             torch.manual_seed(parameters.seed + 1000 * self.gpu_global_rank)
         if graphs is None:
             graphs = torch.device(device).type == 'cuda' and not self.is_distributed
-        self.alg.prepare(env, parameters.ppo.learning_rate_limits, graphs, graphs)
+        self.alg.prepare(env, parameters.ppo.learning_rate_limits, graphs)
         self.trained_seconds = 0.0
-
-    def scheduled(self, part: float) -> tuple[list[float], dict[str, float]]:
-        """
-        Values of the schedule after a fraction of the iterations.
-
-        Returns:
-            list of desired KL, entropy weight, bounds of the standard deviations of tilt and
-            thrust actions, severity of disturbances, depth limit; and factors of the reward
-            weights by term.
-
-        """
-        s = self.parameters.schedule
-        done = float(np.clip((part - s.begin) / max(s.end - s.begin, 1e-9), 0.0, 1.0))
-
-        def at(span):
-            return float(span[0] + done * (span[1] - span[0]))
-
-        factors = {term: at(getattr(s, name)) for name, terms in SCHEDULED.items()
-                   for term in terms}
-        return [at(s.kl), at(s.entropy), at(s.tilt_std_limit), at(s.thrust_std_limit),
-                at(s.severity), at(s.depth_limit)], factors
 
     def apply_schedule(self, part: float) -> None:
         """Set optimiser and environment to the schedule after a fraction of the iterations."""
-        values, factors = self.scheduled(part)
-        self.alg.scheduled.copy_(torch.tensor(values[:4]))
-        self.env.severity.fill_(values[4])
-        self.env.depth_limit.fill_(values[5])
-        weights = [factors.get(name, 1.0) for name in rewards.TERMS]
-        self.env.weights.copy_(self.env.base_weights * torch.tensor(
-            weights, device=self.env.device))
+        s, env = self.parameters.schedule, self.env
+        done = float(np.clip((part - s.begin) / max(s.end - s.begin, 1e-9), 0.0, 1.0))
+
+        def at(name):
+            first, last = getattr(s, name)
+            return float(first + done * (last - first))
+
+        self.alg.scheduled.copy_(torch.tensor([
+            at(name) for name in ('kl', 'entropy', 'tilt_std_limit', 'thrust_std_limit')]))
+        env.severity.fill_(at('severity'))
+        env.depth_limit.fill_(at('depth_limit'))
+        factors = {term: at(name) for name, terms in SCHEDULED.items() for term in terms}
+        env.weights.copy_(env.base_weights * torch.tensor(
+            [factors.get(name, 1.0) for name in rewards.TERMS], device=env.device))
 
     def train(self, progress: Callable[[dict], None] = lambda row: None,
               stop_after: float | None = None) -> None:
-        """
-        Run the remaining iterations.
-
-        Args:
-            progress: called with a row of numbers every ``log_every`` iterations.
-            stop_after: duration after which training stops early [s].
-
-        """
-        p, writer = self.parameters, self._writer()
+        """Run the remaining iterations, or stop after a time [s]; report rows of numbers."""
+        p = self.parameters
+        writer = SummaryWriter(str(self.folder)) if self.folder else None
         if self.is_distributed:
             self.alg.broadcast_parameters()
         before, began, first = self.trained_seconds, time.monotonic(), \
@@ -154,9 +135,10 @@ class Runner(OnPolicyRunner):
                 self.checkpoint()
             if report:
                 row = self._row(elapsed, done - first)
-                self._write(writer, row)
+                for name, value in row.items() if writer else ():
+                    writer.add_scalar(name if '/' in name else f'train/{name}', value, done)
                 progress(row)
-                if stop_after is not None and self._rank_zero_decision(elapsed > stop_after):
+                if stop_after is not None and self._stops(elapsed > stop_after):
                     break
         if self.folder:
             self.checkpoint()
@@ -172,13 +154,7 @@ class Runner(OnPolicyRunner):
         return path
 
     def resume(self, path: Path) -> None:
-        """
-        Continue from a checkpoint.
-
-        Raises:
-            ParameterError: unreadable file, or a checkpoint of another network or robot.
-
-        """
+        """Continue from a checkpoint; ParameterError if it is another network's or robot's."""
         try:
             saved = torch.load(str(path), map_location=str(self.env.device), weights_only=True)
             group, ours = (optimizer['param_groups'][0] for optimizer in (
@@ -200,35 +176,16 @@ class Runner(OnPolicyRunner):
         self.trained_seconds = float(infos.get('seconds', 0.0))
         self.alg.set_rate(rate)
 
-    def _configure_multi_gpu(self):
-        """As rsl-rl, but with several processes on a CPU for tests."""
-        world = int(os.environ.get('WORLD_SIZE', '1'))
-        if world == 1 or torch.device(self.device).type != 'cpu':
-            super()._configure_multi_gpu()
-            return
-        self.gpu_world_size, self.is_distributed = world, True
-        self.gpu_local_rank = int(os.environ.get('LOCAL_RANK', '0'))
-        self.gpu_global_rank = int(os.environ.get('RANK', '0'))
-        self.cfg['multi_gpu'] = {'global_rank': self.gpu_global_rank, 'world_size': world,
-                                 'local_rank': self.gpu_local_rank}
-        torch.distributed.init_process_group('gloo', rank=self.gpu_global_rank, world_size=world)
-
-    def close(self) -> None:
-        """Leave the process group."""
-        if self.is_distributed and torch.distributed.is_initialized():
-            torch.distributed.destroy_process_group()
-
-    def _rank_zero_decision(self, decision: bool) -> bool:
+    def _stops(self, late):
         """Decision of rank 0 for all, because clocks differ and a lone stop blocks the others."""
-        if not self.is_distributed:
-            return decision
-        flag = torch.tensor(float(decision), device=self.env.device)
-        torch.distributed.broadcast(flag, src=0)
+        flag = torch.tensor(float(late), device=self.env.device)
+        if self.is_distributed:
+            torch.distributed.broadcast(flag, src=0)
         return bool(flag)
 
     def _check_finite(self):
         if not torch.isfinite(self.alg.losses).all():
-            raise FloatingPointError(
+            raise RunError(
                 f'iteration {self.current_learning_iteration}: the loss is not finite; try a '
                 'lower ppo.learning_rate, and resume from the last checkpoint'
                 + (f' in {self.folder}' if self.folder else ''))
@@ -239,20 +196,7 @@ class Runner(OnPolicyRunner):
         std = self.alg.std.tolist()
         samples = iterations * self.parameters.ppo.steps * self.env.num_envs * self.gpu_world_size
         return {'iteration': self.current_learning_iteration, 'seconds': seconds,
-                'samples_per_second': samples / max(seconds, 1e-9), **tally,
+                'samples_per_second': samples / seconds, **tally,
                 'value_loss': value, 'surrogate_loss': surrogate, 'entropy': entropy,
                 'divergence': divergence, 'learning_rate': float(self.alg.rate),
                 'tilt_std': sum(std[:4]) / 4, 'thrust_std': sum(std[4:]) / 4}
-
-    def _writer(self):
-        if self.folder is None:
-            return None
-        from torch.utils.tensorboard import SummaryWriter
-        return SummaryWriter(str(self.folder))
-
-    def _write(self, writer, row):
-        if writer:
-            for name, value in row.items():
-                if name != 'iteration':
-                    group = name if '/' in name else f'train/{name}'
-                    writer.add_scalar(group, value, row['iteration'])

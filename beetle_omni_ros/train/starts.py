@@ -1,4 +1,12 @@
-"""Random initial states, targets and differences between robots, for a whole batch."""
+"""
+Random initial states, targets and differences between robots, and replay of missed targets.
+
+A trained policy misses about one target in a thousand. Such situations are too rare in training to
+improve the policy. The environment therefore keeps, for every robot, the state at the start of its
+present target. If the target is missed, this state is stored. A fraction of the next episodes
+begin with stored states, until these are flown well. This is prioritised sampling of initial
+states, similar to that of steps in T. Schaul et al., Prioritized experience replay (2016).
+"""
 
 import numpy as np
 import torch
@@ -13,23 +21,20 @@ from beetle_omni_ros.train.model import (
     delay_intervals,
     nominal_body,
 )
-from beetle_omni_ros.train.parameters import TrainParameters
+from beetle_omni_ros.train.parameters import STRATA, TrainParameters
 
-STRATA = ('wound_back', 'level', 'wound', 'mixed', 'hover', 'hold', 'moving')
 NEAR_POSITION, NEAR_ANGLE = 0.3, 0.6   # [m], [rad] of a target near the present pose
 HISTORY = 2     # stored periods of commands and tilts
 LEAST = 0.2     # smallest drawn quantity of an actuator, as a fraction of the smallest measured
 PAYLOAD_DEPTH = 0.08                   # [m] below base_link, as in the simulated plant
+MISSED_POSITION, MISSED_ATTITUDE = 0.10, 0.10     # [m], [rad] at the end of a target's time
+MISSED_DEPTH = 0.3                                # [m] below both start and target, in between
+FULL = 0.01          # fraction of the robots with a stored state at which all replays happen
+FORGET_FLOWN, FORGET_MISSED = 0.5, 0.1            # probability of deletion after a replay
 
 
 def latencies(parameters: TrainParameters, robot: RobotParameters) -> list[list[float]]:
-    """
-    Ranges of the delays of tilt and thrust commands, of the velocity and of the tilts [s].
-
-    Raises:
-        ParameterError: a delay with the robot file's effects exceeds the stored history.
-
-    """
+    """Ranges of the delays of tilt and thrust commands, of the velocity and of the tilts [s]."""
     r, (tilt, thrust) = parameters.random, robot.command_delays
     made, most = [], HISTORY * parameters.episode.period
     for name, span, more in (('tilt commands', r.command_latency, tilt),
@@ -45,13 +50,7 @@ def latencies(parameters: TrainParameters, robot: RobotParameters) -> list[list[
 
 class Starts:
     """
-    Random initial states of robots; the stratum of a robot follows from its index.
-
-    Args:
-        parameters: training parameters.
-        robot: nominal robot.
-        count: N robots.
-        device: torch device.
+    Random initial states of N robots; the stratum of a robot follows from its index.
 
     Attributes:
         severity: () factor on forces and payloads of new robots, set by the schedule.
@@ -195,3 +194,75 @@ class Starts:
                 'noise': noise, 'bias': bias, 'delays': delays, 'extrapolated': extrapolated,
                 'pushed': pushed.float(),
                 'disturbed': disturbed, 'estimate': torch.zeros_like(wrench)}
+
+
+class Replays:
+    """
+    Store with one place for each robot; its content is in the environment's state.
+
+    Args:
+        state: (N, ...) tensors by name, to which the entries of the store are added:
+            'target_start' and 'stored' (N, K), 'filled' and 'source' (N,).
+        share: largest fraction of the new episodes that begin with a stored state.
+        steps: duration of a replayed target in steps.
+
+    """
+
+    def __init__(self, state: dict[str, torch.Tensor], share: float, steps: float):
+        self._parts = {name: value.shape[1:] for name, value in state.items()}
+        self._share, self._steps = share, steps
+        packed = self._packed(state)
+        state |= {'target_start': packed, 'stored': packed.clone(),
+                'filled': torch.zeros_like(packed[:, 0]),
+                'source': torch.full_like(packed[:, 0], -1.0)}
+
+    def _packed(self, state):
+        return torch.cat([state[name].reshape(len(state[name]), -1) for name in self._parts], -1)
+
+    def unpacked(self, packed: torch.Tensor) -> dict[str, torch.Tensor]:
+        """States (N, ...) by name, from stored ones (N, K)."""
+        sizes = [shape.numel() for shape in self._parts.values()]
+        return {name: part.reshape(-1, *shape)
+                for (name, shape), part in zip(self._parts.items(), packed.split(sizes, -1))}
+
+    def step(self, s: dict, new: dict, fresh: dict, ends: dict, draw: batch.Draw) -> None:
+        """
+        Store missed states, delete flown ones, and choose the robots that begin with a stored one.
+
+        Args:
+            s: state before the step.
+            new: state after the step, with new targets; completed, with robots reset.
+            fresh: new robots.
+            ends: (N,) bool 'due' (time of the target is over), 'done' (end of the episode),
+                'missed' (target or robot lost, if this can be judged).
+            draw: source of random numbers, three for each robot.
+
+        """
+        over, replayed = ends['due'] | ends['done'], s['source'] >= 0
+        chance, pick, choice = draw.uniform(3).unbind(-1)
+        judged = replayed & (ends['due'] | ends['missed'])
+        drop = judged & (chance < torch.where(ends['missed'], FORGET_MISSED, FORGET_FLOWN))
+        place = s['source'].clamp(min=0).long()
+        dropped = torch.zeros_like(s['filled']).scatter_add(0, place, drop.float())
+        keep = ends['missed'] & ~replayed
+        stored = torch.where(keep[:, None], s['target_start'], s['stored'])
+        filled = torch.where(keep, 1.0, torch.where(dropped > 0, 0.0, s['filled']))
+        upto = filled.cumsum(0)
+        count = upto[-1]
+        share = self._share * (count / (FULL * len(filled))).clamp(max=1.0)
+        chosen = ends['done'] & (choice < share)
+        place = torch.searchsorted(upto, pick * count, right=True).clamp(max=len(filled) - 1)
+        again = self.unpacked(stored[place])
+        again['age'] = torch.zeros_like(again['age'])
+        again['target_left'] = torch.full_like(again['target_left'], self._steps)
+        for name in self._parts:
+            start = torch.where(spread(chosen, again[name]), again[name], fresh[name])
+            new[name] = torch.where(spread(ends['done'], start), start, new[name])
+        source = torch.where(chosen, place.float(), torch.where(over, -1.0, s['source']))
+        new.update(stored=stored, filled=filled, source=source, target_start=torch.where(
+            over[:, None], self._packed(new), s['target_start']))
+
+
+def spread(mask: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
+    """Mask (N,) shaped to select rows of ``like`` (N, ...)."""
+    return mask.view(-1, *[1] * (like.dim() - 1))

@@ -10,7 +10,6 @@ import yaml
 
 from beetle_omni_ros.messages.bag_types import from_bytes, TYPESTORE
 from beetle_omni_ros.messages.topics import ALL
-from beetle_omni_ros.nodes import graph
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, ROTOR_NAMES
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.urdf import description, SHIPPED
@@ -96,16 +95,6 @@ def test_rviz_shows_topics_of_the_graph_with_a_quality_of_service_that_matches()
         assert not reliable or name in SHOWN or ALL[name].qos.reliable
         seen.add(display['Class'])
     assert seen == set(expected)
-
-
-def test_the_aggregator_has_one_group_for_each_node():
-    content = yaml.safe_load((VIEWERS / 'diagnostic_aggregator.yaml').read_text())
-    groups = [group for group in content['analyzers']['ros__parameters'].values()
-              if isinstance(group, dict)]
-    for node in graph.NODES:
-        found = [group for group in groups
-                 if any(node.startswith(prefix) for prefix in group['startswith'])]
-        assert len(found) == 1 or node == graph.GENERIC, node
 
 
 def test_a_bag_contains_the_frames_of_all_layouts(tmp_path):

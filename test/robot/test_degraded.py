@@ -4,14 +4,13 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY, Allocation, Allocator
+from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY, Allocator
 from beetle_omni_ros.robot.degraded import (
     allocator,
     DegradedAllocator,
     Holding,
     leaned,
     LocalWeights,
-    sphere,
     up,
 )
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -32,7 +31,7 @@ def stuck(joint, angle):
     return ActuatorHealth(stuck=tuple(angle if i == joint else None for i in range(4)))
 
 
-KINDS = [*[lost(i) for i in range(4)], *[stuck(i, 0.9 * i - 1.2) for i in range(4)], stuck(2, 3.5)]
+KINDS = [lost(0), lost(3), stuck(1, -0.3), stuck(2, 3.5)]
 
 
 def draws(count, seed):
@@ -113,18 +112,6 @@ def test_solutions_near_the_present_tilts_respect_range_and_health(health):
         assert np.all(np.abs(got.tilt - present) <= WEIGHTS.tilt_reach + 1e-9)
 
 
-def test_near_a_solution_the_tilts_do_not_change():
-    health = lost(3)
-    ours = allocator(ROBOT, health)
-    attitude = rotations.from_rpy(0.25, 0.25, 0.0)
-    aim = ours.hover(attitude, np.zeros(4))
-    force = ours.weight @ rotations.matrix(attitude)
-    got = ours.allocate_near(force, np.zeros(3), aim.tilt,
-                             Allocation(aim.tilt, aim.thrust, aim.saturated), WEIGHTS)
-    np.testing.assert_allclose(got.tilt, aim.tilt, atol=1e-6)
-    np.testing.assert_allclose(got.thrust, aim.thrust, atol=1e-5)
-
-
 def test_a_rotor_stuck_at_a_thrust_is_compensated_by_the_others():
     ours = DegradedAllocator(ROBOT, ActuatorHealth(held=(None, 9.0, None, None)))
     for force, torque, present in draws(50, 5):
@@ -142,10 +129,6 @@ def holdings():
 
 def attitudes(count, seed=0):
     return [rotations.normalized(q) for q in np.random.default_rng(seed).normal(size=(count, 4))]
-
-
-def test_a_healthy_robot_holds_every_attitude(holdings):
-    assert holdings[ALL_HEALTHY].margins.min() > 0.0
 
 
 def test_with_a_rotor_lost_every_attitude_near_level_is_held_but_level_is_singular(holdings):
@@ -169,13 +152,7 @@ def test_an_attitude_with_margin_is_held_by_the_allocation(holdings, health):
             np.testing.assert_allclose(torque, 0.0, atol=0.01)
 
 
-def test_heading_does_not_change_the_margin(holdings):
-    for quaternion in attitudes(20):
-        turned = rotations.multiply(rotations.from_rpy(0, 0, 1.1), quaternion)
-        assert holdings[STUCK].margin(turned) == pytest.approx(holdings[STUCK].margin(quaternion))
-
-
-@pytest.mark.parametrize('health, margin', [(LOST, 1.0), (STUCK, 1.0), (LOST, 15.0)])
+@pytest.mark.parametrize('health, margin', [(STUCK, 1.0), (LOST, 15.0)])
 def test_the_nearest_attitude_has_the_margin_and_no_sample_is_nearer(holdings, health, margin):
     holding = holdings[health]
     best = min(margin, 0.8 * holding.margins.max())
@@ -185,16 +162,6 @@ def test_the_nearest_attitude_has_the_margin_and_no_sample_is_nearer(holdings, h
         firm = holding.directions[holding.margins >= best]
         least = np.arccos(np.clip((firm @ up(desired)).max(), -1, 1))
         assert rotations.geodesic_angle(got, desired) <= least + 1e-6
-
-
-def test_leaning_is_the_shortest_rotation():
-    for quaternion, direction in zip(attitudes(20), sphere(20)):
-        got = leaned(quaternion, direction)
-        np.testing.assert_allclose(up(got), direction, atol=1e-9)
-        assert rotations.geodesic_angle(got, quaternion) == pytest.approx(
-            np.arccos(np.clip(up(quaternion) @ direction, -1, 1)), abs=1e-6)
-    upside_down = leaned(LEVEL, np.array([0.0, 0.0, -1.0]))
-    np.testing.assert_allclose(up(upside_down), [0, 0, -1], atol=1e-9)
 
 
 @pytest.mark.parametrize('lost, up_now, rate, tilt', [

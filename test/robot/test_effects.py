@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from beetle_omni_ros.robot.effects import CATALOGUE, delaying
+from beetle_omni_ros.robot.effects import CATALOGUE
 
 
 # The response log's own terms (natural frequency, damping ratio, dead bands) and the numbers of
@@ -26,9 +26,3 @@ def test_a_declaration_is_complete_and_consistent(name):
         assert np.isnan(neutral).all() == bool(spec.number)
         assert np.all(np.isnan(neutral) | (neutral >= spec.low) & (neutral <= spec.high))
         assert spec.step > 0 and (spec.form or spec.typical > spec.smallest > 0)
-
-
-def test_delays_of_commands_and_readings_are_declared():
-    assert delaying('tilt') == ('command_latency', 'joint_command_latency')
-    assert delaying('thrust') == ('rotor_dead_time', 'command_latency')
-    assert delaying('imu', 'encoders') == ('joint_feedback_delay', 'imu_filter_lag')

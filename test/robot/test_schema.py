@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.robot import schema
-from beetle_omni_ros.robot.degraded import HoldingParameters
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import group, parameter, ParameterError, quoted
+from beetle_omni_ros.robot.schema import group, parameter, ParameterError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,19 +36,6 @@ def write(tmp_path, text):
     return path
 
 
-@dataclass(frozen=True, kw_only=True)
-class Longer(HoldingParameters):
-    """The parameters of a shipped file, and one more."""
-
-    rate: float = parameter(5.0, doc='rate', unit='Hz')
-
-
-def test_a_class_of_a_file_reads_the_shipped_one_or_another(tmp_path):
-    assert Longer.load().turn_rate == HoldingParameters.load().turn_rate
-    other = Longer.load(write(tmp_path, 'turn_rate: 3.0\nrate: 4.0\n'))
-    assert isinstance(other, Longer) and (other.turn_rate, other.rate) == (3.0, 4.0)
-
-
 def test_plain_and_ros_form_give_equal_parameters(tmp_path):
     plain = schema.load(Outer, write(tmp_path, 'mass: 2\ninner: {gain: 3}\n'))
     ros = schema.load(Outer, write(
@@ -63,7 +49,6 @@ def test_plain_and_ros_form_give_equal_parameters(tmp_path):
     ('mass: 2\nmas: 3\n', "key 'mas': unknown key; did you mean 'mass'?"),
     ('mass: 2\ninner: {gian: 3}\n', "key 'inner.gian': unknown key; did you mean 'gain'?"),
     ('mass: heavy\n', "key 'mass': expected a number [kg], found 'heavy'"),
-    ('mass: true\n', 'expected a number'),
     ('mass: 3038.6\n', "key 'mass': 3038.6 is outside 0.1 to 10 kg"),
     ('mass: .nan\n', 'is not finite'),
     ('mass: 2\noffset: [0, 0]\n', 'expected shape (3,), found (2,)'),
@@ -86,12 +71,9 @@ def test_a_mistake_is_named_with_file_and_key_in_one_line(tmp_path, text, messag
 
 @pytest.mark.parametrize('text, expected', [
     ('mass: ' + '[' * 30000 + '\n', 'too deep'),
-    ('mass: 0b_\n', 'not valid YAML'),
     ('mass: 2001-13-01\n', 'not valid YAML'),
     ('mass: *' + 'x' * 5000 + '\n', 'not valid YAML at line 1'),
     ('x' * 2_000_000, 'larger than'),
-    ('? ' + 'x' * 5000 + '\n: 1\n', 'unknown key'),
-    ('/**: {ros__parameters: 3}\n', 'expected a mapping'),
     ('extends: [1]\n', "key 'extends': expected the name of a file"),
     ('extends: robot.yaml\neffects: 3\n', "key 'effects': expected a mapping, found 3"),
     ('extends: robot.yaml\neffects: {thrust_coefficient: ' + 'x' * 9000 + '}\n',
@@ -106,13 +88,6 @@ def test_a_broken_robot_file_is_refused_in_one_bounded_line(tmp_path, text, expe
     assert '\n' not in message and len(message) < 1000 + len(str(path))
 
 
-def test_a_long_value_is_truncated_in_messages():
-    for value in ('x' * 10**6, list(range(10**6)), dict.fromkeys(range(99), 'y' * 500),
-                  'a\nb' * 999, b'\xff' * 9999):
-        assert len(quoted(value)) <= 200 and '\n' not in quoted(value)
-    assert quoted('heavy') == "'heavy'" and quoted([1, 2.5]) == '[1, 2.5]'
-
-
 @pytest.mark.parametrize('text, gain', [
     ('mass: 1\n', None), ('mass: 1\nperhaps: null\n', None),
     ('mass: 1\nperhaps: {gain: 2}\n', 2.0), ('mass: 1\nperhaps: {}\n', 1.0)])
@@ -121,29 +96,9 @@ def test_an_optional_group_may_be_absent(tmp_path, text, gain):
     assert (found and found.gain) == gain
 
 
-@pytest.mark.parametrize('text, message', [
-    ('mass: 1\nperhaps: 3\n', "key 'perhaps': expected a mapping"),
-    ('mass: 1\nperhaps: {gain: 11}\n', "key 'perhaps.gain': 11 is outside 0 to 10 1/s")])
-def test_a_mistake_in_an_optional_group_is_named(tmp_path, text, message):
-    with pytest.raises(ParameterError, match=message):
-        schema.load(Outer, write(tmp_path, text))
-
-
-def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(ParameterError, match='nowhere.yaml: cannot be read'):
-        schema.load(Outer, tmp_path / 'nowhere.yaml')
-
-
 def test_flatten_and_nest_invert_each_other():
     outer = Outer(mass=2.0, inner=Inner(gain=4.0))
     flat = {name: value for name, _, _, value in schema.flatten(outer)}
     again = schema.bind(Outer, schema.nest(flat))
-    assert again.mass == 2.0
-    assert again.inner == outer.inner
+    assert again.mass == 2.0 and again.inner == outer.inner
     assert set(flat) >= {'mass', 'inner.gain'}
-
-
-def test_array_defaults_are_not_shared():
-    first, second = Outer(mass=1.0), Outer(mass=1.0)
-    first.offset[0] = 9
-    assert second.offset[0] == 0

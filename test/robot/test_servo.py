@@ -8,7 +8,7 @@ import pytest
 
 from beetle_omni_ros.robot import native
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.servo import CASADI, NUMPY, play, Responses, Servo, Step
+from beetle_omni_ros.robot.servo import CASADI, NUMPY, Responses, Servo, Step
 
 torch = pytest.importorskip('torch')
 
@@ -30,7 +30,7 @@ def states(count=200, seed=0):
 
 @pytest.mark.parametrize('kind', KINDS)
 def test_numpy_casadi_torch_and_c_take_the_same_step(kind):
-    from beetle_omni_ros.train.codegen import torch_function
+    from beetle_omni_ros.train.physics import torch_function
     target, tilt, rate, load = states()
     expected = np.array(Step(NUMPY, KINDS[kind], 0.001)(target, tilt, rate, load))
     names = ca.SX.sym('x', 4)
@@ -40,28 +40,6 @@ def test_numpy_casadi_torch_and_c_take_the_same_step(kind):
     for found in (np.array(step.map(200)(rows)), np.array(native.compiled(step).map(200)(rows)),
                   torch_function(step)(torch.tensor(rows.T)).numpy().T):
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize('kind', KINDS)
-def test_numpy_and_casadi_have_the_same_acceleration(kind):
-    target, tilt, rate, load = states(seed=1)
-    expected = KINDS[kind].acceleration(NUMPY, target, tilt, rate, load)
-    x = ca.SX.sym('x', 4)
-    found = ca.Function('a', [x], [KINDS[kind].acceleration(CASADI, *ca.vertsplit(x))]).map(200)
-    np.testing.assert_allclose(np.array(found(np.stack([target, tilt, rate, load])))[0], expected,
-                               rtol=1e-12)
-
-
-def test_small_steps_agree_with_the_acceleration():
-    target, tilt, rate, load = states(seed=2)
-    inside = np.abs(rate) < 9
-    h = 1e-7
-    for kind in ('plain', 'friction'):
-        _, after = Step(NUMPY, KINDS[kind], h)(target, tilt, rate, load)
-        change = KINDS[kind].acceleration(NUMPY, target, tilt, rate, load)
-        sliding = inside & (np.abs(rate) > 1.0)     # the smooth friction is full there
-        np.testing.assert_allclose(((after - rate) / h)[sliding], change[sliding], rtol=3e-3,
-                                   atol=1.0)
 
 
 def test_a_step_is_of_second_order():
@@ -97,11 +75,6 @@ def test_a_load_beyond_the_motor_torque_moves_the_joint():
     assert rate == pytest.approx(-0.03 / servo.inertia * 1e-5)
 
 
-def test_backlash_follows_only_when_pushed():
-    driving = np.array([0.0, 0.05, 0.2, 0.15, -0.05])
-    np.testing.assert_allclose(play(driving, 0.1), [0.0, 0.0, 0.1, 0.1, 0.05])
-
-
 @pytest.mark.parametrize('name', ['measured', None])
 def test_a_drawn_robot_responds_within_the_limits_of_its_file(name):
     robot = RobotParameters.load(name)
@@ -112,16 +85,3 @@ def test_a_drawn_robot_responds_within_the_limits_of_its_file(name):
             (low, high), (least, most) = getattr(own, key), getattr(allowed, key)
             assert least - 1e-12 <= low <= high <= most + 1e-12, key
         assert own.friction <= allowed.friction
-
-
-def test_without_intervals_the_limits_are_the_numbers_of_file_and_effects():
-    robot = replace(RobotParameters.load(), intervals={}, effects={
-        'command_latency': {'delay': 0.01}, 'joint_command_latency': {'delay': 0.02},
-        'joint_feedback_delay': {'delay': 0.005}, 'rotor_lag': {'time_constant': 0.2},
-        'joint_friction': {'coulomb': 0.01, 'stiction': 0.02}})
-    found = Responses.of(robot)
-    expected = {'servo_lag': robot.joints.time_constant, 'servo_delay': 0.035, 'rotor_lag': 0.2,
-                'rotor_delay': 0.01}
-    for key, value in expected.items():
-        assert getattr(found, key) == pytest.approx((value, value))
-    assert found.friction == pytest.approx(0.02 / robot.joints.kp)

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.robot.parameters import RobotParameters, RotorMapRow
-from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.robot.thrust_map import duty_of_command, FULL_DUTY, STOP_DUTY, ThrustMap
+from beetle_omni_ros.robot.thrust_map import duty_of_command, FULL_DUTY, ThrustMap
 
 ROTORS = RobotParameters.load().rotors
 MAP = ThrustMap(ROTORS)
@@ -53,37 +52,12 @@ def test_interpolation_between_voltages_predicts_an_omitted_row():
                       - thrust).max() < 0.15
 
 
-def test_beyond_the_rows_voltage_is_clamped():
-    for outside, end in ((15.0, 21.4), (30.0, 25.09)):
-        assert MAP.duty(7.0, outside) == MAP.duty(7.0, end)
-        assert MAP.thrust_limit(outside) == MAP.thrust_limit(end)
-
-
 def test_saturation_is_reported_and_limited():
     thrust = np.array([0.0, 5.0, 21.0, 30.0])
     assert MAP.saturated(thrust, 21.4).tolist() == [False, False, True, True]
     assert MAP.saturated(thrust, 25.09).tolist() == [False, False, False, True]
     assert MAP.duty(30.0, 21.4) == MAP.duty(MAP.thrust_limit(21.4), 21.4) < FULL_DUTY
     assert MAP.thrust(FULL_DUTY, 21.4) == MAP.thrust_limit(21.4)
-
-
-def test_zero_thrust_stops_and_the_least_thrust_turns():
-    assert MAP.duty(0.0, 23.0) == STOP_DUTY
-    assert MAP.duty(-3.0, 23.0) == STOP_DUTY
-    assert MAP.duty(1e-6, 23.0) > 51.5
-    assert MAP.thrust(STOP_DUTY, 23.0) == 0
-
-
-def test_arrays_and_scalars_give_equal_results():
-    rng = np.random.default_rng(0)
-    voltage = rng.uniform(20, 26, (50, 1))
-    thrust = rng.uniform(0, 26, (50, 4))
-    duty = MAP.duty(thrust, voltage)
-    for k in range(50):
-        np.testing.assert_allclose(duty[k], MAP.duty(thrust[k], voltage[k, 0]), rtol=1e-12)
-        np.testing.assert_allclose(
-            MAP.thrust(duty[k], voltage[k, 0]),
-            np.minimum(thrust[k], MAP.thrust_limit(voltage[k, 0])), atol=1e-9)
 
 
 def bent(peak=False):
@@ -104,13 +78,3 @@ def test_a_falling_cubic_is_made_monotonic(peak):
     np.testing.assert_allclose(thrust_map.thrust(duty, 23.0), thrust, rtol=1e-6)
     cubic = np.polynomial.polynomial.polyval(thrust / 10, row.coefficients)
     assert np.all(np.abs(duty - np.maximum.accumulate(cubic)) < 2e-3)
-
-
-def test_an_unusable_map_is_refused():
-    with pytest.raises(ParameterError, match='at least one row'):
-        ThrustMap(replace(ROTORS, map=()))
-    with pytest.raises(ParameterError, match='two rows at one voltage'):
-        ThrustMap(replace(ROTORS, map=(ROTORS.map[0], ROTORS.map[0])))
-    steep = replace(ROTORS.map[0], thrust_max=60.0)
-    with pytest.raises(ParameterError, match='25.09 V: duty'):
-        ThrustMap(replace(ROTORS, map=(steep,)))

