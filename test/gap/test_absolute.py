@@ -10,7 +10,6 @@ from beetle_omni_ros.identify.gap import analysis
 from beetle_omni_ros.identify.gap.analysis import Analysis
 from beetle_omni_ros.identify.gap.noise import ceilings, channels_above_ceiling
 from beetle_omni_ros.identify.gap.rollouts import HORIZONS, Runs
-from beetle_omni_ros.identify.gap.verdict import disagreement
 
 MOTION = Motion(5, 20.0)
 
@@ -61,11 +60,3 @@ def test_a_name_needs_finite_free_runs_and_a_gain_on_held_out_flights(monkeypatc
                                                                       after, gain, words):
     why = refuted(monkeypatch, before, after, gain)
     assert words in why and bool(words) == bool(why)
-
-
-@pytest.mark.parametrize('gap, verdict', [(1.2, 'no_gap'), (80.0, 'unknown'),
-                                          (np.nan, 'unknown')])
-def test_no_gap_needs_free_runs_that_agree(gap, verdict):
-    a = Analysis(verdict='no_gap', problem=SimpleNamespace(p=P))
-    disagreement(a, gap)
-    assert a.verdict == verdict

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import yaml
 
-from beetle_omni_ros.identify.gap.apply import own_numbers, write_corrected
+from beetle_omni_ros.identify.gap.apply import write_corrected
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 ROBOT = RobotParameters.load()
@@ -48,9 +48,3 @@ def test_a_number_that_was_not_fitted_has_no_interval(tmp_path):
     assert written['parameters'] == {
         'kp': {'value': 0.33, 'interval': [0.32, 0.34], 'unit': 'N m/rad'},
         'kd': {'value': 0.0094, 'unit': 'N m s/rad'}}
-
-
-def test_a_named_value_has_precedence_over_its_tolerance():
-    assert 'joints' not in own_numbers(ROBOT, TOLERANCES, ['joint_bandwidth'])
-    heavy = replace(ROBOT, effects={'mass': {'mass': 3.2}})
-    assert 'mass' not in own_numbers(heavy, TOLERANCES)

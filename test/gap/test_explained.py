@@ -10,9 +10,8 @@ import pytest
 from beetle_omni_ros.identify.gap.candidates import Candidate, Trial
 from beetle_omni_ros.identify.gap.fit import Problem, State
 from beetle_omni_ros.identify.gap.gates import at_bound, confirmed, cross_validate
-from beetle_omni_ros.identify.gap.keys import all_keys, THRUST_BUS, TILT_BUS, tolerances
+from beetle_omni_ros.identify.gap.keys import all_keys, tolerances
 from beetle_omni_ros.identify.gap.search import Search
-from beetle_omni_ros.identify.inference.prior import Prior
 
 LAG, OTHER = 'rotor_lag.time_constant', 'inertia.inertia[0]'
 
@@ -31,66 +30,6 @@ class Straight(Problem):
     def residual(self, theta):
         return self.noise + self.columns @ [theta.get(LAG, 0.0) - self.truth,
                                             theta.get(OTHER, 0.0)]
-
-
-class Curved(Straight):
-    """The same with derivatives that are too large by two, so that each step is halved."""
-
-    def learn_noise(self, wide, rounds=3):
-        theta = getattr(self, 'at', {})
-        return State(dict(theta), self.residual(theta), 2 * self.columns, [LAG, OTHER])
-
-    def state(self, theta, names):
-        self.at = theta
-
-    def smooth_tilts(self, theta):
-        pass
-
-    def update_residual(self, theta):
-        self.at = theta
-
-
-def test_a_slowly_converging_fit_leaves_no_gain_for_other_candidates():
-    problem = Curved(0.25, 0.0)
-    search = Search.__new__(Search)
-    search.p = P
-    search.problem, search.always, search.wide, search.names = problem, [LAG, OTHER], {}, []
-    state, cost = search._fit_with_noise({}, [])
-    _, again = problem.refine(state, search.always, frozenset(), 10)
-    assert cost - again < 1.0
-
-
-class Rough(Straight):
-    """Two linear tolerances and a friction with a wrong derivative."""
-
-    FRICTION = 'joint_friction.coulomb'
-
-    def residual(self, theta):
-        rubbed = 100.0 + 1e7 * abs(theta.get(self.FRICTION, 0.0) - 0.005)
-        return np.append(super().residual(theta), rubbed)
-
-    def slopes(self, theta, names):
-        made = np.zeros((2001, len(names)))
-        made[2000] = [1e7 if name == self.FRICTION else 0.0 for name in names]
-        return made
-
-    def start(self):
-        """State with the right friction and a derivative of the wrong sign."""
-        theta, names = {self.FRICTION: 0.005}, [LAG, OTHER, self.FRICTION]
-        slopes = self.slopes(theta, names)
-        slopes[:2000, :2] = self.columns
-        return State(theta, self.residual(theta), slopes, names)
-
-
-@pytest.mark.parametrize('split', [False, True])
-def test_an_inaccurate_derivative_does_not_slow_the_other_parameters(split):
-    problem = Rough(0.02, 0.0)
-    start, free = problem.start(), frozenset({Rough.FRICTION})
-    state, cost = problem.refine(start, [LAG, OTHER, Rough.FRICTION], free, 5, split)
-    assert state.theta[Rough.FRICTION] == 0.005
-    assert (cost < float(start.r @ start.r) - 100.0) == split
-    if split:
-        assert state.theta[LAG] == pytest.approx(0.02, abs=0.005)
 
 
 def before(truth, overlap=0.0):
@@ -118,18 +57,6 @@ def test_a_lag_is_not_absorbed_by_the_tolerance_of_another_parameter():
 def test_a_lag_within_tolerance_is_absorbed():
     fitted, believable = before(0.05)
     assert believable == fitted
-
-
-@pytest.mark.parametrize('x, expected', [(0.02, 0.02), (0.2, 0.09), (-0.2, -0.09)])
-def test_a_prior_has_a_plausible_range(x, expected):
-    assert Prior(0.03).within(x, P.beyond) == pytest.approx(expected)
-
-
-def test_a_search_range_extends_beyond_its_plausible_range():
-    prior = Prior(5e-4, 0.010, 0.005, 0.003)
-    assert prior.within(0.004, P.beyond) == 0.004
-    assert prior.within(0.02, P.beyond) == pytest.approx(0.0065)
-    assert prior.within(-0.02, P.beyond) == pytest.approx(-0.0115)
 
 
 @pytest.mark.parametrize('gain, left, agreement, prior_gain, named', [
@@ -184,14 +111,6 @@ def test_no_command_acts_before_its_stamp(name):
     assert at_bound(KEYS, trial, (-0.002, 0.01)) and not at_bound(KEYS, trial, (0.0, 0.0))
 
 
-@pytest.mark.parametrize('name', [
-    'axial_inflow.per_rotor', 'rotor_drag.coefficient', 'body_drag.coefficient',
-    'ground_effect.gain_at_0.25m', 'translational_lift.per_rotor',
-    'tilt_thrust_loss.loss_at_60deg', 'joint_friction.coulomb', 'joint_backlash.gap'])
-def test_an_effect_of_one_sign_stays_on_its_side(name):
-    assert KEYS[name].low == 0.0 < KEYS[name].high
-
-
 def test_an_effect_of_the_robot_file_may_be_fitted_to_zero():
     own = all_keys(replace(ROBOT, effects={'rotor_drag': {'coefficient': 0.8}}))
     key = 'rotor_drag.coefficient'
@@ -201,23 +120,6 @@ def test_an_effect_of_the_robot_file_may_be_fitted_to_zero():
     dead = Trial(Candidate('rotor_thrust_coefficient', (weak,), label='x'), 1.0,
                  {weak: KEYS[weak].low})
     assert at_bound(KEYS, dead)
-
-
-def test_a_reading_may_be_newer_than_in_the_robot_file():
-    late = all_keys(replace(ROBOT, effects={'joint_feedback_delay': {'delay': 0.01}}))
-    key = 'joint_feedback_delay.delay'
-    trial = Trial(Candidate('joint_feedback_delay', (key,), label='late'), 100.0, {key: -0.004})
-    assert not at_bound(late, trial) and at_bound(KEYS, trial)
-
-
-@pytest.mark.parametrize('tilt, thrust, usual', [
-    (0.0, 0.0, True), (0.004, -0.009, True), (-0.009, 0.004, True), (0.011, 0.0, False),
-    (0.0, 0.011, False), (-0.014, 0.0, False)])
-def test_each_bus_has_its_own_range_of_delay(tilt, thrust, usual):
-    priors = tolerances(P)
-    beyond = [abs(priors[name].residual(x)) for name, x in
-              ((TILT_BUS, tilt), (THRUST_BUS, thrust))]
-    assert (max(beyond) < 5.0) == usual
 
 
 class Capped(Problem):

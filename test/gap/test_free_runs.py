@@ -1,14 +1,12 @@
 """Free runs: simulation from measured states."""
 
-from flights import model, Motion, P
+from flights import model, Motion
 import numpy as np
 import pytest
 
-from beetle_omni_ros.identify.gap.noise import Noise
-from beetle_omni_ros.identify.gap.rollouts import _servo_runs, free_runs
+from beetle_omni_ros.identify.gap.rollouts import _servo_runs
 
 GAP = 0.04
-STATES = {'position': 0, 'velocity': 1, 'orientation': 2, 'rate': 3, 'joint': 4}
 
 
 @pytest.fixture(scope='module')
@@ -30,10 +28,3 @@ def test_rotors_follow_their_servos_through_backlash(made):
     turning = one_way & (np.abs(tight[:, -1] - tight[:, 0]) > GAP)  # touches a side
     assert turning.sum() > 20
     np.testing.assert_allclose(np.abs(loose - tight)[:, -1][turning], GAP / 2, atol=2e-3)
-
-
-def test_joints_with_backlash_are_predicted_as_well_as_without(made):
-    noise = Noise.white(P)
-    error = {gap: free_runs(made, {'joint_backlash.gap': gap}, noise).error[..., STATES['joint']]
-             for gap in (0.0, GAP)}
-    np.testing.assert_array_equal(error[GAP], error[0.0])   # encoders are before the backlash

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.identify.gap.bags import Recording
-from beetle_omni_ros.identify.gap.ingest import load_flight, prepare, UnusableFlight
+from beetle_omni_ros.identify.gap.ingest import prepare, UnusableFlight
 from beetle_omni_ros.identify.gap.noise import Noise
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.series import LEAST_SAMPLES, shortest_flight
-from beetle_omni_ros.runs.bag import BagError
 
 
 def recording(duration=16.0):
@@ -51,19 +50,6 @@ def test_a_missing_topic_is_named(topic):
     refused(cut(recording(), topic, slice(0, 0)), topic, 'missing')
 
 
-def test_a_clock_that_jumps_back_is_named_with_its_topic():
-    made = recording()
-    made.times['mocap/pose'] = made.times['mocap/pose'] - 5.0 * (made.times['mocap/pose'] > 8)
-    refused(made, 'mocap/pose', 'clock goes back by')
-
-
-def test_many_stamps_that_occur_twice_are_refused():
-    made = recording()
-    times = made.times['imu/data_raw']
-    made.times['imu/data_raw'] = times[np.arange(len(times)) // 2 * 2]
-    refused(made, 'imu/data_raw', 'twice')
-
-
 def test_long_sensor_gaps_are_refused_and_short_ones_cut_out():
     made = recording()
     t = made.times['imu/data_raw']
@@ -76,13 +62,6 @@ def test_long_sensor_gaps_are_refused_and_short_ones_cut_out():
     t = made.times['joint_states']
     flight = prepare(cut(made, 'joint_states', (t < 6) | (t > 6.4)), ROBOT, P)
     assert flight.start > 6 and flight.findings
-
-
-def test_a_recording_that_is_too_short_is_refused():
-    made = recording()
-    for topic, t in made.times.items():
-        cut(made, topic, t < 4)
-    refused(made, 's of usable flight')
 
 
 def test_a_recording_shorter_than_the_filters_is_refused_for_any_setting():
@@ -111,20 +90,9 @@ def test_the_file_of_another_robot_is_detected():
         prepare(recording(), replace(ROBOT, mass=0.25 * ROBOT.mass), P)
 
 
-def test_a_clipped_accelerometer_is_detected():
-    made = recording()
-    made.values['imu/data_raw'][:, :3] *= 3
-    refused(made, 'imu/data_raw', 'linear acceleration is 3 times')
-
-
 def test_nan_readings_are_omitted_and_counted():
     made = recording()
     made.values['imu/data_raw'][100:104] = np.nan
     flight = prepare(made, ROBOT, P)
     assert any('4 messages' in text for text in flight.findings)
     assert np.isfinite(flight.imu).all()
-
-
-def test_a_missing_bag_is_refused_in_one_line(tmp_path):
-    with pytest.raises(BagError, match='no such bag'):
-        load_flight(tmp_path / 'nothing', ROBOT, P)

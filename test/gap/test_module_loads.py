@@ -6,13 +6,11 @@ from flights import Motion, P, ROBOT
 import numpy as np
 import pytest
 
-from beetle_omni_ros.identify.gap.keys import all_keys
 from beetle_omni_ros.identify.gap.servo import module_load, simulate, undescribed_load, Windows
 from beetle_omni_ros.identify.gap.signals import Signals
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 DESCRIBED, MOTION = RobotParameters.load(), Motion()
-KEYS = ('module_reaction.module_inertia', 'module_reaction.mass_moment')
 
 
 def test_undescribed_modules_load_joints_as_described_ones_of_equal_moment_and_inertia():
@@ -30,13 +28,6 @@ def test_described_module_loads_are_not_counted_twice():
     flight = MOTION.flight()
     assert undescribed_load(Signals(flight, DESCRIBED, P), {}) == ()
     assert not module_load(Signals(flight, ROBOT, P), {}).any()
-
-
-@pytest.mark.parametrize('robot, groups', [(ROBOT, 'BJ'), (DESCRIBED, 'B')],
-                         ids=['undescribed', 'described'])
-def test_the_module_reaction_is_identified_from_joints_without_other_loads(robot, groups):
-    keys = all_keys(robot)
-    assert [keys[name].groups for name in KEYS] == [groups, groups]
 
 
 @pytest.mark.parametrize('sets, base, moment', [

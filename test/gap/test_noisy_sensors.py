@@ -2,14 +2,10 @@
 
 from dataclasses import replace
 
-from flights import KEYS, model, Motion, P, ROBOT, solved
+from flights import model, Motion, P, ROBOT, solved
 import numpy as np
 import pytest
 
-from beetle_omni_ros.identify.gap.candidates import Candidate, Found, Trial
-from beetle_omni_ros.identify.gap.fit import State
-from beetle_omni_ros.identify.gap.keys import tolerances
-from beetle_omni_ros.identify.gap.search import Search
 from beetle_omni_ros.identify.gap.servo import simulate, Windows
 
 MOTION = Motion(7)
@@ -40,15 +36,6 @@ def test_derivatives_by_a_delay_contain_no_encoder_noise(name):
     assert rms(slopes[1] - slopes[0]) < 0.02 * rms(clean)
 
 
-def test_an_outdated_derivative_does_not_explain_noise():
-    made = model(noisy(0.02))
-    slope = made.slopes({}, [DELAY])['J'].ravel()
-    for moved in (-0.004, 0.004):
-        rest = made.residual({DELAY: moved}, 'J')['J'].ravel() - slope * moved
-        gain = (slope @ rest)**2 / (slope @ slope)
-        assert gain < 0.01 * rest @ rest
-
-
 def test_the_delay_of_noisy_encoders_is_recovered():
     found = solved(model(noisy(0.02, joint_delay=0.012)), [DELAY], 'J')
     assert found[DELAY] == pytest.approx(0.012, abs=1e-3)
@@ -71,70 +58,10 @@ def test_tilts_follow_the_servo_model_if_encoders_are_noisy():
     assert rms(after[1][inside]) < 0.05 * rms(before[1][inside])
 
 
-def test_slow_errors_of_the_servo_model_are_corrected_by_the_encoders():
-    made = model(noisy(0.02))
-    made.smooth_tilts({})
-    made.signals.use_model_tilts(made.signals.model_tilts + 0.1)
-    error = made.signals.joints({})[0] - at(made, MOTION.tilt)
-    assert rms(error[100:-150]) < 0.01
-
-
-def test_tilts_follow_good_encoders():
-    made = model(noisy(4e-4))
-    made.smooth_tilts({})
-    assert made.signals.model_tilts is None
-
-
 def test_velocity_follows_the_imu_if_positions_are_noisy():
     errors = [rms((made.signals.pose({})[2] - at(made, MOTION.velocity))[100:-100])
               for made in (model(noisy(position=0.006)), model(noisy(position=0.0035)))]
     assert errors[0] < 0.012 < errors[1]    # the less noisy one is what positions alone give
-
-
-def test_inertia_of_a_servo_is_the_inverse_of_its_gains():
-    k, shape = 400, (1, 1, 4)
-    zero = np.zeros((k, 1, 4))
-    windows = Windows(zero[0], zero[0], zero, zero, zero, P.servo_step, 0, 8)
-    target = np.full((2, k, *shape[1:]), 0.3)
-    heavy, soft = simulate(ROBOT, windows, target, [
-        {'swing.ratio': 0.2}, {'joint_bandwidth.kp': -0.2, 'joint_bandwidth.kd': -0.2}], 0.0)
-    same = simulate(ROBOT, windows, target[:1], [{}], 0.0)[0]
-    assert heavy == pytest.approx(soft, abs=1e-12)
-    assert np.abs(heavy - same).max() > 0.005
-
-
-def test_module_inertia_may_exceed_that_of_the_servo():
-    prior = tolerances(P, swing=0.28)['swing.ratio']
-    assert abs(prior.residual(0.25)) < 1 < abs(prior.residual(0.4))
-    assert abs(tolerances(P)['swing.ratio'].residual(0.25)) > 2
-
-
-def pruned(monkeypatch, name, value, loss):
-    """Number of remaining entries after pruning one whose removal costs ``loss`` of chi2."""
-    trial = Trial(Candidate(name.split('.')[0], (name,), label=name), 99.0, {name: value})
-    search = Search.__new__(Search)
-    search.p = P
-    search.problem = type('Problem', (), {'keys': KEYS, 'priors': {},
-                                          'residual': lambda self, theta: np.zeros(1),
-                                          'prior_cost': lambda self, theta, free: 0.0})()
-    state = State(dict(trial.theta), np.zeros(1), np.zeros((1, 0)), [])
-    monkeypatch.setattr(search, '_refit', lambda start, rest, n: (start, 100.0 + loss),
-                        raising=False)
-    monkeypatch.setattr(search, '_fit_with_noise', lambda theta, rest: (state, 100.0),
-                        raising=False)
-    found = Found(accepted=[trial])
-    search._prune(found, state, 100.0)
-    return len(found.accepted)
-
-
-@pytest.mark.parametrize('loss, kept', [(3.0, 0), (300.0, 1)])
-def test_a_single_step_is_dropped_if_the_fit_does_not_worsen(monkeypatch, loss, kept):
-    assert pruned(monkeypatch, 'rotor_drag.coefficient', 0.4, loss) == kept
-
-
-@pytest.mark.parametrize('value, kept', [(0.004, 1), (-0.012, 0)])
-def test_an_effect_that_the_joint_fit_excludes_is_dropped(monkeypatch, value, kept):
-    assert pruned(monkeypatch, 'joint_feedback_delay.delay', value, 300.0) == kept
 
 
 def test_each_rotor_may_have_a_lag_of_its_own():

@@ -1,6 +1,5 @@
 """Damaged recordings are refused with topic, cause and time."""
 
-import struct
 import warnings
 
 import numpy as np
@@ -9,7 +8,6 @@ from recordings import columns, kept, late_half, recording, ROBOT, turned_pose
 from scipy.signal import step as step_response
 from scipy.spatial.transform import Rotation, Slerp
 
-from beetle_omni_ros.identify.gap.bags import read_recording
 from beetle_omni_ros.identify.gap.ingest import prepare, UnusableFlight
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.recording.actuator_conventions import thrust_damages
@@ -17,8 +15,6 @@ from beetle_omni_ros.identify.recording.check import damages, repaired
 from beetle_omni_ros.identify.recording.limits import RecordingLimits
 from beetle_omni_ros.identify.recording.motion import Motion
 from beetle_omni_ros.identify.recording.readings import reading_damages
-from beetle_omni_ros.messages import bag_types
-from beetle_omni_ros.runs.bag_writer import BagWriter
 
 P = GapParameters.load()
 IMU, POSE, JOINTS, COMMAND = 'imu/data_raw', 'mocap/pose', 'joint_states', 'command'
@@ -348,34 +344,3 @@ def test_a_repair_restores_the_sound_recording(kind):
                               fixed.values[topic][order, k])
             error = np.abs(np.abs(again) - np.abs(column[inside]))
             assert np.median(error) < 1e-3 + 0.03 * np.std(column), (topic, k)
-
-
-def test_without_repair_the_recording_is_unchanged():
-    made = KINDS['degrees per second'][0](recording())
-    before = {topic: v.copy() for topic, v in made.values.items()}
-    repaired(made, ROBOT)
-    for topic, values in before.items():
-        assert np.array_equal(made.values[topic], values)
-
-
-def test_reading_all_messages_at_once_equals_reading_each(tmp_path, monkeypatch):
-    with BagWriter(tmp_path / 'bag') as bag:
-        for k in range(60):
-            bag.write_raw(f'/{IMU}', 'sensor_msgs/msg/Imu', _imu_bytes(k), 0.1 * k + 1.0)
-    at_once = read_recording(tmp_path / 'bag')
-    monkeypatch.setattr(bag_types, 'LAYOUTS', 0)
-    one_by_one = read_recording(tmp_path / 'bag')
-    for part in ('times', 'values', 'received'):
-        assert np.array_equal(getattr(at_once, part)[IMU], getattr(one_by_one, part)[IMU])
-    assert at_once.values[IMU][7] == pytest.approx([7.0, 8.0, 9.0, 4.0, 5.0, 6.0])
-
-
-def _imu_bytes(k):
-    """CDR of an IMU message: header, orientation, rates (k - 3 ...), forces (k ...)."""
-    head = struct.pack('<4xiII', 1_780_000_000 + k, 5_000, 10) + b'base_link\0'
-    head = b'\0\1\0\0' + head[4:]
-    head += b'\0' * (-(len(head) - 4) % 8)
-    rates = [k - 3.0, k - 2.0, k - 1.0]
-    forces = [float(k), k + 1.0, k + 2.0]
-    numbers = [0, 0, 0, 1, *[0] * 9, *rates, *[0] * 9, *forces, *[0] * 9]
-    return head + struct.pack(f'<{len(numbers)}d', *numbers)

@@ -71,11 +71,6 @@ def test_a_lever_arm_is_the_position_of_the_imu():
     assert recovered(MOTION.flight(imu=imu), names, 'A') == pytest.approx(true, abs=1e-3)
 
 
-def test_every_sensor_key_has_its_unit():
-    for name in ('imu_accelerometer_bias.bias[0]', 'mocap_misalignment.rotation[2]'):
-        assert KEYS[name].base == 0.0 and not KEYS[name].body
-
-
 @pytest.mark.parametrize('name', [name for name, effect in CATALOGUE.items()
                                   if any(map(effect.in_readings, effect.parameters))
                                   and treatment('gap', name).acts])

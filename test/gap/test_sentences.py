@@ -5,7 +5,7 @@ from types import SimpleNamespace
 from flights import KEYS, ROBOT
 import pytest
 
-from beetle_omni_ros.identify.gap.results import grids, headline, parameters, summary
+from beetle_omni_ros.identify.gap.results import grids, parameters, summary
 from beetle_omni_ros.robot.effects import CATALOGUE, treatment
 
 
@@ -30,40 +30,6 @@ def test_the_sentence_states_the_value_of_the_robot_file(file, words):
 
 def test_a_truncated_interval_is_stated_by_both_ends():
     assert '0 (0 to 0.08) N s/m' in summary(made(effect(['rotor_drag'], 0.0, [0.0, 0.08], 0.8)))
-
-
-def test_sensor_names_have_their_usual_spelling():
-    text = summary(made(effect(['imu_accelerometer_bias', 'mocap_misalignment'], 0.2, [0.1, 0.3],
-                               0.0)))
-    assert text.startswith('IMU accelerometer bias or MoCap misalignment of')
-
-
-def test_bad_data_states_the_first_cause_and_counts_the_others():
-    result = {'verdict': 'bad_data', 'reason': 'a: imu/data_raw: degrees per second?',
-              'bad_data': [{}, {}]}
-    assert summary(result) == 'a: imu/data_raw: degrees per second? 1 more fault is listed below.'
-    assert summary({**result, 'reason': 'a: cut', 'bad_data': [{}]}) == 'a: cut.'
-
-
-def test_a_partial_explanation_is_stated_once():
-    result = {'verdict': 'unknown', 'reason': 'joint_4 is off, also with centre_of_mass',
-              'partial': [{'names': ['centre_of_mass']}]}
-    assert summary(result).endswith('also with centre_of_mass.')
-    assert 'Wind would explain a part' in summary({**result, 'partial': [{'names': ['wind']}]})
-
-
-def test_the_headline_distinguishes_joints():
-    two = [effect(['joint_offset'], 0.01, [0.0, 0.02], 0.0, 'rad', joint=k) for k in (3, 1)]
-    assert headline(made(*two)) == 'named: joint_offset 3, joint_offset 1'
-    assert 'explain the disagreement' in summary(made(*two))
-
-
-def test_columns_of_named_effects_appear_only_with_named_effects():
-    named, = (g for g in grids(made(effect(['wind'], 1.0, [0.9, 1.1], 0.0)))
-              if g.title.startswith('Free runs'))
-    assert 'sign reversed' in named.header and 'sign reversed' in named.note
-    nothing, = grids({**made(), 'verdict': 'no_gap'})
-    assert nothing.header == ['horizon', 'error'] and 'sign' not in nothing.note
 
 
 @pytest.mark.parametrize('name, deviation, expected', [

@@ -1,6 +1,6 @@
-"""Undetectable effects are listed, also those of one regime."""
+"""Effects are detectable in some regimes, and forces with excitation only."""
 
-from types import SimpleNamespace
+from dataclasses import replace
 
 from flights import KEYS, model, Motion, P
 import numpy as np
@@ -8,7 +8,7 @@ import pytest
 
 from beetle_omni_ros.identify.gap.analysis import Analysis
 from beetle_omni_ros.identify.gap.candidates import candidates
-from beetle_omni_ros.identify.gap.certainty import detectability
+from beetle_omni_ros.identify.gap.certainty import detectability, excitation
 from beetle_omni_ros.identify.gap.fit import Problem
 from beetle_omni_ros.identify.gap.keys import tolerances
 from beetle_omni_ros.identify.gap.verdict import hidden, not_met
@@ -28,8 +28,20 @@ def test_ground_effect_is_detectable_near_the_ground_only(higher, seen):
     assert 'ground_effect' not in hidden(a, P)
 
 
-def test_an_entry_detectable_in_one_form_is_not_undetectable():
-    a = Analysis(detectability={name: SimpleNamespace(sigma=sigma) for name, sigma in (
-        ('rotor_drag', 1.0), ('joint_offset[1]', 1.0), ('joint_offset[2]', 90.0),
-        ('ground_effect', 1.0), ('mass', np.inf))})
-    assert hidden(a, P) == ['rotor_drag'] and not_met(a, P) == ['ground_effect']
+def problem(flight):
+    return Problem([model(flight)], KEYS, tolerances(P), P)
+
+
+def test_a_planned_motion_has_excitation_and_motion_by_gusts_has_not():
+    motion = Motion(7)
+    assert excitation(problem(motion.flight())) > 3 * P.least_liveliness
+    rng, kernel = np.random.default_rng(1), np.hanning(100)
+    gust = np.stack([np.convolve(x, kernel / np.linalg.norm(kernel), 'same')
+                     for x in rng.standard_normal((6, len(motion.t)))], axis=1)
+    gust[:, 3:] *= 0.1      # rad/s, of which only the derivative is used
+    flight = motion.flight(imu=0.1 * gust + [0, 0, 9.80665, 0, 0, 0])
+    flight.pose[:] = [0, 0, 1, 0, 0, 0, 1]
+    hover = problem(flight)
+    hover.noise = replace(hover.noise, sigma={
+        **hover.noise.sigma, 'B': np.array([0.1] * 3 + [0.2] * 3)})
+    assert excitation(hover) < P.least_liveliness

@@ -52,12 +52,6 @@ def process(subject, k):
     return os.getpid()
 
 
-def counted(learnt, k):
-    time.sleep(0.05)
-    learnt.append(k)
-    return os.getpid(), len(learnt)
-
-
 def bad(subject, k, which):
     if k == which:
         raise ValueError(f'item {k}')
@@ -97,14 +91,6 @@ def test_workers_do_the_work_and_end(cores):
         assert len(by) == cores and (os.getpid() in by) == (cores == 1)
     assert children() == before
     assert shared.map(process, range(2)) == [PARENT] * 2        # afterwards as on one core
-
-
-def test_state_of_a_worker_stays_in_its_process(cores):
-    with Workers([]) as shared:
-        done = [row for _ in range(3) for row in shared.map(counted, range(cores))]
-    for pid in {pid for pid, _ in done}:
-        counts = [count for by, count in done if by == pid]
-        assert counts == list(range(1, len(counts) + 1))
 
 
 def test_a_worker_shares_nothing(cores):
@@ -165,10 +151,3 @@ def test_a_thread_limit_limits_the_processes(monkeypatch, threads, expected):
     monkeypatch.setattr(joblib, 'cpu_count', lambda: 3)
     monkeypatch.setenv('OMP_NUM_THREADS', threads)
     assert width() == expected
-
-
-def test_without_a_limit_of_threads_there_is_one_process(monkeypatch):
-    monkeypatch.setattr(joblib, 'cpu_count', lambda: 3)
-    monkeypatch.delenv('OMP_NUM_THREADS', raising=False)
-    monkeypatch.setattr(workers, 'threadpool_limits', None)
-    assert width() == 1
