@@ -43,29 +43,21 @@ def before(truth, overlap=0.0):
     return cost, search._plausible_cost(state, cost)
 
 
-def test_a_lag_far_beyond_tolerance_is_not_absorbed_by_the_tolerance():
-    fitted, believable = before(0.25)
+@pytest.mark.parametrize('lag, overlap, least, most', [
     # The prior of the tolerance costs eight deviations, 70 of chi2; the data give thousands.
-    assert fitted < 2300 and believable > fitted + 1000 * 30**2 * (0.25 - 0.09)**2
-
-
-def test_a_lag_is_not_absorbed_by_the_tolerance_of_another_parameter():
-    fitted, believable = before(0.25, overlap=0.99)
-    assert believable > fitted + 1000
-
-
-def test_a_lag_within_tolerance_is_absorbed():
-    fitted, believable = before(0.05)
-    assert believable == fitted
+    (0.25, 0.0, 1000 * 30**2 * (0.25 - 0.09)**2, np.inf),
+    (0.25, 0.99, 1000, np.inf),     # nor is it absorbed by the tolerance of another parameter
+    (0.05, 0.0, 0.0, 0.0)])
+def test_a_lag_far_beyond_tolerance_is_not_absorbed_by_the_tolerance(lag, overlap, least, most):
+    fitted, believable = before(lag, overlap)
+    assert fitted < 2300 and least <= believable - fitted <= most
 
 
 @pytest.mark.parametrize('gain, left, agreement, prior_gain, named', [
     (60.0, 70.0, 4.0, 0.0, True), (60.0, 170.0, 4.0, 0.0, False), (60.0, 170.0, 10.0, 0.0, True),
     (60.0, 600.0, 10.0, 0.0, False), (600.0, 1700.0, 4.0, 0.0, True),
-    (600.0, 1700.0, 2.5, 0.0, False), (600.0, 6000.0, 10.0, 0.0, False),
-    (30.0, 31.0, 10.0, 0.0, False), (30.0, 31.0, 10.0, 20.0, False),
-    (30.0, 31.0, 10.0, 28.0, True), (30.0, 130.0, 1.5, 28.0, True),
-    (20.0, 21.0, 10.0, 40.0, False), (60.0, 600.0, 10.0, 20.0, False),
+    (600.0, 1700.0, 2.5, 0.0, False), (30.0, 31.0, 10.0, 20.0, False),
+    (30.0, 31.0, 10.0, 28.0, True), (20.0, 21.0, 10.0, 40.0, False),
     (60.0, 600.0, 10.0, 60.0, True)])
 def test_a_small_gap_above_noise_must_be_explained_mostly_by_the_effect(monkeypatch, gain, left,
                                                                         agreement, prior_gain,
@@ -96,30 +88,22 @@ def test_a_small_gain_must_be_even_over_the_blocks(gain, error, positive, prior_
     assert confirmed(Trial(drag, gain, {}, held=blocks, prior_gain=prior_gain), P) == held
 
 
-@pytest.mark.parametrize('name, delay, physical', [
-    ('imu_filter_lag', -0.003, False), ('joint_feedback_delay', -0.003, False),
-    ('joint_feedback_delay', 0.003, True), ('mocap_time_offset', -0.003, True)])
-def test_a_reading_is_not_newer_than_its_stamp(name, delay, physical):
-    key = f'{name}.delay'
-    trial = Trial(Candidate(name, (key,), label=name), 100.0, {key: delay})
-    assert at_bound(KEYS, trial) != physical
-
-
-@pytest.mark.parametrize('name', ['command_latency', 'joint_command_latency', 'rotor_dead_time'])
-def test_no_command_acts_before_its_stamp(name):
-    trial = Trial(Candidate(name, (f'{name}.delay',), label=name), 100.0, {f'{name}.delay': -0.01})
-    assert at_bound(KEYS, trial, (-0.002, 0.01)) and not at_bound(KEYS, trial, (0.0, 0.0))
-
-
-def test_an_effect_of_the_robot_file_may_be_fitted_to_zero():
+@pytest.mark.parametrize('key, x, delays, impossible', [
+    # a reading is not newer than its stamp, and no command acts before its stamp
+    ('imu_filter_lag.delay', -0.003, (), True), ('joint_feedback_delay.delay', -0.003, (), True),
+    ('joint_feedback_delay.delay', 0.003, (), False),
+    ('mocap_time_offset.delay', -0.003, (), False),
+    ('command_latency.delay', -0.01, (-0.002, 0.01), True),
+    ('rotor_dead_time.delay', -0.01, (-0.002, 0.01), True),
+    ('rotor_dead_time.delay', -0.01, (0.0, 0.0), False),
+    # an effect of the robot file may be fitted to zero
+    ('rotor_drag.coefficient', 'low', (), False),
+    ('rotor_thrust_coefficient.scale[0]', 'low', (), True)])
+def test_an_impossible_value_is_no_effect(key, x, delays, impossible):
     own = all_keys(replace(ROBOT, effects={'rotor_drag': {'coefficient': 0.8}}))
-    key = 'rotor_drag.coefficient'
-    gone = Trial(Candidate('rotor_drag', (key,), label='gone'), 100.0, {key: own[key].low})
-    assert own[key].value(own[key].low) == 0.0 and not at_bound(own, gone)
-    weak = 'rotor_thrust_coefficient.scale[0]'
-    dead = Trial(Candidate('rotor_thrust_coefficient', (weak,), label='x'), 1.0,
-                 {weak: KEYS[weak].low})
-    assert at_bound(KEYS, dead)
+    trial = Trial(Candidate(key.partition('.')[0], (key,), label='x'), 100.0,
+                  {key: own[key].low if x == 'low' else x})
+    assert at_bound(own, trial, *([delays] if delays else [])) == impossible
 
 
 class Capped(Problem):

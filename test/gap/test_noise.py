@@ -10,7 +10,7 @@ from beetle_omni_ros.identify.gap.residual import CHANNELS
 P = GapParameters.load()
 FLOORS = dict(zip('BAWJ', (P.floors[0], *P.floors[2:]), strict=True))   # of the first channels
 COUNT = 40000
-KEEPS = [0.0, 0.5, 0.9, 0.97, -0.5]
+KEEPS = [0.0, 0.97, -0.5]
 
 
 def coloured(spread, keep, seed=0):

@@ -41,12 +41,6 @@ def test_the_delay_of_noisy_encoders_is_recovered():
     assert found[DELAY] == pytest.approx(0.012, abs=1e-3)
 
 
-def test_the_noise_of_readings_is_estimated_from_the_readings():
-    signals = model(noisy(0.02, 0.006)).signals
-    assert signals.reading_noise == pytest.approx(0.02, rel=0.15)
-    assert signals.position_noise == pytest.approx(0.006, rel=0.1)
-
-
 def test_tilts_follow_the_servo_model_if_encoders_are_noisy():
     made = model(noisy(0.02))
     inside = slice(100, -150)

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 from flights import KEYS, ROBOT
 import pytest
 
-from beetle_omni_ros.identify.gap.results import grids, parameters, summary
+from beetle_omni_ros.identify.gap.results import parameters, summary
 from beetle_omni_ros.robot.effects import CATALOGUE, treatment
 
 
@@ -39,17 +39,6 @@ def test_intervals_exclude_impossible_values(name, deviation, expected):
     entry, parameter = name.split('.')
     found = parameters(a, entry, (name,), {name: deviation}, ROBOT)[parameter]
     assert found['interval'] == pytest.approx(expected) and found['file'] == 0.0
-
-
-def test_the_table_states_the_sizes_of_a_whole_set_and_what_no_fit_determined():
-    one = effect(['mass', 'wind'], 3.2, [3.1, 3.3], 3.0, 'kg')
-    one['parameters']['y'] = {'value': 50.0, 'interval': [50.0, 50.0], 'file': 50.0,
-                              'unit': 'degC'}
-    one['rivals'] = [{'name': 'wind', 'parameters': {
-        'force': {'value': [0.0, 0.0, -2.0], 'file': [0.0] * 3, 'unit': 'N'}}}]
-    rows = next(g.rows for g in grids(made(one)) if g.title == 'Effects')
-    assert [row[3] for row in rows] == ['3.1..3.3', 'not fitted', '']
-    assert rows[2][:3] == ['or wind', 'force [N]', '0, 0, -2']
 
 
 @pytest.mark.parametrize('name', [n for n in CATALOGUE if treatment('gap', n).acts])

@@ -27,9 +27,10 @@ WIND = trial('wind', 'wind.force[0]')
 def decided(accepted=(), still=False, left=0.0, rivals=(), found=(), trials=(),
             line=SpectralLine(0.0, 0.0, 0.0)):
     """An analysis with a verdict after a search."""
+    accepted = [replace(t) for t in accepted]
     names = [n for t in accepted for n in t.candidate.keys]
     cost = 1000.0 - 200.0 * len(names)
-    search = Found(accepted=list(accepted), state=SimpleNamespace(names=names),
+    search = Found(accepted=accepted, state=SimpleNamespace(names=names),
                    cost=(1000.0, cost, cost - left), low_excitation=still,
                    rivals={t.candidate.label: list(rivals) for t in accepted},
                    trials={t.candidate.label: t for t in trials})
