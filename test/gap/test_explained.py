@@ -103,7 +103,7 @@ def test_an_impossible_value_is_no_effect(key, x, delays, impossible):
     own = all_keys(replace(ROBOT, effects={'rotor_drag': {'coefficient': 0.8}}))
     trial = Trial(Candidate(key.partition('.')[0], (key,), label='x'), 100.0,
                   {key: own[key].low if x == 'low' else x})
-    assert at_bound(own, trial, *([delays] if delays else [])) == impossible
+    assert at_bound(own, trial, delays) == impossible
 
 
 class Capped(Problem):

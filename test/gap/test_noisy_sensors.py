@@ -2,11 +2,9 @@
 
 from dataclasses import replace
 
-from flights import model, Motion, P, ROBOT, solved
+from flights import model, Motion, solved
 import numpy as np
 import pytest
-
-from beetle_omni_ros.identify.gap.servo import simulate, Windows
 
 MOTION = Motion(7)
 DELAY = 'joint_feedback_delay.delay'
@@ -50,34 +48,6 @@ def test_tilts_follow_the_servo_model_if_encoders_are_noisy():
     after = [made.signals.joints({})[k] - truth[j] for j, k in enumerate((0, 2))]
     assert rms(after[0][inside]) < 0.35 * rms(before[0][inside])
     assert rms(after[1][inside]) < 0.05 * rms(before[1][inside])
-
-
-def test_velocity_follows_the_imu_if_positions_are_noisy():
-    errors = [rms((made.signals.pose({})[2] - at(made, MOTION.velocity))[100:-100])
-              for made in (model(noisy(position=0.006)), model(noisy(position=0.0035)))]
-    assert errors[0] < 0.012 < errors[1]    # the less noisy one is what positions alone give
-
-
-def test_each_rotor_may_have_a_lag_of_its_own():
-    signals, h = model(MOTION.flight()).signals, P.grid
-    plain, slow = signals.thrust({})[0], signals.thrust({'rotor.lag[2]': 0.2})[0]
-    assert slow[:, [0, 1, 3]] == pytest.approx(plain[:, [0, 1, 3]], abs=1e-12)
-    # f' = (f* - f) / T with f* as before
-    asked = plain[1:-1] + ROBOT.rotors.time_constant * (plain[2:] - plain[:-2]) / (2 * h)
-    tau = ROBOT.rotors.time_constant * np.exp(0.2)
-    again = slow[1:-1] + tau * (slow[2:] - slow[:-2]) / (2 * h)
-    assert again[:, 2] == pytest.approx(asked[:, 2], abs=0.02)
-    assert rms(slow[:, 2] - plain[:, 2]) > 0.03
-
-
-def test_a_servo_stiffer_than_the_others_sags_less_under_its_load():
-    k, load = 800, 0.02
-    zero, held = np.zeros((k, 1, 4)), np.full((k, 1, 4), load)
-    windows = Windows(zero[0], zero[0], zero, held, zero, P.servo_step, 0, 8)
-    shown = simulate(ROBOT, windows, np.zeros((1, k, 1, 4)),
-                     [{'servo.kp[1]': np.log(1.25), 'servo.kd[2]': 0.3}], 1.0)[0, -1, 0]
-    sag = load / ROBOT.joints.kp        # of a spring
-    assert shown == pytest.approx([sag, sag / 1.25, sag, sag], rel=1e-3)
 
 
 @pytest.mark.parametrize('gain', ['kp', 'kd'])

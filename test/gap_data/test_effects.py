@@ -102,16 +102,6 @@ def test_gyroscopic_torque_is_the_change_of_angular_momentum(shape):
         assert torque == pytest.approx(-change, abs=1e-6)
 
 
-@shapes('rotor_acceleration_torque')
-def test_rotor_acceleration_gives_a_reaction_torque(shape):
-    robot, hidden, _ = put('rotor_acceleration_torque', 0.05, shape)
-    f = robot.hover_thrust
-    torque = hidden.wrenches[0](0, snapshot(thrust_rate=[10.0] * 4), f, UP, (0, 0, 0))[3:]
-    assert torque[2] < 0  # rotor 1 spins positive
-    # Omega grows as the root of thrust: half the relative rate; the line grows a little faster
-    assert torque[2] == pytest.approx(-0.05 * 0.5 * 10.0 / f, rel=0.25)
-
-
 @shapes('rotor_lag')
 def test_rotor_lag_delays_thrust_by_its_time_constant(shape):
     robot, hidden, label = put('rotor_lag', 0.03, shape)
@@ -151,16 +141,6 @@ def test_backlash_has_the_width_of_its_gap(shape):
     assert rising[-1] == pytest.approx(-0.02, rel=0.12)
     assert np.ptp(errors[250:]) == pytest.approx(0.04, rel=0.12)
     assert label['gap'] == 0.04
-
-
-@shapes('joint_deflection')
-def test_deflection_grows_with_thrust_and_is_measured(shape):
-    robot, hidden, _ = put('joint_deflection', 0.003, shape)
-    body = Plant(robot, hidden, multibody=False, position=(0, 0, 5), tilt=[0.0] * 4,
-                 quaternion=(1, 0, 0, 0), thrust=[robot.hover_thrust] * 4)
-    for _ in range(300):
-        body.step()
-    assert body.snapshot.tilt[0] == pytest.approx(0.003 * robot.hover_thrust, rel=1e-3)
 
 
 def test_mass_and_centre_of_mass_change_the_specific_force():

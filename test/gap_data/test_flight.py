@@ -1,6 +1,5 @@
 """The blind flights: tracking, excitation, and reports of lost flights."""
 
-from gap_data.controller import PoseController
 from gap_data.courses import RATE
 from gap_data.flight import fly, LostFlight
 from gap_data.hidden import Hidden
@@ -27,19 +26,6 @@ def test_the_controller_tracks_its_reference(kind, difficulty):
     assert np.sqrt((error ** 2).sum(axis=1).mean()) < 0.2
     assert truth.command_thrust.min() >= 0.3 and truth.command_thrust.max() <= 20.0
     assert np.abs(truth.columns['tilt']).max() < 3.96
-
-
-def test_allocation_gives_the_requested_wrench():
-    controller = PoseController(Robot.nominal(), np.random.default_rng(0), lively=False)
-    tilt, thrust = controller.trim(np.array([3.0, -2.0, 28.0]))
-    robot, force, torque = Robot.nominal(), np.zeros(3), np.zeros(3)
-    for i in range(4):
-        ca, sa = robot.arms[i]
-        f = thrust[i] * np.array([np.sin(tilt[i]) * sa, -np.sin(tilt[i]) * ca, np.cos(tilt[i])])
-        force += f
-        torque += np.cross(robot.positions[i], f) - robot.spin[i] * robot.ratio * f
-    assert force == pytest.approx([3.0, -2.0, 28.0], abs=1e-9)
-    assert torque == pytest.approx(np.zeros(3), abs=1e-9)
 
 
 def test_a_robot_that_cannot_fly_gives_a_lost_flight():

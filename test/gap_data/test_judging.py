@@ -1,7 +1,6 @@
 """The score follows its definition."""
 
 
-from gap_data.intervals import median, share
 from gap_data.judge import judge
 from gap_data.score import score
 from gap_data.workflow import KEYS, read_answer
@@ -113,15 +112,6 @@ def test_scores_of_a_perfect_workflow_and_of_one_without_answers():
                             ('interval covers the truth', 1, None)):
         assert value(right, name) == (pytest.approx(good))
         assert value(silent, name) == (bad if bad is None else pytest.approx(bad))
-
-
-def test_coverage_of_intervals():
-    assert share([])['value'] is None
-    half = share([True] * 50 + [False] * 50)
-    assert half['value'] == 0.5 and half['interval'] == pytest.approx([0.404, 0.596], abs=1e-3)
-    assert share([True] * 20)['interval'][1] == pytest.approx(1.0)
-    middle = median([1.0, 2.0, None, 3.0])
-    assert middle['value'] == 2.0 and middle['count'] == 3
 
 
 def test_an_answer_is_checked_against_the_interface(tmp_path):

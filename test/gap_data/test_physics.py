@@ -1,9 +1,7 @@
 """The robot of the blind flights against closed forms."""
 
-from gap_data.gusts import draw_gust
 from gap_data.hidden import Hidden
 from gap_data.plant import Plant
-from gap_data.rotors import Rotors
 from gap_data.truth import Robot
 import mujoco
 import numpy as np
@@ -104,14 +102,6 @@ def test_thrust_acts_along_the_tilted_rotor(rotor):
     assert body.data.ctrl[3:6] == pytest.approx(torque, abs=1e-9)
 
 
-def test_rotor_is_a_first_order_lag():
-    robot = Robot.nominal()
-    rotors = Rotors(robot, Hidden(), 0.001, [5.0] * 4)
-    for _ in range(94):
-        rotors.advance([9.0] * 4)
-    assert rotors.thrust[0] == pytest.approx(9 - 4 * np.exp(-0.094 / 0.0942), rel=1e-9)
-
-
 def test_a_command_acts_after_its_age_and_delay():
     body = plant(hidden=Hidden(thrust_delay=0.02), command_age=0.01)
     body.command(0.0, [0.1] * 4, [9.0] * 4)
@@ -120,15 +110,3 @@ def test_a_command_acts_after_its_age_and_delay():
     body.step()
     assert body.rotors.thrust[0] > body.robot.hover_thrust
     assert body.data.qpos[body._q[0]] > 0.005  # the tilt had begun to move 20 ms before
-
-
-def test_gusts_have_their_strength_and_spectrum():
-    settings = {'force': [0.3, 0.3], 'torque': [0.01, 0.01], 'time': [0.5, 0.5]}
-    waves = [draw_gust(settings, 60.0, 0.005, np.random.default_rng(k)) for k in range(8)]
-    force = np.concatenate([f for f, _ in waves])
-    assert np.sqrt((force ** 2).mean()) == pytest.approx(0.3, rel=0.1)
-    assert np.sqrt((np.concatenate([t for _, t in waves]) ** 2).mean()) == pytest.approx(
-        0.01, rel=0.1)
-    # two lags of 0.25 s: correlation (1 + s) exp(-s) at s = time / 0.25 s
-    near = (force[:-50] * force[50:]).mean() / (force ** 2).mean()
-    assert near == pytest.approx(2 * np.exp(-1), abs=0.08)

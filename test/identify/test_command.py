@@ -76,21 +76,3 @@ def test_unusable_input_ends_with_status_2_and_one_line(tmp_path, capsys, what):
     assert 'cannot write' in refused(capsys, 'identify', what, bad, '--json', '/nowhere/r.json')
     assert 'cannot write' in refused(capsys, 'identify', what, bad, '--report', '/nowhere/r.html')
     assert refused(capsys, 'identify', what, bad, '--robot', tmp_path / 'absent.yaml')
-
-
-def test_a_bad_validation_log_is_refused_before_the_fit(logs, tmp_path, capsys):
-    bad = tmp_path / 'bad.csv'
-    bad.write_text('t_s,x\n1,2\n')
-    assert 'bad.csv' in refused(capsys, 'identify', 'joint', logs[0], '--validate', bad)
-
-
-def test_several_logs_are_fitted_together(logs, tmp_path):
-    path = tmp_path / 'r.json'
-    assert cli.main([str(a) for a in ('identify', 'joint', *logs[:2], '--json', path)]) == 0
-    assert json.loads(path.read_text())['meta']['logs'] == ['slow.csv', 'fast.csv']
-
-
-def test_help_lists_the_options(capsys):
-    for command in (['identify'], ['identify', 'joint'], ['identify', 'rotor']):
-        assert cli.main([*command, '--help']) == 0
-        assert 'Usage' in capsys.readouterr().out

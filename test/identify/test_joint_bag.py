@@ -1,14 +1,11 @@
 """A bag as a response log has the same rows as the equivalent CSV file."""
 
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from servo_logs import sweep
 from synthetic_flights import write_command, write_joints
 
-from beetle_omni_ros.identify.parameters import shipped
-from beetle_omni_ros.identify.servo import log as servo_log
 from beetle_omni_ros.identify.servo.log import read_joint_log
 from beetle_omni_ros.runs.bag_writer import BagWriter
 from beetle_omni_ros.runs.files import LogError
@@ -34,19 +31,6 @@ def test_each_reading_is_paired_with_the_last_command_before_it(tmp_path):
     assert np.allclose(log.t, t, atol=1e-6)
     assert np.allclose(log.command, np.outer([1, -1, 0.5, 1], command), atol=1e-9)
     assert np.allclose(log.measured, 0.9 * log.command, atol=1e-9)
-
-
-def test_the_part_of_highest_excitation_of_the_longest_stretch_is_used(
-        tmp_path, monkeypatch):
-    given = shipped()
-    monkeypatch.setattr(servo_log, 'shipped',
-                        lambda: replace(given, log=replace(given.log, longest_bag=2.5)))
-    t, command = sweep(duration=9.0)
-    command = np.where((t > 5.0) & (t < 7.5), command, 0.05 * command)
-    sent = (t < 1.0) | (t > 2.0)
-    log = read_joint_log(recorded(tmp_path / 'bag', t, command, sent))
-    assert log.t[-1] - log.t[0] == pytest.approx(2.5, abs=0.02)
-    assert np.abs(log.command[0]).max() == pytest.approx(np.abs(command).max())
 
 
 @pytest.mark.parametrize(('made', 'words'), [

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from servo_logs import COUNT, log_of, sweep, write
 
-from beetle_omni_ros.identify.servo.log import fresh_rows, JointLog, read_joint_log, reading_times
+from beetle_omni_ros.identify.servo.log import fresh_rows, JointLog, read_joint_log
 from beetle_omni_ros.runs.files import LogError
 
 HEADER = ['t_s', 'q1_rad', 'q2_rad', 'command_rad']
@@ -83,16 +83,6 @@ def test_unusable_logs_are_refused(good, tmp_path, case):
     assert words in text and str(path) in text and '\n' not in text
 
 
-@pytest.mark.parametrize('content', [b'', b'\xff\xfe\x00binary', b'\n\n'])
-def test_other_files_are_refused(tmp_path, content):
-    path = tmp_path / 'bad.csv'
-    path.write_bytes(content)
-    with pytest.raises(LogError, match='bad.csv'):
-        read_joint_log(path)
-    with pytest.raises(LogError, match='no such file'):
-        read_joint_log(tmp_path / 'absent.csv')
-
-
 def test_columns_may_have_any_order_and_others_are_ignored(good, tmp_path):
     rows = np.concatenate([good[:, ::-1], good[:, :1]], axis=1)
     log = read_joint_log(saved(tmp_path / 'log.csv', rows, [*HEADER[::-1], 'temperature_C']))
@@ -145,33 +135,6 @@ def test_only_rows_with_a_new_reading_are_used_also_while_the_joints_rest(late, 
     assert len(fresh) == pytest.approx(len(at), abs=5)
     moving = np.r_[True, (np.diff(encoder(ROW * at)) != 0).any(axis=0)]
     assert np.isin(at[moving], fresh).mean() > least
-
-
-def test_a_reading_that_was_held_while_the_joints_moved_is_used_once():
-    lost = np.arange(200, 230)      # 0.6 s
-    at, measured, _ = rows(lost=lost)
-    fresh = np.flatnonzero(fresh_rows(measured))
-    hidden = (fresh > EVERY * lost[0]) & (fresh < EVERY * (lost[-1] + 1))
-    assert not hidden.any() and len(fresh) == pytest.approx(len(at), abs=5)
-
-
-def test_every_row_is_new_where_the_bus_is_as_fast_as_the_logger():
-    t = ROW * np.arange(1600)
-    assert fresh_rows(encoder(t)).all()
-
-
-def test_times_of_periodic_readings_are_restored_from_late_rows():
-    rng = np.random.default_rng(0)
-    true = 1.0 + EVERY * ROW * np.delete(np.arange(400), [100, 101, 250])
-    late = rng.random(len(true)) < 0.15
-    late[0] = late[-1] = True
-    restored = reading_times(true + ROW * late, ROW)
-    assert np.abs(restored - true).max() < 0.02 * ROW
-
-
-def test_readings_in_every_row_keep_their_times():
-    t = np.cumsum(np.random.default_rng(0).uniform(0.8, 1.2, 300)) * ROW
-    assert np.array_equal(reading_times(t, ROW), t)
 
 
 def test_a_log_has_the_readings_of_the_bus_at_their_times():

@@ -11,7 +11,6 @@ from beetle_omni_ros.identify.measured import rotor_values, write_measured
 from beetle_omni_ros.identify.rotor.log import chosen, read_rotor_log
 from beetle_omni_ros.identify.rotor.results import identify_rotor, rotor_results
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.robot.thrust_map import ThrustMap
 from beetle_omni_ros.runs.files import LogError
 
@@ -62,28 +61,6 @@ def test_intervals_hold_the_true_surface_ratio_and_drift(tmp_path):
         inside['thrust'] += list((limits[:, 0] < true) & (true < limits[:, 1]))
         assert np.ptp(limits, axis=1).max() < 0.7
     assert all(np.mean(hits) > 0.8 for hits in inside.values()), inside
-
-
-def test_a_published_voltage_is_predicted_from_the_others(tmp_path):
-    results = rotor_results(identified(tmp_path, bench(np.random.default_rng(0))))
-    assert results['surface']['left_out_rms_N'] < 0.3
-    assert within(results['torque_to_thrust_ratio'], RATIO)
-
-
-def test_one_voltage_gives_a_surface(tmp_path):
-    rows = stand(np.random.default_rng(0))[:, :4]
-    rows[:, 3] = 24.0
-    results = rotor_results(identified(tmp_path, rows))
-    assert 0 < results['surface']['left_out_rms_N'] < 2
-
-
-def test_outliers_do_not_change_the_surface(tmp_path):
-    rows = stand(np.random.default_rng(5))
-    clean = identified(tmp_path, rows, STAND)
-    rows[::40, 1] += 8.0
-    dirty = identified(tmp_path, rows, STAND)
-    assert np.abs(thrust_of(dirty, np.array([0.2, 0.7]), 23.0)
-                  - thrust_of(clean, np.array([0.2, 0.7]), 23.0)).max() < 0.2
 
 
 def test_other_columns_signs_and_units_give_the_same_result(tmp_path):
@@ -242,9 +219,3 @@ def test_unusable_logs_are_refused(tmp_path, case):
         identify_rotor([read_rotor_log(path)])
     assert words in str(caught.value) and 'bad.csv' in str(caught.value)
     assert '\n' not in str(caught.value)
-
-
-@pytest.mark.parametrize('text', ['thrust', 'lift=fz', 'thrust=fz*x', 'thrust='])
-def test_unusable_columns_are_refused(text):
-    with pytest.raises(ParameterError, match='expected QUANTITY'):
-        chosen([text])

@@ -7,8 +7,7 @@ from servo_logs import servo, sweep
 
 from beetle_omni_ros.identify.servo import model as servo_model
 from beetle_omni_ros.identify.servo.log import JointLog
-from beetle_omni_ros.identify.servo.model import INDEX, OFF, published_set, simulate
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.identify.servo.model import INDEX, OFF, simulate
 
 
 def log_for(t, command, start=None):
@@ -92,14 +91,6 @@ def test_uneven_sampling_gives_the_same_motion():
     assert np.abs(even[keep] - uneven)[20:].max() < 2e-3
 
 
-def test_the_published_set_has_the_frequency_of_the_robot_file():
-    joint = RobotParameters.load().joints
-    values = published_set(joint)
-    frequency, damping = values[INDEX['natural_frequency']], values[INDEX['damping_ratio']]
-    assert joint.inertia * frequency**2 == pytest.approx(joint.kp)
-    assert 2 * damping * frequency * joint.inertia == pytest.approx(joint.kd)
-
-
 @pytest.mark.parametrize('values', [
     {}, {'coulomb_friction': 0.013, 'stiction': 0.01}, {'velocity_limit': 3.0},
     {'torque_limit': 0.12, 'load_sine': 0.05, 'load_cosine': -0.02}, {'backlash': 0.02}])
@@ -109,8 +100,3 @@ def test_without_a_compiler_the_numbers_are_the_same(values, monkeypatch):
     monkeypatch.setattr(servo_model, '_compiled', lambda: None)
     assert np.allclose(simulate(log, 0, parameter_set(delay=0.0137, **values)), compiled,
                        rtol=0, atol=1e-9)
-
-
-def test_without_any_compiler_numpy_is_used(monkeypatch):
-    monkeypatch.setenv('CC', '/nowhere/cc')
-    assert servo_model._compiled.__wrapped__() is None

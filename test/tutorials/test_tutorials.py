@@ -199,13 +199,6 @@ def test_the_commands_of_a_tutorial_give_its_results(page, tmp_path, shell):
 
 
 @pytest.mark.parametrize('page', PAGES, ids=lambda page: page.stem)
-def test_shown_lines_follow_from_unchanged_blocks(page):
-    found = blocks(page)
-    shown = [k for k, block in enumerate(found) if not block.language]
-    assert all(block.commands == block.text for block in found[:max(shown, default=0)])
-
-
-@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.stem)
 def test_each_number_of_a_text_is_in_a_command_or_in_its_output(page):
     text = page.read_text()
     known = {number for block in re.findall(r'^```.*?^```$', text, re.DOTALL | re.MULTILINE)
@@ -214,9 +207,3 @@ def test_each_number_of_a_text_is_in_a_command_or_in_its_output(page):
         if 'test: skip' not in section:     # it describes what no test can run
             said = NUMBER.findall(NO_TEXT.sub(' ', f'## {section}'))
             assert set(said) <= known, section
-
-
-@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.stem)
-def test_a_tutorial_has_tested_commands_and_a_picture(page):
-    assert any('skip' not in block.options and block.language == 'sh' for block in blocks(page))
-    assert re.search(r'!\[.*\]\(\S+\.(png|gif)\)', page.read_text())
