@@ -15,7 +15,6 @@ from beetle_omni_ros.identify.gap.candidates import candidates
 from beetle_omni_ros.identify.gap.ingest import prepare
 from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys
 from beetle_omni_ros.identify.gap.residual import FlightModel
-from beetle_omni_ros.identify.gap.signals import Signals
 from beetle_omni_ros.robot import effects
 from beetle_omni_ros.robot.effects import CATALOGUE
 
@@ -79,10 +78,3 @@ def test_the_charge_is_the_integral_of_the_current_since_the_first_message(curre
     assert not flight.findings
     expected = np.interp(flight.start + flight.battery_t, motion.t, motion.charge)
     np.testing.assert_allclose(flight.battery[:, 1], expected, atol=1e-6)
-
-
-def test_without_a_current_no_charge_is_drawn_and_the_voltage_is_kept():
-    made = recording()
-    made.values['battery_state'][:, 1] = np.nan
-    signals = Signals(prepare(made, ROBOT, P), ROBOT, P)
-    assert not signals.charge.any() and signals.voltage.max() < 1

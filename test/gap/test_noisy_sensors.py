@@ -59,16 +59,3 @@ def test_derivatives_by_the_gain_of_a_servo_agree_with_its_joint(gain):
         assert np.abs(moved[:, k]).max() > 1e-3
         assert slopes[:, :, k + 1] == pytest.approx(moved, abs=1e-9)
     assert slopes[:, :, 1:].sum(axis=2) == pytest.approx(slopes[:, :, 0], abs=1e-12)
-
-
-def test_indistinguishable_delays_have_equal_derivatives():
-    names = ['command_latency.delay', 'base.tilt_delay', 'joint_command_latency.delay',
-             'base.thrust_delay', 'rotor_dead_time.delay']
-    slopes = model(MOTION.flight()).slopes({}, names)
-    for group, moved, still in (('B', (3, 4), (1, 2)), ('J', (1, 2), (3, 4))):
-        late = slopes[group][:, :, 0]
-        assert rms(late) > 0.1
-        for k in moved:
-            assert rms(slopes[group][:, :, k] - late) < 1e-6 * rms(late)
-        for k in still:
-            assert rms(slopes[group][:, :, k]) < 1e-6 * rms(late)

@@ -10,10 +10,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from beetle_omni_ros.identify.gap.ingest import prepare, UnusableFlight
 from beetle_omni_ros.identify.gap.parameters import GapParameters
-from beetle_omni_ros.identify.recording.actuator_conventions import thrust_damages
 from beetle_omni_ros.identify.recording.check import damages, repaired
 from beetle_omni_ros.identify.recording.limits import RecordingLimits
-from beetle_omni_ros.identify.recording.motion import Motion
 from beetle_omni_ros.identify.recording.readings import reading_damages
 
 P = GapParameters.load()
@@ -125,14 +123,6 @@ def drifting(made):
     return made
 
 
-def later_and_later(made):
-    """Stamps of arrival, at the end of a queue that fills."""
-    t = made.times[POSE]
-    by = 0.5 * (t - t[0]) / (t[-1] - t[0])
-    made.times[POSE], made.received[POSE] = t + by, made.received[POSE] + by
-    return made
-
-
 def without_gravity(made):
     t, pose = made.times[POSE], made.values[POSE]
     attitude = Slerp(t, Rotation.from_quat(pose[:, 3:]))
@@ -191,7 +181,6 @@ KINDS = {
     'stamps in milliseconds': (stamped(IMU, lambda t: 1000 * t), IMU, ['apart'], None),
     'out of order': (reordered, POSE, ['out of order'], 0.1),
     'recorded twice': (twice(IMU), IMU, ['twice'], 0.0),
-    'MoCap later and later': (later_and_later, POSE, ['drifts'], None),
     'degrees per second': (of(IMU, 3, 6, np.rad2deg), IMU, ['degrees per second'], None),
     'acceleration in g': (of(IMU, 0, 3, lambda v: v / 9.80665), IMU, ['units of g'], None),
     'gravity taken off': (without_gravity, IMU, ['without gravity'], None),
@@ -270,30 +259,6 @@ def test_a_joint_that_rests_until_its_command_arrives_is_not_frozen(seed):
     held = joint_step(size, lag, limits.servo_lag[1] + 0.1, frozen_from=0.0)
     damage, = reading_damages(held, limits, ROBOT)
     assert damage.topic == JOINTS and 'gimbal2 is frozen' in damage.cause
-
-
-@pytest.mark.parametrize('seed', range(2))
-@pytest.mark.parametrize('swapped', [False, True])
-def test_rotors_of_different_strength_in_hover_are_not_taken_for_swapped(swapped, seed):
-    # Two weak neighbours get larger commands, which looks like an unmodelled torque. With
-    # exchanged rotors the torque would be smaller.
-    rng, count = np.random.default_rng(seed), 600
-    share = np.array([0.94, 0.94, 1.06, 1.06])
-    wanted = ROBOT.hover_thrust * (1 + 0.03 * rng.normal(size=(count, 4)))
-    lever = np.cross(ROBOT.rotors.positions, [0.0, 0.0, 1.0]) + np.outer(
-        ROBOT.rotors.spin * ROBOT.rotors.torque_to_thrust_ratio, [0.0, 0.0, 1.0])
-    wrench = np.zeros((count, 6, 4))
-    wrench[:, 2], wrench[:, 3:] = 1 / ROBOT.mass, (lever / ROBOT.inertia).T
-    felt = np.einsum('nci,ni->nc', wrench, wanted)
-    felt += rng.normal(0, 0.05, felt.shape)
-    commanded = wanted / share
-    still, joints = np.zeros((count, 3)), np.zeros((count, 4))
-    motion = Motion(0.1 * np.arange(count), still, felt[:, :3], {}, {}, {}, joints, joints,
-                    np.einsum('nci,ni->nc', wrench[:, :3], commanded), wrench,
-                    commanded[:, [3, 2, 1, 0] if swapped else slice(None)], felt[:, 3:])
-    found = thrust_damages(recording(), motion, ROBOT, RecordingLimits.load())
-    assert [d.cause for d in found if 'order of the thrusts' in d.cause] == [
-        d.cause for d in found] and bool(found) == swapped
 
 
 @pytest.mark.parametrize('kind', ['quaternion w first', 'millimetres', 'degrees per second',

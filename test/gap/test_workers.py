@@ -7,12 +7,11 @@ import subprocess
 import sys
 import time
 
-import joblib
 import numpy as np
 import pytest
 
 from beetle_omni_ros.identify.gap import workers
-from beetle_omni_ros.identify.gap.workers import width, Workers
+from beetle_omni_ros.identify.gap.workers import Workers
 
 pytestmark = pytest.mark.skipif(sys.platform != 'linux', reason='forks on Linux only')
 PARENT = os.getpid()
@@ -118,10 +117,3 @@ def test_workers_end_at_once_with_the_first_process(tmp_path, end):
     finally:
         busy.kill()
         busy.wait()
-
-
-@pytest.mark.parametrize('threads, expected', [('1', 1), ('2', 2), ('99', 3), ('', 3), ('x', 3)])
-def test_a_thread_limit_limits_the_processes(monkeypatch, threads, expected):
-    monkeypatch.setattr(joblib, 'cpu_count', lambda: 3)
-    monkeypatch.setenv('OMP_NUM_THREADS', threads)
-    assert width() == expected

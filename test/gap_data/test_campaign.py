@@ -5,7 +5,7 @@ import json
 import os
 
 from gap_data.campaign import make_report, run_campaign
-from gap_data.cases import Case, load_settings
+from gap_data.cases import Case
 from gap_data.make import make_case
 from gap_data.page import markdown
 from gap_data.workflow import Workflow
@@ -76,20 +76,3 @@ def test_a_campaign_scores_workflows_side_by_side(folder, stub):
     assert all(kept for _, kept in seen[4:])
     report = json.loads(json.dumps(make_report(judged, META)))
     assert '| none: false alarm | <= 0.05 |' in markdown(report)
-
-
-def test_the_command_makes_flights_and_a_report(tmp_path, stub, monkeypatch, capsys):
-    import gap_campaign
-    name = stub([])
-    monkeypatch.syspath_prepend(os.environ['PYTHONPATH'].split(os.pathsep)[0])
-    settings = load_settings()
-    settings['flights']['duration'] = 2.0
-    settings['sets']['test'] = {'clean': {'none': 2}}
-    monkeypatch.setattr(gap_campaign, 'load_settings', lambda: settings)
-    assert gap_campaign.main(['--set', 'test', '--workflow', f'quiet={name}:run_gap', '--jobs',
-                              '1', '--folder', str(tmp_path)]) == 0
-    report = json.loads((tmp_path / 'report.json').read_text())
-    assert [j['right'] for j in report['cases']['quiet']] == [True, True]
-    assert str(tmp_path) not in json.dumps(report['meta'])
-    assert 'none: false alarm' in capsys.readouterr().out
-    assert (tmp_path / 'report.md').is_file()

@@ -115,22 +115,6 @@ def test_rotor_lag_delays_thrust_by_its_time_constant(shape):
     assert label['time_constant'] == pytest.approx(0.1242)
 
 
-@shapes('joint_friction')
-def test_friction_holds_the_joint_against_a_smaller_spring_torque(shape):
-    robot, hidden, label = put('joint_friction', 0.01, shape)
-    stuck = label['stiction'] / 0.3449
-    ends = []
-    for command in (0.9 * stuck, 3.0 * stuck):
-        body = Plant(robot, hidden, multibody=False, position=(0, 0, 5), tilt=[0.0] * 4,
-                     quaternion=(1, 0, 0, 0), thrust=[7.45] * 4)
-        body.command(0.0, [command] * 4, [7.45] * 4)
-        for _ in range(400):
-            body.step()
-        ends.append(body.snapshot.tilt[0])
-    assert abs(ends[0]) < 0.1 * stuck
-    assert 1.5 * stuck < ends[1] < 3.0 * stuck
-
-
 @shapes('joint_backlash')
 def test_backlash_has_the_width_of_its_gap(shape):
     _, hidden, label = put('joint_backlash', 0.04, shape)

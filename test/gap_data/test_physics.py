@@ -32,15 +32,6 @@ def test_falls_freely_without_thrust(multibody):
     assert np.linalg.norm(body.specific_force) < 0.05  # the modules swing a little
 
 
-@BODIES
-def test_hovers_at_hover_thrust(multibody):
-    # a torque-free body: the rotors of the description are not quite symmetric, so tilts drift
-    body = plant(multibody=multibody)
-    data = run(body, 0.1)
-    assert data.qvel[2] == pytest.approx(0.0, abs=2e-3)
-    assert body.specific_force == pytest.approx([0, 0, 9.80665], abs=0.02)
-
-
 def test_multibody_totals_equal_those_of_the_interface():
     body = plant(multibody=True)
     model, data = body.model, body.data

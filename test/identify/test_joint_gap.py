@@ -4,21 +4,17 @@ from dataclasses import replace
 import json
 from pathlib import Path
 
-import casadi as ca
 import numpy as np
 import pytest
 from servo_logs import log_of, servo, sweep, write
 
 from beetle_omni_ros import cli
 from beetle_omni_ros.identify.gap.apply import effects_with
-from beetle_omni_ros.identify.gap.keys import all_keys
-from beetle_omni_ros.identify.gap.keys import friction as friction_of
 from beetle_omni_ros.identify.servo.compare import changes, compare, gap_of
 from beetle_omni_ros.identify.servo.joint import identify
 from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
 from beetle_omni_ros.identify.servo.model import simulate
 from beetle_omni_ros.identify.servo.robot import catalogue_values, file_sets, own_delay
-from beetle_omni_ros.robot import dynamics
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 REAL = sorted((Path(__file__).resolve().parents[3] / 'shared' / 'data').glob('joint_*.csv'))
@@ -142,20 +138,6 @@ def test_changes_between_two_logs_are_reported_with_valid_intervals():
             assert abs(row['difference'] - true.get((row['joint'], row['parameter']), 0.0)) < wide
         if row['parameter'] in ('kp', 'kd', 'delay', 'ramp_lag'):
             assert not row['significant'], row
-
-
-def test_friction_may_be_given_for_each_joint():
-    file_robot = replace(SHIPPED, effects={'joint_friction': {
-        'coulomb': (0.001, 0.002, 0.003, 0.004), 'stiction': 0.002}})
-    for joint in range(4):
-        slow = dynamics.servo_acceleration(file_robot, 0.0, 2.0, 0.0, joint=joint)
-        free = dynamics.servo_acceleration(SHIPPED, 0.0, 2.0, 0.0, joint=joint)
-        torque = float(ca.DM(free - slow)) * INERTIA
-        assert torque == pytest.approx(0.001 * (joint + 1), rel=0.01)
-    coulomb, stiction = friction_of(file_robot)
-    assert np.allclose(coulomb, [0.001, 0.002, 0.003, 0.004])
-    assert np.allclose(stiction, [0.002, 0.002, 0.003, 0.004])
-    assert all_keys(file_robot)['joint_friction.coulomb'].base == pytest.approx(0.0025)
 
 
 def test_the_command_line_writes_a_file_that_explains_the_log(tmp_path, capsys):

@@ -63,14 +63,6 @@ def test_every_term_agrees_with_a_plain_simulation(values):
     assert np.sqrt(np.mean(error[25:]**2)) < 3e-4 and np.abs(error[25:]).max() < 1e-3
 
 
-def test_friction_holds_the_joint_exactly_still():
-    t, command = step_command(size=0.01)
-    held = simulate(log_for(t, command), 0, parameter_set(coulomb_friction=0.011))
-    assert np.all(held == held[0, 0])
-    moved = simulate(log_for(t, command), 0, parameter_set(coulomb_friction=0.009))
-    assert 0 < moved[0, -1] < 0.01
-
-
 def test_parameter_sets_in_a_batch_are_independent():
     t, command = sweep(duration=3.0)
     log = log_for(t, command)
@@ -79,16 +71,6 @@ def test_parameter_sets_in_a_batch_are_independent():
     together = simulate(log, 0, sets)
     for k, alone in enumerate(sets):
         assert np.allclose(together[k], simulate(log, 0, alone[None])[0], atol=1e-12)
-
-
-def test_uneven_sampling_gives_the_same_motion():
-    t, command = sweep(duration=3.0)
-    keep = np.ones(len(t), dtype=bool)
-    keep[50::7] = False
-    model = parameter_set(delay=0.013, coulomb_friction=0.01)
-    even = simulate(log_for(t, command), 0, model, held=False)[0]
-    uneven = simulate(log_for(t[keep], command[keep]), 0, model, held=False)[0]
-    assert np.abs(even[keep] - uneven)[20:].max() < 2e-3
 
 
 @pytest.mark.parametrize('values', [

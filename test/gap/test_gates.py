@@ -1,4 +1,4 @@
-"""Implausible tolerances are not counted against the gain of an effect; gates of a gain."""
+"""Gates of a gain, its implausible tolerances, and the rivals of an effect."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -7,9 +7,9 @@ from flights import KEYS, P, ROBOT
 import numpy as np
 import pytest
 
-from beetle_omni_ros.identify.gap.candidates import Candidate, Trial
+from beetle_omni_ros.identify.gap.candidates import Candidate, Found, Trial
 from beetle_omni_ros.identify.gap.fit import Problem, State
-from beetle_omni_ros.identify.gap.gates import at_bound, confirmed, cross_validate
+from beetle_omni_ros.identify.gap.gates import at_bound, confirmed
 from beetle_omni_ros.identify.gap.keys import all_keys, tolerances
 from beetle_omni_ros.identify.gap.search import Search
 
@@ -53,6 +53,14 @@ def test_a_lag_far_beyond_tolerance_is_not_absorbed_by_the_tolerance(lag, overla
     assert fitted < 2300 and least <= believable - fitted <= most
 
 
+def agreed(agreement):
+    """Cross-validation that confirms the gain with so many standard errors."""
+    def cross_validated(self, trial, accepted):
+        trial.held = SimpleNamespace(total=trial.gain, error=trial.gain / agreement, positive=1.0,
+                                     without_best=0.9 * trial.gain)
+    return cross_validated
+
+
 @pytest.mark.parametrize('gain, left, agreement, prior_gain, named', [
     (60.0, 70.0, 4.0, 0.0, True), (60.0, 170.0, 4.0, 0.0, False), (60.0, 170.0, 10.0, 0.0, True),
     (60.0, 600.0, 10.0, 0.0, False), (600.0, 1700.0, 4.0, 0.0, True),
@@ -66,11 +74,7 @@ def test_a_small_gap_above_noise_must_be_explained_mostly_by_the_effect(monkeypa
     trial = Trial(drag, gain, {'rotor_drag.coefficient': 0.4}, refined=True,
                   prior_gain=prior_gain)
 
-    def agreed(self, trial, accepted):
-        trial.held = SimpleNamespace(total=gain, error=gain / agreement, positive=1.0,
-                                     without_best=0.9 * gain)
-
-    monkeypatch.setattr(Search, '_cross_validate', agreed)
+    monkeypatch.setattr(Search, '_cross_validate', agreed(agreement))
     monkeypatch.setattr(Search, '_closed_loop_bias', lambda self, trial, accepted: False)
     search = Search.__new__(Search)
     search.p = P
@@ -106,34 +110,40 @@ def test_an_impossible_value_is_no_effect(key, x, delays, impossible):
     assert at_bound(own, trial, delays) == impossible
 
 
-class Capped(Problem):
-    """A speed limit that acts in one block of eight; each other block has one outlier."""
-
-    KEY = 'joint_velocity_limit.velocity_limit'
-
-    def __init__(self):
-        self.keys, self.p, self.priors, self.blocks = KEYS, P, {}, 8
-        rng = np.random.default_rng(0)
-        self.block = np.repeat(np.arange(8), 250)
-        self.speed = rng.uniform(0.0, 1.0, 2000) * np.where(self.block == 3, 1.6, 0.95)
-        self.noise = 0.01 * rng.standard_normal(2000)
-        bad = np.setdiff1d(np.arange(0, 2000, 250), [750])
-        self.speed[bad], self.noise[bad] = 1.02, 0.3
-
-    def residual(self, theta):
-        cap = np.exp(theta.get(self.KEY, 3.0))      # far above at first
-        return (np.minimum(self.speed, 1.0) + self.noise - np.minimum(self.speed, cap)) / 0.01
-
-    def at(self, x):
-        slope = (self.residual({self.KEY: x + 0.01}) - self.residual({self.KEY: x - 0.01})) / 0.02
-        return State({self.KEY: x}, self.residual({self.KEY: x}), slope[:, None], [self.KEY])
+DEAD, SLOW, SAG = ('rotor_dead_time.delay', 0.02), (LAG, 0.4), ('voltage_sag.exponent', 0.8)
 
 
-def test_without_the_only_block_at_a_limit_the_limit_is_open():
-    problem = Capped()
-    point, without = problem.at(0.019), problem.at(3.0)     # the value given by bad readings
-    trial = Trial(Candidate('joint_velocity_limit', (problem.KEY,), label='limit'), 1.0,
-                  dict(point.theta))
-    cross_validate(problem, trial, point, without, [], frozenset())
-    missed = ((without.r**2)[problem.block == 3]).sum()
-    assert missed > 1e4 and trial.held.total > -0.01 * missed
+def trial(entry, gain):
+    key, size = entry
+    name = key.partition('.')[0]
+    return Trial(Candidate(name, (key,), label=name), gain, {key: size}, refined=True)
+
+
+def rivals(monkeypatch, accepted, other, beside, instead):
+    """Members of the set of ``accepted`` (220 of chi2), given the gains of ``other``."""
+    own = trial(accepted, 220.0)
+    found = Found(accepted=[own], trials={own.candidate.label: own})
+    left = trial(other, beside)
+    found.trials[left.candidate.label] = left
+    state = State({}, np.zeros(4), np.zeros((4, 1)), [accepted[0]])
+    search = Search.__new__(Search)
+    search.p = P
+    signals = SimpleNamespace(delays=lambda theta: (0.01, 0.01))
+    search.problem = SimpleNamespace(keys=KEYS, residual=lambda theta: np.zeros(4),
+                                     models=[SimpleNamespace(signals=signals)])
+    monkeypatch.setattr(Search, '_refit', lambda self, start, others, n: (start, 1220.0))
+    monkeypatch.setattr(Search, '_propose', lambda *rest: [trial(other, instead)])
+    monkeypatch.setattr(Search, '_cross_validate', agreed(10.0))
+    search._find_rivals(found, state, 1000.0)
+    return [t.candidate.keys[0] for t in found.rivals[own.candidate.label]]
+
+
+@pytest.mark.parametrize('accepted, other', [(DEAD, SLOW), (SLOW, DEAD)])
+@pytest.mark.parametrize('beside, meant', [(33.0, True), (5.0, False)])
+def test_a_lag_of_second_order_is_dead_time_or_lag(monkeypatch, accepted, other, beside, meant):
+    assert rivals(monkeypatch, accepted, other, beside, 120.0) == [other[0]] * meant
+
+
+def test_rivals_of_another_kind_must_explain_as_much(monkeypatch):
+    assert rivals(monkeypatch, DEAD, SAG, 33.0, 120.0) == []
+    assert rivals(monkeypatch, DEAD, SAG, 0.0, 215.0) == [SAG[0]]
