@@ -3,12 +3,20 @@
 from dataclasses import replace
 from functools import cache
 
-from flights import KEYS, model, Motion, ROBOT, solved, STEP
+from flights import KEYS, model, Motion, P, ROBOT, solved, STEP
 import numpy as np
 import pytest
 
 from beetle_omni_ros.identify.gap.candidates import candidates
-from beetle_omni_ros.identify.gap.servo import spin_load
+from beetle_omni_ros.identify.gap.servo import (
+    module_load,
+    simulate,
+    spin_load,
+    undescribed_load,
+    Windows,
+)
+from beetle_omni_ros.identify.gap.signals import Signals
+from beetle_omni_ros.robot.parameters import RobotParameters
 
 MOTION = Motion(9, 12.0)
 FINE = 1e-4
@@ -151,3 +159,31 @@ def test_a_torque_limit_is_recovered_from_samples_at_the_limit():
     assert all(KEYS[key].low < x for x in tried)
     found = solved(made, [key], 'J', None, {key: tried[int(np.argmin(rest[1:]))]}, 6)
     assert KEYS[key].value(found[key]) == pytest.approx(0.05, abs=0.003)
+
+
+DESCRIBED = RobotParameters.load()
+
+
+def test_undescribed_modules_load_joints_as_described_ones_of_equal_moment_and_inertia():
+    flight, module = MOTION.flight(), DESCRIBED.multibody.module
+    moment = -module.mass * module.centre_of_mass[2]
+    inertia = module.inertia[0] - moment * module.centre_of_mass[2]
+    expected = module_load(Signals(flight, DESCRIBED, P), {})
+    hanging, turning = undescribed_load(Signals(flight, ROBOT, P), {})
+    found = moment * hanging + inertia * turning
+    assert np.std(found - expected) < 0.05 * np.std(expected)
+    assert np.std(moment * hanging - expected) > np.std(found - expected)
+
+
+@pytest.mark.parametrize('sets, base, moment', [
+    ({'module_reaction.mass_moment': 2e-3}, 0.0, 2e-3), ({}, 1e-3, 1e-3),
+    ({'module_reaction.mass_moment': -4e-4}, 1e-3, 6e-4)])
+def test_a_servo_sags_under_a_module_that_hangs_beside_its_axis(sets, base, moment):
+    k, gravity = 800, 9.8
+    zero, one = np.zeros((k, 1, 4)), np.ones((k, 1, 4))
+    windows = Windows(zero[0], zero[0], zero, zero, zero, P.servo_step, 0, 8,
+                      (gravity * one, zero))
+    robot = replace(ROBOT, effects={'module_reaction': {'module_inertia': 0.0,
+                                                        'mass_moment': base}})
+    shown = simulate(robot, windows, np.zeros((1, k, 1, 4)), [sets], 0.0)[0, -1, 0]
+    assert shown == pytest.approx(moment * gravity / ROBOT.joints.kp, rel=1e-3)

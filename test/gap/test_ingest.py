@@ -41,11 +41,6 @@ def cut(made, topic, keep):
     return made
 
 
-def test_a_good_recording_is_used_completely():
-    flight = prepare(recording(), ROBOT, P)
-    assert flight.duration > 15 and not flight.findings
-
-
 @pytest.mark.parametrize('topic', ['imu/data_raw', 'mocap/pose', 'joint_states', 'command'])
 def test_a_missing_topic_is_named(topic):
     refused(cut(recording(), topic, slice(0, 0)), topic, 'missing')

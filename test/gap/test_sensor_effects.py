@@ -32,11 +32,6 @@ def test_the_delay_of_a_reading_is_recovered(name, groups, reading):
     assert recovered(flight, [f'{name}.delay'], groups) == pytest.approx([0.012], abs=3e-4)
 
 
-def test_imu_and_mocap_delays_have_opposite_signs_in_their_common_residual():
-    found = recovered(MOTION.flight(imu_delay=0.01), ['mocap_time_offset.delay'], 'W')
-    assert found == pytest.approx([-0.01], abs=5e-4)
-
-
 @pytest.mark.parametrize('name, part', [('imu_accelerometer_bias', 0), ('imu_gyroscope_bias', 3)])
 def test_a_bias_equals_the_added_constant(name, part):
     true = np.array([0.1, -0.05, 0.2])

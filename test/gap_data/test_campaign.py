@@ -1,11 +1,13 @@
 """The campaign from cases to report, with replacements of the workflow."""
 
+import ast
 from dataclasses import replace
 import json
 import os
+from pathlib import Path
 
 from gap_data.campaign import make_report, run_campaign
-from gap_data.cases import Case
+from gap_data.cases import Case, GENERATOR
 from gap_data.make import make_case
 from gap_data.page import markdown
 from gap_data.workflow import Workflow
@@ -76,3 +78,30 @@ def test_a_campaign_scores_workflows_side_by_side(folder, stub):
     assert all(kept for _, kept in seen[4:])
     report = json.loads(json.dumps(make_report(judged, META)))
     assert '| none: false alarm | <= 0.05 |' in markdown(report)
+
+
+ROOT = Path(__file__).resolve().parents[2] / 'benchmarks' / 'gap_data'
+
+
+def imported(path):
+    for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield node.module or ''
+
+
+@pytest.mark.parametrize('path', sorted(ROOT.rglob('*.py')), ids=lambda path: path.stem)
+def test_no_file_imports_the_package(path):
+    assert not [name for name in imported(path) if name.split('.')[0] == 'beetle_omni_ros']
+
+
+def test_the_cache_key_covers_every_file_of_the_generator():
+    files, left = set(), ['make']
+    while left:
+        files.add(file := f'{left.pop()}.py')
+        left += [name.removeprefix('gap_data.') for name in imported(ROOT / file)
+                 if name.startswith('gap_data.')
+                 and f'{name.removeprefix("gap_data.")}.py' not in files]
+    # `cases` itself is in the key by its content: the case's fields
+    assert files - {'cases.py'} <= set(GENERATOR)

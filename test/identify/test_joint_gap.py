@@ -14,7 +14,7 @@ from beetle_omni_ros.identify.servo.compare import changes, compare, gap_of
 from beetle_omni_ros.identify.servo.joint import identify
 from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
 from beetle_omni_ros.identify.servo.model import simulate
-from beetle_omni_ros.identify.servo.robot import catalogue_values, file_sets, own_delay
+from beetle_omni_ros.identify.servo.robot import file_sets, own_delay
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 REAL = sorted((Path(__file__).resolve().parents[3] / 'shared' / 'data').glob('joint_*.csv'))
@@ -76,16 +76,6 @@ def test_servos_of_the_robot_file_agree_with_a_plain_simulation():
     log = JointLog('made.csv', T, (1, 2), shown, np.tile(COMMAND, (2, 1)))
     error = simulate(log, np.arange(2), file_sets(file_robot)[:2]) - shown
     assert np.sqrt(np.mean(error[:, 25:]**2)) < 5e-4 and np.abs(error[:, 25:]).max() < 2e-3
-
-
-def test_a_robot_file_states_the_delay_beyond_that_of_the_simulator():
-    stated = catalogue_values(file_sets(robot())[0], robot())['joint_command_latency']['delay']
-    assert stated == pytest.approx(robot().effects['joint_command_latency']['delay'])
-    later = made(2, delay=DELAY + 0.012)
-    named, = judged(later)['effects']
-    assert named['names'] == ['joint_command_latency']
-    assert named['parameters']['delay']['value'] == pytest.approx(
-        DELAY + 0.012 - own_delay(), abs=0.002)
 
 
 def test_servos_of_the_robot_file_have_no_gap():

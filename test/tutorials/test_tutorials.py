@@ -31,8 +31,6 @@ from ros_flights import FLIGHTS
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted((ROOT / 'docs' / 'tutorials').glob('*.md'))
-NAMES = ('beetle_omni', 'sim_node')
-STARTED = 'first_flight'    # the page whose commands load their modules when first called
 TIMEOUT = 1000       # s of one block
 BLOCK = re.compile(r'(?P<before>[^\n]*)\n(?:\n<!-- test: (?P<options>[^\n]*) -->\n)?\n'
                    r'```(?P<language>\w*)\n(?P<text>.*?)^```$', re.DOTALL | re.MULTILINE)
@@ -103,20 +101,13 @@ def client(tmp_path_factory):
 
 
 @pytest.fixture
-def shell(tmp_path, page, client):
+def shell(tmp_path, client):
     """Environment in which the commands of this checkout are found."""
     programs = tmp_path / 'programs'
     programs.mkdir()
-    texts = {name: f'#!/bin/sh\nexec {sys.executable} -m beetle_omni_ros.start {name} "$@"\n'
-             for name in NAMES}
-    texts['python'] = f'#!/bin/sh\nexec {sys.executable} "$@"\n'
-    texts['ready'] = client
-    if page.stem != STARTED:
-        texts['beetle_omni'] = client
-    else:
-        again = f'if [ -e {programs}/of_$1 ]; then exec {programs}/ready "$@"; fi\n'
-        texts['beetle_omni'] = texts['beetle_omni'].replace(
-            'exec', f'{again}touch {programs}/of_$1\nexec')
+    start = f'#!/bin/sh\nexec {sys.executable}'
+    texts = {'beetle_omni': client, 'python': f'{start} "$@"\n',
+             'sim_node': f'{start} -m beetle_omni_ros.start sim_node "$@"\n'}
     for name, text in texts.items():
         (programs / name).write_text(text)
         (programs / name).chmod(0o755)
