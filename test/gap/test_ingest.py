@@ -2,15 +2,13 @@
 
 from dataclasses import replace
 
-from flights import model, Motion, P, ROBOT
+from flights import Motion, P, ROBOT
 import numpy as np
 import pytest
 
 from beetle_omni_ros.identify.gap.bags import Recording
 from beetle_omni_ros.identify.gap.ingest import prepare, UnusableFlight
-from beetle_omni_ros.identify.gap.noise import Noise
 from beetle_omni_ros.identify.gap.parameters import GapParameters
-from beetle_omni_ros.identify.gap.series import LEAST_SAMPLES, shortest_flight
 
 
 def recording(duration=16.0):
@@ -58,18 +56,11 @@ def test_long_sensor_gaps_are_refused_and_short_ones_cut_out():
 
 
 def test_a_recording_shorter_than_the_filters_is_refused_for_any_setting():
-    p = GapParameters.load(least_duration=3.0)
     made = recording()
     for topic, t in made.times.items():
         cut(made, topic, t < 4)
     with pytest.raises(UnusableFlight, match='s of usable flight'):
-        prepare(made, ROBOT, p)
-    made = recording()
-    for topic, t in made.times.items():
-        cut(made, topic, t < shortest_flight(p) + 0.5)
-    residual = model(prepare(made, ROBOT, p)).residual({})
-    assert min(len(values) for values in residual.values()) >= LEAST_SAMPLES
-    Noise.of([residual], p).whiten(residual)
+        prepare(made, ROBOT, GapParameters.load(least_duration=3.0))
 
 
 def test_a_recording_on_the_ground_or_of_another_robot_is_refused():

@@ -1,10 +1,14 @@
-"""Forces outside the catalogue are found by their correlations, and not found in gusts."""
+"""Forces outside the catalogue are found, not those of gusts; excitation of known ones."""
 
+from dataclasses import replace
 
 from flights import gusts, KEYS, model, Motion, P, pushed
 import numpy as np
 import pytest
 
+from beetle_omni_ros.identify.gap.analysis import Analysis
+from beetle_omni_ros.identify.gap.candidates import candidates
+from beetle_omni_ros.identify.gap.certainty import detectability, excitation
 from beetle_omni_ros.identify.gap.fit import Problem
 from beetle_omni_ros.identify.gap.keys import tolerances
 from beetle_omni_ros.identify.gap.noise import Noise
@@ -12,6 +16,7 @@ from beetle_omni_ros.identify.gap.patterns import (
     patterns,
     spectral_line,
 )
+from beetle_omni_ros.identify.gap.verdict import hidden, not_met
 
 MOTION = Motion(7, duration=60.0)
 NAMES = [*(f'wind.force[{k}]' for k in range(3)),
@@ -63,3 +68,36 @@ def test_a_line_in_the_spectrum_is_found_with_its_size():
 def test_gusts_have_no_line(seed):
     made, _ = problem(gust(seed, 0.2))
     assert spectral_line(made, {}).ratio < P.least_line
+
+
+@pytest.mark.parametrize('higher, seen', [(0.0, True), (30.0, False)])
+def test_ground_effect_is_detectable_near_the_ground_only(higher, seen):
+    motion = Motion(3, 24.0)
+    motion.position[:, 2] += higher
+    made = model(motion.flight())
+    problem = Problem([made], KEYS, tolerances(P), P)
+    state = problem.state({}, [name for name, key in KEYS.items() if not key.form])
+    visible = detectability(problem, state, list(problem.priors), candidates(KEYS, [made]))
+    assert {'ground_effect', 'tilt_thrust_loss', 'propeller_gyroscopic_torque'} <= set(visible)
+    a = Analysis(detectability=visible)
+    assert ('ground_effect' not in not_met(a, P)) == seen
+    assert 'ground_effect' not in hidden(a, P)
+
+
+def of(flight):
+    return Problem([model(flight)], KEYS, tolerances(P), P)
+
+
+def test_a_planned_motion_has_excitation_and_motion_by_gusts_has_not():
+    motion = Motion(7)
+    assert excitation(of(motion.flight())) > 3 * P.least_liveliness
+    rng, kernel = np.random.default_rng(1), np.hanning(100)
+    gust = np.stack([np.convolve(x, kernel / np.linalg.norm(kernel), 'same')
+                     for x in rng.standard_normal((6, len(motion.t)))], axis=1)
+    gust[:, 3:] *= 0.1      # rad/s, of which only the derivative is used
+    flight = motion.flight(imu=0.1 * gust + [0, 0, 9.80665, 0, 0, 0])
+    flight.pose[:] = [0, 0, 1, 0, 0, 0, 1]
+    hover = of(flight)
+    hover.noise = replace(hover.noise, sigma={
+        **hover.noise.sigma, 'B': np.array([0.1] * 3 + [0.2] * 3)})
+    assert excitation(hover) < P.least_liveliness

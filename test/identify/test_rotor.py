@@ -90,12 +90,6 @@ def test_the_lag_and_its_directions_are_recovered(tmp_path):
     assert np.mean(inside) > 0.8
 
 
-def test_dead_time_is_separated_from_the_lag(tmp_path):
-    lag = only_lag(identified(tmp_path, series(np.random.default_rng(0), dead=0.04), SERIES))
-    assert lag['dead_time']['value'] == pytest.approx(0.04, abs=0.008)
-    assert lag['up']['value'] == pytest.approx(0.07, rel=0.2)
-
-
 @pytest.mark.parametrize('seed', range(2))
 def test_a_gain_that_jumps_is_bad_data_with_the_lag_that_remains(tmp_path, seed):
     rng = np.random.default_rng(seed)
