@@ -137,6 +137,14 @@ def test_a_rotor_effect_is_recovered_from_the_thrust_that_results(true, name, va
     assert KEYS[name].value(x) == pytest.approx(value, rel=0.03)
 
 
+def test_play_behind_the_encoder_turns_the_true_tilt_only():
+    made = model(MOTION.flight())
+    tight, loose = made.signals.joints({}), made.signals.joints({'joint_backlash.gap': 0.02})
+    assert np.array_equal(tight[3], loose[3])
+    apart = np.abs(tight[0] - loose[0])
+    assert 0.008 < apart.max() < 0.011
+
+
 def test_the_gyroscopic_load_on_a_joint_agrees_with_euler():
     """Turning the angular momentum needs a torque, which the servo gives about its axis."""
     made = model(MOTION.flight())

@@ -1,13 +1,8 @@
 """Every name of INTERFACES is in the catalogue, with a complete description."""
 
-import math
 
-import numpy as np
-import pytest
 
-from beetle_omni_ros.identify.gap.keys import all_keys
 from beetle_omni_ros.robot.effects import CATALOGUE
-from beetle_omni_ros.robot.parameters import RobotParameters
 
 # layer -> names of its effects, with those of their parameters that are fixed
 NAMES = {
@@ -28,7 +23,6 @@ NAMES = {
              'joint_encoder_error.cosine',
     'sensor': 'imu_accelerometer_bias.bias imu_gyroscope_bias.bias imu_misalignment.rotation '
               'imu_lever_arm mocap_misalignment.rotation'}
-ROBOT = RobotParameters.load()
 
 
 def test_fixed_names_exist_in_their_layer_with_their_parameters():
@@ -37,13 +31,3 @@ def test_fixed_names_exist_in_their_layer_with_their_parameters():
             name, _, parameter = entry.partition('.')
             assert CATALOGUE[name].layer == layer, name
             assert not parameter or parameter in CATALOGUE[name].parameters, entry
-
-
-def test_a_value_of_the_robot_file_is_varied_by_a_ratio():
-    keys = all_keys(ROBOT)
-    assert keys['mass.mass'].relative
-    assert keys['mass.mass'].value(math.log(1.1)) == pytest.approx(1.1 * ROBOT.mass)
-    assert not keys['wind.force[1]'].relative
-    assert keys['wind.force[1]'].value(0.7) == 0.7
-    assert all(math.isfinite(key.base) and key.low < key.high for key in keys.values())
-    assert np.allclose([keys[f'inertia.inertia[{k}]'].base for k in range(3)], ROBOT.inertia)

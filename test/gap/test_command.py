@@ -72,15 +72,12 @@ def test_the_json_has_the_fixed_keys(made):
     assert {'delta_bic', 'cv_gain_se'} <= set(results['effects'][0]['evidence'])
 
 
-def test_the_new_robot_file_is_the_old_one_with_the_wind(made):
-    robot = RobotParameters.load(made[0] / 'new.yaml')
+def test_page_terminal_and_the_new_robot_file_state_the_wind(made):
+    folder, _, printed = made
+    robot = RobotParameters.load(folder / 'new.yaml')
     assert np.allclose(robot.effects['wind']['force'][:2], TRUE[:2], atol=0.1)
     assert replace(robot, effects={}).hash() == RobotParameters.load().hash()
     assert robot.provenance['runs'] and robot.provenance['date']
-
-
-def test_page_and_terminal_state_the_finding(made):
-    folder, _, printed = made
     page = (folder / 'gap.html').read_text()
     assert 'wind' in printed and 'wind' in page
     assert page.count('<img') >= 3 and 'src="http' not in page

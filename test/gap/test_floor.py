@@ -12,7 +12,6 @@ from beetle_omni_ros.identify.gap.keys import tolerances
 from beetle_omni_ros.identify.gap.noise import Noise
 from beetle_omni_ros.identify.gap.residual import THIN
 from beetle_omni_ros.identify.gap.rollouts import (
-    _servo_runs,
     floor_factors,
     gap,
     HORIZONS,
@@ -100,20 +99,3 @@ def test_unknown_torques_tilt_the_thrust():
             place = place + step * velocity
         reached.append([place @ place, velocity @ velocity])
     assert floor[:2] == pytest.approx(np.sqrt(np.mean(reached, axis=0)), rel=0.2)
-
-
-def test_rotors_follow_their_servos_through_backlash():
-    flown, play = model(Motion().flight()), 0.04
-    starts, steps = np.arange(0, 1200, 50), 100
-    _, shaft, tight = _servo_runs(flown, {}, starts, steps)
-    _, same, loose = _servo_runs(flown, {'joint_backlash.gap': play}, starts, steps)
-    seen = flown.signals.joints({'joint_backlash.gap': play})[0]
-    np.testing.assert_array_equal(shaft, tight)     # rotors follow their servos
-    np.testing.assert_array_equal(same, tight)      # which it does not move
-    np.testing.assert_allclose(loose[:, 0], seen[starts], atol=1e-3)
-    np.testing.assert_allclose(loose, seen[starts[:, None] + np.arange(steps + 1)], atol=4e-3)
-    assert np.abs(loose - tight).max() <= play / 2 + 1e-3
-    one_way = np.abs(np.sign(np.diff(tight, axis=1)).sum(axis=1)) == steps
-    turning = one_way & (np.abs(tight[:, -1] - tight[:, 0]) > play)  # touches a side
-    assert turning.sum() > 20
-    np.testing.assert_allclose(np.abs(loose - tight)[:, -1][turning], play / 2, atol=2e-3)

@@ -41,15 +41,9 @@ def best(push):
     return {p.text: p for p in patterns(*problem(push), NAMES)}
 
 
-def field():
-    """A jet across the room, along x where y is small."""
-    y = MOTION.position[:, 1]
-    return np.outer(np.exp(-0.5 * (y / 0.4)**2), [0.6, 0.2, 0.0])
-
-
 def test_a_local_jet_is_a_pattern_over_position():
-    found = best(gust(1) + field())
-    calm = best(gust(1))
+    across = np.exp(-0.5 * (MOTION.position[:, 1] / 0.4)**2)       # where y is small
+    found, calm = best(gust(1) + np.outer(across, [0.6, 0.2, 0.0])), best(gust(1))
     assert found['the place'].gain > P.least_pattern > calm['the place'].gain
     assert found['the place'].gain == max(p.gain for p in found.values())
     assert found['the place'].size[0] > P.least_force

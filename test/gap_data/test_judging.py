@@ -37,6 +37,9 @@ def run(*effects, verdict='named', **more):
 NONE = label(kind='none', accept=('no_gap',))
 HOVER = label({**ROTOR, 'name': 'mass', 'parameters': {'mass': 3.3}}, kind='undecidable',
               accept=('not_decidable',), sets=('mass', 'thrust_coefficient'))
+BAD = label(kind='damaged', accept=('bad_data', 'refused'))
+REFUSED = {'answer': None, 'problems': ['no JSON'], 'status': 2, 'wall_s': 1.0, 'cpu_s': 1.0,
+           'traceback': False, 'message': 'bag/: topic imu/data_raw is missing'}
 WIND = effect('wind', parameter='force')
 SECOND, FOURTH = (effect(ROTOR['name'], value=0.9, interval=(0.89, 0.91), parameter='scale',
                          rotor=rotor) for rotor in (2, 4))
@@ -55,7 +58,11 @@ SECOND, FOURTH = (effect(ROTOR['name'], value=0.9, interval=(0.89, 0.91), parame
     ({**NONE, 'allowed': []}, run(effect('module_reaction')), False, None),
     (HOVER, run(verdict='not_decidable'), True, []), (HOVER, run(verdict='no_gap'), False, []),
     (HOVER, run(effect('thrust_coefficient', 'mass'), verdict='named_set'), True, []),
-    (HOVER, run(effect('mass')), False, None)])
+    (HOVER, run(effect('mass')), False, None),
+    # bad bags need the verdict, or one line
+    (BAD, REFUSED, True, None), (BAD, {**REFUSED, 'message': 'a\nb'}, False, None),
+    (BAD, {**REFUSED, 'traceback': True}, False, None), (BAD, run(verdict='bad_data'), True, []),
+    (BAD, run(effect('mass')), False, None)])
 def test_an_answer_is_judged_by_its_names(truth, answer, right, wrong):
     judged = judge(truth, answer)
     assert judged['right'] == right
@@ -82,17 +89,6 @@ def test_command_delays_may_be_counted_from_the_stamp_or_beyond_the_nominal_age(
                                             interval=(value - 1e-3, value + 1e-3))))['parameters']
         assert row['reading'] == reading
         assert row['error'] == pytest.approx(0.0005) and row['inside'] == [True]
-
-
-def test_bad_bags_need_the_verdict_or_one_line():
-    bad = label(kind='damaged', accept=('bad_data', 'refused'))
-    refused = {'answer': None, 'problems': ['no JSON'], 'status': 2, 'wall_s': 1.0, 'cpu_s': 1.0,
-               'traceback': False, 'message': 'bag/: topic imu/data_raw is missing'}
-    assert judge(bad, refused)['right']
-    assert not judge(bad, {**refused, 'message': 'a\nb'})['right']
-    assert not judge(bad, {**refused, 'traceback': True})['right']
-    assert judge(bad, run(verdict='bad_data'))['right']
-    assert not judge(bad, run(effect('mass')))['right']
 
 
 def test_scores_of_a_perfect_workflow_and_of_one_without_answers():

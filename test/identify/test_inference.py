@@ -5,10 +5,9 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
-from scipy.special import huber as huber_cost
 
 from beetle_omni_ros.identify.inference.blocks import ridge_held_out
-from beetle_omni_ros.identify.inference.least_squares import HUBER, huber, minimise, solved, Steps
+from beetle_omni_ros.identify.inference.least_squares import minimise, solved, Steps
 from beetle_omni_ros.identify.inference.noise import autoregression, gain, whitened
 from beetle_omni_ros.identify.inference.prior import Prior, UNKNOWN
 
@@ -71,12 +70,6 @@ def test_the_derivative_of_a_prior_is_that_of_its_residual(prior):
     assert prior.slope(x) == pytest.approx(numeric, rel=1e-5)
     assert np.abs(prior.residual(prior.within(x, 2.0))).max() <= 2.0 + 1.0 / prior.inner * 4
     assert prior.cost(x) == pytest.approx((prior.residual(x)**2).sum())
-
-
-def test_robust_residuals_square_to_their_cost():
-    x = np.linspace(-9, 9, 101)
-    assert huber(x)**2 == pytest.approx(2 * huber_cost(HUBER, x))
-    assert (np.sign(huber(x)) == np.sign(x)).all()
 
 
 def coloured(seed, count=20000):

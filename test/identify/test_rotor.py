@@ -113,12 +113,6 @@ def test_held_and_impossible_telemetry_is_masked_and_stated(tmp_path):
     assert np.abs(model.rows['voltage'] - rows[:, 3]).max() < 3
     assert thrust_of(model, 0.6, 23.0) == pytest.approx(thrust_of(clean, 0.6, 23.0), abs=0.1)
     assert f'{np.sum(bad[:, 3] != rows[:, 3])} of {len(rows)} rows' in model.logs[0].notes[0]
-    rows = series(np.random.default_rng(3))
-    rows[:, 4:] = rows[np.arange(600) // 30 * 30][:, 4:]
-    rows[5::10, 2:4] = rows[4::10, 2:4]
-    held, repeated = identified(tmp_path, rows, SERIES).logs[0].notes
-    assert '580 of 600' in held and 'up to 0.30 s' in held
-    assert '60 of 600' in repeated
 
 
 def test_the_written_robot_file_gives_the_surface(tmp_path):
