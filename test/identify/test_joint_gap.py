@@ -26,13 +26,9 @@ DELAY = own_delay() + 0.004     # of which a file states the rest
 T, COMMAND = sweep(5.0, periods=(0.5, 0.9), amplitudes=(0.3, 0.6))
 
 
-def stiffness(frequency=FREQUENCY):
-    return INERTIA * frequency**2
-
-
 def robot(**effects):
     """Robot file with the servos of ``made`` and further effects."""
-    kp = stiffness()
+    kp = INERTIA * FREQUENCY**2
     torque = tuple(kp * band for band in (*BANDS, 0.0, 0.0))
     own = {'joint_bandwidth': {'kp': kp, 'kd': 2 * DAMPING * FREQUENCY * INERTIA},
            'joint_friction': {'coulomb': torque, 'stiction': torque},

@@ -11,9 +11,7 @@ from servo_logs import log_of, sweep, write
 import yaml
 
 from beetle_omni_ros import cli
-from beetle_omni_ros.faults.flight import Flight
 from beetle_omni_ros.identify.servo.robot import own_delay
-from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
 
@@ -74,17 +72,6 @@ def test_the_file_has_command_logs_and_what_no_log_shows_but_no_zero(made):
     assert not set(left) & {'joints.kp', 'rotors.map', 'rotors.time_constant'}
     assert 'untimed.csv' in (made / 'r.json').read_text()
     assert (made / 'p.svg').read_text().startswith('<?xml')
-
-
-def test_the_measured_robot_hovers_under_a_controller_that_believes_the_published_one():
-    flight = Flight(controller='nmpc', conditions='nominal', seed=0, plant='measured')
-    flight.loop.take_off()
-    flight.aim((0.0, 0.0, 1.0))
-    flight.fly(6.0)
-    truth = flight.simulator.truth
-    assert not truth.broken
-    assert truth.position == pytest.approx([0, 0, 1], abs=0.05)
-    assert rotations.geodesic_angle(truth.quaternion, [0, 0, 0, 1]) < 0.15
 
 
 @pytest.mark.skipif(not (ROOT / '../shared/data/joint_response_100Hz.csv').is_file(),

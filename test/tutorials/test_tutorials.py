@@ -170,6 +170,7 @@ def test_the_commands_of_a_tutorial_give_its_results(page, tmp_path, shell):
             if block.one('ends'):
                 stop(background.pop(block.one('ends')))
             if not block.language:
+                assert all(one.commands == one.text for one in found[:found.index(block)])
                 true = with_printed_numbers(block.text, printed)
                 if RENEW:
                     page.write_text(page.read_text().replace(block.text, true))
