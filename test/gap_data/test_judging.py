@@ -65,7 +65,7 @@ SECOND, FOURTH = (effect(ROTOR['name'], value=0.9, interval=(0.89, 0.91), parame
     (BAD, run(effect('mass')), False, None)])
 def test_an_answer_is_judged_by_its_names(truth, answer, right, wrong):
     judged = judge(truth, answer)
-    assert judged['right'] == right
+    assert bool(judged['right']) == right
     assert judged['wrong'] == wrong or wrong is None
 
 
