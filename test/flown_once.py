@@ -24,14 +24,9 @@ def flight(name):
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not bag.exists():
             poses, wind, options = FLIGHTS[name]
-            hover(folder / 'new' / name, poses, wind, **options).rename(bag)
-    return bag
-
-
-def hover(bag, poses, wind=None, **options):
-    """Fly poses by the hover controller, in a wind that is not in the robot file."""
-    robot = beetle_omni_ros.robot()
-    bag.parent.mkdir(exist_ok=True)
-    beetle_omni_ros.simulate('hover', poses, bag=bag, **options, plant=replace(
-        robot, effects={'wind': {'force': tuple(wind)}}) if wind is not None else robot)
+            robot, new = beetle_omni_ros.robot(), folder / 'new' / name
+            new.parent.mkdir(exist_ok=True)
+            beetle_omni_ros.simulate('hover', poses, bag=new, **options, plant=replace(
+                robot, effects={'wind': {'force': wind}}) if wind is not None else robot)
+            new.rename(bag)
     return bag
