@@ -11,8 +11,9 @@ WIND = 1.2, -0.8, 0.0       # [N], not in the robot file
 TWO_POSES = [[0.8, 0.4, 1.2, 40, 20, 90], [-0.6, 0.8, 0.9, -30, 35, -120]]
 THREE_POSES = [[-0.7, 0.5, 1.0, -90, 10, -60], [0.9, -0.6, 1.3, 60, 50, 100],
                [0, 0.4, 1.1, 170, 0, 20]]
-FLIGHTS = {'windy_0': (TWO_POSES, WIND, 0), 'windy_1': (TWO_POSES, WIND, 1),
-           'calm': (THREE_POSES, None, 5)}      # name -> poses, wind, seed
+# name -> poses, wind, options
+FLIGHTS = {'windy_0': (TWO_POSES, WIND, {'seed': 0}), 'windy_1': (TWO_POSES, WIND, {'seed': 1}),
+           'published': (THREE_POSES, None, {'seed': 5, 'conditions': 'published'})}
 folder: Path | None = None      # set by conftest.py, the same for all workers
 
 
@@ -22,15 +23,10 @@ def flight(name):
     with open(folder / f'{name}.lock', 'w') as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not bag.exists():
-            poses, wind, seed = FLIGHTS[name]
-            hover(folder / 'new' / name, poses, wind, seed=seed).rename(bag)
-    return bag
-
-
-def hover(bag, poses, wind=None, **options):
-    """Fly poses by the hover controller, in a wind that is not in the robot file."""
-    robot = beetle_omni_ros.robot()
-    bag.parent.mkdir(exist_ok=True)
-    beetle_omni_ros.simulate('hover', poses, bag=bag, **options, plant=replace(
-        robot, effects={'wind': {'force': tuple(wind)}}) if wind is not None else robot)
+            poses, wind, options = FLIGHTS[name]
+            robot, new = beetle_omni_ros.robot(), folder / 'new' / name
+            new.parent.mkdir(exist_ok=True)
+            beetle_omni_ros.simulate('hover', poses, bag=new, **options, plant=replace(
+                robot, effects={'wind': {'force': wind}}) if wind is not None else robot)
+            new.rename(bag)
     return bag

@@ -142,7 +142,7 @@ ROWS = [(f'{before} {value}', fragment) for before, cases in CASES.items()
         for value, fragment in cases]
 EXPECTATIONS = ('expected', 'See beetle_omni', 'no such', 'known', 'needs', 'there is no folder',
                 'it is a folder', 'not a', 'no .mcap', 'ros2 bag', 'at most', 'cannot',
-                'No module', 'No such file', 'missing', 'outside', 'beside it or among')
+                'no module', 'missing', 'outside', 'beside it or among')
 
 
 @pytest.fixture(scope='module')

@@ -1,12 +1,16 @@
-"""Values that are written to a robot file with the named effects."""
+"""Values of the named effects in the results and in a robot file."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
+from flights import KEYS
+from flights import ROBOT as PLAIN
 import numpy as np
 import pytest
-import yaml
 
-from beetle_omni_ros.identify.gap.apply import own_numbers, write_corrected
+from beetle_omni_ros.identify.gap.apply import write_corrected
+from beetle_omni_ros.identify.gap.results import parameters
+from beetle_omni_ros.robot.effects import CATALOGUE, treatment
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 ROBOT = RobotParameters.load()
@@ -39,18 +43,23 @@ def test_by_default_only_named_effects_are_written(tmp_path):
     assert mine.sensors.imu_rotation == (0.01, 0.0, -0.02)
 
 
-def test_a_number_that_was_not_fitted_has_no_interval(tmp_path):
-    servo = {'names': ['joint_bandwidth'], 'parameters': {
-        'kp': {'value': 0.33, 'interval': [0.32, 0.34], 'unit': 'N m/rad'},
-        'kd': {'value': 0.0094, 'interval': [0.0094, 0.0094], 'unit': 'N m s/rad'}}}
-    write_corrected(tmp_path / 'mine.yaml', {**RESULTS, 'effects': [servo]}, ROBOT, None)
-    written, = yaml.safe_load((tmp_path / 'mine.yaml').read_text())['provenance']['named']
-    assert written['parameters'] == {
-        'kp': {'value': 0.33, 'interval': [0.32, 0.34], 'unit': 'N m/rad'},
-        'kd': {'value': 0.0094, 'unit': 'N m s/rad'}}
+@pytest.mark.parametrize('name, deviation, expected', [
+    ('rotor_drag.coefficient', 0.03, [0.0, 0.13]), ('axial_inflow.per_rotor', 0.4, [0.3, 0.5])])
+def test_intervals_exclude_impossible_values(name, deviation, expected):
+    a = SimpleNamespace(keys=KEYS, widths={name: 0.1})
+    entry, parameter = name.split('.')
+    found = parameters(a, entry, (name,), {name: deviation}, PLAIN)[parameter]
+    assert found['interval'] == pytest.approx(expected) and found['file'] == 0.0
 
 
-def test_a_named_value_has_precedence_over_its_tolerance():
-    assert 'joints' not in own_numbers(ROBOT, TOLERANCES, ['joint_bandwidth'])
-    heavy = replace(ROBOT, effects={'mass': {'mass': 3.2}})
-    assert 'mass' not in own_numbers(heavy, TOLERANCES)
+@pytest.mark.parametrize('name', [n for n in CATALOGUE if treatment('gap', n).acts])
+def test_every_entry_states_each_of_its_parameters(name):
+    own = {key.name: key for key in KEYS.values() if key.effect == name}
+    member = 1 if CATALOGUE[name].each else None
+    free = tuple(key for key in own if member is None or key.endswith(f'[{member - 1}]')) or \
+        tuple(own)
+    a = SimpleNamespace(keys=KEYS, widths=dict.fromkeys(own, 0.1))
+    stated = parameters(a, name, free, dict.fromkeys(own, 0.0), PLAIN)
+    assert list(stated) == list(CATALOGUE[name].parameters)
+    for entry in stated.values():
+        assert set(entry) == {'value', 'unit', 'file', 'interval'}

@@ -9,10 +9,8 @@ import pytest
 from scipy.signal import butter, lfilter, sosfilt
 
 from beetle_omni_ros.identify.gap.bands import (
-    by_band,
     differs_between_bands,
     gain_by_part,
-    project_out,
 )
 from beetle_omni_ros.identify.gap.residual import THIN
 from beetle_omni_ros.identify.inference.noise import autoregression
@@ -28,10 +26,6 @@ def problem(flights=2):
     where = np.repeat(np.arange(CHANNELS), LENGTH)
     return SimpleNamespace(p=P, priors={}, where=np.tile(where, flights),
                            flight=np.repeat(np.arange(flights), len(where)))
-
-
-def noise(count, seed):
-    return np.random.default_rng(seed).standard_normal(count)
 
 
 def flown(seed, gusts, wanted):
@@ -58,32 +52,6 @@ def flown(seed, gusts, wanted):
     return planned + jitter - gust, gust + 0.2 * np.gradient(rng.standard_normal(LENGTH))
 
 
-def test_a_parameter_valid_in_all_bands_gains_less_in_one_band():
-    p = problem()
-    x = noise(3 * len(p.where), 1).reshape(-1, 3)
-    everywhere, part = gain_by_part(p, x, x @ [0.3, -0.1, 0.05] + noise(len(p.where), 2))
-    assert part < everywhere
-
-
-def test_a_parameter_valid_in_slow_motion_only_gains_more_there():
-    p = problem()
-    x = noise(len(p.where), 1)[:, None]
-    slowly = lfilter([0.05], [1, -0.95], x[:, 0])
-    everywhere, part = gain_by_part(p, x, 1.0 * slowly + noise(len(p.where), 2))
-    assert part > 1.5 * everywhere > 20
-
-
-@pytest.mark.parametrize('groups, channels', [('B', range(6)), ('J', range(12, 16)),
-                                              ('BAWJ', range(16))])
-def test_the_bands_add_up_to_the_signal(groups, channels):
-    p = problem()
-    x, r = noise(2 * len(p.where), 1).reshape(-1, 2), noise(len(p.where), 2)
-    inside = np.isin(p.where, channels)
-    scores, information = (sum(part) for part in zip(*by_band(p, x, r, groups), strict=True))
-    np.testing.assert_allclose(scores, x[inside].T @ r[inside])
-    np.testing.assert_allclose(information, x[inside].T @ x[inside])
-
-
 @pytest.mark.parametrize('gusts, wanted, true, passes', [
     (0.3, 0.0, 0.0, False),      # closed-loop bias: gusts look like an inertia
     (0.3, 0.2, 0.0, False),
@@ -100,25 +68,3 @@ def test_closed_loop_bias_is_separated_from_an_inertia(gusts, wanted, true, pass
         r[rows] = lfilter(taps, 1, rest - true * acceleration) / sigma
     assert gain_by_part(p, x, r)[0] > P.least_gain
     assert differs_between_bands(p, x, r) != passes
-
-
-def test_a_gain_that_other_parameters_could_reach_is_no_evidence():
-    p = problem()
-    known = noise(len(p.where), 1)
-    own = noise(len(p.where), 2)
-    state = SimpleNamespace(slopes=np.stack([known, own + 2 * known], axis=1), theta={},
-                            r=own + 3 * known, index={'known': 0, 'own': 1})
-    slopes, rest = project_out(p, state, ['known'], state.slopes[:, 1:], frozenset())
-    np.testing.assert_allclose(slopes.T @ known, 0, atol=1e-3)
-    np.testing.assert_allclose(rest @ known, 0, atol=1e-3)
-    np.testing.assert_allclose(rest, slopes[:, 0], atol=1e-6)
-
-
-def test_a_gain_in_the_priors_is_not_a_closed_loop_bias():
-    p = problem()
-    x = noise(len(p.where), 1)[:, None]
-    slowly = lfilter([0.05], [1, -0.95], x[:, 0])
-    r = 0.4 * slowly + noise(len(p.where), 2)
-    part = gain_by_part(p, x, r)[1]
-    assert differs_between_bands(p, x, r)
-    assert not differs_between_bands(p, x, r, gain=part)

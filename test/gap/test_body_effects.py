@@ -1,15 +1,12 @@
 """Each body effect, added to the readings by an independent formula, is recovered."""
 
-from dataclasses import replace
 
-import casadi as ca
 from flights import KEYS, model, Motion, ROBOT, solved
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.identify.gap.residual import THIN
-from beetle_omni_ros.robot.dynamics import rigid_body
 from beetle_omni_ros.robot.effects import CATALOGUE
 
 MOTION = Motion()
@@ -170,51 +167,3 @@ def test_every_body_effect_is_tested():
     asked = {name.partition('.')[0] for name in CASES} | {
         'wind', 'inertia', 'centre_of_mass'}     # the last two: test_dynamics
     assert asked >= {name for name, effect in CATALOGUE.items() if effect.apply}
-
-
-@pytest.mark.parametrize('name', [n for n, e in CATALOGUE.items() if e.apply])
-def test_a_mirrored_robot_gives_mirrored_results(name):
-    """At the x-z plane, vectors change the sign of y, rates and torques that of x and z."""
-    places = np.array([[1, 1, -0.02], [-1, 1, -0.02], [-1, -1, -0.02], [1, -1, -0.02]]) * 0.2
-    robot = replace(ROBOT, rotors=replace(ROBOT.rotors, positions=places))
-    rng = np.random.default_rng(4)
-    partner = [3, 2, 1, 0]
-    true, axial = np.array([1, -1, 1]), np.array([-1, 1, -1])
-    v, w, p = rng.normal(size=3), rng.normal(size=3), np.array([0.3, 0.2, 0.4])
-    attitude = Rotation.random(random_state=1)
-    tilt, rate, acceleration = rng.normal(size=(3, 4))
-    thrust, change = rng.uniform(4, 9, 4), rng.normal(size=4)
-    values = {key: (spec.typical if np.isfinite(spec.typical) else 0.3)
-              for key, spec in CATALOGUE[name].parameters.items()}
-    polar = {'offset': true if name == 'centre_of_mass' else None, 'force': true}
-    plain, mirrored = {}, {}
-    for key, value in values.items():
-        spec = CATALOGUE[name].parameters[key]
-        if np.ndim(spec.neutral) == 0:
-            own = {'mass': 3.3, 'torque_to_thrust_ratio': 0.02}.get(key, value)
-            plain[key] = mirrored[key] = own
-            continue
-        vector = value * rng.uniform(0.5, 1.5, len(spec.neutral))
-        plain[key] = tuple(vector)
-        if len(vector) == 4:
-            sign = -1 if name == 'joint_offset' else 1
-            mirrored[key] = tuple(sign * vector[partner])
-        else:
-            sign = polar.get(key)
-            mirrored[key] = tuple(vector * (1 if sign is None else sign))
-
-    def answer(effects, v, w, p, attitude, tilt, rate, acceleration, thrust, change):
-        out = rigid_body(robot, *(ca.SX(ca.DM(x)) for x in (
-            v, attitude.as_quat(), w, tilt, thrust)), tilt_acceleration=ca.DM(acceleration),
-            effects=effects, tilt_rate=ca.DM(rate), thrust_rate=ca.DM(change),
-            position=ca.DM(p), voltage_ratio=ca.DM(0.9),
-            charge_drawn=ca.DM(0.5))
-        return [np.array(ca.DM(ca.evalf(x))).ravel() for x in out]
-
-    first = answer({name: plain}, v, w, p, attitude, tilt, rate, acceleration, thrust, change)
-    flip = attitude.as_rotvec() * axial
-    second = answer({name: mirrored}, v * true, w * axial, p * true, Rotation.from_rotvec(flip),
-                    -tilt[partner], -rate[partner], -acceleration[partner], thrust[partner],
-                    change[partner])
-    assert np.allclose(first[0] * true, second[0], atol=1e-9)
-    assert np.allclose(first[1] * axial, second[1], atol=1e-9)

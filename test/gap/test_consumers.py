@@ -16,7 +16,6 @@ from beetle_omni_ros.robot import dynamics, effects
 from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.effects import CATALOGUE, LimitStarts
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.sim.parameters import draw, SimulatorParameters
 from beetle_omni_ros.sim.simulator import CommandLink, Simulator
 
@@ -172,12 +171,3 @@ def test_a_consumer_applies_an_effect_or_states_why_not(consumer, name):
 @pytest.mark.parametrize('name', CATALOGUE)
 def test_the_gap_finder_applies_every_effect(name):
     assert gap(name) == effects.treatment('gap', name).acts
-
-
-def test_training_refuses_delays_beyond_its_history():
-    pytest.importorskip('torch')
-    from beetle_omni_ros.train.parameters import TrainParameters
-    from beetle_omni_ros.train.starts import latencies
-    late = replace(ROBOT, effects={'command_latency': {'delay': 0.015}})
-    with pytest.raises(ParameterError, match='tilt commands are up to 30 ms late'):
-        latencies(TrainParameters(), late)

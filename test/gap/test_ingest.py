@@ -2,16 +2,13 @@
 
 from dataclasses import replace
 
-from flights import model, Motion, P, ROBOT
+from flights import Motion, P, ROBOT
 import numpy as np
 import pytest
 
 from beetle_omni_ros.identify.gap.bags import Recording
-from beetle_omni_ros.identify.gap.ingest import load_flight, prepare, UnusableFlight
-from beetle_omni_ros.identify.gap.noise import Noise
+from beetle_omni_ros.identify.gap.ingest import prepare, UnusableFlight
 from beetle_omni_ros.identify.gap.parameters import GapParameters
-from beetle_omni_ros.identify.gap.series import LEAST_SAMPLES, shortest_flight
-from beetle_omni_ros.runs.bag import BagError
 
 
 def recording(duration=16.0):
@@ -34,6 +31,7 @@ def refused(made, *words):
     assert error.value.problems and all(d.topic and d.cause for d in error.value.problems)
     for word in words:
         assert word in text
+    return error.value.problems
 
 
 def cut(made, topic, keep):
@@ -41,36 +39,15 @@ def cut(made, topic, keep):
     return made
 
 
-def test_a_good_recording_is_used_completely():
-    flight = prepare(recording(), ROBOT, P)
-    assert flight.duration > 15 and not flight.findings
-
-
 @pytest.mark.parametrize('topic', ['imu/data_raw', 'mocap/pose', 'joint_states', 'command'])
 def test_a_missing_topic_is_named(topic):
     refused(cut(recording(), topic, slice(0, 0)), topic, 'missing')
 
 
-def test_a_clock_that_jumps_back_is_named_with_its_topic():
-    made = recording()
-    made.times['mocap/pose'] = made.times['mocap/pose'] - 5.0 * (made.times['mocap/pose'] > 8)
-    refused(made, 'mocap/pose', 'clock goes back by')
-
-
-def test_many_stamps_that_occur_twice_are_refused():
-    made = recording()
-    times = made.times['imu/data_raw']
-    made.times['imu/data_raw'] = times[np.arange(len(times)) // 2 * 2]
-    refused(made, 'imu/data_raw', 'twice')
-
-
 def test_long_sensor_gaps_are_refused_and_short_ones_cut_out():
     made = recording()
     t = made.times['imu/data_raw']
-    refused(cut(made, 'imu/data_raw', (t < 5) | (t > 9)), 'imu/data_raw', 'silent')
-    with pytest.raises(UnusableFlight) as error:
-        prepare(made, ROBOT, P)
-    silence, = error.value.problems
+    silence, = refused(cut(made, 'imu/data_raw', (t < 5) | (t > 9)), 'imu/data_raw', 'silent')
     assert silence.topic == 'imu/data_raw' and silence.at_s == pytest.approx(5.0, abs=0.02)
     made = recording(24.0)
     t = made.times['joint_states']
@@ -78,43 +55,20 @@ def test_long_sensor_gaps_are_refused_and_short_ones_cut_out():
     assert flight.start > 6 and flight.findings
 
 
-def test_a_recording_that_is_too_short_is_refused():
-    made = recording()
-    for topic, t in made.times.items():
-        cut(made, topic, t < 4)
-    refused(made, 's of usable flight')
-
-
 def test_a_recording_shorter_than_the_filters_is_refused_for_any_setting():
-    p = GapParameters.load(least_duration=3.0)
     made = recording()
     for topic, t in made.times.items():
         cut(made, topic, t < 4)
     with pytest.raises(UnusableFlight, match='s of usable flight'):
-        prepare(made, ROBOT, p)
-    made = recording()
-    for topic, t in made.times.items():
-        cut(made, topic, t < shortest_flight(p) + 0.5)
-    residual = model(prepare(made, ROBOT, p)).residual({})
-    assert min(len(values) for values in residual.values()) >= LEAST_SAMPLES
-    Noise.of([residual], p).whiten(residual)
+        prepare(made, ROBOT, GapParameters.load(least_duration=3.0))
 
 
-def test_a_recording_on_the_ground_is_refused():
+def test_a_recording_on_the_ground_or_of_another_robot_is_refused():
     made = recording()
     made.values['command'][:, 4:] = 0.0
     refused(made, 'does not fly')
-
-
-def test_the_file_of_another_robot_is_detected():
     with pytest.raises(UnusableFlight, match='robot file does not fit'):
         prepare(recording(), replace(ROBOT, mass=0.25 * ROBOT.mass), P)
-
-
-def test_a_clipped_accelerometer_is_detected():
-    made = recording()
-    made.values['imu/data_raw'][:, :3] *= 3
-    refused(made, 'imu/data_raw', 'linear acceleration is 3 times')
 
 
 def test_nan_readings_are_omitted_and_counted():
@@ -123,8 +77,3 @@ def test_nan_readings_are_omitted_and_counted():
     flight = prepare(made, ROBOT, P)
     assert any('4 messages' in text for text in flight.findings)
     assert np.isfinite(flight.imu).all()
-
-
-def test_a_missing_bag_is_refused_in_one_line(tmp_path):
-    with pytest.raises(BagError, match='no such bag'):
-        load_flight(tmp_path / 'nothing', ROBOT, P)

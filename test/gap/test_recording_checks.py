@@ -1,50 +1,119 @@
 """Damaged recordings are refused with topic, cause and time."""
 
-import struct
+from copy import deepcopy
+from functools import cache
 import warnings
 
+from flown_once import flight
 import numpy as np
 import pytest
-from recordings import columns, kept, late_half, recording, ROBOT, turned_pose
 from scipy.signal import step as step_response
 from scipy.spatial.transform import Rotation, Slerp
 
 from beetle_omni_ros.identify.gap.bags import read_recording
 from beetle_omni_ros.identify.gap.ingest import prepare, UnusableFlight
 from beetle_omni_ros.identify.gap.parameters import GapParameters
-from beetle_omni_ros.identify.recording.actuator_conventions import thrust_damages
 from beetle_omni_ros.identify.recording.check import damages, repaired
 from beetle_omni_ros.identify.recording.limits import RecordingLimits
-from beetle_omni_ros.identify.recording.motion import Motion
 from beetle_omni_ros.identify.recording.readings import reading_damages
-from beetle_omni_ros.messages import bag_types
-from beetle_omni_ros.runs.bag_writer import BagWriter
+from beetle_omni_ros.robot.parameters import RobotParameters
+
+ROBOT = RobotParameters.load()
+
+
+@cache
+def flown():
+    return read_recording(flight('published'))
+
+
+def recording():
+    """24 s over three poses, with noise as in the publication and stamps of a real clock."""
+    made = deepcopy(flown())
+    for topic in made.times:
+        made.times[topic] = made.times[topic] + 1.78e9
+        made.received[topic] = made.received[topic] + 1.78e9
+    return made
+
+
+def late_half(made, topic):
+    """Mask (N,) of the second half of a topic."""
+    received = made.received[topic]
+    return received > 0.5 * (received[0] + received[-1])
+
+
+def columns(made, topic, first, last, change):
+    """Change some columns of a topic's values."""
+    made.values[topic][:, first:last] = change(made.values[topic][:, first:last].copy())
+    return made
+
+
+def kept(made, topic, keep):
+    """Only some messages of a topic."""
+    for part in (made.times, made.values, made.received):
+        part[topic] = part[topic][keep]
+    return made
+
+
+def turned_pose(made, world=None, body=None):
+    """Orientations with a rotation of the world before them and one of the body behind."""
+    q = Rotation.from_quat(made.values['mocap/pose'][:, 3:])
+    q = (Rotation.identity() if world is None else world) * q
+    q = q * (Rotation.identity() if body is None else body)
+    made.values['mocap/pose'] = np.column_stack([made.values['mocap/pose'][:, :3], q.as_quat()])
+    return made
+
 
 P = GapParameters.load()
 IMU, POSE, JOINTS, COMMAND = 'imu/data_raw', 'mocap/pose', 'joint_states', 'command'
 HALF = 12.2
 
 
-def shifted(made, topic, by, late=False, both=False):
-    part = late_half(made, topic) if late else 1.0
-    made.times[topic] = made.times[topic] + by * part
-    if both:
-        made.received[topic] = made.received[topic] + by * part
-    return made
+def shifted(topic, by):
+    """Stamps of the second half are moved."""
+    def change(made):
+        made.times[topic] = made.times[topic] + by * late_half(made, topic)
+        return made
+    return change
 
 
-def frozen(made, topic, begin, end, columns_=slice(None)):
-    t = made.times[topic] - made.times[topic][0]
-    inside = (t > begin) & (t < end)
-    made.values[topic] = made.values[topic].copy()
-    made.values[topic][inside, columns_] = made.values[topic][np.argmax(inside), columns_]
-    return made
+def of(topic, first, last, change):
+    """Some columns of a topic are changed."""
+    return lambda made: columns(made, topic, first, last, change)
 
 
-def spiked(made, topic, rows, column, value):
-    made.values[topic] = made.values[topic].copy()
-    made.values[topic][rows, column] = value
-    return made
+def frozen(topic, begin, end, columns_=slice(None)):
+    def change(made):
+        t = made.times[topic] - made.times[topic][0]
+        inside = (t > begin) & (t < end)
+        made.values[topic][inside, columns_] = made.values[topic][np.argmax(inside), columns_]
+        return made
+    return change
+
+
+def spiked(topic, rows, column, value):
+    def change(made):
+        made.values[topic][rows, column] = value
+        return made
+    return change
+
+
+def noisy(topic, count, deviation):
+    return of(topic, 0, count,
+              lambda v: v + np.random.default_rng(0).normal(0, deviation, v.shape))
+
+
+def twice(topic):
+    return lambda made: kept(made, topic, np.repeat(np.arange(len(made.times[topic])), 2))
+
+
+def turned(topic, columns_, rotation, late=False):
+    """Vectors in some columns are turned, or only those of the second half."""
+    def change(made):
+        rows = late_half(made, topic) if late else slice(None)
+        for part in columns_:
+            made.values[topic][rows, part] = rotation.apply(made.values[topic][rows, part])
+        return made
+    return change
 
 
 def mirrored(made):
@@ -55,34 +124,21 @@ def mirrored(made):
 
 def y_up(made):
     turn = Rotation.from_euler('x', -90, degrees=True)
-    made = columns(made, POSE, 0, 3, turn.apply)
-    return turned_pose(made, world=turn)
+    return turned_pose(turned(POSE, [slice(0, 3)], turn)(made), world=turn)
 
 
 def interleaved(made):
-    other = columns(recording('published'), POSE, 0, 2, lambda v: -v)
-    # Each flight has its own date.
-    began = made.received[POSE][0] - other.received[POSE][0]
-    other.times[POSE] = other.times[POSE] + (began + 2e-3)
-    other.received[POSE] = other.received[POSE] + began
-    for topic in (POSE,):
-        order = np.argsort(np.concatenate([made.received[topic], other.received[topic] + 1e-3]))
-        for a, b in ((made.times, other.times), (made.values, other.values),
-                     (made.received, other.received)):
-            a[topic] = np.concatenate([a[topic], b[topic]])[order]
+    other = columns(recording(), POSE, 0, 2, lambda v: -v)
+    other.times[POSE] = other.times[POSE] + 2e-3
+    order = np.argsort(np.concatenate([made.received[POSE], other.received[POSE] + 1e-3]))
+    for a, b in ((made.times, other.times), (made.values, other.values),
+                 (made.received, other.received)):
+        a[POSE] = np.concatenate([a[POSE], b[POSE]])[order]
     return made
 
 
 def stale(made):
-    made.values[IMU] = made.values[IMU][np.arange(len(made.values[IMU])) // 2 * 2]
-    return made
-
-
-def noisy(made, topic, columns, deviation):
-    made.values[topic] = made.values[topic].copy()
-    made.values[topic][:, :columns] += np.random.default_rng(0).normal(
-        0, deviation, (len(made.values[topic]), columns))
-    return made
+    return of(IMU, 0, 6, lambda v: v[np.arange(len(v)) // 2 * 2])(made)
 
 
 def reordered(made):
@@ -94,27 +150,15 @@ def reordered(made):
 
 
 def flips(made):
-    made.values[POSE] = made.values[POSE].copy()
     half = Rotation.from_euler('z', 180, degrees=True)
     for k in range(300, 2300, 300):
         made.values[POSE][k, 3:] = (Rotation.from_quat(made.values[POSE][k, 3:]) * half).as_quat()
     return made
 
 
-def turned_on_the_way(made):
-    late = late_half(made, IMU)
-    turn = Rotation.from_euler('z', 90, degrees=True)
-    made.values[IMU] = made.values[IMU].copy()
-    for part in (slice(0, 3), slice(3, 6)):
-        made.values[IMU][late, part] = turn.apply(made.values[IMU][late, part])
-    return made
-
-
 def flipped_from_half(made):
     late = late_half(made, POSE)
-    turn = Rotation.from_euler('z', 90, degrees=True)
-    q = Rotation.from_quat(made.values[POSE][late, 3:]) * turn
-    made.values[POSE] = made.values[POSE].copy()
+    q = Rotation.from_quat(made.values[POSE][late, 3:]) * QUARTER
     made.values[POSE][late, 3:] = q.as_quat()
     return made
 
@@ -125,155 +169,111 @@ def drifting(made):
     return made
 
 
-def later_and_later(made, topic, most):
-    """Stamps of arrival, at the end of a queue that fills."""
-    t = made.times[topic]
-    by = most * (t - t[0]) / (t[-1] - t[0])
-    made.times[topic] = t + by
-    made.received[topic] = made.received[topic] + by
-    return made
-
-
 def without_gravity(made):
     t, pose = made.times[POSE], made.values[POSE]
     attitude = Slerp(t, Rotation.from_quat(pose[:, 3:]))
     at = np.clip(made.times[IMU], t[0], t[-1])
-    made.values[IMU] = made.values[IMU].copy()
     made.values[IMU][:, :3] -= attitude(at).inv().apply([0, 0, ROBOT.gravity])
     return made
 
 
-def silent_clock(made):
+def stamped(topic, change):
+    """All stamps of a topic are changed."""
+    def changed(made):
+        made.times[topic] = change(made.times[topic])
+        return made
+    return changed
+
+
+def silent_clock(change):
     """Times of recording that follow the damaged stamps: only the motion shows the fault."""
-    made.received = {}
-    return made
+    def changed(made):
+        made = change(made)
+        made.received = {}
+        return made
+    return changed
 
 
+QUARTER = Rotation.from_euler('z', 90, degrees=True)
+BOTH = slice(0, 3), slice(3, 6)
 # name -> damage, topic, words of which the cause must contain one, time [s] or None
 KINDS = {
-    'quaternion w first': (lambda m: columns(m, POSE, 3, 7, lambda v: v[:, [3, 0, 1, 2]]),
-                           POSE, ['(w, x, y, z)'], None),
-    'quaternion inverse': (lambda m: columns(m, POSE, 3, 7, lambda v: v * [-1, -1, -1, 1]),
-                           POSE, ['inverse'], None),
-    'quaternion scaled': (lambda m: columns(m, POSE, 3, 7, lambda v: 2 * v), POSE, ['norm'],
-                          None),
-    'zero quaternions': (lambda m: spiked(m, POSE, slice(400, None, 500), slice(3, 7), 0.0),
-                         POSE, ['zero quaternion'], 4.0),
-    'millimetres': (lambda m: columns(m, POSE, 0, 3, lambda v: 1e3 * v), POSE, ['millimetres'],
-                    None),
-    'centimetres': (lambda m: columns(m, POSE, 0, 3, lambda v: 1e2 * v), POSE, ['centimetres'],
-                    None),
+    'quaternion w first': (of(POSE, 3, 7, lambda v: v[:, [3, 0, 1, 2]]), POSE, ['(w, x, y, z)'],
+                           None),
+    'quaternion inverse': (of(POSE, 3, 7, lambda v: v * [-1, -1, -1, 1]), POSE, ['inverse'], None),
+    'quaternion scaled': (of(POSE, 3, 7, lambda v: 2 * v), POSE, ['norm'], None),
+    'zero quaternions': (spiked(POSE, slice(400, None, 500), slice(3, 7), 0.0), POSE,
+                         ['zero quaternion'], 4.0),
+    'millimetres': (of(POSE, 0, 3, lambda v: 1e3 * v), POSE, ['millimetres'], None),
     'y up': (y_up, POSE, ['points up'], None),
     'left-handed MoCap': (mirrored, POSE, ['left-handed'], None),
-    'positions exchanged': (lambda m: columns(m, POSE, 0, 3, lambda v: v[:, [1, 0, 2]]), POSE,
+    'positions exchanged': (of(POSE, 0, 3, lambda v: v[:, [1, 0, 2]]), POSE,
                             ['axes of positions'], None),
-    'MoCap body turned': (lambda m: turned_pose(m, body=Rotation.from_euler(
-        'z', 90, degrees=True)), POSE, ['turned'], None),
+    'MoCap body turned': (lambda m: turned_pose(m, body=QUARTER), POSE, ['turned'], None),
     'MoCap body turned on the way': (flipped_from_half, POSE, ['turned', 'jumps'], HALF),
-    'MoCap frozen': (lambda m: frozen(m, POSE, 10, 13.5), POSE, ['frozen'], 10.0),
+    'MoCap frozen': (frozen(POSE, 10, 13.5), POSE, ['frozen'], 10.0),
     'marker flips': (flips, POSE, ['markers'], 3.0),
     'MoCap interleaved': (interleaved, POSE, ['sources', 'interleaved'], 0.0),
-    'MoCap clock back': (lambda m: shifted(m, POSE, -0.3, late=True), POSE, ['clock'], HALF),
-    'MoCap clock back, recorded so': (lambda m: silent_clock(shifted(m, POSE, -0.3, late=True)),
-                                      POSE, ['clock'], HALF),
-    'MoCap clock forward': (lambda m: shifted(m, POSE, 0.5, late=True), POSE, ['clock'], HALF),
-    'MoCap clock forward, recorded so': (
-        lambda m: silent_clock(shifted(m, POSE, 0.5, late=True)), POSE, ['clock'], HALF),
+    'MoCap clock back': (shifted(POSE, -0.3), POSE, ['clock'], HALF),
+    'MoCap clock back, recorded so': (silent_clock(shifted(POSE, -0.3)), POSE, ['clock'], HALF),
     'MoCap clock drifts': (drifting, POSE, ['drift'], None),
-    'MoCap clock drifts, recorded so': (lambda m: silent_clock(drifting(m)), POSE, ['drift'],
-                                        None),
-    'MoCap clock of another computer': (lambda m: shifted(m, POSE, -3600.0), POSE,
-                                        ['behind'], None),
-    'encoder clock late': (lambda m: shifted(m, JOINTS, 0.15, late=True), JOINTS, ['clock'],
-                           HALF),
-    'encoder clock late, recorded so': (
-        lambda m: silent_clock(shifted(m, JOINTS, 0.15, late=True)), JOINTS, ['clock'], HALF),
-    'commands early': (lambda m: silent_clock(shifted(m, COMMAND, -0.5)), JOINTS, ['clock'],
-                       None),
-    'stamps of zero': (lambda m: _stopped(m), IMU, ['do not advance'], None),
-    'stamps in milliseconds': (lambda m: _thousand(m), IMU, ['apart'], None),
+    'MoCap clock drifts, recorded so': (silent_clock(drifting), POSE, ['drift'], None),
+    'MoCap clock of another computer': (stamped(POSE, lambda t: t - 3600), POSE, ['behind'], None),
+    'encoder clock late': (shifted(JOINTS, 0.15), JOINTS, ['clock'], HALF),
+    'encoder clock late, recorded so': (silent_clock(shifted(JOINTS, 0.15)), JOINTS, ['clock'],
+                                        HALF),
+    'commands early': (silent_clock(stamped(COMMAND, lambda t: t - 0.5)), JOINTS, ['clock'], None),
+    'stamps of zero': (stamped(IMU, lambda t: 0 * t), IMU, ['do not advance'], None),
+    'stamps in milliseconds': (stamped(IMU, lambda t: 1000 * t), IMU, ['apart'], None),
     'out of order': (reordered, POSE, ['out of order'], 0.1),
-    'recorded twice': (lambda m: _twice(m), IMU, ['twice'], 0.0),
-    'encoders recorded twice': (lambda m: _twice(m, JOINTS), JOINTS, ['twice'], 0.0),
-    'MoCap later and later': (lambda m: later_and_later(m, POSE, 0.5), POSE, ['drifts'], None),
-    'degrees per second': (lambda m: columns(m, IMU, 3, 6, np.rad2deg), IMU,
-                           ['degrees per second'], None),
-    'acceleration in g': (lambda m: columns(m, IMU, 0, 3, lambda v: v / 9.80665), IMU,
-                          ['units of g'], None),
-    'gravity taken off': (lambda m: without_gravity(m), IMU, ['without gravity'], None),
-    'gravity downwards': (lambda m: columns(m, IMU, 0, 3, lambda v: -v), IMU,
-                          ['opposite sign'], None),
-    'one gyroscope axis reversed': (lambda m: columns(m, IMU, 3, 6, lambda v: v * [1, -1, 1]),
-                                    IMU, ['wrong sign'], None),
-    'IMU axes swapped': (lambda m: columns(m, IMU, 0, 6, lambda v: v[:, [0, 2, 1, 3, 5, 4]]),
-                         IMU, ['swapped', 'left-handed'], None),
-    'IMU turned': (lambda m: columns(columns(m, IMU, 0, 3, lambda v: v[:, [1, 0, 2]]
-                                             * [1, -1, 1]), IMU, 3, 6,
-                                     lambda v: v[:, [1, 0, 2]] * [1, -1, 1]),
-                   IMU, ['turned'], None),
-    'IMU upside down': (lambda m: columns(m, IMU, 0, 6, lambda v: v * [1, -1, -1, 1, -1, -1]), IMU,
-                        ['turned'], None),
-    'IMU turned on the way': (turned_on_the_way, IMU, ['turned'], HALF),
-    'IMU spike': (lambda m: spiked(m, IMU, 3000, 1, 1e6), IMU, ['spike'], 15.0),
+    'recorded twice': (twice(IMU), IMU, ['twice'], 0.0),
+    'degrees per second': (of(IMU, 3, 6, np.rad2deg), IMU, ['degrees per second'], None),
+    'acceleration in g': (of(IMU, 0, 3, lambda v: v / 9.80665), IMU, ['units of g'], None),
+    'gravity taken off': (without_gravity, IMU, ['without gravity'], None),
+    'gravity downwards': (of(IMU, 0, 3, lambda v: -v), IMU, ['opposite sign'], None),
+    'one gyroscope axis reversed': (of(IMU, 3, 6, lambda v: v * [1, -1, 1]), IMU, ['wrong sign'],
+                                    None),
+    'IMU axes swapped': (of(IMU, 0, 6, lambda v: v[:, [0, 2, 1, 3, 5, 4]]), IMU,
+                         ['swapped', 'left-handed'], None),
+    'IMU upside down': (of(IMU, 0, 6, lambda v: v * [1, -1, -1, 1, -1, -1]), IMU, ['turned'],
+                        None),
+    'IMU turned on the way': (turned(IMU, BOTH, QUARTER, late=True), IMU, ['turned'], HALF),
+    'IMU spike': (spiked(IMU, 3000, 1, 1e6), IMU, ['spike'], 15.0),
     'IMU stale': (stale, IMU, ['repeat'], None),
-    'gyroscope clipped': (lambda m: columns(m, IMU, 3, 6, lambda v: np.clip(v, -0.5, 0.5)), IMU,
-                          ['clipped'], None),
-    'one gyroscope axis frozen': (lambda m: frozen(m, IMU, 12, 20, 4), IMU, ['frozen'], 12.0),
-    'joints swapped': (lambda m: columns(m, JOINTS, 0, 4, lambda v: v[:, [1, 0, 2, 3]]), JOINTS,
-                       ['swapped'], None),
-    'joint reversed': (lambda m: columns(m, JOINTS, 2, 3, lambda v: -v), JOINTS, ['against'],
-                       None),
-    'joints in degrees': (lambda m: columns(m, JOINTS, 0, 4, np.rad2deg), JOINTS, ['degrees'],
-                          None),
-    'joints in counts': (lambda m: columns(m, JOINTS, 0, 4, lambda v: 2048 + v * 4096
-                                           / (2 * np.pi)), JOINTS, ['counts'], None),
-    'one joint frozen': (lambda m: frozen(m, JOINTS, 8.5, 24, 1), JOINTS, ['frozen'], 8.5),
-    'MoCap noisy': (lambda m: noisy(m, POSE, 3, 0.03), POSE, ['scatters'], None),
-    'encoders noisy': (lambda m: noisy(m, JOINTS, 4, 0.1), JOINTS, ['scatters'], None),
-    'tilts commanded in degrees': (lambda m: columns(m, COMMAND, 0, 4, np.rad2deg), COMMAND,
-                                   ['degrees'], None),
-    'rotors in reverse order': (lambda m: columns(m, COMMAND, 4, 8, lambda v: v[:, ::-1]), COMMAND,
-                                ['order of the thrusts'], None),
-    'thrusts in millinewtons': (lambda m: columns(m, COMMAND, 4, 8, lambda v: 1e3 * v), COMMAND,
-                                ['millinewtons'], None),
-}
+    'gyroscope clipped': (of(IMU, 3, 6, lambda v: np.clip(v, -0.5, 0.5)), IMU, ['clipped'], None),
+    'one gyroscope axis frozen': (frozen(IMU, 12, 20, 4), IMU, ['frozen'], 12.0),
+    'joints swapped': (of(JOINTS, 0, 4, lambda v: v[:, [1, 0, 2, 3]]), JOINTS, ['swapped'], None),
+    'joint reversed': (of(JOINTS, 2, 3, lambda v: -v), JOINTS, ['against'], None),
+    'joints in degrees': (of(JOINTS, 0, 4, np.rad2deg), JOINTS, ['degrees'], None),
+    'joints in counts': (of(JOINTS, 0, 4, lambda v: 2048 + v * 4096 / (2 * np.pi)), JOINTS,
+                         ['counts'], None),
+    'one joint frozen': (frozen(JOINTS, 8.5, 24, 1), JOINTS, ['frozen'], 8.5),
+    'MoCap noisy': (noisy(POSE, 3, 0.03), POSE, ['scatters'], None),
+    'encoders noisy': (noisy(JOINTS, 4, 0.1), JOINTS, ['scatters'], None),
+    'tilts commanded in degrees': (of(COMMAND, 0, 4, np.rad2deg), COMMAND, ['degrees'], None),
+    'rotors in reverse order': (of(COMMAND, 4, 8, lambda v: v[:, ::-1]), COMMAND,
+                                ['order of the thrusts'], None)}
 
 
-def _stopped(made):
-    made.times[IMU] = np.zeros_like(made.times[IMU])
-    return made
-
-
-def _thousand(made):
-    made.times[IMU] = made.times[IMU] * 1000
-    return made
-
-
-def _twice(made, topic=IMU):
-    return kept(made, topic, np.repeat(np.arange(len(made.times[topic])), 2))
-
-
-@pytest.mark.parametrize('conditions', ['nominal', 'published'])
 @pytest.mark.parametrize('kind', KINDS)
-def test_damage_is_refused_with_topic_cause_and_time(kind, conditions):
+def test_damage_is_refused_with_topic_cause_and_time(kind):
     change, topic, words, at = KINDS[kind]
     with warnings.catch_warnings(), pytest.raises(UnusableFlight) as error:
         warnings.simplefilter('error')
-        prepare(change(recording(conditions)), ROBOT, P)
+        prepare(change(recording()), ROBOT, P)
     assert '\n' not in str(error.value)
     problems = error.value.problems
     right = [d for d in problems if d.topic == topic and any(w in d.cause for w in words)]
     assert right, [d.text for d in problems]
     assert 0.5 < right[0].sure <= 1
-    assert right[0].run == ('calm' if conditions == 'nominal' else conditions)
+    assert right[0].run == 'published'
     if at is not None:
         assert right[0].at_s == pytest.approx(at, abs=2.0 if 'recorded so' not in kind else 4.5)
 
 
-@pytest.mark.parametrize('conditions', ['nominal', 'published'])
-def test_a_sound_recording_has_no_damage(conditions):
-    assert damages(recording(conditions), ROBOT) == []
-    assert damages(silent_clock(recording(conditions)), ROBOT) == []
+def test_a_sound_recording_has_no_damage():
+    assert damages(recording(), ROBOT) == []
+    assert damages(silent_clock(lambda made: made)(recording()), ROBOT) == []
 
 
 def joint_step(size, lag, end, frozen_from=np.inf):
@@ -291,7 +291,7 @@ def joint_step(size, lag, end, frozen_from=np.inf):
     return kept(made, JOINTS, made.times[JOINTS] < at + end)
 
 
-@pytest.mark.parametrize('seed', range(12))
+@pytest.mark.parametrize('seed', range(6))
 def test_a_joint_that_rests_until_its_command_arrives_is_not_frozen(seed):
     # A step of the command, with any delay of a valid servo until the reading changes, and any
     # time until the end of the recording.
@@ -304,30 +304,6 @@ def test_a_joint_that_rests_until_its_command_arrives_is_not_frozen(seed):
     held = joint_step(size, lag, limits.servo_lag[1] + 0.1, frozen_from=0.0)
     damage, = reading_damages(held, limits, ROBOT)
     assert damage.topic == JOINTS and 'gimbal2 is frozen' in damage.cause
-
-
-@pytest.mark.parametrize('seed', range(4))
-@pytest.mark.parametrize('swapped', [False, True])
-def test_rotors_of_different_strength_in_hover_are_not_taken_for_swapped(swapped, seed):
-    # Two weak neighbours get larger commands, which looks like an unmodelled torque. With
-    # exchanged rotors the torque would be smaller.
-    rng, count = np.random.default_rng(seed), 600
-    share = np.array([0.94, 0.94, 1.06, 1.06])
-    wanted = ROBOT.hover_thrust * (1 + 0.03 * rng.normal(size=(count, 4)))
-    lever = np.cross(ROBOT.rotors.positions, [0.0, 0.0, 1.0]) + np.outer(
-        ROBOT.rotors.spin * ROBOT.rotors.torque_to_thrust_ratio, [0.0, 0.0, 1.0])
-    wrench = np.zeros((count, 6, 4))
-    wrench[:, 2], wrench[:, 3:] = 1 / ROBOT.mass, (lever / ROBOT.inertia).T
-    felt = np.einsum('nci,ni->nc', wrench, wanted)
-    felt += rng.normal(0, 0.05, felt.shape)
-    commanded = wanted / share
-    still, joints = np.zeros((count, 3)), np.zeros((count, 4))
-    motion = Motion(0.1 * np.arange(count), still, felt[:, :3], {}, {}, {}, joints, joints,
-                    np.einsum('nci,ni->nc', wrench[:, :3], commanded), wrench,
-                    commanded[:, [3, 2, 1, 0] if swapped else slice(None)], felt[:, 3:])
-    found = thrust_damages(recording(), motion, ROBOT, RecordingLimits.load())
-    assert [d.cause for d in found if 'order of the thrusts' in d.cause] == [
-        d.cause for d in found] and bool(found) == swapped
 
 
 @pytest.mark.parametrize('kind', ['quaternion w first', 'millimetres', 'degrees per second',
@@ -348,34 +324,3 @@ def test_a_repair_restores_the_sound_recording(kind):
                               fixed.values[topic][order, k])
             error = np.abs(np.abs(again) - np.abs(column[inside]))
             assert np.median(error) < 1e-3 + 0.03 * np.std(column), (topic, k)
-
-
-def test_without_repair_the_recording_is_unchanged():
-    made = KINDS['degrees per second'][0](recording())
-    before = {topic: v.copy() for topic, v in made.values.items()}
-    repaired(made, ROBOT)
-    for topic, values in before.items():
-        assert np.array_equal(made.values[topic], values)
-
-
-def test_reading_all_messages_at_once_equals_reading_each(tmp_path, monkeypatch):
-    with BagWriter(tmp_path / 'bag') as bag:
-        for k in range(60):
-            bag.write_raw(f'/{IMU}', 'sensor_msgs/msg/Imu', _imu_bytes(k), 0.1 * k + 1.0)
-    at_once = read_recording(tmp_path / 'bag')
-    monkeypatch.setattr(bag_types, 'LAYOUTS', 0)
-    one_by_one = read_recording(tmp_path / 'bag')
-    for part in ('times', 'values', 'received'):
-        assert np.array_equal(getattr(at_once, part)[IMU], getattr(one_by_one, part)[IMU])
-    assert at_once.values[IMU][7] == pytest.approx([7.0, 8.0, 9.0, 4.0, 5.0, 6.0])
-
-
-def _imu_bytes(k):
-    """CDR of an IMU message: header, orientation, rates (k - 3 ...), forces (k ...)."""
-    head = struct.pack('<4xiII', 1_780_000_000 + k, 5_000, 10) + b'base_link\0'
-    head = b'\0\1\0\0' + head[4:]
-    head += b'\0' * (-(len(head) - 4) % 8)
-    rates = [k - 3.0, k - 2.0, k - 1.0]
-    forces = [float(k), k + 1.0, k + 2.0]
-    numbers = [0, 0, 0, 1, *[0] * 9, *rates, *[0] * 9, *forces, *[0] * 9]
-    return head + struct.pack(f'<{len(numbers)}d', *numbers)

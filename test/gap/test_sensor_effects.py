@@ -32,11 +32,6 @@ def test_the_delay_of_a_reading_is_recovered(name, groups, reading):
     assert recovered(flight, [f'{name}.delay'], groups) == pytest.approx([0.012], abs=3e-4)
 
 
-def test_imu_and_mocap_delays_have_opposite_signs_in_their_common_residual():
-    found = recovered(MOTION.flight(imu_delay=0.01), ['mocap_time_offset.delay'], 'W')
-    assert found == pytest.approx([-0.01], abs=5e-4)
-
-
 @pytest.mark.parametrize('name, part', [('imu_accelerometer_bias', 0), ('imu_gyroscope_bias', 3)])
 def test_a_bias_equals_the_added_constant(name, part):
     true = np.array([0.1, -0.05, 0.2])
@@ -71,11 +66,6 @@ def test_a_lever_arm_is_the_position_of_the_imu():
     assert recovered(MOTION.flight(imu=imu), names, 'A') == pytest.approx(true, abs=1e-3)
 
 
-def test_every_sensor_key_has_its_unit():
-    for name in ('imu_accelerometer_bias.bias[0]', 'mocap_misalignment.rotation[2]'):
-        assert KEYS[name].base == 0.0 and not KEYS[name].body
-
-
 @pytest.mark.parametrize('name', [name for name, effect in CATALOGUE.items()
                                   if any(map(effect.in_readings, effect.parameters))
                                   and treatment('gap', name).acts])
@@ -91,3 +81,55 @@ def test_a_fit_begins_at_the_sensor_effects_of_the_robot_file(name):
     for group in given:
         assert given[group] == pytest.approx(fitted[group], abs=1e-9)
     assert keys[names_of(name, parameter)[0]].value(0.0) == pytest.approx(spec.typical)
+
+
+DELAY = 'joint_feedback_delay.delay'
+
+
+def noisy(tilt=0.0, **late):
+    """A flight with noise of the encoders as large as in the publication or larger [rad]."""
+    rng, flight = np.random.default_rng(3), MOTION.flight(**late)
+    return replace(flight, joint=flight.joint + tilt * rng.standard_normal(flight.joint.shape))
+
+
+def at(made, series):
+    """Series (N, n) at 200 Hz at the times of a model's grid."""
+    return np.stack([np.interp(made.signals.t, MOTION.t, x) for x in series.T], axis=1)
+
+
+def rms(x):
+    return float(np.sqrt((x**2).mean()))
+
+
+@pytest.mark.parametrize('name', [DELAY, 'imu_filter_lag.delay'])
+def test_derivatives_by_a_delay_contain_no_encoder_noise(name):
+    slopes = [model(noisy(tilt)).slopes({}, [name])['J'] for tilt in (0.0, 0.02)]
+    clean = model(noisy()).slopes({}, [DELAY])['J']
+    assert rms(slopes[1] - slopes[0]) < 0.02 * rms(clean)
+
+
+def test_the_delay_of_noisy_encoders_is_recovered():
+    found = solved(model(noisy(0.02, joint_delay=0.012)), [DELAY], 'J')
+    assert found[DELAY] == pytest.approx(0.012, abs=1e-3)
+
+
+def test_tilts_follow_the_servo_model_if_encoders_are_noisy():
+    made = model(noisy(0.02))
+    inside = slice(100, -150)
+    truth = at(made, MOTION.tilt), at(made, MOTION.tilt_acceleration)
+    before = [made.signals.joints({})[k] - truth[j] for j, k in enumerate((0, 2))]
+    made.smooth_tilts({})
+    after = [made.signals.joints({})[k] - truth[j] for j, k in enumerate((0, 2))]
+    assert rms(after[0][inside]) < 0.35 * rms(before[0][inside])
+    assert rms(after[1][inside]) < 0.05 * rms(before[1][inside])
+
+
+@pytest.mark.parametrize('gain', ['kp', 'kd'])
+def test_derivatives_by_the_gain_of_a_servo_agree_with_its_joint(gain):
+    made, own = model(MOTION.flight()), [f'servo.{gain}[{k}]' for k in range(4)]
+    slopes, h = made.slopes({}, [f'joint_bandwidth.{gain}', *own])['J'], 0.01
+    for k, name in enumerate(own):
+        moved = (made.residual({name: h}, 'J')['J'] - made.residual({}, 'J')['J']) / h
+        assert np.abs(moved[:, k]).max() > 1e-3
+        assert slopes[:, :, k + 1] == pytest.approx(moved, abs=1e-9)
+    assert slopes[:, :, 1:].sum(axis=2) == pytest.approx(slopes[:, :, 0], abs=1e-12)

@@ -1,13 +1,10 @@
 """Every hidden effect has the sign and the size of its label."""
 
-from gap_data.cases import Case, load_settings
-from gap_data.effects import CATALOGUE, inject, OUTSIDE, SHAPES
+from gap_data.cases import load_settings
+from gap_data.effects import CATALOGUE, inject, SHAPES
 from gap_data.hidden import Hidden, Snapshot
-from gap_data.make import build
-from gap_data.mjcf import model_xml
 from gap_data.plant import Plant
 from gap_data.truth import Robot
-import mujoco
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -15,6 +12,7 @@ from scipy.spatial.transform import Rotation
 SETTINGS = load_settings()
 ALL = [(name, shape) for name in CATALOGUE for shape in ('plain', *SHAPES.get(name, ()))]
 UP = (0.0, 0.0, 1.0)
+HOVER, LOW = Robot.nominal().hover_thrust, Robot.nominal().positions[0, 2]
 
 
 def put(name, size, shape='plain', seed=0):
@@ -39,11 +37,6 @@ def snapshot(**more):
     return s
 
 
-def gain(hidden, s, *, f=None, axis=UP, speed=(0, 0, 0), rotor=0):
-    f = Robot.nominal().hover_thrust if f is None else f
-    return np.prod([hook(rotor, s, f, axis, speed) for hook in hidden.gains])
-
-
 @pytest.mark.parametrize(('name', 'shape'), ALL)
 def test_every_shape_flies(name, shape):
     entry = SETTINGS['effects'][name]
@@ -57,55 +50,20 @@ def test_every_shape_flies(name, shape):
     assert label
 
 
-@pytest.mark.parametrize('name', OUTSIDE)
-def test_every_effect_outside_the_catalogue_disturbs_the_flight(name):
-    size = SETTINGS['outside'][name]['range'][1]
-    ends = []
-    for effect in (True, False):
-        robot, hidden = Robot.nominal(), Hidden()
-        if effect:
-            inject(name, robot, hidden, size, 'plain', np.random.default_rng(1))
-        body = Plant(robot, hidden, multibody=False, position=(0.1, 0.2, 1.5),
-                     quaternion=(0.98, 0.199, 0, 0), tilt=[1.4, 0.8, -1.4, -0.8],
-                     thrust=[9.0] * 4, velocity=(0.5, 0.5, 0.2), rate=(1.0, 0.0, 0.5))
-        for _ in range(700):
-            body.step()
-        ends.append(body.data.qpos[:7].copy())
-    assert np.abs(ends[0] - ends[1]).max() > 3e-3
-
-
-@shapes('ground_effect')
-def test_ground_effect_has_its_gain_at_a_quarter_metre(shape):
-    _, hidden, label = put('ground_effect', 0.12, shape)
-    z = Robot.nominal().positions[0, 2]
-    assert gain(hidden, snapshot(position=[0, 0, 0.25 - z])) == pytest.approx(1.12)
-    assert gain(hidden, snapshot(position=[0, 0, 0.6])) < 1.06
-    assert label == {'gain_at_0.25m': 0.12}
-
-
-@shapes('tilt_thrust_loss')
-@pytest.mark.parametrize('sign', [1, -1])
-def test_tilt_loss_has_its_size_at_sixty_degrees(shape, sign):
-    _, hidden, _ = put('tilt_thrust_loss', 0.08, shape)
-    assert gain(hidden, snapshot(tilt=[sign * np.radians(60)] * 4)) == pytest.approx(0.92)
-    assert gain(hidden, snapshot()) == pytest.approx(1.0)
-
-
-@shapes('axial_inflow')
-def test_axial_inflow_reduces_thrust_in_a_climb(shape):
-    robot, hidden, _ = put('axial_inflow', 0.4, shape)
-    f, h = robot.hover_thrust, 1e-3
-    slope = f * (gain(hidden, snapshot(), speed=(0, 0, h))
-                 - gain(hidden, snapshot(), speed=(0, 0, -h))) / (2 * h)
-    assert slope == pytest.approx(-0.4, rel=1e-3)
-
-
-@shapes('translational_lift')
-def test_translational_lift_grows_with_lateral_speed(shape):
-    robot, hidden, _ = put('translational_lift', 0.08, shape)
-    f = robot.hover_thrust
-    assert f * (gain(hidden, snapshot(), speed=(1, 0, 0)) - 1) == pytest.approx(0.08, rel=0.03)
-    assert gain(hidden, snapshot(), speed=(0, 0, 2)) == pytest.approx(1.0)
+@pytest.mark.parametrize(('name', 'size', 'state', 'speed', 'change'), [
+    ('ground_effect', 0.12, {'position': [0, 0, 0.25 - LOW]}, (0, 0, 0), 0.12),
+    ('tilt_thrust_loss', 0.08, {'tilt': [np.radians(60)] * 4}, (0, 0, 0), -0.08),
+    ('tilt_thrust_loss', 0.08, {'tilt': [-np.radians(60)] * 4}, (0, 0, 0), -0.08),
+    ('tilt_thrust_loss', 0.08, {}, (0, 0, 0), 0.0),
+    ('axial_inflow', 0.4, {}, (0, 0, 1e-3), -0.4e-3 / HOVER),
+    ('translational_lift', 0.08, {}, (1, 0, 0), 0.08 / HOVER),
+    ('translational_lift', 0.08, {}, (0, 0, 2), 0.0),
+    ('voltage_sag', 1.2, {'voltage': 22.8}, (0, 0, 0), (22.8 / 25.2)**1.2 - 1)])
+def test_a_thrust_changes_by_its_label_in_every_shape(name, size, state, speed, change):
+    for shape in ('plain', *SHAPES.get(name, ())):
+        _, hidden, _ = put(name, size, shape)
+        found = np.prod([hook(0, snapshot(**state), HOVER, UP, speed) for hook in hidden.gains])
+        assert found - 1 == pytest.approx(change, rel=0.03, abs=1e-9)
 
 
 @shapes('rotor_drag')
@@ -144,23 +102,6 @@ def test_gyroscopic_torque_is_the_change_of_angular_momentum(shape):
         assert torque == pytest.approx(-change, abs=1e-6)
 
 
-@shapes('rotor_acceleration_torque')
-def test_rotor_acceleration_gives_a_reaction_torque(shape):
-    robot, hidden, _ = put('rotor_acceleration_torque', 0.05, shape)
-    f = robot.hover_thrust
-    torque = hidden.wrenches[0](0, snapshot(thrust_rate=[10.0] * 4), f, UP, (0, 0, 0))[3:]
-    assert torque[2] < 0  # rotor 1 spins positive
-    # Omega grows as the root of thrust: half the relative rate; the line grows a little faster
-    assert torque[2] == pytest.approx(-0.05 * 0.5 * 10.0 / f, rel=0.25)
-
-
-@shapes('voltage_sag')
-def test_voltage_sag_follows_its_exponent(shape):
-    _, hidden, label = put('voltage_sag', 1.2, shape)
-    assert gain(hidden, snapshot(voltage=22.8)) == pytest.approx((22.8 / 25.2) ** 1.2, rel=1e-6)
-    assert label['exponent'] == 1.2
-
-
 @shapes('rotor_lag')
 def test_rotor_lag_delays_thrust_by_its_time_constant(shape):
     robot, hidden, label = put('rotor_lag', 0.03, shape)
@@ -174,22 +115,6 @@ def test_rotor_lag_delays_thrust_by_its_time_constant(shape):
     assert label['time_constant'] == pytest.approx(0.1242)
 
 
-@shapes('joint_friction')
-def test_friction_holds_the_joint_against_a_smaller_spring_torque(shape):
-    robot, hidden, label = put('joint_friction', 0.01, shape)
-    stuck = label['stiction'] / 0.3449
-    ends = []
-    for command in (0.9 * stuck, 3.0 * stuck):
-        body = Plant(robot, hidden, multibody=False, position=(0, 0, 5), tilt=[0.0] * 4,
-                     quaternion=(1, 0, 0, 0), thrust=[7.45] * 4)
-        body.command(0.0, [command] * 4, [7.45] * 4)
-        for _ in range(400):
-            body.step()
-        ends.append(body.snapshot.tilt[0])
-    assert abs(ends[0]) < 0.1 * stuck
-    assert 1.5 * stuck < ends[1] < 3.0 * stuck
-
-
 @shapes('joint_backlash')
 def test_backlash_has_the_width_of_its_gap(shape):
     _, hidden, label = put('joint_backlash', 0.04, shape)
@@ -200,27 +125,6 @@ def test_backlash_has_the_width_of_its_gap(shape):
     assert rising[-1] == pytest.approx(-0.02, rel=0.12)
     assert np.ptp(errors[250:]) == pytest.approx(0.04, rel=0.12)
     assert label['gap'] == 0.04
-
-
-@shapes('joint_deflection')
-def test_deflection_grows_with_thrust_and_is_measured(shape):
-    robot, hidden, _ = put('joint_deflection', 0.003, shape)
-    body = Plant(robot, hidden, multibody=False, position=(0, 0, 5), tilt=[0.0] * 4,
-                 quaternion=(1, 0, 0, 0), thrust=[robot.hover_thrust] * 4)
-    for _ in range(300):
-        body.step()
-    assert body.snapshot.tilt[0] == pytest.approx(0.003 * robot.hover_thrust, rel=1e-3)
-
-
-def test_offset_is_true_tilt_minus_encoder():
-    robot, hidden, label = put('joint_offset', 0.05)
-    body = Plant(robot, hidden, multibody=False, position=(0, 0, 5), tilt=[0.0] * 4,
-                 quaternion=(1, 0, 0, 0), thrust=[7.0] * 4)
-    body.step()
-    joint = label['joint'] - 1
-    axis = Rotation.from_rotvec(0.05 * np.array([*robot.arms[joint], 0])).apply(UP)
-    assert body.snapshot.tilt[joint] == pytest.approx(0.0, abs=1e-9)
-    assert body.snapshot.axes[joint] == pytest.approx(axis, abs=1e-9)
 
 
 def test_mass_and_centre_of_mass_change_the_specific_force():
@@ -239,29 +143,3 @@ def test_mass_and_centre_of_mass_change_the_specific_force():
     # the described rotors' own small asymmetry adds a constant
     torque += np.sum(np.cross(robot.positions, [0, 0, 7.0]), axis=0)
     assert spin_up == pytest.approx(torque / robot.inertia, rel=0.02, abs=0.01)
-
-
-def test_every_label_contains_the_parameters_of_the_interface():
-    from gap_data.judge import PUBLIC
-    for name, entry in SETTINGS['effects'].items():
-        _, _, label = put(name, entry['range'][0])
-        assert set(PUBLIC.get(name, ())) <= set(label), name
-
-
-def test_a_case_always_has_the_same_truth():
-    case = Case('pairs', 'hard', 7, (('wind', 1.0, 'breathing'), ('mass', 0.2, 'plain')),
-                tolerance=True)
-    (_, _, one), (_, _, two) = build(case), build(case)
-    assert one == two
-
-
-def test_a_large_inertia_change_is_physically_possible():
-    for seed in range(60):
-        rng = np.random.default_rng(seed)
-        robot, nominal = Robot.nominal().within_tolerance(rng), Robot.nominal().inertia
-        before = robot.inertia
-        inject('inertia', robot, Hidden(), 0.3, 'plain', rng)
-        assert np.abs(robot.inertia[:2] / before[:2] - 1).max() <= 0.3 + 1e-9
-        assert np.abs(robot.inertia / nominal - 1).max() > 0.2
-        for multibody in (False, True):     # an inertia that no body can have is refused
-            mujoco.MjModel.from_xml_string(model_xml(robot, multibody=multibody))

@@ -1,6 +1,5 @@
 """Readings of the blind sensors, and their bags."""
 
-from pathlib import Path
 
 from gap_data.bags import DAMAGES, write_bag
 from gap_data.courses import Course
@@ -47,17 +46,6 @@ def test_stamps_are_capture_times_at_the_interface_rates():
     assert recording.mocap[:, 1:4] == pytest.approx(truth.columns['position'][::10])
     assert np.abs(recording.joints[:, 1:5] - truth.columns['tilt'][::5]).max() <= (
         np.pi / 4096 + 1e-12)
-
-
-def test_noise_has_the_requested_size():
-    noise = {'accelerometer': 0.05, 'gyroscope': 0.005, 'position': 0.001, 'orientation': 0.002,
-             'tilt': 0.0}
-    quiet, loud = sample(), sample(noise=noise)
-    away = loud.imu - quiet.imu
-    assert away[:, 1:4].std() == pytest.approx(0.05, rel=0.05)
-    assert away[:, 4:].std() == pytest.approx(0.005, rel=0.05)
-    turn = (Rotation.from_quat(quiet.mocap[:, 4:]).inv() * Rotation.from_quat(loud.mocap[:, 4:]))
-    assert turn.as_rotvec().std() == pytest.approx(0.002, rel=0.08)
 
 
 def test_delays_make_readings_older_than_their_stamps():
@@ -140,10 +128,3 @@ def test_damage_is_in_the_bag(tmp_path, damage):
         assert (np.diff(np.sort(stamps['/imu/data_raw'])) == 0).mean() > 0.1
     else:
         assert np.diff(stamps['/mocap/pose']).max() > 2.0
-
-
-def test_a_bag_does_not_reveal_its_label(tmp_path):
-    write_bag(tmp_path / 'bag', sample(), epoch=1.78e9)
-    text = b''.join(p.read_bytes() for p in Path(tmp_path).rglob('*') if p.is_file())
-    for word in (b'rotor_drag', b'ground_truth', b'effect', b'label', b'sealed'):
-        assert word not in text

@@ -24,14 +24,6 @@ def logs(tmp_path_factory):
             write(folder / 'first.csv', log_of(*fast, SERVOS[:1], seed=3))]
 
 
-def refused(capsys, *arguments):
-    """Run the command, expect status 2 and one line on standard error; return the line."""
-    assert cli.main([str(a) for a in arguments]) == 2
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1, lines
-    return lines[0]
-
-
 def test_joint_writes_all_its_files(logs, tmp_path, capsys):
     slow, fast, first = logs
     json_path, page, params = (tmp_path / name for name in ('r.json', 'r.html', 'robot.yaml'))
@@ -65,32 +57,3 @@ def test_rotor_writes_all_its_files(tmp_path, capsys):
     assert len(results['plateaus']) == 5
     assert page.read_text().count('<img') == 2
     assert len(RobotParameters.load(params).rotors.map) == 5
-
-
-@pytest.mark.parametrize('what', ['joint', 'rotor'])
-def test_unusable_input_ends_with_status_2_and_one_line(tmp_path, capsys, what):
-    assert 'no such file' in refused(capsys, 'identify', what, tmp_path / 'absent.csv')
-    bad = tmp_path / 'bad.csv'
-    bad.write_text('t_s,x\n1,2\n')
-    assert 'is missing' in refused(capsys, 'identify', what, bad)
-    assert 'cannot write' in refused(capsys, 'identify', what, bad, '--json', '/nowhere/r.json')
-    assert 'cannot write' in refused(capsys, 'identify', what, bad, '--report', '/nowhere/r.html')
-    assert refused(capsys, 'identify', what, bad, '--robot', tmp_path / 'absent.yaml')
-
-
-def test_a_bad_validation_log_is_refused_before_the_fit(logs, tmp_path, capsys):
-    bad = tmp_path / 'bad.csv'
-    bad.write_text('t_s,x\n1,2\n')
-    assert 'bad.csv' in refused(capsys, 'identify', 'joint', logs[0], '--validate', bad)
-
-
-def test_several_logs_are_fitted_together(logs, tmp_path):
-    path = tmp_path / 'r.json'
-    assert cli.main([str(a) for a in ('identify', 'joint', *logs[:2], '--json', path)]) == 0
-    assert json.loads(path.read_text())['meta']['logs'] == ['slow.csv', 'fast.csv']
-
-
-def test_help_lists_the_options(capsys):
-    for command in (['identify'], ['identify', 'joint'], ['identify', 'rotor']):
-        assert cli.main([*command, '--help']) == 0
-        assert 'Usage' in capsys.readouterr().out

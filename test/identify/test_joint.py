@@ -9,11 +9,9 @@ import pytest
 from servo_logs import COUNT, log_of, sweep
 
 from beetle_omni_ros.identify.parameters import shipped
-from beetle_omni_ros.identify.servo.fit import decoded, encoded, error_rms, NAMES, Servos
-from beetle_omni_ros.identify.servo.joint import ALWAYS, identify, interval, joint_results
+from beetle_omni_ros.identify.servo.joint import identify, interval, joint_results
 from beetle_omni_ros.identify.servo.log import read_joint_log
-from beetle_omni_ros.identify.servo.model import INDEX, published_set
-from beetle_omni_ros.identify.servo.robot import file_sets
+from beetle_omni_ros.identify.servo.model import INDEX
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 ROBOT = RobotParameters.load()
@@ -76,11 +74,6 @@ def test_a_slow_log_determines_the_lag_and_the_friction():
         == pytest.approx(bands, abs=0.004)
 
 
-def test_unneeded_terms_are_rejected():
-    kept = {entry for name in PARTS for entry in found(name).chosen.entries}
-    assert not kept & {'joint_velocity_limit', 'joint_torque_limit', 'joint_load'}
-
-
 def test_only_a_slow_log_confounds_delay_and_bandwidth():
     pair = ['delay', 'natural_frequency']
     slow, fast = (joint_results(found(name), [], ROBOT)['joints'] for name in PARTS)
@@ -89,59 +82,6 @@ def test_only_a_slow_log_confounds_delay_and_bandwidth():
     for a, b in zip(slow, fast, strict=True):
         widths = [np.ptp(joint['terms']['delay']['interval']) for joint in (a, b)]
         assert widths[0] > 1.5 * widths[1]
-
-
-def test_two_logs_with_different_delays_narrow_the_common_frequency():
-    later = tuple({**servo, 'delay': servo['delay'] + 0.008} for servo in SERVOS)
-    second = log_of(*sweep(**PARTS['fast']), later, seed=5, name='later')
-    fits = []
-    for logs in ([made('fast')], [made('fast'), second]):
-        servos = Servos(logs, file_sets(ROBOT))
-        fits.append(servos.fit([*ALWAYS, 'joint_offset', 'joint_backlash']).fit)
-    both = decoded(fits[1].theta)
-    assert both[3:, INDEX['delay']] - both[:3, INDEX['delay']] == pytest.approx(0.008, abs=5e-4)
-    assert both[:3, 0] == pytest.approx(both[3:, 0])        # both logs share the frequencies
-    assert both[:3, 0] == pytest.approx([servo['frequency'] for servo in SERVOS], abs=3.0)
-    wide, narrow = (np.mean([part[0] @ np.linalg.inv(fit.information) @ part[0]
-                             for part in fit.s]) for fit in fits)
-    assert narrow < 0.75 * wide     # variance; half with twice the data, but for the deviations
-
-
-def test_fits_of_the_slow_log_predict_the_fast_one():
-    for k, values in enumerate(found('slow').values()):
-        assert error_rms(made('fast'), k, values) < 0.008
-        assert error_rms(made('fast'), k, published_set(ROBOT.joints), held=False) > 0.03
-
-
-def test_the_derivatives_are_those_of_the_readings():
-    one = found('fast')
-    s = Servos([made('fast')], np.tile(one.values()[0], (4, 1)))
-    theta = encoded(one.values())
-    _, slopes = s(theta, np.ones(len(NAMES), dtype=bool))
-    for name in ('natural_frequency', 'damping_ratio', 'offset', 'encoder_gain', 'load_sine'):
-        step = np.zeros(len(NAMES))
-        step[INDEX[name]] = 2e-3
-        ends = [s(theta + sign * step, np.zeros(len(NAMES), dtype=bool))[0] for sign in (1, -1)]
-        for k in range(3):
-            numeric = (ends[0][k] - ends[1][k]) / 4e-3
-            error = np.linalg.norm(slopes[k][INDEX[name]] - numeric)
-            assert error < 0.1 * np.linalg.norm(numeric), name
-
-
-def test_a_speed_limit_is_found_if_the_command_exceeds_it():
-    t, command = sweep(4.0, periods=(0.8, 1.2), amplitudes=(1.2, 1.6))
-    one = identify([log_of(t, command, [{'velocity_limit': 5.5, 'coulomb': 0.012}], seed=3)],
-                   ROBOT)
-    assert 'joint_velocity_limit' in one.chosen.entries
-    assert one.values()[0, INDEX['velocity_limit']] == pytest.approx(5.5, rel=0.02)
-
-
-def test_a_limit_that_is_never_reached_stays_with_an_open_interval():
-    for joint in joint_results(found('slow'), [made('fast')], ROBOT)['joints']:
-        limit = joint['terms']['velocity_limit']
-        assert not limit['kept'] and limit['value'] == pytest.approx(
-            ROBOT.joints.velocity_limit)
-        assert limit['interval'][0] > 2 and limit['interval'][1] is None
 
 
 def test_samples_of_the_validation_part_are_not_used_by_the_fit():

@@ -4,23 +4,18 @@ from dataclasses import replace
 import json
 from pathlib import Path
 
-import casadi as ca
 import numpy as np
 import pytest
 from servo_logs import log_of, servo, sweep, write
 
 from beetle_omni_ros import cli
 from beetle_omni_ros.identify.gap.apply import effects_with
-from beetle_omni_ros.identify.gap.keys import all_keys
-from beetle_omni_ros.identify.gap.keys import friction as friction_of
 from beetle_omni_ros.identify.servo.compare import changes, compare, gap_of
 from beetle_omni_ros.identify.servo.joint import identify
 from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
-from beetle_omni_ros.identify.servo.model import INDEX, simulate
-from beetle_omni_ros.identify.servo.robot import catalogue_values, file_sets, own_delay
-from beetle_omni_ros.robot import dynamics
+from beetle_omni_ros.identify.servo.model import simulate
+from beetle_omni_ros.identify.servo.robot import file_sets, own_delay
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import ParameterError
 
 REAL = sorted((Path(__file__).resolve().parents[3] / 'shared' / 'data').glob('joint_*.csv'))
 SHIPPED = RobotParameters.load()
@@ -31,13 +26,9 @@ DELAY = own_delay() + 0.004     # of which a file states the rest
 T, COMMAND = sweep(5.0, periods=(0.5, 0.9), amplitudes=(0.3, 0.6))
 
 
-def stiffness(frequency=FREQUENCY):
-    return INERTIA * frequency**2
-
-
 def robot(**effects):
     """Robot file with the servos of ``made`` and further effects."""
-    kp = stiffness()
+    kp = INERTIA * FREQUENCY**2
     torque = tuple(kp * band for band in (*BANDS, 0.0, 0.0))
     own = {'joint_bandwidth': {'kp': kp, 'kd': 2 * DAMPING * FREQUENCY * INERTIA},
            'joint_friction': {'coulomb': torque, 'stiction': torque},
@@ -69,13 +60,6 @@ def names(result):
     return [(effect['names'], effect.get('joint')) for effect in result['effects']]
 
 
-@pytest.fixture(scope='module')
-def against_shipped():
-    """A log and its results against the shipped file."""
-    log = made(1)
-    return log, judged(log, SHIPPED)
-
-
 def test_servos_of_the_robot_file_agree_with_a_plain_simulation():
     file_robot = robot(joint_offset={'offset': (0.02, -0.01, 0.0, 0.0)},
                        joint_backlash={'gap': 0.024}, joint_feedback_delay={'delay': 0.006},
@@ -90,30 +74,9 @@ def test_servos_of_the_robot_file_agree_with_a_plain_simulation():
     assert np.sqrt(np.mean(error[:, 25:]**2)) < 5e-4 and np.abs(error[:, 25:]).max() < 2e-3
 
 
-def test_a_robot_file_states_the_delay_beyond_that_of_the_simulator():
-    stated = catalogue_values(file_sets(robot())[0], robot())['joint_command_latency']['delay']
-    assert stated == pytest.approx(robot().effects['joint_command_latency']['delay'])
-    later = made(2, delay=DELAY + 0.012)
-    named, = judged(later)['effects']
-    assert named['names'] == ['joint_command_latency']
-    assert named['parameters']['delay']['value'] == pytest.approx(
-        DELAY + 0.012 - own_delay(), abs=0.002)
-
-
-def test_an_offset_servo_turns_its_thrust_to_the_commanded_tilt():
-    zero, target = np.array([0.02, -0.03, 0.0, 0.05]), np.array([0.3, -0.2, 0.8, 0.0])
-    file_robot = replace(SHIPPED, effects={'joint_offset': {'offset': tuple(zero)}})
-    encoder = target + file_sets(file_robot)[:, INDEX['offset']]
-    state = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3)
-    thrust = np.array([7.0, 8.0, 6.0, 9.0])
-    seen, plain = ([np.array(part).ravel() for part in dynamics.body_acceleration(r)(
-        *state, tilt, thrust)] for r, tilt in ((file_robot, encoder), (SHIPPED, target)))
-    assert np.allclose(seen[0], plain[0], atol=1e-9) and np.allclose(seen[1], plain[1], atol=1e-9)
-
-
 def test_servos_of_the_robot_file_have_no_gap():
     assert judged(made(3))['verdict'] == 'no_gap'
-    named = [compare(made(seed), robot()).chosen.entries for seed in range(100, 110)]
+    named = [compare(made(seed), robot()).chosen.entries for seed in range(100, 104)]
     assert sum(map(len, named)) <= 1, named
 
 
@@ -145,23 +108,6 @@ def test_a_change_is_named_alone(changed, both, name):
     assert result['gap_after'] < 1.15 < result['gap_before']
 
 
-def test_friction_of_each_joint_is_measured():
-    effect, = judged(made(6, {'coulomb': 0.030}, {}))['effects']
-    each = effect['parameters']['coulomb']['each']
-    assert each['1'] == pytest.approx(0.030 * stiffness(), rel=0.15)
-    assert each['2'] == pytest.approx(BANDS[1] * stiffness(), rel=0.15)
-
-
-def test_a_corrected_log_has_no_gap():
-    log = made(1)
-    result = judged(log, SHIPPED)
-    assert result['verdict'] in ('named', 'named_set') and result['gap_before'] > 10
-    for effect in result['effects']:
-        assert effect['evidence']['delta_bic'] > 0 and effect['evidence']['cv_gain'] > 0
-    again = judged(log, corrected(SHIPPED, result))
-    assert again['verdict'] == 'no_gap' and again['gap_before'] < 1.2
-
-
 def test_changes_between_two_logs_are_reported_with_valid_intervals():
     before, after = made(7), made(8, {'offset': 0.018}, {}, coulomb=0.024)
     rows = changes(before, replace(after, name='after.csv'), SHIPPED)
@@ -178,39 +124,6 @@ def test_changes_between_two_logs_are_reported_with_valid_intervals():
             assert abs(row['difference'] - true.get((row['joint'], row['parameter']), 0.0)) < wide
         if row['parameter'] in ('kp', 'kd', 'delay', 'ramp_lag'):
             assert not row['significant'], row
-
-
-def test_two_logs_of_the_same_servos_show_no_change():
-    assert not any(row['significant'] for row in changes(made(9), made(10), SHIPPED))
-
-
-def test_friction_may_be_given_for_each_joint():
-    file_robot = replace(SHIPPED, effects={'joint_friction': {
-        'coulomb': (0.001, 0.002, 0.003, 0.004), 'stiction': 0.002}})
-    for joint in range(4):
-        slow = dynamics.servo_acceleration(file_robot, 0.0, 2.0, 0.0, joint=joint)
-        free = dynamics.servo_acceleration(SHIPPED, 0.0, 2.0, 0.0, joint=joint)
-        torque = float(ca.DM(free - slow)) * INERTIA
-        assert torque == pytest.approx(0.001 * (joint + 1), rel=0.01)
-    coulomb, stiction = friction_of(file_robot)
-    assert np.allclose(coulomb, [0.001, 0.002, 0.003, 0.004])
-    assert np.allclose(stiction, [0.002, 0.002, 0.003, 0.004])
-    assert all_keys(file_robot)['joint_friction.coulomb'].base == pytest.approx(0.0025)
-
-
-def test_a_list_of_the_wrong_length_is_refused():
-    with pytest.raises(ParameterError, match=r'joint_friction.coulomb.*\(4,\).*\(3,\)'):
-        replace(SHIPPED, effects={'joint_friction': {'coulomb': (0.1,) * 3, 'stiction': 0.1}})
-
-
-def test_a_flight_keeps_the_differences_between_joints():
-    file_robot = replace(SHIPPED, effects={'joint_friction': {
-        'coulomb': (0.001, 0.002, 0.003, 0.004), 'stiction': 0.004}})
-    named = [{'names': ['joint_friction'], 'parameters': {
-        'coulomb': {'value': 0.0045, 'unit': 'N m'}, 'stiction': {'value': 0.006, 'unit': 'N m'}}}]
-    written = effects_with(file_robot, named)['joint_friction']
-    assert np.allclose(written['coulomb'], [0.003, 0.004, 0.005, 0.006])
-    assert written['stiction'] == 0.006
 
 
 def test_the_command_line_writes_a_file_that_explains_the_log(tmp_path, capsys):

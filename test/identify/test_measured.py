@@ -11,23 +11,9 @@ from servo_logs import log_of, sweep, write
 import yaml
 
 from beetle_omni_ros import cli
-from beetle_omni_ros.control.base import Command
-from beetle_omni_ros.faults.flight import Flight
 from beetle_omni_ros.identify.servo.robot import own_delay
-from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.dynamics import (
-    DISTURBANCE_SIZE,
-    integrator,
-    QUATERNION,
-    STATE_SIZE,
-    THRUST,
-)
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.thrust_map import ThrustMap
-from beetle_omni_ros.sim.parameters import SimulatorParameters
-from beetle_omni_ros.sim.simulator import Simulator
-from beetle_omni_ros.train.model import nominal_body, substep, WRENCH_SIZE
 
 ROOT = Path(__file__).resolve().parents[2]
 PUBLISHED, MEASURED = RobotParameters.load(), RobotParameters.load('measured')
@@ -86,85 +72,6 @@ def test_the_file_has_command_logs_and_what_no_log_shows_but_no_zero(made):
     assert not set(left) & {'joints.kp', 'rotors.map', 'rotors.time_constant'}
     assert 'untimed.csv' in (made / 'r.json').read_text()
     assert (made / 'p.svg').read_text().startswith('<?xml')
-
-
-def test_a_log_of_another_kind_is_refused_in_one_line(tmp_path, capsys):
-    (tmp_path / 'x.csv').write_text('a,b\n1,2\n')
-    assert cli.main(['identify', 'robot', str(tmp_path / 'x.csv'), '--params',
-                     str(tmp_path / 'y.yaml')]) == 2
-    assert 'expected the header' in capsys.readouterr().err
-
-
-def varied(tmp_path, key, end):
-    """The measured robot with one value at an end of its interval."""
-    content = yaml.safe_load(share_path('params/robot_measured.yaml').read_text())
-    at, *names = content, *key.split('.')
-    for name in names[:-1]:
-        at = at[name]
-    at[names[-1]] = np.array(MEASURED.interval(key)[end]).tolist()
-    del content['intervals']
-    if key.endswith('stiction'):    # not below the friction that slides
-        content['effects']['joint_friction']['coulomb'] = 0.0
-    path = tmp_path / 'varied.yaml'
-    path.write_text(yaml.safe_dump(content))
-    return RobotParameters.load(path)
-
-
-def predicted(robot):
-    """States of the NMPC's and of the training's model after commands."""
-    start, u = np.zeros(STATE_SIZE), np.r_[np.full(4, 0.3), 9.0, 8.0, 7.0, 6.0]
-    start[QUATERNION], start[THRUST] = (0, 0, 0, 1), 6.0
-    nmpc, trained, body = integrator(robot), substep(robot, 0.0025), nominal_body(robot)
-    for advance in (lambda x: nmpc(x, u, np.zeros(DISTURBANCE_SIZE), 0.01),
-                    lambda x: trained(x, u, np.zeros(WRENCH_SIZE), body)):
-        x = start
-        for _ in range(10):
-            x = advance(x)
-        yield np.array(x).ravel()
-
-
-def simulated(robot):
-    """State of the plant after commands."""
-    simulator = Simulator(robot, SimulatorParameters.load())
-    simulator.reset(np.array([0.0, 0.0, 20.0]))
-    for _ in range(40):
-        simulator.command(Command(simulator.time, np.full(4, 0.3), np.array([9.0, 8, 7, 6])))
-        truth = simulator.step().truth
-    return np.r_[truth.tilt, truth.thrust, truth.angular_velocity]
-
-
-@pytest.mark.parametrize('key', sorted(MEASURED.intervals))
-def test_every_interval_matters_to_plant_and_models(tmp_path, key):
-    low, high = (varied(tmp_path, key, end) for end in (0, 1))
-    assert np.abs(simulated(low) - simulated(high)).max() > 1e-6
-    if 'latency' in key:
-        assert low.command_delays != high.command_delays
-        return
-    for one, other in zip(predicted(low), predicted(high), strict=True):
-        assert np.abs(one - other).max() > 1e-6
-
-
-def test_the_measured_robot_hovers_under_a_controller_that_believes_the_published_one():
-    flight = Flight(controller='nmpc', conditions='nominal', seed=0, plant='measured')
-    flight.loop.take_off()
-    flight.aim((0.0, 0.0, 1.0))
-    flight.fly(6.0)
-    truth = flight.simulator.truth
-    assert not truth.broken
-    assert truth.position == pytest.approx([0, 0, 1], abs=0.05)
-    assert rotations.geodesic_angle(truth.quaternion, [0, 0, 0, 1]) < 0.15
-
-
-def test_the_measured_map_hovers_and_reaches_as_far_as_the_published_one():
-    measured, published = (ThrustMap(robot.rotors) for robot in (MEASURED, PUBLISHED))
-    assert not measured.repaired
-    for voltage in (21.4, 23.0, 25.0):
-        assert measured.thrust_limit(voltage) > 2.5 * MEASURED.hover_thrust
-        assert measured.thrust_limit(voltage) == pytest.approx(
-            published.thrust_limit(voltage), rel=0.12)
-        duty = published.duty(np.array([3.0, MEASURED.hover_thrust, 15.0]), voltage)
-        assert measured.thrust(duty, voltage) == pytest.approx(
-            [3.0, MEASURED.hover_thrust, 15.0], abs=1.0)
 
 
 @pytest.mark.skipif(not (ROOT / '../shared/data/joint_response_100Hz.csv').is_file(),

@@ -7,8 +7,7 @@ from servo_logs import servo, sweep
 
 from beetle_omni_ros.identify.servo import model as servo_model
 from beetle_omni_ros.identify.servo.log import JointLog
-from beetle_omni_ros.identify.servo.model import INDEX, OFF, published_set, simulate
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.identify.servo.model import INDEX, OFF, simulate
 
 
 def log_for(t, command, start=None):
@@ -64,14 +63,6 @@ def test_every_term_agrees_with_a_plain_simulation(values):
     assert np.sqrt(np.mean(error[25:]**2)) < 3e-4 and np.abs(error[25:]).max() < 1e-3
 
 
-def test_friction_holds_the_joint_exactly_still():
-    t, command = step_command(size=0.01)
-    held = simulate(log_for(t, command), 0, parameter_set(coulomb_friction=0.011))
-    assert np.all(held == held[0, 0])
-    moved = simulate(log_for(t, command), 0, parameter_set(coulomb_friction=0.009))
-    assert 0 < moved[0, -1] < 0.01
-
-
 def test_parameter_sets_in_a_batch_are_independent():
     t, command = sweep(duration=3.0)
     log = log_for(t, command)
@@ -80,24 +71,6 @@ def test_parameter_sets_in_a_batch_are_independent():
     together = simulate(log, 0, sets)
     for k, alone in enumerate(sets):
         assert np.allclose(together[k], simulate(log, 0, alone[None])[0], atol=1e-12)
-
-
-def test_uneven_sampling_gives_the_same_motion():
-    t, command = sweep(duration=3.0)
-    keep = np.ones(len(t), dtype=bool)
-    keep[50::7] = False
-    model = parameter_set(delay=0.013, coulomb_friction=0.01)
-    even = simulate(log_for(t, command), 0, model, held=False)[0]
-    uneven = simulate(log_for(t[keep], command[keep]), 0, model, held=False)[0]
-    assert np.abs(even[keep] - uneven)[20:].max() < 2e-3
-
-
-def test_the_published_set_has_the_frequency_of_the_robot_file():
-    joint = RobotParameters.load().joints
-    values = published_set(joint)
-    frequency, damping = values[INDEX['natural_frequency']], values[INDEX['damping_ratio']]
-    assert joint.inertia * frequency**2 == pytest.approx(joint.kp)
-    assert 2 * damping * frequency * joint.inertia == pytest.approx(joint.kd)
 
 
 @pytest.mark.parametrize('values', [
@@ -109,8 +82,3 @@ def test_without_a_compiler_the_numbers_are_the_same(values, monkeypatch):
     monkeypatch.setattr(servo_model, '_compiled', lambda: None)
     assert np.allclose(simulate(log, 0, parameter_set(delay=0.0137, **values)), compiled,
                        rtol=0, atol=1e-9)
-
-
-def test_without_any_compiler_numpy_is_used(monkeypatch):
-    monkeypatch.setenv('CC', '/nowhere/cc')
-    assert servo_model._compiled.__wrapped__() is None

@@ -31,8 +31,6 @@ from ros_flights import FLIGHTS
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted((ROOT / 'docs' / 'tutorials').glob('*.md'))
-NAMES = ('beetle_omni', 'sim_node')
-STARTED = 'first_flight'    # the page whose commands load their modules when first called
 TIMEOUT = 1000       # s of one block
 BLOCK = re.compile(r'(?P<before>[^\n]*)\n(?:\n<!-- test: (?P<options>[^\n]*) -->\n)?\n'
                    r'```(?P<language>\w*)\n(?P<text>.*?)^```$', re.DOTALL | re.MULTILINE)
@@ -103,20 +101,13 @@ def client(tmp_path_factory):
 
 
 @pytest.fixture
-def shell(tmp_path, page, client):
+def shell(tmp_path, client):
     """Environment in which the commands of this checkout are found."""
     programs = tmp_path / 'programs'
     programs.mkdir()
-    texts = {name: f'#!/bin/sh\nexec {sys.executable} -m beetle_omni_ros.start {name} "$@"\n'
-             for name in NAMES}
-    texts['python'] = f'#!/bin/sh\nexec {sys.executable} "$@"\n'
-    texts['ready'] = client
-    if page.stem != STARTED:
-        texts['beetle_omni'] = client
-    else:
-        again = f'if [ -e {programs}/of_$1 ]; then exec {programs}/ready "$@"; fi\n'
-        texts['beetle_omni'] = texts['beetle_omni'].replace(
-            'exec', f'{again}touch {programs}/of_$1\nexec')
+    start = f'#!/bin/sh\nexec {sys.executable}'
+    texts = {'beetle_omni': client, 'python': f'{start} "$@"\n',
+             'sim_node': f'{start} -m beetle_omni_ros.start sim_node "$@"\n'}
     for name, text in texts.items():
         (programs / name).write_text(text)
         (programs / name).chmod(0o755)
@@ -179,6 +170,7 @@ def test_the_commands_of_a_tutorial_give_its_results(page, tmp_path, shell):
             if block.one('ends'):
                 stop(background.pop(block.one('ends')))
             if not block.language:
+                assert all(one.commands == one.text for one in found[:found.index(block)])
                 true = with_printed_numbers(block.text, printed)
                 if RENEW:
                     page.write_text(page.read_text().replace(block.text, true))
@@ -199,13 +191,6 @@ def test_the_commands_of_a_tutorial_give_its_results(page, tmp_path, shell):
 
 
 @pytest.mark.parametrize('page', PAGES, ids=lambda page: page.stem)
-def test_shown_lines_follow_from_unchanged_blocks(page):
-    found = blocks(page)
-    shown = [k for k, block in enumerate(found) if not block.language]
-    assert all(block.commands == block.text for block in found[:max(shown, default=0)])
-
-
-@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.stem)
 def test_each_number_of_a_text_is_in_a_command_or_in_its_output(page):
     text = page.read_text()
     known = {number for block in re.findall(r'^```.*?^```$', text, re.DOTALL | re.MULTILINE)
@@ -214,9 +199,3 @@ def test_each_number_of_a_text_is_in_a_command_or_in_its_output(page):
         if 'test: skip' not in section:     # it describes what no test can run
             said = NUMBER.findall(NO_TEXT.sub(' ', f'## {section}'))
             assert set(said) <= known, section
-
-
-@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.stem)
-def test_a_tutorial_has_tested_commands_and_a_picture(page):
-    assert any('skip' not in block.options and block.language == 'sh' for block in blocks(page))
-    assert re.search(r'!\[.*\]\(\S+\.(png|gif)\)', page.read_text())
