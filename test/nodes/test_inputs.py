@@ -20,9 +20,7 @@ from std_msgs.msg import String
 
 from beetle_omni_ros.control.base import Command, PoseTarget
 from beetle_omni_ros.control.registry import ControllerEntry
-from beetle_omni_ros.messages import conversions
 from beetle_omni_ros.messages.topics import ALL, COMMAND, EVENT, LATCHED, SENSOR
-from beetle_omni_ros.messages.values import MessageError
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.bridge_nodes import JointBridgeNode, RotorBridgeNode
 from beetle_omni_ros.nodes.control_nodes import ControllerNode, EkfNode, SupervisorNode
@@ -75,23 +73,6 @@ def test_a_bad_target_pose_is_refused_with_its_reason_and_the_old_one_stays(benc
     assert bench.wait(lambda: node._host.target.position[2] == 1.5)
     kinds = node.health.inputs['target_pose'].rejected
     assert kinds['cannot be flown'] == 4 and kinds.total() == 5
-
-
-def test_a_stamp_of_1970_is_refused_in_simulated_time_too(bench, monkeypatch):
-    node = bench.add(StillNode())
-    monkeypatch.setattr(node, 'simulated', True)
-    now = time.time()
-    for time_now, stamp, good in (
-            (now, 1.5, False), (now, now + 1e5, False), (now, now - 60, True),
-            (100.0, 1.5, True), (0.0, now, True), (100.0, now, False)):
-        monkeypatch.setattr(node, 'now', lambda t=time_now: t)
-        target = conversions.take_pose_target(
-            wire.message(ALL['target_pose'], pose(stamp=stamp)))
-        if good:
-            node._check_target(target, now)
-        else:
-            with pytest.raises(MessageError, match='the stamp is .* expected at most'):
-                node._check_target(target, now)
 
 
 def test_bad_and_stale_samples_are_refused_and_counted_by_reason(bench):

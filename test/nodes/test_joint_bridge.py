@@ -116,22 +116,6 @@ def test_a_command_moves_the_joints_and_its_latency_is_reported(active):
     assert operator.stands_at(GOAL)
 
 
-def test_an_ambiguous_turn_is_refused_in_one_line_until_the_operator_confirms_one(bench):
-    emulated, operator = bench
-    operator.go_to('unconfigured')
-    emulated.set_state([0, 3.0, 0, 0], np.zeros(4), np.zeros(4))
-    operator.go_to('inactive')
-    doubt = 'gimbal2 (id 2) stands at -3.28 or +3.00 rad'
-    operator.until(lambda: not operator.change('activate') and doubt in operator.now)
-    assert operator.stage == 'inactive' and not emulated.torque_enabled.any()
-    assert operator.now.startswith('waiting: ') and '\n' not in operator.now
-    assert operator.set(JOINT, 'confirmed_tilts', [0.0, 3.3, 0.0, 0.0])[0]
-    assert operator.set(JOINT, 'confirm_tilts', True)[0]
-    operator.go_to('active')
-    operator.until(lambda: operator.stands_at([0, 3.0, 0, 0]), 'another turn')
-    assert operator.set(JOINT, 'confirm_tilts', False)[0]
-
-
 def test_a_silent_servo_leaves_joint_states_incomplete_and_is_named(active):
     emulated, operator = active
     emulated.faults.silent = {3}

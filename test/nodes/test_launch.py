@@ -1,7 +1,6 @@
 """Processes of the launch file by its arguments; launch itself is replaced."""
 
 from importlib.util import module_from_spec, spec_from_file_location
-import os
 from pathlib import Path
 import re
 import signal
@@ -145,27 +144,3 @@ def test_ros2_bag_records_where_it_is_installed_else_the_recorder(bringup, monke
     else:
         recorder = processes[names.index('recorder_node')]
         assert recorder.kwargs['parameters'] == [{'bag': '/data/run'}]
-
-
-def test_a_launch_is_visible_on_this_computer_only(bringup, monkeypatch):
-    for name in (*graph.ROS_SETTINGS, graph.VARIABLE):
-        monkeypatch.delenv(name, raising=False)
-    bringup.generate_launch_description()
-    assert os.environ[graph.RANGE] == 'LOCALHOST'
-    monkeypatch.setenv(graph.VARIABLE, 'SUBNET')
-    bringup.generate_launch_description()
-    assert os.environ[graph.RANGE] == 'SUBNET'
-    bringup.start(composed='false', discovery='OFF')
-    assert os.environ[graph.RANGE] == 'OFF'
-
-
-def test_the_browser_viewer_is_a_separate_process_without_targets(bringup):
-    def viewers(**arguments):
-        return [action.kwargs['cmd'] for action in bringup.start(**arguments)
-                if 'view' in action.kwargs.get('cmd', ())]
-    assert not viewers()
-    (command,) = viewers(view='true', namespace='robot1')
-    assert command[command.index('--namespace') + 1] == 'robot1'
-    assert '--allow-targets' not in command
-    (command,) = viewers(view='true', allow_targets='true')
-    assert '--allow-targets' in command

@@ -1,7 +1,6 @@
 """rotor_bridge_node as a process with the emulated motor board; test/drivers has its faults."""
 
 from contextlib import contextmanager
-import math
 import os
 import signal
 import time
@@ -14,7 +13,6 @@ pytest.importorskip('serial')
 
 from bridge_bench import QUICK, ROTOR, running_bridge, WITHIN
 
-from beetle_omni_ros.messages import conversions
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 
 pytestmark = pytest.mark.real_time
@@ -119,25 +117,6 @@ def test_commands_are_repeated_and_the_rotors_stop_with_the_stream_or_with_old_c
     operator.age = 0.2
     operator.until(lambda: not board.commands.any())
     operator.counts('inputs', 'command rejected: stale stamp', above=5)
-
-
-def test_battery_and_rotor_speeds_are_published_in_ros_units_and_signs(bridge):
-    board, operator = bridge.board, bridge.operator
-    board.set_battery(23.456, 12.34)
-    board.set_rotors(np.array([1.0, 4.0, 9.0, 0.0]), np.array([30.0, 40.0, 50.0, 60.0]))
-    speeds = np.array([2700, 5400, 8100, 0]) * math.tau / 60
-    operator.until(lambda: operator.batteries and operator.rotors and math.isclose(
-        operator.batteries[-1].current, -12.34, rel_tol=1e-5)
-        and np.allclose(operator.rotors[-1].velocity, speeds))
-    battery, rotors = operator.batteries[-1], operator.rotors[-1]
-    assert battery.voltage == pytest.approx(23.456) and battery.present
-    assert len(battery.cell_voltage) == 6
-    assert rotors.name == ['rotor1', 'rotor2', 'rotor3', 'rotor4']
-    for message in (battery, rotors):
-        age = time.time() - conversions.seconds(message.header.stamp)
-        assert -0.001 <= age < WITHIN
-    board._thrust = None        # rotors follow at once again
-    board.set_battery(25.2, 0.0)
 
 
 def test_diagnostics_contain_link_clock_latency_and_a_failed_esc(flying):

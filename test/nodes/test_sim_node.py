@@ -59,14 +59,6 @@ def test_faults_are_switched_in_flight_and_reported(sim):
     assert node._simulator.faults == []
 
 
-def test_faults_of_device_measurements_are_refused_with_emulated_devices(sim):
-    node = sim()
-    assert put(node, faults='gyroscope_bias x=0.1; rotor_stops rotor=1').successful
-    for text in ('joints_lost', 'battery_unread', 'commands_lost'):
-        answer = put(node, faults=text)
-        assert not answer.successful and 'servo_faults' in answer.reason
-
-
 def test_the_simulator_publishes_simulated_time_only_without_serial_devices(sim):
     node = sim('clock:=simulated', actuators='direct')
     assert '/clock' in topics(node)[0] and '/odom' in topics(node)[1]

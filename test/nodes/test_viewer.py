@@ -1,14 +1,11 @@
 """Markers and frame of the viewer agree with the topics."""
 
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from beetle_omni_ros.control.base import Command, PoseTarget
-from beetle_omni_ros.messages import conversions
 from beetle_omni_ros.messages.values import Odom
-from beetle_omni_ros.nodes import side_nodes
 from beetle_omni_ros.nodes.side_nodes import ViewerNode
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.readings import JointReading
@@ -58,17 +55,3 @@ def test_thrust_arrows_point_along_the_tilted_rotors(viewer):
     axis = viewer._robot.tilt_axes[1]
     assert thrust[1] == pytest.approx(4 * np.cross(axis, [0, 0, 1]))    # a quarter turn about it
     assert markers['rotor1'].header.frame_id == 'world'
-
-
-def test_the_frame_of_the_body_is_sent_once_for_each_estimate(viewer, monkeypatch):
-    monkeypatch.setattr(side_nodes, 'TFMessage', SimpleNamespace)
-    rotation, position = rotations.from_rpy(0.4, -0.2, 1.0), np.array([1.0, 2.0, 3.0])
-    viewer._odom = Odom(5.0, position, np.zeros(3), rotation, np.zeros(3))
-    viewer._move()
-    viewer._move()
-    (message,) = viewer._transforms
-    (frame,) = message.transforms
-    assert (frame.header.frame_id, frame.child_frame_id) == ('world', 'base_link')
-    assert frame.header.stamp.sec == 5
-    assert conversions.xyz(frame.transform.translation) == pytest.approx(position)
-    assert conversions.xyzw(frame.transform.rotation) == pytest.approx(rotation)
