@@ -44,16 +44,15 @@ class BridgeOperator(Operator):
     def __init__(self, number, bridge):
         super().__init__(number)
         self.bridge, node = bridge, self._node
-        self.bridge_states, self.batteries, self.joints, self.rotors = [], [], [], []
+        self.bridge_states, self.batteries, self.joints = [], [], []
         self.tilt = self.thrust = None
         self.period, self.age = 0.01, 0.0
         self._supervisor = wire.Publisher(node, 'supervisor/state')
         self._commands = wire.Publisher(node, 'command')
         self._clients_of_bridge = {}
         wire.subscribe(node, f'{bridge.removesuffix("_node")}/state', self.bridge_states.append)
-        for kind, topic, received in ((BatteryState, 'battery_state', self.batteries),
-                                      (JointState, 'rotor_states', self.rotors)):
-            node.create_subscription(kind, topic, received.append, wire.profile(SENSOR))
+        node.create_subscription(BatteryState, 'battery_state', self.batteries.append,
+                                 wire.profile(SENSOR))
         node.create_subscription(JointState, 'joint_states', lambda message: self.joints.append(
             (message, time.time())), wire.profile(SENSOR))
         self._stop = threading.Event()

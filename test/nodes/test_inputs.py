@@ -89,7 +89,7 @@ def test_bad_and_stale_samples_are_refused_and_counted_by_reason(bench):
 
 @pytest.mark.parametrize(('kind', 'overrides'), [
     (SimNode, ()), (JointBridgeNode, ('port:=/tmp/none/a',)),
-    (RotorBridgeNode, ('port:=/tmp/none/b',)), (StillNode, ())])
+    (RotorBridgeNode, ('port:=/tmp/none/b',))])
 def test_only_the_supervisors_commands_are_executed_and_others_are_named(make_bench, kind,
                                                                          overrides):
     bench, texts = make_bench(*overrides), []

@@ -1,5 +1,6 @@
 """Markers and frame of the viewer agree with the topics."""
 
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,40 +12,24 @@ from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.readings import JointReading
 
 
-class Sent(list):
-    """A publisher that stores its messages."""
-
-    publish = list.append
-    subscribed = 1
-
-    def get_subscription_count(self):
-        return self.subscribed
-
-
 @pytest.fixture
 def viewer(make, monkeypatch):
     node = make(ViewerNode)
-    monkeypatch.setattr(node, '_markers', Sent())
-    monkeypatch.setattr(node, '_transforms', Sent(), raising=False)
+    monkeypatch.setattr(node, '_markers', SimpleNamespace(
+        sent=[], get_subscription_count=lambda: 1))
+    node._markers.publish = node._markers.sent.append
     return node
 
 
 def test_thrust_arrows_point_along_the_tilted_rotors(viewer):
     rotation = rotations.from_rpy(0.4, -0.2, 1.0)
     position, tilt = np.array([1.0, 2.0, 3.0]), np.array([0.0, np.pi / 2, 0.0, -0.3])
-    viewer._draw()
-    assert not viewer._markers              # without any message
     viewer._odom = Odom(5.0, position, np.zeros(3), rotation, np.zeros(3))
     viewer._joints = JointReading(5.0, tilt, np.zeros(4))
     viewer._command = Command(5.0, tilt, np.array([8.0, 4.0, 0.0, 20.0]))
     viewer._target = PoseTarget(position, rotation)
-    viewer._markers.subscribed = viewer._transforms.subscribed = 0
     viewer._draw()
-    viewer._move()
-    assert not viewer._markers and not viewer._transforms
-    viewer._markers.subscribed = 1
-    viewer._draw()
-    markers = {marker.ns: marker for marker in viewer._markers[-1].markers}
+    markers = {marker.ns: marker for marker in viewer._markers.sent[-1].markers}
     assert set(markers) == {'body', 'rotor1', 'rotor2', 'rotor3', 'rotor4', 'target'}
     arrows = np.array([[[p.x, p.y, p.z] for p in markers[f'rotor{k}'].points]
                        for k in (1, 2, 3, 4)])
