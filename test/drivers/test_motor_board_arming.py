@@ -121,7 +121,6 @@ def test_a_refusal_to_arm_is_reported_and_not_retried(bench):
 
 @pytest.mark.parametrize(('status', 'why'), [
     (BoardStatus(0.0, 'boot', 'none', (), 1), 'restarted'),
-    (BoardStatus(0.0, 'disarmed', 'none', (), 1), 'restarted'),
     (BoardStatus(0.0, 'disarmed', 'watchdog reset', (), 1), 'restarted (watchdog reset)'),
     (BoardStatus(0.0, 'disarmed', 'no target for too long', (), 1),
      'disarmed (no target for too long)'),
@@ -179,13 +178,6 @@ def test_arming_in_flight_never_happens(bench):
     for state in ('disarmed', 'emergency_stop', 'takeoff'):
         arming.follow(state)
     assert arming.text == 'lost: the supervisor was not disarmed before'
-    assert board.asked is False
-
-
-def test_a_board_found_armed_is_disarmed(bench):
-    board, arming = bench
-    board.state.status = ARMED
-    arming.update(CYCLE)
     assert board.asked is False
 
 
