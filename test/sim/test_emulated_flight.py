@@ -121,25 +121,6 @@ def test_thrusts_and_tilts_act_and_are_measured(flight):
     np.testing.assert_allclose(flight.latest['rotors'].rpm, rpm, rtol=0.02)
 
 
-def test_torque_off_frees_the_joints_and_torque_on_holds_them_where_they_are(flight):
-    flight.tilt = np.full(4, 0.4)
-    flight.until(lambda: np.all(flight.truth.tilt > 0.35))
-    assert flight.bus.disable()
-    flight.tilt = np.full(4, -1.0)
-    flight.run(0.2)
-    assert np.all(flight.truth.tilt > 0.0) and np.all(flight.readings.effort == 0)
-    flight.tilt = flight.truth.tilt
-    flight.bus.enable()
-    flight.run(0.2)
-    np.testing.assert_allclose(flight.truth.tilt, flight.tilt, atol=0.15)
-
-
-def test_a_failed_esc_stops_its_rotor_alone(flight):
-    flight.switch(board={'failed_escs': np.array([4.0])})
-    flight.until(lambda: flight.truth.thrust[3] < 0.1)
-    np.testing.assert_allclose(flight.truth.thrust[:3], HOVER[:3], rtol=0.02)
-
-
 def test_without_the_servos_cable_the_joints_hold(flight):
     flight.tilt = np.full(4, 0.4)
     flight.until(lambda: np.all(flight.truth.tilt > 0.35))

