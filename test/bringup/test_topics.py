@@ -57,16 +57,15 @@ def paused():
     ('mocap', stream(50, 0.01), {'mocap/pose rate': 'fail'}),
     ('mocap', stream(240, 0.01), {'mocap/pose rate': 'warn'}),
     ('mocap', paused(), {'mocap/pose rate': 'warn'}),
-    ('battery', stream(50, 0.001), {}), ('battery', stream(10, 0.001), {}),
-    ('battery', stream(5, 0.001), {'battery_state rate': 'fail'})])
+    ('battery', stream(50, 0.001), {})])
 def test_rates_outside_their_limits_fail(key, made, bad):
     assert levels(judged(**{key: made})) == bad
 
 
 @pytest.mark.parametrize(('age', 'jitter', 'level', 'words'), [
     (0.010, 0.004, 'ok', ''), (0.050, 0.001, 'warn', 'not synchronised'),
-    (0.050, 0.100, 'warn', 'buffers'), (3600.0, 0.01, 'fail', 'not synchronised'),
-    (0.150, 0.300, 'fail', 'buffers'), (-0.020, 0.001, 'fail', 'not synchronised')])
+    (0.050, 0.100, 'warn', 'buffers'), (0.150, 0.300, 'fail', 'buffers'),
+    (-0.020, 0.001, 'fail', 'not synchronised')])
 def test_ages_distinguish_latency_from_a_clock_offset(age, jitter, level, words):
     finding = judged(mocap=stream(100, age, jitter))['mocap/pose age']
     assert finding.level == level and words in finding.remedy
