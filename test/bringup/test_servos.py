@@ -96,16 +96,6 @@ def test_each_fault_is_found_and_named(name):
     assert all(word in text for word in words), text
 
 
-def test_a_servo_that_has_shut_down_is_reported():
-    with running(reboot_after_overload=False) as (bus, emulated):
-        bus.link.close()
-        emulated.servos[2].trip(0x20)
-        found = servos(emulated.port)
-    assert found['gimbal3'].level == 'fail' and 'overload' in found['gimbal3'].found
-    assert 'reboot' in found['gimbal3'].remedy
-    assert 'gimbal3 torque' not in found
-
-
 def test_without_the_sdk_the_extra_is_named(monkeypatch):
     monkeypatch.delitem(sys.modules, 'beetle_omni_ros.drivers.servo_link')
     with EmulatedServoBus() as emulated:

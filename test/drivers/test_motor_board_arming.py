@@ -179,13 +179,3 @@ def test_arming_in_flight_never_happens(bench):
         arming.follow(state)
     assert arming.text == 'lost: the supervisor was not disarmed before'
     assert board.asked is False
-
-
-def test_an_acknowledgement_contradicted_by_the_heartbeat_does_not_start_a_flight(bench):
-    board, arming = bench
-    arming.follow('disarmed')
-    arming.follow('takeoff')
-    board.answer()
-    board.state.status = BoardStatus(0.0, 'disarmed', 'heartbeat of the host lost', (), 1)
-    arming.update(CYCLE)
-    assert arming.text == 'lost: disarmed (heartbeat of the host lost)'

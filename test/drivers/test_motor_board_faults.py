@@ -61,17 +61,6 @@ def test_delayed_targets_are_refused_and_the_rotors_stop():
         assert until(lambda: pilot.has_event('disarmed (no target for too long)'))
 
 
-def test_a_board_that_does_not_transmit_is_reported_and_still_follows_targets():
-    with flying() as (emulated, board, pilot):
-        emulated.faults.mute = True
-        assert until(lambda: pilot.has_event('no message for 0.3 s'))
-        assert keeps_flying(emulated, 0.3)
-        assert board.ready == 'no message from the board'
-        emulated.faults.mute = False
-        assert until(lambda: pilot.has_event('messages again'))
-        assert board.state.status.armed
-
-
 def test_voltage_sag_is_compensated_or_reported_as_saturation():
     with flying() as (emulated, board, pilot):
         emulated.set_battery(25.0, 30.0)

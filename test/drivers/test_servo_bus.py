@@ -11,7 +11,6 @@ from servo_bench import arrived, bench, COUNT, JOINTS, running, SHIPPED, until
 
 from beetle_omni_ros.drivers import servo_registers as registers
 from beetle_omni_ros.drivers.device_parameters import ServoBusParameters
-from beetle_omni_ros.drivers.servo_bus import examine
 from beetle_omni_ros.drivers.servo_link import ServoBusError
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import bind, load_yaml, ParameterError
@@ -93,24 +92,6 @@ def test_goals_beyond_the_travel_are_clipped():
         bus.read()  # answered after the goals
         assert emulated.goals == pytest.approx([TRAVEL, -TRAVEL, 0, 0], abs=COUNT)
         assert bus.clipped == 1
-
-
-@pytest.mark.real_time
-def test_examining_changes_nothing_and_configuring_names_all_defects_in_one_line():
-    with bench() as (bus, emulated):
-        emulated.servos[0]['Model Number'] = 1200
-        emulated.faults.silent = {2}
-        emulated.servos[2].trip(table.OVERLOAD)
-        before = [bytes(servo._memory[:120]) for servo in emulated.servos]
-        defects = [examine(bus.link, servo)[0] for servo in bus.servos]
-        assert defects == ['model 1200, expected 1210 (XC330-T181-T)', 'does not answer',
-                           'overload', '']
-        assert bus.servos[3].firmware == 52
-        assert [bytes(servo._memory[:120]) for servo in emulated.servos] == before
-        with pytest.raises(ServoBusError, match='gimbal2 .id 2.: does not answer; .* '
-                                                'gimbal3 .id 3.: overload') as caught:
-            bus.configure()
-        assert '\n' not in str(caught.value) and 'gimbal4' not in str(caught.value)
 
 
 @pytest.mark.parametrize(('change', 'text'), [

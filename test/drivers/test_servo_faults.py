@@ -84,18 +84,6 @@ def test_a_lasting_overload_disables_the_servo_with_a_reason_until_the_service_r
         until(lambda *now: powered(*now) and arrived(GOAL)(*now), bus, GOAL)
 
 
-def test_an_overheated_servo_is_left_off():
-    with running() as (bus, emulated):
-        emulated.faults.overheated = {4}
-        _, servos = until(lambda _, servos: 'overheated' in servos[3].message
-                           and servos[3].temperature > 70, bus, GOAL)
-        for _ in range(50):
-            tick(bus, GOAL)
-        assert bus.servos[3].recoveries == 0
-        assert emulated.torque_enabled.tolist() == [True, True, True, False]
-        assert any('shut down (overheated)' in line for line in bus.take_events())
-
-
 def test_expired_watchdogs_are_cleared_and_goals_are_followed_again():
     with running() as (bus, emulated):
         until(arrived(GOAL), bus, GOAL)

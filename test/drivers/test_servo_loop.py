@@ -99,22 +99,6 @@ def test_readings_include_validity_and_obedience_of_each_servo():
     assert loop.incomplete == 2 and loop.cycles == 2
 
 
-def test_a_servo_is_lost_after_a_timeout_without_obeying():
-    loop, bus, clock, _ = make()
-    bus.obeying = np.array([True, False, True, True])
-    clock.now += 0.2
-    loop._cycle()
-    assert not loop.lost(0.3)
-    clock.now += 0.2
-    loop._cycle()
-    assert 'gimbal2' in loop.lost(0.3) and 'gimbal1' not in loop.lost(0.3)
-    bus.link.is_open = False
-    assert loop.lost(0.3) == '/dev/none: no connection'
-    bus.link.is_open, bus.obeying = True, VALID
-    loop._cycle()
-    assert not loop.lost(0.3)
-
-
 @pytest.mark.real_time
 def test_goals_of_many_threads_are_all_handled():
     bus = FakeBus()

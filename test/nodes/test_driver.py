@@ -162,10 +162,3 @@ def test_an_unusable_source_is_refused_in_one_line(capsys, monkeypatch, argument
     assert cli.main(['drive', *arguments]) == 2
     line, = capsys.readouterr().err.splitlines()
     assert expected in line
-
-
-def test_without_a_graph_the_missing_topic_is_named(ros_domain, monkeypatch, capfd):
-    monkeypatch.setattr(driver, 'SUPERVISOR_TIMEOUT', 0.3)
-    assert driver.run_drive('terminal', domain_id=ros_domain) == 1
-    line, = [one for one in capfd.readouterr().err.splitlines() if one.startswith('beetle')]
-    assert 'supervisor_node: not seen' in line and 'expected a running graph' in line

@@ -2,20 +2,15 @@
 
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
-import re
-import signal
 import stat
-import subprocess
 import sys
 from types import ModuleType
 
 import pytest
-from test_deploy import install, UNIT
 
 from beetle_omni_ros.messages.topics import TOPICS
 from beetle_omni_ros.nodes import graph
 from beetle_omni_ros.nodes.graph import BRIDGES
-from beetle_omni_ros.nodes.operator import Operator
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
 
@@ -88,23 +83,6 @@ def test_simulator_and_bridges_meet_at_the_same_ports_in_a_private_folder(bringu
     assert not set(BRIDGES) & set(direct) and 'actuators' not in direct['sim_node']
     assert [direct[name]['robot_file'] for name in ('sim_node', 'ekf_node')] == [
         'b.yaml', 'a.yaml']
-
-
-@pytest.mark.real_time
-def test_the_bridges_of_the_service_start_and_wait_for_their_ports(tmp_path, ros_domain):
-    assert install(tmp_path).returncode == 0
-    start = re.search(r"exec python3 (.*)'$", (tmp_path / UNIT).read_text(), re.M)[1]
-    service = subprocess.Popen([sys.executable, *start.replace('/dev', str(tmp_path)).split()])
-    operator = Operator(ros_domain)
-    try:
-        assert operator.wait(lambda: set(operator.bridges) == set(BRIDGES), 40)
-        ports = tmp_path / 'beetle_servos', tmp_path / 'motor_board'
-        assert operator.wait(lambda: all(f'waiting: {port}' in operator.bridges[name]
-                                         for name, port in zip(BRIDGES, ports, strict=True)), 20)
-    finally:
-        operator.close()
-        service.send_signal(signal.SIGINT)
-        assert service.wait(20) == 0
 
 
 def test_each_controller_can_be_active_with_the_other_on_standby(bringup, capsys, monkeypatch):

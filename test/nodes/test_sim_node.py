@@ -60,14 +60,6 @@ def test_the_simulator_publishes_simulated_time_only_without_serial_devices(sim)
     assert np.allclose(np.diff([before, *ticks]), 0.005, rtol=0, atol=1e-6)
 
 
-def test_an_existing_path_is_refused_and_unchanged(sim, tmp_path):
-    servos, taken = tmp_path / 'servos', tmp_path / 'notes.txt'
-    taken.write_text('keep')
-    with pytest.raises(OSError, match=r'notes.txt: cannot be used as a port, it exists'):
-        sim(f'servo_port:={servos}', f'board_port:={taken}')
-    assert taken.read_text() == 'keep' and not os.path.lexists(servos)
-
-
 def test_faults_of_devices_change_in_flight_and_are_in_the_diagnostics(sim, tmp_path):
     servos, board = tmp_path / 'servos', tmp_path / 'board'
     servos.symlink_to('/nowhere')           # left by a process that was killed

@@ -118,20 +118,4 @@ def test_devices_receive_angles_of_their_encoders():
     np.testing.assert_array_equal(actuators.bus.shown[-1][0], simulator.truth.tilt)
 
 
-def test_the_board_receives_pack_and_rotor_states():
-    actuators, simulator = coupled()
-    actuators.board.thrust_targets = np.full(4, HOVER)
-    errors = []
-    for _ in range(400):
-        actuators.step()
-        errors.append(actuators.board.error)
-    battery = simulator.battery
-    assert actuators.board.pack == (battery.voltage, battery.current)
-    assert battery.current > 10 and battery.voltage < ROBOT.battery.full_voltage
-    np.testing.assert_array_equal(actuators.board.rotors, simulator.truth.thrust)
-    deviation = np.std(errors, axis=0)
-    expected = [WORLD.battery.voltage_noise, WORLD.battery.current_noise]
-    np.testing.assert_allclose(deviation, expected, rtol=0.15)
-
-
 # --- fault switches ---------------------------------------------------------------------------

@@ -86,24 +86,6 @@ def position(servo):
     return servo['Present Position']
 
 
-@pytest.mark.parametrize(('name', 'value', 'error'), [
-    ('Operating Mode', 2, Error.DATA_RANGE), ('Bus Watchdog', 128, Error.DATA_RANGE),
-    ('Present Position', 5, Error.ACCESS),
-    ('Goal Position', 1_048_576, Error.DATA_RANGE), ('Goal Position', -534, Error.NONE)])
-def test_a_value_outside_its_range_is_refused_and_changes_nothing(servo, name, value, error):
-    before = servo[name]
-    assert write(servo, name, value) == error
-    assert servo[name] == (value if error is Error.NONE else before)
-
-
-def test_only_whole_known_registers_are_accessible(servo):
-    for address, data, error in ((116, b'\0\0', Error.DATA_LENGTH), (117, b'\0', Error.ACCESS),
-                                 (14, b'\0', Error.ACCESS), (64, b'', Error.DATA_LENGTH)):
-        assert servo.write(address, data) == error
-    for address, length in ((66, 1), (60, 3), (147, 2), (0, 0), (600, 1)):
-        assert servo.read(address, length) == (Error.ACCESS, b'')
-
-
 def test_eeprom_is_locked_while_torque_is_on_and_a_change_of_mode_resets_gains(servo):
     write(servo, 'Position P Gain', 700)
     assert write(servo, 'Torque Enable', 1) == Error.NONE
@@ -132,18 +114,6 @@ def test_the_watchdog_stops_the_servo_and_locks_its_goals_until_cleared(servo):
     for name, value in (('Goal Position', 0), ('Bus Watchdog', 5)):
         assert write(servo, name, value) == Error.DATA_RANGE
     assert write(servo, 'Bus Watchdog', 0) == write(servo, 'Goal Position', 4000) == Error.NONE
-
-
-@pytest.mark.parametrize(('fault', 'shuts_down'), [
-    (emulated.OVERLOAD, True), (emulated.OVERHEATING, True), (emulated.VOLTAGE_ERROR, False)])
-def test_hardware_errors_raise_the_alert_and_those_of_shutdown_take_torque(servo, fault,
-                                                                           shuts_down):
-    write(servo, 'Torque Enable', 1)
-    servo.trip(fault)
-    assert servo.alert == 0x80 and servo.torque is not shuts_down
-    assert write(servo, 'Torque Enable', 1) == (Error.RESULT_FAIL if shuts_down else Error.NONE)
-    servo.reboot(0.0)
-    assert servo.alert == 0 and write(servo, 'Torque Enable', 1) == Error.NONE
 
 
 def test_a_reboot_keeps_eeprom_forgets_ram_and_the_turns(servo):
@@ -185,13 +155,6 @@ def line(bus):
     port.closePort()
 
 
-def group_read(line, address, length):
-    group = sdk.GroupSyncRead(*line, address, length)
-    for name in (1, 2, 3, 4):
-        group.addParam(name)
-    return group
-
-
 def test_the_table_agrees_with_the_makers_model_file():
     folder = Path(sdk.__file__).parents[1] / 'dynamixel_easy_sdk' / 'control_table'
     path = folder / 'xc330_t181_fw52.model'
@@ -225,37 +188,6 @@ def test_the_sdk_reads_writes_pings_and_receives_errors(bus, line):
     time.sleep(0.06)
     assert handler.read1ByteTxRx(port, 1, 64) == (0, 0, 0)
     assert bus.refusals == 2
-
-
-@pytest.mark.real_time
-def test_group_reads_give_the_values_of_the_plant_or_the_fault(bus, line):
-    angles = np.array([0.5, -1.0, 3.6, -3.9])
-    bus.set_state(angles, [1.0, -2.0, 0.0, 5.0], [0.1, 0.0, -0.2, 0.0])
-    group = group_read(line, 126, 10)
-    assert group.txRxPacket() == sdk.COMM_SUCCESS
-    for name, angle in zip((1, 2, 3, 4), angles, strict=True):
-        raw = group.getData(name, 132, 4)
-        counts = raw - (1 << 32) if raw >> 31 else raw
-        assert (counts - 2048) * 2 * np.pi / 4096 == pytest.approx(angle, abs=0.0008)
-    for fault, value in (('bad_crc', 1.0), ('dropped', 1.0), ('silent', {2})):
-        usual = getattr(bus.faults, fault)
-        setattr(bus.faults, fault, value)
-        assert group.txRxPacket() in (sdk.COMM_RX_CORRUPT, sdk.COMM_RX_TIMEOUT)
-        setattr(bus.faults, fault, usual)
-    assert group.txRxPacket() == sdk.COMM_SUCCESS
-
-
-@pytest.mark.real_time
-def test_group_writes_reach_all_at_their_baud_rate_only(bus, line):
-    port, handler = line
-    group = sdk.GroupSyncWrite(port, handler, 116, 4)
-    for name in (1, 2, 3, 4):
-        group.addParam(name, [name, 4, 0, 0])
-    assert group.txPacket() == sdk.COMM_SUCCESS
-    handler.ping(port, 1)  # answered after what came before
-    assert [servo['Goal Position'] for servo in bus.servos] == [1025, 1026, 1027, 1028]
-    port.setBaudRate(57600)
-    assert handler.ping(port, 1)[1] == sdk.COMM_RX_TIMEOUT
 
 
 @settings(max_examples=300, deadline=None)

@@ -40,18 +40,6 @@ def test_same_seed_same_numbers_other_seed_others(conditions):
     assert np.any(numbers(Simulator(ROBOT, WORLD, conditions, seed=8)) != expected)
 
 
-def test_command_moves_rotors_and_joints_two_ticks_after_its_stamp():
-    simulator = Simulator(ROBOT, WORLD)
-    simulator.reset(HIGH)
-    for _ in range(3):
-        simulator.step()
-    simulator.command(Command(simulator.time, np.full(4, 0.2), HOVER))
-    thrusts = [simulator.step().truth.thrust[0] for _ in range(4)]
-    lag = -np.expm1(-0.005 / ROBOT.rotors.time_constant)
-    np.testing.assert_allclose(thrusts[:3], [0, 0, lag * HOVER[0]], rtol=1e-6)
-    assert simulator.truth.tilt[0] > 0.01
-
-
 def test_weak_battery_caps_the_thrust():
     weak = replace(WORLD, battery=replace(WORLD.battery, initial_charge=0.05))
     reached, voltages = [], []
