@@ -20,13 +20,11 @@ UNIT = 'etc/systemd/system/beetle-omni-bridges.service'
 
 
 def install(root, *options):
-    """Run the installer into a folder."""
     return subprocess.run(['sh', str(DEPLOY / 'install.sh'), '--root', str(root), '--user',
                            'pilot', *options], capture_output=True, text=True, timeout=60)
 
 
 def files(root):
-    """Path -> text of all files below ``root``."""
     return {str(path.relative_to(root)): path.read_text()
             for path in root.rglob('*') if path.is_file()}
 

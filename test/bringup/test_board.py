@@ -20,7 +20,6 @@ ALL = ['board port', 'board port latency timer', 'board firmware', 'board receiv
 
 @pytest.fixture
 def emulated():
-    """A motor board."""
     with EmulatedMotorBoard(parameters=QUICK) as made:
         yield made
 
@@ -41,12 +40,10 @@ def test_a_good_board_passes_and_stays_disarmed(emulated):
 
 
 def volts(volts):
-    """Return a function that sets the voltage of the pack."""
     return lambda emulated: emulated.set_battery(volts, 0.0)
 
 
 def put(**faults):
-    """Return a function that sets faults of the board."""
     return lambda emulated: [setattr(emulated.faults, *item) for item in faults.items()]
 
 

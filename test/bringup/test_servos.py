@@ -21,7 +21,6 @@ NAMES = [f'gimbal{k}' for k in (1, 2, 3, 4)]
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch):
-    """Use few reads."""
     monkeypatch.setattr(room, 'ROUNDS', 5)
 
 
@@ -64,7 +63,6 @@ def hot(emulated):
 
 
 def put(**faults):
-    """Return a function that sets faults of the bus."""
     return lambda emulated: [setattr(emulated.faults, *item) for item in faults.items()]
 
 

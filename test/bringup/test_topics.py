@@ -14,7 +14,6 @@ from beetle_omni_ros.bringup.findings import (
 
 
 def stream(rate, age, jitter=0.001, size=9.81, seconds=3.0, seed=0):
-    """A topic at a constant rate."""
     rng = np.random.default_rng(seed)
     arrivals = 100.0 + np.arange(0, seconds, 1 / rate)
     return Stream(arrivals=list(arrivals), ages=list(age + jitter * rng.random(len(arrivals))),
@@ -22,7 +21,6 @@ def stream(rate, age, jitter=0.001, size=9.81, seconds=3.0, seed=0):
 
 
 def graph(**streams):
-    """A graph with two good sensors, or with the given streams."""
     made = {'mocap': stream(100, 0.010), 'imu': stream(200, 0.001)} | streams
     names = {'mocap': 'mocap/pose', 'imu': 'imu/data_raw', 'joints': 'joint_states',
              'battery': 'battery_state'}
@@ -95,7 +93,6 @@ def test_wrong_units_duplicate_publishers_frozen_and_broken_messages_are_reporte
 
 
 def running(state='ready', level=0):
-    """Observations of the joint bridge and of its topic."""
     made = graph(joints=stream(200, 0.002))
     made.states['joint_bridge'] = state
     made.diagnostics = {

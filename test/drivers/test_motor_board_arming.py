@@ -27,7 +27,6 @@ class BoardStub:
         return self.commands[-1]
 
     def answer(self, accepted=True, reason=''):
-        """Answer the newest command."""
         command = self.commands[-1]
         command.accepted, command.reason = accepted, reason
         if accepted:
@@ -46,7 +45,6 @@ def bench():
 
 
 def disarmed(board, arming):
-    """The supervisor is disarmed and the board confirms it."""
     arming.follow('disarmed')
     board.answer()
     arming.update(CYCLE)
@@ -54,7 +52,6 @@ def disarmed(board, arming):
 
 
 def in_flight(bench):
-    """Arm the board and enter 'flies'."""
     board, arming = bench
     assert disarmed(board, arming) == 'ready'
     arming.follow('takeoff')

@@ -14,17 +14,14 @@ pytestmark = pytest.mark.real_time
 
 
 def keeps_flying(emulated, seconds=0.6):
-    """Whether the rotors run during this time."""
     return not until(lambda: not emulated.commands.all(), seconds) and emulated.armed
 
 
 def stays_stopped(emulated):
-    """Whether no rotor turns for a while, although targets are sent."""
     return not until(emulated.commands.any, 0.5)
 
 
 def arms_again(board, pilot):
-    """Whether the board can be armed after zero throttle."""
     pilot.thrust = np.zeros(4)
     time.sleep(QUICK.throttle_low_time)
     return until(lambda: board.start(True).wait().accepted)

@@ -21,12 +21,10 @@ DELAYS = strategies.floats(1e-5, 0.2)
 
 @pytest.fixture
 def board():
-    """A state without messages."""
     return BoardState(PARAMETERS, CELLS, time.time)
 
 
 def tell(board, number, values, now=None):
-    """Give a message of the board; return the events."""
     (message,) = MavlinkReceiver(1, 1).feed(reference.pack(number, values))
     board.message(message, time.monotonic() if now is None else now)
     return board.take()[2]

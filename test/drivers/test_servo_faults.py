@@ -15,7 +15,6 @@ BRISK = {'timing': replace(PATIENT, reply=0.01)}    # one fault costs one tick
 
 
 def powered(readings, servos):
-    """Condition: all servos answer and have torque and no error."""
     return readings.valid.all() and all(
         one.torque and one.recovery is None and not one.message for one in servos)
 

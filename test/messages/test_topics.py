@@ -33,7 +33,6 @@ SERIES = ('mocap/pose', 'imu/data_raw', 'joint_states', 'battery_state', 'rotor_
 
 
 def value(topic, seed=0, stamp=STAMP):
-    """A value of a topic."""
     draw = np.random.default_rng(seed).normal
     turn = rotations.normalized(draw(size=4))
     path = TrajectoryTarget(stamp + np.arange(3.0), draw(size=(3, 3)), np.tile(turn, (3, 1)),

@@ -20,12 +20,10 @@ class FaultOperator(Witness):
     """Witness that sets faults of the simulated devices."""
 
     def set(self, name, value):
-        """Set a parameter of sim_node."""
         accepted, reason = super().set('sim_node', name, value)
         assert accepted, reason
 
     def device(self, key):
-        """Newest value of the devices' diagnostics, as number or text."""
         self.diagnostics.pop(DEVICES, None)
         assert self.wait(lambda: DEVICES in self.diagnostics, 5), 'sim_node is silent'
         return self.values(DEVICES)[key]
@@ -36,7 +34,6 @@ class FaultOperator(Witness):
         self.take_off(lambda: self.state == 'flying:nmpc')
 
     def ask(self, service):
-        """Call a service of joint_bridge_node."""
         client = self._node.create_client(Trigger, f'joint_bridge_node/{service}')
         assert self.wait(client.service_is_ready, 5)
         future = client.call_async(Trigger.Request())

@@ -64,7 +64,6 @@ def fly(node, stamps, height=1.0):
 
 @pytest.fixture
 def follower(make):
-    """A node that has joint angles."""
     node = make(FollowerNode)
     fly(node, 99.9 + 0.005 * np.arange(20))
     assert not node._publisher          # no joint angles yet

@@ -69,7 +69,6 @@ class Terminal:
         os.write(self.mine, keys.encode())
 
     def shows(self, text):
-        """Whether the program has printed ``text``."""
         while select.select([self.mine], [], [], 0)[0]:
             self.text += os.read(self.mine, 4096).decode()
         return text in self.text

@@ -55,7 +55,6 @@ def switches(witness):
 
 
 def loses_one_node_after_another(graph, witness, bag):
-    """Kill a node, and observe how the others go on."""
     killed_at = witness.time()
     graph.kill('recorder_node')
     assert witness.stays_in_the_air(0.5)

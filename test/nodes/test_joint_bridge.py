@@ -29,7 +29,6 @@ def shared(tmp_path_factory):
 
 @pytest.fixture
 def bench(shared):
-    """Return bus and operator, without faults and without goals."""
     emulated, operator = shared
     yield shared
     emulated.faults = ServoFaults()
@@ -38,7 +37,6 @@ def bench(shared):
 
 @pytest.fixture
 def active(bench):
-    """Return the same with torque on, all servos ready and following a goal."""
     emulated, operator = bench
     operator.go_to('active')
     operator.tilt = HOME
@@ -47,7 +45,6 @@ def active(bench):
 
 
 def is_back(emulated, operator):
-    """Wait for the state before a fault."""
     operator.until(lambda: operator.now == 'ready' and emulated.torque_enabled.all()
                    and operator.stands_at(HOME), 'not back')
 

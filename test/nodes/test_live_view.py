@@ -18,7 +18,6 @@ TURNED = np.array([0.0, 0.0, np.sin(0.3), np.cos(0.3)])
 
 @pytest.fixture
 def bench(make_bench):
-    """A node in place of the supervisor."""
     return make_bench(user='supervisor_node')
 
 

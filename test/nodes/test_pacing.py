@@ -18,7 +18,6 @@ TICK, ROS = 0.005, 1.8e9
 
 @pytest.fixture
 def clock():
-    """Return the time, set by the test."""
     return SimpleNamespace(now=ROS)
 
 

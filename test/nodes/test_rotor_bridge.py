@@ -26,7 +26,6 @@ class Bench:
         self.board, self.graph, self.operator = board, graph, operator
 
     def take_off(self):
-        """Take off and wait until the rotors turn as commanded."""
         self.operator.reaches('ready')
         self.operator.supervise('takeoff')
         self.operator.until(lambda: self.board.armed)
@@ -39,7 +38,6 @@ class Bench:
             self.board.thrust_targets, thrust, rtol=1e-3, atol=0))
 
     def stops(self):
-        """Wait until no rotor may turn."""
         self.operator.until(lambda: not self.board.armed and not self.board.commands.any())
 
 
@@ -60,7 +58,6 @@ def shared(tmp_path_factory):
 
 @pytest.fixture
 def bridge(shared):
-    """Process and board at rest, without faults."""
     shared.operator.reaches('ready')
     shared.operator.bridge_states[:-1] = []
     yield shared
@@ -76,7 +73,6 @@ def bridge(shared):
 
 @pytest.fixture
 def flying(bridge):
-    """The same with turning rotors."""
     bridge.take_off()
     return bridge
 

@@ -14,13 +14,11 @@ ROOT = Path(__file__).parents[2]
 
 
 def start(node, *arguments, **popen):
-    """Start a node's process with its output in a pipe."""
     return subprocess.Popen([sys.executable, '-m', 'beetle_omni_ros.start', node, *arguments],
                             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **popen)
 
 
 def finish(process, timeout=20):
-    """Wait for the end; return (exit status, standard error)."""
     try:
         _, error = process.communicate(timeout=timeout)
     except subprocess.TimeoutExpired:
@@ -95,7 +93,6 @@ def test_a_node_ends_with_the_process_that_started_its_graph(ros_domain):
 
 
 def running(pid):
-    """Whether the process exists and is no zombie."""
     try:
         with open(f'/proc/{pid}/stat') as file:
             return file.read().rsplit(')', 1)[1].split()[0] != 'Z'

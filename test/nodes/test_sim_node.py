@@ -14,7 +14,6 @@ pytestmark = pytest.mark.real_time
 
 @pytest.fixture
 def sim(make):
-    """Make a sim_node with parameters."""
     return lambda *overrides, actuators='emulated': make(
         SimNode, f'actuators:={actuators}', *overrides)
 
@@ -27,7 +26,6 @@ def put(node, **values):
 
 
 def topics(node):
-    """Topics that a node publishes and subscribes."""
     return ({one.topic_name for one in node.publishers},
             {one.topic_name for one in node.subscriptions})
 

@@ -36,7 +36,6 @@ def random_states(count, seed):
 
 
 def difference(found, expected):
-    """Relative difference of two accelerations."""
     return np.linalg.norm(found - expected) / np.linalg.norm(expected)
 
 

@@ -16,7 +16,6 @@ def link():
 
 
 def command(stamp, tilt=0.1, thrust=5.0):
-    """A command with equal tilts and thrusts."""
     return SimpleNamespace(stamp=stamp, tilt=np.full(4, tilt), thrust=np.full(4, thrust))
 
 

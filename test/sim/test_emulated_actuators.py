@@ -40,14 +40,12 @@ class Board:
 
 
 def coupled(conditions='nominal', seed=0):
-    """A flying simulator with those devices."""
     simulator = Simulator(ROBOT, WORLD, conditions, seed)
     simulator.reset(HIGH)
     return EmulatedActuators(simulator, Bus(), Board()), simulator
 
 
 def wave(k):
-    """Tilts and thrusts of command ``k``."""
     return 0.4 * np.sin(0.05 * k + np.arange(4)), HOVER + np.cos(0.1 * k + np.arange(4))
 
 

@@ -190,7 +190,6 @@ def test_faults_that_stay_in_the_list_continue():
 # Crashes ---------------------------------------------------------------------------------------
 
 def fallen(height, quaternion=(0, 0, 0, 1)):
-    """A simulator after a fall without thrust."""
     simulator = Simulator(ROBOT, WORLD)
     simulator.reset([0, 0, height], quaternion)
     for _ in range(400):

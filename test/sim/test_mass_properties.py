@@ -10,7 +10,6 @@ from beetle_omni_ros.robot.parameters import combined, mass_properties, Variatio
 
 
 def whole(properties):
-    """All parts as one."""
     return combined([properties.main_body, *properties.modules, properties.end_effector])
 
 

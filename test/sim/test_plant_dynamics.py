@@ -13,7 +13,6 @@ WEIGHTLESS = replace(ROBOT, gravity=0.0)
 
 
 def spinning(made, velocity, angular_velocity):
-    """Set a plant in motion."""
     made.data.qvel[:6] = np.concatenate([velocity, angular_velocity])
 
 

@@ -14,7 +14,6 @@ TICK = WORLD.plant.tick
 
 
 def at_rest(conditions='nominal', seconds=20, seed=0):
-    """Frames of a robot that stands on the floor."""
     simulator = Simulator(ROBOT, WORLD, conditions, seed)
     return simulator, [simulator.step() for _ in range(int(seconds / TICK))]
 

@@ -13,7 +13,6 @@ HOVER = np.full(4, ROBOT.hover_thrust)
 
 
 def numbers(simulator, ticks=300):
-    """Every number of a short flight, as one array."""
     values = []
     for k in range(ticks):
         if k % 2 == 0:
