@@ -1,6 +1,5 @@
 """The installer of the onboard computer, the images and the container."""
 
-import os
 from pathlib import Path
 import re
 import shutil
@@ -87,21 +86,3 @@ def test_unusable_options_are_refused_in_one_line_and_write_nothing(tmp_path, op
     done = install(tmp_path, *options)
     assert done.returncode == 2 and done.stderr.startswith('install: error: ')
     assert not files(tmp_path)
-
-
-def test_the_entry_point_finds_what_colcon_installed(tmp_path):
-    place = tmp_path / 'ws/install/beetle_omni_ros/lib/beetle_omni_ros'
-    for setup in ('opt/ros/jazzy/setup.bash', 'ws/.venv/bin/activate', 'ws/install/setup.bash'):
-        (tmp_path / setup).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / setup).write_text(f'export SEEN="$SEEN {setup}"\n')
-    place.mkdir(parents=True)
-    (place / 'beetle_omni').write_text('#!/bin/sh\necho "$SEEN: $1"\n')
-    (place / 'beetle_omni').chmod(0o755)
-    entry = tmp_path / 'entrypoint'
-    entry.write_text(re.sub(r'/(opt/ros|ws)/', rf'{tmp_path}/\1/',
-                            (DEPLOY / 'entrypoint').read_text()))
-    assert os.access(DEPLOY / 'entrypoint', os.X_OK)
-    done = subprocess.run(['bash', str(entry), 'beetle_omni', 'fly'], capture_output=True,
-                          text=True, timeout=60)
-    assert done.stdout.strip().endswith('ws/install/setup.bash: fly'), done.stderr
-    assert 'COPY . src/beetle_omni_ros' in (DEPLOY / 'Dockerfile').read_text()

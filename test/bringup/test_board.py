@@ -8,7 +8,6 @@ pytest.importorskip('dynamixel_sdk')
 
 from check_helpers import board, levels, QUICK, repeated
 
-from beetle_omni_ros.drivers import motor_board_state
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 
 pytestmark = pytest.mark.real_time
@@ -60,13 +59,6 @@ def test_each_fault_is_found_and_named(emulated, break_it, changes, bad, words):
     break_it(emulated)
     found = board_with(emulated, bad, **changes)[next(iter(bad))]
     assert words in found.found + found.remedy
-
-
-def test_firmware_with_another_protocol_version_is_refused(emulated, monkeypatch):
-    monkeypatch.setattr(motor_board_state, 'CONTRACT_VERSION', 2)
-    found = board_with(emulated, {'board firmware': 'fail'})
-    assert 'contract 1' in found['board firmware'].found
-    assert 'contract 2' in found['board firmware'].remedy
 
 
 def test_a_silent_or_foreign_board_ends_the_checks(emulated):

@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.messages import conversions
-from beetle_omni_ros.sim.emulated import ServoFaults
 from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
 
 pytestmark = pytest.mark.real_time
 
-GOAL, HOME, ERROR = [0.5, -1.0, 3.5, -3.5], [0.0] * 4, 2
+GOAL, HOME = [0.5, -1.0, 3.5, -3.5], [0.0] * 4
 
 
 @pytest.fixture(scope='module')
@@ -29,10 +28,8 @@ def shared(tmp_path_factory):
 
 @pytest.fixture
 def bench(shared):
-    emulated, operator = shared
     yield shared
-    emulated.faults = ServoFaults()
-    operator.tilt, operator.age = None, 0.0
+    shared[1].tilt, shared[1].age = None, 0.0
 
 
 @pytest.fixture
@@ -40,13 +37,9 @@ def active(bench):
     emulated, operator = bench
     operator.go_to('active')
     operator.tilt = HOME
-    is_back(emulated, operator)
-    return bench
-
-
-def is_back(emulated, operator):
     operator.until(lambda: operator.now == 'ready' and emulated.torque_enabled.all()
-                   and operator.stands_at(HOME), 'not back')
+                   and operator.stands_at(HOME), 'not active')
+    return bench
 
 
 def test_transitions_switch_port_and_torque(bench):
@@ -91,17 +84,6 @@ def test_a_command_moves_the_joints_and_its_latency_is_reported(active):
     assert servo['id'] == '2' and servo['errors'] == 'none' and servo['torque'] == 'True'
     operator.age, operator.tilt = 0.3, HOME
     operator.counts('inputs', 'command rejected: stale stamp')
-
-
-def test_a_silent_servo_leaves_joint_states_incomplete_and_is_named(active):
-    emulated, operator = active
-    emulated.faults.silent = {3}
-    operator.reaches('lost: ')
-    assert 'gimbal3' in operator.now and 'silent; check its cable and power' in operator.now
-    operator.until(lambda: list(operator.joints[-1][0].name) == ['gimbal1', 'gimbal2', 'gimbal4'])
-    assert operator.status('bus').level == operator.status('gimbal3').level == ERROR
-    emulated.faults.silent = set()
-    is_back(emulated, operator)
 
 
 def test_a_composed_bridge_waits_for_its_port_and_reports_why(tmp_path):

@@ -86,18 +86,6 @@ def position(servo):
     return servo['Present Position']
 
 
-def test_eeprom_is_locked_while_torque_is_on_and_a_change_of_mode_resets_gains(servo):
-    write(servo, 'Position P Gain', 700)
-    assert write(servo, 'Torque Enable', 1) == Error.NONE
-    for name in ('ID', 'Baud Rate', 'Operating Mode', 'Homing Offset'):
-        assert write(servo, name, servo[name]) == Error.ACCESS, name
-    write(servo, 'Torque Enable', 0)
-    write(servo, 'Current Limit', 300)
-    assert write(servo, 'Goal Current', 301) == Error.DATA_LIMIT
-    assert write(servo, 'Operating Mode', 4) == Error.NONE
-    assert (servo['Position P Gain'], servo['Goal Current']) == (900, 300)
-
-
 def test_the_watchdog_stops_the_servo_and_locks_its_goals_until_cleared(servo):
     write(servo, 'Bus Watchdog', 5)
     servo.advance(10.0, 35, 12.0)

@@ -268,19 +268,6 @@ def test_a_fault_file_of_one_flight_is_read(tmp_path):
     assert faults[-1] == Fault('rotor_stops', 1.0, 0.03, rotor=1)
 
 
-@pytest.mark.parametrize(('text', 'named'), [
-    ('faults: 3', "key 'faults'"), ('fault: []', "key 'fault'"), ('faults: [3]', 'fault 1'),
-    ('faults: [{what: rotor_stop}]', 'near: rotor_stops'),
-    ('faults: [{what: rotor_weak, rotor: 1}]', "'share' is missing"),
-    ('faults: [{what: mocap_lost, at: .nan}]', "key 'at'")])
-def test_unusable_files_name_the_key_in_one_line(tmp_path, text, named):
-    path = tmp_path / 'faults.yaml'
-    path.write_text(text)
-    with pytest.raises(ParameterError, match='faults.yaml') as raised:
-        load_faults(path)
-    assert named in str(raised.value) and '\n' not in str(raised.value)
-
-
 def test_short_texts_describe_a_fault():
     assert parse_faults(' rotor_stops rotor=2;mocap_lost duration=3 ; ') == [
         Fault('rotor_stops', rotor=2), Fault('mocap_lost', duration=3)]

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from sim_robots import HIGH, LEVEL, ROBOT, WORLD
+from sim_robots import HIGH, ROBOT, WORLD
 
 from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.sim.parameters import draw
@@ -138,19 +138,3 @@ def test_published_draws_fill_their_ranges():
                            ('tilt_command_delay', {1, 2, 3}),
                            ('thrust_command_delay', {1, 2, 3})]:
         assert {round(getattr(d, name) / tick) for d in drawn} == expected
-
-
-def test_published_imu_stamps_omit_the_latency():
-    quiet = replace(WORLD, imu=replace(WORLD.imu, angular_velocity_noise=0.0),
-                    published=replace(WORLD.published, angular_velocity_noise=0.0,
-                                      angular_velocity_bias=0.0))
-    simulator = Simulator(ROBOT, quiet, 'published', seed=2)
-    simulator.reset(HIGH, LEVEL)
-    simulator.set_wrench(np.zeros(3), [0, 0, 0.3])
-    frames = [simulator.step() for _ in range(40)]
-    late = round(simulator.conditions.imu_latency / TICK)
-    assert late >= 3
-    for now, before, then in zip(frames[late + 1:], frames, frames[1:]):
-        assert now.imu.stamp == now.time
-        mean = (before.truth.angular_velocity + then.truth.angular_velocity) / 2
-        np.testing.assert_allclose(now.imu.angular_velocity, mean, atol=2e-4)
