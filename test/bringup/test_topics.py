@@ -6,7 +6,6 @@ import pytest
 
 from beetle_omni_ros.bringup.findings import (
     check_topics,
-    closed_port,
     ObservedGraph,
     Status,
     Stream,
@@ -111,16 +110,3 @@ def test_a_running_bridge_is_judged_by_its_reports():
         found = by_item(check_topics(running(state), ROBOT.gravity))
         assert levels(found) == {'joint_bridge state': level}
         assert found['joint_bridge state'].found == state
-
-
-def test_a_port_in_use_by_a_bridge_is_judged_by_its_reports():
-    busy = 'servo port', 'p: in use by another process', 'stop it', 'joint_bridge'
-    port, state, gimbal = closed_port(*busy, running())
-    assert [port.level, state.level, gimbal.level] == ['ok'] * 3
-    assert 'joint_bridge_node reports' in port.found
-    rows = by_item(check_topics(running(), ROBOT.gravity, frozenset({'joint_bridge'})))
-    assert 'joint_bridge state' not in rows
-    absent = 'servo port', 'p: no such port', 'plug it in', 'joint_bridge'
-    for given, observed in ((busy, None), (busy, graph()), (absent, running())):
-        finding, = closed_port(*given, observed)
-        assert (finding.level, finding.remedy) == ('fail', given[2])

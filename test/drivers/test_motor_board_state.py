@@ -87,22 +87,6 @@ def test_the_voltage_filter_depends_on_time_and_not_on_message_count(board):
     assert board.voltage == pytest.approx(24.0)
 
 
-def test_changes_are_reported_once_and_severe_ones_as_errors(board):
-    def heartbeat(state, reason=0, conditions=0):
-        mode = state | reason << 8 | conditions << 16 | 1 << 24
-        return tell(board, 0, (mode, 2, 0, 1, 4, 3))
-
-    assert heartbeat(1) == (('info', 'motor board: found, disarmed, contract 1'),)
-    assert heartbeat(3) == (('info', 'motor board: armed'),)
-    assert heartbeat(3) == ()
-    assert heartbeat(2, 0, 32) == (('error', 'motor board: targets timed out'),)
-    assert heartbeat(2, 0, 32 | 8) == (('warning', 'motor board: battery low'),)
-    assert heartbeat(1, 3) == (('error', 'motor board: disarmed (no target for too long)'),)
-    assert heartbeat(3) == (('info', 'motor board: armed'),)
-    assert heartbeat(1, 1) == (('info', 'motor board: disarmed (requested by the host)'),)
-    assert heartbeat(0, 4)[0] == ('warning', 'motor board: restarted (watchdog reset)')
-
-
 # --- the clock --------------------------------------------------------------------------------
 
 @given(strategies.floats(-1e4, 1e4), strategies.floats(-1e-4, 1e-4),

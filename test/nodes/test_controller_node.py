@@ -123,18 +123,6 @@ def test_the_newest_target_is_used_an_unset_stamp_means_now_and_a_landing_resets
     assert follower.follower.resets == 1
 
 
-@pytest.mark.parametrize(('given', 'name', 'values'), [
-    ((f'controller:={OWN}',), 'pose_controller', {'controller': OWN}),
-    (('controller:=rl_memory', 'without:=all'), 'rl_memory',
-     {'policy': registry.find('rl_memory').policy_file, 'without': 'all'})])
-def test_a_parameter_selects_the_controller_of_a_node_with_its_parameters(make, given, name,
-                                                                          values):
-    node = make(ControllerNode, *given)
-    assert node.get_name() == f'{name}_node'
-    assert f'/{name}/command' in [publisher.topic_name for publisher in node.publishers]
-    assert {key: node.get_parameter(key).value for key in values} == values
-
-
 def test_an_exception_of_step_is_logged_and_reported_and_publishes_no_command(
         make, tmp_path, capfd):
     own = tmp_path / 'bad.py'

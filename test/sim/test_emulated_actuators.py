@@ -81,24 +81,6 @@ def test_a_servo_without_torque_does_not_drive_and_shows_no_current():
     assert np.all(efforts[:, 1] == 0) and np.all(np.abs(efforts).max(axis=0)[[0, 2, 3]] > 0.01)
 
 
-def test_a_stopped_servo_holds_its_true_angle_despite_encoder_faults():
-    actuators, simulator = coupled('published', seed=2)
-    actuators.bus.goals = [1.0] * 4
-    for _ in range(7):
-        actuators.step()
-    actuators.bus.stopped = [True] * 4
-    actuators.bus.goals = [-2.0] * 4
-    where = simulator.truth.tilt
-    assert np.all(simulator.truth.tilt_velocity > 1.0)      # in the middle of its way
-    for _ in range(100):
-        actuators.step()
-    np.testing.assert_allclose(simulator.truth.tilt, where, atol=0.02)
-    actuators.bus.stopped = [False] * 4
-    for _ in range(150):
-        actuators.step()
-    np.testing.assert_allclose(simulator.truth.tilt, -2.0, atol=0.1)
-
-
 def test_devices_receive_angles_of_their_encoders():
     actuators, simulator = coupled('published', seed=3)
     errors = []

@@ -69,52 +69,6 @@ def test_a_packet_with_a_flipped_bit_is_ignored(payload, place, bit):
     assert payload not in list(Receiver().feed(bytes(raw)))
 
 
-# --- one servo --------------------------------------------------------------------------------
-
-@pytest.fixture
-def servo():
-    return EmulatedServo(1, reboot_time=0.0)
-
-
-def write(servo, name, value):
-    register = TABLE[name]
-    return servo.write(register.address, value.to_bytes(register.size, 'little', signed=value < 0))
-
-
-def position(servo):
-    servo.read(132, 4)
-    return servo['Present Position']
-
-
-def test_the_watchdog_stops_the_servo_and_locks_its_goals_until_cleared(servo):
-    write(servo, 'Bus Watchdog', 5)
-    servo.advance(10.0, 35, 12.0)
-    assert not servo.expired, 'it counts only while torque is on'
-    servo.last_packet = 20.0
-    write(servo, 'Torque Enable', 1)
-    write(servo, 'Goal Position', 4000)
-    servo.angle = 0.5
-    servo.advance(20.09, 35, 12.0)
-    assert not servo.expired and servo.goal > 2
-    servo.advance(20.11, 35, 12.0)
-    assert servo.expired and servo['Bus Watchdog'] == 255
-    assert servo.goal == pytest.approx(0.5, abs=emulated.POSITION_UNIT)
-    for name, value in (('Goal Position', 0), ('Bus Watchdog', 5)):
-        assert write(servo, name, value) == Error.DATA_RANGE
-    assert write(servo, 'Bus Watchdog', 0) == write(servo, 'Goal Position', 4000) == Error.NONE
-
-
-def test_a_reboot_keeps_eeprom_forgets_ram_and_the_turns(servo):
-    write(servo, 'Operating Mode', 4)
-    write(servo, 'Position P Gain', 700)
-    servo.angle = 3.6
-    whole = position(servo)
-    write(servo, 'Torque Enable', 1)
-    servo.reboot(0.0)
-    assert not servo.torque and (servo['Operating Mode'], servo['Position P Gain']) == (4, 900)
-    assert whole > 4095 and position(servo) == whole - 4096
-
-
 @given(st.floats(-3.9, 3.9), st.sampled_from((-1, 1)), st.integers(0, 4095),
        st.integers(-2, 2))
 def test_goals_mean_the_same_angle_as_positions(angle, sign, zero, turns):
@@ -122,25 +76,10 @@ def test_goals_mean_the_same_angle_as_positions(angle, sign, zero, turns):
     servo.angle = angle + turns * 2 * np.pi
     servo.reboot(-1.0)
     servo.angle = angle
-    assert write(servo, 'Goal Position', position(servo)) == Error.NONE
+    servo.read(132, 4)
+    assert servo.write(TABLE['Goal Position'].address, servo['Present Position'].to_bytes(
+        4, 'little', signed=True)) == Error.NONE
     assert servo.goal == pytest.approx(angle, abs=0.51 * emulated.POSITION_UNIT)
-
-
-# --- the line, through the SDK ----------------------------------------------------------------
-
-@pytest.fixture
-def bus():
-    with EmulatedServoBus(reboot_time=0.05) as made:
-        yield made
-
-
-@pytest.fixture
-def line(bus):
-    """(port, packet handler), opened as the SDK's examples do."""
-    port = sdk.PortHandler(bus.port)
-    assert port.setBaudRate(1_000_000)
-    yield port, sdk.PacketHandler(2.0)
-    port.closePort()
 
 
 def test_the_table_agrees_with_the_makers_model_file():
@@ -158,24 +97,27 @@ def test_the_table_agrees_with_the_makers_model_file():
 
 
 @pytest.mark.real_time
-def test_the_sdk_reads_writes_pings_and_receives_errors(bus, line):
-    port, handler = line
-    assert handler.ping(port, 2) == (1210, sdk.COMM_SUCCESS, 0)
-    assert handler.ping(port, 9)[1] == sdk.COMM_RX_TIMEOUT
-    assert handler.write1ByteTxRx(port, 1, 11, 4) == (sdk.COMM_SUCCESS, 0)
-    for value in (-534 & 0xFFFFFFFF, 0xFFFDFFFF, 0xFFFFFFFD):   # with a header, all legal
-        assert handler.write4ByteTxRx(port, 1, 116, value) == (sdk.COMM_SUCCESS, 0)
-        assert handler.read4ByteTxRx(port, 1, 116) == (value, 0, 0)
-    assert handler.write1ByteTxRx(port, 1, 64, 1) == (sdk.COMM_SUCCESS, 0)
-    assert handler.write1ByteTxRx(port, 1, 11, 3) == (sdk.COMM_SUCCESS, 7)
-    assert handler.write2ByteTxRx(port, 1, 116, 5) == (sdk.COMM_SUCCESS, 5)
-    assert bus.torque_enabled.tolist() == [True, False, False, False]
-    assert bus.goals[0] == pytest.approx((-3 - 2048) * 2 * np.pi / 4096)
-    assert handler.reboot(port, 1) == (0, 0)
-    assert handler.ping(port, 1)[1] == sdk.COMM_RX_TIMEOUT
-    time.sleep(0.06)
-    assert handler.read1ByteTxRx(port, 1, 64) == (0, 0, 0)
-    assert bus.refusals == 2
+def test_the_sdk_reads_writes_pings_and_receives_errors():
+    with EmulatedServoBus(reboot_time=0.05) as bus:
+        port, handler = sdk.PortHandler(bus.port), sdk.PacketHandler(2.0)
+        assert port.setBaudRate(1_000_000)
+        assert handler.ping(port, 2) == (1210, sdk.COMM_SUCCESS, 0)
+        assert handler.ping(port, 9)[1] == sdk.COMM_RX_TIMEOUT
+        assert handler.write1ByteTxRx(port, 1, 11, 4) == (sdk.COMM_SUCCESS, 0)
+        for value in (-534 & 0xFFFFFFFF, 0xFFFDFFFF, 0xFFFFFFFD):   # with a header, all legal
+            assert handler.write4ByteTxRx(port, 1, 116, value) == (sdk.COMM_SUCCESS, 0)
+            assert handler.read4ByteTxRx(port, 1, 116) == (value, 0, 0)
+        assert handler.write1ByteTxRx(port, 1, 64, 1) == (sdk.COMM_SUCCESS, 0)
+        assert handler.write1ByteTxRx(port, 1, 11, 3) == (sdk.COMM_SUCCESS, 7)
+        assert handler.write2ByteTxRx(port, 1, 116, 5) == (sdk.COMM_SUCCESS, 5)
+        assert bus.torque_enabled.tolist() == [True, False, False, False]
+        assert bus.goals[0] == pytest.approx((-3 - 2048) * 2 * np.pi / 4096)
+        assert handler.reboot(port, 1) == (0, 0)
+        assert handler.ping(port, 1)[1] == sdk.COMM_RX_TIMEOUT
+        time.sleep(0.06)
+        assert handler.read1ByteTxRx(port, 1, 64) == (0, 0, 0)
+        assert bus.refusals == 2
+        port.closePort()
 
 
 @settings(max_examples=300, deadline=None)
