@@ -57,9 +57,9 @@ class FollowerNode(ControllerNode):
         self.follower = self._host.controller
 
 
-def fly(node, stamps, height=1.0):
+def fly(node, stamps):
     for stamp in np.atleast_1d(stamps):
-        node._on_odom(Odom(stamp, np.array([0, 0, height]), np.zeros(3), LEVEL, np.zeros(3)))
+        node._on_odom(Odom(stamp, np.array([0, 0, 1.0]), np.zeros(3), LEVEL, np.zeros(3)))
 
 
 @pytest.fixture

@@ -243,8 +243,7 @@ def test_a_soft_touchdown_breaks_nothing():
 
 @pytest.mark.parametrize(('numbers', 'named'), [
     ({'rotor': 5}, '1 to 4'), ({'rotor': True}, 'whole'),
-    ({'rotor': 1, 'servo': 1}, "'servo' is unknown"),
-    ({'rotor': 16 ** 9000}, 'an integer of 36001 bits'), ({'x' * 9000: 1}, 'xxx... is unknown')])
+    ({'rotor': 1, 'servo': 1}, "'servo' is unknown"), ({'x' * 9000: 1}, 'xxx... is unknown')])
 def test_numbers_are_checked_by_name(numbers, named):
     with pytest.raises(ParameterError, match=named):
         Fault('rotor_stops', **numbers)
