@@ -43,7 +43,7 @@ def wait_until_it_spins(process):
     ('ekf_node', ['-p', 'imu.rat:=100.0'], "'imu.rat': unknown key; did you mean 'rate'"),
     ('ekf_node', ['--params-file', 'broken.yaml'], 'line 3'),
     ('reference_node', ['-p', 'task:=somersault'], "task 'somersault': expected"),
-    ('controller_node', ['-p', 'controller:=absent.module:My'], "no module 'absent'")])
+    ('controller_node', ['-p', 'controller:=absent.module:My'], "No module named 'absent'")])
 def test_unusable_parameters_end_in_one_line_and_status_2(ros_domain, tmp_path, node, arguments,
                                                           named):
     (tmp_path / 'broken.yaml').write_text(
