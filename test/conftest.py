@@ -24,6 +24,7 @@ for folder in sorted(Path(__file__).parent.iterdir()):
     if folder.is_dir() and folder.name != '__pycache__':
         sys.path.append(str(folder))
 sys.path.append(str(Path(__file__).parent))
+import stillness  # noqa: E402
 
 # Tests that depend on the system clock have the mark real_time: nodes, buses and devices, some
 # with limits of milliseconds. A short stall of a shared computer fails them without a defect of
@@ -77,14 +78,7 @@ def pytest_collection_modifyitems(config, items):
         item.add_marker(pytest.mark.flaky(reruns=RERUNS))
     if real_time and not WORKER and not config.getoption('markexpr').endswith('not real_time') \
             and not config.getoption('numprocesses', None):
-        from stillness import Heartbeat
-        config.stash[BEAT] = Heartbeat()
-
-
-def pytest_unconfigure(config):
-    """Stop watching."""
-    if BEAT in config.stash:
-        config.stash[BEAT].close()
+        config.stash[BEAT] = stillness.watch()
 
 
 @pytest.fixture(scope='session', autouse=True)
@@ -97,21 +91,6 @@ def shared_folder(tmp_path_factory):
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_runtest_protocol(item):
-    """Require the mark real_time of tests with devices, whose threads use the clock."""
-    if item.get_closest_marker('real_time'):
-        return (yield)
-    from beetle_omni_ros.sim.emulated.pseudo_terminal import PseudoTerminal
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(PseudoTerminal, 'plug', _refuse)
-        return (yield)
-
-
-def _refuse(_):
-    raise RuntimeError('an emulated device runs by the clock: mark the test real_time')
-
-
-@pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item, call):
     """Skip a real-time test that failed during a stall, with the reason."""
     if call.when == 'setup':
@@ -121,7 +100,8 @@ def pytest_runtest_makereport(item, call):
     if report.failed and last and BEAT in item.config.stash \
             and item.get_closest_marker('real_time'):
         offset = time.monotonic() - time.time()
-        stalls = item.config.stash[BEAT].stalls(item.stash[BEGIN] + offset, call.stop + offset)
+        stalls = stillness.stalls(
+            item.config.stash[BEAT], item.stash[BEGIN] + offset, call.stop + offset)
         if (longest := max(stalls, default=0.0)) >= STALL:
             report.outcome = 'skipped'
             report.longrepr = (str(item.path), item.location[1] + 1,

@@ -38,17 +38,14 @@ def repeated(look, condition, attempts=8):
 
 
 def levels(found, *, without='ok'):
-    """Item -> level of the findings that are not ok."""
     return {item: finding.level for item, finding in found.items() if finding.level != without}
 
 
 def servos(port, graph=None, **changes):
-    """Check a bus; item -> finding."""
     parameters = replace(ServoBusParameters.load(), port=port, timing=PATIENT, **changes)
     return by_item(check_servos(parameters, ROBOT.joints, graph))
 
 
 def board(port, graph=None, seconds=1.2, **changes):
-    """Check a motor board; item -> finding."""
     parameters = replace(MotorBoardParameters.load(), port=port, **changes)
     return by_item(check_board(parameters, ROBOT, seconds, graph))

@@ -39,7 +39,6 @@ def robot(tmp_path):
 
 
 def checked(arguments, path):
-    """Run the command; return its exit status and JSON."""
     status = cli.main([*arguments, '--json', str(path)])
     return status, json.loads(path.read_text())
 

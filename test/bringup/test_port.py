@@ -34,14 +34,6 @@ def test_a_missing_port_lists_the_existing_ports(adapter, monkeypatch):
     assert 'no USB serial port is present' in devices.unusable_port('/dev/beetle_servos')[1]
 
 
-def test_a_dangling_link_and_a_regular_file_are_refused_as_ports(tmp_path):
-    (tmp_path / 'link').symlink_to('/dev/ttyUSB77')
-    assert '/dev/ttyUSB77' in devices.unusable_port(str(tmp_path / 'link'))[0]
-    (tmp_path / 'file').touch()
-    for path in (tmp_path, tmp_path / 'file'):
-        assert 'no serial port' in devices.unusable_port(str(path))[0]
-
-
 def test_a_port_without_permission_is_reported_with_the_remedy(monkeypatch):
     device, line = os.openpty()
     name, user = os.ttyname(line), pwd.getpwuid(os.geteuid()).pw_name

@@ -6,7 +6,6 @@ import pytest
 
 from beetle_omni_ros.bringup.findings import (
     check_topics,
-    closed_port,
     ObservedGraph,
     Status,
     Stream,
@@ -14,7 +13,6 @@ from beetle_omni_ros.bringup.findings import (
 
 
 def stream(rate, age, jitter=0.001, size=9.81, seconds=3.0, seed=0):
-    """A topic at a constant rate."""
     rng = np.random.default_rng(seed)
     arrivals = 100.0 + np.arange(0, seconds, 1 / rate)
     return Stream(arrivals=list(arrivals), ages=list(age + jitter * rng.random(len(arrivals))),
@@ -22,7 +20,6 @@ def stream(rate, age, jitter=0.001, size=9.81, seconds=3.0, seed=0):
 
 
 def graph(**streams):
-    """A graph with two good sensors, or with the given streams."""
     made = {'mocap': stream(100, 0.010), 'imu': stream(200, 0.001)} | streams
     names = {'mocap': 'mocap/pose', 'imu': 'imu/data_raw', 'joints': 'joint_states',
              'battery': 'battery_state'}
@@ -57,16 +54,15 @@ def paused():
     ('mocap', stream(50, 0.01), {'mocap/pose rate': 'fail'}),
     ('mocap', stream(240, 0.01), {'mocap/pose rate': 'warn'}),
     ('mocap', paused(), {'mocap/pose rate': 'warn'}),
-    ('battery', stream(50, 0.001), {}), ('battery', stream(10, 0.001), {}),
-    ('battery', stream(5, 0.001), {'battery_state rate': 'fail'})])
+    ('battery', stream(50, 0.001), {})])
 def test_rates_outside_their_limits_fail(key, made, bad):
     assert levels(judged(**{key: made})) == bad
 
 
 @pytest.mark.parametrize(('age', 'jitter', 'level', 'words'), [
     (0.010, 0.004, 'ok', ''), (0.050, 0.001, 'warn', 'not synchronised'),
-    (0.050, 0.100, 'warn', 'buffers'), (3600.0, 0.01, 'fail', 'not synchronised'),
-    (0.150, 0.300, 'fail', 'buffers'), (-0.020, 0.001, 'fail', 'not synchronised')])
+    (0.050, 0.100, 'warn', 'buffers'), (0.150, 0.300, 'fail', 'buffers'),
+    (-0.020, 0.001, 'fail', 'not synchronised')])
 def test_ages_distinguish_latency_from_a_clock_offset(age, jitter, level, words):
     finding = judged(mocap=stream(100, age, jitter))['mocap/pose age']
     assert finding.level == level and words in finding.remedy
@@ -96,7 +92,6 @@ def test_wrong_units_duplicate_publishers_frozen_and_broken_messages_are_reporte
 
 
 def running(state='ready', level=0):
-    """Observations of the joint bridge and of its topic."""
     made = graph(joints=stream(200, 0.002))
     made.states['joint_bridge'] = state
     made.diagnostics = {
@@ -115,16 +110,3 @@ def test_a_running_bridge_is_judged_by_its_reports():
         found = by_item(check_topics(running(state), ROBOT.gravity))
         assert levels(found) == {'joint_bridge state': level}
         assert found['joint_bridge state'].found == state
-
-
-def test_a_port_in_use_by_a_bridge_is_judged_by_its_reports():
-    busy = 'servo port', 'p: in use by another process', 'stop it', 'joint_bridge'
-    port, state, gimbal = closed_port(*busy, running())
-    assert [port.level, state.level, gimbal.level] == ['ok'] * 3
-    assert 'joint_bridge_node reports' in port.found
-    rows = by_item(check_topics(running(), ROBOT.gravity, frozenset({'joint_bridge'})))
-    assert 'joint_bridge state' not in rows
-    absent = 'servo port', 'p: no such port', 'plug it in', 'joint_bridge'
-    for given, observed in ((busy, None), (busy, graph()), (absent, running())):
-        finding, = closed_port(*given, observed)
-        assert (finding.level, finding.remedy) == ('fail', given[2])

@@ -19,14 +19,12 @@ HOVER = np.array([7.0, 7.5, 8.0, 8.5])
 
 
 def driver(port, **changes):
-    """Driver with a short reconnect period."""
     return MotorBoard(replace(MotorBoardParameters.load(), port=port, reconnect_period=0.05,
                               **changes), ROBOT)
 
 
 @contextmanager
 def opened(port, **changes):
-    """Driver with its port open."""
     with closing(driver(port, **changes)) as board:
         board.open()
         yield board
@@ -58,24 +56,20 @@ class Pilot:
             time.sleep(max(0.0, due - time.monotonic()))
 
     def has_event(self, text):
-        """Whether an event with this text arrived."""
         self.events += self.board.poll()[2]
         return any(text in event for _, event in self.events)
 
     def __enter__(self):
-        """Start to send."""
         self._thread.start()
         return self
 
     def __exit__(self, *_):
-        """Stop sending."""
         self._stop.set()
         self._thread.join()
 
 
 @contextmanager
 def connected(**changes):
-    """Emulated board and driver, ready to arm."""
     with EmulatedMotorBoard(parameters=QUICK) as emulated, \
             opened(emulated.port, **changes) as board:
         assert until(lambda: not board.ready), board.ready

@@ -34,7 +34,6 @@ def bench(guard=False, timing=PATIENT, servos=None, **parameters):
 
 @contextmanager
 def running(**options):
-    """As :func:`bench`, configured and with torque on."""
     with bench(**options) as (bus, emulated):
         bus.configure()
         bus.enable()
@@ -43,7 +42,6 @@ def running(**options):
 
 
 def tick(bus, goal):
-    """Run one cycle of the bridge; return readings and servos."""
     bus.write_goals(goal)
     readings = bus.read()
     bus.upkeep()

@@ -64,7 +64,6 @@ def test_good_frames_in_pieces_are_found_after_any_noise(noise, frames, data):
 
 
 def sequence_of(*numbers):
-    """Frames of one message with these sequence numbers."""
     return b''.join(reference.pack(111, (1, 2), sequence) for sequence in numbers)
 
 

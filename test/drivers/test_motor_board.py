@@ -23,56 +23,17 @@ from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 pytestmark = pytest.mark.real_time
 
 
-def test_thrusts_with_bad_stamps_are_not_sent():
-    with connected() as (emulated, board):
-        board.start(True).wait()
-        for thrust, age, reason in (
-                ([1, 2, 3, 4], 0.2, 'stale stamp'), ([1, 2, 3, 4], -0.2, 'stamp in the future')):
-            assert board.send(thrust, time.time() - age).reason == reason
-        time.sleep(0.05)
-        assert not emulated.commands.any()
-
-
 def test_refused_arming_is_reported_with_the_reason():
     with connected() as (emulated, board):
         emulated.set_battery(20.0, 0.0)
         assert until(lambda: 'battery low' in board.state.status.conditions)
         assert board.start(True).wait().reason == 'refused by the board: battery low'
         emulated.set_battery(25.0, 0.0)
-        for _ in range(20):
-            board.send(HOVER, time.time())
-            time.sleep(0.005)
-        result = board.start(True).wait()
-        assert not result.accepted and result.reason.endswith('throttle not low')
-        time.sleep(QUICK.throttle_low_time)
         assert board.start(True).wait().accepted and emulated.armed
         emulated._firmware._heartbeat = lambda state, now: common.MAVLink_heartbeat_message(
             2, 0, 1, 1 | 9 << 24, 3, 3)
         assert until(lambda: board.state.status.contract == 9)
         assert board.start(True).wait().reason == 'firmware follows contract 9, this driver 1'
-
-
-def test_battery_rotors_and_clock_have_si_units_and_stamps_of_the_computer():
-    with connected() as (emulated, board):
-        emulated.set_battery(23.456, 12.34)
-        emulated.set_rotors(np.array([1.0, 4.0, 9.0, 0.0]), np.array([30.0, 40.0, 50.0, 60.0]))
-        time.sleep(0.6)         # one ESC_INFO
-        before = time.time()
-        board.poll()
-        time.sleep(0.1)
-        battery, rotors, _ = board.poll()
-        assert (battery.voltage, battery.current) == (23.456, -12.34)
-        assert rotors.rpm.tolist() == [2700, 5400, 8100, 0]
-        assert rotors.temperature.tolist() == [30, 40, 50, 60]
-        assert rotors.current.sum() == pytest.approx(12.34, rel=1e-5)
-        assert before - 0.02 < rotors.stamp <= time.time()
-        link, now = board.link(), time.monotonic()
-        truth, bound = emulated._firmware.clock(now) - now, link['clock_uncertainty_ms'] / 1e3
-        assert abs(link['clock_offset_s'] - truth) <= bound < 0.02
-        emulated.faults.mute = True
-        time.sleep(0.05)
-        board.poll()
-        assert board.poll()[:2] == (None, None)
 
 
 def test_an_independent_parser_accepts_all_output_of_the_driver():
@@ -134,25 +95,6 @@ def test_a_step_of_the_computers_clock_does_not_stop_the_rotors():
         assert sum(emulated.refused.values()) <= 2
 
 
-def test_stamps_stay_monotonic_when_the_offset_is_corrected():
-    with connected() as (emulated, board):
-        stamps = []
-        emulated.on_target = lambda now, stamp: stamps.append(stamp)
-        assert board.start(True).wait().accepted
-        clock, begin = board.state.clock, time.time()
-        for k, correction in enumerate((0.0, -0.003, 0.002, -0.003)):
-            low, high, at = clock._bounds
-            clock._bounds = low + correction, high + correction, at
-            board.send(HOVER, begin + 0.001 * k)
-            board.send(HOVER, begin + 0.001 * k)
-            time.sleep(0.003)
-        time.sleep(0.03)
-        assert len(stamps) == 8
-        assert stamps[::2] == stamps[1::2]
-        assert stamps == sorted(stamps) and len(set(stamps)) == 4
-        assert emulated.refused == {}
-
-
 CHILD = """
 import sys, time
 sys.path.insert(0, sys.argv[2])
@@ -163,18 +105,16 @@ assert until(lambda: not board.ready) and board.start(True).wait().accepted
 for _ in range(40):
     board.send(HOVER, time.time())
     time.sleep(0.005)
-if sys.argv[3]:
-    raise RuntimeError('a bug in the bridge')
+raise RuntimeError('a bug in the bridge')
 """
 
 
-@pytest.mark.parametrize('end', ['', 'fail'])
-def test_a_process_disarms_at_exit_and_after_an_exception(end):
+def test_a_process_disarms_after_an_exception():
     with EmulatedMotorBoard(parameters=QUICK) as emulated:
         arrivals, folder = [], Path(__file__).parent
         emulated.on_target = lambda now, stamp: arrivals.append(now)
         subprocess.run(
-            [sys.executable, '-c', CHILD, emulated.port, str(folder), end], timeout=20,
+            [sys.executable, '-c', CHILD, emulated.port, str(folder)], timeout=20,
             stderr=subprocess.DEVNULL, env={**os.environ, 'PYTHONPATH': os.pathsep.join(
                 [str(folder.parents[1]), *sys.path])})
         assert arrivals and not emulated.armed

@@ -27,7 +27,6 @@ class BoardStub:
         return self.commands[-1]
 
     def answer(self, accepted=True, reason=''):
-        """Answer the newest command."""
         command = self.commands[-1]
         command.accepted, command.reason = accepted, reason
         if accepted:
@@ -46,7 +45,6 @@ def bench():
 
 
 def disarmed(board, arming):
-    """The supervisor is disarmed and the board confirms it."""
     arming.follow('disarmed')
     board.answer()
     arming.update(CYCLE)
@@ -54,7 +52,6 @@ def disarmed(board, arming):
 
 
 def in_flight(bench):
-    """Arm the board and enter 'flies'."""
     board, arming = bench
     assert disarmed(board, arming) == 'ready'
     arming.follow('takeoff')
@@ -121,7 +118,6 @@ def test_a_refusal_to_arm_is_reported_and_not_retried(bench):
 
 @pytest.mark.parametrize(('status', 'why'), [
     (BoardStatus(0.0, 'boot', 'none', (), 1), 'restarted'),
-    (BoardStatus(0.0, 'disarmed', 'none', (), 1), 'restarted'),
     (BoardStatus(0.0, 'disarmed', 'watchdog reset', (), 1), 'restarted (watchdog reset)'),
     (BoardStatus(0.0, 'disarmed', 'no target for too long', (), 1),
      'disarmed (no target for too long)'),
@@ -180,20 +176,3 @@ def test_arming_in_flight_never_happens(bench):
         arming.follow(state)
     assert arming.text == 'lost: the supervisor was not disarmed before'
     assert board.asked is False
-
-
-def test_a_board_found_armed_is_disarmed(bench):
-    board, arming = bench
-    board.state.status = ARMED
-    arming.update(CYCLE)
-    assert board.asked is False
-
-
-def test_an_acknowledgement_contradicted_by_the_heartbeat_does_not_start_a_flight(bench):
-    board, arming = bench
-    arming.follow('disarmed')
-    arming.follow('takeoff')
-    board.answer()
-    board.state.status = BoardStatus(0.0, 'disarmed', 'heartbeat of the host lost', (), 1)
-    arming.update(CYCLE)
-    assert arming.text == 'lost: disarmed (heartbeat of the host lost)'

@@ -13,31 +13,23 @@ from board_bench import flying, HOVER, QUICK, until
 pytestmark = pytest.mark.real_time
 
 
-def holds(condition, seconds):
-    """Whether a condition remains true for this time."""
-    return not until(lambda: not condition(), seconds)
-
-
 def keeps_flying(emulated, seconds=0.6):
-    """Whether the rotors run during this time."""
-    return holds(lambda: emulated.commands.all(), seconds) and emulated.armed
+    return not until(lambda: not emulated.commands.all(), seconds) and emulated.armed
 
 
-def stays_stopped(emulated, seconds=0.5):
-    """Whether no rotor turns during this time, although targets are sent."""
-    return holds(lambda: not emulated.commands.any(), seconds)
+def stays_stopped(emulated):
+    return not until(emulated.commands.any, 0.5)
 
 
 def arms_again(board, pilot):
-    """Whether the board can be armed after zero throttle."""
     pilot.thrust = np.zeros(4)
     time.sleep(QUICK.throttle_low_time)
     return until(lambda: board.start(True).wait().accepted)
 
 
 @pytest.mark.parametrize('faults', [
-    {'corrupt_out': 0.3}, {'corrupt_in': 0.3}, {'drop_in': 0.3, 'drop_out': 0.3},
-    {'delay_in': 0.03, 'delay_out': 0.03}], ids=str)
+    {'corrupt_out': 0.3}, {'corrupt_in': 0.3},
+    {'drop_in': 0.3, 'drop_out': 0.3, 'delay_in': 0.03, 'delay_out': 0.03}], ids=str)
 def test_a_poor_link_is_counted_and_tolerated(faults):
     with flying() as (emulated, board, _):
         for name, value in faults.items():
@@ -66,17 +58,6 @@ def test_delayed_targets_are_refused_and_the_rotors_stop():
         assert until(lambda: pilot.has_event('disarmed (no target for too long)'))
 
 
-def test_a_board_that_does_not_transmit_is_reported_and_still_follows_targets():
-    with flying() as (emulated, board, pilot):
-        emulated.faults.mute = True
-        assert until(lambda: pilot.has_event('no message for 0.3 s'))
-        assert keeps_flying(emulated, 0.3)
-        assert board.ready == 'no message from the board'
-        emulated.faults.mute = False
-        assert until(lambda: pilot.has_event('messages again'))
-        assert board.state.status.armed
-
-
 def test_voltage_sag_is_compensated_or_reported_as_saturation():
     with flying() as (emulated, board, pilot):
         emulated.set_battery(25.0, 30.0)
@@ -87,23 +68,10 @@ def test_voltage_sag_is_compensated_or_reported_as_saturation():
         assert np.all(emulated.commands > before)
         pilot.thrust = np.full(4, 20.0)
         assert until(lambda: pilot.results[-1].saturated.all())
-        emulated.faults.voltage_sag = 5.0
-        assert until(lambda: pilot.has_event('battery low'))
         emulated.faults.voltage_sag = 0.0
         emulated.set_battery(3.0, 0.0)
         assert until(lambda: pilot.has_event('3.0 V not plausible'))
         assert keeps_flying(emulated, 0.2)
-
-
-def test_a_short_disconnection_stops_the_rotors_briefly():
-    with flying() as (emulated, board, pilot):
-        emulated.unplug()
-        assert until(lambda: pilot.has_event('unplugged'))
-        assert until(lambda: pilot.results[-1].reason == 'port is away')
-        assert until(lambda: not emulated.commands.any())
-        emulated.plug()
-        assert until(lambda: emulated.commands.all(), 0.4)
-        assert pilot.has_event('port opened again') and board.link()['connections'] == 2
 
 
 def test_a_long_disconnection_disarms_and_reconnecting_does_not_arm():
@@ -117,13 +85,11 @@ def test_a_long_disconnection_disarms_and_reconnecting_does_not_arm():
         assert arms_again(board, pilot)
 
 
-@pytest.mark.parametrize(('fault', 'event'), [
-    ('hang', 'restarted (watchdog reset)'), ('reboot', 'restarted')])
-def test_a_board_that_restarts_in_flight_stops_and_needs_arming_again(fault, event):
+def test_a_board_that_hangs_in_flight_stops_and_needs_arming_again():
     with flying() as (emulated, board, pilot):
-        getattr(emulated, fault)()
+        emulated.hang()
         assert until(lambda: not emulated.commands.any(), 0.15)
-        assert until(lambda: pilot.has_event(event))
+        assert until(lambda: pilot.has_event('restarted (watchdog reset)'))
         assert stays_stopped(emulated) and not board.state.status.armed
         assert board.link()['lost'] == 0
         assert arms_again(board, pilot)
@@ -143,7 +109,3 @@ def test_a_failed_esc_is_named_and_the_other_rotors_continue():
             rotors = board.poll()[1]
         assert np.isnan(rotors.rpm[2]) and rotors.failures[2] == ('generic',)
         assert np.all(rotors.rpm[[0, 1, 3]] > 1000)
-        board.start(False).wait()
-        pilot.thrust = np.zeros(4)
-        time.sleep(QUICK.throttle_low_time + 0.05)
-        assert board.start(True).wait().reason == 'refused by the board: ESC failure'

@@ -4,7 +4,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import pytest
 
-from beetle_omni_ros.drivers.serial_port import SerialPortError
 from beetle_omni_ros.drivers.servo_link import NoAnswer, ServoBusError, ServoLink
 from beetle_omni_ros.drivers.servo_registers import GOAL_POSITION, HARDWARE_ERROR, TORQUE_ENABLE
 from beetle_omni_ros.sim.emulated.servo_bus import packet, sealed, status
@@ -53,12 +52,6 @@ def test_sent_packets_equal_the_documented_bytes():
     assert link.packet_of_sync_write(GOAL_POSITION, {1: 150, 2: 170}) == link.sent[2]
 
 
-def test_data_with_headers_and_error_bytes_are_read_with_the_feedback():
-    blocks = [(1, 0, b'\xff\xff\xfd\x00'), (2, 0x80, b'\xff\xff\xfd\xff'), (3, 0x87, b'abcd')]
-    assert Wire(b''.join(status(*block) for block in blocks)).sync_read(65, 4, IDS) == {
-        name: (error, data) for name, error, data in blocks}
-
-
 def test_the_valid_part_of_a_truncated_answer_is_used():
     for kept in range(len(ALL)):
         answers = Wire(ALL[:kept]).sync_read(126, 10, IDS)
@@ -81,23 +74,6 @@ def test_a_late_answer_to_another_request_is_skipped(late):
     link = Wire(late)
     assert link.sync_read(126, 10, IDS) == {}
     assert link.late
-
-
-def test_refusals_and_silence_are_one_line_with_port_and_id():
-    with pytest.raises(ServoBusError, match=r'^wire, id 1: write 1 to Torque Enable\(64\): '
-                                            'refused, no access'):
-        Wire(status(1, 7)).write(1, TORQUE_ENABLE, 1)
-    with pytest.raises(NoAnswer, match='^wire, id 1: ping: There is no status packet!$'):
-        Wire().ping(1)
-    with pytest.raises(SerialPortError, match='^wire: not open$'):
-        ServoLink('wire', 1_000_000, 0.001).ping(1)
-
-
-@pytest.mark.parametrize('late', [status(1, 0), status(1, 0, b'\1\2'), status(2, 0, b'\0')])
-def test_a_late_answer_is_not_taken_for_the_value_of_a_register(late):
-    with pytest.raises(NoAnswer):
-        Wire(late).read(1, TORQUE_ENABLE)
-    assert Wire(late + status(1, 0, b'\1')).read(1, TORQUE_ENABLE) == 1
 
 
 def test_a_write_whose_answer_is_lost_is_repeated():

@@ -1,7 +1,6 @@
 """The table of topics: nodes and bags write the same bytes and read the same values."""
 
 from dataclasses import fields, replace
-import itertools
 
 import numpy as np
 import pytest
@@ -9,7 +8,7 @@ import pytest
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.messages import bag_types
 from beetle_omni_ros.messages.bag_types import from_bytes, read_all, to_bytes
-from beetle_omni_ros.messages.topics import ALL, TABLE, topic_of
+from beetle_omni_ros.messages.topics import ALL
 from beetle_omni_ros.messages.values import (
     Diagnostic,
     HealthReport,
@@ -34,7 +33,6 @@ SERIES = ('mocap/pose', 'imu/data_raw', 'joint_states', 'battery_state', 'rotor_
 
 
 def value(topic, seed=0, stamp=STAMP):
-    """A value of a topic."""
     draw = np.random.default_rng(seed).normal
     turn = rotations.normalized(draw(size=4))
     path = TrajectoryTarget(stamp + np.arange(3.0), draw(size=(3, 3)), np.tile(turn, (3, 1)),
@@ -157,12 +155,3 @@ def test_non_finite_values_are_read_but_refused_in_flight(topic):
     assert np.isnan(getattr(entry.read(message), name)).all()
     with pytest.raises(MessageError, match='not finite'):
         entry.take(message)
-
-
-def test_names_are_unique_and_any_controller_has_a_topic():
-    assert len(ALL) == len(TABLE)
-    assert topic_of('mine/command').name == 'mine/command'
-    with pytest.raises(KeyError):
-        topic_of('mine/state')
-    for one, other in itertools.combinations(TABLE, 2):
-        assert one.name != other.name

@@ -44,16 +44,15 @@ class BridgeOperator(Operator):
     def __init__(self, number, bridge):
         super().__init__(number)
         self.bridge, node = bridge, self._node
-        self.bridge_states, self.batteries, self.joints, self.rotors = [], [], [], []
+        self.bridge_states, self.batteries, self.joints = [], [], []
         self.tilt = self.thrust = None
         self.period, self.age = 0.01, 0.0
         self._supervisor = wire.Publisher(node, 'supervisor/state')
         self._commands = wire.Publisher(node, 'command')
         self._clients_of_bridge = {}
         wire.subscribe(node, f'{bridge.removesuffix("_node")}/state', self.bridge_states.append)
-        for kind, topic, received in ((BatteryState, 'battery_state', self.batteries),
-                                      (JointState, 'rotor_states', self.rotors)):
-            node.create_subscription(kind, topic, received.append, wire.profile(SENSOR))
+        node.create_subscription(BatteryState, 'battery_state', self.batteries.append,
+                                 wire.profile(SENSOR))
         node.create_subscription(JointState, 'joint_states', lambda message: self.joints.append(
             (message, time.time())), wire.profile(SENSOR))
         self._stop = threading.Event()
@@ -69,11 +68,9 @@ class BridgeOperator(Operator):
                     for part in (tilt, thrust))))
 
     def supervise(self, state):
-        """Publish a state of the supervisor."""
         self._supervisor.publish(state)
 
     def ask(self, name, kind=Trigger, request=None):
-        """Call a service of the bridge; return its response."""
         if name not in self._clients_of_bridge:
             self._clients_of_bridge[name] = self._node.create_client(kind, f'{self.bridge}/{name}')
         client = self._clients_of_bridge[name]
@@ -90,11 +87,9 @@ class BridgeOperator(Operator):
 
     @property
     def stage(self):
-        """Lifecycle state of the bridge."""
         return self.ask('get_state', GetState).current_state.label
 
     def go_to(self, stage):
-        """Bring the bridge to a lifecycle state from any other."""
         path = {'unconfigured': 0, 'inactive': 1, 'active': 2}
         end = time.monotonic() + WITHIN
         while (here := path[self.stage]) != path[stage]:
@@ -105,25 +100,20 @@ class BridgeOperator(Operator):
 
     @property
     def now(self):
-        """Newest state of the bridge."""
         return self.bridge_states[-1] if self.bridge_states else ''
 
     def until(self, condition, why=''):
-        """Wait until a condition holds."""
         assert self.wait(condition, WITHIN), f'{why} {self.bridge_states[-3:]}'
 
     def reaches(self, state):
-        """Wait for a state of the bridge."""
         self.until(lambda: self.now.startswith(state), state)
 
     def status(self, name):
-        """Return the next message of a status."""
         self.diagnostics.pop(f'{self.bridge}: {name}', None)
         self.until(lambda: f'{self.bridge}: {name}' in self.diagnostics, f'no status {name}')
         return self.diagnostics[f'{self.bridge}: {name}']
 
     def counts(self, name, key, above=0):
-        """Wait until a counter in a status is above a number."""
         self.until(lambda: int(self.status(name).values.get(key, 0)) > above, f'{name} {key}')
 
     def stands_at(self, goal):
@@ -133,7 +123,6 @@ class BridgeOperator(Operator):
             message.position, goal, atol=3 * COUNT)
 
     def close(self):
-        """Stop publishing."""
         self._stop.set()
         self._thread.join()
         super().close()

@@ -54,5 +54,4 @@ def make_bench(ros_domain):
 
 @pytest.fixture
 def bench(make_bench):
-    """A bench without parameters."""
     return make_bench()

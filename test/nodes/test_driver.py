@@ -1,6 +1,6 @@
 """Manual driving through ROS: keys, lines of text, a joystick, and refusals."""
 
-from contextlib import contextmanager
+from contextlib import closing
 import fcntl
 import os
 import pty
@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import termios
-import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -45,7 +44,6 @@ def flight(graph):
     if witness.state != 'disarmed':
         assert witness.call('land')[0]
         assert witness.wait(lambda: witness.state == 'disarmed', PATIENCE), witness.states
-    witness.states.clear()
     return graph
 
 
@@ -71,7 +69,6 @@ class Terminal:
         os.write(self.mine, keys.encode())
 
     def shows(self, text):
-        """Whether the program has printed ``text``."""
         while select.select([self.mine], [], [], 0)[0]:
             self.text += os.read(self.mine, 4096).decode()
         return text in self.text
@@ -84,16 +81,6 @@ class Terminal:
     def echoes(self):
         return bool(self.state[LOCAL_FLAGS] & termios.ECHO)
 
-    def ends(self, witness):
-        """Exit status of the program."""
-        assert witness.wait(lambda: self.shows('') or self.process.poll() is not None, PATIENCE)
-        deadline = time.monotonic() + PATIENCE
-        while self.process.poll() is None and time.monotonic() < deadline:
-            self.shows('')
-            time.sleep(0.05)
-        self.shows('')
-        return self.process.poll()
-
     def close(self):
         self.process.kill()
         self.process.wait()
@@ -101,45 +88,10 @@ class Terminal:
         os.close(self.its)
 
 
-@contextmanager
-def driving(flight):
-    """A driving terminal that shows its keys."""
+def test_keys_become_targets_and_ctrl_c_restores_the_terminal(flight):
     domain, witness = flight
-    terminal = Terminal(domain)
-    try:
+    with closing(Terminal(domain)) as terminal:
         assert witness.wait(lambda: terminal.shows('q quit'), PATIENCE), terminal.text
-        yield witness, terminal
-    finally:
-        terminal.close()
-
-
-def test_ctrl_c_and_a_closed_terminal_end_the_driver(flight):
-    with driving(flight) as (witness, terminal):
-        ctrl_c_restores_the_terminal(witness, terminal)
-    with driving(flight) as (witness, terminal):
-        a_terminal_that_closes_ends_the_driver(witness, terminal)
-
-
-def ctrl_c_restores_the_terminal(witness, terminal):
-    assert witness.wait(lambda: not terminal.echoes, 10)
-    terminal.press('\x03')
-    assert terminal.ends(witness) == 130
-    assert 'Traceback' not in terminal.text
-    assert 'left; the robot holds its last target' in terminal.text
-    assert terminal.state == terminal.before
-
-
-def a_terminal_that_closes_ends_the_driver(witness, terminal):
-    terminal.press('\x04')      # Ctrl-D is no end of input if keys are read one by one
-    witness.spin(0.5)
-    assert terminal.process.poll() is None
-    os.close(terminal.mine)
-    assert witness.wait(lambda: terminal.process.poll() is not None, PATIENCE)
-    terminal.mine = os.open(os.devnull, os.O_RDONLY)
-
-
-def test_keys_become_targets_and_q_restores_the_terminal(flight):
-    with driving(flight) as (witness, terminal):
         targets = []
         wire.subscribe(witness._node, 'target_pose', targets.append, qos=EVENT)
         assert witness.wait(lambda: not terminal.echoes, 10)
@@ -157,22 +109,19 @@ def test_keys_become_targets_and_q_restores_the_terminal(flight):
         assert len(targets) > 3     # at the speed, not at once
         assert witness.wait(lambda: abs(
             witness.truth.position[2] - targets[-1].position[2]) < 0.1, PATIENCE)
-        terminal.press('q')
-        assert terminal.ends(witness) == 0
-        assert 'left; the robot holds its last target' in terminal.text
+        terminal.press('\x03')
+        assert witness.wait(lambda: terminal.shows('its last target')
+                            and terminal.process.poll() is not None, PATIENCE), terminal.text
+        assert terminal.process.poll() == 130 and 'Traceback' not in terminal.text
         assert terminal.state == terminal.before and witness.state.startswith('flying')
-
-
-def drive(source, domain):
-    return subprocess.Popen(
-        [sys.executable, '-m', 'beetle_omni_ros.start', 'beetle_omni', 'drive', source,
-         '--domain-id', str(domain)], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE, text=True, env={**os.environ, 'COLUMNS': '300'})
 
 
 def test_lines_of_text_fly_the_robot_within_the_fence(flight):
     domain, witness = flight
-    driver = drive('terminal', domain)
+    driver = subprocess.Popen(
+        [sys.executable, '-m', 'beetle_omni_ros.start', 'beetle_omni', 'drive', 'terminal',
+         '--domain-id', str(domain)], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True, env={**os.environ, 'COLUMNS': '300'})
     driver.stdin.write('up 1\narm\nwait\njump\ngoto 40 0 1\nup 0.4\nroll 60\nwait\nwhere\n')
     driver.stdin.close()
     driver.stdin = None
@@ -212,10 +161,3 @@ def test_an_unusable_source_is_refused_in_one_line(capsys, monkeypatch, argument
     assert cli.main(['drive', *arguments]) == 2
     line, = capsys.readouterr().err.splitlines()
     assert expected in line
-
-
-def test_without_a_graph_the_missing_topic_is_named(ros_domain, monkeypatch, capfd):
-    monkeypatch.setattr(driver, 'SUPERVISOR_TIMEOUT', 0.3)
-    assert driver.run_drive('terminal', domain_id=ros_domain) == 1
-    line, = [one for one in capfd.readouterr().err.splitlines() if one.startswith('beetle')]
-    assert 'supervisor_node: not seen' in line and 'expected a running graph' in line

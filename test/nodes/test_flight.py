@@ -5,7 +5,8 @@ Each test has its own ROS domain and folders, so that tests can run at the same
 time. The robot is observed through ground_truth/odom, which does not depend on other nodes.
 """
 
-import json
+from contextlib import contextmanager
+import io
 import os
 from pathlib import Path
 import signal
@@ -15,19 +16,15 @@ import time
 
 import numpy as np
 import pytest
+from rich.console import Console
 from witness import HEADER, READY, running_graph
 
+from beetle_omni_ros.nodes import fly
 from beetle_omni_ros.nodes.graph import in_simulated_time
 from beetle_omni_ros.runs.bag import read_bag
-from beetle_omni_ros.runs.metrics import metrics
-from beetle_omni_ros.runs.tasks import make_task
 
 NODES = ('recorder_node', 'sim_node', 'ekf_node', 'nmpc_node', 'supervisor_node',
          'reference_node')
-
-
-def logged(graph, name):
-    return graph.log(name).read_text()
 
 
 def test_switches_and_the_loss_of_recorder_reference_controller_and_estimator(ros_domain,
@@ -45,8 +42,8 @@ def test_switches_and_the_loss_of_recorder_reference_controller_and_estimator(ro
 
 
 def switches(witness):
-    """Select each controller some times; test/evaluation checks that no command jumps."""
-    names = ['rl', 'nmpc'] * 3
+    """Select each controller; test/evaluation checks that no command jumps."""
+    names = ['rl', 'nmpc']
     for name in names:
         assert witness.stays_in_the_air(0.5)
         assert witness.wait(lambda name=name: witness.set(
@@ -58,7 +55,6 @@ def switches(witness):
 
 
 def loses_one_node_after_another(graph, witness, bag):
-    """Kill a node, and observe how the others go on."""
     killed_at = witness.time()
     graph.kill('recorder_node')
     assert witness.stays_in_the_air(0.5)
@@ -74,11 +70,11 @@ def loses_one_node_after_another(graph, witness, bag):
     assert witness.wait(lambda: witness.state == 'fallback', 2)
     assert witness.stays_in_the_air(1.5)
     assert np.linalg.norm(witness.truth.velocity) < 0.5
-    assert 'nmpc_node silent' in logged(graph, 'supervisor_node')
+    assert 'nmpc_node silent' in graph.log('supervisor_node').read_text()
 
     graph.kill('ekf_node')
     assert witness.wait(lambda: witness.state == 'landing', 2)
-    assert 'ekf_node silent' in logged(graph, 'supervisor_node')
+    assert 'ekf_node silent' in graph.log('supervisor_node').read_text()
     sinking = []
     assert witness.wait(lambda: sinking.append(witness.truth.velocity[2])
                         or witness.state == 'disarmed', 15)
@@ -88,23 +84,6 @@ def loses_one_node_after_another(graph, witness, bag):
     assert np.all(witness.last_command[1].thrust == 0)
     assert set(graph.dead()) == {'recorder_node', 'reference_node', 'nmpc_node', 'ekf_node'}
     assert 'SIGKILL' in graph.dead()['ekf_node']
-
-
-FLY = ('import sys\nfrom pathlib import Path\nfrom beetle_omni_ros.nodes.fly import run_fly\n'
-       'composed = sys.argv[4] == "composed"\n'
-       'sys.exit(run_fly(task=sys.argv[1], bag=Path(sys.argv[2]), json_path=Path(sys.argv[3]), '
-       'composed=composed, standby=composed, clock=sys.argv[5]))')
-
-
-def fly(tmp_path, poses, arrangement, clock='auto'):
-    """Start a flight by the command line; (process, bag, result file)."""
-    task, bag, result = tmp_path / 'poses.csv', tmp_path / 'run', tmp_path / 'result.json'
-    task.write_text(HEADER + poses)
-    environment = dict(os.environ)
-    environment.pop('ROS_DOMAIN_ID', None)
-    return subprocess.Popen(
-        [sys.executable, '-c', FLY, str(task), str(bag), str(result), arrangement, clock],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment), bag, result
 
 
 def children(pid):
@@ -121,37 +100,34 @@ def children(pid):
     return found
 
 
-@pytest.mark.alone
-def test_one_call_flies_and_the_bag_gives_the_printed_numbers(tmp_path):
-    process, bag, result = fly(tmp_path, '0.3,0,1,20,0,0\n', 'composed')
-    output, error = process.communicate(timeout=READY)
-    assert process.returncode == 0, error
-    results = json.loads(result.read_text())
-    # A slow computer flies in simulated time, in which latencies have no meaning.
-    real = results['meta']['clock'] == 'system'
-    assert 'CPU' in output and ('latency' if real else 'of real time') in output
-    assert results['nmpc']['success_rate'] == 1.0 and len(results['nmpc']['poses']) == 1
-    assert results['meta']['graph']['cpu_percent'] > 0
-    again = metrics(read_bag(bag), make_task(str(tmp_path / 'poses.csv')))
-    assert again['poses'] == results['nmpc']['poses']
-    assert again['compute_ms'] == results['nmpc']['compute_ms']
-    assert read_bag(bag).meta['task'] == str(tmp_path / 'poses.csv')
+@contextmanager
+def flying(tmp_path, *options):
+    """Fly by the command line; yield process and bag in flight."""
+    task, bag, temporary = tmp_path / 'poses.csv', tmp_path / 'bag', tmp_path / 'tmp'
+    task.write_text(HEADER + '0,0,1.2,0,0,0\n' * 10)
+    temporary.mkdir()
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'beetle_omni_ros.cli', 'fly', '--task', str(task), '--bag',
+         str(bag), '--alone', '--clock', 'simulated', *options], stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL, text=True, env={**os.environ, 'TMPDIR': str(temporary)})
+    deadline = time.monotonic() + READY
+    try:
+        while not any(b'flying:nmpc' in file.read_bytes() for file in bag.glob('*.mcap')):
+            assert process.poll() is None and time.monotonic() < deadline
+            time.sleep(0.2)
+        yield process, bag
+    finally:
+        process.kill()
+        process.communicate()
+    assert not list(temporary.iterdir())
 
 
 def test_a_killed_node_is_named_and_all_processes_end(tmp_path):
-    process, bag, _ = fly(tmp_path, '0,0,1.2,0,0,0\n' * 10, 'separate', 'simulated')
-    deadline, nodes = time.monotonic() + READY, {}
-    try:
-        while not (bag.is_dir() and b'flying:nmpc' in newest(bag)):
-            assert process.poll() is None and time.monotonic() < deadline
-            time.sleep(0.2)
+    with flying(tmp_path, '--separate') as (process, bag):
         nodes = children(process.pid)
         assert set(NODES) == set(nodes)
         os.kill(nodes['nmpc_node'], signal.SIGKILL)
         _, error = process.communicate(timeout=60)
-    finally:
-        process.kill()
-        process.communicate()
     assert process.returncode == 1
     assert 'nmpc_node died (ended by SIGKILL)' in error
     assert not any(Path(f'/proc/{pid}').exists() for pid in nodes.values())
@@ -159,6 +135,33 @@ def test_a_killed_node_is_named_and_all_processes_end(tmp_path):
     assert [state.partition(':')[0] for state in states[-2:]] == ['landing', 'disarmed']
 
 
-def newest(bag):
-    """Return the raw bytes of a bag so far."""
-    return b''.join(file.read_bytes() for file in bag.glob('*.mcap'))
+def test_sigterm_ends_a_flight_cleanly_and_the_bag_is_complete(tmp_path):
+    with flying(tmp_path) as (process, bag):
+        for _ in range(2):
+            process.send_signal(signal.SIGTERM)
+            time.sleep(0.1)
+        _, error = process.communicate(timeout=60)
+    assert error.strip() == 'beetle_omni fly: interrupted; everything is stopped'
+    assert process.returncode == 130
+    log = read_bag(bag)
+    assert not log.warnings and 'flying:nmpc' in log.states and log.meta['interrupted']
+
+
+@pytest.mark.parametrize(('load', 'options', 'simulated'), [
+    (0.99, {}, True), (0.5, {}, False), (0.99, {'clock': 'system'}, False),
+    (0.5, {'clock': 'simulated'}, True), (0.99, {'actuators': 'emulated'}, False)])
+def test_fly_leaves_real_time_only_if_asked_or_needed_and_reports_it(monkeypatch, tmp_path, load,
+                                                                     options, simulated):
+    flown = []
+    monkeypatch.setattr(fly, '_fly', lambda graph, controller, task, meta, console, faults:
+                        flown.append((graph, meta)) or 1)    # flown, but without a bag
+    monkeypatch.setattr(fly, 'needed_load', lambda: load)
+    text = io.StringIO()
+    assert fly.run_fly(bag=tmp_path / 'bag', domain_id=1, console=Console(file=text, width=300),
+                       **options) == 1
+    (graph, meta), = flown
+    assert graph.simulated == simulated and meta['clock'] == (
+        'simulated' if simulated else 'system')
+    assert ({'joint_bridge_node', 'rotor_bridge_node'} <= set(graph.nodes)) != simulated
+    assert ('the nodes would need 99% of a core' in text.getvalue()) == (
+        simulated and not options)

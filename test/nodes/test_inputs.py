@@ -20,9 +20,7 @@ from std_msgs.msg import String
 
 from beetle_omni_ros.control.base import Command, PoseTarget
 from beetle_omni_ros.control.registry import ControllerEntry
-from beetle_omni_ros.messages import conversions
 from beetle_omni_ros.messages.topics import ALL, COMMAND, EVENT, LATCHED, SENSOR
-from beetle_omni_ros.messages.values import MessageError
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.bridge_nodes import JointBridgeNode, RotorBridgeNode
 from beetle_omni_ros.nodes.control_nodes import ControllerNode, EkfNode, SupervisorNode
@@ -77,23 +75,6 @@ def test_a_bad_target_pose_is_refused_with_its_reason_and_the_old_one_stays(benc
     assert kinds['cannot be flown'] == 4 and kinds.total() == 5
 
 
-def test_a_stamp_of_1970_is_refused_in_simulated_time_too(bench, monkeypatch):
-    node = bench.add(StillNode())
-    monkeypatch.setattr(node, 'simulated', True)
-    now = time.time()
-    for time_now, stamp, good in (
-            (now, 1.5, False), (now, now + 1e5, False), (now, now - 60, True),
-            (100.0, 1.5, True), (0.0, now, True), (100.0, now, False)):
-        monkeypatch.setattr(node, 'now', lambda t=time_now: t)
-        target = conversions.take_pose_target(
-            wire.message(ALL['target_pose'], pose(stamp=stamp)))
-        if good:
-            node._check_target(target, now)
-        else:
-            with pytest.raises(MessageError, match='the stamp is .* expected at most'):
-                node._check_target(target, now)
-
-
 def test_bad_and_stale_samples_are_refused_and_counted_by_reason(bench):
     node = bench.add(EkfNode())
     samples = bench.publisher(Imu, 'imu/data_raw', wire.profile(SENSOR))
@@ -108,7 +89,7 @@ def test_bad_and_stale_samples_are_refused_and_counted_by_reason(bench):
 
 @pytest.mark.parametrize(('kind', 'overrides'), [
     (SimNode, ()), (JointBridgeNode, ('port:=/tmp/none/a',)),
-    (RotorBridgeNode, ('port:=/tmp/none/b',)), (StillNode, ())])
+    (RotorBridgeNode, ('port:=/tmp/none/b',))])
 def test_only_the_supervisors_commands_are_executed_and_others_are_named(make_bench, kind,
                                                                          overrides):
     bench, texts = make_bench(*overrides), []

@@ -18,13 +18,7 @@ TICK, ROS = 0.005, 1.8e9
 
 @pytest.fixture
 def clock():
-    """Return the time, set by the test."""
     return SimpleNamespace(now=ROS)
-
-
-@pytest.fixture
-def pacing(clock):
-    return RealTimePacing(TICK, lambda: clock.now)
 
 
 def run(pacing, clock, seconds, jitter=None):
@@ -39,14 +33,16 @@ def run(pacing, clock, seconds, jitter=None):
     return np.array(ages)
 
 
-def test_jitter_loses_no_ticks(pacing, clock):
+def test_jitter_loses_no_ticks(clock):
+    pacing = RealTimePacing(TICK, lambda: clock.now)
     ages = run(pacing, clock, 10.0, np.random.default_rng(2).uniform(0, 0.003, 2000))
     assert pacing.ticks == pytest.approx(2000, abs=1) and pacing.lost_ticks == 0
     assert ages.max() < 0.0035 and ages.min() > -0.002
 
 
 @pytest.mark.parametrize(('step', 'ticks'), [(3.0, 200 + CATCH_UP_TICKS), (-3600.0, 200)])
-def test_a_stall_and_a_clock_that_was_set_cause_no_lasting_delay(pacing, clock, step, ticks):
+def test_a_stall_and_a_clock_that_was_set_cause_no_lasting_delay(clock, step, ticks):
+    pacing = RealTimePacing(TICK, lambda: clock.now)
     run(pacing, clock, 0.5)
     clock.now += step
     assert pacing.due() == ticks - 200

@@ -47,22 +47,14 @@ def test_the_node_publishes_the_commands_of_the_policy(make, tmp_path):
     assert node._controller_status()[2]['policy'] == 'rl'
 
 
-def test_a_file_of_the_nmpc_reaches_its_node(tmp_path):
-    mine = tmp_path / 'mine.yaml'
-    mine.write_text('limits: {tilt_rate_share: 0.5}\n')
-    for active in ('nmpc', 'hover'):
-        assert plan_of(active, nmpc=str(mine))[0]['nmpc_node'] == {'nmpc_file': str(mine)}
-    with pytest.raises(ParameterError, match="for the controller 'nmpc', which does not run"):
-        plan_of('hover', nmpc=str(mine), standby=False)
-    mine.write_text('limits: {tilt_rate: 7.0}\n')
-    with pytest.raises(ParameterError, match="unknown key; did you mean 'tilt_rate_share'"):
-        plan_of('nmpc', nmpc=str(mine))
-
-
-def test_an_unusable_policy_is_not_on_standby(tmp_path):
+def test_files_reach_their_nodes_and_an_unusable_policy_is_not_on_standby(tmp_path):
     policy = str(write(tmp_path / 'policy.onnx'))
     other = str(share_path('params/robot_weak_and_heavy.yaml'))
-    assert list(plan_of('nmpc', policy=policy)[0]) == ['nmpc_node', 'rl_node']
+    nmpc = tmp_path / 'nmpc.yaml'
+    nmpc.write_text('limits: {tilt_rate_share: 0.5}\n')
+    nodes, _ = plan_of('nmpc', policy=policy, nmpc=str(nmpc))
+    assert list(nodes) == ['nmpc_node', 'rl_node']
+    assert nodes['nmpc_node'] == {'nmpc_file': str(nmpc)}
     nodes, reason = plan_of('nmpc', policy=policy, robot_file=other)
     assert list(nodes) == ['nmpc_node'] and 'mass' in reason['rl']
     nodes, reason = plan_of('nmpc', policy=policy, robot_file=other, allow_other_robot=True)

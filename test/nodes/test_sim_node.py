@@ -1,7 +1,6 @@
 """sim_node with emulated actuators: ports instead of topics, faults in flight."""
 
 import os
-import stat
 
 import numpy as np
 import pytest
@@ -15,7 +14,6 @@ pytestmark = pytest.mark.real_time
 
 @pytest.fixture
 def sim(make):
-    """Make a sim_node with parameters."""
     return lambda *overrides, actuators='emulated': make(
         SimNode, f'actuators:={actuators}', *overrides)
 
@@ -28,21 +26,16 @@ def put(node, **values):
 
 
 def topics(node):
-    """Topics that a node publishes and subscribes."""
     return ({one.topic_name for one in node.publishers},
             {one.topic_name for one in node.subscriptions})
 
 
-def test_commands_and_joint_states_pass_through_ports_or_topics(sim):
-    node = sim(actuators='direct')
+def test_faults_are_switched_in_flight_and_reported(sim):
+    node = sim('faults:="mocap_lost"', actuators='direct')
     published, subscribed = topics(node)
     assert {'/joint_states', '/battery_state'} <= published and '/command' in subscribed
     refused = put(node, servo_faults__silent=[2])
     assert not refused.successful and 'servo_faults: silent [2]: there are no' in refused.reason
-
-
-def test_faults_are_switched_in_flight_and_reported(sim):
-    node = sim('faults:="mocap_lost"', actuators='direct')
     assert node._robot_status()[0] == base.OK
     node._simulator.step()
     level, text, values = node._robot_status()
@@ -50,21 +43,11 @@ def test_faults_are_switched_in_flight_and_reported(sim):
     assert put(node, faults='mocap_lost; rotor_stops rotor=2').successful
     node._simulator.step()
     assert node._simulator.faults == ['mocap_lost', 'rotor_stops']
-    for text, named in (('rotor_stops', "'rotor' is missing"), ('wings', 'rotor_stops'),
-                        ('controller_nan', 'affects a process')):
-        answer = put(node, faults=text)
-        assert not answer.successful and named in answer.reason
+    answer = put(node, faults='controller_nan')
+    assert not answer.successful and 'affects a process' in answer.reason
     assert node._simulator.faults == ['mocap_lost', 'rotor_stops']
     assert put(node, faults='').successful
     assert node._simulator.faults == []
-
-
-def test_faults_of_device_measurements_are_refused_with_emulated_devices(sim):
-    node = sim()
-    assert put(node, faults='gyroscope_bias x=0.1; rotor_stops rotor=1').successful
-    for text in ('joints_lost', 'battery_unread', 'commands_lost'):
-        answer = put(node, faults=text)
-        assert not answer.successful and 'servo_faults' in answer.reason
 
 
 def test_the_simulator_publishes_simulated_time_only_without_serial_devices(sim):
@@ -73,14 +56,6 @@ def test_the_simulator_publishes_simulated_time_only_without_serial_devices(sim)
     before = node.now()
     ticks = [node._on_timer() or node.now() for _ in range(10)]
     assert np.allclose(np.diff([before, *ticks]), 0.005, rtol=0, atol=1e-6)
-
-
-def test_an_existing_path_is_refused_and_unchanged(sim, tmp_path):
-    servos, taken = tmp_path / 'servos', tmp_path / 'notes.txt'
-    taken.write_text('keep')
-    with pytest.raises(OSError, match=r'notes.txt: cannot be used as a port, it exists'):
-        sim(f'servo_port:={servos}', f'board_port:={taken}')
-    assert taken.read_text() == 'keep' and not os.path.lexists(servos)
 
 
 def test_faults_of_devices_change_in_flight_and_are_in_the_diagnostics(sim, tmp_path):
@@ -98,18 +73,13 @@ def test_faults_of_devices_change_in_flight_and_are_in_the_diagnostics(sim, tmp_
     assert values['armed'] is False and values['torque'] == [False] * 4
     assert put(node, servo_faults__silent=[], board_faults__voltage_sag=0.0).successful
     assert node._devices_status()[0] == base.OK
-    for name, value, text in (('servo_faults__silent', [9], 'servo_faults.silent: no servo has'),
-                              ('board_faults__failed_escs', [5], '5 is outside 1 to 4')):
-        refused = put(node, **{name: value})
-        assert not refused.successful and text in refused.reason
+    refused = put(node, servo_faults__silent=[9])
+    assert not refused.successful and 'servo_faults.silent: no servo has' in refused.reason
     assert node._devices.faults == []
-    for _ in range(2):      # an event happens each time it is set, and resets itself
-        bus.servos[1]['Torque Enable'] = 1
-        assert put(node, servo_faults__reboot=2).successful
-        assert not bus.servos[1].torque
-        assert node.get_parameter('servo_faults.reboot').value == 0
-    for port in (servos, board):
-        assert stat.S_ISCHR(os.stat(port).st_mode)
+    bus.servos[1]['Torque Enable'] = 1
+    assert put(node, servo_faults__reboot=2).successful
+    assert not bus.servos[1].torque
+    assert node.get_parameter('servo_faults.reboot').value == 0     # an event resets itself
     node.destroy_node()
     assert not os.path.lexists(servos) and not os.path.lexists(board)
 

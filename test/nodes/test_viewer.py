@@ -6,48 +6,30 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.control.base import Command, PoseTarget
-from beetle_omni_ros.messages import conversions
 from beetle_omni_ros.messages.values import Odom
-from beetle_omni_ros.nodes import side_nodes
 from beetle_omni_ros.nodes.side_nodes import ViewerNode
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.readings import JointReading
 
 
-class Sent(list):
-    """A publisher that stores its messages."""
-
-    publish = list.append
-    subscribed = 1
-
-    def get_subscription_count(self):
-        return self.subscribed
-
-
 @pytest.fixture
 def viewer(make, monkeypatch):
     node = make(ViewerNode)
-    monkeypatch.setattr(node, '_markers', Sent())
-    monkeypatch.setattr(node, '_transforms', Sent(), raising=False)
+    monkeypatch.setattr(node, '_markers', SimpleNamespace(
+        sent=[], get_subscription_count=lambda: 1))
+    node._markers.publish = node._markers.sent.append
     return node
 
 
 def test_thrust_arrows_point_along_the_tilted_rotors(viewer):
     rotation = rotations.from_rpy(0.4, -0.2, 1.0)
     position, tilt = np.array([1.0, 2.0, 3.0]), np.array([0.0, np.pi / 2, 0.0, -0.3])
-    viewer._draw()
-    assert not viewer._markers              # without any message
     viewer._odom = Odom(5.0, position, np.zeros(3), rotation, np.zeros(3))
     viewer._joints = JointReading(5.0, tilt, np.zeros(4))
     viewer._command = Command(5.0, tilt, np.array([8.0, 4.0, 0.0, 20.0]))
     viewer._target = PoseTarget(position, rotation)
-    viewer._markers.subscribed = viewer._transforms.subscribed = 0
     viewer._draw()
-    viewer._move()
-    assert not viewer._markers and not viewer._transforms
-    viewer._markers.subscribed = 1
-    viewer._draw()
-    markers = {marker.ns: marker for marker in viewer._markers[-1].markers}
+    markers = {marker.ns: marker for marker in viewer._markers.sent[-1].markers}
     assert set(markers) == {'body', 'rotor1', 'rotor2', 'rotor3', 'rotor4', 'target'}
     arrows = np.array([[[p.x, p.y, p.z] for p in markers[f'rotor{k}'].points]
                        for k in (1, 2, 3, 4)])
@@ -58,17 +40,3 @@ def test_thrust_arrows_point_along_the_tilted_rotors(viewer):
     axis = viewer._robot.tilt_axes[1]
     assert thrust[1] == pytest.approx(4 * np.cross(axis, [0, 0, 1]))    # a quarter turn about it
     assert markers['rotor1'].header.frame_id == 'world'
-
-
-def test_the_frame_of_the_body_is_sent_once_for_each_estimate(viewer, monkeypatch):
-    monkeypatch.setattr(side_nodes, 'TFMessage', SimpleNamespace)
-    rotation, position = rotations.from_rpy(0.4, -0.2, 1.0), np.array([1.0, 2.0, 3.0])
-    viewer._odom = Odom(5.0, position, np.zeros(3), rotation, np.zeros(3))
-    viewer._move()
-    viewer._move()
-    (message,) = viewer._transforms
-    (frame,) = message.transforms
-    assert (frame.header.frame_id, frame.child_frame_id) == ('world', 'base_link')
-    assert frame.header.stamp.sec == 5
-    assert conversions.xyz(frame.transform.translation) == pytest.approx(position)
-    assert conversions.xyzw(frame.transform.rotation) == pytest.approx(rotation)

@@ -30,11 +30,9 @@ class Sent(list):
         self._topic = topic
 
     def publish(self, value):
-        """Store a value."""
         self.append(topic_of(self._topic).write(value))
 
     def stamps(self):
-        """Return the stamps of all messages [s]."""
         return np.array([conversions.seconds(message.header.stamp) for message in self])
 
 
@@ -119,20 +117,17 @@ class Bench:
         return node
 
     def publisher(self, kind, topic, profile=wire.profile(EVENT)):
-        """Make a publisher and wait for its subscription."""
         made = self.user.create_publisher(kind, topic, profile)
         assert self.wait(lambda: made.get_subscription_count())
         return made
 
     def wait(self, condition, timeout=20.0):
-        """Spin until a condition holds."""
         end = time.monotonic() + timeout
         while not condition() and time.monotonic() < end:
             self.executor.spin_once(timeout_sec=0.02)
         return condition()
 
     def close(self):
-        """Destroy the nodes."""
         for node in self.nodes:
             self.executor.remove_node(node)
             node.destroy_node()

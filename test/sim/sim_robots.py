@@ -28,7 +28,6 @@ def immovable():
 
 
 def plant(robot=ROBOT, position=HIGH, quaternion=LEVEL, variation=None):
-    """A plant at rest."""
     made = Plant(robot, WORLD.plant, variation)
     made.reset(position, quaternion)
     return made

@@ -36,7 +36,6 @@ def random_states(count, seed):
 
 
 def difference(found, expected):
-    """Relative difference of two accelerations."""
     return np.linalg.norm(found - expected) / np.linalg.norm(expected)
 
 
@@ -73,26 +72,6 @@ def test_modules_given_by_effect_act_as_described_ones():
         without.append(bare - true)
     missed, without = (np.linalg.norm(rows, axis=0) for rows in (missed, without))
     assert (missed < 0.2 * without).all()
-
-
-def held_target(made, state, tilt):
-    """Tilt targets at which no joint accelerates: the response to a target is linear."""
-    rest = made.acceleration(*state, tilt_target=tilt)[6:]
-    response = np.stack([(made.acceleration(*state, tilt_target=tilt + 0.01 * unit)[6:] - rest)
-                         / 0.01 for unit in np.eye(4)], axis=1)
-    return tilt - np.linalg.solve(response, rest)
-
-
-def test_module_reaction_is_how_the_tilting_modules_shift_the_centre_of_mass():
-    effects = {'module_reaction': module_reaction()}
-    made = plant(ROBOT)
-    plain, shifted = (body_acceleration(replace(ROBOT, effects=e)) for e in ({}, effects))
-    for p, q, v, _, tilt, _, thrust in random_states(20, seed=4):
-        state = (p, q, v, np.zeros(3), tilt, np.zeros(4), thrust)
-        found = made.acceleration(*state, tilt_target=held_target(made, state, tilt))
-        without, with_shift = (np.linalg.norm(found[:3] - np.array(
-            model(v, q, np.zeros(3), tilt, thrust)[0]).ravel()) for model in (plain, shifted))
-        assert with_shift < 0.15 * without
 
 
 def test_plant_without_module_inertia_agrees_with_newton_euler():

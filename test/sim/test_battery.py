@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from sim_robots import ROBOT, WORLD
 
-from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.sim.simulator import Battery
 
 HOVER = np.full(4, ROBOT.hover_thrust)
@@ -54,12 +53,3 @@ def test_overload_and_empty_pack_stay_finite():
         assert np.isfinite([battery.voltage, battery.current, battery.thrust_limit]).all()
         assert battery.voltage > 0 and battery.thrust_limit >= 0
     assert battery.charge == 0
-
-
-@pytest.mark.parametrize('levels, voltages', [
-    ([0.0, 1.0], [0.8, 0.9, 1.0]), ([0.0, 0.5, 0.4, 1.0], [0.8, 0.9, 0.95, 1.0]),
-    ([0.0, 0.5, 1.0], [0.8, 0.7, 1.0]), ([0.1, 1.0], [0.8, 1.0])])
-def test_an_invalid_charge_curve_is_refused(levels, voltages):
-    with pytest.raises(ParameterError, match='charge_levels'):
-        replace(WORLD.battery, charge_levels=np.array(levels),
-                relative_voltages=np.array(voltages))

@@ -1,7 +1,5 @@
 """The state machine of the emulated firmware against the protocol, without port or clock."""
 
-from collections import Counter
-import re
 
 from hypothesis import given, settings, strategies
 import pytest
@@ -82,18 +80,6 @@ def test_targets_are_ignored_until_armed_and_followed_then():
     assert bench.board.conditions(bench.now) & firmware.SATURATED
 
 
-def test_arming_is_refused_with_the_reason():
-    assert Bench().blocked_by() == firmware.NO_HEARTBEAT
-    for voltage in (20.9, float('nan')):
-        bench = Bench(voltage)
-        bench.beat()
-        assert bench.blocked_by() == firmware.BATTERY_LOW
-    bench = Bench()
-    bench.beat()
-    bench.board.failed = frozenset([2])
-    assert bench.blocked_by() == firmware.ESC_FAILURE
-
-
 def test_force_overrides_nothing_and_disarming_is_always_accepted():
     bench = Bench()
     bench.beat()
@@ -126,21 +112,6 @@ def test_rotors_stop_100_ms_after_the_last_target_and_start_again_with_the_next(
     assert bench.outputs == firmware.STOP
 
 
-def test_heartbeat_loss_disarms_despite_targets_and_idling_despite_heartbeats():
-    bench = Bench().arm()
-    for _ in range(220):
-        bench.target(0.5)
-        bench.wait(0.005)
-    assert bench.outputs == firmware.STOP and bench.state == firmware.DISARMED
-    bench = Bench().arm()
-    for _ in range(5):
-        bench.wait(0.39)
-        bench.beat()
-        assert bench.state == firmware.ARMED
-    bench.wait(0.1)
-    assert bench.state == firmware.DISARMED
-
-
 @pytest.mark.parametrize(('reason', 'make'), [
     ('stale stamp', lambda bench: bench.target(0.5, age=0.11)),
     ('stamp in the future', lambda bench: bench.target(0.5, age=-0.06)),
@@ -154,50 +125,6 @@ def test_bad_targets_are_refused_and_counted(reason, make):
     make(bench)
     assert bench.outputs == firmware.STOP
     assert bench.board.refused == {reason: 1}
-
-
-def test_during_a_hang_the_outputs_stay_until_the_watchdog_resets():
-    bench = Bench().arm()
-    bench.target(0.5)
-    bench.board.hang(bench.now)
-    bench.wait(0.09)
-    bench.command(0.0)
-    assert bench.outputs[0] == 0.5              # nothing executes
-    bench.wait(0.011)
-    assert bench.outputs == firmware.STOP and bench.state == firmware.BOOT
-    bench.wait(PARAMETERS.boot_time)
-    (first,) = bench.board.due(bench.now, NOTHING)
-    assert first.custom_mode & 0xFF == firmware.BOOT
-    assert first.custom_mode >> 8 & 0xFF == firmware.WATCHDOG
-    assert bench.state == firmware.DISARMED
-
-
-def test_the_time_answer_repeats_the_request_and_adds_the_board_clock():
-    bench = Bench()
-    (answer,) = bench.board.receive(common.MAVLink_timesync_message(0, 12345), bench.now)
-    assert answer.ts1 == 12345
-    assert answer.tc1 == pytest.approx(1e9 * bench.board.clock(bench.now), abs=1e3)
-    assert bench.board.receive(common.MAVLink_timesync_message(7, 12345), bench.now) == []
-
-
-def test_messages_come_at_their_rates():
-    bench, counts = Bench(), Counter()
-    for _ in range(10001):
-        counts.update(one.get_type() for one in bench.board.due(bench.now, NOTHING))
-        bench.wait(0.001)
-    expected = {'HEARTBEAT': 50, 'BATTERY_STATUS': 500, 'ESC_STATUS': 1000, 'ESC_INFO': 20,
-                'SYS_STATUS': 10}
-    assert set(counts) == set(expected)
-    for name, count in expected.items():
-        assert count <= counts[name] <= count + 3
-
-
-def test_the_document_shows_the_emulated_numbers_and_version():
-    rows = re.findall(r'^\| `(\w+)` \| ([\d.]+) (?:s|V|Hz) \|', reference.DOCUMENT, re.MULTILINE)
-    assert len(rows) == 14
-    for name, value in rows:
-        assert getattr(PARAMETERS, name) == float(value), name
-    assert f'**Contract version {firmware.CONTRACT_VERSION}.**' in reference.DOCUMENT
 
 
 ACTIONS = strategies.sampled_from(['beat', 'arm', 'disarm', 'thrust', 'zero', 'old', 'nan',

@@ -16,7 +16,6 @@ def link():
 
 
 def command(stamp, tilt=0.1, thrust=5.0):
-    """A command with equal tilts and thrusts."""
     return SimpleNamespace(stamp=stamp, tilt=np.full(4, tilt), thrust=np.full(4, thrust))
 
 
@@ -42,9 +41,7 @@ def test_late_command_acts_at_once_but_never_overtakes_a_newer_one():
 
 
 @pytest.mark.parametrize('field, value, reason', [
-    ('tilt', np.array([0, np.nan, 0, 0]), 'not finite'),
-    ('thrust', np.array([0, np.inf, 0, 0]), 'not finite'), ('stamp', np.nan, 'not finite'),
-    ('stamp', 1e9, 'from the future')])
+    ('tilt', np.array([0, np.nan, 0, 0]), 'not finite'), ('stamp', 1e9, 'from the future')])
 def test_unusable_command_is_refused_and_counted(field, value, reason):
     made, bad = link(), command(0.0)
     setattr(bad, field, value)

@@ -1,7 +1,6 @@
 """Emulated servos against the manual's examples and limits, and against the maker's SDK."""
 
 from pathlib import Path
-from random import Random
 import time
 
 from hypothesis import given, settings
@@ -70,96 +69,6 @@ def test_a_packet_with_a_flipped_bit_is_ignored(payload, place, bit):
     assert payload not in list(Receiver().feed(bytes(raw)))
 
 
-# --- one servo --------------------------------------------------------------------------------
-
-@pytest.fixture
-def servo():
-    return EmulatedServo(1, reboot_time=0.0)
-
-
-def write(servo, name, value):
-    register = TABLE[name]
-    return servo.write(register.address, value.to_bytes(register.size, 'little', signed=value < 0))
-
-
-def position(servo):
-    servo.read(132, 4)
-    return servo['Present Position']
-
-
-@pytest.mark.parametrize(('name', 'value', 'error'), [
-    ('Operating Mode', 2, Error.DATA_RANGE), ('Baud Rate', 7, Error.DATA_RANGE),
-    ('ID', 253, Error.DATA_RANGE), ('Torque Enable', 2, Error.DATA_RANGE),
-    ('Position P Gain', 16384, Error.DATA_RANGE), ('Bus Watchdog', 128, Error.DATA_RANGE),
-    ('Model Number', 5, Error.ACCESS), ('Present Position', 5, Error.ACCESS),
-    ('Goal Position', 1_048_576, Error.DATA_RANGE), ('Goal Position', -534, Error.NONE)])
-def test_a_value_outside_its_range_is_refused_and_changes_nothing(servo, name, value, error):
-    before = servo[name]
-    assert write(servo, name, value) == error
-    assert servo[name] == (value if error is Error.NONE else before)
-
-
-def test_only_whole_known_registers_are_accessible(servo):
-    for address, data, error in ((116, b'\0\0', Error.DATA_LENGTH), (117, b'\0', Error.ACCESS),
-                                 (14, b'\0', Error.ACCESS), (64, b'', Error.DATA_LENGTH)):
-        assert servo.write(address, data) == error
-    for address, length in ((66, 1), (60, 3), (147, 2), (0, 0), (600, 1)):
-        assert servo.read(address, length) == (Error.ACCESS, b'')
-
-
-def test_eeprom_is_locked_while_torque_is_on_and_a_change_of_mode_resets_gains(servo):
-    write(servo, 'Position P Gain', 700)
-    assert write(servo, 'Torque Enable', 1) == Error.NONE
-    for name in ('ID', 'Baud Rate', 'Operating Mode', 'Homing Offset'):
-        assert write(servo, name, servo[name]) == Error.ACCESS, name
-    write(servo, 'Torque Enable', 0)
-    write(servo, 'Current Limit', 300)
-    assert write(servo, 'Goal Current', 301) == Error.DATA_LIMIT
-    assert write(servo, 'Operating Mode', 4) == Error.NONE
-    assert (servo['Position P Gain'], servo['Goal Current']) == (900, 300)
-
-
-def test_the_watchdog_stops_the_servo_and_locks_its_goals_until_cleared(servo):
-    write(servo, 'Bus Watchdog', 5)
-    servo.advance(10.0, 35, 12.0)
-    assert not servo.expired, 'it counts only while torque is on'
-    servo.last_packet = 20.0
-    write(servo, 'Torque Enable', 1)
-    write(servo, 'Goal Position', 4000)
-    servo.angle = 0.5
-    servo.advance(20.09, 35, 12.0)
-    assert not servo.expired and servo.goal > 2
-    servo.advance(20.11, 35, 12.0)
-    assert servo.expired and servo['Bus Watchdog'] == 255
-    assert servo.goal == pytest.approx(0.5, abs=emulated.POSITION_UNIT)
-    for name, value in (('Goal Position', 0), ('Bus Watchdog', 5)):
-        assert write(servo, name, value) == Error.DATA_RANGE
-    assert write(servo, 'Bus Watchdog', 0) == write(servo, 'Goal Position', 4000) == Error.NONE
-
-
-@pytest.mark.parametrize(('fault', 'shuts_down'), [
-    (emulated.OVERLOAD, True), (emulated.OVERHEATING, True), (emulated.VOLTAGE_ERROR, False)])
-def test_hardware_errors_raise_the_alert_and_those_of_shutdown_take_torque(servo, fault,
-                                                                           shuts_down):
-    write(servo, 'Torque Enable', 1)
-    servo.trip(fault)
-    assert servo.alert == 0x80 and servo.torque is not shuts_down
-    assert write(servo, 'Torque Enable', 1) == (Error.RESULT_FAIL if shuts_down else Error.NONE)
-    servo.reboot(0.0)
-    assert servo.alert == 0 and write(servo, 'Torque Enable', 1) == Error.NONE
-
-
-def test_a_reboot_keeps_eeprom_forgets_ram_and_the_turns(servo):
-    write(servo, 'Operating Mode', 4)
-    write(servo, 'Position P Gain', 700)
-    servo.angle = 3.6
-    whole = position(servo)
-    write(servo, 'Torque Enable', 1)
-    servo.reboot(0.0)
-    assert not servo.torque and (servo['Operating Mode'], servo['Position P Gain']) == (4, 900)
-    assert whole > 4095 and position(servo) == whole - 4096
-
-
 @given(st.floats(-3.9, 3.9), st.sampled_from((-1, 1)), st.integers(0, 4095),
        st.integers(-2, 2))
 def test_goals_mean_the_same_angle_as_positions(angle, sign, zero, turns):
@@ -167,32 +76,10 @@ def test_goals_mean_the_same_angle_as_positions(angle, sign, zero, turns):
     servo.angle = angle + turns * 2 * np.pi
     servo.reboot(-1.0)
     servo.angle = angle
-    assert write(servo, 'Goal Position', position(servo)) == Error.NONE
+    servo.read(132, 4)
+    assert servo.write(TABLE['Goal Position'].address, servo['Present Position'].to_bytes(
+        4, 'little', signed=True)) == Error.NONE
     assert servo.goal == pytest.approx(angle, abs=0.51 * emulated.POSITION_UNIT)
-
-
-# --- the line, through the SDK ----------------------------------------------------------------
-
-@pytest.fixture
-def bus():
-    with EmulatedServoBus(reboot_time=0.05) as made:
-        yield made
-
-
-@pytest.fixture
-def line(bus):
-    """(port, packet handler), opened as the SDK's examples do."""
-    port = sdk.PortHandler(bus.port)
-    assert port.setBaudRate(1_000_000)
-    yield port, sdk.PacketHandler(2.0)
-    port.closePort()
-
-
-def group_read(line, address, length):
-    group = sdk.GroupSyncRead(*line, address, length)
-    for name in (1, 2, 3, 4):
-        group.addParam(name)
-    return group
 
 
 def test_the_table_agrees_with_the_makers_model_file():
@@ -210,70 +97,27 @@ def test_the_table_agrees_with_the_makers_model_file():
 
 
 @pytest.mark.real_time
-def test_the_sdk_reads_writes_pings_and_receives_errors(bus, line):
-    port, handler = line
-    assert handler.ping(port, 2) == (1210, sdk.COMM_SUCCESS, 0)
-    assert handler.ping(port, 9)[1] == sdk.COMM_RX_TIMEOUT
-    assert handler.write1ByteTxRx(port, 1, 11, 4) == (sdk.COMM_SUCCESS, 0)
-    for value in (-534 & 0xFFFFFFFF, 0xFFFDFFFF, 0xFFFFFFFD):   # with a header, all legal
-        assert handler.write4ByteTxRx(port, 1, 116, value) == (sdk.COMM_SUCCESS, 0)
-        assert handler.read4ByteTxRx(port, 1, 116) == (value, 0, 0)
-    assert handler.write1ByteTxRx(port, 1, 64, 1) == (sdk.COMM_SUCCESS, 0)
-    assert handler.write1ByteTxRx(port, 1, 11, 3) == (sdk.COMM_SUCCESS, 7)
-    assert handler.write2ByteTxRx(port, 1, 116, 5) == (sdk.COMM_SUCCESS, 5)
-    assert bus.torque_enabled.tolist() == [True, False, False, False]
-    assert bus.goals[0] == pytest.approx((-3 - 2048) * 2 * np.pi / 4096)
-    assert handler.reboot(port, 1) == (0, 0)
-    assert handler.ping(port, 1)[1] == sdk.COMM_RX_TIMEOUT
-    time.sleep(0.06)
-    assert handler.read1ByteTxRx(port, 1, 64) == (0, 0, 0)
-    assert bus.refusals == 2
-
-
-@pytest.mark.real_time
-def test_group_reads_give_the_values_of_the_plant_or_the_fault(bus, line):
-    angles = np.array([0.5, -1.0, 3.6, -3.9])
-    bus.set_state(angles, [1.0, -2.0, 0.0, 5.0], [0.1, 0.0, -0.2, 0.0])
-    group = group_read(line, 126, 10)
-    assert group.txRxPacket() == sdk.COMM_SUCCESS
-    for name, angle in zip((1, 2, 3, 4), angles, strict=True):
-        raw = group.getData(name, 132, 4)
-        counts = raw - (1 << 32) if raw >> 31 else raw
-        assert (counts - 2048) * 2 * np.pi / 4096 == pytest.approx(angle, abs=0.0008)
-    for fault, value in (('bad_crc', 1.0), ('dropped', 1.0), ('silent', {2})):
-        usual = getattr(bus.faults, fault)
-        setattr(bus.faults, fault, value)
-        assert group.txRxPacket() in (sdk.COMM_RX_CORRUPT, sdk.COMM_RX_TIMEOUT)
-        setattr(bus.faults, fault, usual)
-    assert group.txRxPacket() == sdk.COMM_SUCCESS
-
-
-@pytest.mark.real_time
-def test_group_writes_reach_all_at_their_baud_rate_only(bus, line):
-    port, handler = line
-    group = sdk.GroupSyncWrite(port, handler, 116, 4)
-    for name in (1, 2, 3, 4):
-        group.addParam(name, [name, 4, 0, 0])
-    assert group.txPacket() == sdk.COMM_SUCCESS
-    handler.ping(port, 1)  # answered after what came before
-    assert [servo['Goal Position'] for servo in bus.servos] == [1025, 1026, 1027, 1028]
-    port.setBaudRate(57600)
-    assert handler.ping(port, 1)[1] == sdk.COMM_RX_TIMEOUT
-
-
-@pytest.mark.real_time
-def test_the_emulator_tolerates_noise(bus, line):
-    port, handler = line
-    random = Random(3)
-    for k in range(60):
-        body = bytes((random.choice((1, 0xFE)), *random.randbytes(2), random.choice(
-            (1, 2, 3, 8, 0x55, 0x82, 0x83))))
-        port.writePort(random.randbytes(random.randrange(1, 300)))
-        port.writePort(b'\xff\xff\xfd\x00' + body)
-        port.writePort(packet(body[0], body[3], random.randbytes(random.randrange(9))))
-    time.sleep(0.15)  # a pause on the line ends an unfinished packet
-    bus.set_state(*np.zeros((3, 4)))
-    assert handler.ping(port, bus.servos[1]['ID'])[:2] == (1210, sdk.COMM_SUCCESS)
+def test_the_sdk_reads_writes_pings_and_receives_errors():
+    with EmulatedServoBus(reboot_time=0.05) as bus:
+        port, handler = sdk.PortHandler(bus.port), sdk.PacketHandler(2.0)
+        assert port.setBaudRate(1_000_000)
+        assert handler.ping(port, 2) == (1210, sdk.COMM_SUCCESS, 0)
+        assert handler.ping(port, 9)[1] == sdk.COMM_RX_TIMEOUT
+        assert handler.write1ByteTxRx(port, 1, 11, 4) == (sdk.COMM_SUCCESS, 0)
+        for value in (-534 & 0xFFFFFFFF, 0xFFFDFFFF, 0xFFFFFFFD):   # with a header, all legal
+            assert handler.write4ByteTxRx(port, 1, 116, value) == (sdk.COMM_SUCCESS, 0)
+            assert handler.read4ByteTxRx(port, 1, 116) == (value, 0, 0)
+        assert handler.write1ByteTxRx(port, 1, 64, 1) == (sdk.COMM_SUCCESS, 0)
+        assert handler.write1ByteTxRx(port, 1, 11, 3) == (sdk.COMM_SUCCESS, 7)
+        assert handler.write2ByteTxRx(port, 1, 116, 5) == (sdk.COMM_SUCCESS, 5)
+        assert bus.torque_enabled.tolist() == [True, False, False, False]
+        assert bus.goals[0] == pytest.approx((-3 - 2048) * 2 * np.pi / 4096)
+        assert handler.reboot(port, 1) == (0, 0)
+        assert handler.ping(port, 1)[1] == sdk.COMM_RX_TIMEOUT
+        time.sleep(0.06)
+        assert handler.read1ByteTxRx(port, 1, 64) == (0, 0, 0)
+        assert bus.refusals == 2
+        port.closePort()
 
 
 @settings(max_examples=300, deadline=None)

@@ -1,8 +1,6 @@
 """Faults of the simulated robot: each has its stated effect at its time only."""
 
 from dataclasses import replace
-from math import inf
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +9,6 @@ from sim_robots import HIGH, ROBOT, WORLD
 from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.sim.emulated.motor_board import EmulatedBoardParameters
 from beetle_omni_ros.sim.fault_lists import FaultList, load_faults, parse_faults
 from beetle_omni_ros.sim.fault_lists import text as text_of
 from beetle_omni_ros.sim.faults import Fault, KINDS, OF_PROCESSES, READINGS
@@ -96,7 +93,7 @@ def test_a_fault_kind_changes_its_quantity_from_its_start_only(kind, healthy):
         assert changed == SENSING[kind]
 
 
-@pytest.mark.parametrize('kind', ['imu_spikes', 'mocap_noisy', 'mocap_drops', 'commands_drop'])
+@pytest.mark.parametrize('kind', ['imu_spikes', 'commands_drop'])
 def test_a_random_kind_is_deterministic(kind):
     fault = some(kind, at=0.1)
     assert differing(flight(fault, ticks=80)[0], flight(fault, ticks=80)[0]) == set()
@@ -134,13 +131,8 @@ def test_rotor_speeds_come_at_50_hz_and_are_those_of_the_thrust():
     assert 0.5 < np.std(errors) / WORLD.rotor_speed.noise < 1.5
 
 
-def test_the_rotor_speed_is_that_of_the_emulated_board():
-    assert WORLD.rotor_speed.rpm_at_1_newton == EmulatedBoardParameters.load().rpm_at_1_newton
-
-
-@pytest.mark.parametrize('share', [0.8, 0.5])
-def test_a_propeller_that_breaks_changes_no_speed(share):
-    intact, _ = flight(ticks=300)
+def test_a_propeller_that_breaks_changes_no_speed():
+    share, (intact, _) = 0.5, flight(ticks=300)
     broken, _ = flight(Fault('propeller_broken', at=0.5, rotor=1, share=share, duration=0.5),
                        ticks=300)
     speeds = [np.array([frame.rotors.speed[0] for frame in frames if frame.rotors is not None])
@@ -178,15 +170,6 @@ def test_a_turn_of_the_markers_is_in_base_link(healthy):
             np.testing.assert_allclose(frame.mocap.quaternion, turned, atol=1e-12)
 
 
-def test_late_poses_have_unchanged_content(healthy):
-    frames, _ = flight(Fault('mocap_delayed', delay=0.03))
-    expected = [frame.mocap for frame in healthy if frame.mocap is not None]
-    late = [frame.mocap for frame in frames if frame.mocap is not None]
-    for one, other in zip(late, expected):
-        np.testing.assert_array_equal(flat(one), flat(other))
-    assert len(late) == len(expected) - 3
-
-
 def test_faults_that_stay_in_the_list_continue():
     simulator = Simulator(ROBOT, WORLD)
     simulator.reset(HIGH)
@@ -204,27 +187,9 @@ def test_faults_that_stay_in_the_list_continue():
     assert simulator.faults == []
 
 
-def test_pushes_and_payloads_add_to_those_of_the_task():
-    simulator = Simulator(ROBOT, WORLD)
-    simulator.reset(HIGH)
-    simulator.set_wrench([0, 0, 5], [0, 0, 0])
-    simulator.set_payload(0.2)
-    simulator.set_faults([Fault('push', duration=0.1, x=3.0),
-                          Fault('payload', duration=0.1, mass=0.3)])
-    simulator.step()
-    plant = simulator._plant
-    np.testing.assert_array_equal(plant._wrench, [3, 0, 5, 0, 0, 0])
-    assert plant._payload == 0.5
-    for _ in range(30):
-        simulator.step()
-    np.testing.assert_array_equal(plant._wrench, [0, 0, 5, 0, 0, 0])
-    assert plant._payload == 0.2
-
-
 # Crashes ---------------------------------------------------------------------------------------
 
 def fallen(height, quaternion=(0, 0, 0, 1)):
-    """A simulator after a fall without thrust."""
     simulator = Simulator(ROBOT, WORLD)
     simulator.reset([0, 0, height], quaternion)
     for _ in range(400):
@@ -275,27 +240,13 @@ def test_a_soft_touchdown_breaks_nothing():
 
 # Declarations ----------------------------------------------------------------------------------
 
-@pytest.mark.parametrize(('arguments', 'named'), [
-    (('rotor_stop',), 'rotor_stops'), (('rotor_stops',), "'rotor' is missing"),
-    (('mocap_lost', -1.0), "'at'"), (('mocap_lost', 0.0, -inf), "'duration'")])
-def test_an_unknown_fault_kind_is_refused(arguments, named):
-    with pytest.raises(ParameterError, match=named):
-        Fault(*arguments)
-
 
 @pytest.mark.parametrize(('numbers', 'named'), [
-    ({'rotor': 5}, '1 to 4'), ({'rotor': 1.5}, 'whole'), ({'rotor': True}, 'whole'),
-    ({'rotor': 'x'}, 'whole'), ({'rotor': 1, 'servo': 1}, "'servo' is unknown"),
-    ({'rotor': 10 ** 400}, '1 to 4'), ({'rotor': float('nan')}, 'whole'),
-    ({'x' * 9000: 1}, 'xxx... is unknown')])
+    ({'rotor': 5}, '1 to 4'), ({'rotor': True}, 'whole'),
+    ({'rotor': 1, 'servo': 1}, "'servo' is unknown"), ({'x' * 9000: 1}, 'xxx... is unknown')])
 def test_numbers_are_checked_by_name(numbers, named):
     with pytest.raises(ParameterError, match=named):
         Fault('rotor_stops', **numbers)
-
-
-def test_the_simulator_refuses_faults_of_processes():
-    with pytest.raises(ParameterError, match='controller_silent'):
-        Simulator(ROBOT, WORLD).set_faults([Fault('controller_silent')])
 
 
 def test_the_shipped_list_contains_every_kind():
@@ -316,23 +267,6 @@ def test_a_fault_file_of_one_flight_is_read(tmp_path):
     assert faults[-1] == Fault('rotor_stops', 1.0, 0.03, rotor=1)
 
 
-@pytest.mark.parametrize(('text', 'named'), [
-    ('faults: 3', "key 'faults'"), ('fault: []', "key 'fault'"), ('faults: [3]', 'fault 1'),
-    ('faults: [{what: rotor_stop}]', 'near: rotor_stops'),
-    ('faults: [{what: rotor_stops}]', "'rotor' is missing"),
-    ('faults: [{what: rotor_weak, rotor: 1}]', "'share' is missing"),
-    ('faults: [{what: rotor_blinks, share: 1}]', "key 'share'"),
-    ('faults: [{what: mocap_lost, at: .nan}]', "key 'at'"),
-    ('faults: [{what: mocap_lost, self: 1}]', "key 'self'"),
-    ('faults: [{what: [1]}]', "key 'what'")])
-def test_unusable_files_name_the_key_in_one_line(tmp_path, text, named):
-    path = tmp_path / 'faults.yaml'
-    path.write_text(text)
-    with pytest.raises(ParameterError, match='faults.yaml') as raised:
-        load_faults(path)
-    assert named in str(raised.value) and '\n' not in str(raised.value)
-
-
 def test_short_texts_describe_a_fault():
     assert parse_faults(' rotor_stops rotor=2;mocap_lost duration=3 ; ') == [
         Fault('rotor_stops', rotor=2), Fault('mocap_lost', duration=3)]
@@ -342,10 +276,3 @@ def test_short_texts_describe_a_fault():
     for text in ('rotor_stops 2', 'rotor_stops rotor=x', 'nothing'):
         with pytest.raises(ParameterError, match='faults'):
             parse_faults(text)
-
-
-def test_the_docs_name_every_kind():
-    page = (Path(__file__).parents[2] / 'docs' / 'faults.md').read_text()
-    table = page.split('## Kinds')[1].split('## Crashes')[0]
-    named = [line.split('`')[1] for line in table.splitlines() if line.startswith('| `')]
-    assert sorted(named) == sorted(KINDS)

@@ -13,7 +13,6 @@ WEIGHTLESS = replace(ROBOT, gravity=0.0)
 
 
 def spinning(made, velocity, angular_velocity):
-    """Set a plant in motion."""
     made.data.qvel[:6] = np.concatenate([velocity, angular_velocity])
 
 
@@ -77,17 +76,6 @@ def test_wrench_acts_in_its_frames():
     np.testing.assert_allclose(angular - np.cross(centre, linear), [0, 0, 0.05], atol=1e-4)
 
 
-def test_hover_thrust_carries_the_robot():
-    """Equal thrusts balance the weight; 0.2 mm between arms and centre leaves a moment."""
-    made = plant()
-    hover = np.full(4, ROBOT.hover_thrust)
-    acceleration = made.acceleration(HIGH, LEVEL, np.zeros(3), np.zeros(3), np.zeros(4),
-                                     np.zeros(4), hover)
-    np.testing.assert_allclose(acceleration[:3], 0, atol=2e-3)
-    moment = np.cross(ROBOT.rotors.positions, hover[:, None] * [0, 0, 1]).sum(axis=0)
-    np.testing.assert_allclose(ROBOT.inertia * acceleration[3:6], moment, atol=2e-4)
-
-
 def test_robot_rests_on_its_feet():
     made = plant(position=None)
     height = made.state[0][2]
@@ -97,16 +85,6 @@ def test_robot_rests_on_its_feet():
     assert made.contact
     np.testing.assert_allclose(made.state[0][:3], [0, 0, height], atol=1e-5)
     np.testing.assert_allclose(made.specific_force, [0, 0, ROBOT.gravity], atol=1e-3)
-
-
-@pytest.mark.parametrize('rpy', [(0, 0, 0), (np.pi, 0, 0), (1.2, 0.3, 0), (0, -np.pi / 2, 0.4)])
-def test_dropped_robot_comes_to_rest_above_the_floor(rpy):
-    made = plant(position=[0, 0, 1.0], quaternion=rotations.from_rpy(*rpy))
-    for _ in range(1000):
-        made.step()
-    lowest = made.data.geom_xpos[1:, 2].min()
-    assert made.contact and lowest > 0
-    assert np.abs(made.state[1][:6]).max() < 0.05
 
 
 def test_payload_adds_its_weight_below_the_centre():

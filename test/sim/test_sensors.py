@@ -3,12 +3,10 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from scipy.spatial.transform import Rotation
-from sim_robots import HIGH, LEVEL, ROBOT, WORLD
+from sim_robots import HIGH, ROBOT, WORLD
 
 from beetle_omni_ros.control.base import Command
-from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.sim.parameters import draw
 from beetle_omni_ros.sim.simulator import Simulator
 
@@ -16,7 +14,6 @@ TICK = WORLD.plant.tick
 
 
 def at_rest(conditions='nominal', seconds=20, seed=0):
-    """Frames of a robot that stands on the floor."""
     simulator = Simulator(ROBOT, WORLD, conditions, seed)
     return simulator, [simulator.step() for _ in range(int(seconds / TICK))]
 
@@ -111,26 +108,6 @@ def test_imu_readings_sum_to_the_motion_even_through_jolts():
     assert (attitude.inv() * Rotation.from_quat(frame.truth.quaternion)).magnitude() < 1e-6
 
 
-def test_joints_at_their_rate_limit_have_constant_velocity():
-    """No burst of module inertia in the reading."""
-    quiet = replace(WORLD, imu=replace(WORLD.imu, specific_force_noise=0.0))
-    simulator = Simulator(ROBOT, quiet)
-    simulator.reset(HIGH)
-    slewing = 0
-    for _ in range(60):
-        simulator.command(Command(simulator.time, np.array([3.5, 0, 0, 0]), np.zeros(4)))
-        before = simulator.truth.velocity
-        frame = simulator.step()
-        if frame.truth.tilt_velocity[0] > 0.99 * ROBOT.joints.velocity_limit:
-            slewing += 1
-            acceleration = (frame.truth.velocity - before) / TICK
-            expected = Rotation.from_quat(frame.truth.quaternion).inv().apply(
-                acceleration + [0, 0, ROBOT.gravity])
-            if slewing > 1:
-                np.testing.assert_allclose(frame.imu.specific_force, expected, atol=0.1)
-    assert slewing > 40
-
-
 def test_published_biases_and_noise_come_from_the_table():
     simulator, frames = at_rest('published', seed=5)
     drawn, p = simulator.conditions, WORLD.published
@@ -161,27 +138,3 @@ def test_published_draws_fill_their_ranges():
                            ('tilt_command_delay', {1, 2, 3}),
                            ('thrust_command_delay', {1, 2, 3})]:
         assert {round(getattr(d, name) / tick) for d in drawn} == expected
-
-
-def test_published_imu_stamps_omit_the_latency():
-    quiet = replace(WORLD, imu=replace(WORLD.imu, angular_velocity_noise=0.0),
-                    published=replace(WORLD.published, angular_velocity_noise=0.0,
-                                      angular_velocity_bias=0.0))
-    simulator = Simulator(ROBOT, quiet, 'published', seed=2)
-    simulator.reset(HIGH, LEVEL)
-    simulator.set_wrench(np.zeros(3), [0, 0, 0.3])
-    frames = [simulator.step() for _ in range(40)]
-    late = round(simulator.conditions.imu_latency / TICK)
-    assert late >= 3
-    for now, before, then in zip(frames[late + 1:], frames, frames[1:]):
-        assert now.imu.stamp == now.time
-        mean = (before.truth.angular_velocity + then.truth.angular_velocity) / 2
-        np.testing.assert_allclose(now.imu.angular_velocity, mean, atol=2e-4)
-
-
-@pytest.mark.parametrize('change, key', [
-    ({'mocap': replace(WORLD.mocap, latency=0.008)}, 'mocap.latency'),
-    ({'encoders': replace(WORLD.encoders, latency=0.0033)}, 'encoder latency')])
-def test_latency_between_ticks_is_refused(change, key):
-    with pytest.raises(ParameterError, match=f'{key}: .*multiple of the simulator tick'):
-        Simulator(ROBOT, replace(WORLD, **change))
