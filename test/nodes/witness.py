@@ -19,7 +19,7 @@ BUSY = 0.85         # share of a core above which tests are not valid
 READY = 240     # s; without a cache the controller is compiled first
 # A busy test machine must not cause timeouts; 80 ms leave the supervisor 20 ms
 # before the actuators stop by themselves.
-PATIENT = {'commands': {'timeout': 0.08, 'stale_after': 0.08}}
+PATIENT = {'commands': {'timeout': 0.08}}
 
 
 class Sent(list):
