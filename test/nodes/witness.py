@@ -86,7 +86,8 @@ def running_graph(nodes, folder, domain, *, operator=Witness, ready=lambda one: 
     try:
         graph.start()
         witness = operator(domain)
-        assert witness.wait(lambda: ready(witness), READY), graph.dead()
+        assert witness.wait(lambda: graph.dead() or ready(witness), READY)
+        assert not graph.dead(), graph.dead()
         yield graph, witness
     finally:
         stubborn = graph.stop()
