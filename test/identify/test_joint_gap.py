@@ -152,8 +152,11 @@ def test_friction_of_each_joint_is_measured():
     assert each['2'] == pytest.approx(BANDS[1] * stiffness(), rel=0.15)
 
 
-def test_a_corrected_log_has_no_gap():
-    log = made(1)
+# Other entries take up the gain of the second encoder to less than a count.
+@pytest.mark.parametrize(('seed', 'changed'), [
+    (1, ()), (21, ({'gain': 0.03, 'offset': -0.01}, {'gain': -0.006}))])
+def test_a_corrected_log_has_no_gap(seed, changed):
+    log = made(seed, *changed)
     result = judged(log, SHIPPED)
     assert result['verdict'] in ('named', 'named_set') and result['gap_before'] > 10
     for effect in result['effects']:
