@@ -108,6 +108,19 @@ def test_a_change_is_named_alone(changed, both, name):
     assert result['gap_after'] < 1.15 < result['gap_before']
 
 
+# Other entries take up the gain of the second encoder to less than a count.
+@pytest.mark.parametrize(('seed', 'changed'), [
+    (1, ()), (21, ({'gain': 0.03, 'offset': -0.01}, {'gain': -0.006}))])
+def test_a_corrected_log_has_no_gap(seed, changed):
+    log = made(seed, *changed)
+    result = judged(log, SHIPPED)
+    assert result['verdict'] in ('named', 'named_set') and result['gap_before'] > 10
+    for effect in result['effects']:
+        assert effect['evidence']['delta_bic'] > 0 and effect['evidence']['cv_gain'] > 0
+    again = judged(log, corrected(SHIPPED, result))
+    assert again['verdict'] == 'no_gap' and again['gap_before'] < 1.2
+
+
 def test_changes_between_two_logs_are_reported_with_valid_intervals():
     before, after = made(7), made(8, {'offset': 0.018}, {}, coulomb=0.024)
     rows = changes(before, replace(after, name='after.csv'), SHIPPED)

@@ -16,6 +16,7 @@ from scipy.stats import t
 HUBER = 3.0         # standard deviations from which the loss is linear
 CONVERGED = 1e-4    # decrease of the cost, relative to the number of samples
 WIDTH = 1.96        # standard deviations of a 95 % interval
+SLOWEST = 4         # cosines of slow noise
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,7 @@ class Fit:
         held: (blocks,) chi2 of each block, predicted from the others.
         deviations: (blocks, X) change of x without each block.
         inflation: variance of the gradient over that of independent residuals, >= 1.
-        slow: (X, X) variance of the gradient by its slowest change over each recording.
+        slow: (recordings, SLOWEST, X) slowest changes of the gradient over each recording.
 
     """
 
@@ -111,18 +112,25 @@ class Fit:
 
         The curvature holds for noise inflated by :attr:`inflation`, which is that of short
         memory. Noise that drifts over the whole recording moves some parameters further, as a
-        zero. So each parameter is widened by the mean over the units of its variance by
-        :attr:`slow`, with the quantile of Student's t for as many terms (Lazarus et al. 2018).
+        zero. So each parameter is widened by the mean over the units that have it of its variance
+        by :attr:`slow`, with the quantile of Student's t for as many terms (Lazarus et al. 2018).
         """
-        size, units = len(self.x), len(self.s)
+        size = len(self.x)
         curvature = np.linalg.inv((self.information - np.eye(size)) / self.inflation
                                   + np.eye(size))
         inverse = np.linalg.inv(self.information)
-        slow, own = (np.einsum('upx,xy,upy->up', self.s, c, self.s) for c in (
-            inverse @ (self.slow + np.eye(size)) @ inverse, curvature))
-        ratio = (slow / np.where(own > 0, own, 1.0)).mean(axis=0)
-        ratio *= (t.isf(0.025, units * slowest(units)) / WIDTH)**2
-        widen = np.sqrt(np.maximum(ratio, 1.0)) @ (self.s != 0).any(axis=0)
+        widen = np.ones(size)
+        for p in range(self.s.shape[1]):
+            own = self.s[self.s[:, p].any(axis=1), p]
+            if not len(own):
+                continue
+            # cosines of each recording: at least SLOWEST in all units
+            count = -(-SLOWEST // len(own))
+            waves = own @ inverse @ self.slow[:, :count].reshape(-1, size).T
+            slow = (waves**2).sum(axis=1) / count + ((own @ inverse)**2).sum(axis=1)
+            ratio = (slow / np.einsum('ux,xy,uy->u', own, curvature, own)).mean()
+            ratio *= (t.isf(0.025, len(own) * count) / WIDTH)**2
+            widen[own.any(axis=0)] = np.sqrt(max(ratio, 1.0))
         return curvature * widen[:, None] * widen
 
     def spread(self) -> np.ndarray:
@@ -211,14 +219,13 @@ def _judged(x, s, theta, residuals, slopes, groups, blocks, memory):
         moved = j.T @ (part @ deviations.T) if size else np.zeros((len(r), count))
         for b in range(count):
             held[b] += (robust(r[block == b] + moved[block == b, b])[0]**2).sum()
-    ratio, slow = 1.0, np.zeros((size, size))
+    ratio, slow = 1.0, np.array([_slow(g) for g in series.values()])
     if size:
         inverse = np.linalg.inv(information)
         spread = sum(_long_run(g, memory[group] if isinstance(memory, dict) else memory)
                      for group, g in series.items())
         ratio = np.trace(inverse @ spread) / max(np.trace(inverse @ (information - np.eye(size))),
                                                  1e-9)
-        slow = sum(_slow(g, slowest(len(s))) for g in series.values())
     return Fit(x, s, theta, float(sum(r @ r for r in residuals)), information, held, deviations,
                float(max(ratio, 1.0)), slow)
 
@@ -232,14 +239,8 @@ def _long_run(scores, memory):
     return total
 
 
-def slowest(units: int) -> int:
-    """Number of cosines of each recording, for at least four in all units."""
-    return max(1, -(-4 // units))
-
-
-def _slow(scores, count):
-    """Variance (X, X) of the sum of scores (n, X), by their first cosine transforms."""
+def _slow(scores):
+    """First cosine transforms (SLOWEST, X) of scores (n, X); each squared is a variance."""
     n = len(scores)
-    waves = np.cos(np.pi * np.arange(1, count + 1)[:, None] * (np.arange(n) + 0.5) / n)
-    made = np.sqrt(2 / count) * waves @ scores
-    return made.T @ made
+    waves = np.cos(np.pi * np.arange(1, SLOWEST + 1)[:, None] * (np.arange(n) + 0.5) / n)
+    return np.sqrt(2) * waves @ scores

@@ -204,7 +204,7 @@ def _rivals(found, name):
     for other in (rival for rival in CATALOGUE[name].confused_with
                   if rival in NAMED and rival not in entries and rival in found.trials):
         swapped = s.fit([*(e for e in entries if e != name), other],
-                        starts=(found.trials[other], found.full))
+                        starts=(found.trials[other], found.full), still=found.chosen.still)
         if s.evidence(swapped) > s.evidence(found.chosen) - CERTAIN:
             rivals[other] = s.evidence(swapped)
             found.trials[other] = swapped

@@ -24,6 +24,7 @@ from beetle_omni_ros.identify.servo.model import (
     TERMS,
 )
 from beetle_omni_ros.identify.servo.robot import ENTRIES, LIMITS
+from beetle_omni_ros.robot.effects import CATALOGUE
 
 LOGARITHMIC = np.array([term.logarithmic for term in TERMS.values()])
 STEP = np.where(LOGARITHMIC, 0.01, 2e-4)      # of the derivatives
@@ -56,10 +57,11 @@ def mask(entries: Sequence[str]) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Trial:
-    """A model: the entries that may differ from the base, and their fit."""
+    """A model: the entries that may differ from the base, except at some units, and their fit."""
 
     entries: tuple[str, ...]
     fit: Fit
+    still: np.ndarray       # (U, P) terms of these entries that stay at the base
 
 
 class Servos:
@@ -153,17 +155,22 @@ class Servos:
         self.inflation = trial.fit.inflation
         return trial
 
-    def fit(self, entries: Sequence[str], starts: Sequence = ()) -> Trial:
+    def fit(self, entries: Sequence[str], starts: Sequence = (),
+            still: np.ndarray | None = None) -> Trial:
         """
         Fit the terms of some entries; the others have their base values.
 
         Args:
             entries: names in ``ENTRIES``.
             starts: dictionaries of values, or trials of other entries to start from.
+            still: (U, P) terms of units that stay at the base; none by default.
 
         """
         active = mask(entries)
+        still = np.zeros(self.base.shape, dtype=bool) if still is None else still
         s = design(self.spreads, self.labels, active)
+        s[still] = 0.0
+        s = s[:, :, s.any(axis=(0, 1))]
         fits = []
         for start in starts or STARTS:
             target = self.base.copy()
@@ -178,7 +185,7 @@ class Servos:
             x = self._nearest(s, target)
             fits.append(solve(self, self.base, s, x, self.labels['log'], self._blocks, self.low,
                               HIGH, self.memory))
-        return Trial(tuple(entries), min(fits, key=lambda fit: fit.chi2 + fit.x @ fit.x))
+        return Trial(tuple(entries), min(fits, key=lambda fit: fit.chi2 + fit.x @ fit.x), still)
 
     def evidence(self, trial: Trial) -> float:
         """Logarithm of the evidence [nat] of a trial."""
@@ -268,7 +275,8 @@ def select(servos: Servos, always: Sequence[str], allowed: Sequence[str], least:
         allowed: further entries.
         least: least gain of evidence [nat] of an entry.
         named: whether an entry must also change some joint's fit by an encoder count (RMS) and
-            improve the prediction of left-out blocks in total.
+            improve the prediction of left-out blocks in total. An entry of each joint stays at the
+            base where it does not change the fit.
 
     """
     candidates = [name for name in servos.candidates() if name in {*always, *allowed}]
@@ -289,16 +297,26 @@ def select(servos: Servos, always: Sequence[str], allowed: Sequence[str], least:
         chosen = max(better, key=gain)
     while True:
         without = {name: servos.fit([other for other in chosen.entries if other != name],
-                                    starts=(chosen, full))
+                                    starts=(chosen, full), still=chosen.still)
                    for name in chosen.entries if name not in always}
         useless = [name for name, fewer in without.items() if not worth(chosen, fewer)
                    or named and not servos.visible(chosen, fewer).any()]
-        if not useless:
+        if useless:
+            fewer = without[max(useless, key=lambda name: gain(without[name]))]
+            # The terms that stay were chosen beside the dropped entry.
+            chosen = servos.fit(fewer.entries, (fewer,)) if fewer.still.any() else fewer
+            continue
+        # An entry of each joint is dropped where the others take up its effect, and the others are
+        # fitted again. One entry at a time, because two entries may take up each other's effect.
+        stills = [chosen.still | ~servos.visible(chosen, fewer)[:, None] & mask([name])
+                  for name, fewer in without.items() if named and CATALOGUE[name].each == 'joint']
+        rests = [servos.fit(chosen.entries, (chosen, full), still) for still in stills
+                 if (still != chosen.still).any()]
+        if not rests:
             break
-        name = max(useless, key=lambda name: gain(without[name]))
-        chosen = without[name]
+        chosen = max(rests, key=gain)
     rejected = [name for name in candidates if name not in chosen.entries]
-    trials = without | {name: servos.fit([*chosen.entries, name], starts=(chosen, full))
+    trials = without | {name: servos.fit([*chosen.entries, name], (chosen, full), chosen.still)
                         for name in rejected}
     gains = {name: (gain(chosen) - gain(trial)) * (1 if name in chosen.entries else -1)
              for name, trial in trials.items()}
