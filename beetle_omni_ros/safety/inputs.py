@@ -232,6 +232,8 @@ class Inputs:
             if not good and 'estimator_wrong' not in self.watch.faults:
                 return False
         self.backup.correct(stamp, position, quaternion)
+        if self.airborne and self.imu.silent:
+            self.watch.contact.on_pose(stamp, position, self.height)
         self.mocap.reset()
         return True
 

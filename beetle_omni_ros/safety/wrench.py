@@ -1,5 +1,6 @@
 """Detection of a lost rotor or contact by unexplained forces and torques."""
 
+from collections import deque
 from math import exp, expm1, sqrt
 
 import numpy as np
@@ -38,6 +39,9 @@ AFTER_HIT = 1.0         # [s] after an impact, in which a push at any height is 
 SUPPORT = 0.35          # [-] of the weight; healthy flights near the ground stay below 0.2
 SUPPORT_TIME = 0.15     # [s]
 USUAL = 1.0             # [s] time constant of the learnt steady push in the air
+# Without IMU: change of the velocity that is an impact, three deviations of published MoCap noise
+BUMP = 1.2              # [m/s]
+SPAN, LONGEST_TRACK = 3, 0.12   # poses of either velocity; [s] of both
 
 
 class WrenchWatch:
@@ -191,6 +195,7 @@ class ContactWatch:
     def reset(self) -> None:
         """Begin anew."""
         self._for, self.reason, self._usual, self._since_hit = 0.0, '', 0.0, np.inf
+        self._track: deque = deque(maxlen=2 * SPAN + 1)
 
     def update(self, dt: float, height: float | None, wrench: WrenchWatch) -> None:
         """
@@ -214,3 +219,15 @@ class ContactWatch:
         self._for = self._for + dt if carried else 0.0
         if self._for >= SUPPORT_TIME and not self.reason:
             self.reason = f'{push:.1f} of the weight are carried by something else'
+
+    def on_pose(self, stamp: float, position: np.ndarray, height: float | None) -> None:
+        """Detect an impact by MoCap alone, if there is no IMU; ``height`` as in :meth:`update`."""
+        self._track.append((stamp, position))
+        (t, a), (u, b), (v, c) = self._track[0], self._track[len(self._track) // 2], \
+            self._track[-1]
+        if len(self._track) <= 2 * SPAN or v - t > LONGEST_TRACK or height is None \
+                or height > NEAR_GROUND:
+            return
+        change = (c - b) / (v - u) - (b - a) / (u - t)
+        if (size := sqrt(change.dot(change))) > BUMP:
+            self.reason = f'velocity changed by {size:.1f} m/s at once'
