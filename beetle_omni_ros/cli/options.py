@@ -21,8 +21,8 @@ ControllerOption = Annotated[str, typer.Option(
     '--controller', metavar='NAME', help=f'The active controller: {KNOWN}.')]
 TaskOption = Annotated[str, typer.Option(
     '--task', help='CSV file of poses, or waypoints, randomN (random100), lemniscate, '
-                   'lemniscate_large, hover, force, force_down, force_up, torque, torque_pulses '
-                   'or payload.', metavar='TASK')]
+                   'lemniscate_large, hover, force, force_down, force_up, torque, torque_pulses, '
+                   'wind, pushes, payload or steps.', metavar='TASK')]
 ConditionsOption = Annotated[str, typer.Option(
     '--conditions', metavar='nominal|published',
     help="nominal: the simulator with the measured parameters; published: with the publication's "

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from math import cos, pi, sin
+from math import cos, exp, pi, sin, sqrt
 from pathlib import Path
 import re
 
@@ -43,6 +43,33 @@ PUSHES = {
     'torque_pulses': ('torque', (0, 0, 0, 1, 0, 0), AUTHORS_LEVELS, 0.05, 5.0),
 }
 
+# Task 'wind': a fan blows along x for 10 s at each speed. On the robot at rest in hover, wind u
+# has the force k u + c |u| u. k is the drag of the rotors in their plane (Faessler et al. 2018),
+# and along their axes (Leishman 2006, ch. 2), with the usual values of robot/effects.py. c is 0.5
+# x 1.2 kg/m^3 x 1.05 x 0.029 m^2: drag coefficient of a cube (Hoerner 1965), and the silhouette of
+# the meshes from the side. On the axis of a free round jet, the turbulence is 0.25 of the speed,
+# and its integral length 0.7 half-widths (Pope 2000, ch. 5); a half-width of 0.25 m covers the
+# robot. The spectrum is Dryden's longitudinal one, first-order filtered noise, for all three axes.
+WIND_SPEEDS = (2.0, 3.0, 4.0)  # [m/s]
+WIND_DURATION = 10.0  # [s] of one speed
+WIND_SAMPLE = 0.02  # [s] of constant force
+ROTOR_DRAG = np.array([0.4, 0.4, 1.6])  # [N s/m] k of all rotors, in x, y and z
+BODY_DRAG = 0.018  # [N s^2/m^2] c
+TURBULENCE = 0.25  # [-]
+EDDY = 0.7 * 0.25  # [m] integral length
+
+# Task 'pushes': a stick pushes from four sides, 0.1 m above base_link. The publication states no
+# size. This impulse makes mean speeds of its order.
+PUSH_FORCE = 10.0  # [N]
+PUSH_DURATION = 0.1  # [s]
+PUSH_HEIGHT = 0.1  # [m]
+PUSH_PERIOD = 5.0  # [s]
+PUSH_SIDES = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
+
+# Task 'steps': each axis steps alone from the hover and back. The steps are those of the set
+# points in the authors' code (`SetPointTraj`).
+STEPS = np.array([0.3, 0.2, 0.5, *np.degrees([0.5, 0.5, 0.3])])  # [m], [deg]
+
 # The 3D lemniscate of the publication: a figure of eight with varying height and attitude. With
 # the phase phi, one round of which is 2 pi, and theta = phi + pi / 2:
 #   x = A cos(theta),  y = A sin(2 theta) / 2,  z = H + C sin(2 theta + pi / 2)
@@ -62,7 +89,9 @@ RAMP = 4.0  # [s] from rest to full speed
 DURATION = 2 * RAMP + ROUNDS * PERIOD  # [s]
 SAMPLE_PERIOD = 0.02  # [s] between the samples of the published trajectory
 
-NAMES = ('waypoints', 'random100', *TILTS, 'hover', *PUSHES, 'payload')
+NAMES = ('waypoints', 'random100', *TILTS, 'hover', *PUSHES, 'wind', 'pushes', 'payload',
+         'steps')
+WITH_WRENCHES = ('force', 'torque', 'wind', 'pushes')  # kinds of tasks
 
 
 @dataclass(frozen=True)
@@ -76,7 +105,8 @@ class Segment:
         force_world: (3,) external force in world [N].
         torque_body: (3,) external torque in base_link [N m].
         payload: mass attached below the body [kg].
-        level: disturbance level of this segment [N, N m or kg], 0 for none.
+        level: disturbance level of this segment [N, N m, m/s or kg] or number of a push, 0 for
+            none.
 
     """
 
@@ -95,7 +125,8 @@ class Task:
 
     Attributes:
         name: name or file given by the user.
-        kind: 'poses', 'trajectory', 'hover', 'force', 'torque' or 'payload'.
+        kind: 'poses', 'trajectory', 'hover', 'force', 'torque', 'wind', 'pushes', 'payload' or
+            'steps'; it decides the metrics.
         segments: segments in order.
         poses: (P, 6) pose targets in order: x, y, z [m], roll, pitch, yaw [deg].
         rounds: (start, end) of each round of a trajectory, since the task's start [s].
@@ -243,6 +274,13 @@ def make_task(name: str | Path, seed: int = 0, reach: float = np.inf) -> Task:
         return Task(name, name, tuple(
             Segment(POSE_DURATION, _builder(HOVER), payload=mass, level=mass)
             for mass in PAYLOADS), np.tile(HOVER, (len(PAYLOADS), 1)))
+    if name == 'steps':
+        poses = np.vstack([HOVER, *(pose for step in np.diag(STEPS)
+                                    for pose in (HOVER + step, HOVER))])
+        return _pose_task(name, poses, kind=name)
+    if name in ('wind', 'pushes'):
+        disturbed = _wind(np.random.default_rng(seed)) if name == 'wind' else _stick()
+        return Task(name, name, (Segment(POSE_DURATION, _builder(HOVER)), *disturbed), HOVER[None])
     if name in PUSHES:
         kind, direction, levels, push, rest = PUSHES[name]
         segments = [segment for level in levels for segment in (
@@ -274,13 +312,36 @@ def _push(duration, wrench, level=0.0):
     return Segment(duration, force_world=wrench[:3], torque_body=wrench[3:], level=level)
 
 
+def _wind(rng):
+    """Segments of a fan."""
+    for speed in WIND_SPEEDS:
+        count = round(WIND_DURATION / WIND_SAMPLE)
+        kept = exp(-WIND_SAMPLE * speed / EDDY)
+        gusts = TURBULENCE * speed * rng.standard_normal((count, 3))
+        for k in range(1, count):
+            gusts[k] = kept * gusts[k - 1] + sqrt(1 - kept ** 2) * gusts[k]
+        for gust in gusts:
+            wind = gust + [speed, 0, 0]
+            force = ROTOR_DRAG * wind + BODY_DRAG * np.linalg.norm(wind) * wind
+            yield _push(WIND_SAMPLE, np.concatenate([force, np.zeros(3)]), speed)
+
+
+def _stick():
+    """Segments of stick pushes."""
+    for k, side in enumerate(PUSH_SIDES):
+        force = PUSH_FORCE * side
+        torque = np.cross([0, 0, PUSH_HEIGHT], force)
+        yield _push(PUSH_DURATION, np.concatenate([force, torque]), k + 1)
+        yield Segment(PUSH_PERIOD - PUSH_DURATION, level=k + 1)
+
+
 def _builder(pose):
     return lambda start: pose_target(pose, start)
 
 
-def _pose_task(name, poses):
+def _pose_task(name, poses, kind='poses'):
     segments = tuple(Segment(POSE_DURATION, _builder(pose)) for pose in poses)
-    return Task(name, 'poses', segments, poses)
+    return Task(name, kind, segments, poses)
 
 
 def _lemniscate_task(name):

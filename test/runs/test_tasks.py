@@ -100,6 +100,34 @@ def test_each_level_has_the_impulse_of_its_protocol(name, axis, levels, seconds,
     assert times[-1] == pytest.approx(8 + len(levels) * period, abs=0.01)
 
 
+def test_the_wind_has_the_stated_mean_intensity_and_length_and_follows_the_seed():
+    shares, (times, first) = [], _played(make_task('wind', 0), 0.02)
+    for seed in range(12):
+        again = _played(make_task('wind', seed), 0.02)[1]
+        assert np.array_equal(first, again) == (seed == 0)
+        for k, speed in enumerate((2, 3, 4)):
+            force = again[(times > 7.999 + 10 * k) & (times < 17.999 + 10 * k)]
+            drag = 0.4 * speed + 0.018 * speed ** 2
+            # The vertical force is nearly linear in the gust.
+            lift = force[:, 2] / (1.6 + 0.018 * speed)
+            lag = 0.7 * 0.25 / speed
+            near, far = int(lag / 0.02), int(lag / 0.02) + 1
+            correlation = [np.corrcoef(lift[:-n], lift[n:])[0, 1] for n in (near, far)]
+            shares.append([force[:, 0].mean() / drag, lift.std() / (0.25 * speed),
+                           np.interp(lag, [0.02 * near, 0.02 * far], correlation)])
+            assert not force[:, 3:].any()
+    assert np.mean(shares, axis=0) == pytest.approx([1, 1, np.exp(-1)], abs=0.06)
+
+
+def test_stick_pushes_come_from_four_sides_above_the_centre():
+    times, wrenches = _played(make_task('pushes'))
+    impulses = np.array([wrenches[(times > 7.999 + 5 * k) & (times < 12.999 + 5 * k)].sum(axis=0)
+                         for k in range(4)]) * 0.005
+    assert np.linalg.norm(impulses[:, :3], axis=1) == pytest.approx(1.0)
+    assert impulses.sum(axis=0) == pytest.approx(0.0, abs=1e-9)
+    assert impulses[:, 3:] == pytest.approx(np.cross([0, 0, 0.1], impulses[:, :3]))
+
+
 @pytest.mark.parametrize(('recovers_at', 'lost'), [(9.5, None), (20.0, 2.5)])
 def test_a_robot_turned_over_may_recover_until_the_next_level(recovers_at, lost):
     task = make_task('torque')
