@@ -35,7 +35,7 @@ WAYPOINT_ROUNDS = 3
 # push and of the rest after it [s]. The first two are those of the published figure, which rise
 # without a return to rest. The others are the protocol of the authors, with a rest.
 AUTHORS_LEVELS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
-PUSHES = {
+RISING = {
     'force': ('force', (0, 0, 1, 0, 0, 0), tuple(np.arange(10.0, 101.0, 10.0)), 2.0, 0.0),
     'torque': ('torque', (0, 0, 0, 1, 0, 0), tuple(np.arange(2.5, 30.1, 2.5)), 0.05, 1.95),
     'force_down': ('force', (0, 0, -1, 0, 0, 0), AUTHORS_LEVELS, 2.0, 2.0),
@@ -89,7 +89,7 @@ RAMP = 4.0  # [s] from rest to full speed
 DURATION = 2 * RAMP + ROUNDS * PERIOD  # [s]
 SAMPLE_PERIOD = 0.02  # [s] between the samples of the published trajectory
 
-NAMES = ('waypoints', 'random100', *TILTS, 'hover', *PUSHES, 'wind', 'pushes', 'payload',
+NAMES = ('waypoints', 'random100', *TILTS, 'hover', *RISING, 'wind', 'pushes', 'payload',
          'steps')
 WITH_WRENCHES = ('force', 'torque', 'wind', 'pushes')  # kinds of tasks
 
@@ -281,8 +281,8 @@ def make_task(name: str | Path, seed: int = 0, reach: float = np.inf) -> Task:
     if name in ('wind', 'pushes'):
         disturbed = _wind(np.random.default_rng(seed)) if name == 'wind' else _stick()
         return Task(name, name, (Segment(POSE_DURATION, _builder(HOVER)), *disturbed), HOVER[None])
-    if name in PUSHES:
-        kind, direction, levels, push, rest = PUSHES[name]
+    if name in RISING:
+        kind, direction, levels, push, rest = RISING[name]
         segments = [segment for level in levels for segment in (
             _push(push, level * np.array(direction), level), Segment(rest, level=level))
             if segment.duration]
@@ -307,7 +307,7 @@ def pose_target(pose: np.ndarray, stamp: float = 0.0) -> PoseTarget:
                       rotations.from_rpy(*np.radians(pose[3:])), stamp)
 
 
-def _push(duration, wrench, level=0.0):
+def _push(duration, wrench, level):
     """Segment with a wrench (6,): force in world [N], torque in base_link [N m]."""
     return Segment(duration, force_world=wrench[:3], torque_body=wrench[3:], level=level)
 
