@@ -22,7 +22,7 @@ from beetle_omni_ros.identify.servo.log import HEADER, is_bag, read_joint_log
 from beetle_omni_ros.identify.servo.model import INDEX
 from beetle_omni_ros.identify.servo.robot import catalogue_values, JOINTS, own_delay
 from beetle_omni_ros.robot.effects import CATALOGUE, settings
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.parameters import RobotParameters, TILT_LAG
 from beetle_omni_ros.runs.files import LogError
 
 MILLI = 1e3
@@ -32,8 +32,8 @@ GAINS = 'natural_frequency', 'damping_ratio'
 HEAD = """\
 # The robot as its logs show it; `provenance` has command, logs and the origin of each value, and
 # `intervals` the 95 % intervals [lowest, highest]. Lists are of gimbal1 to gimbal4. Units: kp
-# [N m/rad], kd [N m s/rad], coulomb and stiction [N m], gap, sine and cosine [rad], delay and
-# time_constant [s], torque_to_thrust_ratio [m]. A row of the map is as in robot.yaml.
+# [N m/rad], kd [N m s/rad], coulomb and stiction [N m], gap, sine and cosine [rad], delay,
+# tilt_lag and time_constant [s], torque_to_thrust_ratio [m]. A row of the map is as in robot.yaml.
 """
 
 
@@ -118,6 +118,14 @@ def servo_values(found: Found, robot: RobotParameters) -> tuple[dict, dict, dict
             effects[entry][name] = _plain(value)
             intervals[key] = [_plain(low), _plain(high)]
             origin[key] = how
+    if effects.keys() >= {'joint_bandwidth', 'joint_command_latency'}:
+        lags = [other['joint_bandwidth']['kd'] / other['joint_bandwidth']['kp']
+                + other['joint_command_latency']['delay'] for other in (best, *others)]
+        low, *_, high = np.percentile(np.concatenate(lags[1:], axis=1), TAILS, axis=1)
+        low, high = np.minimum(low, lags[0][:, 0]), np.maximum(high, lags[0][:, 0])
+        intervals[TILT_LAG] = [_plain(low), _plain(high)]
+        origin[TILT_LAG] = how | {'how': 'Kd / Kp plus delay [s]; the logs determine the sum '
+                                         'better than its parts'}
     if 'joint_offset' in found.chosen.entries:
         zeros = MILLI * found.values()[:, INDEX['offset']]
         origin['not written: joint_offset'] = how | {

@@ -23,6 +23,8 @@ CLOSE = 5e-4        # [m] within which a described part agrees with the totals; 
 MISSING = 0.1       # [1] of the inertia that a described main body may lack; 0.07 as shipped
 JOINT_NAMES = ('gimbal1', 'gimbal2', 'gimbal3', 'gimbal4')
 ROTOR_NAMES = ('rotor1', 'rotor2', 'rotor3', 'rotor4')
+TILT_LAG = 'tilt_lag'   # interval of a property; the logs determine it better than its parts
+DRAWS = 100             # of a robot with such a lag
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -252,14 +254,36 @@ class RobotParameters:
         A robot with measured values drawn from their intervals, positive ones by ratio.
 
         The values of one joint have one place in their intervals: logs determine their ratios, the
-        lag Kd / Kp and the angle at which friction holds, better than the values.
+        lag Kd / Kp and the angle at which friction holds, better than the values. Places whose
+        ``tilt_lag`` is outside its interval contradict the logs and are drawn again.
+
+        Raises:
+            ParameterError: no place has a ``tilt_lag`` inside its interval.
+
         """
-        place, drawn = rng.random(4), {}
-        for key, (low, high) in self.intervals.items():
-            share = place if np.shape(low) == (4,) else rng.random(np.shape(low))
-            value = (low * (high / low)**share if np.all(low > 0) else low + (high - low) * share)
-            drawn[key] = value if np.ndim(value) else float(value)
-        nested = schema.nest(drawn)
+        each, shared = ({key: pair for key, pair in self.intervals.items()
+                         if key != TILT_LAG and (np.shape(pair[0]) == (4,)) == joint}
+                        for joint in (True, False))
+        low, high = self.intervals.get(TILT_LAG, (-np.inf, np.inf))
+        for _ in range(DRAWS):
+            drawn = {key: _between(*pair, rng.random(np.shape(pair[0])))
+                     for key, pair in shared.items()}
+            places = rng.random((DRAWS, 4))
+            made = {key: _between(*pair, places) for key, pair in each.items()}
+            kp, kd = (made.get(f'effects.joint_bandwidth.{name}', getattr(self.joints, name))
+                      for name in ('kp', 'kd'))
+            lag = kd / kp + drawn.get('effects.joint_command_latency.delay',
+                                      self.command_delays[0])
+            fits = np.broadcast_to((low <= lag) & (lag <= high), places.shape)
+            if fits.any(axis=0).all():
+                break
+        else:
+            raise ParameterError(f"key 'intervals.{TILT_LAG}': no values of the other intervals "
+                                 f'have such a lag, {np.mean([low, high], axis=0).tolist()} s')
+        first = fits.argmax(axis=0), range(4)
+        drawn |= {key: value[first] for key, value in made.items()}
+        nested = schema.nest({key: value if np.ndim(value) else float(value)
+                              for key, value in drawn.items()})
         effects = nested.pop('effects', {})
         own = {name: replace(getattr(self, name), **value) if isinstance(value, dict) else value
                for name, value in nested.items()}
@@ -332,6 +356,11 @@ class RobotParameters:
     def command_delays(self) -> tuple[float, float]:
         """Delays of tilt and of thrust commands [s] by the effects."""
         return catalogue.command_delays(self.effects)
+
+    @property
+    def tilt_lag(self) -> np.ndarray:
+        """(4,) lag of the joints behind a ramp [s], by damping and by the effects' delays."""
+        return self.joints.kd / self.joints.kp + self.command_delays[0] + np.zeros(4)
 
     @property
     def sensors(self) -> catalogue.SensorErrors:
@@ -407,8 +436,10 @@ def _extended(base: Path, below: dict, path: Path, content: dict) -> dict:
     """
     rotors = content.get('rotors')
     if 'intervals' in below:    # those of values that the file replaces do not hold for it
+        moved = {'effects', 'joints'} & set(content)
         below = below | {'intervals': {key: pair for key, pair in below['intervals'].items()
-                                       if not _states(content, key.split('.'))}}
+                                       if not _states(content, key.split('.'))
+                                       and not (key == TILT_LAG and moved)}}
     merged, own = _overlaid(below, content), content.get('multibody', {})
     moves = {'mass', 'multibody'} & set(content) or (
         isinstance(rotors, dict) and 'positions' in rotors)
@@ -437,6 +468,12 @@ def _unchecked(multibody: dict, own: dict) -> dict:
     if isinstance(module, dict) and not (isinstance(stated, dict) and 'joint_offset' in stated):
         kept['module'] = {key: value for key, value in module.items() if key != 'joint_offset'}
     return kept
+
+
+def _between(low, high, share):
+    """Value at a share of an interval, of a positive one by ratio."""
+    low, high = np.array(low), np.array(high)
+    return low * (high / low)**share if np.all(low > 0) else low + (high - low) * share
 
 
 @contextmanager

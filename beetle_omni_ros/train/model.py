@@ -14,7 +14,6 @@ import casadi as ca
 import numpy as np
 
 from beetle_omni_ros.robot import dynamics as model
-from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.servo import CASADI, SLIDING_RATE, Step
 
@@ -50,33 +49,18 @@ def nominal_body(robot: RobotParameters) -> list[float]:
     return [effects.get('mass', {}).get('mass', robot.mass),
             *effects.get('inertia', {}).get('inertia', tuple(robot.inertia)),
             *effects.get('centre_of_mass', {}).get('offset', (0.0, 0.0, 0.0)),
-            *actuator_intervals(replace(robot, intervals={}))[0]]
+            *actuators(robot)]
 
 
-def actuator_intervals(robot: RobotParameters) -> np.ndarray:
-    """(2, 21) lowest and highest measured values of the quantities ``ACTUATORS``."""
-    def joints(effect, name, otherwise=(0.0, 0.0)):
-        pair = robot.interval(f'effects.{effect}.{name}') if effect in robot.effects else otherwise
-        return [np.broadcast_to(bound, 4) for bound in pair]
-
-    return np.hstack([
-        joints('joint_bandwidth', 'kp', robot.interval('joints.kp')),
-        joints('joint_bandwidth', 'kd', robot.interval('joints.kd')),
-        joints('joint_friction', 'coulomb'), joints('joint_friction', 'stiction'),
-        joints('joint_backlash', 'gap'),
-        np.reshape(robot.interval('effects.rotor_lag.time_constant'
-                                  if 'rotor_lag' in robot.effects else 'rotors.time_constant'),
-                   (2, 1))])
-
-
-def delay_intervals(robot: RobotParameters) -> np.ndarray:
-    """(2, 2) shortest and longest measured delays of tilt and of thrust commands [s]."""
-    total = np.zeros((2, 2))
-    for name in robot.effects:
-        for k, what in enumerate(('tilt', 'thrust')):
-            if what in CATALOGUE[name].delays:
-                total[:, k] += robot.interval(f'effects.{name}.delay')
-    return total
+def actuators(robot: RobotParameters) -> np.ndarray:
+    """(21,) quantities ``ACTUATORS`` of a robot."""
+    effects = robot.effects
+    friction = effects.get('joint_friction', {'coulomb': 0.0, 'stiction': 0.0})
+    play = effects.get('joint_backlash', {'gap': 0.0})
+    gains = effects.get('joint_bandwidth', {'kp': robot.joints.kp, 'kd': robot.joints.kd})
+    joints = (gains['kp'], gains['kd'], friction['coulomb'], friction['stiction'], play['gap'])
+    lag = effects.get('rotor_lag', {}).get('time_constant', robot.rotors.time_constant)
+    return np.hstack([*(np.broadcast_to(value, 4) for value in joints), lag])
 
 
 def _servos(robot, x, target, h, body):

@@ -15,15 +15,11 @@ from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.train import batch
-from beetle_omni_ros.train.model import (
-    actuator_intervals,
-    ACTUATORS,
-    delay_intervals,
-    nominal_body,
-)
+from beetle_omni_ros.train.model import actuators, nominal_body
 from beetle_omni_ros.train.parameters import STRATA, TrainParameters
 
 NEAR_POSITION, NEAR_ANGLE = 0.3, 0.6   # [m], [rad] of a target near the present pose
+DRAWN = 2048    # robots from the measured intervals, of which the robots of the training are made
 HISTORY = 2     # stored periods of commands and tilts
 LEAST = 0.2     # smallest drawn quantity of an actuator, as a fraction of the smallest measured
 PAYLOAD_DEPTH = 0.08                   # [m] below base_link, as in the simulated plant
@@ -87,9 +83,11 @@ class Starts:
         self._longest_delay = HISTORY * parameters.episode.period
         self._spread = [float(share) for share in r.actuator_spread]
         measured = RobotParameters.load(r.actuators)
-        self._nominal = tensor([*nominal_body(robot)[ACTUATORS], *robot.command_delays])
-        self._measured = tensor(np.hstack([actuator_intervals(measured),
-                                           delay_intervals(measured)]))
+        self._nominal = tensor([*actuators(robot), *robot.command_delays])
+        rng = np.random.default_rng(parameters.seed)
+        self._drawn = tensor([[*actuators(one), *one.command_delays] for one in (
+            measured.drawn(rng) for _ in range(DRAWN))])
+        self._least = LEAST * torch.minimum(self._drawn.min(0).values, self._nominal)
         self._thrust_limit = [float(t) for t in r.thrust_limit]
 
     def draw(self, d: batch.Draw) -> dict[str, torch.Tensor]:
@@ -154,16 +152,13 @@ class Starts:
         """
         Quantities of servos and rotors (N, 21), and delays by effects beyond the nominal (N, 2).
 
-        A robot lies on the line from the nominal one to one that is drawn from the measured
+        A robot lies on the line from the nominal one to one of the robots drawn from the measured
         intervals, also somewhat beyond both; with one place for its servos, one for its rotors.
         """
-        low, high = self._measured
-        count = low.shape[0]
-        drawn = low + (high - low) * d.uniform(count)
+        drawn = self._drawn[(d.uniform(1)[:, 0] * len(self._drawn)).long()]
         servo, rotor = d.uniform(2, *self._spread).split(1, -1)
-        share = torch.cat((servo.expand(-1, count - 3), rotor, servo, rotor), -1)
-        made = torch.maximum(self._nominal + share * (drawn - self._nominal),
-                             LEAST * torch.minimum(low, self._nominal))
+        share = torch.cat((servo.expand(-1, drawn.shape[1] - 3), rotor, servo, rotor), -1)
+        made = torch.maximum(self._nominal + share * (drawn - self._nominal), self._least)
         return made[:, :-2], made[:, -2:] - self._nominal[-2:]
 
     def _randomisation(self, d):

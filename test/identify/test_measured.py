@@ -51,6 +51,8 @@ def test_the_intervals_hold_the_true_robot(made):
         'effects.joint_friction.coulomb': [
             one['coulomb'] * k for one, k in zip(TRUE, kp, strict=True)],
         'effects.joint_command_latency.delay': TRUE[0]['delay'] - own_delay(),
+        'tilt_lag': [2 * one['damping'] / one['frequency'] + one['delay'] - own_delay()
+                     for one in TRUE],
         'rotors.torque_to_thrust_ratio': RATIO}
     assert set(truth) | {'rotors.time_constant', 'effects.joint_friction.stiction'} \
         == set(robot.intervals)

@@ -1,5 +1,6 @@
 """The robot file: its consistency, and refusals."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -141,6 +142,20 @@ def test_a_drawn_robot_lies_in_the_intervals_of_the_file(tmp_path):
     assert 0.03 <= lags.min() < 0.035 and 0.065 < lags.max() <= 0.07
     assert {each.mass for each in drawn} == {robot.mass}
     assert robot.interval('mass') == (robot.mass, robot.mass)
+
+
+def test_a_drawn_robot_has_the_lag_that_the_logs_determine():
+    robot = RobotParameters.load('measured')
+    low, high = robot.interval('tilt_lag')
+    drawn = np.array([robot.drawn(np.random.default_rng(seed)).tilt_lag for seed in range(50)])
+    assert np.all((low <= drawn) & (drawn <= high))
+    free = replace(robot, intervals={
+        key: pair for key, pair in robot.intervals.items() if key != 'tilt_lag'})
+    lags = np.array([free.drawn(np.random.default_rng(seed)).tilt_lag for seed in range(50)])
+    assert np.mean((low <= lags) & (lags <= high)) < 0.9       # the other intervals allow more
+    impossible = replace(robot, intervals=robot.intervals | {'tilt_lag': (low / 10, low / 5)})
+    with pytest.raises(ParameterError, match='tilt_lag'):
+        impossible.drawn(np.random.default_rng(0))
 
 
 def test_an_interval_belongs_to_the_value_of_its_file(tmp_path):

@@ -10,13 +10,13 @@ from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.train.batch import Draw
 from beetle_omni_ros.train.model import (
-    actuator_intervals,
     ACTUATORS,
+    actuators,
     LAG,
     nominal_body,
     STIFFNESS,
 )
-from beetle_omni_ros.train.starts import Starts, STRATA
+from beetle_omni_ros.train.starts import DRAWN, Starts, STRATA
 
 PERIOD = 0.01
 
@@ -111,21 +111,20 @@ def test_severity_scales_forces_and_payloads_of_new_robots():
     assert (full['body'][:, 6] <= 0).all()     # it hangs below
 
 
-def test_drawn_actuators_lie_between_the_nominal_robot_and_the_measured_intervals():
-    low, high = (torch.tensor(each).float()
-                 for each in actuator_intervals(RobotParameters.load('measured')))
-    nominal = torch.tensor(nominal_body(ROBOT))[ACTUATORS].float()
+def test_drawn_actuators_are_those_of_robots_that_the_robot_file_draws():
+    rng, file = np.random.default_rng(0), RobotParameters.load('measured')
+    drawn = torch.tensor(np.array([actuators(file.drawn(rng)) for _ in range(DRAWN)])).float()
+    low, high = drawn.min(0).values, drawn.max(0).values
+    nominal = torch.tensor(actuators(ROBOT)).float()
     measured = quiet({'random.actuator_spread': [1.0, 1.0]}, robots=2000)
     body, later = measured.state['body'][:, ACTUATORS], measured.state['delays'][:, :2] - 0.01
-    assert ((low - 1e-6 <= body) & (body <= high + 1e-6)).all()
-    middle = 0.5 * (low + high)
-    torch.testing.assert_close(body.mean(0), middle, rtol=0.05, atol=1e-4)
+    distance = torch.cdist(body, drawn, compute_mode='donot_use_mm_for_euclid_dist')
+    assert distance.min(1).values.max() < 1e-6
+    torch.testing.assert_close(body.mean(0), drawn.mean(0), rtol=0.05, atol=1e-4)
+    lag = body[:, 4:8] / body[:, :4] + later[:, :1]
+    bounds = torch.tensor(np.array(file.interval('tilt_lag'))).float()
+    assert ((bounds[0] - 1e-5 <= lag) & (lag <= bounds[1] + 1e-5)).all()
     assert later.min() >= -1e-6 and later[:, 0].max() > 0.004 and not later[:, 1].any()
-    # as the robot file draws its robots
-    drawn = [nominal_body(RobotParameters.load('measured').drawn(np.random.default_rng(seed)))
-             for seed in range(20)]
-    drawn = torch.tensor(drawn).float()[:, ACTUATORS]
-    assert ((low - 1e-6 <= drawn) & (drawn <= high + 1e-6)).all()
     between = quiet({'random.actuator_spread': [0.0, 1.0]}, robots=2000)
     for part in (STIFFNESS, LAG):
         place = between.state['body'][:, part]
