@@ -142,7 +142,7 @@ class ControllerEntry:
 
     def completed(self, mapping: dict, from_user: bool) -> dict:
         """Values of a parameter file and of ``fixed``; a user's file takes precedence."""
-        return {**self.fixed, **mapping} if from_user else {**mapping, **self.fixed}
+        return _merged(self.fixed, mapping) if from_user else _merged(mapping, self.fixed)
 
     def load_parameters(self, options: ControllerOptions = ControllerOptions()):
         """
@@ -241,6 +241,12 @@ class ControllerEntry:
                                  'target [m], above 0')
 
 
+def _merged(low: Mapping[str, Any], high: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested values of both, those of ``high`` where both have one."""
+    return {**low, **{key: _merged(low[key], value) if key in low and isinstance(value, Mapping)
+                      else value for key, value in high.items()}}
+
+
 # Line styles: blue for RL and red for NMPC as in the publication. The variants are lighter and
 # dashed, so that readers who cannot distinguish the colours can also read the figures.
 _NMPC = 'beetle_omni_ros.control.nmpc:NmpcController'
@@ -265,8 +271,20 @@ SHIPPED: Mapping[str, ControllerEntry] = {entry.name: entry for entry in (
         description='the learned policy with the estimated disturbance as input',
         controller=_POLICY, parameters_file='params/rl.yaml',
         policy_file='policies/rl_memory.onnx', fixed={'policy': 'policies/rl_memory.onnx'},
-        guidance='unwinding, routing, turning, trimming', compared=True, cost=0.08,
+        guidance='unwinding, routing, turning, trimming', cost=0.08,
         line=Line('#58b4e8', (0, (5, 1.6)), 's')),
+    ControllerEntry(
+        name='rl_published', label='RL, published training',
+        description='params/train_published.yaml, without guidance', controller=_POLICY,
+        parameters_file='params/rl.yaml', policy_file='policies/rl_published.onnx',
+        fixed={'policy': 'policies/rl_published.onnx', 'without': 'all'}, compared=True,
+        cost=0.07, line=Line('#3f8f8a', (0, (4, 1, 1, 1)), 'P')),
+    ControllerEntry(
+        name='nmpc_corrected', label='NMPC, corrected weight',
+        description='params/nmpc_published.yaml with weights.tilt 20 instead of 2',
+        controller=_NMPC, parameters_file='params/nmpc_published.yaml',
+        fixed={'weights': {'tilt': 20.0}}, flies_degraded=True, compared=True, cost=0.13,
+        line=Line('#b5651d', (0, (5, 1.2)), '<')),
     ControllerEntry(
         name='nmpc_published', label='NMPC, published settings',
         description='params/nmpc_published.yaml', controller=_NMPC,
