@@ -23,8 +23,9 @@ from beetle_omni_ros.runs.tasks import make_task, Task
 
 TASKS = ('random100', 'waypoints', 'lemniscate', 'force', 'torque', 'payload', 'hover')
 CONDITIONS = ('nominal', 'published')
-SEEDS = (0, 1)  # default; a long task is flown with the first one only
-LONG = 50.0  # [s]
+# Longest task [s] -> default number of seeds. A comparison of all then takes at most 90 minutes on
+# two cores: three lists of 100 poses, ten flights of a short task.
+SEEDS = {60.0: 10, 300.0: 5, np.inf: 3}
 
 START_COST = 2.0  # core seconds to build simulator and controller
 TRACE_PERIOD = 0.02  # [s] between samples of a trace
@@ -96,7 +97,7 @@ def plan(controllers: Sequence[str], tasks: Sequence[str] = TASKS,
         controllers: names, or references to classes.
         tasks: names, or paths of pose files.
         conditions: 'nominal', 'published'.
-        seeds: numbers from 0; None: 0 and 1, but only 0 for tasks of more than 50 s.
+        seeds: numbers from 0; None: those of ``SEEDS``.
         policy: file that replaces the shipped policy, for the controller of `--policy`.
         plant: robot file of the simulated plant.
 
@@ -110,7 +111,8 @@ def plan(controllers: Sequence[str], tasks: Sequence[str] = TASKS,
     other = {registry.owner('--policy'): str(policy)} if policy else {}
     entries, flights = registry.find_all(controllers), []
     for task in tasks:
-        usual = SEEDS[:1] if make_task(task).duration > LONG else SEEDS
+        duration = make_task(task).duration
+        usual = range(next(count for longest, count in SEEDS.items() if duration <= longest))
         flights += [Flight(task, condition, entry.name, seed, other.get(entry.name, ''),
                            entry.spec, str(plant or ''))
                     for condition, entry, seed in product(

@@ -9,16 +9,14 @@ from matplotlib.ticker import FuncFormatter
 import numpy as np
 
 from beetle_omni_ros.comparison.flights import Flight
-from beetle_omni_ros.comparison.summary import look, PUBLISHED
+from beetle_omni_ros.comparison.summary import look
 from beetle_omni_ros.pages.figures import FAINT, INK, panels
-from beetle_omni_ros.runs import table as published
 from beetle_omni_ros.runs.metrics import L_WINDOW, REACHED_ORIENTATION, REACHED_POSITION, U_WINDOW
 from beetle_omni_ros.runs.tasks import make_task, PERIOD, POSE_DURATION
 
 FLOOR = {'position': 2e-4, 'orientation': 1e-2}  # of logarithmic errors [m], [deg]
 UNITS = {'position': 'm', 'orientation': 'deg'}
 STEP = 0.05  # [s] between points of a folded curve
-BINS = 28  # edges of a histogram
 BEFORE = 2.0  # [s] of hover shown before the first disturbance
 SHOWN = {'position': 2.0, 'orientation': 180.0}  # largest limit of a disturbance's axes [m], [deg]
 
@@ -47,77 +45,26 @@ def label_once(figure: Figure, axes, columns: int = 6) -> None:
                   handlelength=2.4, columnspacing=1.4, borderaxespad=0.2)
 
 
-def distributions(groups: Groups, task: str) -> Figure | None:
-    """Position against orientation errors at the target, and their histograms."""
-    points = {name: _points(results) for name, results in groups.items()}
-    points = {name: values for name, values in points.items() if len(values)}
-    if not points:
-        return None
-    figure, axes = panels(1, 3, height=3.3, width_ratios=(1.25, 1, 1))
-    scatter, *histograms = axes[0]
-    for name, values in points.items():
-        style = look(name)
-        scatter.scatter(*values.T, s=13, color=style.colour, marker=style.marker, alpha=0.65,
-                        linewidths=0, label=style.label)
-    _published_points(scatter, task)
-    _reached_box(scatter)
-    for panel, (what, floor), column in zip(histograms, FLOOR.items(), (0, 1), strict=True):
-        high = max(values[:, column].max() for values in points.values()) * 1.3
-        low = max(floor, min(values[:, column].min() for values in points.values()) * 0.8)
-        edges = np.geomspace(low, max(high, low * 10), BINS)
-        for name, values in points.items():
-            share = np.histogram(np.maximum(values[:, column], low), edges)[0] / len(values)
+def distributions(groups: Groups, task: str) -> Figure:
+    """Share of the poses with at most an error at the target; lost ones never count."""
+    figure, axes = panels(1, 2, height=2.8)
+    for panel, what, limit in zip(axes[0], FLOOR, (REACHED_POSITION, REACHED_ORIENTATION),
+                                  strict=True):
+        for name, results in groups.items():
+            found = [pose[f'U_{what}_{UNITS[what]}'] for result in results
+                     for pose in result['metrics']['poses']]
+            values = np.sort([max(value, FLOOR[what]) for value in found if value is not None])
             style = look(name)
-            panel.stairs(share, edges, color=style.colour, lw=1.4)
-            panel.stairs(share, edges, color=style.colour, alpha=0.16, fill=True, lw=0)
+            panel.step(values, 100 * np.arange(1, len(values) + 1) / len(found), where='post',
+                       color=style.colour, ls=style.dashes, lw=1.5, label=style.label)
+        panel.axvline(limit, color=FAINT, lw=1, ls=(0, (3, 2)))
         panel.set_xscale('log')
         plain_ticks(panel.xaxis)
+        panel.set_ylim(0, 101)
         panel.set_xlabel(f'U {what} error [{UNITS[what]}]')
-        panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{100 * value:.0f} %'))
-        panel.axvline((REACHED_POSITION, REACHED_ORIENTATION)[column], color=FAINT, lw=1,
-                      ls=(0, (3, 2)))
-    histograms[0].set_ylabel('share of the poses')
-    label_once(figure, scatter)
+    axes[0, 0].set_ylabel('share of the poses [%]')
+    label_once(figure, axes[0, 0])
     return figure
-
-
-def _points(results):
-    """(N, 2) U errors of all flown poses, at least the floor of the axes."""
-    values = np.array([[pose['U_position_m'], pose['U_orientation_deg']]
-                       for result in results for pose in result['metrics']['poses']
-                       if pose['U_position_m'] is not None]).reshape(-1, 2)
-    return np.maximum(values[np.all(np.isfinite(values), axis=1)], list(FLOOR.values()))
-
-
-def _published_points(panel, task):
-    if not task.startswith('random'):
-        return
-    for column, name in PUBLISHED.items():
-        numbers = published.RANDOM_POSES[name]
-        x, y = (numbers['mean'][key] for key in ('U_position_m', 'U_orientation_deg'))
-        spans = [[[value - numbers['min'][key]], [numbers['max'][key] - value]]
-                 for value, key in ((x, 'U_position_m'), (y, 'U_orientation_deg'))]
-        style = look(column)
-        panel.errorbar(x, y, xerr=spans[0], yerr=spans[1], color=style.colour, lw=0.8, alpha=0.55,
-                       zorder=1)
-        panel.plot(x, y, marker='*', ms=13, color=style.colour, mec='white', mew=0.8, ls='',
-                   label=f'published {name}', zorder=5)
-
-
-def _reached_box(panel):
-    panel.set_xscale('log')
-    panel.set_yscale('log')
-    plain_ticks(panel.xaxis)
-    plain_ticks(panel.yaxis)
-    (left, _), (bottom, _) = panel.get_xlim(), panel.get_ylim()
-    panel.plot([REACHED_POSITION, REACHED_POSITION, left],
-               [bottom, REACHED_ORIENTATION, REACHED_ORIENTATION], color=FAINT, lw=1,
-               ls=(0, (3, 2)))
-    panel.set_xlim(left=left)
-    panel.set_ylim(bottom=bottom)
-    panel.text(left, REACHED_ORIENTATION, '  reached', color=FAINT, fontsize=8, va='bottom')
-    panel.set_xlabel('U position error [m]')
-    panel.set_ylabel('U orientation error [deg]')
 
 
 def convergence(groups: Groups, task: str) -> Figure:
@@ -253,16 +200,13 @@ def lemniscate_errors(groups: Groups, task: str) -> Figure | None:
     return figure
 
 
+_POSES = [('errors', 'Share of the poses with at most an error at the target; dashed: reached',
+           distributions),
+          ('convergence', 'Errors after a pose was asked for: median and 10 to 90 % band over all '
+           'poses', convergence)]
+_TIME = 'Errors in time, the disturbance dashed; × where control was lost; thin lines: more seeds'
 # Kind of a task -> name, caption and function of each figure.
-DRAWN = {
-    'random': [('errors', 'Errors at the target; stars: published means, with their ranges',
-                distributions),
-               ('convergence', 'Errors after a pose was asked for: median and 10 to 90 % band '
-                'over all poses', convergence)],
-    'lemniscate': [('errors', 'Tracking errors in a round: mean of all rounds, least to largest '
-                    'as a band', lemniscate_errors)],
-    'force': [('errors', 'Errors in time, the disturbance dashed; × where control was lost; thin '
-               'lines: further seeds', disturbance)],
-    'torque': [('errors', 'Errors in time, the disturbance dashed; × where control was lost; thin '
-                'lines: further seeds; each torque lasts 0.05 s', disturbance)],
-    'waypoints': [], 'payload': [], 'hover': []}
+DRAWN = {'random': _POSES, 'poses': _POSES, 'force': [('errors', _TIME, disturbance)],
+         'torque': [('errors', f'{_TIME}; each torque lasts 0.05 s', disturbance)],
+         'lemniscate': [('errors', 'Tracking errors in a round: mean of all rounds, least to '
+                         'largest as a band', lemniscate_errors)]}
