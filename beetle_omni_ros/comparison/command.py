@@ -156,7 +156,6 @@ def results_of(flown: dict, arguments: tuple, names: list[str], skipped: dict,
                  'controllers': names, 'specs': specs, 'skipped': skipped, 'tasks': list(tasks),
                  'conditions': list(conditions),
                  'seeds': sorted({flight.seed for flight in flights}),
-                 'policy_file': str(policy) if policy else None,
                  'plant': str(plant) if plant else None,
                  'policies': {name: f'{files[name].name} ({file_digest(files[name])})'
                               for name in names if files[name]},

@@ -31,7 +31,6 @@ START_COST = 2.0  # core seconds to build simulator and controller
 TRACE_PERIOD = 0.02  # [s] between samples of a trace
 LONG_TRACE_PERIOD = 0.05  # [s] between samples in a long task
 TRACED_FINELY = 300.0  # [s] longest task with TRACE_PERIOD
-COMMAND_WINDOW = 2.0  # [s] of commands kept at the end of a flight
 
 
 @dataclass(frozen=True, order=True)
@@ -164,10 +163,8 @@ def trace(log: FlightLog, task: Task) -> dict[str, np.ndarray]:
     Samples of a flight for the figures.
 
     Returns:
-        t (N,) since the first target [s], position (N, 3) [m], quaternion (N, 4), speed (N,)
-        [m/s], rate (N,) [rad/s], position_error (N,) [m], orientation_error (N,) [deg], NaN
-        without a target; and command_t (M,) [s], command_tilt (M, 4) [rad], command_thrust (M, 4)
-        [N] of the last 2 s.
+        t (N,) since the first target [s], position_error (N,) [m] and orientation_error (N,)
+        [deg], NaN without a target.
 
     """
     if not log.targets:
@@ -182,13 +179,6 @@ def trace(log: FlightLog, task: Task) -> dict[str, np.ndarray]:
                              strict=True):
         window = body.window(target.stamp, min(until, end))
         apart[:, window] = errors(body, target, window)
-    recent = (log.command_t > end - COMMAND_WINDOW) & (log.command_t <= end)
-    kept = {'t': body.t[index] - start, 'position': body.position[index],
-            'quaternion': body.quaternion[index],
-            'speed': np.linalg.norm(body.velocity[index], axis=1),
-            'rate': np.linalg.norm(body.angular_velocity[index], axis=1),
-            'position_error': apart[0, index], 'orientation_error': apart[1, index],
-            'command_t': log.command_t[recent] - start,
-            'command_tilt': log.command_tilt[recent],
-            'command_thrust': log.command_thrust[recent]}
+    kept = {'t': body.t[index] - start, 'position_error': apart[0, index],
+            'orientation_error': apart[1, index]}
     return {name: values.astype(np.float32) for name, values in kept.items()}

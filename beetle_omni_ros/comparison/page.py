@@ -29,6 +29,7 @@ COLOURS = 128  # of a picture; enough for thin lines with smooth edges
 TITLE = 'RL and NMPC under one architecture'
 README = ('rl', 'nmpc')     # columns of the table in the readme
 BEGIN, END = '<!-- compare -->\n', '<!-- end of compare -->\n'    # around that table
+COMPUTED = ('"0.3 on average"', '"typically within 10"')    # published times of a step
 TEXTS = {
     'random': 'One pose after the other, 8 s each, x and y within 2 m, z from 0.6 to 2 m, any '
               'attitude, upside down included.',
@@ -158,7 +159,7 @@ def compute(results: dict) -> Grid:
     ours = [name for name in results['meta']['controllers'] if name in times]
     rows = []
     for text, key, digits, *published in (
-            ('median [ms]', 'median', 3, '"0.3 on average"', '"typically within 10"'),
+            ('median [ms]', 'median', 3, *COMPUTED),
             ('99th percentile [ms]', 'p99', 2), ('largest [ms]', 'max', 2),
             ('over 10 ms', 'deadline_misses', 0, ABSENT, '"occasionally"'), ('steps', 'steps', 0)):
         rows.append([text, *(number(times[name][key], digits) for name in ours),
@@ -191,6 +192,9 @@ def glance(results: dict) -> Grid:
                     number(of[name]['mean'], metric.digits) if name in of else ABSENT
                     for name in ours), *(
                     number(entry.get('mean'), None) + real * bool(entry) for entry in given)])
+    rows.append(['CPU time of a step: median [ms]', *(
+        number(results['summary']['compute'].get(name, {}).get('median'), 3) for name in ours),
+        *(f'{text} *' for text in COMPUTED)])
     return Grid('All experiments', [
         '', *(look(name).label for name in ours),
         *(f'{look(name).label} (published)' for name in PUBLISHED)], rows, note=NOTES['glance'],
@@ -216,14 +220,14 @@ def with_table(path: Path, results: dict) -> str:
     whole = glance(results)
     shown = [0, *(k for k, name in enumerate(results['meta']['controllers'], 1)
                   if name in README), *sorted(whole.faint_columns)]
-    rows = [k for k, row in enumerate(whole.rows) if ', nominal: ' in row[0]]
+    rows = [k for k, row in enumerate(whole.rows) if ', published: ' not in row[0]]
     table = replace(whole, header=[whole.header[k] for k in shown], rows=[
         [whole.rows[row][k].replace(', nominal: ', ': ') for k in shown] for row in rows],
         best=frozenset((n, m) for n, row in enumerate(rows) for m, k in enumerate(shown)
                        if (row, k) in whole.best))
     meta, (before, after) = results['meta'], parted(path)
-    return (f"{before}\n{markdown(table)}\nCommand: `make compare` (commit {meta['commit']}, seeds "
-            f"{meta['seeds'][0]} to {meta['seeds'][-1]}).\n\n{after}")
+    return (f"{before}\n{markdown(table)}\nCommand: `make compare` (commit {meta['commit']}, "
+            f"seeds {meta['seeds'][0]} to {meta['seeds'][-1]}).\n\n{after}")
 
 
 def sections(results: dict, flown: dict) -> list[Section]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from beetle_omni_ros.comparison.flights import Flight
 from beetle_omni_ros.comparison.summary import look
-from beetle_omni_ros.pages.figures import FAINT, INK, panels
+from beetle_omni_ros.pages.figures import FAINT, INK, legend, panels
 from beetle_omni_ros.runs.metrics import L_WINDOW, REACHED_ORIENTATION, REACHED_POSITION, U_WINDOW
 from beetle_omni_ros.runs.tasks import make_task, PERIOD, POSE_DURATION
 
@@ -37,14 +37,6 @@ def plain_ticks(axis) -> None:
     axis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
 
 
-def label_once(figure: Figure, axes, columns: int = 6) -> None:
-    """Add one legend above the figure, each name once."""
-    handles, labels = axes.get_legend_handles_labels()
-    unique = dict(zip(labels, handles, strict=True))
-    figure.legend(unique.values(), unique.keys(), loc='outside upper left', ncols=columns,
-                  handlelength=2.4, columnspacing=1.4, borderaxespad=0.2)
-
-
 def distributions(groups: Groups, task: str) -> Figure:
     """Share of the poses with at most an error at the target; lost ones never count."""
     figure, axes = panels(1, 2, height=2.8)
@@ -63,7 +55,7 @@ def distributions(groups: Groups, task: str) -> Figure:
         panel.set_ylim(0, 101)
         panel.set_xlabel(f'U {what} error [{UNITS[what]}]')
     axes[0, 0].set_ylabel('share of the poses [%]')
-    label_once(figure, axes[0, 0])
+    legend(figure, axes[0, 0])
     return figure
 
 
@@ -91,7 +83,7 @@ def convergence(groups: Groups, task: str) -> Figure:
         panel.set_xlim(0, POSE_DURATION)
         panel.set_ylabel(f'{what} error [{UNITS[what]}]')
         panel.set_xlabel('time since the pose was asked for [s]')
-    label_once(figure, axes[0, 0])
+    legend(figure, axes[0, 0])
     return figure
 
 
@@ -122,8 +114,7 @@ def disturbance(groups: Groups, kind: str) -> Figure:
         panel.plot([], [], color=INK, lw=1.1, ls=(0, (4, 2.5)), label=f'{kind} (right axis)')
         highest = 0.0
         for name, results in groups.items():
-            for k, result in enumerate(results):
-                highest = max(highest, _error_curve(panel, result, what, name, k))
+            highest = max(highest, _error_curve(panel, results[0], what, name))
         panel.set_ylim(0, min(1.08 * highest, SHOWN[what]) or 1)
         panel.set_ylabel(f'{what} error [{UNITS[what]}]')
         panel.set_zorder(right.get_zorder() + 1)
@@ -131,7 +122,7 @@ def disturbance(groups: Groups, kind: str) -> Figure:
     axes[1, 0].set_xlim(POSE_DURATION - BEFORE, times[-1])
     axes[1, 0].set_xticks(np.arange(POSE_DURATION - BEFORE, times[-1] + 0.1, 2.0))
     axes[1, 0].set_xlabel('time since the hover was asked for [s]')
-    label_once(figure, axes[0, 0])
+    legend(figure, axes[0, 0])
     return figure
 
 
@@ -145,12 +136,11 @@ def _levels(task):
     return np.array([*times, begin]), np.array([*levels, levels[-1]])
 
 
-def _error_curve(panel, result, what, name, k):
+def _error_curve(panel, result, what, name):
     """Plot one flight's errors, mark lost control, and return the largest error."""
     style, trace = look(name), result['trace']
     t, values = trace['t'], trace[f'{what}_error']
-    panel.plot(t, values, color=style.colour, ls=style.dashes, lw=1.5 if k == 0 else 0.8,
-               alpha=1.0 if k == 0 else 0.45, label=style.label)
+    panel.plot(t, values, color=style.colour, ls=style.dashes, lw=1.5, label=style.label)
     kind = 'force' if 'force' in result['metrics'] else 'torque'
     lost = next((value for key, value in result['metrics'][kind].items()
                  if key.startswith('lost_at')), None)
@@ -196,7 +186,7 @@ def lemniscate_errors(groups: Groups, task: str) -> Figure | None:
         panel.set_ylim(bottom=0)
         panel.set_xlim(0, PERIOD)
     axes[1, 0].set_xlabel('time in the round [s]')
-    label_once(figure, axes[0, 0])
+    legend(figure, axes[0, 0])
     return figure
 
 
@@ -204,7 +194,7 @@ _POSES = [('errors', 'Share of the poses with at most an error at the target; da
            distributions),
           ('convergence', 'Errors after a pose was asked for: median and 10 to 90 % band over all '
            'poses', convergence)]
-_TIME = 'Errors in time, the disturbance dashed; × where control was lost; thin lines: more seeds'
+_TIME = 'Errors in time in the first flight, the disturbance dashed; × where control was lost'
 # Kind of a task -> name, caption and function of each figure.
 DRAWN = {'random': _POSES, 'poses': _POSES, 'force': [('errors', _TIME, disturbance)],
          'torque': [('errors', f'{_TIME}; each torque lasts 0.05 s', disturbance)],

@@ -44,13 +44,12 @@ TITLES = {'waypoints': 'Five waypoints', 'lemniscate': '3D lemniscate',
 
 @dataclass(frozen=True)
 class Look:
-    """Label and text of a controller, and its line: colour, dashes, marker."""
+    """Label and text of a controller, and its line: colour and dashes."""
 
     label: str
     text: str
     colour: str
     dashes: str | tuple = '-'
-    marker: str = 'o'
 
 
 def look(controller: str) -> Look:
@@ -58,11 +57,10 @@ def look(controller: str) -> Look:
     name = controller.removeprefix(PREFIX)
     entry = registry.SHIPPED.get(name)
     if entry is None:
-        return Look(name, '', SPARE[crc32(name.encode()) % len(SPARE)], (0, (4, 1, 1, 1)), 'X')
-    line = entry.line
+        return Look(name, '', SPARE[crc32(name.encode()) % len(SPARE)], (0, (4, 1, 1, 1)))
     if name != controller:
-        return Look(entry.label, 'the publication', line.colour, ':', '*')
-    return Look(entry.label, entry.description, line.colour, line.dashes, line.marker)
+        return Look(entry.label, 'the publication', entry.line[0], ':')
+    return Look(entry.label, entry.description, *entry.line)
 
 
 def kind_of(task: str) -> str:
