@@ -173,7 +173,7 @@ def compare(controllers: Annotated[Optional[str], typer.Option(
                 help='nominal, published, or both.')] = ','.join(CONDITIONS),
             seeds: Annotated[Optional[str], typer.Option(
                 '--seeds', metavar='N,...',
-                help='Default: 0 to 9; 0 to 4 above 60 s, 0 to 2 above 300 s.')] = None,
+                help='Default: 0 to 9; 0 to 5 above 60 s, 0 to 2 above 300 s.')] = None,
             policy: PolicyOption = None,
             plant: PlantOption = None,
             jobs: JobsOption = None,

@@ -25,7 +25,7 @@ TASKS = ('random100', 'waypoints', 'lemniscate', 'force', 'torque', 'payload', '
 CONDITIONS = ('nominal', 'published')
 # Longest task [s] -> default number of seeds. A comparison of all then takes at most 90 minutes on
 # two cores: three lists of 100 poses, ten flights of a short task.
-SEEDS = {60.0: 10, 300.0: 5, np.inf: 3}
+SEEDS = {60.0: 10, 300.0: 6, np.inf: 3}
 
 START_COST = 2.0  # core seconds to build simulator and controller
 TRACE_PERIOD = 0.02  # [s] between samples of a trace

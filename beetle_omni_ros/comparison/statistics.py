@@ -16,6 +16,7 @@ from scipy.special import ndtr, stdtrit
 CONFIDENCE = 0.95
 RESAMPLES = 10_000
 SEED = 0
+FEWEST = 6      # values of an interval; fewer have equal signs by chance in over 5 % of the cases
 
 # Values of a controller by what was flown: (seed,) or (seed, pose).
 Sample = Mapping[tuple[int, ...], float | None]
@@ -28,12 +29,12 @@ def _drawn(count):
 
 
 def described(values: np.ndarray) -> dict:
-    """Mean, its interval [low, high] (None with less than two values), least, largest, count."""
+    """Mean, its interval [low, high] (None with less than FEWEST values), min, max, count."""
     count = len(values)
     if not count:
         return {'mean': None, 'low': None, 'high': None, 'min': None, 'max': None, 'count': 0}
     low = high = None
-    if count > 1:
+    if count >= FEWEST:
         far = stdtrit(count - 1, 0.5 - 0.5 * CONFIDENCE)
         tail = ndtr(far * sqrt(count / (count - 1)))
         low, high = map(float, np.quantile(values[_drawn(count)].mean(axis=1), (tail, 1 - tail)))

@@ -69,7 +69,8 @@ def test_a_best_number_differs_from_every_other():
                          'far': sampled(far)})['a']['best']
     assert compared({'a': sampled(values), 'far': sampled(far)}, more=True)['far']['best']
     assert not compared({'a': sampled(values)})['a']['best']
-    one = compared({'a': sampled([1.0]), 'far': sampled([9.0])})    # one flight: no interval
-    assert one['a']['low'] is None and not one['a']['best']
+    for count, best in ((1, False), (5, False), (6, True)):     # few flights: no interval
+        few = compared({'a': sampled([1.0] * count), 'far': sampled([9.0] * count)})
+        assert few['a']['best'] == best and (few['a']['low'] is not None) == best
     same = compared({'a': sampled(values), 'b': sampled(values)})
     assert not same['a']['best'] and not same['b']['best']
