@@ -45,9 +45,9 @@ def distributions(groups: Groups, task: str) -> Figure:
         for name, results in groups.items():
             found = [pose[f'U_{what}_{UNITS[what]}'] for result in results
                      for pose in result['metrics']['poses']]
-            values = np.sort([max(value, FLOOR[what]) for value in found if value is not None])
-            style = look(name)
-            panel.step(values, 100 * np.arange(1, len(values) + 1) / len(found), where='post',
+            known = np.sort([max(value, FLOOR[what]) for value in found if value is not None])
+            values, style = np.concatenate([known[:1], known]), look(name)
+            panel.step(values, 100 * np.arange(len(values)) / len(found), where='post',
                        color=style.colour, ls=style.dashes, lw=1.5, label=style.label)
         panel.axvline(limit, color=FAINT, lw=1, ls=(0, (3, 2)))
         panel.set_xscale('log')
