@@ -167,13 +167,14 @@ def compare(controllers: Annotated[Optional[str], typer.Option(
                 help=f"Controllers: {KNOWN}. Default: {', '.join(registry.compared())}; a "
                      'missing policy is left out.')] = None,
             tasks: Annotated[Optional[str], typer.Option(
-                '--tasks', metavar='TASK,...', help='Names or pose files. Default: all.')] = None,
+                '--tasks', metavar='TASK,...', help='Names or pose files. Default: those '
+                                                     'of the publication.')] = None,
             conditions: Annotated[str, typer.Option(
                 '--conditions', metavar='NAME,...',
                 help='nominal, published, or both.')] = ','.join(CONDITIONS),
             seeds: Annotated[Optional[str], typer.Option(
                 '--seeds', metavar='N,...',
-                help='Default: 0 to 9; 0 to 5 above 60 s, 0 to 2 above 300 s.')] = None,
+                help='Default: 0 to 9; 0 to 5 above 50 s, 0 to 2 above 300 s.')] = None,
             policy: PolicyOption = None,
             plant: PlantOption = None,
             jobs: JobsOption = None,

@@ -20,8 +20,9 @@ KNOWN = f"{', '.join(registry.SHIPPED)}, any registered one, {registry.CLASS}"
 ControllerOption = Annotated[str, typer.Option(
     '--controller', metavar='NAME', help=f'The active controller: {KNOWN}.')]
 TaskOption = Annotated[str, typer.Option(
-    '--task', help='CSV file of poses, or waypoints, randomN (random100), lemniscate, hover, '
-                   'force, torque or payload.', metavar='TASK')]
+    '--task', help='CSV file of poses, or waypoints, randomN (random100), lemniscate, '
+                   'lemniscate_large, hover, force, force_down, force_up, torque, torque_pulses, '
+                   'wind, pushes, payload or steps.', metavar='TASK')]
 ConditionsOption = Annotated[str, typer.Option(
     '--conditions', metavar='nominal|published',
     help="nominal: the simulator with the measured parameters; published: with the publication's "

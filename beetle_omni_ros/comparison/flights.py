@@ -21,11 +21,12 @@ from beetle_omni_ros.runs.log import errors, FlightLog, motion
 from beetle_omni_ros.runs.metrics import metrics
 from beetle_omni_ros.runs.tasks import make_task, Task
 
-TASKS = ('random100', 'waypoints', 'lemniscate', 'force', 'torque', 'payload', 'hover')
+TASKS = ('random100', 'waypoints', 'lemniscate', 'force', 'torque', 'wind', 'pushes', 'payload',
+         'hover')
 CONDITIONS = ('nominal', 'published')
 # Longest task [s] -> default number of seeds. A comparison of all then takes at most 90 minutes on
 # two cores: three lists of 100 poses, ten flights of a short task.
-SEEDS = {60.0: 10, 300.0: 6, np.inf: 3}
+SEEDS = {50.0: 10, 300.0: 6, np.inf: 3}
 
 START_COST = 2.0  # core seconds to build simulator and controller
 TRACE_PERIOD = 0.02  # [s] between samples of a trace

@@ -12,12 +12,14 @@ from beetle_omni_ros.comparison.flights import Flight
 from beetle_omni_ros.comparison.summary import look
 from beetle_omni_ros.pages.figures import FAINT, INK, legend, panels
 from beetle_omni_ros.runs.metrics import L_WINDOW, REACHED_ORIENTATION, REACHED_POSITION, U_WINDOW
-from beetle_omni_ros.runs.tasks import make_task, PERIOD, POSE_DURATION
+from beetle_omni_ros.runs.tasks import make_task, POSE_DURATION, RISING, TILTS
 
 FLOOR = {'position': 2e-4, 'orientation': 1e-2}  # of logarithmic errors [m], [deg]
 UNITS = {'position': 'm', 'orientation': 'deg'}
 STEP = 0.05  # [s] between points of a folded curve
 BEFORE = 2.0  # [s] of hover shown before the first disturbance
+LEVELS = {'force': 'force [N]', 'torque': 'torque [N m]', 'wind': 'wind [m/s]',
+          'pushes': 'number of the push', 'payload': 'payload [kg]'}
 SHOWN = {'position': 2.0, 'orientation': 180.0}  # largest limit of a disturbance's axes [m], [deg]
 
 Groups = dict[str, list[dict]]      # controller -> one result with a trace for each seed
@@ -99,41 +101,36 @@ def _folded(results, key, grid):
     return np.array(rows)
 
 
-def disturbance(groups: Groups, kind: str) -> Figure:
-    """Errors over time with the disturbance dashed, as in the publication."""
-    unit = 'N' if kind == 'force' else 'N m'
+def in_time(groups: Groups, task: str) -> Figure:
+    """Errors of the first flights over time, with the disturbance dashed as in the publication."""
+    flown = make_task(task)
     figure, axes = panels(2, height=2.1, sharex=True)
-    times, levels = _levels(make_task(kind))
     for panel, what in zip(axes[:, 0], SHOWN, strict=True):
-        right = panel.twinx()
-        right.step(times, levels, where='post', color=INK, lw=1.1, ls=(0, (4, 2.5)))
-        right.set_ylim(0, levels.max() * 1.15)
-        right.set_ylabel(f'{kind} [{unit}]')
-        right.grid(False)
-        right.spines['right'].set_visible(True)
-        panel.plot([], [], color=INK, lw=1.1, ls=(0, (4, 2.5)), label=f'{kind} (right axis)')
-        highest = 0.0
-        for name, results in groups.items():
-            highest = max(highest, _error_curve(panel, results[0], what, name))
+        if flown.kind in LEVELS:
+            _levels(panel, flown)
+        highest = max(_error_curve(panel, results[0], what, name)
+                      for name, results in groups.items())
         panel.set_ylim(0, min(1.08 * highest, SHOWN[what]) or 1)
         panel.set_ylabel(f'{what} error [{UNITS[what]}]')
-        panel.set_zorder(right.get_zorder() + 1)
-        panel.patch.set_visible(False)
-    axes[1, 0].set_xlim(POSE_DURATION - BEFORE, times[-1])
-    axes[1, 0].set_xticks(np.arange(POSE_DURATION - BEFORE, times[-1] + 0.1, 2.0))
+    axes[1, 0].set_xlim(POSE_DURATION - BEFORE, flown.duration)
     axes[1, 0].set_xlabel('time since the hover was asked for [s]')
     legend(figure, axes[0, 0])
     return figure
 
 
-def _levels(task):
-    """Times and levels for a step plot."""
-    times, levels, begin = [0.0], [0.0], 0.0
-    for segment in task.segments:
-        times.append(begin)
-        levels.append(segment.level)
-        begin += segment.duration
-    return np.array([*times, begin]), np.array([*levels, levels[-1]])
+def _levels(panel, task):
+    """Plot the level of the disturbance on an axis to the right."""
+    right, name = panel.twinx(), LEVELS[task.kind]
+    levels = [segment.level for segment in task.segments]
+    style = {'color': INK, 'lw': 1.1, 'ls': (0, (4, 2.5))}
+    right.step([0.0, *task.ends], [*levels, levels[-1]], where='post', **style)
+    right.set_ylim(0, max(levels) * 1.15)
+    right.set_ylabel(name)
+    right.grid(False)
+    right.spines['right'].set_visible(True)
+    panel.plot([], [], label=f'{name} (right axis)', **style)
+    panel.set_zorder(right.get_zorder() + 1)
+    panel.patch.set_visible(False)
 
 
 def _error_curve(panel, result, what, name):
@@ -141,10 +138,8 @@ def _error_curve(panel, result, what, name):
     style, trace = look(name), result['trace']
     t, values = trace['t'], trace[f'{what}_error']
     panel.plot(t, values, color=style.colour, ls=style.dashes, lw=1.5, label=style.label)
-    kind = 'force' if 'force' in result['metrics'] else 'torque'
-    lost = next((value for key, value in result['metrics'][kind].items()
-                 if key.startswith('lost_at')), None)
-    if lost is not None:
+    if any(result['metrics'].get(kind, {}).get(f'lost_at_{unit}') is not None
+           for kind, unit in (('force', 'N'), ('torque', 'N_m'))):
         last = np.flatnonzero(np.isfinite(values))[-1:]
         panel.plot(t[last], np.minimum(values[last], SHOWN[what] * 0.98), marker='X', ms=8,
                    color=style.colour, mec='white', mew=0.8, ls='', zorder=6, clip_on=False)
@@ -152,51 +147,12 @@ def _error_curve(panel, result, what, name):
     return float(np.max(shown)) if shown.size else 0.0
 
 
-def _laps(results, keys):
-    """Phase grid (N,) [s] of a round and (R, N, len(keys)) values of all complete rounds."""
-    grid = np.arange(0.0, PERIOD, STEP)
-    rounds = []
-    for result in results:
-        trace = result['trace']
-        columns = np.column_stack([trace[key] for key in keys])
-        for begin, end in make_task('lemniscate').rounds:
-            if trace['t'][-1] >= end - 0.1:
-                rounds.append(np.column_stack([np.interp(grid + begin, trace['t'], values)
-                                               for values in columns.T]))
-    return grid, np.array(rounds)
-
-
-def lemniscate_errors(groups: Groups, task: str) -> Figure | None:
-    """Tracking errors over a round: mean of all rounds, minimum to maximum as a band."""
-    figure, axes = panels(2, height=1.6, sharex=True)
-    drawn = False
-    for name, results in groups.items():
-        style = look(name)
-        grid, rounds = _laps(results, ('position_error', 'orientation_error'))
-        for column in range(2 if len(rounds) else 0):
-            values, panel, drawn = rounds[:, :, column], axes[column, 0], True
-            panel.fill_between(grid, values.min(axis=0), values.max(axis=0), color=style.colour,
-                               alpha=0.2, lw=0)
-            panel.plot(grid, values.mean(axis=0), color=style.colour, ls=style.dashes, lw=1.4,
-                       label=style.label)
-    if not drawn:
-        return None
-    for panel, what in zip(axes[:, 0], UNITS, strict=True):
-        panel.set_ylabel(f'{what} error [{UNITS[what]}]')
-        panel.set_ylim(bottom=0)
-        panel.set_xlim(0, PERIOD)
-    axes[1, 0].set_xlabel('time in the round [s]')
-    legend(figure, axes[0, 0])
-    return figure
-
-
 _POSES = [('errors', 'Share of the poses with at most an error at the target; dashed: reached',
            distributions),
           ('convergence', 'Errors after a pose was asked for: median and 10 to 90 % band over all '
            'poses', convergence)]
-_TIME = 'Errors in time in the first flight, the disturbance dashed; × where control was lost'
+_TIME = [('errors', 'Errors in time in the first flight, the disturbance dashed; × where control '
+          'was lost', in_time)]
 # Kind of a task -> name, caption and function of each figure.
-DRAWN = {'random': _POSES, 'poses': _POSES, 'force': [('errors', _TIME, disturbance)],
-         'torque': [('errors', f'{_TIME}; each torque lasts 0.05 s', disturbance)],
-         'lemniscate': [('errors', 'Tracking errors in a round: mean of all rounds, least to '
-                         'largest as a band', lemniscate_errors)]}
+DRAWN = {'random': _POSES, 'poses': _POSES, **dict.fromkeys(
+    (*RISING, *TILTS, 'wind', 'pushes', 'payload'), _TIME)}

@@ -18,7 +18,7 @@ from beetle_omni_ros.control import registry
 from beetle_omni_ros.pages.page import at
 from beetle_omni_ros.runs import table as published
 from beetle_omni_ros.runs.metrics import failed, POSE_KEYS
-from beetle_omni_ros.runs.tasks import FORCE_LEVELS, PAYLOADS, TORQUE_LEVELS, WAYPOINTS
+from beetle_omni_ros.runs.tasks import PAYLOADS, PUSH_PERIOD, RISING, TILTS, WAYPOINTS
 
 PREFIX = 'published_'    # prefix of a controller in the publication
 # Colours of controllers outside the package, chosen by name.
@@ -34,12 +34,14 @@ PUBLISHED = {f'{PREFIX}{name}': entry.label for name, entry in reversed(
     registry.SHIPPED.items()) if entry.label in published.RANDOM_POSES}
 # Kind of a task -> published numbers, and whether they are of the real robot.
 PRINTED: dict[str, tuple[dict, bool]] = {
-    'random': (published.RANDOM_POSES, False), 'force': (published.DISTURBANCE, False),
-    'torque': (published.DISTURBANCE, False), 'waypoints': (published.WAYPOINTS, True),
-    'lemniscate': (published.LEMNISCATE, True)}
+    'random': (published.RANDOM_POSES, False), 'waypoints': (published.WAYPOINTS, True),
+    'lemniscate': (published.LEMNISCATE, True), 'wind': (published.WIND, True),
+    'pushes': (published.PUSHED, True), **dict.fromkeys(RISING, (published.DISTURBANCE, False))}
 TITLES = {'waypoints': 'Five waypoints', 'lemniscate': '3D lemniscate',
-          'force': 'Force disturbance', 'torque': 'Torque disturbance',
-          'payload': 'Payload', 'hover': 'Steady hover'}
+          'lemniscate_large': 'Large 3D lemniscate', 'force': 'Force disturbance',
+          'torque': 'Torque disturbance', 'force_down': 'Force downwards',
+          'force_up': 'Force upwards', 'torque_pulses': 'Torque pulses', 'wind': 'Fan',
+          'pushes': 'Stick pushes', 'payload': 'Payload', 'hover': 'Steady hover'}
 
 
 @dataclass(frozen=True)
@@ -161,7 +163,8 @@ def _errors(kind):
     return made
 
 
-def _disturbance(kind, unit, levels):
+def _disturbance(kind, _, levels, *times):
+    unit = 'N' if kind == 'force' else 'N_m'
     key, text, beyond = f'{kind}_{unit}', unit.replace('_', ' '), 2 * levels[-1] - levels[-2]
 
     def lost(judged):
@@ -178,6 +181,27 @@ def _disturbance(kind, unit, levels):
             lambda judged, level=level, name=name: peak(judged, level, name), detail=True)
         for level in map(float, levels) for name, size, digits in (
             ('peak_position_m', 'm', 3), ('peak_orientation_deg', 'deg', 1))}}
+
+
+def _wind():
+    made = {}
+    for name, unit, digits in (('position', 'm', 4), ('orientation', 'deg', 2)):
+        for part, text in (('mean', 'error'), ('std', 'standard deviation')):
+            path = f'{name}_{part}_{unit}'
+            made[path] = _at(f'strongest wind: {name} {text} [{unit}]', digits, f'wind.-1.{path}',
+                             path, glance=True)
+    return made
+
+
+def _pushes():
+    def recovery(judged):
+        return float(np.mean([PUSH_PERIOD if push['recovery_s'] is None else push['recovery_s']
+                              for push in judged['pushes']['pushes']]))
+
+    speed, rate = 'speed_mean_m_s', 'angular_speed_mean_rad_s'
+    return {'recovery': Metric('recovery to 0.02 m and 2 deg [s]', 2, recovery, glance=True),
+            'speed': _at('mean speed [m/s]', 3, f'pushes.{speed}', speed),
+            'rate': _at('mean body rate [rad/s]', 3, f'pushes.{rate}', rate)}
 
 
 def _payload():
@@ -200,8 +224,8 @@ def _payload():
 
 METRICS: dict[str, dict[str, Metric]] = {
     'random': _poses(), 'poses': _poses(), 'waypoints': _waypoints(),
-    'lemniscate': _errors('trajectory'), 'force': _disturbance('force', 'N', FORCE_LEVELS),
-    'torque': _disturbance('torque', 'N_m', TORQUE_LEVELS), 'payload': _payload(),
+    **{name: _errors('trajectory') for name in TILTS}, 'wind': _wind(), 'pushes': _pushes(),
+    **{name: _disturbance(*of) for name, of in RISING.items()}, 'payload': _payload(),
     'hover': {**_errors('hover'), **_changes(True)}}
 
 

@@ -73,7 +73,7 @@ def test_the_published_training_has_the_published_values_and_no_own_term():
             documented += 1
         elif doc.startswith('own: '):
             assert value == 0 or name == 'reward.termination', name
-    assert documented == 22
+    assert documented == 23
     for entry in fields(published.random):      # but velocities are old, with no estimator
         if entry.name != 'carried_share':
             np.testing.assert_array_equal(
