@@ -52,6 +52,8 @@ FILES = {
     'recording.yaml': ('identify.recording.limits:RecordingLimits',
                        'Limits of the checks of a recording against itself.'),
     'train.yaml': ('train.parameters:TrainParameters', 'The training of a policy.'),
+    'train_published.yaml': ('train.parameters:TrainParameters',
+                             'The training with the settings of the publication.'),
     'faults.yaml': ('sim.fault_lists:FaultList', 'The listed faults.'),
     'identify.yaml': ('identify.parameters:IdentifyParameters',
                       'Identification of servos and rotors from logs.'),

@@ -164,16 +164,17 @@ def evaluate(controllers: Annotated[str, typer.Option(
 
 def compare(controllers: Annotated[Optional[str], typer.Option(
                 '--controllers', metavar='NAME,...',
-                help=f'Controllers: {KNOWN}. Default: the shipped policies that exist, and '
-                     'both NMPCs.')] = None,
+                help=f"Controllers: {KNOWN}. Default: {', '.join(registry.compared())}; a "
+                     'missing policy is left out.')] = None,
             tasks: Annotated[Optional[str], typer.Option(
-                '--tasks', metavar='TASK,...', help='Names or pose files. Default: all.')] = None,
+                '--tasks', metavar='TASK,...', help='Names or pose files. Default: those '
+                                                     'of the publication.')] = None,
             conditions: Annotated[str, typer.Option(
                 '--conditions', metavar='NAME,...',
                 help='nominal, published, or both.')] = ','.join(CONDITIONS),
             seeds: Annotated[Optional[str], typer.Option(
                 '--seeds', metavar='N,...',
-                help='Default: 0,1; only 0 for tasks of more than 50 s.')] = None,
+                help='Default: 0 to 9; 0 to 5 above 50 s, 0 to 2 above 300 s.')] = None,
             policy: PolicyOption = None,
             plant: PlantOption = None,
             jobs: JobsOption = None,
@@ -190,6 +191,9 @@ def compare(controllers: Annotated[Optional[str], typer.Option(
             cache: Annotated[Optional[Path], typer.Option(
                 '--cache', metavar='DIR', help='Cache of finished flights. Default: .flights in '
                                                'the output.')] = None,
+            readme: Annotated[Optional[Path], typer.Option(
+                '--readme', metavar='FILE', help='Markdown file whose table of results is '
+                                                 'renewed.')] = None,
             json_path: JsonOption = None):
     """
     Fly every experiment with several controllers and write one page about it.
@@ -205,7 +209,7 @@ def compare(controllers: Annotated[Optional[str], typer.Option(
     check_writable(json_path)
     from beetle_omni_ros.comparison.command import run_compare
     run_compare(**arguments, output=output, jobs=jobs, backend=backend, address=address,
-                cache=cache, policy=policy, plant=plant, json_path=json_path)
+                cache=cache, policy=policy, plant=plant, readme=readme, json_path=json_path)
 
 
 def faults(faults: Annotated[Optional[Path], typer.Option(

@@ -41,8 +41,8 @@ def run_compare(*, output: Path, controllers: list[str] | None = None,
                 seeds: list[int] | None = None, jobs: int | None = None,
                 backend: str = 'processes', address: str | None = None,
                 cache: Path | None = None, policy: Path | None = None,
-                plant: Path | None = None, json_path: Path | None = None,
-                console: Console | None = None) -> dict:
+                plant: Path | None = None, readme: Path | None = None,
+                json_path: Path | None = None, console: Console | None = None) -> dict:
     """
     Fly the missing flights, then write page, pictures and numbers.
 
@@ -60,6 +60,8 @@ def run_compare(*, output: Path, controllers: list[str] | None = None,
     names = controllers or registry.compared()
     arguments = (names, tasks or TASKS, conditions or CONDITIONS, seeds)
     check_backend(backend)
+    if readme:
+        page.parted(readme)     # refuses a file without the place
     if plant:
         RobotParameters.load(plant)
     plan(*arguments)  # refuses unusable input before any work
@@ -86,6 +88,8 @@ def run_compare(*, output: Path, controllers: list[str] | None = None,
                          plant)
     results['meta']['guidance'] = {entry.name: text for entry, text in available.items()}
     write(results, flown, output, console)
+    if readme:
+        write_text(readme, page.with_table(readme, results), '--readme')
     write_json(json_path, results)
     return results
 
@@ -152,7 +156,6 @@ def results_of(flown: dict, arguments: tuple, names: list[str], skipped: dict,
                  'controllers': names, 'specs': specs, 'skipped': skipped, 'tasks': list(tasks),
                  'conditions': list(conditions),
                  'seeds': sorted({flight.seed for flight in flights}),
-                 'policy_file': str(policy) if policy else None,
                  'plant': str(plant) if plant else None,
                  'policies': {name: f'{files[name].name} ({file_digest(files[name])})'
                               for name in names if files[name]},

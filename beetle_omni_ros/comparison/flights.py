@@ -21,16 +21,17 @@ from beetle_omni_ros.runs.log import errors, FlightLog, motion
 from beetle_omni_ros.runs.metrics import metrics
 from beetle_omni_ros.runs.tasks import make_task, Task
 
-TASKS = ('random100', 'waypoints', 'lemniscate', 'force', 'torque', 'payload', 'hover')
+TASKS = ('random100', 'waypoints', 'lemniscate', 'force', 'torque', 'wind', 'pushes', 'payload',
+         'hover')
 CONDITIONS = ('nominal', 'published')
-SEEDS = (0, 1)  # default; a long task is flown with the first one only
-LONG = 50.0  # [s]
+# Longest task [s] -> default number of seeds. A comparison of all then takes at most 90 minutes on
+# two cores: three lists of 100 poses, ten flights of a short task.
+SEEDS = {50.0: 10, 300.0: 6, np.inf: 3}
 
 START_COST = 2.0  # core seconds to build simulator and controller
 TRACE_PERIOD = 0.02  # [s] between samples of a trace
 LONG_TRACE_PERIOD = 0.05  # [s] between samples in a long task
 TRACED_FINELY = 300.0  # [s] longest task with TRACE_PERIOD
-COMMAND_WINDOW = 2.0  # [s] of commands kept at the end of a flight
 
 
 @dataclass(frozen=True, order=True)
@@ -96,7 +97,7 @@ def plan(controllers: Sequence[str], tasks: Sequence[str] = TASKS,
         controllers: names, or references to classes.
         tasks: names, or paths of pose files.
         conditions: 'nominal', 'published'.
-        seeds: numbers from 0; None: 0 and 1, but only 0 for tasks of more than 50 s.
+        seeds: numbers from 0; None: those of ``SEEDS``.
         policy: file that replaces the shipped policy, for the controller of `--policy`.
         plant: robot file of the simulated plant.
 
@@ -110,7 +111,8 @@ def plan(controllers: Sequence[str], tasks: Sequence[str] = TASKS,
     other = {registry.owner('--policy'): str(policy)} if policy else {}
     entries, flights = registry.find_all(controllers), []
     for task in tasks:
-        usual = SEEDS[:1] if make_task(task).duration > LONG else SEEDS
+        duration = make_task(task).duration
+        usual = range(next(count for longest, count in SEEDS.items() if duration <= longest))
         flights += [Flight(task, condition, entry.name, seed, other.get(entry.name, ''),
                            entry.spec, str(plant or ''))
                     for condition, entry, seed in product(
@@ -162,10 +164,8 @@ def trace(log: FlightLog, task: Task) -> dict[str, np.ndarray]:
     Samples of a flight for the figures.
 
     Returns:
-        t (N,) since the first target [s], position (N, 3) [m], quaternion (N, 4), speed (N,)
-        [m/s], rate (N,) [rad/s], position_error (N,) [m], orientation_error (N,) [deg], NaN
-        without a target; and command_t (M,) [s], command_tilt (M, 4) [rad], command_thrust (M, 4)
-        [N] of the last 2 s.
+        t (N,) since the first target [s], position_error (N,) [m] and orientation_error (N,)
+        [deg], NaN without a target.
 
     """
     if not log.targets:
@@ -180,13 +180,6 @@ def trace(log: FlightLog, task: Task) -> dict[str, np.ndarray]:
                              strict=True):
         window = body.window(target.stamp, min(until, end))
         apart[:, window] = errors(body, target, window)
-    recent = (log.command_t > end - COMMAND_WINDOW) & (log.command_t <= end)
-    kept = {'t': body.t[index] - start, 'position': body.position[index],
-            'quaternion': body.quaternion[index],
-            'speed': np.linalg.norm(body.velocity[index], axis=1),
-            'rate': np.linalg.norm(body.angular_velocity[index], axis=1),
-            'position_error': apart[0, index], 'orientation_error': apart[1, index],
-            'command_t': log.command_t[recent] - start,
-            'command_tilt': log.command_tilt[recent],
-            'command_thrust': log.command_thrust[recent]}
+    kept = {'t': body.t[index] - start, 'position_error': apart[0, index],
+            'orientation_error': apart[1, index]}
     return {name: values.astype(np.float32) for name, values in kept.items()}

@@ -9,17 +9,17 @@ from matplotlib.ticker import FuncFormatter
 import numpy as np
 
 from beetle_omni_ros.comparison.flights import Flight
-from beetle_omni_ros.comparison.summary import look, PUBLISHED
-from beetle_omni_ros.pages.figures import FAINT, INK, panels
-from beetle_omni_ros.runs import table as published
+from beetle_omni_ros.comparison.summary import look
+from beetle_omni_ros.pages.figures import FAINT, INK, legend, panels
 from beetle_omni_ros.runs.metrics import L_WINDOW, REACHED_ORIENTATION, REACHED_POSITION, U_WINDOW
-from beetle_omni_ros.runs.tasks import make_task, PERIOD, POSE_DURATION
+from beetle_omni_ros.runs.tasks import make_task, POSE_DURATION, RISING, TILTS
 
 FLOOR = {'position': 2e-4, 'orientation': 1e-2}  # of logarithmic errors [m], [deg]
 UNITS = {'position': 'm', 'orientation': 'deg'}
 STEP = 0.05  # [s] between points of a folded curve
-BINS = 28  # edges of a histogram
 BEFORE = 2.0  # [s] of hover shown before the first disturbance
+LEVELS = {'force': 'force [N]', 'torque': 'torque [N m]', 'wind': 'wind [m/s]',
+          'pushes': 'number of the push', 'payload': 'payload [kg]'}
 SHOWN = {'position': 2.0, 'orientation': 180.0}  # largest limit of a disturbance's axes [m], [deg]
 
 Groups = dict[str, list[dict]]      # controller -> one result with a trace for each seed
@@ -39,85 +39,26 @@ def plain_ticks(axis) -> None:
     axis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
 
 
-def label_once(figure: Figure, axes, columns: int = 6) -> None:
-    """Add one legend above the figure, each name once."""
-    handles, labels = axes.get_legend_handles_labels()
-    unique = dict(zip(labels, handles, strict=True))
-    figure.legend(unique.values(), unique.keys(), loc='outside upper left', ncols=columns,
-                  handlelength=2.4, columnspacing=1.4, borderaxespad=0.2)
-
-
-def distributions(groups: Groups, task: str) -> Figure | None:
-    """Position against orientation errors at the target, and their histograms."""
-    points = {name: _points(results) for name, results in groups.items()}
-    points = {name: values for name, values in points.items() if len(values)}
-    if not points:
-        return None
-    figure, axes = panels(1, 3, height=3.3, width_ratios=(1.25, 1, 1))
-    scatter, *histograms = axes[0]
-    for name, values in points.items():
-        style = look(name)
-        scatter.scatter(*values.T, s=13, color=style.colour, marker=style.marker, alpha=0.65,
-                        linewidths=0, label=style.label)
-    _published_points(scatter, task)
-    _reached_box(scatter)
-    for panel, (what, floor), column in zip(histograms, FLOOR.items(), (0, 1), strict=True):
-        high = max(values[:, column].max() for values in points.values()) * 1.3
-        low = max(floor, min(values[:, column].min() for values in points.values()) * 0.8)
-        edges = np.geomspace(low, max(high, low * 10), BINS)
-        for name, values in points.items():
-            share = np.histogram(np.maximum(values[:, column], low), edges)[0] / len(values)
-            style = look(name)
-            panel.stairs(share, edges, color=style.colour, lw=1.4)
-            panel.stairs(share, edges, color=style.colour, alpha=0.16, fill=True, lw=0)
+def distributions(groups: Groups, task: str) -> Figure:
+    """Share of the poses with at most an error at the target; lost ones never count."""
+    figure, axes = panels(1, 2, height=2.8)
+    for panel, what, limit in zip(axes[0], FLOOR, (REACHED_POSITION, REACHED_ORIENTATION),
+                                  strict=True):
+        for name, results in groups.items():
+            found = [pose[f'U_{what}_{UNITS[what]}'] for result in results
+                     for pose in result['metrics']['poses']]
+            known = np.sort([max(value, FLOOR[what]) for value in found if value is not None])
+            values, style = np.concatenate([known[:1], known]), look(name)
+            panel.step(values, 100 * np.arange(len(values)) / len(found), where='post',
+                       color=style.colour, ls=style.dashes, lw=1.5, label=style.label)
+        panel.axvline(limit, color=FAINT, lw=1, ls=(0, (3, 2)))
         panel.set_xscale('log')
         plain_ticks(panel.xaxis)
+        panel.set_ylim(0, 101)
         panel.set_xlabel(f'U {what} error [{UNITS[what]}]')
-        panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{100 * value:.0f} %'))
-        panel.axvline((REACHED_POSITION, REACHED_ORIENTATION)[column], color=FAINT, lw=1,
-                      ls=(0, (3, 2)))
-    histograms[0].set_ylabel('share of the poses')
-    label_once(figure, scatter)
+    axes[0, 0].set_ylabel('share of the poses [%]')
+    legend(figure, axes[0, 0])
     return figure
-
-
-def _points(results):
-    """(N, 2) U errors of all flown poses, at least the floor of the axes."""
-    values = np.array([[pose['U_position_m'], pose['U_orientation_deg']]
-                       for result in results for pose in result['metrics']['poses']
-                       if pose['U_position_m'] is not None]).reshape(-1, 2)
-    return np.maximum(values[np.all(np.isfinite(values), axis=1)], list(FLOOR.values()))
-
-
-def _published_points(panel, task):
-    if not task.startswith('random'):
-        return
-    for column, name in PUBLISHED.items():
-        numbers = published.RANDOM_POSES[name]
-        x, y = (numbers['mean'][key] for key in ('U_position_m', 'U_orientation_deg'))
-        spans = [[[value - numbers['min'][key]], [numbers['max'][key] - value]]
-                 for value, key in ((x, 'U_position_m'), (y, 'U_orientation_deg'))]
-        style = look(column)
-        panel.errorbar(x, y, xerr=spans[0], yerr=spans[1], color=style.colour, lw=0.8, alpha=0.55,
-                       zorder=1)
-        panel.plot(x, y, marker='*', ms=13, color=style.colour, mec='white', mew=0.8, ls='',
-                   label=f'published {name}', zorder=5)
-
-
-def _reached_box(panel):
-    panel.set_xscale('log')
-    panel.set_yscale('log')
-    plain_ticks(panel.xaxis)
-    plain_ticks(panel.yaxis)
-    (left, _), (bottom, _) = panel.get_xlim(), panel.get_ylim()
-    panel.plot([REACHED_POSITION, REACHED_POSITION, left],
-               [bottom, REACHED_ORIENTATION, REACHED_ORIENTATION], color=FAINT, lw=1,
-               ls=(0, (3, 2)))
-    panel.set_xlim(left=left)
-    panel.set_ylim(bottom=bottom)
-    panel.text(left, REACHED_ORIENTATION, '  reached', color=FAINT, fontsize=8, va='bottom')
-    panel.set_xlabel('U position error [m]')
-    panel.set_ylabel('U orientation error [deg]')
 
 
 def convergence(groups: Groups, task: str) -> Figure:
@@ -144,7 +85,7 @@ def convergence(groups: Groups, task: str) -> Figure:
         panel.set_xlim(0, POSE_DURATION)
         panel.set_ylabel(f'{what} error [{UNITS[what]}]')
         panel.set_xlabel('time since the pose was asked for [s]')
-    label_once(figure, axes[0, 0])
+    legend(figure, axes[0, 0])
     return figure
 
 
@@ -160,54 +101,45 @@ def _folded(results, key, grid):
     return np.array(rows)
 
 
-def disturbance(groups: Groups, kind: str) -> Figure:
-    """Errors over time with the disturbance dashed, as in the publication."""
-    unit = 'N' if kind == 'force' else 'N m'
+def in_time(groups: Groups, task: str) -> Figure:
+    """Errors of the first flights over time, with the disturbance dashed as in the publication."""
+    flown = make_task(task)
     figure, axes = panels(2, height=2.1, sharex=True)
-    times, levels = _levels(make_task(kind))
     for panel, what in zip(axes[:, 0], SHOWN, strict=True):
-        right = panel.twinx()
-        right.step(times, levels, where='post', color=INK, lw=1.1, ls=(0, (4, 2.5)))
-        right.set_ylim(0, levels.max() * 1.15)
-        right.set_ylabel(f'{kind} [{unit}]')
-        right.grid(False)
-        right.spines['right'].set_visible(True)
-        panel.plot([], [], color=INK, lw=1.1, ls=(0, (4, 2.5)), label=f'{kind} (right axis)')
-        highest = 0.0
-        for name, results in groups.items():
-            for k, result in enumerate(results):
-                highest = max(highest, _error_curve(panel, result, what, name, k))
+        if flown.kind in LEVELS:
+            _levels(panel, flown)
+        highest = max(_error_curve(panel, results[0], what, name)
+                      for name, results in groups.items())
         panel.set_ylim(0, min(1.08 * highest, SHOWN[what]) or 1)
         panel.set_ylabel(f'{what} error [{UNITS[what]}]')
-        panel.set_zorder(right.get_zorder() + 1)
-        panel.patch.set_visible(False)
-    axes[1, 0].set_xlim(POSE_DURATION - BEFORE, times[-1])
-    axes[1, 0].set_xticks(np.arange(POSE_DURATION - BEFORE, times[-1] + 0.1, 2.0))
+    axes[1, 0].set_xlim(POSE_DURATION - BEFORE, flown.duration)
     axes[1, 0].set_xlabel('time since the hover was asked for [s]')
-    label_once(figure, axes[0, 0])
+    legend(figure, axes[0, 0])
     return figure
 
 
-def _levels(task):
-    """Times and levels for a step plot."""
-    times, levels, begin = [0.0], [0.0], 0.0
-    for segment in task.segments:
-        times.append(begin)
-        levels.append(segment.level)
-        begin += segment.duration
-    return np.array([*times, begin]), np.array([*levels, levels[-1]])
+def _levels(panel, task):
+    """Plot the level of the disturbance on an axis to the right."""
+    right, name = panel.twinx(), LEVELS[task.kind]
+    levels = [segment.level for segment in task.segments]
+    style = {'color': INK, 'lw': 1.1, 'ls': (0, (4, 2.5))}
+    right.step([0.0, *task.ends], [*levels, levels[-1]], where='post', **style)
+    right.set_ylim(0, max(levels) * 1.15)
+    right.set_ylabel(name)
+    right.grid(False)
+    right.spines['right'].set_visible(True)
+    panel.plot([], [], label=f'{name} (right axis)', **style)
+    panel.set_zorder(right.get_zorder() + 1)
+    panel.patch.set_visible(False)
 
 
-def _error_curve(panel, result, what, name, k):
+def _error_curve(panel, result, what, name):
     """Plot one flight's errors, mark lost control, and return the largest error."""
     style, trace = look(name), result['trace']
     t, values = trace['t'], trace[f'{what}_error']
-    panel.plot(t, values, color=style.colour, ls=style.dashes, lw=1.5 if k == 0 else 0.8,
-               alpha=1.0 if k == 0 else 0.45, label=style.label)
-    kind = 'force' if 'force' in result['metrics'] else 'torque'
-    lost = next((value for key, value in result['metrics'][kind].items()
-                 if key.startswith('lost_at')), None)
-    if lost is not None:
+    panel.plot(t, values, color=style.colour, ls=style.dashes, lw=1.5, label=style.label)
+    if any(result['metrics'].get(kind, {}).get(f'lost_at_{unit}') is not None
+           for kind, unit in (('force', 'N'), ('torque', 'N_m'))):
         last = np.flatnonzero(np.isfinite(values))[-1:]
         panel.plot(t[last], np.minimum(values[last], SHOWN[what] * 0.98), marker='X', ms=8,
                    color=style.colour, mec='white', mew=0.8, ls='', zorder=6, clip_on=False)
@@ -215,54 +147,12 @@ def _error_curve(panel, result, what, name, k):
     return float(np.max(shown)) if shown.size else 0.0
 
 
-def _laps(results, keys):
-    """Phase grid (N,) [s] of a round and (R, N, len(keys)) values of all complete rounds."""
-    grid = np.arange(0.0, PERIOD, STEP)
-    rounds = []
-    for result in results:
-        trace = result['trace']
-        columns = np.column_stack([trace[key] for key in keys])
-        for begin, end in make_task('lemniscate').rounds:
-            if trace['t'][-1] >= end - 0.1:
-                rounds.append(np.column_stack([np.interp(grid + begin, trace['t'], values)
-                                               for values in columns.T]))
-    return grid, np.array(rounds)
-
-
-def lemniscate_errors(groups: Groups, task: str) -> Figure | None:
-    """Tracking errors over a round: mean of all rounds, minimum to maximum as a band."""
-    figure, axes = panels(2, height=1.6, sharex=True)
-    drawn = False
-    for name, results in groups.items():
-        style = look(name)
-        grid, rounds = _laps(results, ('position_error', 'orientation_error'))
-        for column in range(2 if len(rounds) else 0):
-            values, panel, drawn = rounds[:, :, column], axes[column, 0], True
-            panel.fill_between(grid, values.min(axis=0), values.max(axis=0), color=style.colour,
-                               alpha=0.2, lw=0)
-            panel.plot(grid, values.mean(axis=0), color=style.colour, ls=style.dashes, lw=1.4,
-                       label=style.label)
-    if not drawn:
-        return None
-    for panel, what in zip(axes[:, 0], UNITS, strict=True):
-        panel.set_ylabel(f'{what} error [{UNITS[what]}]')
-        panel.set_ylim(bottom=0)
-        panel.set_xlim(0, PERIOD)
-    axes[1, 0].set_xlabel('time in the round [s]')
-    label_once(figure, axes[0, 0])
-    return figure
-
-
+_POSES = [('errors', 'Share of the poses with at most an error at the target; dashed: reached',
+           distributions),
+          ('convergence', 'Errors after a pose was asked for: median and 10 to 90 % band over all '
+           'poses', convergence)]
+_TIME = [('errors', 'Errors in time in the first flight, the disturbance dashed; × where control '
+          'was lost', in_time)]
 # Kind of a task -> name, caption and function of each figure.
-DRAWN = {
-    'random': [('errors', 'Errors at the target; stars: published means, with their ranges',
-                distributions),
-               ('convergence', 'Errors after a pose was asked for: median and 10 to 90 % band '
-                'over all poses', convergence)],
-    'lemniscate': [('errors', 'Tracking errors in a round: mean of all rounds, least to largest '
-                    'as a band', lemniscate_errors)],
-    'force': [('errors', 'Errors in time, the disturbance dashed; × where control was lost; thin '
-               'lines: further seeds', disturbance)],
-    'torque': [('errors', 'Errors in time, the disturbance dashed; × where control was lost; thin '
-                'lines: further seeds; each torque lasts 0.05 s', disturbance)],
-    'waypoints': [], 'payload': [], 'hover': []}
+DRAWN = {'random': _POSES, 'poses': _POSES, **dict.fromkeys(
+    (*RISING, *TILTS, 'wind', 'pushes', 'payload'), _TIME)}

@@ -1,21 +1,24 @@
 """
-Numbers of a comparison, summarised over all flights of one task, conditions and controller.
+Numbers of a comparison: metrics of all flights of one task and conditions, by controller.
 
 The summary is part of the JSON file, and the page takes each of its numbers from it.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
-from math import isfinite
 from pathlib import Path
+from typing import Any
 from zlib import crc32
 
 import numpy as np
 
 from beetle_omni_ros.comparison.flights import Flight
+from beetle_omni_ros.comparison.statistics import compared
 from beetle_omni_ros.control import registry
+from beetle_omni_ros.pages.page import at
 from beetle_omni_ros.runs import table as published
-from beetle_omni_ros.runs.metrics import POSE_KEYS
+from beetle_omni_ros.runs.metrics import failed, POSE_KEYS
+from beetle_omni_ros.runs.tasks import PAYLOADS, PUSH_PERIOD, RISING, TILTS, WAYPOINTS
 
 PREFIX = 'published_'    # prefix of a controller in the publication
 # Colours of controllers outside the package, chosen by name.
@@ -29,23 +32,26 @@ CONDITIONS = {
 # Column of the publication's numbers -> its name there.
 PUBLISHED = {f'{PREFIX}{name}': entry.label for name, entry in reversed(
     registry.SHIPPED.items()) if entry.label in published.RANDOM_POSES}
-# Key of the summary -> keys of mean and standard deviation in the metrics of a flight.
-EFFORT = {'hover_speed_m_s': ('hover_speed_mean_m_s', 'hover_speed_std_m_s'),
-          'hover_angular_speed_rad_s': ('hover_angular_speed_mean_rad_s',
-                                        'hover_angular_speed_std_rad_s'),
-          'joint_error_rad': ('joint_error_mean_rad', 'joint_error_std_rad'),
-          'thrust_N': ('thrust_mean_N', 'thrust_std_N')}
+# Kind of a task -> published numbers, and whether they are of the real robot.
+PRINTED: dict[str, tuple[dict, bool]] = {
+    'random': (published.RANDOM_POSES, False), 'waypoints': (published.WAYPOINTS, True),
+    'lemniscate': (published.LEMNISCATE, True), 'wind': (published.WIND, True),
+    'pushes': (published.PUSHED, True), **dict.fromkeys(RISING, (published.DISTURBANCE, False))}
+TITLES = {'waypoints': 'Five waypoints', 'lemniscate': '3D lemniscate',
+          'lemniscate_large': 'Large 3D lemniscate', 'force': 'Force disturbance',
+          'torque': 'Torque disturbance', 'force_down': 'Force downwards',
+          'force_up': 'Force upwards', 'torque_pulses': 'Torque pulses', 'wind': 'Fan',
+          'pushes': 'Stick pushes', 'payload': 'Payload', 'hover': 'Steady hover'}
 
 
 @dataclass(frozen=True)
 class Look:
-    """Label and text of a controller, and its line: colour, dashes, marker."""
+    """Label and text of a controller, and its line: colour and dashes."""
 
     label: str
     text: str
     colour: str
     dashes: str | tuple = '-'
-    marker: str = 'o'
 
 
 def look(controller: str) -> Look:
@@ -53,21 +59,174 @@ def look(controller: str) -> Look:
     name = controller.removeprefix(PREFIX)
     entry = registry.SHIPPED.get(name)
     if entry is None:
-        return Look(name, '', SPARE[crc32(name.encode()) % len(SPARE)], (0, (4, 1, 1, 1)), 'X')
-    line = entry.line
+        return Look(name, '', SPARE[crc32(name.encode()) % len(SPARE)], (0, (4, 1, 1, 1)))
     if name != controller:
-        return Look(entry.label, 'the publication', line.colour, ':', '*')
-    return Look(entry.label, entry.description, line.colour, line.dashes, line.marker)
+        return Look(entry.label, 'the publication', entry.line[0], ':')
+    return Look(entry.label, entry.description, *entry.line)
+
+
+def kind_of(task: str) -> str:
+    """Kind of a task: 'random', 'poses' for a pose file, or its name."""
+    return task if task in TITLES else 'random' if task[6:].isdigit() else 'poses'
 
 
 def task_title(task: str) -> str:
     """Heading of a task."""
-    titles = {'waypoints': 'Five waypoints', 'lemniscate': '3D lemniscate',
-              'force': 'Force disturbance', 'torque': 'Torque disturbance',
-              'payload': 'Payload', 'hover': 'Steady hover'}
-    if task.startswith('random') and task[6:].isdigit():
-        return f'{task[6:]} random poses'
-    return titles.get(task, f'Poses of {Path(task).name}')
+    return TITLES.get(task) or (f'{task[6:]} random poses' if kind_of(task) == 'random'
+                                else f'Poses of {Path(task).name}')
+
+
+@dataclass(frozen=True)
+class Metric:
+    """
+    A number that a flight has once, or once for each pose.
+
+    Attributes:
+        title: its name with the unit.
+        digits: displayed digits.
+        of: function of the metrics of a flight: the number, or the list of those of its poses.
+        printed: path of the published mean.
+        more: whether more is better.
+        glance: whether it is in the table of all experiments.
+        detail: whether it is part of another number, and its differences are not displayed.
+
+    """
+
+    title: str
+    digits: int
+    of: Callable[[dict], Any]
+    printed: str = ''
+    more: bool = False
+    glance: bool = False
+    detail: bool = False
+
+
+def _at(title, digits, path, printed='', **options):
+    """Metric at a path of keys in the metrics of a flight."""
+    return Metric(title, digits, lambda judged: at(judged, path), printed, **options)
+
+
+def _mean(values):
+    values = [value for value in values if value is not None]
+    return float(np.mean(values)) if values else None
+
+
+def _poses():
+    names = ('U ‖p error‖ [m]', 'U ‖θ error‖ [deg]', 'L ‖p error‖ [m]', 'L ‖θ error‖ [deg]')
+    made = {key: Metric(name, digits, lambda judged, key=key: [
+        pose[key] for pose in judged['poses']], f'mean.{key}', glance=True)
+        for key, name, digits in zip(POSE_KEYS, names, (4, 2, 3, 2), strict=True)}
+    return {
+        **made,
+        'reached': Metric('poses reached [%]', 1, lambda judged: [
+            100.0 * pose['reached'] for pose in judged['poses']], more=True, glance=True),
+        'speed': _at('‖v‖ at the target [m/s]', 4, *2 * ['hover_speed_mean_m_s']),
+        'rate': _at('‖ω‖ at the target [rad/s]', 4, *2 * ['hover_angular_speed_mean_rad_s']),
+        'joint_error': _at('|q* − q| [rad]', 4, *2 * ['joint_error_mean_rad']),
+        'joint_error_hover': _at('|q* − q| at the target [rad]', 4, 'joint_error_hover_mean_rad'),
+        'thrust': _at('thrust f* [N]', 2, *2 * ['thrust_mean_N']), **_changes(False)}
+
+
+def _changes(glance):
+    """Changes of the commands in 10 ms at the target."""
+    return {f'change_{key}': _at(f'{name} command change in 10 ms, RMS [{unit}]', digits,
+                                 f'hover_command_change_rms.{key}', glance=glance)
+            for key, name, unit, digits in (('joint_rad', 'tilt', 'rad', 5),
+                                            ('thrust_N', 'thrust', 'N', 4))}
+
+
+def _waypoints():
+    made = {}
+    for k, target in enumerate(WAYPOINTS):
+        text = '[{:g}, {:g}, {:g}] m, [{:g}, {:g}, {:g}] deg: '.format(*target)
+        for key, digits in ((POSE_KEYS[0], 4), (POSE_KEYS[1], 2)):
+            made[f'{k}.{key}'] = Metric(
+                text + f"U [{'m' if key == POSE_KEYS[0] else 'deg'}]", digits,
+                lambda judged, k=k, key=key: _mean(
+                    pose[key] for pose in judged['poses'][k::len(WAYPOINTS)]),
+                f'by_pose.{k}.{key}', detail=True)
+    means = {key: _at(metric.title, metric.digits, *2 * [metric.printed],
+                      glance=key in POSE_KEYS[:2])
+             for key, metric in _poses().items() if key in POSE_KEYS}
+    return {**means, 'reached': Metric('poses reached [%]', 1, lambda judged: 100.0 * (
+        judged['success_rate'] or 0.0), more=True), **made}
+
+
+def _errors(kind):
+    """Mean and largest errors of a trajectory or a hover."""
+    made = {}
+    for name, unit, digits in (('position', 'm', 4), ('orientation', 'deg', 3)):
+        path = f'{name}_mean_{unit}'
+        made[name] = _at(f'{name} error [{unit}]', digits, f'{kind}.{path}', path, glance=True)
+        made[f'{name}_max'] = _at(f'largest {name} error [{unit}]', digits,
+                                  f'{kind}.{name}_max_{unit}')
+    return made
+
+
+def _disturbance(kind, _, levels, *times):
+    unit = 'N' if kind == 'force' else 'N_m'
+    key, text, beyond = f'{kind}_{unit}', unit.replace('_', ' '), 2 * levels[-1] - levels[-2]
+
+    def lost(judged):
+        level = judged[kind][f'lost_at_{unit}']
+        return float(beyond if level is None else level)
+
+    def peak(judged, level, name):
+        return next((entry[name] for entry in judged[kind]['levels']
+                     if entry[f'level_{unit}'] == level), None)
+
+    return {'lost': Metric(f'control lost at [{text}]', 1, lost, key, more=True, glance=True), **{
+        f'{level:g}.{name}': Metric(
+            f'{level:g} {text}: largest error [{size}]', digits,
+            lambda judged, level=level, name=name: peak(judged, level, name), detail=True)
+        for level in map(float, levels) for name, size, digits in (
+            ('peak_position_m', 'm', 3), ('peak_orientation_deg', 'deg', 1))}}
+
+
+def _wind():
+    made = {}
+    for name, unit, digits in (('position', 'm', 4), ('orientation', 'deg', 2)):
+        for part, text in (('mean', 'error'), ('std', 'standard deviation')):
+            path = f'{name}_{part}_{unit}'
+            made[path] = _at(f'strongest wind: {name} {text} [{unit}]', digits, f'wind.-1.{path}',
+                             path, glance=True)
+    return made
+
+
+def _pushes():
+    def recovery(judged):
+        return float(np.mean([PUSH_PERIOD if push['recovery_s'] is None else push['recovery_s']
+                              for push in judged['pushes']['pushes']]))
+
+    speed, rate = 'speed_mean_m_s', 'angular_speed_mean_rad_s'
+    return {'recovery': Metric('recovery to 0.02 m and 2 deg [s]', 2, recovery, glance=True),
+            'speed': _at('mean speed [m/s]', 3, f'pushes.{speed}', speed),
+            'rate': _at('mean body rate [rad/s]', 3, f'pushes.{rate}', rate)}
+
+
+def _payload():
+    def height(judged, mass):
+        return next((abs(entry['height_error_m']) for entry in judged['payload']
+                     if entry['payload_kg'] == mass and entry['height_error_m'] is not None), None)
+
+    def worst(judged):
+        found = [height(judged, mass) for mass in PAYLOADS]
+        return None if None in found else max(found)
+
+    return {'worst': Metric('largest height error [m]', 4, worst, glance=True), **{
+        f'{mass:g}.height': Metric(f'{mass:g} kg: height error [m]', 4, lambda judged, mass=mass:
+                                   height(judged, mass), detail=True) for mass in PAYLOADS}, **{
+        f'{mass:g}.orientation': Metric(
+            f'{mass:g} kg: orientation error [deg]', 2, lambda judged, mass=mass: next(
+                (entry['orientation_deg'] for entry in judged['payload']
+                 if entry['payload_kg'] == mass), None), detail=True) for mass in PAYLOADS}}
+
+
+METRICS: dict[str, dict[str, Metric]] = {
+    'random': _poses(), 'poses': _poses(), 'waypoints': _waypoints(),
+    **{name: _errors('trajectory') for name in TILTS}, 'wind': _wind(), 'pushes': _pushes(),
+    **{name: _disturbance(*of) for name, of in RISING.items()}, 'payload': _payload(),
+    'hover': {**_errors('hover'), **_changes(True)}}
 
 
 def summarise(flown: dict[Flight, dict]) -> dict:
@@ -75,120 +234,40 @@ def summarise(flown: dict[Flight, dict]) -> dict:
     Summarise results of :func:`fly_flight`.
 
     Returns:
-        ``tasks``: task -> conditions -> controller -> numbers, with published numbers under the
-        conditions 'paper'; ``compute``: CPU times.
+        ``tasks``: task -> conditions -> ``flights`` (controller -> seeds, failures, lost) and
+        ``metrics`` (name in :data:`METRICS` -> :func:`statistics.compared`); ``compute``: CPU
+        times.
 
     """
     summary: dict = {}
-    groups: dict[tuple, list] = {}
-    for flight in sorted(flown, key=lambda flight: flight.seed):
-        key = (flight.task, flight.conditions, flight.controller)
-        groups.setdefault(key, []).append((flight, flown[flight]))
-    for (task, conditions, controller), results in groups.items():
-        numbers = summary.setdefault(task, {}).setdefault(conditions, {})
-        numbers[controller] = _group(task, results)
-    for task, by_conditions in summary.items():
-        if paper := _paper(task):
-            by_conditions['paper'] = paper
+    groups: dict[tuple, dict] = {}
+    for flight, result in flown.items():
+        groups.setdefault((flight.task, flight.conditions), {}).setdefault(
+            flight.controller, {})[flight.seed] = result
+    for (task, conditions), by_name in groups.items():
+        judged = {name: {seed: by_seed[seed]['metrics'] for seed in sorted(by_seed)
+                         if by_seed[seed]['metrics']} for name, by_seed in by_name.items()}
+        summary.setdefault(task, {})[conditions] = {
+            'flights': {name: {
+                'seeds': sorted(by_seed),
+                'failures': {str(seed): result['failure'] for seed, result in by_seed.items()
+                             if result['failure']},
+                'lost': sum(map(failed, judged[name].values()))}
+                for name, by_seed in by_name.items()},
+            'metrics': {key: compared({name: _sample(metric, by_seed)
+                                       for name, by_seed in judged.items()}, metric.more)
+                        for key, metric in METRICS[kind_of(task)].items()}}
     return {'tasks': summary, 'compute': _compute(flown)}
 
 
-def _group(task, results):
-    """Numbers of one controller in one task under one set of conditions."""
-    made = {'seeds': [flight.seed for flight, _ in results],
-            'failures': {str(flight.seed): result['failure'] for flight, result in results
-                         if result['failure']}}
-    judged = [result['metrics'] for _, result in results if result['metrics']]
-    made['crashed'] = sum(bool(metrics['crashed']) for metrics in judged)
-    made['flights'] = len(results)
-    if not judged:
-        return made
-    made.update(_poses(judged))
-    for key, (mean, std) in EFFORT.items():
-        made[key] = _pooled(judged, mean, std)
-    made['joint_error_hover_rad'] = {'mean': _mean(m['joint_error_hover_mean_rad']
-                                                   for m in judged)}
-    made['command_change_rms'] = {
-        name: _root_mean_square(m['hover_command_change_rms'][name] for m in judged)
-        for name in ('joint_rad', 'thrust_N')}
-    if task == 'waypoints':
-        made['by_pose'] = _by_pose([pose for m in judged for pose in m['poses']])
-    for kind, make in (('trajectory', _tracking), ('payload', _payload), ('hover', _hover)):
-        if parts := [m[kind] for m in judged if kind in m]:
-            made[kind] = make(parts)
-    if 'payload' in made:
-        made['payload_height_max_m'] = _most(
-            abs(end) for entry in made['payload']
-            for end in _known(entry['height_error_m'][which] for which in ('min', 'max')))
-    for kind, unit in (('force', 'N'), ('torque', 'N_m')):
-        if parts := [m[kind] for m in judged if kind in m]:
-            made[kind] = _levels(parts, unit)
-    return made
-
-
-def _poses(judged):
-    poses = [pose for metrics in judged for pose in metrics['poses']]
-    return {'poses': len(poses), 'reached': sum(pose['reached'] for pose in poses),
-            'flown': sum(pose['U_position_m'] is not None for pose in poses),
-            **{key: _spread(pose[key] for pose in poses) for key in POSE_KEYS}}
-
-
-def _by_pose(poses):
-    """One entry for each different target, in the order of the flights."""
-    groups: dict[tuple, list] = {}
-    for pose in poses:
-        groups.setdefault(tuple(round(v, 4) for v in pose['target']), []).append(pose)
-    return [{'target': list(target), 'flown': len(group),
-             **{key: _spread(pose[key] for pose in group) for key in POSE_KEYS}}
-            for target, group in groups.items()]
-
-
-def _tracking(parts):
-    """Errors over all rounds of all flights, and the range of the rounds' means."""
-    rounds = [part for tracking in parts for part in tracking['rounds']]
-    made: dict = {'rounds': len(rounds)}
-    for name, unit in (('position', 'm'), ('orientation', 'deg')):
-        means = [part[f'{name}_mean_{unit}'] for part in rounds]
-        made[f'{name}_{unit}'] = {
-            **_pooled(rounds, f'{name}_mean_{unit}', f'{name}_std_{unit}'),
-            'min': _least(part[f'{name}_min_{unit}'] for part in rounds),
-            'max': _most(part[f'{name}_max_{unit}'] for part in rounds),
-            'round_min': _least(means), 'round_max': _most(means)}
-    return made
-
-
-def _payload(parts):
-    masses = sorted({entry['payload_kg'] for part in parts for entry in part})
-    return [{'payload_kg': mass, **{
-        key: _spread(entry[key] for part in parts for entry in part
-                     if entry['payload_kg'] == mass)
-        for key in ('height_error_m', 'position_m', 'orientation_deg')}} for mass in masses]
-
-
-def _hover(parts):
-    return {f'{name}_{unit}': {**_pooled(parts, f'{name}_mean_{unit}', f'{name}_std_{unit}'),
-                               'max': _most(part[f'{name}_max_{unit}'] for part in parts)}
-            for name, unit in (('position', 'm'), ('orientation', 'deg'))}
-
-
-def _levels(parts, unit):
-    """Errors at each level, and the level of lost control in each flight."""
-    lost = [part[f'lost_at_{unit}'] for part in parts]
-    known = [level for level in lost if level is not None]
-    steps = sorted({entry[f'level_{unit}'] for part in parts for entry in part['levels']})
-    levels = []
-    for step in steps:
-        entries = [entry for part in parts for entry in part['levels']
-                   if entry[f'level_{unit}'] == step]
-        levels.append({'level': step, 'flown': len(entries),
-                       'lost': sum(entry['lost'] for entry in entries),
-                       **{key: _spread(entry[key] for entry in entries)
-                          for key in ('peak_position_m', 'peak_orientation_deg',
-                                      'end_position_m', 'end_orientation_deg')}})
-    return {'lost_at': lost, 'lost_min': min(known, default=None),
-            'lost_max': max(known) if known and len(known) == len(lost) else None,
-            'withstood_min': _least(part[f'withstood_{unit}'] for part in parts),
-            'levels': levels}
+def _sample(metric, by_seed):
+    """Values of a controller by (seed,), or by (seed, pose)."""
+    sample = {}
+    for seed, judged in by_seed.items():
+        value = metric.of(judged)
+        sample |= {(seed, k): each for k, each in enumerate(value)} \
+            if isinstance(value, list) else {(seed,): value}
+    return sample
 
 
 def _compute(flown):
@@ -202,80 +281,16 @@ def _compute(flown):
         if times:
             made[controller] = {
                 'median': float(np.median([t['median'] for t in times])),
-                'p99': _most(t['p99'] for t in times), 'max': _most(t['max'] for t in times),
-                'deadline_misses': sum(t['deadline_misses'] for t in times),
-                'steps': sum(t['steps'] for t in times), 'flights': len(times)}
+                **{key: max(t[key] for t in times) for key in ('p99', 'max')},
+                **{key: sum(t[key] for t in times) for key in ('deadline_misses', 'steps')},
+                'flights': len(times)}
     return made
 
 
-def _paper(task):
-    """Published numbers of a task: published controller -> numbers in the form of the summary."""
-    made: dict = {}
-    for column, name in PUBLISHED.items():
-        real = f'{name}, real robot'
-        if task.startswith('random'):
-            made[column] = {**_published_poses(published.RANDOM_POSES[name]),
-                            **{key: {'mean': published.RANDOM_POSES[name][mean],
-                                     'std': published.RANDOM_POSES[name][std]}
-                               for key, (mean, std) in EFFORT.items()}}
-        elif task == 'waypoints':
-            made[column] = {**_published_poses(published.WAYPOINTS[real]), 'by_pose': [
-                {key: {'mean': value} for key, value in pose.items()}
-                for pose in published.WAYPOINTS[real]['by_pose']]}
-        elif task == 'lemniscate':
-            tracking = published.LEMNISCATE[real]
-            made[column] = {'trajectory': {f'{what}_{unit}': {
-                part: tracking[f'{what}_{part}_{unit}'] for part in ('mean', 'std')}
-                for what, unit in (('position', 'm'), ('orientation', 'deg'))}}
-        elif task in ('force', 'torque'):
-            unit = 'N' if task == 'force' else 'N_m'
-            level = published.DISTURBANCE[name][f'{task}_{unit}']
-            made[column] = {task: {'lost_min': level, 'lost_max': level}}
-    return made
-
-
-def _published_poses(numbers):
-    return {key: {what: numbers[what][key] for what in ('mean', 'min', 'max')
-                  if key in numbers.get(what, {})}
-            for key in POSE_KEYS if key in numbers['mean']}
-
-
-def _known(values: Iterable):
-    return [float(value) for value in values if value is not None and isfinite(value)]
-
-
-def _mean(values):
-    values = _known(values)
-    return float(np.mean(values)) if values else None
-
-
-def _least(values):
-    return min(_known(values), default=None)
-
-
-def _most(values):
-    return max(_known(values), default=None)
-
-
-def _root_mean_square(values):
-    values = _known(values)
-    return float(np.sqrt(np.mean(np.square(values)))) if values else None
-
-
-def _spread(values):
-    values = _known(values)
-    if not values:
-        return dict.fromkeys(('mean', 'median', 'min', 'max'))
-    return {'mean': float(np.mean(values)), 'median': float(np.median(values)),
-            'min': min(values), 'max': max(values)}
-
-
-def _pooled(parts, mean, std):
-    """Mean and standard deviation of all samples, from parts of equal size."""
-    pairs = [(part[mean], part[std]) for part in parts
-             if part.get(mean) is not None and part.get(std) is not None]
-    if not pairs:
-        return {'mean': None, 'std': None}
-    means, deviations = np.array(pairs).T
-    square = np.mean(deviations ** 2 + means ** 2) - np.mean(means) ** 2
-    return {'mean': float(np.mean(means)), 'std': float(np.sqrt(max(square, 0.0)))}
+def printed(task: str, metric: Metric, column: str) -> dict:
+    """Published mean of a metric, with std, min and max where they are printed; {} for none."""
+    numbers, real = PRINTED.get(kind_of(task), ({}, False))
+    found = numbers.get(PUBLISHED[column] + ', real robot' * real, {})
+    parts = ('mean', 'std', 'min', 'max') if 'mean' in metric.printed else ('mean',)
+    return {part: value for part in parts
+            if (value := at(found, metric.printed.replace('mean', part))) is not None}

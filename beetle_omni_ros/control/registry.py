@@ -40,15 +40,6 @@ RESERVED = ('controller', 'ekf', 'joint_bridge', 'meta', 'none', 'operator', 're
             'reference', 'rotor_bridge', 'sim', 'supervisor', 'viewer')
 
 
-@dataclass(frozen=True)
-class Line:
-    """Line style of a controller in figures; without a colour one is chosen."""
-
-    colour: str = ''
-    dashes: str | tuple = '-'
-    marker: str = 'o'
-
-
 @dataclass(frozen=True, kw_only=True)
 class ControllerOptions:
     """
@@ -92,7 +83,7 @@ class ControllerEntry:
         stands_by: whether it runs in the ROS graph on standby.
         compared: whether `beetle_omni compare` flies it by default.
         cost: core seconds for a simulated second, to order flights; without influence on results.
-        line: style in figures.
+        line: colour and dashes in figures.
 
     """
 
@@ -111,7 +102,7 @@ class ControllerEntry:
     stands_by: bool = False
     compared: bool = False
     cost: float = 0.1
-    line: Line = field(default_factory=Line)
+    line: tuple[str, str | tuple] = ('', '-')
 
     def __post_init__(self):
         """Refuse an invalid name."""
@@ -142,7 +133,7 @@ class ControllerEntry:
 
     def completed(self, mapping: dict, from_user: bool) -> dict:
         """Values of a parameter file and of ``fixed``; a user's file takes precedence."""
-        return {**self.fixed, **mapping} if from_user else {**mapping, **self.fixed}
+        return _merged(self.fixed, mapping) if from_user else _merged(mapping, self.fixed)
 
     def load_parameters(self, options: ControllerOptions = ControllerOptions()):
         """
@@ -241,6 +232,12 @@ class ControllerEntry:
                                  'target [m], above 0')
 
 
+def _merged(low: Mapping[str, Any], high: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested values of both, those of ``high`` where both have one."""
+    return {**low, **{key: _merged(low[key], value) if key in low and isinstance(value, Mapping)
+                      else value for key, value in high.items()}}
+
+
 # Line styles: blue for RL and red for NMPC as in the publication. The variants are lighter and
 # dashed, so that readers who cannot distinguish the colours can also read the figures.
 _NMPC = 'beetle_omni_ros.control.nmpc:NmpcController'
@@ -249,35 +246,47 @@ SHIPPED: Mapping[str, ControllerEntry] = {entry.name: entry for entry in (
     ControllerEntry(
         name='nmpc', label='NMPC', description='offset-free, params/nmpc.yaml', controller=_NMPC,
         parameters_file='params/nmpc.yaml', option='--nmpc', flies_degraded=True, stands_by=True,
-        compared=True, cost=0.1, line=Line('#c8281e', '-', '^')),
+        compared=True, cost=0.1, line=('#c8281e', '-')),
     ControllerEntry(
         name='rl', label='RL', description='the learned policy, 33 observations',
         controller=_POLICY, parameters_file='params/rl.yaml', policy_file='policies/rl.onnx',
         option='--policy', guidance='unwinding, routing, turning, trimming', stands_by=True,
-        compared=True, cost=0.07, line=Line('#1b5fb4', '-', 'o')),
+        compared=True, cost=0.07, line=('#1b5fb4', '-')),
     ControllerEntry(
         name='rl_bare', label='RL, bare', description='the learned policy without guidance',
         controller=_POLICY, parameters_file='params/rl.yaml', policy_file='policies/rl.onnx',
         fixed={'without': 'all'}, compared=True, cost=0.07,
-        line=Line('#0b2d5c', (0, (2, 1)), 'x')),
+        line=('#0b2d5c', (0, (2, 1)))),
     ControllerEntry(
         name='rl_memory', label='RL, memory',
         description='the learned policy with the estimated disturbance as input',
         controller=_POLICY, parameters_file='params/rl.yaml',
         policy_file='policies/rl_memory.onnx', fixed={'policy': 'policies/rl_memory.onnx'},
-        guidance='unwinding, routing, turning, trimming', compared=True, cost=0.08,
-        line=Line('#58b4e8', (0, (5, 1.6)), 's')),
+        guidance='unwinding, routing, turning, trimming', cost=0.08,
+        line=('#58b4e8', (0, (5, 1.6)))),
+    ControllerEntry(
+        name='rl_published', label='RL, published training',
+        description='params/train_published.yaml, without guidance', controller=_POLICY,
+        parameters_file='params/rl.yaml', policy_file='policies/rl_published.onnx',
+        fixed={'policy': 'policies/rl_published.onnx', 'without': 'all'}, compared=True,
+        cost=0.07, line=('#3f8f8a', (0, (4, 1, 1, 1)))),
+    ControllerEntry(
+        name='nmpc_corrected', label='NMPC, corrected weight',
+        description='params/nmpc_published.yaml with weights.tilt 20 instead of 2',
+        controller=_NMPC, parameters_file='params/nmpc_published.yaml',
+        fixed={'weights': {'tilt': 20.0}}, flies_degraded=True, compared=True, cost=0.13,
+        line=('#b5651d', (0, (5, 1.2)))),
     ControllerEntry(
         name='nmpc_published', label='NMPC, published settings',
         description='params/nmpc_published.yaml', controller=_NMPC,
         parameters_file='params/nmpc_published.yaml', flies_degraded=True, compared=True,
-        cost=0.13, line=Line('#e8960c', (0, (3, 1.2, 1, 1.2)), 'v')),
+        cost=0.13, line=('#e8960c', (0, (3, 1.2, 1, 1.2)))),
     ControllerEntry(
         name='hover', label='hover PD',
         description="PD with allocation, the supervisor's fallback",
         controller='beetle_omni_ros.control.hover:HoverController',
         parameters_file='params/hover.yaml', flies_degraded=True, cost=0.05,
-        line=Line('#5b6770', (0, (1, 1.2)), 'D')))}
+        line=('#5b6770', (0, (1, 1.2)))))}
 DEFAULT = next(iter(SHIPPED))       # the default controller
 _ADDED: dict[str, ControllerEntry] = {}     # of this process alone
 

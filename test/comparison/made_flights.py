@@ -10,7 +10,8 @@ from beetle_omni_ros.runs.log import LogRecorder
 from beetle_omni_ros.runs.metrics import metrics
 from beetle_omni_ros.runs.tasks import make_task
 
-TASKS = ('random3', 'waypoints', 'lemniscate', 'force', 'torque', 'payload', 'hover')
+TASKS = ('random3', 'waypoints', 'lemniscate', 'force', 'torque', 'wind', 'pushes',
+         'payload', 'hover')
 FAILED = {'failure': 'no take-off <within> 30 s', 'metrics': None, 'trace': {}, 'cpu_s': 1.0,
           'host': 'here'}
 

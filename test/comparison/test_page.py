@@ -11,6 +11,7 @@ from rich.console import Console
 
 from beetle_omni_ros.comparison import command, page
 from beetle_omni_ros.comparison.flights import Flight
+from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs import table as published
 
 CONTROLLERS = ('rl', 'nmpc', 'nmpc_published')
@@ -42,22 +43,50 @@ def table_of(results, title):
                 if block.title.startswith(title))
 
 
+def row_of(table, title):
+    return next(k for k, row in enumerate(table.rows) if row[0] == title)
+
+
 def test_numbers_of_a_table_follow_from_the_flights_and_are_on_both_pages(whole):
     _, html, numbers, text = whole
     for conditions in ('nominal', 'published'):
         table = table_of(numbers, f'3 random poses, {conditions}')
         assert table.rows[0][0].startswith('U ‖p error‖ [m]')
+        means = []
         for column, controller in enumerate(CONTROLLERS, 1):
             found = [pose['U_position_m'] for flight in numbers['flights']
                      for pose in flight['metrics']['poses']
                      if (flight['task'], flight['conditions'], flight['controller'])
                      == ('random3', conditions, controller)]
             assert len(found) == 6
-            cell = table.rows[0][column]
-            shown = f'{np.mean(found):.4f} [{min(found):.4f}, {max(found):.4f}]'
-            assert cell == shown and cell in html and cell in text
-        best = min(range(1, 4), key=lambda k: float(table.rows[0][k].split()[0]))
-        assert (0, best) in table.best
+            cell, means = table.rows[0][column], [*means, np.mean(found)]
+            low, high = map(float, re.fullmatch(r'[\d.]+ \[([\d.]+), ([\d.]+)\]', cell).groups())
+            assert cell.startswith(f'{means[-1]:.4f} ') and low < means[-1] < high
+            assert cell in html and cell in text
+            assert table.rows[2][column] == f'{min(found):.4f} to {max(found):.4f}'
+        # every flight of a later controller is worse than the same one of an earlier controller
+        assert table.rows[1][1] == '–' and (0, 1) in table.best
+        for column in (2, 3):
+            assert table.rows[1][column].startswith(f'{means[column - 1] - means[0]:.4f} [0.')
+    glance = table_of(numbers, 'All experiments')
+    row = row_of(glance, '3 random poses, published: U ‖p error‖ [m]')
+    assert glance.rows[row][1] == f'{means[0]:.4f}' and (row, 1) in glance.best
+
+
+def test_a_part_of_the_readme_is_renewed(whole, tmp_path):
+    _, _, numbers, _ = whole
+    path = tmp_path / 'README.md'
+    path.write_text(f'before\n{page.BEGIN}old\n{page.END}after\n')
+    for _ in range(2):      # again in place of itself
+        path.write_text(page.with_table(path, numbers))
+    text = path.read_text()
+    assert text.startswith('before\n') and text.endswith('after\n') and 'old' not in text
+    rows = [line for line in text.splitlines() if line.startswith('| Five waypoints: U')]
+    assert [row.count('|') for row in rows] == [6, 6]     # RL, NMPC, and both as published
+    assert rows[0].endswith('| 0.077 * | 0.042 * |')
+    path.write_text('no place')
+    with pytest.raises(ParameterError, match='--readme .*expected the lines'):
+        page.with_table(path, numbers)
 
 
 def test_the_page_needs_no_network(whole):
@@ -68,17 +97,20 @@ def test_the_page_needs_no_network(whole):
 
 
 def test_published_numbers_keep_their_printed_form(whole):
-    row = table_of(whole[2], '3 random poses, nominal').rows[1]
-    assert row[-1] == '40.99 [0.41, 136.97]'
-    poses = [float(row[-2].split(' / ')[0]) for row in table_of(whole[2], 'Five way').rows[:5]]
+    table = table_of(whole[2], '3 random poses, nominal')
+    row = row_of(table, 'U ‖θ error‖ [deg]')
+    assert table.rows[row][-1] == '40.99' and table.rows[row + 2][-1] == '0.41 to 136.97'
+    assert table.rows[row_of(table, '‖v‖ at the target [m/s]')][-1] == '0.008 ± 0.0005'
+    poses = [float(row[-2]) for row in table_of(whole[2], 'Five way').rows
+             if row[0].endswith('deg: U [m]')]
     mean = published.WAYPOINTS['RL, real robot']['mean']['U_position_m']
-    assert np.mean(poses) == pytest.approx(mean, abs=5e-4)
+    assert len(poses) == 5 and np.mean(poses) == pytest.approx(mean, abs=5e-4)
 
 
 def test_pictures_named_in_the_markdown_exist(whole):
     folder, _, _, text = whole
     names = re.findall(r'!\[[^\]]*\]\(([^)]+)\)', text)
-    assert len(names) > 8
+    assert len(names) == 16
     for name in names:
         assert (folder / name).read_bytes().startswith(b'\x89PNG')
     assert {path.name for path in folder.glob('*.png')} == set(names)
@@ -101,8 +133,12 @@ def test_failed_and_crashed_flights_are_reported_and_affect_no_other(tmp_path):
     assert 'touched the ground' in html and 'crash at 20.9 s' in html
     assert 'no such file' in html and 'no such file' in text
     waypoints = numbers['summary']['tasks']['waypoints']['nominal']
-    assert waypoints['rl']['failures'] == {'0': FAILED['failure']}
-    assert (waypoints['nmpc']['reached'], waypoints['nmpc']['poses']) == (2, 15)
-    assert (waypoints['nmpc']['flown'], waypoints['nmpc_published']['flown']) == (2, 15)
-    force = numbers['summary']['tasks']['force']['nominal']['rl']['force']
-    assert force['lost_at'] == [30.0] and force['withstood_min'] == 20.0
+    assert waypoints['flights']['rl']['failures'] == {'0': FAILED['failure']}
+    assert [waypoints['flights'][name]['lost'] for name in CONTROLLERS] == [0, 1, 0]
+    reached, last = waypoints['metrics']['reached'], waypoints['metrics']['4.U_position_m']
+    assert reached['nmpc']['mean'] == pytest.approx(200 / 15)
+    assert [reached[name]['count'] for name in CONTROLLERS[1:]] == [1, 1]
+    assert [last[name]['count'] for name in CONTROLLERS] == [0, 0, 1]
+    force = numbers['summary']['tasks']['force']['nominal']['metrics']
+    assert force['lost']['rl']['mean'] == 30.0
+    assert force['20.peak_position_m']['rl']['count'] == 1

@@ -1,7 +1,9 @@
 """`beetle_omni train`: a smoke run, resume, one-line refusals."""
 
+from dataclasses import fields
 import json
 from pathlib import Path
+import re
 import shutil
 
 import learning  # noqa: F401
@@ -14,7 +16,10 @@ from beetle_omni_ros.control.base import PoseTarget, State
 from beetle_omni_ros.control.policy import PolicyController, PolicyParameters
 from beetle_omni_ros.control.policy_file import PolicyNetwork
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.resources import share_path
+from beetle_omni_ros.robot.schema import flatten
 from beetle_omni_ros.train import command
+from beetle_omni_ros.train.assess import conditions
 from beetle_omni_ros.train.command import parse_changes
 from beetle_omni_ros.train.parameters import read_parameters, TrainParameters
 from beetle_omni_ros.train.ppo import GraphPpo
@@ -55,6 +60,25 @@ def test_a_run_writes_all_documented_files(run):
 
 def test_the_shipped_parameters_are_the_defaults():
     assert TrainParameters.load().plain() == TrainParameters().plain()
+
+
+def test_the_published_training_has_the_published_values_and_no_own_term():
+    published = TrainParameters.load(share_path('params/train_published.yaml'))
+    usual, documented = TrainParameters().plain(), 0
+    for name, entry, _, value in flatten(published):
+        doc = entry.metadata['doc']
+        if found := re.search(r'\bpublished( -[\d.e-]+)?', doc):
+            np.testing.assert_array_equal(value, float(found[1]) if found[1]
+                                          else usual[name], name)
+            documented += 1
+        elif doc.startswith('own: '):
+            assert value == 0 or name == 'reward.termination', name
+    assert documented == 23
+    for entry in fields(published.random):      # but velocities are old, with no estimator
+        if entry.name != 'carried_share':
+            np.testing.assert_array_equal(
+                getattr(published.random, entry.name),
+                getattr(conditions('published', published.random), entry.name), entry.name)
 
 
 def test_the_policy_of_a_run_flies(run):
