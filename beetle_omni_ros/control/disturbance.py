@@ -13,16 +13,17 @@ estimator therefore models the play of each servo, and the targets overcome it.
 """
 
 from collections import deque
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, State
-from beetle_omni_ros.control.nmpc_parameters import DisturbanceParameters
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY, clipped
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import parameter
 
 LONGEST_STEP = 0.1  # [s] a longer gap between states restarts the actuator model
 SHORT = 0.002           # [s] a command change nearer to an end of a span is treated as at this end
@@ -33,23 +34,35 @@ TILT_CORRECTION = 0.2   # share of a measured tilt error that corrects the tilt 
 HISTORY = 64        # number of stored states and commands, more than any latency needs
 
 
-class FunctionCall:
-    """A CasADi function of vectors with fixed buffers, for fast calls with numpy arrays."""
+@dataclass(frozen=True, kw_only=True)
+class DisturbanceParameters:
+    """Disturbance estimates; a bandwidth of 0 switches one off."""
 
-    def __init__(self, function: ca.Function):
-        self._buffer, self._evaluate = function.buffer()
-        self._arguments = [np.zeros(function.numel_in(i)) for i in range(function.n_in())]
-        self._result = np.zeros(function.numel_out(0))
-        for i, array in enumerate(self._arguments):
-            self._buffer.set_arg(i, array.data)
-        self._buffer.set_res(0, self._result.data)
+    force_bandwidth: float = parameter(
+        3.0, doc='bandwidth of the external force', unit='rad/s', low=0, high=50)
+    torque_bandwidth: float = parameter(
+        4.0, doc='bandwidth of the external torque', unit='rad/s', low=0, high=50)
+    tilt_bandwidth: float = parameter(
+        3.0, doc='bandwidth of the servo offsets', unit='rad/s', low=0, high=50)
 
-    def __call__(self, *values) -> np.ndarray:
-        """The result for these arguments, a fresh array."""
-        for array, value in zip(self._arguments, values):
+
+def buffered(function: ca.Function) -> Callable[..., np.ndarray]:
+    """Make a fast call of a CasADi function of vectors: numpy arrays in fixed buffers."""
+    buffer, evaluate = function.buffer()
+    arguments = [np.zeros(function.numel_in(i)) for i in range(function.n_in())]
+    result = np.zeros(function.numel_out(0))
+    for i, array in enumerate(arguments):
+        buffer.set_arg(i, array.data)
+    buffer.set_res(0, result.data)
+
+    def call(*values) -> np.ndarray:
+        for array, value in zip(arguments, values):
             array[:] = value
-        self._evaluate()
-        return self._result.copy()
+        evaluate()
+        return result.copy()
+
+    call.__dict__['buffer'] = buffer    # `evaluate` has its address only
+    return call
 
 
 class DisturbanceEstimator:
@@ -73,8 +86,8 @@ class DisturbanceEstimator:
     """
 
     def __init__(self, robot: RobotParameters, parameters: DisturbanceParameters,
-                 command_delay: float, advance: FunctionCall):
-        self._robot, self._advance = robot, advance
+                 command_delay: float, advance: ca.Function):
+        self._robot, self._advance = robot, buffered(advance)
         self.delay = max(command_delay + sum(robot.command_delays) / 2, 0.0)
         p = parameters
         # bandwidth times inertia: turns a velocity error of one step into a change of force

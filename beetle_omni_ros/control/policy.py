@@ -6,9 +6,8 @@ from math import isfinite
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, PoseTarget, Reference, State, Target
-from beetle_omni_ros.control.disturbance import DisturbanceEstimator, FunctionCall
+from beetle_omni_ros.control.disturbance import DisturbanceEstimator, DisturbanceParameters
 from beetle_omni_ros.control.guidance import Charge, Guidance
-from beetle_omni_ros.control.nmpc_parameters import DisturbanceParameters
 from beetle_omni_ros.control.policy_file import kind, PolicyNetwork
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -73,7 +72,7 @@ class PolicyController:
         self._hover = [robot.hover_thrust] * 4
         self._estimator = DisturbanceEstimator(
             robot, DisturbanceParameters(), COMMAND_DELAY,
-            FunctionCall(model.integrator(robot))) if contract.memory else None
+            model.integrator(robot)) if contract.memory else None
         self._guidance, self._charge = Guidance(robot.tilt_axes, p.without), Charge()
         self.guidance = self._guidance.text
         self.reset()

@@ -3,8 +3,8 @@
 import casadi as ca
 import numpy as np
 
-from beetle_omni_ros.control import ocp
-from beetle_omni_ros.control.nmpc_parameters import NmpcWeights
+from beetle_omni_ros.control.nmpc import NmpcWeights
+from beetle_omni_ros.control.ocp import stage_functions
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -25,23 +25,23 @@ def random_point(seed, size):
 
 
 def test_the_cost_is_zero_at_the_reference_for_both_quaternion_signs():
-    problem = ocp.build(ROBOT, SERVO_LAG, True)
+    stage, _ = stage_functions(ROBOT, SERVO_LAG, True)
     _, _, d, reference = random_point(1, 21)
     reference[21:] = 0
     u = np.r_[reference[13:17] - d[6:], reference[17:21]]
     for sign in (1, -1):
         x = reference[:21].copy()
         x[6:10] *= sign
-        *_, q, r = problem.stage(x, u, d, reference, WEIGHTS, 0.1)
+        *_, q, r = stage(x, u, d, reference, WEIGHTS, 0.1)
         assert np.allclose(np.array(q), 0, atol=1e-9)
         assert np.allclose(np.array(r), 0, atol=1e-9)
 
 
 def test_one_interval_agrees_with_fine_integration_of_the_lagged_model():
-    problem = ocp.build(ROBOT, SERVO_LAG, True)
+    stage, _ = stage_functions(ROBOT, SERVO_LAG, True)
     x, u, d, reference = random_point(4, 21)
     x[10:13] *= 0.5
-    coarse = np.array(problem.stage(x, u, d, reference, WEIGHTS, 0.05)[0]).ravel()
+    coarse = np.array(stage(x, u, d, reference, WEIGHTS, 0.05)[0]).ravel()
     fine = x.copy()
     fine_step = 0.05 / 200
     for _ in range(200):  # midpoint rule on all states, lags included

@@ -2,11 +2,9 @@
 
 import casadi as ca
 import numpy as np
-import pytest
 
-from beetle_omni_ros.control import ocp
-from beetle_omni_ros.control.nmpc_parameters import NmpcWeights
-from beetle_omni_ros.control.rti import Rti
+from beetle_omni_ros.control.nmpc import NmpcWeights
+from beetle_omni_ros.control.ocp import REFERENCE_SIZE, Rti, stage_functions
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 ROBOT = RobotParameters.load()
@@ -18,15 +16,10 @@ REACH = 0.15   # [rad]
 REACHES = 2
 
 
-@pytest.fixture(scope='module')
-def problem():
-    return ocp.build(ROBOT, 0.03, True)
-
-
 def setting(thrust=None):
     x = np.zeros(21)
     x[2], x[9], x[17:] = 1.0, 1.0, ROBOT.hover_thrust
-    references = np.zeros((len(INTERVALS) + 1, ocp.REFERENCE_SIZE))
+    references = np.zeros((len(INTERVALS) + 1, REFERENCE_SIZE))
     references[:, :21] = x
     references[:, 0] = 1.5
     references[:, 6:10] = [np.sin(0.5), 0, 0, np.cos(0.5)]
@@ -35,15 +28,16 @@ def setting(thrust=None):
     return x, references, 0.05 * np.ones(10), bounds
 
 
-def qp_by_casadi(problem, x, u, x0, references, disturbance, bounds):
+def qp_by_casadi(x, u, x0, references, disturbance, bounds):
     """The same QP, written as one dense program and solved by qpOASES-like active sets (qrqp)."""
-    n, size, nu = len(INTERVALS), problem.state_size, 8
+    n, size, nu = len(INTERVALS), 21, 8
+    stage, terminal = stage_functions(ROBOT, 0.03, True)
     opti_x = [ca.MX.sym(f'x{k}', size) for k in range(n + 1)]
     opti_u = [ca.MX.sym(f'u{k}', nu) for k in range(n)]
     slack = [ca.MX.sym(f's{k}', 13) for k in range(1, n + 1)]
     cost, equal, low, high, inequality = 0, [opti_x[0] - (x0 - x[0])], [], [], []
     for k in range(n):
-        f, a, b, q_xx, r_uu, s_ux, q, r = problem.stage(
+        f, a, b, q_xx, r_uu, s_ux, q, r = stage(
             x[k] if k else x0, u[k], disturbance, references[k], WEIGHTS, INTERVALS[k])
         dx = opti_x[k] if k else ca.MX.zeros(size)
         du = opti_u[k]
@@ -53,7 +47,7 @@ def qp_by_casadi(problem, x, u, x0, references, disturbance, bounds):
         inequality.append(du)
         low.append(bounds[:nu] - u[k])
         high.append(bounds[nu:2 * nu] - u[k])
-    hessian, gradient = problem.terminal(x[n], references[n], WEIGHTS)
+    hessian, gradient = terminal(x[n], references[n], WEIGHTS)
     cost += 0.5 * opti_x[n].T @ hessian @ opti_x[n] + gradient.T @ opti_x[n]
     for k in range(REACHES + 1):
         tilt = (x[k] if k else x0)[13:17] + (opti_x[k][13:17] if k else 0)
@@ -81,25 +75,25 @@ def qp_by_casadi(problem, x, u, x0, references, disturbance, bounds):
     return values[size * (n + 1):size * (n + 1) + nu].reshape(nu) + u[0]
 
 
-def test_the_first_command_is_that_of_an_independent_qp_solver(problem):
+def test_the_first_command_is_that_of_an_independent_qp_solver():
     x0, references, disturbance, bounds = setting()
-    rti = Rti(problem, INTERVALS, SOFT, 1e-9, 60, REACHES)
+    rti = Rti(ROBOT, 0.03, True, INTERVALS, SOFT, 1e-9, 60, REACHES)
     rti.fill(x0, np.r_[np.zeros(4), x0[17:]])
     x, u = rti.states.copy(), rti.inputs.copy()
     status, _ = rti.step(x0, references, disturbance, WEIGHTS, bounds)
     assert status == 0
-    reference = qp_by_casadi(problem, x, u, x0, references, disturbance, bounds)
+    reference = qp_by_casadi(x, u, x0, references, disturbance, bounds)
     assert np.allclose(rti.inputs[0], reference, atol=1e-5)
 
 
-def test_a_plan_sinks_below_the_smallest_height_only_while_it_cannot_help_it(problem):
+def test_a_plan_sinks_below_the_smallest_height_only_while_it_cannot_help_it():
     x0, references, disturbance, bounds = setting()
     x0[5] = -0.6                                      # [m/s] sinking
     references[:, 2] = 0.8
     heights = []
     for height in (-1000.0, 0.92):
         bounds[-len(INTERVALS):] = height
-        rti = Rti(problem, INTERVALS, (10.0, 100.0, 1e5), 1e-8, 80, REACHES)
+        rti = Rti(ROBOT, 0.03, True, INTERVALS, (10.0, 100.0, 1e5), 1e-8, 80, REACHES)
         rti.fill(x0, np.r_[np.zeros(4), x0[17:]])
         for _ in range(8):
             rti.step(x0, references, 0 * disturbance, WEIGHTS, bounds)
@@ -108,9 +102,9 @@ def test_a_plan_sinks_below_the_smallest_height_only_while_it_cannot_help_it(pro
     assert heights[1].min() > 0.91
 
 
-def test_an_unsolved_qp_leaves_the_plan_unchanged(problem):
+def test_an_unsolved_qp_leaves_the_plan_unchanged():
     x0, references, disturbance, bounds = setting()
-    rti = Rti(problem, INTERVALS, SOFT, 1e-6, 50, REACHES)
+    rti = Rti(ROBOT, 0.03, True, INTERVALS, SOFT, 1e-6, 50, REACHES)
     rti.fill(x0, np.r_[np.zeros(4), x0[17:]])
     rti.step(x0, references, disturbance, WEIGHTS, bounds)
     before = rti.states.copy(), rti.inputs.copy()

@@ -9,7 +9,7 @@ import pytest
 
 from beetle_omni_ros.control.base import Command, State
 from beetle_omni_ros.control.disturbance import DisturbanceEstimator, redated
-from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
+from beetle_omni_ros.control.nmpc import NmpcParameters
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf, ImuReading, PoseReading
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.robot import dynamics, effects
@@ -61,7 +61,7 @@ def nmpc(robot):
     derivative = dynamics.full_model(robot)
     settings = NmpcParameters.load()
     estimator = DisturbanceEstimator(robot, settings.disturbance, settings.model.command_delay,
-                                     None)
+                                     dynamics.integrator(ROBOT))
     state = State(0.0, np.zeros(3), np.zeros(3), np.array([0, 0, 0, 1.0]), np.zeros(3),
                   np.zeros(4), np.ones(4), 0.0)
     allocator = Allocator(robot)

@@ -51,7 +51,7 @@ def test_files_reach_their_nodes_and_an_unusable_policy_is_not_on_standby(tmp_pa
     policy = str(write(tmp_path / 'policy.onnx'))
     other = str(share_path('params/robot_weak_and_heavy.yaml'))
     nmpc = tmp_path / 'nmpc.yaml'
-    nmpc.write_text('limits: {tilt_rate_share: 0.5}\n')
+    nmpc.write_text('limits: {velocity: 2.0}\n')
     nodes, _ = plan_of('nmpc', policy=policy, nmpc=str(nmpc))
     assert list(nodes) == ['nmpc_node', 'rl_node']
     assert nodes['nmpc_node'] == {'nmpc_file': str(nmpc)}
