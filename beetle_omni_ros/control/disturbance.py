@@ -77,10 +77,7 @@ class DisturbanceEstimator:
 
     Attributes:
         delay: from a command to the actuators [s], with the mean of the robot file's delays of
-            tilts and thrusts. With a delay of 50 ms of the tilts only, the NMPC's error on a
-            lemniscate of 2.4 m and 16 s is then 4 mm. It is 5 mm with a prediction by the whole
-            delay, 27 mm with a longer servo lag in the horizon, and 8 mm without prediction. With
-            80 ms it is 6 mm with the mean; without prediction the robot crashes.
+            tilts and thrusts, with which the NMPC's error on a lemniscate is smallest.
         disturbance: (10,) force in world [N], torque in body [N m], servo offsets [rad].
 
     """
@@ -126,12 +123,6 @@ class DisturbanceEstimator:
             self._state[model.TILT], self._state[model.THRUST] = health.possible(
                 self._state[model.TILT], self._state[model.THRUST])
 
-    def _acting(self, command):
-        """Effective command (8,) of the remaining actuators."""
-        if self._health.healthy:
-            return command
-        return np.concatenate(self._health.possible(command[:4], command[4:]))
-
     def update(self, state: State) -> np.ndarray:
         """
         Update with one state estimate.
@@ -154,12 +145,16 @@ class DisturbanceEstimator:
             self._commands.append(self._moving(state.command))
         step = state.stamp - self._stamp
         if self._state is None or not 0 < step <= LONGEST_STEP:
-            present = self._restart(state)
+            thrust = np.zeros(4) if state.command is None else state.command.thrust
+            actuators = np.concatenate([state.tilt, state.tilt_velocity, thrust])
+            self._tilts.clear()
         else:
             predicted = self._flown(self._state, self._stamp, step)
-            self._learn(state, predicted, step)
-            present = self._measured(state, predicted)
-            self._correct_tilt(state, present, step)
+            self._learn(state, predicted)
+            actuators = predicted[13:]
+        present = np.concatenate([state.position, state.velocity, state.quaternion,
+                                  state.angular_velocity, actuators])
+        self._correct_tilt(state, present, step)
         self._state, self._stamp = present, state.stamp
         self._tilts.append((state.stamp, present[model.TILT].copy()))
         self._learnt.append((state.stamp, self.disturbance))
@@ -181,16 +176,6 @@ class DisturbanceEstimator:
                                        self._direction)
         return tilt + self._band * self._direction
 
-    def _restart(self, state):
-        thrust = np.zeros(4) if state.command is None else state.command.thrust
-        self._tilts.clear()
-        return np.concatenate([state.position, state.velocity, state.quaternion,
-                               state.angular_velocity, state.tilt, state.tilt_velocity, thrust])
-
-    def _measured(self, state, predicted):
-        return np.concatenate([state.position, state.velocity, state.quaternion,
-                               state.angular_velocity, predicted[13:]])
-
     def _flown(self, state, start, duration):
         """(25,) state after a time span, in which commands may change."""
         end = start + duration
@@ -202,23 +187,24 @@ class DisturbanceEstimator:
             if at < end - SHORT:
                 changes.append(at)
         for until in reversed(changes):
-            state = self._advance(state, self._acting(self._input(start, until - start)),
-                                  self.disturbance, until - start)
+            tilt, thrust = self._input((start + until) / 2 - self.delay)
+            if not self._health.healthy:
+                tilt, thrust = self._health.possible(tilt, thrust)
+            state = self._advance(state, np.concatenate([tilt, thrust]), self.disturbance,
+                                  until - start)
             start = until
         return state
 
-    def _input(self, start, duration):
-        """Command (8,) that acts on the robot around the middle of a time span."""
-        middle = start + duration / 2 - self.delay
+    def _input(self, stamp):
+        """Tilts and thrusts of the command that was in force for a state of this stamp."""
         for command in reversed(self._commands):
-            if command.stamp <= middle:
-                return np.concatenate([command.tilt, command.thrust])
+            if command.stamp <= stamp:
+                return command.tilt, command.thrust
         if self._commands:
-            return np.concatenate([self._commands[0].tilt, self._commands[0].thrust])
-        return np.concatenate([self._state[model.TILT] if self._state is not None
-                               else np.zeros(4), np.zeros(4)])
+            return self._commands[0].tilt, self._commands[0].thrust
+        return (np.zeros(4) if self._state is None else self._state[model.TILT]), np.zeros(4)
 
-    def _learn(self, state, predicted, step):
+    def _learn(self, state, predicted):
         change = np.zeros(model.DISTURBANCE_SIZE)
         change[model.FORCE] = self._force_gain * (state.velocity - predicted[model.VELOCITY])
         change[model.TORQUE] = self._torque_gain * (
