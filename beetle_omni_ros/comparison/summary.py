@@ -54,10 +54,10 @@ def look(controller: str) -> Look:
     entry = registry.SHIPPED.get(name)
     if entry is None:
         return Look(name, '', SPARE[crc32(name.encode()) % len(SPARE)], (0, (4, 1, 1, 1)), 'X')
-    line = entry.line
+    colour, dashes, marker = entry.line
     if name != controller:
-        return Look(entry.label, 'the publication', line.colour, ':', '*')
-    return Look(entry.label, entry.description, line.colour, line.dashes, line.marker)
+        return Look(entry.label, 'the publication', colour, ':', '*')
+    return Look(entry.label, entry.description, colour, dashes, marker)
 
 
 def task_title(task: str) -> str:

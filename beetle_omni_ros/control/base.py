@@ -245,8 +245,7 @@ def error_text(error: Exception) -> str:
 
 def guidance_of(controller: Controller) -> str:
     """Text that names the functions that modify the targets of a controller; 'none' for none."""
-    text = getattr(controller, 'guidance', '')
-    return text if text and isinstance(text, str) else 'none'
+    return getattr(controller, 'guidance', '') or 'none'
 
 
 def reach_of(controller: Controller) -> float:

@@ -20,13 +20,8 @@ from beetle_omni_ros.control.base import (
     Target,
 )
 from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY
-from beetle_omni_ros.robot.schema import ParameterError
 
 MOTORS_OFF = ('disarmed', 'emergency_stop')     # states of the supervisor
-
-
-class ControllerError(ParameterError):
-    """A method of a controller raised, or returned no command; one line."""
 
 
 class ControllerHost:
@@ -122,46 +117,38 @@ class ControllerHost:
 
     def step(self, state: State, target: Target | None = None) -> Command | None:
         """Command for a state, to ``target`` or the target in force; None after an exception."""
-        return self.call('step', self._step, corrected(state, self._health),
-                         target or self.target_in_force)
+        return self.call('step', self._timed, self.controller.step,
+                         corrected(state, self._health), target or self.target_in_force,
+                         flaw=flaw)
 
-    def _step(self, state, target):
-        return checked(self._timed(self.controller.step, state, target))
-
-    def call(self, method: str, function: Callable, *arguments: Any) -> Any:
+    def call(self, method: str, function: Callable, *arguments: Any,
+             flaw: Callable[[Any], str] = lambda result: '') -> Any:
         """
         Call the controller's ``method`` by a function; returns its result.
 
         In a process with other nodes, an exception would end the supervisor, too. It is reported,
-        and None is returned.
+        and None is returned, like for a result with a flaw.
         """
         try:
-            return function(*arguments)
-        except ControllerError as error:
-            text = str(error)
+            result = function(*arguments)
+            text = flaw(result)
         except Exception as error:
-            text = f'{method} raised {error_text(error)}'
-        self.errors, self.error = self.errors + 1, f"controller '{self._name}': {text}"
+            text = f'raised {error_text(error)}'
+        if not text:
+            return result
+        self.errors, self.error = self.errors + 1, f"controller '{self._name}': {method} {text}"
         self._report(self.error)
         return None
 
 
-def checked(command: object) -> Command:
-    """
-    Check the return value of a controller's ``step`` and return it.
-
-    Raises:
-        ControllerError: it is no command; one line.
-
-    """
+def flaw(command: object) -> str:
+    """Why the result of a controller's ``step`` is no command, or ''."""
     if not isinstance(command, Command):
-        raise ControllerError(f'step returned {type(command).__name__}, expected '
-                              'control.base.Command')
+        return f'returned {type(command).__name__}, expected control.base.Command'
     for part in ('tilt', 'thrust'):
         shape = getattr(getattr(command, part), 'shape', None)
         if shape != (ROTORS,):
-            raise ControllerError(
-                f'step returned a command whose {part} is '
-                f"{f'of shape {shape}' if shape is not None else 'no array'}, expected a numpy "
-                f'array of {ROTORS}')
-    return command
+            return (f'returned a command whose {part} is '
+                    f"{f'of shape {shape}' if shape is not None else 'no array'}, expected a "
+                    f'numpy array of {ROTORS}')
+    return ''

@@ -10,12 +10,11 @@ large libraries that it needs take seconds.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib import import_module, metadata
 from importlib.util import module_from_spec, spec_from_file_location
 import inspect
-from math import inf
 from pathlib import Path
 import re
 import sys
@@ -38,15 +37,6 @@ NAME = re.compile(r'[a-z][a-z0-9_]*')
 # Names whose `<name>_node` or `<name>/command` exists, and words of results and states.
 RESERVED = ('controller', 'ekf', 'joint_bridge', 'meta', 'none', 'operator', 'recorder',
             'reference', 'rotor_bridge', 'sim', 'supervisor', 'viewer')
-
-
-@dataclass(frozen=True)
-class Line:
-    """Line style of a controller in figures; without a colour one is chosen."""
-
-    colour: str = ''
-    dashes: str | tuple = '-'
-    marker: str = 'o'
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,16 +73,14 @@ class ControllerEntry:
         description: one line.
         period: between its commands [s].
         parameters_file: shipped file of them; in the package's share, or any path.
-        fixed: parameters that override the shipped file.
-        policy_file: its network; '' for none. With a network its parameters have ``policy`` and
-            ``allow_other_robot``.
+        policy_file: its network; '' for none.
         option: of the command line that replaces the file of this controller only.
         guidance: names the functions that modify its targets, see :mod:`control.guidance`.
         flies_degraded: whether it can fly with failed actuators (``set_health``).
         stands_by: whether it runs in the ROS graph on standby.
         compared: whether `beetle_omni compare` flies it by default.
         cost: core seconds for a simulated second, to order flights; without influence on results.
-        line: style in figures.
+        line: colour, dashes and marker in figures.
 
     """
 
@@ -103,7 +91,6 @@ class ControllerEntry:
     description: str = ''
     period: float = PERIOD
     parameters_file: str = ''
-    fixed: Mapping[str, Any] = field(default_factory=dict)
     policy_file: str = ''
     option: str = ''
     guidance: str = 'none'
@@ -111,7 +98,7 @@ class ControllerEntry:
     stands_by: bool = False
     compared: bool = False
     cost: float = 0.1
-    line: Line = field(default_factory=Line)
+    line: tuple[str, str | tuple, str] = ('', '-', 'o')
 
     def __post_init__(self):
         """Refuse an invalid name."""
@@ -140,40 +127,29 @@ class ControllerEntry:
         """Class of its parameters, or None."""
         return getattr(self.builder, 'Parameters', None)
 
-    def completed(self, mapping: dict, from_user: bool) -> dict:
-        """Values of a parameter file and of ``fixed``; a user's file takes precedence."""
-        return {**self.fixed, **mapping} if from_user else {**mapping, **self.fixed}
-
     def load_parameters(self, options: ControllerOptions = ControllerOptions()):
         """
         Parameters from a file and the options; None for a controller without parameters.
 
         Raises:
-            ParameterError: an unusable file, or a file for a controller without parameters.
+            ParameterError: an unusable file, or an option that the controller lacks.
 
         """
-        kind = self.parameter_class
-        if kind is None:
-            if options.parameters:
-                raise ParameterError(f"controller '{self.reference}': reads no parameter file, "
-                                     f'given {options.parameters}')
-            return None
-        file = options.parameters or self.parameters_file and (
-            self.parameters_file if Path(self.parameters_file).is_file()
-            else share_path(self.parameters_file))
-        mapping = schema.load_yaml(file) if file else {}
-        parameters = schema.bind(kind, self.completed(mapping, bool(options.parameters)),
-                                 str(file or ''))
-        if options.without:
-            if not hasattr(parameters, 'without'):
-                raise ParameterError(f"--without {options.without}: controller "
-                                     f"'{self.reference}' has no layers of guidance")
-            parameters = replace(parameters, without=options.without)
-        if not (self.policy_file and hasattr(parameters, 'policy')):
-            return parameters
-        return replace(parameters, policy=str(options.policy or self.policy_file),
-                       allow_other_robot=parameters.allow_other_robot
-                       or options.allow_other_robot)
+        kind, file = self.parameter_class, options.parameters
+        if kind is None and file:
+            raise ParameterError(f"controller '{self.reference}': reads no parameter file, "
+                                 f'given {file}')
+        if not file and self.parameters_file:
+            file = Path(self.parameters_file)
+            file = file if file.is_file() else share_path(self.parameters_file)
+        parameters = kind and (schema.load(kind, file) if file else kind())
+        if options.without and not hasattr(parameters, 'without'):
+            raise ParameterError(f"--without {options.without}: controller '{self.reference}' has "
+                                 'no layers of guidance')
+        given = {'policy': str(options.policy or ''), 'without': options.without,
+                 'allow_other_robot': options.allow_other_robot}
+        return parameters and replace(parameters, **{
+            key: value for key, value in given.items() if value and hasattr(parameters, key)})
 
     def make(self, robot: RobotParameters, options: ControllerOptions = ControllerOptions(),
              parameters: Any = None) -> Controller:
@@ -208,15 +184,7 @@ class ControllerEntry:
 
     def reach(self, robot: RobotParameters, options: ControllerOptions = ControllerOptions()
               ) -> float:
-        """
-        Largest distance to a target [m]; inf if it has none.
-
-        The value comes from its parameters if they have it, because building may take seconds.
-
-        Raises:
-            ParameterError: as :meth:`make`.
-
-        """
+        """Largest distance to a target [m], from its parameters: building may take seconds."""
         parameters = self.load_parameters(options)
         return float(parameters.reach) if hasattr(parameters, 'reach') \
             else reach_of(self.make(robot, options))
@@ -235,10 +203,6 @@ class ControllerEntry:
         if not isinstance(period, (int, float)) or not 0 < period <= LONGEST_PERIOD:
             raise ParameterError(f'{at}period is {period!r}, expected the time between two steps, '
                                  f'above 0 and at most {LONGEST_PERIOD:g} s')
-        reach = getattr(controller, 'reach', inf)
-        if not isinstance(reach, (int, float)) or not reach > 0:
-            raise ParameterError(f'{at}reach is {reach!r}, expected the distance of the farthest '
-                                 'target [m], above 0')
 
 
 # Line styles: blue for RL and red for NMPC as in the publication. The variants are lighter and
@@ -249,35 +213,34 @@ SHIPPED: Mapping[str, ControllerEntry] = {entry.name: entry for entry in (
     ControllerEntry(
         name='nmpc', label='NMPC', description='offset-free, params/nmpc.yaml', controller=_NMPC,
         parameters_file='params/nmpc.yaml', option='--nmpc', flies_degraded=True, stands_by=True,
-        compared=True, cost=0.1, line=Line('#c8281e', '-', '^')),
+        compared=True, cost=0.1, line=('#c8281e', '-', '^')),
     ControllerEntry(
         name='rl', label='RL', description='the learned policy, 33 observations',
         controller=_POLICY, parameters_file='params/rl.yaml', policy_file='policies/rl.onnx',
         option='--policy', guidance='unwinding, routing, turning, trimming', stands_by=True,
-        compared=True, cost=0.07, line=Line('#1b5fb4', '-', 'o')),
+        compared=True, cost=0.07, line=('#1b5fb4', '-', 'o')),
     ControllerEntry(
         name='rl_bare', label='RL, bare', description='the learned policy without guidance',
-        controller=_POLICY, parameters_file='params/rl.yaml', policy_file='policies/rl.onnx',
-        fixed={'without': 'all'}, compared=True, cost=0.07,
-        line=Line('#0b2d5c', (0, (2, 1)), 'x')),
+        controller=_POLICY, parameters_file='params/rl_bare.yaml', policy_file='policies/rl.onnx',
+        compared=True, cost=0.07, line=('#0b2d5c', (0, (2, 1)), 'x')),
     ControllerEntry(
         name='rl_memory', label='RL, memory',
         description='the learned policy with the estimated disturbance as input',
-        controller=_POLICY, parameters_file='params/rl.yaml',
-        policy_file='policies/rl_memory.onnx', fixed={'policy': 'policies/rl_memory.onnx'},
+        controller=_POLICY, parameters_file='params/rl_memory.yaml',
+        policy_file='policies/rl_memory.onnx',
         guidance='unwinding, routing, turning, trimming', compared=True, cost=0.08,
-        line=Line('#58b4e8', (0, (5, 1.6)), 's')),
+        line=('#58b4e8', (0, (5, 1.6)), 's')),
     ControllerEntry(
         name='nmpc_published', label='NMPC, published settings',
         description='params/nmpc_published.yaml', controller=_NMPC,
         parameters_file='params/nmpc_published.yaml', flies_degraded=True, compared=True,
-        cost=0.13, line=Line('#e8960c', (0, (3, 1.2, 1, 1.2)), 'v')),
+        cost=0.13, line=('#e8960c', (0, (3, 1.2, 1, 1.2)), 'v')),
     ControllerEntry(
         name='hover', label='hover PD',
         description="PD with allocation, the supervisor's fallback",
         controller='beetle_omni_ros.control.hover:HoverController',
         parameters_file='params/hover.yaml', flies_degraded=True, cost=0.05,
-        line=Line('#5b6770', (0, (1, 1.2)), 'D')))}
+        line=('#5b6770', (0, (1, 1.2)), 'D')))}
 DEFAULT = next(iter(SHIPPED))       # the default controller
 _ADDED: dict[str, ControllerEntry] = {}     # of this process alone
 
@@ -320,7 +283,7 @@ def entry_of(found: Any, spec: str, name: str = '') -> ControllerEntry:
     return ControllerEntry(
         # an inherited name would be that of another controller
         name=name or vars(found).get('name') or snake, controller=found, spec=spec,
-        label=found.__name__, description=(found.__doc__ or '').strip().partition('\n')[0],
+        description=(found.__doc__ or '').strip().partition('\n')[0],
         period=PERIOD if isinstance(period, property) else period,
         parameters_file=str(beside) if file and beside.is_file() else file,
         policy_file=getattr(found, 'policy_file', ''),

@@ -107,7 +107,7 @@ class ControllerNode(FlightNode):
             registry.find(controller or _requested_controller())
         is_own = isinstance(controller, str) and controller     # the executable has one controller
         super().__init__(f'{entry.name}_node', node_parameters(entry, not is_own),
-                         entry.parameters_file, entry.file_key, completed=entry.completed)
+                         entry.parameters_file, entry.file_key)
         self._entry = entry
         robot = RobotParameters.load(self.parameters.robot_file or None)
         controller = entry.make(

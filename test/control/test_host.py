@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.control.base import Command, PoseTarget, State, TrajectoryTarget
-from beetle_omni_ros.control.host import checked, ControllerHost
+from beetle_omni_ros.control.host import ControllerHost
 from beetle_omni_ros.robot.allocation import ActuatorHealth
-from beetle_omni_ros.robot.schema import ParameterError
 
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 
@@ -110,11 +109,13 @@ def test_an_exception_of_any_method_is_counted_and_reported(method):
         f"controller 'own': {method} raised ValueError: bad (test_host.py:")
 
 
-def test_the_return_value_of_step_is_checked():
-    good = Command(0.0, np.zeros(4), np.ones(4))
-    assert checked(good) is good
-    for wrong, message in ((None, 'returned NoneType'), ((0, 1), 'returned tuple'),
-                           (Command(0.0, [0] * 4, np.ones(4)), 'tilt is no array'),
-                           (Command(0.0, np.zeros(4), np.ones(3)), r'thrust is of shape \(3,\)')):
-        with pytest.raises(ParameterError, match=message):
-            checked(wrong)
+@pytest.mark.parametrize('wrong, message', [
+    (None, 'returned NoneType'), ((0, 1), 'returned tuple'),
+    (Command(0.0, [0] * 4, np.ones(4)), 'tilt is no array'),
+    (Command(0.0, np.zeros(4), np.ones(3)), 'thrust is of shape (3,)')], ids=str)
+def test_a_return_value_of_step_that_is_no_command_is_an_error(wrong, message):
+    host = ControllerHost('own', Own())
+    host.controller.step = lambda state, target: wrong
+    host.on_estimate(state())
+    assert host.step(state()) is None and host.errors == 1
+    assert host.error.startswith("controller 'own': step returned ") and message in host.error
