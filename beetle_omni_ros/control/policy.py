@@ -1,5 +1,6 @@
 """A trained policy as a controller."""
 
+from collections import deque
 from dataclasses import dataclass
 from math import isfinite
 
@@ -7,13 +8,14 @@ import numpy as np
 
 from beetle_omni_ros.control.base import Command, PoseTarget, Reference, State, Target
 from beetle_omni_ros.control.disturbance import DisturbanceEstimator, DisturbanceParameters
-from beetle_omni_ros.control.guidance import Charge, Guidance
+from beetle_omni_ros.control.guidance import Guidance
 from beetle_omni_ros.control.policy_file import kind, PolicyNetwork
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import parameter, ParameterFile
 
 DEFAULT = 'policies/rl.onnx'
+LATEST = 10             # steps within which a command is reported as the executed command
 COMMAND_DELAY = 0.01    # [s] from the state stamp to the actuators, for the disturbance estimate
 # An action beyond is a fault: it is sent to the supervisor unchanged; smaller ones are clipped to
 # the limits of the actuators, as in training (100: 25 rad, 50 N).
@@ -73,7 +75,7 @@ class PolicyController:
         self._estimator = DisturbanceEstimator(
             robot, DisturbanceParameters(), COMMAND_DELAY,
             model.integrator(robot)) if contract.memory else None
-        self._guidance, self._charge = Guidance(robot.tilt_axes, p.without), Charge()
+        self._guidance = Guidance(robot.tilt_axes, p.without)
         self.guidance = self._guidance.text
         self.reset()
 
@@ -82,7 +84,7 @@ class PolicyController:
         self._command: Command | None = None
         self._steps = self._rejected = self._faults = self._cut = 0
         self._guidance.reset()
-        self._charge.reset()
+        self._latest: deque[list[float]] = deque(maxlen=LATEST)
         if self._estimator:
             self._estimator.reset()
 
@@ -90,14 +92,20 @@ class PolicyController:
         """One command for one state; a non-finite state repeats the last command."""
         self._steps += 1
         if isinstance(target, PoseTarget):
-            target = self._guidance.target(state, target, self._charge.holds(state))
+            target = self._guidance.target(state, target, self._in_charge(state))
         values = self.infer(state, target.at(state.stamp))
         if values is None:
             self._rejected += 1
             return self._repeated(state)
         self._command = Command(state.stamp, np.array(values[:4]), np.array(values[4:]))
-        self._charge.gave(values)
+        self._latest.append(values)
         return self._command
+
+    def _in_charge(self, state):
+        """Whether the executed command is one of the latest commands."""
+        command = state.command
+        return command is not None \
+            and command.tilt.tolist() + command.thrust.tolist() in self._latest
 
     def infer(self, state: State, reference: Reference) -> list[float] | None:
         """

@@ -217,7 +217,7 @@ SHIPPED: Mapping[str, ControllerEntry] = {entry.name: entry for entry in (
     ControllerEntry(
         name='rl', label='RL', description='the learned policy, 33 observations',
         controller=_POLICY, parameters_file='params/rl.yaml', policy_file='policies/rl.onnx',
-        option='--policy', guidance='unwinding, routing, turning, trimming', stands_by=True,
+        option='--policy', guidance='unwinding, routing, trimming', stands_by=True,
         compared=True, cost=0.07, line=('#1b5fb4', '-', 'o')),
     ControllerEntry(
         name='rl_bare', label='RL, bare', description='the learned policy without guidance',
@@ -228,7 +228,7 @@ SHIPPED: Mapping[str, ControllerEntry] = {entry.name: entry for entry in (
         description='the learned policy with the estimated disturbance as input',
         controller=_POLICY, parameters_file='params/rl_memory.yaml',
         policy_file='policies/rl_memory.onnx',
-        guidance='unwinding, routing, turning, trimming', compared=True, cost=0.08,
+        guidance='unwinding, routing, trimming', compared=True, cost=0.08,
         line=('#58b4e8', (0, (5, 1.6)), 's')),
     ControllerEntry(
         name='nmpc_published', label='NMPC, published settings',

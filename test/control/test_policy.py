@@ -1,6 +1,7 @@
 """The policy as a controller: observation, commands, bad numbers."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 from policy_files import write
@@ -118,6 +119,16 @@ def test_a_state_that_is_not_finite_repeats_the_last_command(tmp_path, field):
     fresh.step(state(1.0), TARGET)
     after, expected = (p.step(state(1.02, command=last), TARGET) for p in (policy, fresh))
     assert np.allclose(after.tilt, expected.tilt, atol=1e-9)
+
+
+def test_only_its_latest_commands_put_the_policy_in_charge(tmp_path):
+    policy, charges = controller(write(tmp_path / 'p.onnx')), []
+    policy._guidance = SimpleNamespace(
+        target=lambda state, target, in_charge: charges.append(in_charge) or target)
+    own = policy.step(state(1.0), TARGET)
+    for command in (own, None, replace(own, thrust=own.thrust + 0.1)):
+        policy.step(state(1.01, command), TARGET)
+    assert charges == [False, True, False, False]
 
 
 def test_the_policy_with_memory_observes_a_push_in_body_axes(tmp_path):
