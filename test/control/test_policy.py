@@ -45,8 +45,8 @@ def test_each_block_contains_the_quantity_of_its_name(seed):
     state, reference, previous, disturbance = drawn(seed)
     values = observed(state, reference, previous) + disturbed(state, disturbance)
     table = PolicyContract.default(ROBOT, memory=True).observations
-    ends = np.cumsum([block.size for block in table])
-    seen = {block.name: values[end - block.size:end] for block, end in zip(table, ends)}
+    ends = np.cumsum([block['size'] for block in table])
+    seen = {block['name']: values[end - block['size']:end] for block, end in zip(table, ends)}
     body, goal = Rotation.from_quat(state.quaternion), Rotation.from_quat(reference.quaternion)
     to_body = body.inv()
     expected = {
