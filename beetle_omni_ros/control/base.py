@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from math import inf, sqrt
 from pathlib import Path
 import sysconfig
@@ -66,15 +66,7 @@ class State:
 
     @classmethod
     def join(cls, estimate: Any, joints: Any, command: Command | None = None) -> State:
-        """
-        Join the estimate, the measured joints and the command in force.
-
-        Args:
-            estimate: with the first five attributes of a state.
-            joints: with stamp, position and velocity.
-            command: the command in force.
-
-        """
+        """Join the estimate, the measured joints and the command in force."""
         return cls(estimate.stamp, estimate.position, estimate.velocity, estimate.quaternion,
                    estimate.angular_velocity, joints.position, joints.velocity, joints.stamp,
                    command)
@@ -136,7 +128,7 @@ class TrajectoryTarget:
     quaternions: np.ndarray
     velocities: np.ndarray
     angular_velocities: np.ndarray
-    stamp: float = field(default=0.0)
+    stamp: float = 0.0
 
     def at(self, time: float) -> Reference:
         """The reference at ``time``: faster than :meth:`sample` of one time."""
@@ -182,14 +174,13 @@ class Controller(Protocol):
     A function of state and target with internal memory.
 
     ``step`` is called once every ``period`` [s] with a new state. A ``step`` that raises sends no
-    command for this state. It is also called for a controller on
-    standby, so that this controller can take over without a jump; ``state.command`` is the
-    executed command.
+    command for this state. It is also called for a controller on standby, so that this controller
+    can take over without a jump; ``state.command`` is the executed command.
 
     Optional members of a controller:
 
     - ``diagnostics() -> dict``: health of the last step and since reset, for operators and logs;
-    - ``set_health(health)``, if it can fly with failed actuators, see :func:`forward_health`;
+    - ``set_health(health)``, if it can fly with failed actuators;
     - ``reach``: largest distance to a target [m], see :func:`reach_of`;
     - ``guidance``: text for result tables, names the functions that modify its targets.
 
@@ -226,13 +217,6 @@ def corrected(state: State, health: ActuatorHealth) -> State:
     if command is not None:
         command = replace(command, tilt=health.true(command.tilt))
     return replace(state, tilt=health.true(state.tilt), command=command)
-
-
-def forward_health(controller: Controller, health: ActuatorHealth) -> None:
-    """Pass the health of the actuators to a controller with ``set_health``."""
-    set_health = getattr(controller, 'set_health', None)
-    if set_health is not None:
-        set_health(health)
 
 
 def error_text(error: Exception) -> str:

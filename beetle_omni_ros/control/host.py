@@ -12,7 +12,6 @@ from beetle_omni_ros.control.base import (
     Controller,
     corrected,
     error_text,
-    forward_health,
     PoseTarget,
     reach_of,
     ROTORS,
@@ -22,6 +21,11 @@ from beetle_omni_ros.control.base import (
 from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY
 
 MOTORS_OFF = ('disarmed', 'emergency_stop')     # states of the supervisor
+
+
+def direct(function: Callable, *arguments: Any) -> Any:
+    """Call a function."""
+    return function(*arguments)
 
 
 class ControllerHost:
@@ -42,13 +46,14 @@ class ControllerHost:
         controller: the argument.
         target: target of the operator or the task, or None.
         override: target of the supervisor, which replaces it, or None.
+        mode: state of the supervisor, 'flying:NAME' while the controller NAME is active.
         errors: number of exceptions.
         error: the last one in one line, or ''.
 
     """
 
     def __init__(self, name: str, controller: Controller,
-                 timed: Callable[..., object] = lambda step, *arguments: step(*arguments),
+                 timed: Callable[..., Any] = direct,
                  report: Callable[[str], None] = lambda text: None):
         self.controller = controller
         self.target: Target | None = None
@@ -58,17 +63,12 @@ class ControllerHost:
         self._hold: Target | None = None
         self._position: np.ndarray | None = None
         self._health = ALL_HEALTHY
-        self._mode, self._own_mode = '', f'flying:{name}'
-
-    @property
-    def mode(self) -> str:
-        """State of the supervisor, 'flying:NAME' while the controller NAME is active."""
-        return self._mode
+        self.mode, self._own_mode = '', f'flying:{name}'
 
     @property
     def active(self) -> bool:
         """Whether the controller flies."""
-        return self._mode == self._own_mode
+        return self.mode == self._own_mode
 
     @property
     def target_in_force(self) -> Target | None:
@@ -83,10 +83,10 @@ class ControllerHost:
             why the target is dropped at the takeover from another controller, or ''.
 
         """
-        state, before = mode.partition(':')[0], self._mode
-        self._mode = mode
+        state, before = mode.partition(':')[0], self.mode
+        self.mode = mode
         if state in MOTORS_OFF and before.partition(':')[0] != state:
-            self.call('reset', self.controller.reset)
+            self.call('reset')
             self._hold = self.override = None
         if not self.active or mode == before or self.target is None:
             return ''
@@ -98,12 +98,12 @@ class ControllerHost:
     def on_health(self, health: ActuatorHealth) -> None:
         """Take the health of the actuators, for this object and the controller."""
         self._health = health
-        self.call('set_health', forward_health, self.controller, health)
+        self.call('set_health', health)
 
     def on_estimate(self, estimate: Any) -> None:
         """Take position (3,), quaternion (4,) and stamp of each estimate."""
         self._position = estimate.position
-        if self.target is None and (self._hold is None or not self._mode.startswith('flying')):
+        if self.target is None and (self._hold is None or not self.mode.startswith('flying')):
             self._hold = PoseTarget(estimate.position, estimate.quaternion, estimate.stamp)
 
     def too_far(self, target: Target, now: float) -> str:
@@ -117,20 +117,22 @@ class ControllerHost:
 
     def step(self, state: State, target: Target | None = None) -> Command | None:
         """Command for a state, to ``target`` or the target in force; None after an exception."""
-        return self.call('step', self._timed, self.controller.step,
-                         corrected(state, self._health), target or self.target_in_force,
-                         flaw=flaw)
+        return self.call('step', corrected(state, self._health), target or self.target_in_force,
+                         run=self._timed, flaw=flaw)
 
-    def call(self, method: str, function: Callable, *arguments: Any,
+    def call(self, method: str, *arguments: Any, run: Callable[..., Any] = direct,
              flaw: Callable[[Any], str] = lambda result: '') -> Any:
         """
-        Call the controller's ``method`` by a function; returns its result.
+        Call the controller's ``method`` if it has one; returns its result.
 
         In a process with other nodes, an exception would end the supervisor, too. It is reported,
         and None is returned, like for a result with a flaw.
         """
+        function = getattr(self.controller, method, None)
+        if function is None:
+            return None
         try:
-            result = function(*arguments)
+            result = run(function, *arguments)
             text = flaw(result)
         except Exception as error:
             text = f'raised {error_text(error)}'

@@ -38,7 +38,7 @@ class PolicyParameters(ParameterFile, file='rl.yaml'):
 
 class PolicyController:
     """
-    The learnt controller: a :class:`control.base.Controller`.
+    The learnt controller.
 
     Its previous action is the executed command, of any controller, so that it can take over from
     another controller. Targets are clipped to the limits of the actuators, as in training. An
@@ -48,12 +48,6 @@ class PolicyController:
     Args:
         robot: the controller's model of the robot.
         parameters: policy file and guidance.
-
-    Attributes:
-        network: the network of the policy file.
-        contract: the metadata of the policy file.
-        reach: largest distance to a target [m].
-        guidance: text that lists its active parts.
 
     Raises:
         ParameterError: the file is missing, broken, or does not fit; one line.
@@ -110,10 +104,6 @@ class PolicyController:
     def infer(self, state: State, reference: Reference) -> list[float] | None:
         """
         Compute observation and action, and clip the targets to the limits of the actuators.
-
-        Args:
-            state: of the robot.
-            reference: of the target; a pose target is modified by the guidance.
 
         Returns:
             Tilt targets (4) [rad] and thrust targets (4) [N], or None if an input of the network
@@ -182,13 +172,7 @@ def observed(state: State, reference: Reference, previous_action) -> list[float]
     Observation (33) in the blocks of :data:`policy_file.OBSERVATIONS`, in SI units.
 
     All vectors are in base_link, so that they do not depend on position, and on heading only by
-    the attitude columns.
-
-    Args:
-        state: position, velocity, attitude, rates and tilts of the robot.
-        reference: at the time of the state plus the lookahead.
-        previous_action: (8,) the executed command as an action.
-
+    the attitude columns. ``previous_action`` (8,) is the executed command as an action.
     """
     xx, xy, xz, yx, yy, yz, zx, zy, zz = _rotation(state.quaternion)
     ax, bx, cx, ay, by, cy, az, bz, cz = _rotation(reference.quaternion)

@@ -41,21 +41,12 @@ RESERVED = ('controller', 'ekf', 'joint_bridge', 'meta', 'none', 'operator', 're
 
 @dataclass(frozen=True, kw_only=True)
 class ControllerOptions:
-    """
-    Files that replace a controller's own files.
-
-    Attributes:
-        parameters: file of parameters.
-        policy: network.
-        allow_other_robot: fly a policy that was trained for other robot parameters.
-        without: layers of the guidance that are off.
-
-    """
+    """Files of parameters and network that replace a controller's own ones, and switches."""
 
     parameters: Path | None = None
     policy: Path | None = None
-    allow_other_robot: bool = False
-    without: str = ''
+    allow_other_robot: bool = False     # fly a policy trained for other robot parameters
+    without: str = ''                   # layers of the guidance that are off
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -154,12 +145,7 @@ class ControllerEntry:
     def make(self, robot: RobotParameters, options: ControllerOptions = ControllerOptions(),
              parameters: Any = None) -> Controller:
         """
-        Build the controller.
-
-        Args:
-            robot: its model of the robot.
-            options: files that replace its own.
-            parameters: replace those of files and options.
+        Build the controller; ``parameters`` replace those of files and options.
 
         Raises:
             ParameterError: what is wrong with its class or its files, in one line.
@@ -259,11 +245,11 @@ def names() -> list[str]:
 
 def entry_of(found: Any, spec: str, name: str = '') -> ControllerEntry:
     """
-    Make an entry from an entry, a class or a function.
+    Make an entry from a class, or a function that builds a controller.
 
     Args:
-        found: an entry, a class, or a function that builds a controller. A class may have
-            ``name``, ``Parameters``, ``parameters_file``, ``policy_file`` and ``guidance``.
+        found: a class may have ``name``, ``Parameters``, ``parameters_file``, ``policy_file`` and
+            ``guidance``.
         spec: reference by which other processes find it.
         name: under which it is registered; '' uses its own name.
 
@@ -271,36 +257,27 @@ def entry_of(found: Any, spec: str, name: str = '') -> ControllerEntry:
         ParameterError: it cannot be registered.
 
     """
-    if isinstance(found, ControllerEntry):
-        return replace(found, name=name or found.name, spec=spec)
     if not callable(found):
         raise ParameterError(f"controller '{spec}': a {type(found).__name__}, expected a class "
                              'with step(state, target), reset() and period')
     snake = re.sub(r'(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])', '_', found.__name__).lower()
     file = getattr(found, 'parameters_file', '')
     beside = Path(getattr(sys.modules.get(found.__module__), '__file__', None) or '').parent / file
-    period, guidance = getattr(found, 'period', PERIOD), getattr(found, 'guidance', 'none')
+    own = {key: value for key in ('period', 'policy_file', 'guidance')
+           if (value := getattr(found, key, None)) and not isinstance(value, property)}
     return ControllerEntry(
         # an inherited name would be that of another controller
         name=name or vars(found).get('name') or snake, controller=found, spec=spec,
         description=(found.__doc__ or '').strip().partition('\n')[0],
-        period=PERIOD if isinstance(period, property) else period,
         parameters_file=str(beside) if file and beside.is_file() else file,
-        policy_file=getattr(found, 'policy_file', ''),
-        guidance='none' if isinstance(guidance, property) else guidance,
-        flies_degraded=hasattr(found, 'set_health'))
+        flies_degraded=hasattr(found, 'set_health'), **own)
 
 
 def add(found: Any) -> ControllerEntry:
     """
     Register a class, or a function that builds a controller, in this process under its name.
 
-    A controller of the same name that was added before is replaced, for example when a notebook
-    cell runs again.
-
-    Raises:
-        ParameterError: it is no controller, or its name is used by another package.
-
+    It replaces one of the same name, for example when a notebook cell runs again.
     """
     entry = _untaken(entry_of(found, ''))
     _ADDED[entry.name] = entry
@@ -333,13 +310,7 @@ def find(reference: str) -> ControllerEntry:
 
 
 def find_all(references: Iterable[str]) -> list[ControllerEntry]:
-    """
-    Look several controllers up; no two of them may have one name.
-
-    Raises:
-        ParameterError: as :func:`find`, or a name twice.
-
-    """
+    """Look several controllers up; no two of them may have one name."""
     entries: dict[str, ControllerEntry] = {}
     for reference in references:
         entry = find(reference)
@@ -370,15 +341,7 @@ def _untaken(entry):
 
 
 def loaded(reference: str) -> Any:
-    """
-    Import the object of ``package.module:Name`` or ``path/to/file.py:Name``.
-
-    Modules are also searched in the working folder.
-
-    Raises:
-        ParameterError: what is missing, in one line.
-
-    """
+    """Import ``package.module:Name`` or ``path/to/file.py:Name``, also from the working folder."""
     place, _, name = reference.rpartition(':')
     if not place or not name.isidentifier():
         raise ParameterError(f"controller '{reference}': expected {CLASS}")
@@ -416,23 +379,8 @@ def _executed(path):
     return sys.modules[name]
 
 
-def make(reference: str, robot: RobotParameters,
-         options: ControllerOptions = ControllerOptions()) -> Controller:
-    """Build a controller, see :func:`find` and :meth:`ControllerEntry.make`."""
-    return find(reference).make(robot, options)
-
-
 def pilot(among: Iterable[str] | None = None) -> str:
-    """
-    Name of the controller that lands the robot when actuators are lost.
-
-    Args:
-        among: available names; None: all registered names.
-
-    Returns:
-        The first shipped controller that can; '' if none is available.
-
-    """
+    """First of the shipped controllers ``among`` names that flies with lost actuators, or ''."""
     there = set(SHIPPED if among is None else among)
     return next((name for name, entry in SHIPPED.items()
                  if entry.flies_degraded and name in there), '')

@@ -209,7 +209,7 @@ class ControllerNode(FlightNode):
 
     def _controller_status(self):
         host, controller = self._host, self._host.controller
-        report = host.call('diagnostics', getattr(controller, 'diagnostics', dict)) or {}
+        report = host.call('diagnostics') or {}
         new, self._reported_errors = host.errors - self._reported_errors, host.errors
         values = {**report, 'guidance': guidance_of(controller)}
         if host.errors:
