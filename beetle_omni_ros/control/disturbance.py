@@ -78,13 +78,14 @@ class DisturbanceEstimator:
     Attributes:
         delay: from a command to the actuators [s], with the mean of the robot file's delays of
             tilts and thrusts, with which the NMPC's error on a lemniscate is smallest.
+        encoder_delay: from the capture of tilts to their stamp [s].
         disturbance: (10,) force in world [N], torque in body [N m], servo offsets [rad].
 
     """
 
     def __init__(self, robot: RobotParameters, parameters: DisturbanceParameters,
                  command_delay: float, advance: ca.Function):
-        self._robot, self._advance = robot, buffered(advance)
+        self._advance, self.encoder_delay = buffered(advance), robot.sensors.encoder_delay
         self.delay = max(command_delay + sum(robot.command_delays) / 2, 0.0)
         p = parameters
         # bandwidth times inertia: turns a velocity error of one step into a change of force
@@ -133,13 +134,10 @@ class DisturbanceEstimator:
 
         """
         present = self.observe(state)
-        if self.delay == 0:
-            return present
         return self._flown(present, state.stamp, self.delay)
 
     def observe(self, state: State) -> np.ndarray:
         """Update with one state estimate; returns the (25,) full state at its stamp."""
-        state = redated(state, self._robot)
         if state.command is not None and (
                 not self._commands or state.command.stamp > self._commands[-1].stamp):
             self._commands.append(self._moving(state.command))
@@ -213,7 +211,7 @@ class DisturbanceEstimator:
 
     def _correct_tilt(self, state, present, step):
         """Compare the encoders with the tilt model at their capture time."""
-        modelled = self._modelled_tilt(state.tilt_stamp)
+        modelled = self._modelled_tilt(state.tilt_stamp - self.encoder_delay)
         if modelled is None:
             return
         limit = LIMIT[model.TILT_OFFSET]
@@ -239,9 +237,3 @@ class DisturbanceEstimator:
                 return tilt + part * (later[1] - tilt)
             later = (time, tilt)
         return None
-
-
-def redated(state: State, robot: RobotParameters) -> State:
-    """State with the capture time of its tilts, which may be before their stamp."""
-    delay = robot.sensors.encoder_delay
-    return replace(state, tilt_stamp=state.tilt_stamp - delay) if delay else state

@@ -26,9 +26,6 @@ NO_HEIGHT = -1000.0      # [m] a bound that is never reached
 FAILURES_TO_RESTART = 5  # unsolved cycles in a row after which the horizon is initialised again
 
 
-LONGEST_HORIZON = 64     # MAX_STAGES of rti.c
-
-
 @dataclass(frozen=True, kw_only=True)
 class ModelParameters:
     """Options of the prediction model."""
@@ -113,12 +110,6 @@ class NmpcParameters(ParameterFile, file='nmpc.yaml'):
     reach: float = parameter(10.0, doc='a target farther from the robot is refused', unit='m',
                              low=0.5, high=1000, read_only=True)
 
-    def __post_init__(self):
-        """Refuse a grid with too many stages for the solver."""
-        if self.horizon.ndim != 1 or not 2 <= len(self.horizon) <= LONGEST_HORIZON:
-            raise ParameterError(f'horizon: expected 2 to {LONGEST_HORIZON} lengths [s], found '
-                                 f'{self.horizon.tolist()}')
-
     def actuators(self, robot: RobotParameters) -> tuple[float, float, float, float]:
         """
         Actuators of the problem: of the robot file, unless this file overrides them.
@@ -137,7 +128,7 @@ class NmpcParameters(ParameterFile, file='nmpc.yaml'):
 
 class NmpcController:
     """
-    The model-based controller: a :class:`control.base.Controller`.
+    The model-based controller.
 
     Each step estimates disturbances, predicts the state at the time at which the command will act,
     shifts the stored horizon, and solves one QP. If a QP is not solved, the shifted previous plan
@@ -211,13 +202,7 @@ class NmpcController:
         self._estimator.reset()
         self._started, self._failures, self._iterate = False, 0, 0
         self._above = False     # whether the robot was above the smallest height
-        self._statuses: dict[int, int] = {}
-        self._iterations = self._rejected = 0
-
-    @property
-    def disturbance(self) -> np.ndarray:
-        """(10,) estimated force in world [N], torque in body [N m], servo offsets [rad]."""
-        return self._estimator.disturbance.copy()
+        self._steps = self._unsolved = self._rejected = self._iterations = 0
 
     def step(self, state: State, target: Target) -> Command:
         """One command for one state; see the class. A non-finite state repeats the plan."""
@@ -236,13 +221,12 @@ class NmpcController:
             self._iterate = FIRST_ITERATIONS
         else:
             self._rti.shift(self.period)
-        for _ in range(self._iterate):
-            self._rti.step(x0, references, disturbance, self._weights, bounds)
+        for _ in range(1 + self._iterate):
+            solved, self._iterations = self._rti.step(x0, references, disturbance, self._weights,
+                                                      bounds)
         self._iterate = 0
-        status, self._iterations = self._rti.step(x0, references, disturbance, self._weights,
-                                                  bounds)
-        self._statuses[status] = self._statuses.get(status, 0) + 1
-        self._failures = 0 if status == 0 else self._failures + 1
+        self._steps, self._unsolved = self._steps + 1, self._unsolved + (not solved)
+        self._failures = 0 if solved else self._failures + 1
         self._started = self._failures < FAILURES_TO_RESTART
         return self._command(state.stamp)
 
@@ -256,19 +240,17 @@ class NmpcController:
         planned = self._rti.inputs[0]
         command = clipped(np.r_[self._estimator.sent(planned[:4]), planned[4:]],
                           self._bounds[:8], self._bounds[8:16])
-        rotors, health = self._robot.rotors, self._health
-        tilt = command[:4]
-        thrust = clipped(command[4:], rotors.thrust_min, rotors.thrust_max)
-        return Command(stamp, *((tilt, thrust) if health.healthy else
-                                health.possible(tilt, thrust)))
+        rotors = self._robot.rotors
+        tilt, thrust = command[:4], clipped(command[4:], rotors.thrust_min, rotors.thrust_max)
+        if not self._health.healthy:
+            tilt, thrust = self._health.possible(tilt, thrust)
+        return Command(stamp, tilt, thrust)
 
     def diagnostics(self) -> dict[str, float | int | str]:
         """Solver health and estimated disturbances."""
-        steps = sum(self._statuses.values())
-        unsolved = steps - self._statuses.get(0, 0)
         d = self._estimator.disturbance
-        return {'steps': steps, 'unsolved': unsolved, 'rejected_states': self._rejected,
-                'iterations': self._iterations,
+        return {'steps': self._steps, 'unsolved': self._unsolved,
+                'rejected_states': self._rejected, 'iterations': self._iterations,
                 'force_estimate_N': float(np.linalg.norm(d[model.FORCE])),
                 'torque_estimate_Nm': float(np.linalg.norm(d[model.TORQUE])),
                 'servo_offset_rad': float(np.max(np.abs(d[model.TILT_OFFSET])))}

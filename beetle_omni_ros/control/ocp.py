@@ -24,6 +24,7 @@ import numpy as np
 from beetle_omni_ros.robot import dynamics
 from beetle_omni_ros.robot.native import built, generated
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import ParameterError
 
 FOLDER = Path(ca.__file__).resolve().parent
 OPTIONS = (f'-I{FOLDER}/include', f'-L{FOLDER}', '-l:libhpipm.so', '-l:libblasfeo.so.0', '-lm',
@@ -157,6 +158,7 @@ class Rti:
 
     Raises:
         CompilerError: there is no usable compiler.
+        ParameterError: more than MAX_STAGES intervals.
 
     """
 
@@ -175,7 +177,6 @@ class Rti:
             getattr(lib, name).restype = _DOUBLES
             getattr(lib, name).argtypes = [c_void_p]
         lib.rti_step.argtypes = [c_void_p] * 6
-        lib.rti_fill.argtypes = [c_void_p] * 3
         lib.rti_shift.argtypes = [c_void_p, c_double]
         lib.rti_iterations.argtypes = lib.rti_free.argtypes = [c_void_p]
         n, size = len(intervals), stage.size1_in(0)
@@ -184,7 +185,7 @@ class Rti:
                                       weights.ctypes.data_as(_DOUBLES), tolerance, max_iterations,
                                       reaches)
         if not self._handle:
-            raise MemoryError(f'the NMPC could not be allocated for {n} intervals')
+            raise ParameterError(f'horizon: expected at most 64 intervals, found {n}')
         self.states = np.ctypeslib.as_array(lib.rti_states(self._handle), (n + 1, size))
         self.inputs = np.ctypeslib.as_array(lib.rti_inputs(self._handle), (n, INPUT_SIZE))
 
@@ -201,7 +202,7 @@ class Rti:
         """Move the stored trajectory forward by ``time`` [s], at most the shortest interval."""
         self._library.rti_shift(self._handle, time)
 
-    def step(self, x0, references, disturbance, weights, bounds) -> tuple[int, int]:
+    def step(self, x0, references, disturbance, weights, bounds) -> tuple[bool, int]:
         """
         One iteration; the result is in ``states`` and ``inputs``.
 
@@ -215,10 +216,10 @@ class Rti:
                 smallest height.
 
         Returns:
-            QP status (0 solved) and iterations; above 1 nothing has changed.
+            Whether the QP was solved, and iterations.
 
         """
         status = self._library.rti_step(
             self._handle, x0.ctypes.data, references.ctypes.data, disturbance.ctypes.data,
             weights.ctypes.data, bounds.ctypes.data)
-        return status, self._library.rti_iterations(self._handle)
+        return status == 0, self._library.rti_iterations(self._handle)

@@ -58,8 +58,8 @@ def test_servo_offsets_and_torque_are_estimated(controller):
     disturbance = np.r_[np.zeros(3), [0.1, -0.05, 0.03], [0.02, -0.01, 0.015, 0.0]]
     body = Body(disturbance=disturbance).fly(controller, target, 6.0)
     assert body.errors(target)[-1] == pytest.approx((0, 0), abs=9e-4)
-    assert np.allclose(controller.disturbance[6:], disturbance[6:], atol=2e-3)
-    assert np.allclose(controller.disturbance[3:6], disturbance[3:6], atol=1e-2)
+    assert np.allclose(controller._estimator.disturbance[6:], disturbance[6:], atol=2e-3)
+    assert np.allclose(controller._estimator.disturbance[3:6], disturbance[3:6], atol=1e-2)
 
 
 def test_a_moving_reference_is_tracked_with_preview(controller):
