@@ -4,31 +4,19 @@ Guidance: functions that modify the pose targets of a controller.
 A controller that is a function of the present state, like a policy, needs it for wound joints and
 for steady errors. Guidance is optional: a controller may contain a :class:`Guidance`.
 
-Unwinding frees joints: from a joint's stop through a level attitude back to the target. Most
-thrust directions correspond to two joint angles, a full turn apart. Beyond half a turn the better
-angle may be a full turn back, and on the way there the thrust points in wrong directions. A
-policy, a function of the present state, does not turn back: two opposite joints stay near half a
-turn or at their stops, with an attitude error of 10 to 90 degrees. In level hover each tilt is
-zero, and no other angle within the travel gives the same thrust. A level target at the target
-position therefore unwinds all joints. From there the target is reached as after a take-off.
+- Unwinding: from a joint's stop through a level attitude back to the target. A level attitude
+  unwinds all joints, and from there the target is reached as after a take-off. If the turn back is
+  long, the attitude half way follows, because a policy may choose either direction for nearly half
+  a turn, and the wrong one winds the joints differently.
+- Routing: through an intermediate attitude if the shortest turn needs more than the travel of a
+  joint.
+- Trimming: an integral against the steady error.
 
-The heading of the level attitude determines both turns. In a turn about an arm, the two arms
-across point upward half way. Their thrust cannot carry weight there, and their joints must turn
-over by half a turn in an arbitrary direction. In a turn about an axis between two arms all four
-joints turn continuously. The selected heading therefore keeps the arms away from upright in both
-turns. The heading also determines the joint angles at the target: a heading that leads to the same
-angles as at the missed target is used only if there is no other. If the turn back is long, the
-attitude half way is the first target, because a policy may choose either direction for nearly half
-a turn, and the wrong one winds the joints differently.
-
-Routing passes an intermediate attitude if the shortest turn needs more than the travel of a joint.
-A policy begins this turn nevertheless. It loses the thrust of two rotors half way, dives, and
-arrives with joints at their stops or not at all. By way of an intermediate attitude the joints end
-at other angles.
+docs/explanation/policy.md has the reasons.
 """
 
 from dataclasses import replace
-from math import dist, hypot, inf, isfinite, sqrt
+from math import dist, hypot, inf, sqrt
 
 import numpy as np
 
@@ -148,9 +136,7 @@ class Guidance:
         if self._given is None or not given.same_pose(self._given):
             self._start()
         self._given = given
-        if not isfinite(sum(state.quaternion.tolist()) + sum(state.tilt.tolist())):
-            self._given = None      # repeat with the next state
-        elif self._looked is None \
+        if self._looked is None \
                 or rotations.geodesic_angle(given.quaternion, self._looked) >= ANOTHER:
             self._looked, self._way = given.quaternion, []
             between = route(state.quaternion, given.quaternion, state.tilt, self._axes) \
@@ -233,7 +219,7 @@ class Trimming:
         The modified target for the policy.
 
         Args:
-            state: of the robot; a state that is not finite does not change the integral.
+            state: of the robot.
             given: the target. If it is not near the last target, the integral is reset, because
                 the steady error is different there.
             learn: whether this policy is active and flies towards the target.
@@ -264,7 +250,7 @@ class Trimming:
 
 
 def _near(way, turn):
-    """Whether an error may be a steady error; NaN is not."""
+    """Whether an error may be a steady error."""
     return hypot(*way) <= NEAR_DISTANCE and hypot(*turn) <= NEAR_ANGLE
 
 

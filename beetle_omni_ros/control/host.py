@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -116,7 +117,15 @@ class ControllerHost:
                                          f'{reach:g} m: the reach of the controller')
 
     def step(self, state: State, target: Target | None = None) -> Command | None:
-        """Command for a state, to ``target`` or the target in force; None after an exception."""
+        """
+        Command for a state, to ``target`` or the target in force.
+
+        None after an exception, and for a state that is not finite.
+        """
+        if not isfinite(sum(sum(part.tolist()) for part in (
+                state.position, state.velocity, state.quaternion, state.angular_velocity,
+                state.tilt, state.tilt_velocity))):
+            return None
         return self.call('step', corrected(state, self._health), target or self.target_in_force,
                          run=self._timed, flaw=flaw)
 

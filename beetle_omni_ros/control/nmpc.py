@@ -202,13 +202,10 @@ class NmpcController:
         self._estimator.reset()
         self._started, self._failures, self._iterate = False, 0, 0
         self._above = False     # whether the robot was above the smallest height
-        self._steps = self._unsolved = self._rejected = self._iterations = 0
+        self._steps = self._unsolved = self._iterations = 0
 
     def step(self, state: State, target: Target) -> Command:
-        """One command for one state; see the class. A non-finite state repeats the plan."""
-        if self._started and not _finite(state):
-            self._rejected += 1
-            return self._command(state.stamp)
+        """One command for one state; see the class."""
         full = self._estimator.update(state)
         x0 = np.concatenate([full[:13], full[model.TILT], full[model.THRUST]])[:self._state_size]
         start = state.stamp + self._estimator.delay
@@ -249,14 +246,7 @@ class NmpcController:
     def diagnostics(self) -> dict[str, float | int | str]:
         """Solver health and estimated disturbances."""
         d = self._estimator.disturbance
-        return {'steps': self._steps, 'unsolved': self._unsolved,
-                'rejected_states': self._rejected, 'iterations': self._iterations,
+        return {'steps': self._steps, 'unsolved': self._unsolved, 'iterations': self._iterations,
                 'force_estimate_N': float(np.linalg.norm(d[model.FORCE])),
                 'torque_estimate_Nm': float(np.linalg.norm(d[model.TORQUE])),
                 'servo_offset_rad': float(np.max(np.abs(d[model.TILT_OFFSET])))}
-
-
-def _finite(state):
-    return bool(np.isfinite(np.concatenate([
-        state.position, state.velocity, state.quaternion, state.angular_velocity, state.tilt,
-        state.tilt_velocity])).all())

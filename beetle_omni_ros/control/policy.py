@@ -2,14 +2,13 @@
 
 from collections import deque
 from dataclasses import dataclass
-from math import isfinite
 
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, PoseTarget, Reference, State, Target
 from beetle_omni_ros.control.disturbance import DisturbanceEstimator, DisturbanceParameters
 from beetle_omni_ros.control.guidance import Guidance
-from beetle_omni_ros.control.policy_file import kind, PolicyNetwork
+from beetle_omni_ros.control.policy_file import PolicyNetwork
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import parameter, ParameterFile
@@ -60,8 +59,7 @@ class PolicyController:
         p = parameters or PolicyParameters.load()
         self.network = PolicyNetwork(p.policy, robot, p.allow_other_robot)
         self.contract = contract = self.network.contract
-        self.name = kind(contract.memory)
-        self.period, self.reach = 1 / contract.rate_hz, p.reach
+        self.name, self.period, self.reach = contract.name, 1 / contract.rate_hz, p.reach
         self._scale, self._offset = contract.action_scale, contract.action_offset
         tilt, rotors = robot.joints.position_limit, robot.rotors
         self._limits = [(-tilt, tilt)] * 4 + [(rotors.thrust_min, rotors.thrust_max)] * 4
@@ -74,26 +72,21 @@ class PolicyController:
         self.reset()
 
     def reset(self) -> None:
-        """Reset the last command, the estimate and all counts."""
-        self._command: Command | None = None
-        self._steps = self._rejected = self._faults = self._cut = 0
+        """Reset the last commands, the estimate and all counts."""
+        self._steps = self._faults = self._cut = 0
         self._guidance.reset()
         self._latest: deque[list[float]] = deque(maxlen=LATEST)
         if self._estimator:
             self._estimator.reset()
 
     def step(self, state: State, target: Target) -> Command:
-        """One command for one state; a non-finite state repeats the last command."""
+        """One command for one state."""
         self._steps += 1
         if isinstance(target, PoseTarget):
             target = self._guidance.target(state, target, self._in_charge(state))
         values = self.infer(state, target.at(state.stamp))
-        if values is None:
-            self._rejected += 1
-            return self._repeated(state)
-        self._command = Command(state.stamp, np.array(values[:4]), np.array(values[4:]))
         self._latest.append(values)
-        return self._command
+        return Command(state.stamp, np.array(values[:4]), np.array(values[4:]))
 
     def _in_charge(self, state):
         """Whether the executed command is one of the latest commands."""
@@ -101,50 +94,23 @@ class PolicyController:
         return command is not None \
             and command.tilt.tolist() + command.thrust.tolist() in self._latest
 
-    def infer(self, state: State, reference: Reference) -> list[float] | None:
+    def infer(self, state: State, reference: Reference) -> list[float]:
         """
         Compute observation and action, and clip the targets to the limits of the actuators.
 
         Returns:
-            Tilt targets (4) [rad] and thrust targets (4) [N], or None if an input of the network
-            is not finite.
+            Tilt targets (4) [rad] and thrust targets (4) [N].
 
         """
-        observation = self._observe(state, reference)
-        return None if observation is None else self._targets(self.network(observation))
-
-    def diagnostics(self) -> dict[str, float | int | str]:
-        """Counts since reset, and the disturbance estimates of a policy with memory."""
-        values: dict[str, float | int | str] = {
-            'policy': self.contract.name, 'steps': self._steps,
-            'rejected_states': self._rejected, 'faulty_actions': self._faults,
-            'steps_at_a_limit': self._cut, **self._guidance.diagnostics()}
-        if self._estimator:
-            d = self._estimator.disturbance
-            values['force_estimate_N'] = float(np.linalg.norm(d[model.FORCE]))
-            values['torque_estimate_Nm'] = float(np.linalg.norm(d[model.TORQUE]))
-        return values
-
-    def _observe(self, state, reference):
-        """Inputs of the network, or None when one of them is not finite."""
         command = state.command     # before the first: the measured tilts and hover thrust
         before = state.tilt.tolist() + self._hover if command is None else \
             command.tilt.tolist() + command.thrust.tolist()
         observation = observed(state, reference, [
             (v - o) / s for v, o, s in zip(before, self._offset, self._scale)])
-        if not isfinite(sum(observation)):
-            return None
         if self._estimator:
-            if not isfinite(sum(state.tilt_velocity.tolist())):
-                return None
             self._estimator.observe(state)
-            if not isfinite(sum(self._estimator.disturbance.tolist())):
-                self._estimator.reset()
             observation += disturbed(state, self._estimator.disturbance)
-        return observation
-
-    def _targets(self, action):
-        """Tilt and thrust targets, within limits unless the action is a fault."""
+        action = self.network(observation)
         values = [s * a + o for a, o, s in zip(action, self._offset, self._scale)]
         # also false for NaN
         if not all(-ACTION_LIMIT <= a <= ACTION_LIMIT for a in action):
@@ -155,13 +121,17 @@ class PolicyController:
         self._cut += cut != values
         return cut
 
-    def _repeated(self, state):
-        """The last command with the state's stamp; before the first, hover thrust."""
-        last = self._command
-        if last is not None:
-            return Command(state.stamp, last.tilt, last.thrust)
-        tilt = state.tilt if np.isfinite(state.tilt).all() else np.zeros(4)
-        return Command(state.stamp, tilt, np.array(self._hover))
+    def diagnostics(self) -> dict[str, float | int | str]:
+        """Counts since reset, and the disturbance estimates of a policy with memory."""
+        values: dict[str, float | int | str] = {
+            'policy': self.contract.name, 'steps': self._steps,
+            'faulty_actions': self._faults, 'steps_at_a_limit': self._cut,
+            **self._guidance.diagnostics()}
+        if self._estimator:
+            d = self._estimator.disturbance
+            values['force_estimate_N'] = float(np.linalg.norm(d[model.FORCE]))
+            values['torque_estimate_Nm'] = float(np.linalg.norm(d[model.TORQUE]))
+        return values
 
 
 # Plain floats below: on vectors of three, numpy's calls cost ten times the arithmetic.

@@ -64,11 +64,6 @@ JSON = ('observations', 'actions', 'action_scale', 'action_offset', 'rate_hz', '
 DEFAULTS = dict.fromkeys(('robot_values', 'training', 'metrics'), '{}')
 
 
-def kind(memory: bool) -> str:
-    """Name of a policy with or without the estimated disturbance."""
-    return 'rl' + ('_memory' if memory else '')
-
-
 @dataclass(frozen=True, kw_only=True)
 class PolicyContract:
     """Description of a policy: the metadata of docs/reference/policy_file.md."""
@@ -96,7 +91,7 @@ class PolicyContract:
                    action_scale=[TILT_SCALE] * 4 + [THRUST_SCALE] * 4,
                    action_offset=[0.0] * 4 + [robot.hover_thrust] * 4, rate_hz=RATE_HZ,
                    robot=robot.name, robot_hash=robot.hash(), robot_values=robot.as_dict(),
-                   name=kind(memory))
+                   name='rl_memory' if memory else 'rl')
 
     @property
     def memory(self) -> bool:
@@ -115,13 +110,7 @@ class PolicyContract:
 
     @classmethod
     def from_metadata(cls, metadata: dict[str, str]) -> PolicyContract:
-        """
-        Read a file's custom metadata.
-
-        Raises:
-            ParameterError: naming the entry that is missing or unusable.
-
-        """
+        """Read a file's custom metadata; an error names the missing or unusable entry."""
         found = metadata.get('format')
         if found != FORMAT:
             raise ParameterError(f"metadata 'format': expected {FORMAT!r}, found {quoted(found)}")
@@ -138,10 +127,6 @@ class PolicyContract:
     def check(self, robot: RobotParameters, allow_other_robot: bool = False) -> str:
         """
         Compare with the description of this version for ``robot``.
-
-        Args:
-            robot: the model of the robot.
-            allow_other_robot: accept a policy that was trained for another one.
 
         Returns:
             A warning, one line, when another robot was allowed; else ''.
@@ -198,13 +183,7 @@ def _differences(flown, trained, prefix=''):
 
 
 def verify(data: bytes) -> None:
-    """
-    Compare an ONNX file's content with the checksum in it.
-
-    Raises:
-        ParameterError: they differ, or there is none.
-
-    """
+    """Compare an ONNX file's content with the checksum in it; refuse it if they differ."""
     before, entry, after = data.rpartition(ENTRY)
     if not entry:
         raise ParameterError("metadata 'checksum' is missing: truncated, or no policy; python -m "
@@ -256,9 +235,6 @@ class PolicyNetwork:
         path: ONNX file with the metadata of :class:`PolicyContract`.
         robot: the robot that it flies.
         allow_other_robot: accept one that was trained for other robot parameters.
-
-    Attributes:
-        contract: the metadata of the file.
 
     Raises:
         ParameterError: one line with the file and what is missing, broken or different.
@@ -319,22 +295,14 @@ class PolicyNetwork:
 
 
 def find(path: str | Path) -> Path:
-    """
-    Locate a policy: an absolute path, or one in the package's share or the present folder.
-
-    Raises:
-        ParameterError: there is no such file.
-
-    """
-    path = Path(path)
+    """Locate a policy: an absolute path, or one in the package's share or the present folder."""
     try:
         found = share_path(str(path))
     except FileNotFoundError:
-        found = path
+        found = Path(path)
     if not found.is_file():
-        where = '' if path.is_absolute() else \
-            f", neither in the package's share nor in {Path.cwd()}"
-        raise ParameterError(f'policy {path}: no such file{where}')
+        raise ParameterError(f"policy {path}: no such file, neither in the package's share nor in "
+                             f'{Path.cwd()}')
     return found
 
 

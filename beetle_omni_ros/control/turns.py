@@ -42,7 +42,7 @@ def levelled(quaternion: np.ndarray) -> np.ndarray:
 def level_between(start: np.ndarray, end: np.ndarray, axes: np.ndarray,
                   failed: Sequence[np.ndarray] = ()) -> np.ndarray:
     """
-    Choose the best level attitude between two attitudes.
+    Choose the level attitude between two attitudes of the least :func:`turning_cost`.
 
     Args:
         start: (4,) attitude, xyzw.
@@ -50,9 +50,6 @@ def level_between(start: np.ndarray, end: np.ndarray, axes: np.ndarray,
         axes: (4, 3) unit tilt axes in base_link.
         failed: (4,) tilts [rad] with which the end was not held; headings that lead to other tilts
             are preferred.
-
-    Returns:
-        (4,) the level attitude, xyzw, of the least :func:`turning_cost` there and on.
 
     """
     begin, goal = Rotation.from_quat(start), Rotation.from_quat(end)
@@ -131,19 +128,10 @@ SPREAD = Rotation.from_quat(spread_attitudes(ATTITUDES))
 
 def turning_cost(start: Rotation, end: Rotation, axes: np.ndarray) -> np.ndarray:
     """
-    Angle of the shortest turn between two attitudes, weighted by arms near upright [rad].
+    Angles (n,) of the shortest turns between attitudes, weighted by arms near upright [rad].
 
     The thrust of a rotor is across its arm, so sqrt(1 - (arm . up)^2) of it can hold weight; the
     angle is weighted with the inverse square of that for the worst arm.
-
-    Args:
-        start: one attitude or n of them.
-        end: the same.
-        axes: (4, 3) unit tilt axes in base_link.
-
-    Returns:
-        (n,) costs.
-
     """
     angle, up = turned(start, end)
     upright = np.max((up @ axes.T) ** 2, axis=-1)
@@ -165,11 +153,7 @@ def tilts_along(up: np.ndarray, axes: np.ndarray) -> np.ndarray:
 
 def turned(start: Rotation, end: Rotation) -> tuple[np.ndarray, np.ndarray]:
     """
-    Follow the shortest turns between attitudes.
-
-    Args:
-        start: one attitude or n of them.
-        end: the same.
+    Follow the shortest turns between attitudes, one or n of them at each end.
 
     Returns:
         (n,) their angles [rad], and (n, POINTS, 3) world's z in the turning body.

@@ -1,5 +1,6 @@
 """The interface of a controller, and its host: target in force, stopped motors, exceptions."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -87,6 +88,16 @@ def test_a_target_beyond_the_reach_is_dropped_at_the_takeover_only():
     assert flown(host, 10.0) == 10.0
     host.target = at(17.0)
     assert host.on_mode('flying:own', 0.0) == '' and flown(host, 10.0) == 17.0
+
+
+@pytest.mark.parametrize('part', ['velocity', 'tilt'])
+def test_a_state_that_is_not_finite_does_not_reach_the_controller(part):
+    host, good = ControllerHost('own', Own()), state()
+    host.on_estimate(good)
+    bad = getattr(good, part).copy()
+    bad[1] = np.nan
+    assert host.step(replace(good, **{part: bad})) is None and not host.controller.states
+    assert host.step(good) is not None and host.errors == 0
 
 
 @pytest.mark.parametrize('method', ['step', 'reset', 'set_health'])

@@ -80,17 +80,6 @@ def test_without_a_compiler_the_cause_is_named(monkeypatch):
         NmpcController(ROBOT)
 
 
-def test_a_nan_state_repeats_the_plan_and_does_not_poison_the_next_cycles(controller):
-    body = Body().fly(controller, PoseTarget(np.array([0.0, 0.0, 1.0]), LEVEL), 0.2)
-    bad = replace(body.state(), position=np.full(3, np.nan), command=None)
-    repeated = controller.step(bad, PoseTarget(np.array([0.0, 0.0, 1.0]), LEVEL))
-    assert np.allclose(repeated.thrust, body.command.thrust, atol=0.2)
-    assert controller.diagnostics()['rejected_states'] == 1
-    body.time += 0.01
-    moved = PoseTarget(np.array([0.5, 0.0, 1.0]), rotations.from_rpy(0.5, 0, 0))
-    assert body.fly(controller, moved, 5.0).errors(moved)[-1] == pytest.approx((0, 0), abs=4e-4)
-
-
 @pytest.mark.parametrize('robot, k, expected', [
     ({'joints': {'kd': 0.02}}, 0, 0.02 / ROBOT.joints.kp),
     ({'joints': {'kd': 0.0}}, 0, np.sqrt(ROBOT.joints.inertia / ROBOT.joints.kp)),

@@ -102,25 +102,6 @@ def test_an_action_that_is_not_finite_is_left_to_the_supervisor(tmp_path):
     assert policy.diagnostics()['faulty_actions'] == 1
 
 
-@pytest.mark.parametrize('field', ['velocity', 'tilt'])
-def test_a_state_that_is_not_finite_repeats_the_last_command(tmp_path, field):
-    path = write(tmp_path / 'p.onnx', memory=True, hidden=(16,))
-    policy = controller(path)
-    last = policy.step(state(1.0), TARGET)
-    broken = getattr(state(), field).copy()
-    broken[1] = np.nan
-    command = policy.step(state(1.01, command=last, **{field: broken}), TARGET)
-    assert command.stamp == 1.01
-    assert np.array_equal(command.tilt, last.tilt)
-    assert np.array_equal(command.thrust, last.thrust)
-    assert policy.diagnostics()['rejected_states'] == 1
-    # and it has no later effect
-    fresh = controller(path)
-    fresh.step(state(1.0), TARGET)
-    after, expected = (p.step(state(1.02, command=last), TARGET) for p in (policy, fresh))
-    assert np.allclose(after.tilt, expected.tilt, atol=1e-9)
-
-
 def test_only_its_latest_commands_put_the_policy_in_charge(tmp_path):
     policy, charges = controller(write(tmp_path / 'p.onnx')), []
     policy._guidance = SimpleNamespace(
