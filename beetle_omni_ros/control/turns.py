@@ -12,8 +12,6 @@ from math import sqrt
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from beetle_omni_ros.robot import rotations
-
 HEADINGS = 24           # number of compared level attitudes
 # Routing: largest tilt along the shortest turn, above which another way is searched, and its
 # largest tilt, if possible [rad].
@@ -24,19 +22,6 @@ SHORTER = 0.2           # [rad] by which an intermediate attitude must be better
 STRAIGHT_UP = np.array([0.0, 0.0, 1.0])
 POINTS = 16             # of a turn at which the arms are evaluated
 LEAST_USE = 0.2         # smallest used share of an arm's thrust that can carry weight
-
-
-def levelled(quaternion: np.ndarray) -> np.ndarray:
-    """(4,) the level attitude nearest to ``quaternion``, both xyzw."""
-    up = rotations.matrix(quaternion).T @ STRAIGHT_UP      # world's z in the body
-    axis = np.cross(up, STRAIGHT_UP)
-    sine = np.linalg.norm(axis)
-    if sine < 1e-9:     # level already, or upside down: about the own x axis
-        turn = np.array([1.0, 0.0, 0.0]) * (0.0 if up[2] > 0 else np.pi)
-    else:
-        turn = axis / sine * np.arctan2(sine, up[2])
-    return rotations.normalized(rotations.multiply(
-        quaternion, rotations.conjugate(rotations.exp(turn))))
 
 
 def level_between(start: np.ndarray, end: np.ndarray, axes: np.ndarray,
@@ -54,8 +39,7 @@ def level_between(start: np.ndarray, end: np.ndarray, axes: np.ndarray,
     """
     begin, goal = Rotation.from_quat(start), Rotation.from_quat(end)
     heading = np.linspace(0.0, 2 * np.pi, HEADINGS, endpoint=False)
-    levels = Rotation.from_rotvec(heading[:, None] * STRAIGHT_UP) \
-        * Rotation.from_quat(levelled(start))
+    levels = Rotation.from_rotvec(heading[:, None] * STRAIGHT_UP)
     cost = turning_cost(begin, levels, axes) + turning_cost(levels, goal, axes)
     tilts = tilts_along(turned(levels, goal)[1], axes)[:, -1]
     failures = np.zeros(HEADINGS)

@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.control.turns import (
     level_between,
-    levelled,
     route,
     ROUTED,
     tilts_along,
@@ -19,21 +18,8 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 
 AXES = RobotParameters.load().tilt_axes
 STEPS = np.linspace(-0.5, 0.5, 101)[:, None]
-
-
 quaternions = st.tuples(*[st.floats(-1, 1)] * 4).filter(
     lambda q: sum(v * v for v in q) > 0.01).map(rotations.normalized)
-
-
-@settings(max_examples=100, deadline=None)
-@given(quaternions)
-def test_the_level_attitude_is_the_nearest_one(quaternion):
-    level = levelled(quaternion)
-    assert rotations.matrix(level)[2] == pytest.approx([0, 0, 1], abs=1e-7)
-    way = rotations.geodesic_angle(level, quaternion)
-    for yaw in np.linspace(0, 2 * np.pi, 12):
-        other = rotations.multiply(rotations.exp(np.array([0, 0, yaw])), level)
-        assert rotations.geodesic_angle(other, quaternion) >= way - 1e-6
 
 
 def uses(start, end):
