@@ -2,14 +2,10 @@
 Disturbance estimates for offset-free control.
 
 Three slow estimates integrate the prediction error of the model: an external force in world, an
-external torque in body and an offset of each servo's resting angle. A wrong mass or thrust
-coefficient, a shifted centre of mass, wind and servo sag under load are absorbed by one of them. A
-controller that predicts with them has no steady error. The module also predicts quantities that no
-sensor reports: the rotors' thrust, and the present tilts, because encoder readings are delayed.
-
-Friction holds a servo until its target is a band (friction over stiffness) away. In a loop around
-a floating body this play causes a limit cycle. For a robot file with ``joint_friction`` the
-estimator therefore models the play of each servo, and the targets overcome it.
+external torque in body and an offset of each servo's resting angle. A controller that predicts
+with them has no steady error. The module also predicts quantities that no sensor reports: the
+rotors' thrust, and the present tilts. For a robot file with ``joint_friction`` it models the play
+of each servo, and the targets overcome it. docs/explanation/nmpc.md has the reasons.
 """
 
 from collections import deque

@@ -30,8 +30,7 @@ ALL = 'all'             # in place of the names of all layers
 # Unwinding
 ATTEMPTS = 2            # to unwind, for one target
 WOUND = 2.4             # [rad] a joint beyond is wound; hover with a force or payload needs less
-# A larger error misses the target [rad], [m]; below this share of the smallest so far, it falls.
-MISSED_ANGLE, MISSED_DISTANCE, PROGRESS = 0.14, 0.08, 0.8
+MISSED_ANGLE, MISSED_DISTANCE = 0.14, 0.08      # [rad], [m]: a larger error misses the target
 PATIENCE = 0.8          # [s] with missed target without progress, minus the time within the limits
 HEIGHT = 1.2            # [m] smallest height of the level attitude: the robot may dive
 ARRIVED = 0.35          # [rad] distance from level at which the robot turns back
@@ -165,20 +164,13 @@ class Guidance:
         error = max(rotations.geodesic_angle(state.quaternion, given.quaternion) / MISSED_ANGLE,
                     dist(given.position.tolist(), state.position.tolist()) / MISSED_DISTANCE)
         elapsed, self._seen = state.stamp - self._seen, state.stamp
-        if error > max(1.0, self._progress()):
+        if error > max(1.0, self._least - min(STEP, 0.5 * self._least)):
             self._missed += elapsed
         elif error > 1.0:
             self._least, self._missed = error, 0.0
         else:       # the error may oscillate about its limit: the longer side decides
             self._missed = max(0.0, self._missed - elapsed)
         return self._missed >= PATIENCE
-
-    def _progress(self):
-        """Error below which there is progress."""
-        if self._least == inf:
-            return inf
-        return self._least - max((1 - PROGRESS) * self._least,
-                                 min(STEP, 0.5 * self._least))
 
     def _through_level(self, state, given):
         """The way from a joint's stop to the target."""

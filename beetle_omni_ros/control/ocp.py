@@ -1,13 +1,9 @@
 """
 The NMPC's optimal control problem as stage functions, generated from the robot's model.
 
-One shooting interval: rigid body by Runge-Kutta 4, while the first-order lags of servos and rotors
-are evaluated in closed form at the start, middle and end of the interval. An interval may
-therefore be much longer than a servo's time constant, for which an explicit rule on the whole
-state would be unstable. The cost is least squares in position, velocity, the vector part of the
-attitude error quaternion, body rates, tilts, thrusts and the lead of commands over what has been
-reached (beyond the lead that a moving reference needs). With the reference attitude fixed it is
-linear in the state, so its Gauss-Newton Hessian is exact.
+The rigid body is integrated by Runge-Kutta 4, the first-order lags of servos and rotors in closed
+form at the start, middle and end of an interval, which may therefore be much longer than a servo's
+time constant. docs/explanation/nmpc.md has the cost.
 
 :class:`Rti` iterates: one Gauss-Newton QP a cycle around a stored, shifted trajectory. The
 iteration is in rti.c and compiled together with the stage functions. The QP is solved by HPIPM,

@@ -51,45 +51,25 @@ class ControllerOptions:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ControllerEntry:
-    """
-    One controller; all programs that accept a controller's name use this entry.
+    """One controller; all programs that accept a controller's name use this entry."""
 
-    Attributes:
-        name: of its results, its topic ``<name>/command`` and its node ``<name>_node``.
-        controller: class or function, or 'package.module:Class', called with the robot and, where
-            its signature has them, ``parameters`` and ``options``. Its attribute ``Parameters`` is
-            the class of its parameters (:mod:`robot.schema`).
-        spec: reference by which another process finds it; '' means its name.
-        label: short, for headings of figures.
-        description: one line.
-        period: between its commands [s].
-        parameters_file: shipped file of them; in the package's share, or any path.
-        policy_file: its network; '' for none.
-        option: of the command line that replaces the file of this controller only.
-        guidance: names the functions that modify its targets, see :mod:`control.guidance`.
-        flies_degraded: whether it can fly with failed actuators (``set_health``).
-        stands_by: whether it runs in the ROS graph on standby.
-        compared: whether `beetle_omni compare` flies it by default.
-        cost: core seconds for a simulated second, to order flights; without influence on results.
-        line: colour, dashes and marker in figures.
-
-    """
-
-    name: str
+    name: str               # of its results, its topic '<name>/command' and node '<name>_node'
+    # Class or function, or 'package.module:Class', called with the robot and, where its signature
+    # has them, `parameters` and `options`. Its `Parameters` is the class of its parameters.
     controller: str | Callable[..., Controller]
-    spec: str = ''
-    label: str = ''
+    spec: str = ''          # reference by which another process finds it; '': its name
+    label: str = ''         # short, for headings of figures
     description: str = ''
-    period: float = PERIOD
-    parameters_file: str = ''
-    policy_file: str = ''
-    option: str = ''
-    guidance: str = 'none'
-    flies_degraded: bool = False
-    stands_by: bool = False
-    compared: bool = False
-    cost: float = 0.1
-    line: tuple[str, str | tuple, str] = ('', '-', 'o')
+    period: float = PERIOD      # [s] between its commands
+    parameters_file: str = ''   # shipped file of them; in the package's share, or any path
+    policy_file: str = ''       # its network
+    option: str = ''        # of the command line, replaces the file of this controller only
+    guidance: str = 'none'  # names the functions that modify its targets
+    flies_degraded: bool = False    # with failed actuators
+    stands_by: bool = False     # in the ROS graph
+    compared: bool = False  # by default
+    cost: float = 0.1       # core seconds for a simulated second, to order flights
+    line: tuple[str, str | tuple, str] = ('', '-', 'o')     # colour, dashes, marker in figures
 
     def __post_init__(self):
         """Refuse an invalid name."""

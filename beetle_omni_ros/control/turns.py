@@ -7,7 +7,6 @@ initial tilts.
 """
 
 from collections.abc import Sequence
-from math import sqrt
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -16,7 +15,7 @@ HEADINGS = 24           # number of compared level attitudes
 # Routing: largest tilt along the shortest turn, above which another way is searched, and its
 # largest tilt, if possible [rad].
 ROUTED, AIM = 3.4, 3.2
-ATTITUDES = 150         # compared intermediate attitudes; 50 and 400 give similar flights
+SPREAD = Rotation.create_group('I')    # compared intermediate attitudes, 60 evenly spread
 EXCESS = 5.0            # cost of joint angles relative to the length of the turn [rad/rad]
 SHORTER = 0.2           # [rad] by which an intermediate attitude must be better
 STRAIGHT_UP = np.array([0.0, 0.0, 1.0])
@@ -90,24 +89,6 @@ def _wound(up, tilt, axes):
 
 def _excess(wound):
     return EXCESS * np.maximum(0.0, wound - AIM)
-
-
-def spread_attitudes(count: int) -> np.ndarray:
-    """
-    (count, 4) unit quaternions xyzw, evenly spread.
-
-    A spiral on the three-sphere after M. Alexa, Super-Fibonacci spirals: fast, low-discrepancy
-    sampling of SO(3) (2022).
-    """
-    part = (np.arange(count) + 0.5) / count
-    inner, outer = np.sqrt(part), np.sqrt(1 - part)
-    alpha = 2 * np.pi * count * part / sqrt(2)
-    beta = 2 * np.pi * count * part / 1.533751168755204288118041
-    return np.column_stack([inner * np.sin(alpha), inner * np.cos(alpha), outer * np.sin(beta),
-                            outer * np.cos(beta)])
-
-
-SPREAD = Rotation.from_quat(spread_attitudes(ATTITUDES))
 
 
 def turning_cost(start: Rotation, end: Rotation, axes: np.ndarray) -> np.ndarray:
