@@ -1,9 +1,8 @@
 """
 Hover: PD on the pose with a disturbance observer, then allocation.
 
-The simplest controller for comparisons, and the fallback of the supervisor. It needs the robot's
-parameters, no compiler and no solver. It is stable from any attitude, because translation and
-rotation do not couple on this robot.
+The simplest controller for comparisons, and the fallback of the supervisor. It is stable from any
+attitude, because translation and rotation do not couple on this robot.
 
     acceleration = Kp e_p + Kd e_v - d           (world)
     angular acceleration = Kp e_R + Kd e_w - d   (base_link)

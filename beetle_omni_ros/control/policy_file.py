@@ -274,13 +274,13 @@ class PolicyNetwork:
         self._input = np.zeros((1, size), np.float32)
         self._output = np.zeros((1, len(self.contract.actions)), np.float32)
         binding = self._binding = self._session.io_binding()
-        for bind, name, array, found in (
-                (binding.bind_input, INPUT, self._input, self._session.get_inputs()),
-                (binding.bind_output, OUTPUT, self._output, self._session.get_outputs())):
+        for name, bind, array, found in (
+                (INPUT, binding.bind_input, self._input, self._session.get_inputs()),
+                (OUTPUT, binding.bind_output, self._output, self._session.get_outputs())):
             tensors = [(tensor.name, tensor.type, *tensor.shape[1:]) for tensor in found]
             expected = [(name, 'tensor(float)', array.shape[1])]
             if tensors != expected:
-                raise ParameterError(f'{bind.__name__[5:]}: expected {expected}, found {tensors}')
+                raise ParameterError(f'expected {expected}, found {tensors}')
             bind(name, 'cpu', 0, np.float32, array.shape, array.ctypes.data)
 
     def _warm_up(self):

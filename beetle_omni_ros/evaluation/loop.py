@@ -20,8 +20,14 @@ import time
 import numpy as np
 
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.control.base import Command, Controller, PoseTarget, State, Target
-from beetle_omni_ros.control.host import ControllerHost
+from beetle_omni_ros.control.base import (
+    Command,
+    Controller,
+    ControllerHost,
+    PoseTarget,
+    State,
+    Target,
+)
 from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.parameters import EkfParameters

@@ -10,8 +10,13 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.control.base import guidance_of, PoseTarget, State
-from beetle_omni_ros.control.host import ControllerHost, MOTORS_OFF
+from beetle_omni_ros.control.base import (
+    ControllerHost,
+    guidance_of,
+    MOTORS_OFF,
+    PoseTarget,
+    State,
+)
 from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.control.registry import ControllerEntry
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf

@@ -6,8 +6,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from beetle_omni_ros.control.base import Command, PoseTarget, State, TrajectoryTarget
-from beetle_omni_ros.control.host import ControllerHost
+from beetle_omni_ros.control.base import (
+    Command,
+    ControllerHost,
+    PoseTarget,
+    State,
+    TrajectoryTarget,
+)
 from beetle_omni_ros.robot.allocation import ActuatorHealth
 
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
