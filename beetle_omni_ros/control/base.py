@@ -239,11 +239,6 @@ def reach_of(controller: Controller) -> float:
     return float(getattr(controller, 'reach', inf))
 
 
-def direct(function: Callable, *arguments: Any) -> Any:
-    """Call a function."""
-    return function(*arguments)
-
-
 class ControllerHost:
     """
     Steps one controller for the supervisor.
@@ -269,7 +264,7 @@ class ControllerHost:
     """
 
     def __init__(self, name: str, controller: Controller,
-                 timed: Callable[..., Any] = direct,
+                 timed: Callable[..., Any] = lambda step, *arguments: step(*arguments),
                  report: Callable[[str], None] = lambda text: None):
         self.controller = controller
         self.target: Target | None = None
@@ -341,22 +336,22 @@ class ControllerHost:
                 state.position, state.velocity, state.quaternion, state.angular_velocity,
                 state.tilt, state.tilt_velocity))):
             return None
-        return self.call('step', corrected(state, self._health), target or self.target_in_force,
-                         run=self._timed, flaw=flaw)
+        return self.call('step', corrected(state, self._health), target or self.target_in_force)
 
-    def call(self, method: str, *arguments: Any, run: Callable[..., Any] = direct,
-             flaw: Callable[[Any], str] = lambda result: '') -> Any:
+    def call(self, method: str, *arguments: Any) -> Any:
         """
         Call the controller's ``method`` if it has one; returns its result.
 
         In a process with other nodes, an exception would end the supervisor, too. It is reported,
-        and None is returned, like for a result with a flaw.
+        and None is returned, like for a step without a command.
         """
         function = getattr(self.controller, method, None)
         if function is None:
             return None
         try:
-            result = run(function, *arguments)
+            if method != 'step':
+                return function(*arguments)
+            result = self._timed(function, *arguments)
             text = flaw(result)
         except Exception as error:
             text = f'raised {error_text(error)}'

@@ -136,7 +136,11 @@ class DisturbanceEstimator:
         """Update with one state estimate; returns the (25,) full state at its stamp."""
         if state.command is not None and (
                 not self._commands or state.command.stamp > self._commands[-1].stamp):
-            self._commands.append(self._moving(state.command))
+            self._sent = state.command.tilt
+            # with the tilts at which each servo would rest without friction
+            rest = clipped(self._commands[-1].tilt, self._sent - self._band,
+                           self._sent + self._band) if self._commands else self._sent
+            self._commands.append(replace(state.command, tilt=rest))
         step = state.stamp - self._stamp
         if self._state is None or not 0 < step <= LONGEST_STEP:
             thrust = np.zeros(4) if state.command is None else state.command.thrust
@@ -153,14 +157,6 @@ class DisturbanceEstimator:
         self._tilts.append((state.stamp, present[model.TILT].copy()))
         self._learnt.append((state.stamp, self.disturbance))
         return present
-
-    def _moving(self, command):
-        """Command in whose tilts each servo would rest without friction."""
-        self._sent = command.tilt
-        if self._commands:
-            command = replace(command, tilt=clipped(
-                self._commands[-1].tilt, self._sent - self._band, self._sent + self._band))
-        return command
 
     def sent(self, tilt: np.ndarray) -> np.ndarray:
         """Targets (4,) [rad] that overcome the friction, for targets without friction."""

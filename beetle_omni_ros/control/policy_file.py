@@ -33,8 +33,7 @@ FORMAT = 'beetle_omni_policy/1'
 INPUT, OUTPUT = 'observation', 'action'
 TILT_SCALE, THRUST_SCALE = 0.25, 0.5   # [rad], [N] for an action of 1, as published
 RATE_HZ = 100
-NAMED = 5               # differing parameters in a message
-LONGEST = 1000          # characters of a refusal: the metadata may hold anything
+LONGEST = 500           # characters of differences in a message: metadata may hold anything
 WARM_UP = 20            # calls at start, because the first calls are slow
 FATAL_ONLY = 4          # onnxruntime's log level: errors are raised, and reported by this module
 LEVEL = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0)   # x and z axis of a level body
@@ -163,8 +162,7 @@ class PolicyContract:
             known = shipped.as_dict()
         found = list(_differences(flown.as_dict(), known)) if known else []
         found = found or [f'robot_hash {self.robot_hash} in training, {flown.hash()} here']
-        more = f'; {len(found) - NAMED} more' if len(found) > NAMED else ''
-        return f"trained for other robot parameters: {'; '.join(found[:NAMED])}{more}"
+        return f"trained for other robot parameters: {shortened('; '.join(found), LONGEST)}"
 
 
 def _rows(value):
@@ -254,7 +252,7 @@ class PolicyNetwork:
             self._bind(self.contract.observation_size)
             self._warm_up()
         except ParameterError as error:
-            raise ParameterError(f'policy {path}: {shortened(str(error), LONGEST)}') from None
+            raise ParameterError(f'policy {path}: {shortened(str(error), 2 * LONGEST)}') from None
         except Exception as error:      # onnxruntime's exceptions have no common base class
             # the informative end of its messages, which begin with codes
             reason = str(error).strip().partition('\n')[0].split(' : ')[-1]

@@ -80,24 +80,6 @@ def test_without_a_compiler_the_cause_is_named(monkeypatch):
         NmpcController(ROBOT)
 
 
-@pytest.mark.parametrize('robot, k, expected', [
-    ({'joints': {'kd': 0.02}}, 0, 0.02 / ROBOT.joints.kp),
-    ({'joints': {'kd': 0.0}}, 0, np.sqrt(ROBOT.joints.inertia / ROBOT.joints.kp)),
-    ({'joints': {'velocity_limit': 5.0}}, 2, 3.5),
-    ({'rotors': {'thrust_max': 15.0}}, 3, 15.0)])
-def test_actuators_of_the_problem_are_those_of_the_robot(robot, k, expected):
-    (part, change), = robot.items()
-    changed = replace(ROBOT, **{part: replace(getattr(ROBOT, part), **change)})
-    assert NmpcParameters.load().actuators(changed)[k] == pytest.approx(expected)
-
-
-def test_the_published_settings_are_unchanged():
-    p = NmpcParameters.load(share_path('params/nmpc_published.yaml'))
-    assert not p.model.rotor_lag
-    assert p.horizon.tolist() == [0.1] * 20
-    assert p.limits.velocity == 1.0
-    assert p.actuators(ROBOT) == (0.048, 3.15, 7.0, 30.0)
-    assert (p.weights.position_xy, p.weights.position_z, p.weights.tilt) == (300, 400, 2)
-    assert (p.weights.tilt_change, p.weights.thrust_command) == (250, 2)
-    assert not p.limits.soft
-    assert p.unwind > 2 * np.pi
+def test_a_file_overrides_the_actuators_of_the_robot():
+    published = NmpcParameters.load(share_path('params/nmpc_published.yaml'))
+    assert published.actuators(ROBOT) == (0.048, 3.15, 7.0, 30.0)

@@ -105,7 +105,7 @@ def test_an_incompatible_network_is_refused_with_the_difference(tmp_path, option
 
 
 def test_other_metadata_are_refused_until_the_checksum_is_added(tmp_path):
-    path = write(tmp_path / 'p.onnx', hidden=(16,))
+    path = write(tmp_path / 'p.onnx')
     model = onnx.load(path)
     onnx.save(model, path)
     PolicyNetwork(path, ROBOT)

@@ -28,7 +28,8 @@ def plan_of(controller, **options):
 
 
 def test_the_node_publishes_the_commands_of_the_policy(make, tmp_path):
-    policy = write(tmp_path / 'policy.onnx', hidden=(32, 16), seed=5)
+    weights = 0.05 * np.random.default_rng(5).normal(size=(33, 8))
+    policy = write(tmp_path / 'policy.onnx', weights=weights)
     node, sent = make(RlNode, f'policy:={policy}'), []
     node._publisher = SimpleNamespace(publish=sent.append)
     controller = PolicyController(RobotParameters.load(), replace(
