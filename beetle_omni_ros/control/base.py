@@ -234,7 +234,7 @@ def guidance_of(controller: Controller) -> str:
     return getattr(controller, 'guidance', '') or 'none'
 
 
-def reach_of(controller: Controller) -> float:
+def reach_of(controller: Any) -> float:
     """Largest distance to a target of a controller [m]; inf if it has none."""
     return float(getattr(controller, 'reach', inf))
 

@@ -68,7 +68,6 @@ class ControllerEntry:
     flies_degraded: bool = False    # with failed actuators
     stands_by: bool = False     # in the ROS graph
     compared: bool = False  # by default
-    cost: float = 0.1       # core seconds for a simulated second, to order flights
     line: tuple[str, str | tuple, str] = ('', '-', 'o')     # colour, dashes, marker in figures
 
     def __post_init__(self):
@@ -148,12 +147,10 @@ class ControllerEntry:
         self._check(controller)
         return controller
 
-    def reach(self, robot: RobotParameters, options: ControllerOptions = ControllerOptions()
-              ) -> float:
+    def reach(self, robot: RobotParameters) -> float:
         """Largest distance to a target [m], from its parameters: building may take seconds."""
-        parameters = self.load_parameters(options)
-        return float(parameters.reach) if hasattr(parameters, 'reach') \
-            else reach_of(self.make(robot, options))
+        parameters = self.load_parameters()
+        return reach_of(parameters if hasattr(parameters, 'reach') else self.make(robot))
 
     def _check(self, controller):
         """Refuse a result that is no controller."""
@@ -179,33 +176,33 @@ SHIPPED: Mapping[str, ControllerEntry] = {entry.name: entry for entry in (
     ControllerEntry(
         name='nmpc', label='NMPC', description='offset-free, params/nmpc.yaml', controller=_NMPC,
         parameters_file='params/nmpc.yaml', option='--nmpc', flies_degraded=True, stands_by=True,
-        compared=True, cost=0.1, line=('#c8281e', '-', '^')),
+        compared=True, line=('#c8281e', '-', '^')),
     ControllerEntry(
         name='rl', label='RL', description='the learned policy, 33 observations',
         controller=_POLICY, parameters_file='params/rl.yaml', policy_file='policies/rl.onnx',
         option='--policy', guidance='unwinding, routing, trimming', stands_by=True,
-        compared=True, cost=0.07, line=('#1b5fb4', '-', 'o')),
+        compared=True, line=('#1b5fb4', '-', 'o')),
     ControllerEntry(
         name='rl_bare', label='RL, bare', description='the learned policy without guidance',
         controller=_POLICY, parameters_file='params/rl_bare.yaml', policy_file='policies/rl.onnx',
-        compared=True, cost=0.07, line=('#0b2d5c', (0, (2, 1)), 'x')),
+        compared=True, line=('#0b2d5c', (0, (2, 1)), 'x')),
     ControllerEntry(
         name='rl_memory', label='RL, memory',
         description='the learned policy with the estimated disturbance as input',
         controller=_POLICY, parameters_file='params/rl_memory.yaml',
         policy_file='policies/rl_memory.onnx',
-        guidance='unwinding, routing, trimming', compared=True, cost=0.08,
+        guidance='unwinding, routing, trimming', compared=True,
         line=('#58b4e8', (0, (5, 1.6)), 's')),
     ControllerEntry(
         name='nmpc_published', label='NMPC, published settings',
         description='params/nmpc_published.yaml', controller=_NMPC,
         parameters_file='params/nmpc_published.yaml', flies_degraded=True, compared=True,
-        cost=0.13, line=('#e8960c', (0, (3, 1.2, 1, 1.2)), 'v')),
+        line=('#e8960c', (0, (3, 1.2, 1, 1.2)), 'v')),
     ControllerEntry(
         name='hover', label='hover PD',
         description="PD with allocation, the supervisor's fallback",
         controller='beetle_omni_ros.control.hover:HoverController',
-        parameters_file='params/hover.yaml', flies_degraded=True, cost=0.05,
+        parameters_file='params/hover.yaml', flies_degraded=True,
         line=('#5b6770', (0, (1, 1.2)), 'D')))}
 DEFAULT = next(iter(SHIPPED))       # the default controller
 _ADDED: dict[str, ControllerEntry] = {}     # of this process alone

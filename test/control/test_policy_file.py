@@ -21,14 +21,6 @@ ROBOT = RobotParameters.load()
 ACTIONS = ['gimbal1', 'gimbal2', 'gimbal3', 'gimbal4', 'rotor1', 'rotor2', 'rotor3', 'rotor4']
 
 
-def test_scales_and_offsets_are_the_published_ones():
-    contract = PolicyContract.default(ROBOT)
-    assert contract.actions == ACTIONS
-    assert np.allclose(contract.action_scale, [0.25] * 4 + [0.5] * 4)
-    assert np.allclose(contract.action_offset, [0.0] * 4 + [3.0386 * 9.80665 / 4] * 4)
-    assert contract.rate_hz == 100
-
-
 def table(change):
     """JSON of the observation table after ``change`` of its rows."""
     rows = json.loads(PolicyContract.default(ROBOT).to_metadata()['observations'])

@@ -6,13 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from beetle_omni_ros.control.turns import (
-    level_between,
-    route,
-    ROUTED,
-    tilts_along,
-    turned,
-)
+from beetle_omni_ros.control.turns import level_between, route, ROUTED
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 
@@ -39,21 +33,6 @@ def test_the_route_to_an_inverted_attitude_has_no_vertical_arm(off, direction, y
     level = level_between(start, target, AXES)
     assert rotations.matrix(level)[2] == pytest.approx([0, 0, 1], abs=1e-7)
     assert min(uses(start, level)) > 0.45 and min(uses(level, target)) > 0.45
-
-
-def upward(attitude, tilts):
-    """World's z (..., 4) of the thrust directions at tilts (..., 4)."""
-    tilted = Rotation.from_rotvec((AXES * tilts[..., None]).reshape(-1, 3))
-    return (tilted.apply([0, 0, 1]) @ rotations.matrix(attitude)[2]).reshape(tilts.shape)
-
-
-@settings(max_examples=50, deadline=None)
-@given(quaternions, st.floats(-np.pi, np.pi))
-def test_after_a_rotation_each_thrust_points_upward_as_far_as_its_arm_permits(end, yaw):
-    way = turned(Rotation.from_euler('z', yaw), Rotation.from_quat(end))[1]
-    tilts = tilts_along(way, AXES)[0, -1]
-    across = [np.linalg.norm(np.cross(rotations.matrix(end) @ axis, [0, 0, 1])) for axis in AXES]
-    assert upward(end, tilts) == pytest.approx(across, abs=1e-6)
 
 
 def winding(attitudes, tilt):
