@@ -83,7 +83,7 @@ class ReferencePlanner:
             references[:, THRUST] = allocation.thrust
         else:
             self._follow(target, start + self._times, tilt, disturbance, references)
-        if self._effects:
+        if self._effects is not None:
             columns = references.T
             self._beside = np.stack([np.array(part).T for part in self._effects(
                 columns[:13], columns[TILT], columns[THRUST])])
