@@ -88,8 +88,7 @@ class Guidance:
 
     def _start(self):
         """Begin with a new target."""
-        self._left = ATTEMPTS
-        self._failed: list[np.ndarray] = []
+        self._failed: list[np.ndarray] = []     # tilts at the begin of each unwinding
         self._watch(-inf)
 
     def _watch(self, now):
@@ -97,21 +96,13 @@ class Guidance:
         self._least, self._missed, self._seen = inf, 0.0, now
 
     def target(self, state: State, given: PoseTarget, in_charge: bool = True) -> PoseTarget:
-        """
-        The modified pose target for the controller.
-
-        Args:
-            state: of the robot.
-            given: the target.
-            in_charge: whether this controller is active.
-
-        """
+        """The modified pose target; ``in_charge``: whether this controller is active."""
         if given is not self._given:
             self._take(state, given)
         if self._way:
             self._go_on(state)
-        elif 'unwinding' in self._on and self._left and self._stuck(state, given):
-            self._left -= 1
+        elif 'unwinding' in self._on and len(self._failed) < ATTEMPTS \
+                and self._stuck(state, given):
             self._unwound += 1
             self._until = state.stamp + DURATION
             self._failed.append(state.tilt.copy())
