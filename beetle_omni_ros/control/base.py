@@ -176,8 +176,8 @@ class Controller(Protocol):
     A function of state and target with internal memory.
 
     ``step`` is called once every ``period`` [s] with a new, finite state. A ``step`` that raises
-    sends no command for this state. It is also called for a controller on standby, so that this controller
-    can take over without a jump; ``state.command`` is the executed command.
+    sends no command for this state. It is also called for a controller on standby, so that this
+    controller can take over without a jump; ``state.command`` is the executed command.
 
     Optional members of a controller:
 
