@@ -112,7 +112,8 @@ class ControllerEntry:
         if not file and self.parameters_file:
             file = Path(self.parameters_file)
             file = file if file.is_file() else share_path(self.parameters_file)
-        parameters = kind and (schema.load(kind, file) if file else kind())
+        parameters = kind and schema.bind(kind, schema.load_yaml(file) if file else {},
+                                          str(file or ''))
         if options.without and not hasattr(parameters, 'without'):
             raise ParameterError(f"--without {options.without}: controller '{self.reference}' has "
                                  'no layers of guidance')
