@@ -123,7 +123,7 @@ def evaluate(controllers: Annotated[str, typer.Option(
              allow_other_robot: OtherRobotOption = False,
              without: Annotated[str, typer.Option(
                  '--without', metavar='LAYER,...',
-                 help='Layers of the guidance that are off: unwinding, routing, turning, '
+                 help='Layers of the guidance that are off: unwinding, routing, '
                       'trimming, or all.')] = '',
              bag: Annotated[Optional[Path], typer.Option(
                  '--bag', metavar='DIR', help='New folder for the bag; with several controllers '

@@ -28,7 +28,7 @@ CONDITIONS = ('nominal', 'published')
 # two cores: three lists of 100 poses, ten flights of a short task.
 SEEDS = {50.0: 10, 300.0: 6, np.inf: 3}
 
-START_COST = 2.0  # core seconds to build simulator and controller
+START_COST, COST = 2.0, 0.1  # core seconds to build simulator and controller; for a second
 TRACE_PERIOD = 0.02  # [s] between samples of a trace
 LONG_TRACE_PERIOD = 0.05  # [s] between samples in a long task
 TRACED_FINELY = 300.0  # [s] longest task with TRACE_PERIOD
@@ -75,7 +75,7 @@ class Flight:
     @cached_property
     def cost(self) -> float:
         """Approximate duration of the computation [core seconds]."""
-        return START_COST + registry.find(self.reference).cost * self.make_task().duration
+        return START_COST + COST * self.make_task().duration
 
     @property
     def reference(self) -> str:

@@ -2,27 +2,24 @@
 Disturbance estimates for offset-free control.
 
 Three slow estimates integrate the prediction error of the model: an external force in world, an
-external torque in body and an offset of each servo's resting angle. A wrong mass or thrust
-coefficient, a shifted centre of mass, wind and servo sag under load are absorbed by one of them. A
-controller that predicts with them has no steady error. The module also predicts quantities that no
-sensor reports: the rotors' thrust, and the present tilts, because encoder readings are delayed.
-
-Friction holds a servo until its target is a band (friction over stiffness) away. In a loop around
-a floating body this play causes a limit cycle. For a robot file with ``joint_friction`` the
-estimator therefore models the play of each servo, and the targets overcome it.
+external torque in body and an offset of each servo's resting angle. A controller that predicts
+with them has no steady error. The module also predicts quantities that no sensor reports: the
+rotors' thrust, and the present tilts. For a robot file with ``joint_friction`` it models the play
+of each servo, and the targets overcome it. docs/explanation/nmpc.md has the reasons.
 """
 
 from collections import deque
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, State
-from beetle_omni_ros.control.nmpc_parameters import DisturbanceParameters
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY, clipped
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import parameter
 
 LONGEST_STEP = 0.1  # [s] a longer gap between states restarts the actuator model
 SHORT = 0.002           # [s] a command change nearer to an end of a span is treated as at this end
@@ -33,23 +30,35 @@ TILT_CORRECTION = 0.2   # share of a measured tilt error that corrects the tilt 
 HISTORY = 64        # number of stored states and commands, more than any latency needs
 
 
-class FunctionCall:
-    """A CasADi function of vectors with fixed buffers, for fast calls with numpy arrays."""
+@dataclass(frozen=True, kw_only=True)
+class DisturbanceParameters:
+    """Disturbance estimates; a bandwidth of 0 switches one off."""
 
-    def __init__(self, function: ca.Function):
-        self._buffer, self._evaluate = function.buffer()
-        self._arguments = [np.zeros(function.numel_in(i)) for i in range(function.n_in())]
-        self._result = np.zeros(function.numel_out(0))
-        for i, array in enumerate(self._arguments):
-            self._buffer.set_arg(i, array.data)
-        self._buffer.set_res(0, self._result.data)
+    force_bandwidth: float = parameter(
+        3.0, doc='bandwidth of the external force', unit='rad/s', low=0, high=50)
+    torque_bandwidth: float = parameter(
+        4.0, doc='bandwidth of the external torque', unit='rad/s', low=0, high=50)
+    tilt_bandwidth: float = parameter(
+        3.0, doc='bandwidth of the servo offsets', unit='rad/s', low=0, high=50)
 
-    def __call__(self, *values) -> np.ndarray:
-        """The result for these arguments, a fresh array."""
-        for array, value in zip(self._arguments, values):
+
+def buffered(function: ca.Function) -> Callable[..., np.ndarray]:
+    """Make a fast call of a CasADi function of vectors: numpy arrays in fixed buffers."""
+    buffer, evaluate = function.buffer()
+    arguments = [np.zeros(function.numel_in(i)) for i in range(function.n_in())]
+    result = np.zeros(function.numel_out(0))
+    for i, array in enumerate(arguments):
+        buffer.set_arg(i, array.data)
+    buffer.set_res(0, result.data)
+
+    def call(*values) -> np.ndarray:
+        for array, value in zip(arguments, values):
             array[:] = value
-        self._evaluate()
-        return self._result.copy()
+        evaluate()
+        return result.copy()
+
+    call.__dict__['buffer'] = buffer    # `evaluate` has its address only
+    return call
 
 
 class DisturbanceEstimator:
@@ -64,17 +73,15 @@ class DisturbanceEstimator:
 
     Attributes:
         delay: from a command to the actuators [s], with the mean of the robot file's delays of
-            tilts and thrusts. With a delay of 50 ms of the tilts only, the NMPC's error on a
-            lemniscate of 2.4 m and 16 s is then 4 mm. It is 5 mm with a prediction by the whole
-            delay, 27 mm with a longer servo lag in the horizon, and 8 mm without prediction. With
-            80 ms it is 6 mm with the mean; without prediction the robot crashes.
+            tilts and thrusts, with which the NMPC's error on a lemniscate is smallest.
+        encoder_delay: from the capture of tilts to their stamp [s].
         disturbance: (10,) force in world [N], torque in body [N m], servo offsets [rad].
 
     """
 
     def __init__(self, robot: RobotParameters, parameters: DisturbanceParameters,
-                 command_delay: float, advance: FunctionCall):
-        self._robot, self._advance = robot, advance
+                 command_delay: float, advance: ca.Function):
+        self._advance, self.encoder_delay = buffered(advance), robot.sensors.encoder_delay
         self.delay = max(command_delay + sum(robot.command_delays) / 2, 0.0)
         p = parameters
         # bandwidth times inertia: turns a velocity error of one step into a change of force
@@ -113,12 +120,6 @@ class DisturbanceEstimator:
             self._state[model.TILT], self._state[model.THRUST] = health.possible(
                 self._state[model.TILT], self._state[model.THRUST])
 
-    def _acting(self, command):
-        """Effective command (8,) of the remaining actuators."""
-        if self._health.healthy:
-            return command
-        return np.concatenate(self._health.possible(command[:4], command[4:]))
-
     def update(self, state: State) -> np.ndarray:
         """
         Update with one state estimate.
@@ -129,36 +130,33 @@ class DisturbanceEstimator:
 
         """
         present = self.observe(state)
-        if self.delay == 0:
-            return present
         return self._flown(present, state.stamp, self.delay)
 
     def observe(self, state: State) -> np.ndarray:
         """Update with one state estimate; returns the (25,) full state at its stamp."""
-        state = redated(state, self._robot)
         if state.command is not None and (
                 not self._commands or state.command.stamp > self._commands[-1].stamp):
-            self._commands.append(self._moving(state.command))
+            self._sent = state.command.tilt
+            # with the tilts at which each servo would rest without friction
+            rest = clipped(self._commands[-1].tilt, self._sent - self._band,
+                           self._sent + self._band) if self._commands else self._sent
+            self._commands.append(replace(state.command, tilt=rest))
         step = state.stamp - self._stamp
         if self._state is None or not 0 < step <= LONGEST_STEP:
-            present = self._restart(state)
+            thrust = np.zeros(4) if state.command is None else state.command.thrust
+            actuators = np.concatenate([state.tilt, state.tilt_velocity, thrust])
+            self._tilts.clear()
         else:
             predicted = self._flown(self._state, self._stamp, step)
-            self._learn(state, predicted, step)
-            present = self._measured(state, predicted)
-            self._correct_tilt(state, present, step)
+            self._learn(state, predicted)
+            actuators = predicted[13:]
+        present = np.concatenate([state.position, state.velocity, state.quaternion,
+                                  state.angular_velocity, actuators])
+        self._correct_tilt(state, present, step)
         self._state, self._stamp = present, state.stamp
         self._tilts.append((state.stamp, present[model.TILT].copy()))
         self._learnt.append((state.stamp, self.disturbance))
         return present
-
-    def _moving(self, command):
-        """Command in whose tilts each servo would rest without friction."""
-        self._sent = command.tilt
-        if self._commands:
-            command = replace(command, tilt=clipped(
-                self._commands[-1].tilt, self._sent - self._band, self._sent + self._band))
-        return command
 
     def sent(self, tilt: np.ndarray) -> np.ndarray:
         """Targets (4,) [rad] that overcome the friction, for targets without friction."""
@@ -167,16 +165,6 @@ class DisturbanceEstimator:
             self._direction = np.where(np.abs(motion) > RESOLUTION, np.sign(motion),
                                        self._direction)
         return tilt + self._band * self._direction
-
-    def _restart(self, state):
-        thrust = np.zeros(4) if state.command is None else state.command.thrust
-        self._tilts.clear()
-        return np.concatenate([state.position, state.velocity, state.quaternion,
-                               state.angular_velocity, state.tilt, state.tilt_velocity, thrust])
-
-    def _measured(self, state, predicted):
-        return np.concatenate([state.position, state.velocity, state.quaternion,
-                               state.angular_velocity, predicted[13:]])
 
     def _flown(self, state, start, duration):
         """(25,) state after a time span, in which commands may change."""
@@ -189,23 +177,24 @@ class DisturbanceEstimator:
             if at < end - SHORT:
                 changes.append(at)
         for until in reversed(changes):
-            state = self._advance(state, self._acting(self._input(start, until - start)),
-                                  self.disturbance, until - start)
+            tilt, thrust = self._input((start + until) / 2 - self.delay)
+            if not self._health.healthy:
+                tilt, thrust = self._health.possible(tilt, thrust)
+            state = self._advance(state, np.concatenate([tilt, thrust]), self.disturbance,
+                                  until - start)
             start = until
         return state
 
-    def _input(self, start, duration):
-        """Command (8,) that acts on the robot around the middle of a time span."""
-        middle = start + duration / 2 - self.delay
+    def _input(self, stamp):
+        """Tilts and thrusts of the command that was in force for a state of this stamp."""
         for command in reversed(self._commands):
-            if command.stamp <= middle:
-                return np.concatenate([command.tilt, command.thrust])
+            if command.stamp <= stamp:
+                return command.tilt, command.thrust
         if self._commands:
-            return np.concatenate([self._commands[0].tilt, self._commands[0].thrust])
-        return np.concatenate([self._state[model.TILT] if self._state is not None
-                               else np.zeros(4), np.zeros(4)])
+            return self._commands[0].tilt, self._commands[0].thrust
+        return (np.zeros(4) if self._state is None else self._state[model.TILT]), np.zeros(4)
 
-    def _learn(self, state, predicted, step):
+    def _learn(self, state, predicted):
         change = np.zeros(model.DISTURBANCE_SIZE)
         change[model.FORCE] = self._force_gain * (state.velocity - predicted[model.VELOCITY])
         change[model.TORQUE] = self._torque_gain * (
@@ -214,7 +203,7 @@ class DisturbanceEstimator:
 
     def _correct_tilt(self, state, present, step):
         """Compare the encoders with the tilt model at their capture time."""
-        modelled = self._modelled_tilt(state.tilt_stamp)
+        modelled = self._modelled_tilt(state.tilt_stamp - self.encoder_delay)
         if modelled is None:
             return
         limit = LIMIT[model.TILT_OFFSET]
@@ -240,9 +229,3 @@ class DisturbanceEstimator:
                 return tilt + part * (later[1] - tilt)
             later = (time, tilt)
         return None
-
-
-def redated(state: State, robot: RobotParameters) -> State:
-    """State with the capture time of its tilts, which may be before their stamp."""
-    delay = robot.sensors.encoder_delay
-    return replace(state, tilt_stamp=state.tilt_stamp - delay) if delay else state

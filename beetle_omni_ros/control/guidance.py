@@ -1,31 +1,47 @@
 """
-Guidance: functions that modify the pose targets of a controller, one after the other.
+Guidance: functions that modify the pose targets of a controller.
 
-A controller that is a function of the present state, like a policy, needs it for wound joints, for
-dives in large turns and for steady errors. Guidance is optional: a controller may contain a
-:class:`Guidance`.
+A controller that is a function of the present state, like a policy, needs it for wound joints and
+for steady errors. Guidance is optional: a controller may contain a :class:`Guidance`.
+
+- Unwinding: from a joint's stop through a level attitude back to the target. A level attitude
+  unwinds all joints, and from there the target is reached as after a take-off. If the turn back is
+  long, the attitude half way follows, because a policy may choose either direction for nearly half
+  a turn, and the wrong one winds the joints differently.
+- Routing: through an intermediate attitude if the shortest turn needs more than the travel of a
+  joint.
+- Trimming: an integral against the steady error.
+
+docs/explanation/policy.md has the reasons.
 """
 
-from collections import deque
 from dataclasses import replace
 from math import dist, hypot, inf, sqrt
 
 import numpy as np
 
 from beetle_omni_ros.control.base import PoseTarget, State
-from beetle_omni_ros.control.unwinding import Routing, Unwinding
+from beetle_omni_ros.control.turns import level_between, route
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.schema import ParameterError, quoted
 
-LAYERS = 'unwinding', 'routing', 'turning', 'trimming'
+LAYERS = 'unwinding', 'routing', 'trimming'
 ALL = 'all'             # in place of the names of all layers
-LATEST = 10             # steps within which a command is reported as the executed command
-# Turning: the attitude error [rad] above which height and distance apply, the smallest height of
-# the modified target in world [m], and its largest distance if the robot is upside down [m].
-LARGE, TURN_HEIGHT, TURN_DISTANCE = 1.0, 1.0, 2.0
-# The attitude error [rad] above which the depth applies: the depth below start and target [m],
-# predicted within this time [s], at which the target is raised by CLIMB [m].
-SETTLED, DEPTH, OUTLOOK, CLIMB = 0.5, 0.1, 0.3, 2.0
+# Unwinding
+ATTEMPTS = 2            # to unwind, for one target
+WOUND = 2.4             # [rad] a joint beyond is wound; hover with a force or payload needs less
+MISSED_ANGLE, MISSED_DISTANCE = 0.14, 0.08      # [rad], [m]: a larger error misses the target
+PATIENCE = 0.8          # [s] with missed target without progress, minus the time within the limits
+HEIGHT = 1.2            # [m] smallest height of the level attitude: the robot may dive
+ARRIVED = 0.35          # [rad] distance from level at which the robot turns back
+UNWOUND = 1.0           # [rad] largest tilt at which it turns back, not to wind the joints again
+LONG_TURN = 2.0         # [rad] a longer turn from level to the target has a target half way ...
+HALF_WAY = 0.6          # [rad] ... until this distance from it
+STEP = 1.5              # in limits: an error decrease of this, or of half the error, is progress
+# Routing
+NEAR = 0.8              # [rad] distance at which the intermediate attitude is reached
+ANOTHER = 0.3           # [rad] change of the target that starts a new search
+DURATION = 1.5          # [s] longest time to an intermediate attitude, of both
 # Trimming: rate of the integral [1/s], and largest shift and turn of the target [m], [rad].
 TRIM_RATE, TRIM_DISTANCE, TRIM_ANGLE = 1.0, 0.06, 0.15
 # Smaller errors may be steady errors [m], [rad]; a faster robot is on its way [m/s], [rad/s].
@@ -35,7 +51,7 @@ LONGEST_STEP = 0.1      # [s] between two states; after a longer gap no integral
 
 class Guidance:
     """
-    Unwinding if the joints are stuck, otherwise routing; then turning and trimming.
+    Intermediate attitudes of unwinding and routing; otherwise trimming.
 
     Args:
         axes: (4, 3) unit tilt axes in base_link.
@@ -56,109 +72,106 @@ class Guidance:
                                  f'{quoted(", ".join(sorted(unknown)))}')
         self._on = [name for name in LAYERS if not off & {name, ALL}]
         self.text = ', '.join(self._on) or 'none'
-        self._unwinding, self._routing = Unwinding(axes), Routing(axes)
-        self._turning, self._trimming = Turning(), Trimming()
+        self._axes, self._trimming = axes, Trimming()
+        self.reset()
 
     def reset(self) -> None:
         """Reset the memory of the target and of all parts."""
-        for part in (self._unwinding, self._routing, self._turning, self._trimming):
-            part.reset()
+        self._trimming.reset()
+        self._unwound = self._routed = 0        # counts
+        self._given: PoseTarget | None = None
+        self._looked: np.ndarray | None = None  # attitude of the target of the last search
+        # Attitudes on the way: smallest height, distance and tilt at which each is reached.
+        self._way: list[tuple[np.ndarray, float, float, float]] = []
+        self._until = 0.0
+        self._start()
+
+    def _start(self):
+        """Begin with a new target."""
+        self._failed: list[np.ndarray] = []     # tilts at the begin of each unwinding
+        self._watch(-inf)
+
+    def _watch(self, now):
+        """Wait for progress from now on."""
+        self._least, self._missed, self._seen = inf, 0.0, now
 
     def target(self, state: State, given: PoseTarget, in_charge: bool = True) -> PoseTarget:
-        """
-        The modified pose target for the controller.
-
-        Args:
-            state: of the robot.
-            given: the target.
-            in_charge: whether this controller is active.
-
-        """
-        aim = self._unwinding.target(state, given) if 'unwinding' in self._on else given
-        if aim is given and 'routing' in self._on:
-            aim = self._routing.target(state, given)
-        shown = self._turning.target(state, given, aim) if 'turning' in self._on else aim
-        if shown is given and 'trimming' in self._on:
-            return self._trimming.target(state, given, in_charge)
+        """The modified pose target; ``in_charge``: whether this controller is active."""
+        if given is not self._given:
+            self._take(state, given)
+        if self._way:
+            self._go_on(state)
+        elif 'unwinding' in self._on and len(self._failed) < ATTEMPTS \
+                and self._stuck(state, given):
+            self._unwound += 1
+            self._until = state.stamp + DURATION
+            self._failed.append(state.tilt.copy())
+            self._way = self._through_level(state, given)
+        if not self._way:
+            return self._trimming.target(state, given, in_charge) if 'trimming' in self._on \
+                else given
         self._trimming.reset()      # the joints may be wound differently afterwards
-        return shown
+        attitude, height, _, _ = self._way[0]
+        position = given.position
+        if position[2] < height:
+            position = np.array([*position[:2], height])
+        return replace(given, position=position, quaternion=attitude)
 
     def diagnostics(self) -> dict[str, int]:
         """Counts since the last reset."""
-        return {'unwound': self._unwinding.attempts, 'routed': self._routing.routed}
+        return {'unwound': self._unwound, 'routed': self._routed}
 
+    def _take(self, state, given):
+        """Begin with another target; search a route if its attitude differs from the last."""
+        if self._given is None or not given.same_pose(self._given):
+            self._start()
+        self._given = given
+        if self._looked is None \
+                or rotations.geodesic_angle(given.quaternion, self._looked) >= ANOTHER:
+            self._looked, self._way = given.quaternion, []
+            between = route(state.quaternion, given.quaternion, state.tilt, self._axes) \
+                if 'routing' in self._on else None
+            if between is not None:
+                self._routed += 1
+                self._way, self._until = [(between, -inf, NEAR, inf)], state.stamp + DURATION
 
-class Charge:
-    """Detects whether the executed commands are those of one controller."""
+    def _go_on(self, state):
+        """Remove a reached intermediate attitude, or all of them after the time limit."""
+        attitude, _, angle, tilt = self._way[0]
+        if state.stamp >= self._until:
+            self._way = []
+        elif rotations.geodesic_angle(state.quaternion, attitude) < angle \
+                and np.abs(state.tilt).max() < tilt:
+            self._way = self._way[1:]
+            self._until = state.stamp + DURATION
+        if not self._way:
+            self._watch(state.stamp)
 
-    def __init__(self):
-        self.reset()
+    def _stuck(self, state, given):
+        """Whether joints are wound, and the error has not decreased for a long time."""
+        if not max(map(abs, state.tilt.tolist())) >= WOUND:    # mostly; the rest costs more
+            self._watch(state.stamp)
+            return False
+        error = max(rotations.geodesic_angle(state.quaternion, given.quaternion) / MISSED_ANGLE,
+                    dist(given.position.tolist(), state.position.tolist()) / MISSED_DISTANCE)
+        elapsed, self._seen = state.stamp - self._seen, state.stamp
+        if error > max(1.0, self._least - min(STEP, 0.5 * self._least)):
+            self._missed += elapsed
+        elif error > 1.0:
+            self._least, self._missed = error, 0.0
+        else:       # the error may oscillate about its limit: the longer side decides
+            self._missed = max(0.0, self._missed - elapsed)
+        return self._missed >= PATIENCE
 
-    def reset(self) -> None:
-        """Remove all stored commands."""
-        self._latest: deque[list[float]] = deque(maxlen=LATEST)
-
-    def gave(self, values: list[float]) -> None:
-        """Store a command: tilts [rad], then thrusts [N]."""
-        self._latest.appendleft(values)
-
-    def holds(self, state: State) -> bool:
-        """Whether the executed command is one of the latest commands."""
-        command = state.command
-        return command is not None and command.tilt.tolist() + command.thrust.tolist() \
-            in self._latest
-
-
-class Turning:
-    """
-    Shifts pose targets during a large turn, to limit the dive.
-
-    While joints turn over, thrust is missing and the robot sinks. It sinks most if it also
-    accelerates sideways while upside down. During a large turn, low targets are therefore raised.
-    If the robot is upside down, the distance to the target is limited. If the robot will sink
-    below start and target, the target is raised further until the prediction ends.
-    """
-
-    def __init__(self):
-        self.reset()
-
-    def reset(self) -> None:
-        """Reset the start of the way to the target."""
-        self._given: PoseTarget | None = None
-        self._lowest = -inf
-
-    def target(self, state: State, given: PoseTarget, aim: PoseTarget | None = None) -> PoseTarget:
-        """
-        The modified target: ``aim``, or its attitude at another position.
-
-        Args:
-            state: of the robot; if it is not finite, the result is ``aim``.
-            given: the target.
-            aim: the target after unwinding and routing; if it differs from ``given``, the turn is
-                large.
-
-        """
-        z = float(state.position[2])
-        if given is not self._given:
-            if self._given is None or not given.same_pose(self._given):
-                self._lowest = min(float(given.position[2]), z)
-            self._given = given
-        aim = given if aim is None else aim
-        passing = aim is not given
-        left = rotations.geodesic_angle(state.quaternion, given.quaternion)
-        if not (passing or left > SETTLED):
-            return given
-        place = aim.position.tolist()
-        if passing or left > LARGE:
-            place[2] = max(place[2], TURN_HEIGHT)
-            at = state.position.tolist()
-            far = dist(place, at)
-            x, y = state.quaternion[:2].tolist()
-            if far > TURN_DISTANCE and x * x + y * y > 0.5:     # upside down
-                place = [a + TURN_DISTANCE / far * (b - a) for a, b in zip(at, place)]
-        if z + OUTLOOK * float(state.velocity[2]) < self._lowest - DEPTH:
-            place[2] = max(place[2], z) + CLIMB
-        return aim if place == aim.position.tolist() else replace(aim, position=np.array(place))
+    def _through_level(self, state, given):
+        """The way from a joint's stop to the target."""
+        level = level_between(state.quaternion, given.quaternion, self._axes, self._failed)
+        way = [(level, HEIGHT, ARRIVED, UNWOUND)]
+        turn = rotations.log(rotations.multiply(rotations.conjugate(level), given.quaternion))
+        if np.linalg.norm(turn) > LONG_TURN:
+            half = rotations.multiply(level, rotations.exp(0.5 * turn))
+            way.append((half, HEIGHT, HALF_WAY, inf))
+        return way
 
 
 class Trimming:
@@ -189,7 +202,7 @@ class Trimming:
         The modified target for the policy.
 
         Args:
-            state: of the robot; a state that is not finite does not change the integral.
+            state: of the robot.
             given: the target. If it is not near the last target, the integral is reset, because
                 the steady error is different there.
             learn: whether this policy is active and flies towards the target.
@@ -216,12 +229,11 @@ class Trimming:
                 self.rotation = _added(self.rotation, TRIM_RATE * elapsed, turn, TRIM_ANGLE)
 
 
-
 # Plain floats, which are faster; turns are small, half an angle is its sine.
 
 
 def _near(way, turn):
-    """Whether an error may be a steady error; NaN is not."""
+    """Whether an error may be a steady error."""
     return hypot(*way) <= NEAR_DISTANCE and hypot(*turn) <= NEAR_ANGLE
 
 

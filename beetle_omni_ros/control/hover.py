@@ -1,9 +1,8 @@
 """
 Hover: PD on the pose with a disturbance observer, then allocation.
 
-The simplest controller for comparisons, and the fallback of the supervisor. It needs the robot's
-parameters, no compiler and no solver. It is stable from any attitude, because translation and
-rotation do not couple on this robot.
+The simplest controller for comparisons, and the fallback of the supervisor. It is stable from any
+attitude, because translation and rotation do not couple on this robot.
 
     acceleration = Kp e_p + Kd e_v - d           (world)
     angular acceleration = Kp e_R + Kd e_w - d   (base_link)
@@ -29,7 +28,7 @@ from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY, clipped, nearest_turn
 from beetle_omni_ros.robot.degraded import allocator, DegradedAllocator, LocalWeights
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import group, parameter, ParameterFile
+from beetle_omni_ros.robot.schema import parameter, ParameterFile
 
 LONGEST_STEP = 0.1   # [s] between two states from which an acceleration is computed
 DAMPING = 1e-2   # [(1/kg)^2] keeps the thrusts near the plain projection where directions agree
@@ -41,29 +40,25 @@ FULL_THRUST = 1.0       # [N] below it a joint turns more slowly: its direction 
 STOP_OVERLAP = 0.3      # [rad] beyond the stop: the rotor keeps 95 % of its useful thrust
 
 
-@dataclass(frozen=True, kw_only=True)
-class AxisGains:
-    """Gains of three axes as accelerations, so that they are valid for any mass and inertia."""
-
-    kp: float = parameter(6.0, doc='acceleration for each unit of error', unit='1/s^2', low=0,
-                          high=100)
-    kd: float = parameter(4.5, doc='acceleration for each unit of rate error', unit='1/s', low=0,
-                          high=50)
-    error_limit: float = parameter(0.6, doc='longer errors are shortened to this', unit='m or rad',
-                                   low=0.01, high=10)
-    rate_limit: float = parameter(3.0, doc='longer rate errors are shortened to this',
-                                  unit='m/s or rad/s', low=0.1, high=50)
-    disturbance_limit: float = parameter(4.0, doc='largest acceleration that is compensated',
-                                         unit='m/s^2 or rad/s^2', low=0, high=100)
+# Errors and rate errors of position [m], [m/s] and attitude [rad], [rad/s] are shortened to these.
+POSITION_LIMITS, ATTITUDE_LIMITS = (0.6, 3.0), (0.6, 6.0)
+# Largest compensated acceleration [m/s^2] and angular acceleration [rad/s^2]: 2 N m, the hover
+# thrust of one rotor on its arm. With 8 a robot with a propeller of 70 % landed tilted by 24 deg.
+COMPENSATED = 4.0, 33.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class HoverParameters(ParameterFile, file='hover.yaml'):
-    """Tuning of the hover controller."""
+    """Gains as accelerations, so that they are valid for any mass and inertia."""
 
-    position: AxisGains = group(AxisGains, 'position and velocity in world')
-    attitude: AxisGains = group(AxisGains, 'attitude and rate in base_link')
-    degraded: LocalWeights = group(LocalWeights, 'allocation with what is left of the actuators')
+    position_kp: float = parameter(6.0, doc='acceleration for a position error', unit='1/s^2',
+                                   low=0, high=100)
+    position_kd: float = parameter(4.5, doc='acceleration for a velocity error', unit='1/s',
+                                   low=0, high=50)
+    attitude_kp: float = parameter(10.0, doc='angular acceleration for an attitude error',
+                                   unit='1/s^2', low=0, high=100)
+    attitude_kd: float = parameter(5.5, doc='angular acceleration for a rate error', unit='1/s',
+                                   low=0, high=50)
 
 
 class HoverController:
@@ -97,11 +92,8 @@ class HoverController:
         """Reset disturbances and thrust model; the next step starts from state.command."""
         self._before: State | None = None
         self._disturbance = np.zeros(6)     # acceleration in world, angular in base_link
-        self._stamp: float | None = None
         self._command: Command | None = None
         self._thrust = np.zeros(4)          # modelled [N]
-        self._errors = (0.0, 0.0)
-        self._saturations = 0
 
     def step(self, state: State, target: Any) -> Command:
         """
@@ -110,9 +102,10 @@ class HoverController:
         The time since the previous step is taken from the stamps, so the controller may be
         called at any rate; a repeated stamp repeats the command.
         """
-        if self._stamp is not None and state.stamp <= self._stamp and self._command is not None:
-            return self._command
-        gap = state.stamp - self._stamp if self._stamp is not None else self.period
+        last = self._command
+        if last is not None and state.stamp <= last.stamp:
+            return last
+        gap = self.period if last is None else state.stamp - last.stamp
         dt = min(gap, 5 * self.period)   # after a pause: no single long step
         in_force = state.command
         self.observe(state)
@@ -124,9 +117,7 @@ class HoverController:
         else:
             goal = self._allocator.hover(state.quaternion, present, force, torque)
             tilt = self._waiting_at_stops(goal.tilt, state.quaternion, present)
-        self._saturations += bool(goal.saturated.any())
         self._command = Command(state.stamp, *self._targets(state, goal, tilt, present, dt))
-        self._stamp = state.stamp
         return self._command
 
     def observe(self, state: State, free: bool = True) -> None:
@@ -150,7 +141,7 @@ class HoverController:
         if not free or state.command is None:
             return
         force, torque = self._allocator.wrench(state.tilt, self._thrust)
-        rate, inertia, p = state.angular_velocity, self._robot.inertia, self.parameters
+        rate, inertia = state.angular_velocity, self._robot.inertia
         gain = -expm1(-dt / DISTURBANCE_TIME)
         mass, weight = self._allocator.mass, self._allocator.weight.tolist()
         # plain floats, because each numpy operation takes longer than these together
@@ -164,15 +155,8 @@ class HoverController:
         old = self._disturbance
         new = np.array([part + gain * (change / dt - model - part) for part, change, model in zip(
             old.tolist(), changes, modelled)])
-        old[:3] = _shortened(new[:3], p.position.disturbance_limit)
-        old[3:] = _shortened(new[3:], p.attitude.disturbance_limit)
-
-    def diagnostics(self) -> dict[str, float | int | str]:
-        """Errors of the last step, disturbances and saturated steps since reset."""
-        return {'position_error_m': self._errors[0], 'attitude_error_rad': self._errors[1],
-                'force_disturbance_m_s2': float(np.linalg.norm(self._disturbance[:3])),
-                'torque_disturbance_rad_s2': float(np.linalg.norm(self._disturbance[3:])),
-                'saturated_steps': int(self._saturations)}
+        old[:3] = _shortened(new[:3], COMPENSATED[0])
+        old[3:] = _shortened(new[3:], COMPENSATED[1])
 
     def _waiting_at_stops(self, goal, quaternion, present):
         """Tilt goals (4,) [rad]: a stop instead of a full turn that only a transient needs."""
@@ -188,10 +172,10 @@ class HoverController:
         """Allocation near the present tilts, towards tilts that hold a nearby attitude."""
         turn = rotations.log(rotations.multiply(rotations.conjugate(state.quaternion),
                                                 target.at(state.stamp).quaternion))
-        ahead = rotations.exp(_shortened(turn, self.parameters.attitude.error_limit))
+        ahead = rotations.exp(_shortened(turn, ATTITUDE_LIMITS[0]))
         aim = degraded.hover(rotations.multiply(state.quaternion, ahead), present)
         force = (degraded.weight + force) @ rotations.matrix(state.quaternion)
-        return degraded.allocate_near(force, torque, present, aim, self.parameters.degraded)
+        return degraded.allocate_near(force, torque, present, aim, LocalWeights())
 
     def _wrench(self, state, target):
         """Force without the support of the weight (world) and torque (base_link)."""
@@ -199,12 +183,11 @@ class HoverController:
         to_body = rotations.conjugate(state.quaternion)
         attitude_error = rotations.log(rotations.multiply(to_body, reference.quaternion))
         relative = rotations.matrix(rotations.multiply(to_body, reference.quaternion))
-        position_error = reference.position - state.position
-        self._errors = (float(np.linalg.norm(position_error)),
-                        float(np.linalg.norm(attitude_error)))
-        acceleration = _pd(self.parameters.position, position_error,
+        p = self.parameters
+        acceleration = _pd(p.position_kp, p.position_kd, POSITION_LIMITS,
+                           reference.position - state.position,
                            reference.velocity - state.velocity) - self._disturbance[:3]
-        angular = _pd(self.parameters.attitude, attitude_error,
+        angular = _pd(p.attitude_kp, p.attitude_kd, ATTITUDE_LIMITS, attitude_error,
                       relative @ reference.angular_velocity - state.angular_velocity) \
             - self._disturbance[3:]
         inertia, rate = self._robot.inertia, state.angular_velocity
@@ -270,10 +253,8 @@ class HoverController:
         return thrust
 
 
-def _pd(gains, error, rate_error):
-    """Acceleration (3,) of proportional and derivative gain, both with limited errors."""
-    return gains.kp * _shortened(error, gains.error_limit) \
-        + gains.kd * _shortened(rate_error, gains.rate_limit)
+def _pd(kp, kd, limits, error, rate_error):
+    return kp * _shortened(error, limits[0]) + kd * _shortened(rate_error, limits[1])
 
 
 def _shortened(vector, limit):

@@ -1,21 +1,31 @@
 """
 The NMPC's optimal control problem as stage functions, generated from the robot's model.
 
-One shooting interval: rigid body by Runge-Kutta 4, while the first-order lags of servos and rotors
-are evaluated in closed form at the start, middle and end of the interval. An interval may
-therefore be much longer than a servo's time constant, for which an explicit rule on the whole
-state would be unstable. The cost is least squares in position, velocity, the vector part of the
-attitude error quaternion, body rates, tilts, thrusts and the lead of commands over what has been
-reached (beyond the lead that a moving reference needs). With the reference attitude fixed it is
-linear in the state, so its Gauss-Newton Hessian is exact.
+The rigid body is integrated by Runge-Kutta 4, the first-order lags of servos and rotors in closed
+form at the start, middle and end of an interval, which may therefore be much longer than a servo's
+time constant. docs/explanation/nmpc.md has the cost.
+
+:class:`Rti` iterates: one Gauss-Newton QP a cycle around a stored, shifted trajectory. The
+iteration is in rti.c and compiled together with the stage functions. The QP is solved by HPIPM,
+which the casadi wheel contains with BLASFEO and the headers of both.
 """
 
-from dataclasses import dataclass
+import ctypes
+from ctypes import c_double, c_int, c_void_p, POINTER
+from pathlib import Path
 
 import casadi as ca
+import numpy as np
 
 from beetle_omni_ros.robot import dynamics
+from beetle_omni_ros.robot.native import built, generated
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import ParameterError
+
+FOLDER = Path(ca.__file__).resolve().parent
+OPTIONS = (f'-I{FOLDER}/include', f'-L{FOLDER}', '-l:libhpipm.so', '-l:libblasfeo.so.0', '-lm',
+           f'-Wl,-rpath,{FOLDER}')
+_DOUBLES = POINTER(c_double)
 
 # Order of the weight vector; see NmpcWeights for meanings and units.
 WEIGHTS = ('position_xy', 'position_z', 'velocity', 'attitude_xy', 'attitude_z', 'rate', 'tilt',
@@ -23,27 +33,13 @@ WEIGHTS = ('position_xy', 'position_z', 'velocity', 'attitude_xy', 'attitude_z',
 INPUT_SIZE = 8
 # position, velocity, quaternion, rate, tilt, thrust, lead of tilt and of thrust commands
 REFERENCE_SIZE = 29
+# Smallest duration of an interval in the cost of command leads [s]; otherwise aggressive commands
+# in short first intervals would be cheap.
+CHANGE_TIME = 0.1
 
 
-@dataclass(frozen=True)
-class Ocp:
-    """
-    Stage functions of one problem.
-
-    Attributes:
-        state_size: 21 with the rotor lag in the model, 17 with thrust as a direct input.
-        stage: (x, u, d, reference, weights, h) -> x_next, A, B, Q, R, S, q, r.
-        terminal: (x, reference, weights) -> Q, q.
-
-    """
-
-    state_size: int
-    stage: ca.Function
-    terminal: ca.Function
-
-
-def build(robot: RobotParameters, servo_lag: float, rotor_lag: bool,
-          change_time: float = 0.0) -> Ocp:
+def stage_functions(robot: RobotParameters, servo_lag: float, rotor_lag: bool
+                    ) -> tuple[ca.Function, ca.Function]:
     """
     Write the stage functions for a robot.
 
@@ -52,8 +48,10 @@ def build(robot: RobotParameters, servo_lag: float, rotor_lag: bool,
         servo_lag: time constant of the servos' first-order reduction [s].
         rotor_lag: whether thrust is a state with the robot's rotor time constant
             (21 states) or follows its command at once (17 states).
-        change_time: smallest duration for the cost of command leads in an interval [s]; otherwise
-            aggressive commands in short first intervals would be cheap.
+
+    Returns:
+        stage: (x, u, d, reference, weights, h) -> x_next, A, B, Q, R, S, q, r, and
+        terminal: (x, reference, weights) -> Q, q.
 
     """
     size = 21 if rotor_lag else 17
@@ -63,7 +61,7 @@ def build(robot: RobotParameters, servo_lag: float, rotor_lag: bool,
     h = ca.SX.sym('h')
 
     x_next = _interval(robot, servo_lag, rotor_lag, x, u, d, h)
-    part = ca.fmax(h, change_time) / h
+    part = ca.fmax(h, CHANGE_TIME) / h
     residual, weight = _residual(rotor_lag, x, u, d, reference, weights, part)
     z = ca.vertcat(x, u)
     jacobian = ca.jacobian(residual, z)
@@ -76,9 +74,8 @@ def build(robot: RobotParameters, servo_lag: float, rotor_lag: bool,
 
     residual, weight = _residual(rotor_lag, x, None, None, reference, weights, 1)
     jacobian = ca.jacobian(residual, x)
-    terminal = ca.Function('terminal', [x, reference, weights], [ca.densify(e) for e in (
+    return stage, ca.Function('terminal', [x, reference, weights], [ca.densify(e) for e in (
         jacobian.T @ ca.diag(weight) @ jacobian, jacobian.T @ (weight * residual))])
-    return Ocp(size, stage, terminal)
 
 
 def _interval(robot, servo_lag, rotor_lag, x, u, d, h):
@@ -140,3 +137,85 @@ def _residual(rotor_lag, x, u, d, reference, weights, change):
         residual.append(u[4:] - reference[17:21] - reference[25:29])
         weight += [w['thrust_command']] * 4
     return ca.vertcat(*residual), ca.vertcat(*weight)
+
+
+class Rti:
+    """
+    The compiled iteration; a call costs a fraction of a millisecond.
+
+    Args:
+        robot, servo_lag, rotor_lag: of :func:`stage_functions`.
+        intervals: (N,) interval lengths [s].
+        soft: linear weight of the slacks, quadratic weight on velocity and rate, quadratic weight
+            on the height; or None.
+        tolerance: residual at which the QP counts as solved.
+        max_iterations: of the QP.
+        reaches: number of intervals after the first in which the lead of tilt targets is bounded.
+
+    Raises:
+        CompilerError: there is no usable compiler.
+        ParameterError: more than MAX_STAGES intervals.
+
+    """
+
+    def __init__(self, robot, servo_lag, rotor_lag, intervals, soft, tolerance, max_iterations,
+                 reaches=0):
+        # HPIPM names BLASFEO only by soname; having it loaded first resolves that anywhere.
+        ctypes.CDLL(str(FOLDER / 'libblasfeo.so.0'), mode=ctypes.RTLD_GLOBAL)
+        stage, terminal = stage_functions(robot, servo_lag, rotor_lag)
+        source = generated([stage, terminal]) + '\n' \
+            + Path(__file__).with_name('rti.c').read_text()
+        self._library = lib = ctypes.CDLL(str(built('nmpc', source, OPTIONS)))
+        lib.rti_create.restype = c_void_p
+        lib.rti_create.argtypes = [c_int, _DOUBLES, c_int, c_int, _DOUBLES, c_double, c_int,
+                                   c_int]
+        for name in ('rti_states', 'rti_inputs'):
+            getattr(lib, name).restype = _DOUBLES
+            getattr(lib, name).argtypes = [c_void_p]
+        lib.rti_step.argtypes = [c_void_p] * 6
+        lib.rti_shift.argtypes = [c_void_p, c_double]
+        lib.rti_iterations.argtypes = lib.rti_free.argtypes = [c_void_p]
+        n, size = len(intervals), stage.size1_in(0)
+        weights = np.array(soft if soft else (0.0,) * 3, dtype=float)
+        self._handle = lib.rti_create(n, intervals.ctypes.data_as(_DOUBLES), size, int(bool(soft)),
+                                      weights.ctypes.data_as(_DOUBLES), tolerance, max_iterations,
+                                      reaches)
+        if not self._handle:
+            raise ParameterError(f'horizon: expected at most 64 intervals, found {n}')
+        self.states = np.ctypeslib.as_array(lib.rti_states(self._handle), (n + 1, size))
+        self.inputs = np.ctypeslib.as_array(lib.rti_inputs(self._handle), (n, INPUT_SIZE))
+
+    def __del__(self):
+        if getattr(self, '_handle', None):
+            self._library.rti_free(self._handle)
+            self._handle = None
+
+    def fill(self, x, u):
+        """Store one state and one input over the whole horizon."""
+        self.states[:], self.inputs[:] = x, u
+
+    def shift(self, time: float):
+        """Move the stored trajectory forward by ``time`` [s], at most the shortest interval."""
+        self._library.rti_shift(self._handle, time)
+
+    def step(self, x0, references, disturbance, weights, bounds) -> tuple[bool, int]:
+        """
+        One iteration; the result is in ``states`` and ``inputs``.
+
+        Args:
+            x0: (nx,) present state.
+            references: (N + 1, 29).
+            disturbance: (10,) force in world, torque in body, tilt offsets.
+            weights: (11,) in the order of ``ocp.WEIGHTS``.
+            bounds: (18 + 2 N,) lower and upper input bounds, limits of |v| and |w|, for each
+                interval the largest lead of a tilt target, and for each of the nodes 1 to N the
+                smallest height.
+
+        Returns:
+            Whether the QP was solved, and iterations.
+
+        """
+        status = self._library.rti_step(
+            self._handle, x0.ctypes.data, references.ctypes.data, disturbance.ctypes.data,
+            weights.ctypes.data, bounds.ctypes.data)
+        return status == 0, self._library.rti_iterations(self._handle)

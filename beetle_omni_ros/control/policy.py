@@ -1,20 +1,20 @@
 """A trained policy as a controller."""
 
+from collections import deque
 from dataclasses import dataclass
-from math import isfinite
 
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, PoseTarget, Reference, State, Target
-from beetle_omni_ros.control.disturbance import DisturbanceEstimator, FunctionCall
-from beetle_omni_ros.control.guidance import Charge, Guidance
-from beetle_omni_ros.control.nmpc_parameters import DisturbanceParameters
-from beetle_omni_ros.control.policy_file import kind, PolicyNetwork
+from beetle_omni_ros.control.disturbance import DisturbanceEstimator, DisturbanceParameters
+from beetle_omni_ros.control.guidance import Guidance
+from beetle_omni_ros.control.policy_file import PolicyNetwork
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import parameter, ParameterFile
 
 DEFAULT = 'policies/rl.onnx'
+LATEST = 10             # steps within which a command is reported as the executed command
 COMMAND_DELAY = 0.01    # [s] from the state stamp to the actuators, for the disturbance estimate
 # An action beyond is a fault: it is sent to the supervisor unchanged; smaller ones are clipped to
 # the limits of the actuators, as in training (100: 25 rad, 50 N).
@@ -37,7 +37,7 @@ class PolicyParameters(ParameterFile, file='rl.yaml'):
 
 class PolicyController:
     """
-    The learnt controller: a :class:`control.base.Controller`.
+    The learnt controller.
 
     Its previous action is the executed command, of any controller, so that it can take over from
     another controller. Targets are clipped to the limits of the actuators, as in training. An
@@ -47,12 +47,6 @@ class PolicyController:
     Args:
         robot: the controller's model of the robot.
         parameters: policy file and guidance.
-
-    Attributes:
-        network: the network of the policy file.
-        contract: the metadata of the policy file.
-        reach: largest distance to a target [m].
-        guidance: text that lists its active parts.
 
     Raises:
         ParameterError: the file is missing, broken, or does not fit; one line.
@@ -65,89 +59,58 @@ class PolicyController:
         p = parameters or PolicyParameters.load()
         self.network = PolicyNetwork(p.policy, robot, p.allow_other_robot)
         self.contract = contract = self.network.contract
-        self.name = kind(contract.memory)
-        self.period, self.reach = 1 / contract.rate_hz, p.reach
+        self.name, self.period, self.reach = contract.name, 1 / contract.rate_hz, p.reach
         self._scale, self._offset = contract.action_scale, contract.action_offset
         tilt, rotors = robot.joints.position_limit, robot.rotors
         self._limits = [(-tilt, tilt)] * 4 + [(rotors.thrust_min, rotors.thrust_max)] * 4
         self._hover = [robot.hover_thrust] * 4
         self._estimator = DisturbanceEstimator(
             robot, DisturbanceParameters(), COMMAND_DELAY,
-            FunctionCall(model.integrator(robot))) if contract.memory else None
-        self._guidance, self._charge = Guidance(robot.tilt_axes, p.without), Charge()
+            model.integrator(robot)) if contract.memory else None
+        self._guidance = Guidance(robot.tilt_axes, p.without)
         self.guidance = self._guidance.text
         self.reset()
 
     def reset(self) -> None:
-        """Reset the last command, the estimate and all counts."""
-        self._command: Command | None = None
-        self._steps = self._rejected = self._faults = self._cut = 0
+        """Reset the last commands, the estimate and all counts."""
+        self._steps = self._faults = self._cut = 0
         self._guidance.reset()
-        self._charge.reset()
+        self._latest: deque[list[float]] = deque(maxlen=LATEST)
         if self._estimator:
             self._estimator.reset()
 
     def step(self, state: State, target: Target) -> Command:
-        """One command for one state; a non-finite state repeats the last command."""
+        """One command for one state."""
         self._steps += 1
         if isinstance(target, PoseTarget):
-            target = self._guidance.target(state, target, self._charge.holds(state))
+            target = self._guidance.target(state, target, self._in_charge(state))
         values = self.infer(state, target.at(state.stamp))
-        if values is None:
-            self._rejected += 1
-            return self._repeated(state)
-        self._command = Command(state.stamp, np.array(values[:4]), np.array(values[4:]))
-        self._charge.gave(values)
-        return self._command
+        self._latest.append(values)
+        return Command(state.stamp, np.array(values[:4]), np.array(values[4:]))
 
-    def infer(self, state: State, reference: Reference) -> list[float] | None:
+    def _in_charge(self, state):
+        """Whether the executed command is one of the latest commands."""
+        command = state.command
+        return command is not None \
+            and command.tilt.tolist() + command.thrust.tolist() in self._latest
+
+    def infer(self, state: State, reference: Reference) -> list[float]:
         """
         Compute observation and action, and clip the targets to the limits of the actuators.
 
-        Args:
-            state: of the robot.
-            reference: of the target; a pose target is modified by the guidance.
-
         Returns:
-            Tilt targets (4) [rad] and thrust targets (4) [N], or None if an input of the network
-            is not finite.
+            Tilt targets (4) [rad] and thrust targets (4) [N].
 
         """
-        observation = self._observe(state, reference)
-        return None if observation is None else self._targets(self.network(observation))
-
-    def diagnostics(self) -> dict[str, float | int | str]:
-        """Counts since reset, and the disturbance estimates of a policy with memory."""
-        values: dict[str, float | int | str] = {
-            'policy': self.contract.name, 'steps': self._steps,
-            'rejected_states': self._rejected, 'faulty_actions': self._faults,
-            'steps_at_a_limit': self._cut, **self._guidance.diagnostics()}
-        if self._estimator:
-            d = self._estimator.disturbance
-            values['force_estimate_N'] = float(np.linalg.norm(d[model.FORCE]))
-            values['torque_estimate_Nm'] = float(np.linalg.norm(d[model.TORQUE]))
-        return values
-
-    def _observe(self, state, reference):
-        """Inputs of the network, or None when one of them is not finite."""
         command = state.command     # before the first: the measured tilts and hover thrust
         before = state.tilt.tolist() + self._hover if command is None else \
             command.tilt.tolist() + command.thrust.tolist()
         observation = observed(state, reference, [
             (v - o) / s for v, o, s in zip(before, self._offset, self._scale)])
-        if not isfinite(sum(observation)):
-            return None
         if self._estimator:
-            if not isfinite(sum(state.tilt_velocity.tolist())):
-                return None
             self._estimator.observe(state)
-            if not isfinite(sum(self._estimator.disturbance.tolist())):
-                self._estimator.reset()
             observation += disturbed(state, self._estimator.disturbance)
-        return observation
-
-    def _targets(self, action):
-        """Tilt and thrust targets, within limits unless the action is a fault."""
+        action = self.network(observation)
         values = [s * a + o for a, o, s in zip(action, self._offset, self._scale)]
         # also false for NaN
         if not all(-ACTION_LIMIT <= a <= ACTION_LIMIT for a in action):
@@ -158,13 +121,17 @@ class PolicyController:
         self._cut += cut != values
         return cut
 
-    def _repeated(self, state):
-        """The last command with the state's stamp; before the first, hover thrust."""
-        last = self._command
-        if last is not None:
-            return Command(state.stamp, last.tilt, last.thrust)
-        tilt = state.tilt if np.isfinite(state.tilt).all() else np.zeros(4)
-        return Command(state.stamp, tilt, np.array(self._hover))
+    def diagnostics(self) -> dict[str, float | int | str]:
+        """Counts since reset, and the disturbance estimates of a policy with memory."""
+        values: dict[str, float | int | str] = {
+            'policy': self.contract.name, 'steps': self._steps,
+            'faulty_actions': self._faults, 'steps_at_a_limit': self._cut,
+            **self._guidance.diagnostics()}
+        if self._estimator:
+            d = self._estimator.disturbance
+            values['force_estimate_N'] = float(np.linalg.norm(d[model.FORCE]))
+            values['torque_estimate_Nm'] = float(np.linalg.norm(d[model.TORQUE]))
+        return values
 
 
 # Plain floats below: on vectors of three, numpy's calls cost ten times the arithmetic.
@@ -175,13 +142,7 @@ def observed(state: State, reference: Reference, previous_action) -> list[float]
     Observation (33) in the blocks of :data:`policy_file.OBSERVATIONS`, in SI units.
 
     All vectors are in base_link, so that they do not depend on position, and on heading only by
-    the attitude columns.
-
-    Args:
-        state: position, velocity, attitude, rates and tilts of the robot.
-        reference: at the time of the state plus the lookahead.
-        previous_action: (8,) the executed command as an action.
-
+    the attitude columns. ``previous_action`` (8,) is the executed command as an action.
     """
     xx, xy, xz, yx, yy, yz, zx, zy, zz = _rotation(state.quaternion)
     ax, bx, cx, ay, by, cy, az, bz, cz = _rotation(reference.quaternion)

@@ -10,7 +10,7 @@ loads; the checksum therefore covers every byte of the file except its own entry
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 import hashlib
 from itertools import zip_longest
 import json
@@ -19,7 +19,7 @@ from math import isclose, isfinite
 import os
 from pathlib import Path
 import sys
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -31,11 +31,9 @@ from beetle_omni_ros.robot.schema import ParameterError, quoted, shortened
 log = logging.getLogger(__name__)
 FORMAT = 'beetle_omni_policy/1'
 INPUT, OUTPUT = 'observation', 'action'
-ACTIONS = JOINT_NAMES + ROTOR_NAMES
 TILT_SCALE, THRUST_SCALE = 0.25, 0.5   # [rad], [N] for an action of 1, as published
 RATE_HZ = 100
-NAMED = 5               # differing parameters in a message
-LONGEST = 1000          # characters of a refusal: the metadata may hold anything
+LONGEST = 500           # characters of differences in a message: metadata may hold anything
 WARM_UP = 20            # calls at start, because the first calls are slow
 FATAL_ONLY = 4          # onnxruntime's log level: errors are raised, and reported by this module
 LEVEL = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0)   # x and z axis of a level body
@@ -43,67 +41,41 @@ LEVEL = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0)   # x and z axis of a level body
 ENTRY, DIGITS = b'rS\n\x08checksum\x12Gsha256:', 64
 
 
-class Block(NamedTuple):
-    """One named part of the observation: values, SI unit ('1': none), and what it belongs to."""
-
-    name: str
-    size: int
-    unit: str
-    frame: str
+def _blocks(*rows):
+    """Named parts of the observation: values, SI unit ('1': none), and what they belong to."""
+    return [dict(zip(('name', 'size', 'unit', 'frame'), row, strict=True)) for row in rows]
 
 
-OBSERVATIONS = (
-    Block('velocity', 3, 'm/s', 'base_link'),                 # R^T (v - v_ref)
-    Block('angular_velocity', 3, 'rad/s', 'base_link'),       # w - R^T R_ref w_ref
-    Block('target_position', 3, 'm', 'base_link'),            # R^T (p_ref - p)
-    Block('attitude', 6, '1', 'world'),                       # x and z axis of base_link
-    Block('target_attitude', 6, '1', 'world'),                # x and z axis of the reference
-    Block('tilt', 4, 'rad', 'joint'),                         # measured
-    Block('previous_action', 8, '1', 'action'),               # the command in force
-)
-DISTURBANCES = (
-    Block('disturbance_force', 3, 'N', 'base_link'),          # estimated external force
-    Block('disturbance_torque', 3, 'N m', 'base_link'),       # estimated external torque
-)
-
-
-def kind(memory: bool) -> str:
-    """Name of a policy with or without the estimated disturbance."""
-    return 'rl' + ('_memory' if memory else '')
+OBSERVATIONS = _blocks(
+    ('velocity', 3, 'm/s', 'base_link'),                 # R^T (v - v_ref)
+    ('angular_velocity', 3, 'rad/s', 'base_link'),       # w - R^T R_ref w_ref
+    ('target_position', 3, 'm', 'base_link'),            # R^T (p_ref - p)
+    ('attitude', 6, '1', 'world'),                       # x and z axis of base_link
+    ('target_attitude', 6, '1', 'world'),                # x and z axis of the reference
+    ('tilt', 4, 'rad', 'joint'),                         # measured
+    ('previous_action', 8, '1', 'action'))               # the command in force
+DISTURBANCES = _blocks(
+    ('disturbance_force', 3, 'N', 'base_link'),          # estimated external force
+    ('disturbance_torque', 3, 'N m', 'base_link'))       # estimated external torque
+# Entries of the metadata in JSON; the others are plain text. Entries that a file need not have.
+JSON = ('observations', 'actions', 'action_scale', 'action_offset', 'rate_hz', 'robot_values',
+        'training', 'metrics')
+DEFAULTS = dict.fromkeys(('robot_values', 'training', 'metrics'), '{}')
 
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyContract:
-    """
-    Description of a policy: inputs, outputs, rate and robot.
+    """Description of a policy: the metadata of docs/reference/policy_file.md."""
 
-    Attributes:
-        observations: blocks of the input, in their order.
-        actions: names of the outputs, in their order.
-        action_scale: (8,) targets = scale * action + offset [rad, then N].
-        action_offset: (8,) [rad, then N].
-        rate_hz: steps a second.
-        robot: name of the robot that it was trained for.
-        robot_hash: :meth:`RobotParameters.hash` of that robot.
-        robot_values: its parameters, :meth:`RobotParameters.as_dict`; {} in an old file.
-        name: of the policy.
-        training: conditions: randomisation, seed, iterations, duration and so on.
-        metrics: results of the assessment.
-        commit: of the code that trained it.
-        version: of the package that wrote the file.
-        created: ISO 8601.
-
-    """
-
-    observations: tuple[Block, ...]
-    actions: tuple[str, ...] = ACTIONS
-    action_scale: tuple[float, ...]
-    action_offset: tuple[float, ...]
-    rate_hz: float = RATE_HZ
+    observations: list[dict]        # blocks of the input, in their order
+    actions: list[str]              # names of the outputs, in their order
+    action_scale: list[float]       # targets = scale * action + offset [rad, then N]
+    action_offset: list[float]
+    rate_hz: float
     robot: str
     robot_hash: str
-    robot_values: dict = field(default_factory=dict)
-    name: str = ''
+    robot_values: dict              # :meth:`RobotParameters.as_dict`; {} in an old file
+    name: str
     training: dict = field(default_factory=dict)
     metrics: dict = field(default_factory=dict)
     commit: str = ''
@@ -114,35 +86,30 @@ class PolicyContract:
     def default(cls, robot: RobotParameters, memory: bool = False) -> PolicyContract:
         """Describe a policy that this version can fly on ``robot``."""
         return cls(observations=OBSERVATIONS + DISTURBANCES if memory else OBSERVATIONS,
+                   actions=[*JOINT_NAMES, *ROTOR_NAMES],
+                   action_scale=[TILT_SCALE] * 4 + [THRUST_SCALE] * 4,
+                   action_offset=[0.0] * 4 + [robot.hover_thrust] * 4, rate_hz=RATE_HZ,
                    robot=robot.name, robot_hash=robot.hash(), robot_values=robot.as_dict(),
-                   action_scale=(TILT_SCALE,) * 4 + (THRUST_SCALE,) * 4,
-                   action_offset=(0.0,) * 4 + (robot.hover_thrust,) * 4, name=kind(memory))
+                   name='rl_memory' if memory else 'rl')
 
     @property
     def memory(self) -> bool:
         """Whether the estimated disturbance is an input."""
-        return any(block.name == DISTURBANCES[0].name for block in self.observations)
+        return len(self.observations) > len(OBSERVATIONS)
 
     @property
     def observation_size(self) -> int:
         """Length of the input."""
-        return sum(block.size for block in self.observations)
+        return sum(block['size'] for block in self.observations)
 
     def to_metadata(self) -> dict[str, str]:
         """Texts for the ONNX file's custom metadata."""
-        values = {**asdict(self), 'observations': [b._asdict() for b in self.observations]}
-        return {'format': FORMAT, **{key: json.dumps(value) if key in READ else value
-                                     for key, value in values.items()}}
+        return {'format': FORMAT, **{key: json.dumps(value) if key in JSON else value
+                                     for key, value in vars(self).items()}}
 
     @classmethod
     def from_metadata(cls, metadata: dict[str, str]) -> PolicyContract:
-        """
-        Read a file's custom metadata.
-
-        Raises:
-            ParameterError: naming the entry that is missing or unusable.
-
-        """
+        """Read a file's custom metadata; an error names the missing or unusable entry."""
         found = metadata.get('format')
         if found != FORMAT:
             raise ParameterError(f"metadata 'format': expected {FORMAT!r}, found {quoted(found)}")
@@ -150,8 +117,8 @@ class PolicyContract:
         for key in cls.__dataclass_fields__:
             text: Any = metadata.get(key, DEFAULTS.get(key))
             try:
-                values[key] = READ[key](json.loads(text)) if key in READ else str(text or '')
-            except (ArithmeticError, RecursionError, TypeError, ValueError):
+                values[key] = json.loads(text) if key in JSON else text or ''
+            except (RecursionError, TypeError, ValueError):
                 raise ParameterError(f"metadata '{key}': missing or unusable, found "
                                      f'{quoted(text)}') from None
         return cls(**values)
@@ -159,10 +126,6 @@ class PolicyContract:
     def check(self, robot: RobotParameters, allow_other_robot: bool = False) -> str:
         """
         Compare with the description of this version for ``robot``.
-
-        Args:
-            robot: the model of the robot.
-            allow_other_robot: accept a policy that was trained for another one.
 
         Returns:
             A warning, one line, when another robot was allowed; else ''.
@@ -175,11 +138,11 @@ class PolicyContract:
         warning = self._other_robot(robot)
         for key in ('observations', 'actions', 'action_scale', 'rate_hz',
                     *([] if warning else ['action_offset'])):
-            for ours, theirs in zip_longest(np.atleast_1d(getattr(expected, key)),
-                                            np.atleast_1d(getattr(self, key))):
-                same = isclose(ours, theirs) if isinstance(ours, float) and theirs is not None \
-                    else np.array_equal(ours, theirs)
-                if not same:
+            for ours, theirs in zip_longest(_rows(getattr(expected, key)),
+                                            _rows(getattr(self, key))):
+                close = isinstance(ours, float) and isinstance(theirs, (float, int)) \
+                    and isclose(ours, theirs)
+                if not close and ours != theirs:
                     raise ParameterError(f'{key}: expected {ours}, found {theirs}')
         if warning and not allow_other_robot:
             raise ParameterError(f'{warning}; train a policy for this robot, or fly this policy '
@@ -199,19 +162,11 @@ class PolicyContract:
             known = shipped.as_dict()
         found = list(_differences(flown.as_dict(), known)) if known else []
         found = found or [f'robot_hash {self.robot_hash} in training, {flown.hash()} here']
-        more = f'; {len(found) - NAMED} more' if len(found) > NAMED else ''
-        return f"trained for other robot parameters: {'; '.join(found[:NAMED])}{more}"
+        return f"trained for other robot parameters: {shortened('; '.join(found), LONGEST)}"
 
 
-def _floats(values):
-    return tuple(map(float, values))
-
-
-# How JSON entries are read; the others are plain text. Entries that a file need not have.
-READ = {'observations': lambda rows: tuple(Block(**row) for row in rows), 'actions': tuple,
-        'action_scale': _floats, 'action_offset': _floats, 'rate_hz': float,
-        'robot_values': dict, 'training': dict, 'metrics': dict}
-DEFAULTS = dict.fromkeys(('robot_values', 'training', 'metrics'), '{}')
+def _rows(value):
+    return value if isinstance(value, list) else [value]
 
 
 def _differences(flown, trained, prefix=''):
@@ -226,13 +181,7 @@ def _differences(flown, trained, prefix=''):
 
 
 def verify(data: bytes) -> None:
-    """
-    Compare an ONNX file's content with the checksum in it.
-
-    Raises:
-        ParameterError: they differ, or there is none.
-
-    """
+    """Compare an ONNX file's content with the checksum in it; refuse it if they differ."""
     before, entry, after = data.rpartition(ENTRY)
     if not entry:
         raise ParameterError("metadata 'checksum' is missing: truncated, or no policy; python -m "
@@ -285,9 +234,6 @@ class PolicyNetwork:
         robot: the robot that it flies.
         allow_other_robot: accept one that was trained for other robot parameters.
 
-    Attributes:
-        contract: the metadata of the file.
-
     Raises:
         ParameterError: one line with the file and what is missing, broken or different.
 
@@ -306,7 +252,7 @@ class PolicyNetwork:
             self._bind(self.contract.observation_size)
             self._warm_up()
         except ParameterError as error:
-            raise ParameterError(f'policy {path}: {shortened(str(error), LONGEST)}') from None
+            raise ParameterError(f'policy {path}: {shortened(str(error), 2 * LONGEST)}') from None
         except Exception as error:      # onnxruntime's exceptions have no common base class
             # the informative end of its messages, which begin with codes
             reason = str(error).strip().partition('\n')[0].split(' : ')[-1]
@@ -324,22 +270,22 @@ class PolicyNetwork:
     def _bind(self, size):
         """Let the session read and write the same two arrays at every call."""
         self._input = np.zeros((1, size), np.float32)
-        self._output = np.zeros((1, len(ACTIONS)), np.float32)
+        self._output = np.zeros((1, len(self.contract.actions)), np.float32)
         binding = self._binding = self._session.io_binding()
-        for bind, name, array, found in (
-                (binding.bind_input, INPUT, self._input, self._session.get_inputs()),
-                (binding.bind_output, OUTPUT, self._output, self._session.get_outputs())):
+        for name, bind, array, found in (
+                (INPUT, binding.bind_input, self._input, self._session.get_inputs()),
+                (OUTPUT, binding.bind_output, self._output, self._session.get_outputs())):
             tensors = [(tensor.name, tensor.type, *tensor.shape[1:]) for tensor in found]
             expected = [(name, 'tensor(float)', array.shape[1])]
             if tensors != expected:
-                raise ParameterError(f'{bind.__name__[5:]}: expected {expected}, found {tensors}')
+                raise ParameterError(f'expected {expected}, found {tensors}')
             bind(name, 'cpu', 0, np.float32, array.shape, array.ctypes.data)
 
     def _warm_up(self):
         """Call as in level flight; refuse a network whose output is not finite."""
         rest: list[float] = []
         for block in self.contract.observations:
-            rest += LEVEL if 'attitude' in block.name else [0.0] * block.size
+            rest += LEVEL if 'attitude' in block['name'] else [0.0] * block['size']
         for _ in range(WARM_UP):
             action = self(rest)
         if not all(map(isfinite, action)):
@@ -347,22 +293,14 @@ class PolicyNetwork:
 
 
 def find(path: str | Path) -> Path:
-    """
-    Locate a policy: an absolute path, or one in the package's share or the present folder.
-
-    Raises:
-        ParameterError: there is no such file.
-
-    """
-    path = Path(path)
+    """Locate a policy: an absolute path, or one in the package's share or the present folder."""
     try:
         found = share_path(str(path))
     except FileNotFoundError:
-        found = path
+        found = Path(path)
     if not found.is_file():
-        where = '' if path.is_absolute() else \
-            f", neither in the package's share nor in {Path.cwd()}"
-        raise ParameterError(f'policy {path}: no such file{where}')
+        raise ParameterError(f"policy {path}: no such file, neither in the package's share nor in "
+                             f'{Path.cwd()}')
     return found
 
 

@@ -12,7 +12,6 @@ from beetle_omni_ros.robot.degraded import allocator
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
 
-FIRST_ROUNDS = 3        # iterations of allocation with effects for a new target; later one a plan
 DIFFERENCE_STEP = 1e-3  # [s] for the reference's acceleration
 HALF_TURN = 0.5         # [rad] from half a turn of a joint, where errors decide its direction:
                         # 0.1 of the encoder, 0.2 to 0.3 of a joint not yet at rest
@@ -44,12 +43,11 @@ class ReferencePlanner:
         self._times, self._unwind, self._robot = times, unwind, robot
         self._allocator = Allocator(robot)
         self._movable = np.ones(4, dtype=bool)
-        self._effects = EffectWrench(robot, self._allocator, len(times))
-        self._beside = np.zeros((2, len(times), 3))     # force and torque of the effects, per node
-        self._target: Target | None = None
+        self._effects = effect_wrench(robot, self._allocator, len(times))
+        # force and torque of the effects at each node, of the plan before
+        self._beside = np.zeros((2, len(times), 3))
         self._turned_to: PoseTarget | None = None
         self._towards: np.ndarray | None = None     # tilts in the middle of a half turn
-        self._inertia = np.asarray(robot.inertia)
         length = np.diff(times)[:, None]
         self._tilt_lead = 1 / -np.expm1(-length / servo_lag)
         self._thrust_lead = 1 / -np.expm1(-length / robot.rotors.time_constant)
@@ -72,16 +70,6 @@ class ReferencePlanner:
             disturbance: (10,) as in :mod:`robot.dynamics`.
 
         """
-        if not self._effects.needed:
-            return self._once(target, start, quaternion, tilt, disturbance)
-        rounds = 1 if target is self._target else FIRST_ROUNDS
-        self._target = target
-        for _ in range(rounds):
-            references = self._once(target, start, quaternion, tilt, disturbance)
-            self._beside = np.stack(self._effects(references))
-        return references
-
-    def _once(self, target, start, quaternion, tilt, disturbance):
         references = np.zeros((len(self._times), REFERENCE_SIZE))
         if isinstance(target, PoseTarget):
             force, torque = self._beside[:, 0]
@@ -93,8 +81,12 @@ class ReferencePlanner:
             references[:, TILT] = self._turned(target, self._unwound(allocation.tilt, tilt),
                                                quaternion, tilt)
             references[:, THRUST] = allocation.thrust
-            return references
-        self._follow(target, start + self._times, tilt, disturbance, references)
+        else:
+            self._follow(target, start + self._times, tilt, disturbance, references)
+        if self._effects is not None:
+            columns = references.T
+            self._beside = np.stack([np.array(part).T for part in self._effects(
+                columns[:13], columns[TILT], columns[THRUST])])
         return references
 
     def _turned(self, target, tilt, quaternion, present):
@@ -134,7 +126,8 @@ class ReferencePlanner:
         acceleration = (ahead.velocity - now.velocity) / DIFFERENCE_STEP
         angular_acceleration = (ahead.angular_velocity - rate) / DIFFERENCE_STEP
         force = self._allocator.mass * acceleration - disturbance[model.FORCE] - self._beside[0]
-        torque = self._inertia * angular_acceleration + np.cross(rate, self._inertia * rate) \
+        inertia = self._robot.inertia
+        torque = inertia * angular_acceleration + np.cross(rate, inertia * rate) \
             - disturbance[model.TORQUE] - self._beside[1]
         references[:, 0:3], references[:, 3:6] = now.position, now.velocity
         references[:, 6:10], references[:, 10:13] = now.quaternion, rate
@@ -147,53 +140,29 @@ class ReferencePlanner:
         references[:-1, THRUST_LEAD] = self._thrust_lead * np.diff(references[:, THRUST], axis=0)
 
 
-class EffectWrench:
+def effect_wrench(robot: RobotParameters, allocator: Allocator, nodes: int) -> ca.Function | None:
     """
     Model less allocation, at the nodes of a reference.
 
     Without this correction, tilts and thrusts of the reference would not hold its pose in the
     model, and the plan would have a steady error.
 
-    Args:
-        robot: with the effects.
-        allocator: of the same robot.
-        nodes: N + 1.
-
-    Attributes:
-        needed: whether the robot file has an effect that the allocation lacks.
+    Returns:
+        (pose with velocity, tilt, thrust) -> force in world [N] and torque in base_link [N m],
+        each with a column for a node; None if the allocation has all effects of the robot file.
 
     """
-
-    def __init__(self, robot: RobotParameters, allocator: Allocator, nodes: int):
-        self.needed = any(CATALOGUE[name].apply is not None and not CATALOGUE[name].allocated
-                          for name in robot.effects)
-        if not self.needed:
-            return
-        pose, tilt, thrust = ca.SX.sym('pose', 13), ca.SX.sym('tilt', 4), ca.SX.sym('thrust', 4)
-        velocity, quaternion, rate = pose[3:6], pose[6:10], pose[10:13]
-        acceleration, angular = model.rigid_body(robot, velocity, quaternion, rate, tilt, thrust,
-                                                 position=pose[0:3])
-        components = ca.vertcat(*[part for i in range(4) for part in (
-            thrust[i] * ca.cos(tilt[i]), thrust[i] * ca.sin(tilt[i]))])
-        wrench = ca.DM(allocator.matrix) @ components
-        inertia = ca.DM(robot.inertia)
-        force = allocator.mass * acceleration + ca.DM(allocator.weight) \
-            - model.rotation_matrix(quaternion) @ wrench[:3]
-        torque = inertia * angular + ca.cross(rate, inertia * rate) - wrench[3:]
-        self._function = ca.Function('effect_wrench', [pose, tilt, thrust],
-                                     [force, torque]).map(nodes)
-
-    def __call__(self, references: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """
-        Wrench at each node.
-
-        Args:
-            references: (N + 1, at least 21) position, velocity, quaternion, rates, tilts, thrusts.
-
-        Returns:
-            (N + 1, 3) force in world [N] and (N + 1, 3) torque in base_link [N m].
-
-        """
-        columns = references.T
-        force, torque = self._function(columns[:13], columns[13:17], columns[17:21])
-        return np.array(force).T, np.array(torque).T
+    if all(CATALOGUE[name].apply is None or CATALOGUE[name].allocated for name in robot.effects):
+        return None
+    pose, tilt, thrust = ca.SX.sym('pose', 13), ca.SX.sym('tilt', 4), ca.SX.sym('thrust', 4)
+    velocity, quaternion, rate = pose[3:6], pose[6:10], pose[10:13]
+    acceleration, angular = model.rigid_body(robot, velocity, quaternion, rate, tilt, thrust,
+                                             position=pose[0:3])
+    components = ca.vertcat(*[part for i in range(4) for part in (
+        thrust[i] * ca.cos(tilt[i]), thrust[i] * ca.sin(tilt[i]))])
+    wrench = ca.DM(allocator.matrix) @ components
+    inertia = ca.DM(robot.inertia)
+    force = allocator.mass * acceleration + ca.DM(allocator.weight) \
+        - model.rotation_matrix(quaternion) @ wrench[:3]
+    torque = inertia * angular + ca.cross(rate, inertia * rate) - wrench[3:]
+    return ca.Function('effect_wrench', [pose, tilt, thrust], [force, torque]).map(nodes)

@@ -10,12 +10,11 @@ large libraries that it needs take seconds.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib import import_module, metadata
 from importlib.util import module_from_spec, spec_from_file_location
 import inspect
-from math import inf
 from pathlib import Path
 import re
 import sys
@@ -42,67 +41,34 @@ RESERVED = ('controller', 'ekf', 'joint_bridge', 'meta', 'none', 'operator', 're
 
 @dataclass(frozen=True, kw_only=True)
 class ControllerOptions:
-    """
-    Files that replace a controller's own files.
-
-    Attributes:
-        parameters: file of parameters.
-        policy: network.
-        allow_other_robot: fly a policy that was trained for other robot parameters.
-        without: layers of the guidance that are off.
-
-    """
+    """Files of parameters and network that replace a controller's own ones, and switches."""
 
     parameters: Path | None = None
     policy: Path | None = None
-    allow_other_robot: bool = False
-    without: str = ''
+    allow_other_robot: bool = False     # fly a policy trained for other robot parameters
+    without: str = ''                   # layers of the guidance that are off
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ControllerEntry:
-    """
-    One controller; all programs that accept a controller's name use this entry.
+    """One controller; all programs that accept a controller's name use this entry."""
 
-    Attributes:
-        name: of its results, its topic ``<name>/command`` and its node ``<name>_node``.
-        controller: class or function, or 'package.module:Class', called with the robot and, where
-            its signature has them, ``parameters`` and ``options``. Its attribute ``Parameters`` is
-            the class of its parameters (:mod:`robot.schema`).
-        spec: reference by which another process finds it; '' means its name.
-        label: short, for headings of figures.
-        description: one line.
-        period: between its commands [s].
-        parameters_file: shipped file of them; in the package's share, or any path.
-        fixed: parameters that override the shipped file.
-        policy_file: its network; '' for none. With a network its parameters have ``policy`` and
-            ``allow_other_robot``.
-        option: of the command line that replaces the file of this controller only.
-        guidance: names the functions that modify its targets, see :mod:`control.guidance`.
-        flies_degraded: whether it can fly with failed actuators (``set_health``).
-        stands_by: whether it runs in the ROS graph on standby.
-        compared: whether `beetle_omni compare` flies it by default.
-        cost: core seconds for a simulated second, to order flights; without influence on results.
-        line: colour and dashes in figures.
-
-    """
-
-    name: str
+    name: str               # of its results, its topic '<name>/command' and node '<name>_node'
+    # Class or function, or 'package.module:Class', called with the robot and, where its signature
+    # has them, `parameters` and `options`. Its `Parameters` is the class of its parameters.
     controller: str | Callable[..., Controller]
-    spec: str = ''
-    label: str = ''
+    spec: str = ''          # reference by which another process finds it; '': its name
+    label: str = ''         # short, for headings of figures
     description: str = ''
-    period: float = PERIOD
-    parameters_file: str = ''
-    fixed: Mapping[str, Any] = field(default_factory=dict)
-    policy_file: str = ''
-    option: str = ''
-    guidance: str = 'none'
-    flies_degraded: bool = False
-    stands_by: bool = False
-    compared: bool = False
-    cost: float = 0.1
-    line: tuple[str, str | tuple] = ('', '-')
+    period: float = PERIOD      # [s] between its commands
+    parameters_file: str = ''   # shipped file of them; in the package's share, or any path
+    policy_file: str = ''       # its network
+    option: str = ''        # of the command line, replaces the file of this controller only
+    guidance: str = 'none'  # names the functions that modify its targets
+    flies_degraded: bool = False    # with failed actuators
+    stands_by: bool = False     # in the ROS graph
+    compared: bool = False  # by default
+    line: tuple[str, str | tuple] = ('', '-')       # colour and dashes in figures
 
     def __post_init__(self):
         """Refuse an invalid name."""
@@ -131,50 +97,35 @@ class ControllerEntry:
         """Class of its parameters, or None."""
         return getattr(self.builder, 'Parameters', None)
 
-    def completed(self, mapping: dict, from_user: bool) -> dict:
-        """Values of a parameter file and of ``fixed``; a user's file takes precedence."""
-        return _merged(self.fixed, mapping) if from_user else _merged(mapping, self.fixed)
-
     def load_parameters(self, options: ControllerOptions = ControllerOptions()):
         """
         Parameters from a file and the options; None for a controller without parameters.
 
         Raises:
-            ParameterError: an unusable file, or a file for a controller without parameters.
+            ParameterError: an unusable file, or an option that the controller lacks.
 
         """
-        kind = self.parameter_class
-        if kind is None:
-            if options.parameters:
-                raise ParameterError(f"controller '{self.reference}': reads no parameter file, "
-                                     f'given {options.parameters}')
-            return None
-        file = options.parameters or self.parameters_file and (
-            self.parameters_file if Path(self.parameters_file).is_file()
-            else share_path(self.parameters_file))
-        mapping = schema.load_yaml(file) if file else {}
-        parameters = schema.bind(kind, self.completed(mapping, bool(options.parameters)),
-                                 str(file or ''))
-        if options.without:
-            if not hasattr(parameters, 'without'):
-                raise ParameterError(f"--without {options.without}: controller "
-                                     f"'{self.reference}' has no layers of guidance")
-            parameters = replace(parameters, without=options.without)
-        if not (self.policy_file and hasattr(parameters, 'policy')):
-            return parameters
-        return replace(parameters, policy=str(options.policy or self.policy_file),
-                       allow_other_robot=parameters.allow_other_robot
-                       or options.allow_other_robot)
+        kind, file = self.parameter_class, options.parameters
+        if kind is None and file:
+            raise ParameterError(f"controller '{self.reference}': reads no parameter file, "
+                                 f'given {file}')
+        if not file and self.parameters_file:
+            file = Path(self.parameters_file)
+            file = file if file.is_file() else share_path(self.parameters_file)
+        parameters = kind and schema.bind(kind, schema.load_yaml(file) if file else {},
+                                          str(file or ''))
+        if options.without and not hasattr(parameters, 'without'):
+            raise ParameterError(f"--without {options.without}: controller '{self.reference}' has "
+                                 'no layers of guidance')
+        given = {'policy': str(options.policy or ''), 'without': options.without,
+                 'allow_other_robot': options.allow_other_robot}
+        return parameters and replace(parameters, **{
+            key: value for key, value in given.items() if value and hasattr(parameters, key)})
 
     def make(self, robot: RobotParameters, options: ControllerOptions = ControllerOptions(),
              parameters: Any = None) -> Controller:
         """
-        Build the controller.
-
-        Args:
-            robot: its model of the robot.
-            options: files that replace its own.
-            parameters: replace those of files and options.
+        Build the controller; ``parameters`` replace those of files and options.
 
         Raises:
             ParameterError: what is wrong with its class or its files, in one line.
@@ -197,20 +148,10 @@ class ControllerEntry:
         self._check(controller)
         return controller
 
-    def reach(self, robot: RobotParameters, options: ControllerOptions = ControllerOptions()
-              ) -> float:
-        """
-        Largest distance to a target [m]; inf if it has none.
-
-        The value comes from its parameters if they have it, because building may take seconds.
-
-        Raises:
-            ParameterError: as :meth:`make`.
-
-        """
-        parameters = self.load_parameters(options)
-        return float(parameters.reach) if hasattr(parameters, 'reach') \
-            else reach_of(self.make(robot, options))
+    def reach(self, robot: RobotParameters) -> float:
+        """Largest distance to a target [m], from its parameters: building may take seconds."""
+        parameters = self.load_parameters()
+        return reach_of(parameters if hasattr(parameters, 'reach') else self.make(robot))
 
     def _check(self, controller):
         """Refuse a result that is no controller."""
@@ -226,16 +167,6 @@ class ControllerEntry:
         if not isinstance(period, (int, float)) or not 0 < period <= LONGEST_PERIOD:
             raise ParameterError(f'{at}period is {period!r}, expected the time between two steps, '
                                  f'above 0 and at most {LONGEST_PERIOD:g} s')
-        reach = getattr(controller, 'reach', inf)
-        if not isinstance(reach, (int, float)) or not reach > 0:
-            raise ParameterError(f'{at}reach is {reach!r}, expected the distance of the farthest '
-                                 'target [m], above 0')
-
-
-def _merged(low: Mapping[str, Any], high: Mapping[str, Any]) -> dict[str, Any]:
-    """Nested values of both, those of ``high`` where both have one."""
-    return {**low, **{key: _merged(low[key], value) if key in low and isinstance(value, Mapping)
-                      else value for key, value in high.items()}}
 
 
 # Line styles: blue for RL and red for NMPC as in the publication. The variants are lighter and
@@ -246,46 +177,42 @@ SHIPPED: Mapping[str, ControllerEntry] = {entry.name: entry for entry in (
     ControllerEntry(
         name='nmpc', label='NMPC', description='offset-free, params/nmpc.yaml', controller=_NMPC,
         parameters_file='params/nmpc.yaml', option='--nmpc', flies_degraded=True, stands_by=True,
-        compared=True, cost=0.1, line=('#c8281e', '-')),
+        compared=True, line=('#c8281e', '-')),
     ControllerEntry(
         name='rl', label='RL', description='the learned policy, 33 observations',
         controller=_POLICY, parameters_file='params/rl.yaml', policy_file='policies/rl.onnx',
-        option='--policy', guidance='unwinding, routing, turning, trimming', stands_by=True,
-        compared=True, cost=0.07, line=('#1b5fb4', '-')),
+        option='--policy', guidance='unwinding, routing, trimming', stands_by=True,
+        compared=True, line=('#1b5fb4', '-')),
     ControllerEntry(
         name='rl_bare', label='RL, bare', description='the learned policy without guidance',
-        controller=_POLICY, parameters_file='params/rl.yaml', policy_file='policies/rl.onnx',
-        fixed={'without': 'all'}, compared=True, cost=0.07,
-        line=('#0b2d5c', (0, (2, 1)))),
+        controller=_POLICY, parameters_file='params/rl_bare.yaml', policy_file='policies/rl.onnx',
+        compared=True, line=('#0b2d5c', (0, (2, 1)))),
     ControllerEntry(
         name='rl_memory', label='RL, memory',
         description='the learned policy with the estimated disturbance as input',
-        controller=_POLICY, parameters_file='params/rl.yaml',
-        policy_file='policies/rl_memory.onnx', fixed={'policy': 'policies/rl_memory.onnx'},
-        guidance='unwinding, routing, turning, trimming', cost=0.08,
-        line=('#58b4e8', (0, (5, 1.6)))),
+        controller=_POLICY, parameters_file='params/rl_memory.yaml',
+        policy_file='policies/rl_memory.onnx',
+        guidance='unwinding, routing, trimming', line=('#58b4e8', (0, (5, 1.6)))),
     ControllerEntry(
         name='rl_published', label='RL, published training',
         description='params/train_published.yaml, without guidance', controller=_POLICY,
-        parameters_file='params/rl.yaml', policy_file='policies/rl_published.onnx',
-        fixed={'policy': 'policies/rl_published.onnx', 'without': 'all'}, compared=True,
-        cost=0.07, line=('#3f8f8a', (0, (4, 1, 1, 1)))),
+        parameters_file='params/rl_published.yaml', policy_file='policies/rl_published.onnx',
+        compared=True, line=('#3f8f8a', (0, (4, 1, 1, 1)))),
     ControllerEntry(
         name='nmpc_corrected', label='NMPC, corrected weight',
         description='params/nmpc_published.yaml with weights.tilt 20 instead of 2',
-        controller=_NMPC, parameters_file='params/nmpc_published.yaml',
-        fixed={'weights': {'tilt': 20.0}}, flies_degraded=True, compared=True, cost=0.13,
-        line=('#b5651d', (0, (5, 1.2)))),
+        controller=_NMPC, parameters_file='params/nmpc_corrected.yaml', flies_degraded=True,
+        compared=True, line=('#b5651d', (0, (5, 1.2)))),
     ControllerEntry(
         name='nmpc_published', label='NMPC, published settings',
         description='params/nmpc_published.yaml', controller=_NMPC,
         parameters_file='params/nmpc_published.yaml', flies_degraded=True, compared=True,
-        cost=0.13, line=('#e8960c', (0, (3, 1.2, 1, 1.2)))),
+        line=('#e8960c', (0, (3, 1.2, 1, 1.2)))),
     ControllerEntry(
         name='hover', label='hover PD',
         description="PD with allocation, the supervisor's fallback",
         controller='beetle_omni_ros.control.hover:HoverController',
-        parameters_file='params/hover.yaml', flies_degraded=True, cost=0.05,
+        parameters_file='params/hover.yaml', flies_degraded=True,
         line=('#5b6770', (0, (1, 1.2)))))}
 DEFAULT = next(iter(SHIPPED))       # the default controller
 _ADDED: dict[str, ControllerEntry] = {}     # of this process alone
@@ -305,11 +232,11 @@ def names() -> list[str]:
 
 def entry_of(found: Any, spec: str, name: str = '') -> ControllerEntry:
     """
-    Make an entry from an entry, a class or a function.
+    Make an entry from a class, or a function that builds a controller.
 
     Args:
-        found: an entry, a class, or a function that builds a controller. A class may have
-            ``name``, ``Parameters``, ``parameters_file``, ``policy_file`` and ``guidance``.
+        found: a class may have ``name``, ``Parameters``, ``parameters_file``, ``policy_file`` and
+            ``guidance``.
         spec: reference by which other processes find it.
         name: under which it is registered; '' uses its own name.
 
@@ -317,36 +244,27 @@ def entry_of(found: Any, spec: str, name: str = '') -> ControllerEntry:
         ParameterError: it cannot be registered.
 
     """
-    if isinstance(found, ControllerEntry):
-        return replace(found, name=name or found.name, spec=spec)
     if not callable(found):
         raise ParameterError(f"controller '{spec}': a {type(found).__name__}, expected a class "
                              'with step(state, target), reset() and period')
     snake = re.sub(r'(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])', '_', found.__name__).lower()
     file = getattr(found, 'parameters_file', '')
     beside = Path(getattr(sys.modules.get(found.__module__), '__file__', None) or '').parent / file
-    period, guidance = getattr(found, 'period', PERIOD), getattr(found, 'guidance', 'none')
+    own = {key: value for key in ('period', 'policy_file', 'guidance')
+           if (value := getattr(found, key, None)) and not isinstance(value, property)}
     return ControllerEntry(
         # an inherited name would be that of another controller
         name=name or vars(found).get('name') or snake, controller=found, spec=spec,
-        label=found.__name__, description=(found.__doc__ or '').strip().partition('\n')[0],
-        period=PERIOD if isinstance(period, property) else period,
+        description=(found.__doc__ or '').strip().partition('\n')[0],
         parameters_file=str(beside) if file and beside.is_file() else file,
-        policy_file=getattr(found, 'policy_file', ''),
-        guidance='none' if isinstance(guidance, property) else guidance,
-        flies_degraded=hasattr(found, 'set_health'))
+        flies_degraded=hasattr(found, 'set_health'), **own)
 
 
 def add(found: Any) -> ControllerEntry:
     """
     Register a class, or a function that builds a controller, in this process under its name.
 
-    A controller of the same name that was added before is replaced, for example when a notebook
-    cell runs again.
-
-    Raises:
-        ParameterError: it is no controller, or its name is used by another package.
-
+    It replaces one of the same name, for example when a notebook cell runs again.
     """
     entry = _untaken(entry_of(found, ''))
     _ADDED[entry.name] = entry
@@ -379,13 +297,7 @@ def find(reference: str) -> ControllerEntry:
 
 
 def find_all(references: Iterable[str]) -> list[ControllerEntry]:
-    """
-    Look several controllers up; no two of them may have one name.
-
-    Raises:
-        ParameterError: as :func:`find`, or a name twice.
-
-    """
+    """Look several controllers up; no two of them may have one name."""
     entries: dict[str, ControllerEntry] = {}
     for reference in references:
         entry = find(reference)
@@ -416,15 +328,7 @@ def _untaken(entry):
 
 
 def loaded(reference: str) -> Any:
-    """
-    Import the object of ``package.module:Name`` or ``path/to/file.py:Name``.
-
-    Modules are also searched in the working folder.
-
-    Raises:
-        ParameterError: what is missing, in one line.
-
-    """
+    """Import ``package.module:Name`` or ``path/to/file.py:Name``, also from the working folder."""
     place, _, name = reference.rpartition(':')
     if not place or not name.isidentifier():
         raise ParameterError(f"controller '{reference}': expected {CLASS}")
@@ -462,23 +366,8 @@ def _executed(path):
     return sys.modules[name]
 
 
-def make(reference: str, robot: RobotParameters,
-         options: ControllerOptions = ControllerOptions()) -> Controller:
-    """Build a controller, see :func:`find` and :meth:`ControllerEntry.make`."""
-    return find(reference).make(robot, options)
-
-
 def pilot(among: Iterable[str] | None = None) -> str:
-    """
-    Name of the controller that lands the robot when actuators are lost.
-
-    Args:
-        among: available names; None: all registered names.
-
-    Returns:
-        The first shipped controller that can; '' if none is available.
-
-    """
+    """First of the shipped controllers ``among`` names that flies with lost actuators, or ''."""
     there = set(SHIPPED if among is None else among)
     return next((name for name, entry in SHIPPED.items()
                  if entry.flies_degraded and name in there), '')

@@ -121,13 +121,6 @@ struct rti *rti_create(int horizon, const double *interval, int nx, int soft,
     return s;
 }
 
-/* Fill the stored trajectory with one state and one input. */
-void rti_fill(struct rti *s, const double *x, const double *u)
-{
-    for (int k = 0; k <= s->horizon; k++) memcpy(s->x + k * s->nx, x, s->nx * sizeof(double));
-    for (int k = 0; k < s->horizon; k++) memcpy(s->u + k * NU, u, NU * sizeof(double));
-}
-
 /* Move the stored trajectory forward by a time no longer than the shortest interval. */
 void rti_shift(struct rti *s, double time)
 {

@@ -106,7 +106,7 @@ def own_files(controller: str) -> tuple[Path, ...]:
     """Code of a controller outside the package; nothing for a shipped one."""
     if controller in registry.SHIPPED:
         return ()
-    file = Path(inspect.getfile(registry.find(controller).builder()))
+    file = Path(inspect.getfile(registry.find(controller).builder))
     top = file.parent
     while (top / '__init__.py').is_file():
         top = top.parent

@@ -20,8 +20,14 @@ import time
 import numpy as np
 
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.control.base import Command, Controller, PoseTarget, State, Target
-from beetle_omni_ros.control.host import ControllerError, ControllerHost
+from beetle_omni_ros.control.base import (
+    Command,
+    Controller,
+    ControllerHost,
+    PoseTarget,
+    State,
+    Target,
+)
 from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.parameters import EkfParameters
@@ -29,7 +35,7 @@ from beetle_omni_ros.estimation.state import pose_covariance, twist_covariance
 from beetle_omni_ros.messages.values import Odom, Wrench
 from beetle_omni_ros.robot.allocation import ALL_HEALTHY
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import RunError
+from beetle_omni_ros.robot.schema import ParameterError, RunError
 from beetle_omni_ros.runs.log import Recorder
 from beetle_omni_ros.runs.targets import TargetChecks
 from beetle_omni_ros.runs.tasks import Task, TaskPlayer
@@ -234,7 +240,7 @@ class FlightLoop:
             whether the robot was airborne to the end.
 
         Raises:
-            ControllerError, RunError: no take-off.
+            ParameterError, RunError: no take-off.
 
         """
         with collector_off():
@@ -293,7 +299,7 @@ class FlightLoop:
         Arm and climb until a controller flies.
 
         Raises:
-            ControllerError: the active controller raised an exception.
+            ParameterError: the active controller raised an exception.
             RunError: no take-off.
 
         """
@@ -314,7 +320,7 @@ class FlightLoop:
     def _step_before_flight(self):
         self.step()
         if error := self._hosts[self.supervisor.active].error:
-            raise ControllerError(error)
+            raise ParameterError(error)
 
     def step(self) -> Frame:
         """Run one tick of the simulator and of every process that is due in it."""

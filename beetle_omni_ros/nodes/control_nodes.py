@@ -10,8 +10,13 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.control.base import guidance_of, PoseTarget, State
-from beetle_omni_ros.control.host import ControllerHost, MOTORS_OFF
+from beetle_omni_ros.control.base import (
+    ControllerHost,
+    guidance_of,
+    MOTORS_OFF,
+    PoseTarget,
+    State,
+)
 from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.control.registry import ControllerEntry
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
@@ -107,7 +112,7 @@ class ControllerNode(FlightNode):
             registry.find(controller or _requested_controller())
         is_own = isinstance(controller, str) and controller     # the executable has one controller
         super().__init__(f'{entry.name}_node', node_parameters(entry, not is_own),
-                         entry.parameters_file, entry.file_key, completed=entry.completed)
+                         entry.parameters_file, entry.file_key)
         self._entry = entry
         robot = RobotParameters.load(self.parameters.robot_file or None)
         controller = entry.make(
@@ -209,7 +214,7 @@ class ControllerNode(FlightNode):
 
     def _controller_status(self):
         host, controller = self._host, self._host.controller
-        report = host.call('diagnostics', getattr(controller, 'diagnostics', dict)) or {}
+        report = host.call('diagnostics') or {}
         new, self._reported_errors = host.errors - self._reported_errors, host.errors
         values = {**report, 'guidance': guidance_of(controller)}
         if host.errors:

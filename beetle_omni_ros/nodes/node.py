@@ -45,8 +45,7 @@ class FlightNode(Node):
 
     def __init__(self, name: str, parameter_class: type, file: str | None = None,
                  file_key: str | None = None, on_change: Callable | None = None,
-                 changeable: tuple[str, ...] | None = None,
-                 completed: Callable[[dict, bool], dict] | None = None):
+                 changeable: tuple[str, ...] | None = None):
         """
         Claim the name, read the parameters, start diagnostics.
 
@@ -67,7 +66,7 @@ class FlightNode(Node):
         self.simulated = bool(self.get_parameter(parameters.CLOCK).value)
         self.flight_clock = self.get_clock() if self.simulated else self.steady_clock
         self.parameters = parameters.declare(self, parameter_class, file, file_key,
-                                             on_change, changeable, completed)
+                                             on_change, changeable)
         self.health = Health(self)
         self.get_logger().debug('started')      # the first call is slow: not during a flight
 

@@ -29,8 +29,7 @@ def file_parameter(what: str = 'robot file'):
 
 
 def declare(node: Node, cls: type, file: str | None = None, file_key: str | None = None,
-            on_change: Callable | None = None, changeable: tuple[str, ...] | None = None,
-            completed: Callable[[dict, bool], dict] | None = None):
+            on_change: Callable | None = None, changeable: tuple[str, ...] | None = None):
     """
     Declare every leaf of the parameter dataclass ``cls`` on ``node``.
 
@@ -45,7 +44,6 @@ def declare(node: Node, cls: type, file: str | None = None, file_key: str | None
         on_change: called with the new instance when parameters are set in flight; may raise
             ParameterError to refuse. Without it every parameter is read-only.
         changeable: names that may be set in flight; None: all that are not read-only.
-        completed: (values of the file, whether the user named it) -> completed values.
 
     Returns:
         The validated instance of ``cls``.
@@ -56,11 +54,8 @@ def declare(node: Node, cls: type, file: str | None = None, file_key: str | None
     """
     overrides = {name: value.value for name, value in node._parameter_overrides.items()
                  if name not in ROS_OWN and not name.startswith(ROS_OWN_PREFIX)}
-    own_file = overrides.get(file_key)
-    start_from = own_file or (share_path(file) if file else None)
+    start_from = overrides.get(file_key) or (share_path(file) if file else None)
     mapping = schema.load_yaml(start_from) if start_from else {}
-    if completed is not None:
-        mapping = completed(mapping, bool(own_file))
     for name, value in overrides.items():
         _put(mapping, name, value)
     instance = schema.bind(cls, mapping)

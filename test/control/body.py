@@ -3,7 +3,7 @@
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, State
-from beetle_omni_ros.control.disturbance import FunctionCall
+from beetle_omni_ros.control.disturbance import buffered
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import ALL_HEALTHY, Allocator
@@ -29,7 +29,7 @@ class Body:
 
     def __init__(self, position=(0.0, 0.0, 1.0), attitude=LEVEL, present=np.zeros(4), robot=ROBOT,
                  disturbance=np.zeros(10)):
-        self._advance = FunctionCall(model.integrator(robot, 4))
+        self._advance = buffered(model.integrator(robot, 4))
         hover = Allocator(ROBOT).hover(attitude, present)
         self.x = np.concatenate([position, np.zeros(3), attitude, np.zeros(3), hover.tilt,
                                  np.zeros(4), hover.thrust])

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.control.base import Command, PoseTarget, State
-from beetle_omni_ros.control.disturbance import DisturbanceEstimator, FunctionCall
-from beetle_omni_ros.control.nmpc import NmpcController
-from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
+from beetle_omni_ros.control.disturbance import buffered, DisturbanceEstimator
+from beetle_omni_ros.control.nmpc import NmpcController, NmpcParameters
 from beetle_omni_ros.evaluation.loop import FlightLoop
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.parameters import find_robot, RobotParameters
@@ -28,7 +27,7 @@ def command(k):
 def test_each_command_within_the_delay_acts_from_its_own_time(delay):
     p = NmpcParameters.load()
     p = replace(p, model=replace(p.model, command_delay=delay))
-    advance = FunctionCall(model.integrator(ROBOT))
+    advance = model.integrator(ROBOT)
     estimator = DisturbanceEstimator(ROBOT, p.disturbance, p.model.command_delay, advance)
     now, rest = 12, State(0.0, np.zeros(3), np.zeros(3), np.array([0.0, 0, 0, 1]), np.zeros(3),
                           np.zeros(4), np.zeros(4), 0.0)
@@ -41,7 +40,7 @@ def test_each_command_within_the_delay_acts_from_its_own_time(delay):
     for step in range(round(delay / FINE)):
         at = t + (step + 0.5) * FINE - delay
         u = command(min(int(np.floor(at / PERIOD + 1e-9)), now - 1))
-        x = advance(x, np.r_[u.tilt, u.thrust], estimator.disturbance, FINE)
+        x = buffered(advance)(x, np.r_[u.tilt, u.thrust], estimator.disturbance, FINE)
     for part, tolerance in ((model.VELOCITY, 2e-3), (model.RATE, 5e-3), (model.TILT, 4e-3),
                             (model.THRUST, 1e-3)):
         assert np.allclose(predicted[part], x[part], atol=tolerance)
@@ -52,7 +51,7 @@ def test_a_servo_held_by_friction_does_not_wind_up_the_offset():
     friction = band * ROBOT.joints.kp
     robot = replace(ROBOT, effects={'joint_friction': {'coulomb': friction, 'stiction': friction}})
     estimator = DisturbanceEstimator(robot, p.disturbance, p.model.command_delay,
-                                     FunctionCall(model.integrator(ROBOT)))
+                                     model.integrator(ROBOT))
     rest, sent = np.zeros(4), None      # targets within the band do not move the joints
     for k in range(500):
         estimator.observe(State(k * PERIOD, np.zeros(3), np.zeros(3), np.array([0.0, 0, 0, 1]),

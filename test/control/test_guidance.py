@@ -1,4 +1,4 @@
-"""Guidance: trimmed steady errors, raised targets in large turns, layers that are off."""
+"""Guidance: joints at their stops, detours around them, trimmed steady errors, layers off."""
 
 from dataclasses import replace
 
@@ -7,27 +7,27 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from beetle_omni_ros.control.base import Command, PoseTarget, State
+from beetle_omni_ros.control.base import PoseTarget, State
 from beetle_omni_ros.control.guidance import (
-    Charge,
-    CLIMB,
+    ATTEMPTS,
+    DURATION,
     Guidance,
-    LARGE,
+    HEIGHT,
+    MISSED_ANGLE,
+    NEAR,
+    PATIENCE,
     Trimming,
-    TURN_DISTANCE,
-    TURN_HEIGHT,
-    Turning,
 )
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 
-ROBOT = RobotParameters.load()
-TARGET = PoseTarget(np.array([0.4, -0.3, 1.5]), rotations.from_rpy(0.8, -0.5, 2.0), stamp=3.0)
+AXES = RobotParameters.load().tilt_axes
+GOAL = PoseTarget(np.array([0.4, -0.3, 1.5]), rotations.from_rpy(0.8, -0.5, 2.0), stamp=3.0)
 SMALL = st.tuples(*[st.floats(-0.03, 0.03)] * 3).map(np.array)
 
 
-def state(stamp, way=(0, 0, 0), turn=(0, 0, 0), target=TARGET, **changed):
+def state(stamp, way=(0, 0, 0), turn=(0, 0, 0), target=GOAL, **changed):
     """State of a robot with an offset from a target, a vector in world and a rotation."""
     values = {'position': target.position - np.array(way), 'velocity': np.zeros(3),
               'quaternion': rotations.multiply(target.quaternion, rotations.conjugate(
@@ -36,7 +36,7 @@ def state(stamp, way=(0, 0, 0), turn=(0, 0, 0), target=TARGET, **changed):
     return State(stamp, **values, tilt=np.zeros(4), tilt_velocity=np.zeros(4), tilt_stamp=stamp)
 
 
-def wait(trimming, seconds, begin=0.0, target=TARGET, **where):
+def wait(trimming, seconds, begin=0.0, target=GOAL, **where):
     for k in range(round(100 * seconds) + 1):
         shown = trimming.target(state(begin + 0.01 * k, target=target, **where), target)
     return shown
@@ -49,114 +49,164 @@ def test_a_constant_tracking_error_is_trimmed_to_zero(way, turn):
     trimming = Trimming()
     position, lag = np.zeros(3), np.zeros(3)
     for k in range(700):
-        shown = trimming.target(state(0.01 * k, way - position, turn - lag), TARGET)
+        shown = trimming.target(state(0.01 * k, way - position, turn - lag), GOAL)
         asked = rotations.log(rotations.multiply(
-            rotations.conjugate(TARGET.quaternion), shown.quaternion))
-        position += 0.01 / 0.3 * (shown.position - TARGET.position - position)
+            rotations.conjugate(GOAL.quaternion), shown.quaternion))
+        position += 0.01 / 0.3 * (shown.position - GOAL.position - position)
         lag += 0.01 / 0.3 * (asked - lag)
     assert np.linalg.norm(way - position) < 0.03 * max(np.linalg.norm(way), 1e-3)
     assert np.linalg.norm(turn - lag) < 0.03 * max(np.linalg.norm(turn), 1e-3)
-    assert shown.stamp == TARGET.stamp
+    assert shown.stamp == GOAL.stamp
 
 
 @pytest.mark.parametrize('where', [
     {'way': (0.2, 0, 0)}, {'turn': (0, 0.5, 0)},
-    {'way': (0.01, 0, 0), 'velocity': np.array([0, 0.3, 0])}, {'position': np.full(3, np.nan)}])
-def test_the_trim_does_not_change_in_motion_or_for_nan_states(where):
+    {'way': (0.01, 0, 0), 'velocity': np.array([0, 0.3, 0])}])
+def test_the_trim_does_not_change_in_motion(where):
     trimming = Trimming()
     shown = wait(trimming, 2.0, **where)
-    assert shown.position == pytest.approx(TARGET.position)
-    assert shown.quaternion == pytest.approx(TARGET.quaternion)
+    assert shown.position == pytest.approx(GOAL.position)
+    assert shown.quaternion == pytest.approx(GOAL.quaternion)
 
 
 def test_the_trim_is_kept_for_equal_and_nearby_targets_only():
     trimming = Trimming()
     wait(trimming, 3.0, way=(0.02, 0, 0))
     found = list(trimming.position)
-    again = PoseTarget(TARGET.position.copy(), TARGET.quaternion.copy(), stamp=9.0)
-    near = replace(TARGET, position=TARGET.position + [0, 0.05, 0])
+    again = PoseTarget(GOAL.position.copy(), GOAL.quaternion.copy(), stamp=9.0)
+    near = replace(GOAL, position=GOAL.position + [0, 0.05, 0])
     for target in (again, near):
         shown = trimming.target(state(9.0, target=target), target)
         assert shown.position - target.position == pytest.approx(found)
-    far = replace(TARGET, position=TARGET.position + [0, 0.5, 0])
+    far = replace(GOAL, position=GOAL.position + [0, 0.5, 0])
     assert trimming.target(state(9.0, target=far), far).position == pytest.approx(far.position)
 
 
-LEVEL = rotations.from_rpy(0.0, 0.0, 0.0)
-FAR, NEAR = rotations.from_rpy(2.0, 0.0, 0.0), rotations.from_rpy(0.3, 0.0, 0.0)
+TARGET = PoseTarget(np.array([0.0, 0.0, 1.0]), rotations.from_rpy(1.2, 0.4, -2.0))
+OFF = rotations.multiply(TARGET.quaternion, rotations.exp(np.array([0.0, 0.4, 0.0])))
+WOUND = np.array([1.5, 3.8, -1.5, -3.7])
 
 
-def turned(quaternion, height=1.0, sinking=0.0, place=(0.0, 0.0)):
-    return State(0.0, np.array([*place, height]), np.array([0.0, 0.0, -sinking]),
-                 np.asarray(quaternion, float), np.zeros(3), np.zeros(4), np.zeros(4),
-                 tilt_stamp=0.0)
+def unwinding():
+    return Guidance(AXES, 'routing, trimming')
 
 
-def pose(height=1.5, quaternion=LEVEL, place=(0.3, -0.4)):
-    return PoseTarget(np.array([*place, height]), quaternion)
+def stuck(stamp, **changed):
+    values = {'position': TARGET.position, 'velocity': np.zeros(3), 'quaternion': OFF,
+              'angular_velocity': np.zeros(3), 'tilt': WOUND, 'tilt_velocity': np.zeros(4),
+              **changed}
+    return State(stamp, **values, tilt_stamp=stamp)
 
 
-@given(st.floats(0.2, 2.5), st.floats(0.0, 3.1), st.floats(-3, 3))
-def test_only_low_targets_with_a_large_rotation_are_raised(height, angle, yaw):
-    target = pose(height, rotations.from_rpy(0.0, 0.0, yaw))
-    away = rotations.multiply(target.quaternion, rotations.exp(np.array([angle, 0.0, 0.0])))
-    shown = Turning().target(turned(away), target)
-    if height >= TURN_HEIGHT or angle < LARGE - 1e-6:
-        assert shown is target
-    elif angle > LARGE + 1e-6:
-        assert shown.position == pytest.approx([0.3, -0.4, TURN_HEIGHT])
-        assert shown.quaternion is target.quaternion and target.position[2] == height
+def fly(guidance, seconds, begin=0.0, target=TARGET, **changed):
+    """Targets of the guidance over a time, every 10 ms."""
+    return [guidance.target(stuck(begin + 0.01 * k, **changed), target)
+            for k in range(round(seconds * 100))]
 
 
-@given(st.floats(-5, 5), st.floats(-5, 5), st.floats(1.0, 4.0), st.floats(0.0, 3.1))
-def test_the_distance_of_an_inverted_target_is_limited_during_a_large_rotation(x, y, z, angle):
-    target, now = pose(z, place=(x, y)), turned(rotations.from_rpy(angle, 0.0, 0.0), 1.0)
-    shown, way = Turning().target(now, target), target.position - now.position
-    if angle < np.pi / 2 - 1e-6 or np.linalg.norm(way) <= TURN_DISTANCE:
-        assert shown is target
-    elif angle > np.pi / 2 + 1e-6:
-        step = shown.position - now.position
-        assert np.linalg.norm(step) == pytest.approx(TURN_DISTANCE)
-        assert np.cross(step, way) == pytest.approx(np.zeros(3), abs=1e-9) and step @ way > 0
+def test_a_robot_stuck_at_a_joint_stop_gets_a_level_target_above_its_place_after_the_timeout():
+    guidance = unwinding()
+    shown = fly(guidance, 1.0)
+    first = next(k for k, t in enumerate(shown) if t is not TARGET)
+    assert 0.01 * first == pytest.approx(PATIENCE, abs=0.011)
+    assert all(t.quaternion is shown[-1].quaternion for t in shown[first:])
+    assert shown[-1].position == pytest.approx([0.0, 0.0, HEIGHT])
+    assert rotations.matrix(shown[-1].quaternion)[2, 2] == pytest.approx(1.0)
+    assert guidance.diagnostics()['unwound'] == 1
 
 
-@pytest.mark.parametrize('attitude, height, sinking, begin, caught', [
-    (FAR, 1.25, 0.0, 1.3, False),        # above its start, less the depth
-    (FAR, 1.15, 0.0, 1.3, True),
-    (FAR, 1.3, 0.5, 1.3, True),          # it will be
-    (FAR, 1.3, 0.3, 1.3, False),
-    (FAR, 1.3, 0.5, 1.1, False),         # it began lower
-    (FAR, 1.45, 0.1, 2.0, False),        # the target is lower than where it began
-    (FAR, 1.35, 0.5, 2.0, True),
-    (NEAR, 1.15, 0.5, 1.3, False),       # a small rotation
-], ids=str)
-def test_a_predicted_descent_below_start_and_target_raises_the_target(attitude, height, sinking,
-                                                                      begin, caught):
-    turning, target = Turning(), pose(1.5)
-    turning.target(turned(attitude, begin), target)
-    shown = turning.target(turned(attitude, height, sinking), target)
-    assert shown.position[:2] == pytest.approx([0.3, -0.4])
-    assert shown.position[2] == pytest.approx(1.5 + CLIMB if caught else 1.5)
+@pytest.mark.parametrize('low, high, goes_through_level', [
+    (0.8, 1.4, True), (0.3, 0.95, False), (0.4, 1.4, False)])
+def test_oscillation_about_the_limit_counts_as_missed_and_arrival_does_not(low, high,
+                                                                          goes_through_level):
+    guidance = unwinding()
+    shown = []
+    for k in range(300):
+        part = low + (high - low) * (0.5 + 0.5 * np.sin(2 * np.pi * 0.01 * k))
+        attitude = rotations.multiply(TARGET.quaternion, rotations.exp(
+            np.array([0, part * MISSED_ANGLE, 0])))
+        shown.append(guidance.target(stuck(0.01 * k, quaternion=attitude), TARGET))
+    assert any(t is not TARGET for t in shown) == goes_through_level
 
 
-def test_only_its_latest_commands_put_a_controller_in_charge():
-    charge, at = Charge(), state(0.0)
-    own = Command(0.0, np.full(4, 0.1), np.full(4, 7.0))
-    charge.gave([0.1] * 4 + [7.0] * 4)
-    assert charge.holds(replace(at, command=own)) and not charge.holds(at)
-    assert not charge.holds(replace(at, command=replace(own, thrust=np.full(4, 7.1))))
-    for k in range(10):
-        charge.gave([0.2] * 4 + [float(k)] * 4)
-    assert not charge.holds(replace(at, command=own))
+def test_the_target_returns_once_the_joints_are_unwound():
+    guidance = unwinding()
+    level = fly(guidance, 1.0)[-1]
+    assert fly(guidance, 0.1, 1.0, quaternion=level.quaternion)[-1].quaternion \
+        is level.quaternion     # still wound
+    assert fly(guidance, 0.1, 1.1, quaternion=level.quaternion,
+               tilt=np.full(4, 0.5))[-1] is TARGET
+
+
+UPSIDE_DOWN = PoseTarget(np.array([0.0, 0.0, 1.5]), rotations.from_rpy(2.98, 0.02, 1.6))
+
+
+def missed(target, seconds=1.0):
+    """An unwinding at the start of its route through level, the attitude, and its target."""
+    guidance = unwinding()
+    off = rotations.multiply(target.quaternion, rotations.exp(np.array([0.0, 0.3, 0.0])))
+    return guidance, fly(guidance, seconds, target=target, position=target.position,
+                          quaternion=off)[-1]
+
+
+def test_a_long_return_rotation_passes_an_attitude_halfway():
+    guidance, level = missed(UPSIDE_DOWN)
+    there = {'target': UPSIDE_DOWN, 'position': UPSIDE_DOWN.position, 'tilt': np.full(4, 0.5)}
+    half = fly(guidance, 0.1, 1.0, quaternion=level.quaternion, **there)[-1]
+    turns = [rotations.geodesic_angle(a.quaternion, b.quaternion)
+             for a, b in ((level, half), (half, UPSIDE_DOWN), (level, UPSIDE_DOWN))]
+    assert turns[0] == pytest.approx(turns[1]) == pytest.approx(turns[2] / 2)
+    shown = fly(guidance, 0.1, 1.1, quaternion=level.quaternion, **there)[-1]
+    assert shown.quaternion is half.quaternion
+    near = rotations.multiply(half.quaternion, rotations.exp(np.array([0.0, 0.0, 0.4])))
+    assert fly(guidance, 0.1, 1.2, quaternion=near, **there)[-1] is UPSIDE_DOWN
+
+
+def test_the_number_of_attempts_is_limited_and_the_target_returns():
+    guidance = unwinding()
+    shown = fly(guidance, 30.0)
+    away = sum(t is not TARGET for t in shown) * 0.01
+    assert guidance.diagnostics()['unwound'] == ATTEMPTS
+    assert away == pytest.approx(ATTEMPTS * DURATION, abs=0.1)
+    assert shown[-1] is TARGET
+
+
+PLACE = np.array([0.5, -0.5, 1.5])
+# Inverted with two joints wound by half a turn; the target would wind them further.
+START, TILT = rotations.from_rpy(np.pi - 0.2, 0.3, 0.0), np.array([-3.0, -2.9, 3.0, 2.9])
+END = rotations.from_rpy(0.7, 0.1, 0.3)     # its direct rotation winds joints up to 5.8 rad
+
+
+def inverted(attitude, **changed):
+    return PoseTarget(**{'position': PLACE, 'quaternion': attitude, **changed})
+
+
+def wound_state(stamp=0.0, quaternion=START):
+    return State(stamp, PLACE, np.zeros(3), quaternion, np.zeros(3), TILT, np.zeros(4), stamp)
+
+
+def test_a_route_is_searched_once_for_each_attitude_and_again_after_reset():
+    routing, given = Guidance(AXES, 'unwinding, trimming'), inverted(END)
+    between = routing.target(wound_state(), given).quaternion
+    for off, passed in ((NEAR + 0.05, False), (NEAR - 0.05, True)):
+        near = rotations.multiply(between, rotations.exp(np.array([0.0, off, 0.0])))
+        assert (routing.target(wound_state(0.1, near), given) is given) == passed
+    little = rotations.multiply(END, rotations.exp(np.array([0.1, 0.0, 0.0])))
+    for same in (inverted(END), inverted(END, position=PLACE + 1), inverted(little)):
+        assert routing.target(wound_state(5.0), same) is same
+    assert routing.target(wound_state(6.0), inverted(START)).quaternion is START    # no turn
+    assert routing.target(wound_state(7.0), inverted(END)).quaternion is not END
+    assert routing.diagnostics()['routed'] == 2
+    routing.reset()
+    assert routing.diagnostics()['routed'] == 0
+    assert routing.target(wound_state(8.0), inverted(END)).quaternion is not END
 
 
 def test_layers_that_are_off_do_not_act_and_are_not_in_the_description():
-    assert Guidance(ROBOT.tilt_axes).text == 'unwinding, routing, turning, trimming'
-    assert Guidance(ROBOT.tilt_axes, 'trimming, routing').text == 'unwinding, turning'
-    low = PoseTarget(np.array([0.0, 0.0, 0.5]), rotations.exp(np.array([1.5, 0.0, 0.0])))
-    bare = Guidance(ROBOT.tilt_axes, 'all')
-    assert bare.text == 'none' and bare.target(turned(LEVEL, 0.5), low) is low
-    shown = Guidance(ROBOT.tilt_axes).target(turned(LEVEL, 0.5), low)
-    assert shown.position[2] == TURN_HEIGHT
-    with pytest.raises(ParameterError, match=r"'without'.*trimming or all, found 'trim'"):
-        Guidance(ROBOT.tilt_axes, 'trim')
+    assert Guidance(AXES).text == 'unwinding, routing, trimming'
+    assert Guidance(AXES, 'trimming, routing').text == 'unwinding'
+    bare = Guidance(AXES, 'all')
+    assert bare.text == 'none' and fly(bare, 2.0)[-1] is TARGET
+    assert bare.target(wound_state(), inverted(END)).quaternion is END
+    with pytest.raises(ParameterError, match=r"'without'.*trimming or all, found 'turning'"):
+        Guidance(AXES, 'turning')

@@ -1,14 +1,19 @@
 """The interface of a controller, and its host: target in force, stopped motors, exceptions."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from beetle_omni_ros.control.base import Command, PoseTarget, State, TrajectoryTarget
-from beetle_omni_ros.control.host import checked, ControllerHost
+from beetle_omni_ros.control.base import (
+    Command,
+    ControllerHost,
+    PoseTarget,
+    State,
+    TrajectoryTarget,
+)
 from beetle_omni_ros.robot.allocation import ActuatorHealth
-from beetle_omni_ros.robot.schema import ParameterError
 
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 
@@ -90,6 +95,16 @@ def test_a_target_beyond_the_reach_is_dropped_at_the_takeover_only():
     assert host.on_mode('flying:own', 0.0) == '' and flown(host, 10.0) == 17.0
 
 
+@pytest.mark.parametrize('part', ['velocity', 'tilt'])
+def test_a_state_that_is_not_finite_does_not_reach_the_controller(part):
+    host, good = ControllerHost('own', Own()), state()
+    host.on_estimate(good)
+    bad = getattr(good, part).copy()
+    bad[1] = np.nan
+    assert host.step(replace(good, **{part: bad})) is None and not host.controller.states
+    assert host.step(good) is not None and host.errors == 0
+
+
 @pytest.mark.parametrize('method', ['step', 'reset', 'set_health'])
 def test_an_exception_of_any_method_is_counted_and_reported(method):
     reported = []
@@ -110,11 +125,13 @@ def test_an_exception_of_any_method_is_counted_and_reported(method):
         f"controller 'own': {method} raised ValueError: bad (test_host.py:")
 
 
-def test_the_return_value_of_step_is_checked():
-    good = Command(0.0, np.zeros(4), np.ones(4))
-    assert checked(good) is good
-    for wrong, message in ((None, 'returned NoneType'), ((0, 1), 'returned tuple'),
-                           (Command(0.0, [0] * 4, np.ones(4)), 'tilt is no array'),
-                           (Command(0.0, np.zeros(4), np.ones(3)), r'thrust is of shape \(3,\)')):
-        with pytest.raises(ParameterError, match=message):
-            checked(wrong)
+@pytest.mark.parametrize('wrong, message', [
+    (None, 'returned NoneType'), ((0, 1), 'returned tuple'),
+    (Command(0.0, [0] * 4, np.ones(4)), 'tilt is no array'),
+    (Command(0.0, np.zeros(4), np.ones(3)), 'thrust is of shape (3,)')], ids=str)
+def test_a_return_value_of_step_that_is_no_command_is_an_error(wrong, message):
+    host = ControllerHost('own', Own())
+    host.controller.step = lambda state, target: wrong
+    host.on_estimate(state())
+    assert host.step(state()) is None and host.errors == 1
+    assert host.error.startswith("controller 'own': step returned ") and message in host.error

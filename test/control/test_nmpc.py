@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
-from beetle_omni_ros.control.nmpc import NmpcController
-from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
+from beetle_omni_ros.control.nmpc import NmpcController, NmpcParameters
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
@@ -59,8 +58,8 @@ def test_servo_offsets_and_torque_are_estimated(controller):
     disturbance = np.r_[np.zeros(3), [0.1, -0.05, 0.03], [0.02, -0.01, 0.015, 0.0]]
     body = Body(disturbance=disturbance).fly(controller, target, 6.0)
     assert body.errors(target)[-1] == pytest.approx((0, 0), abs=9e-4)
-    assert np.allclose(controller.disturbance[6:], disturbance[6:], atol=2e-3)
-    assert np.allclose(controller.disturbance[3:6], disturbance[3:6], atol=1e-2)
+    assert np.allclose(controller._estimator.disturbance[6:], disturbance[6:], atol=2e-3)
+    assert np.allclose(controller._estimator.disturbance[3:6], disturbance[3:6], atol=1e-2)
 
 
 def test_a_moving_reference_is_tracked_with_preview(controller):
@@ -81,36 +80,6 @@ def test_without_a_compiler_the_cause_is_named(monkeypatch):
         NmpcController(ROBOT)
 
 
-def test_a_nan_state_repeats_the_plan_and_does_not_poison_the_next_cycles(controller):
-    body = Body().fly(controller, PoseTarget(np.array([0.0, 0.0, 1.0]), LEVEL), 0.2)
-    bad = replace(body.state(), position=np.full(3, np.nan), command=None)
-    repeated = controller.step(bad, PoseTarget(np.array([0.0, 0.0, 1.0]), LEVEL))
-    assert np.allclose(repeated.thrust, body.command.thrust, atol=0.2)
-    assert controller.diagnostics()['rejected_states'] == 1
-    body.time += 0.01
-    moved = PoseTarget(np.array([0.5, 0.0, 1.0]), rotations.from_rpy(0.5, 0, 0))
-    assert body.fly(controller, moved, 5.0).errors(moved)[-1] == pytest.approx((0, 0), abs=4e-4)
-
-
-@pytest.mark.parametrize('robot, field, expected', [
-    ({'joints': {'kd': 0.02}}, 'servo_lag', 0.02 / ROBOT.joints.kp),
-    ({'joints': {'kd': 0.0}}, 'servo_lag', np.sqrt(ROBOT.joints.inertia / ROBOT.joints.kp)),
-    ({'joints': {'velocity_limit': 5.0}}, 'tilt_rate', 3.5),
-    ({'rotors': {'thrust_max': 15.0}}, 'thrust_max', 15.0)])
-def test_actuators_of_the_problem_are_those_of_the_robot(robot, field, expected):
-    (part, change), = robot.items()
-    changed = replace(ROBOT, **{part: replace(getattr(ROBOT, part), **change)})
-    p = NmpcParameters.load()
-    assert getattr(p.actuators(changed), field) == pytest.approx(expected)
-
-
-def test_the_published_settings_are_unchanged():
-    p = NmpcParameters.load(share_path('params/nmpc_published.yaml'))
-    assert not p.model.rotor_lag
-    assert p.horizon.intervals.tolist() == [0.1] * 20
-    assert p.limits.velocity == 1.0
-    assert p.actuators(ROBOT) == (0.048, 3.15, 10.0, 30.0)
-    assert (p.weights.position_xy, p.weights.position_z, p.weights.tilt) == (300, 400, 2)
-    assert (p.weights.tilt_change, p.weights.thrust_command) == (250, 2)
-    assert not p.limits.soft
-    assert p.unwind > 2 * np.pi
+def test_a_file_overrides_the_actuators_of_the_robot():
+    published = NmpcParameters.load(share_path('params/nmpc_published.yaml'))
+    assert published.actuators(ROBOT) == (0.048, 3.15, 7.0, 30.0)

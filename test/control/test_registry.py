@@ -138,7 +138,7 @@ def test_parameters_options_and_attributes_of_a_class_are_used(module, tmp_path)
     ('{}_absent:My', "no module '.*_absent'"), ('{}.py', 'expected FILE.py:Class')])
 def test_an_unusable_class_is_refused_in_one_line(module, spec, message):
     with pytest.raises(ParameterError, match=message) as caught:
-        registry.make(spec.format(module), ROBOT)
+        registry.find(spec.format(module)).make(ROBOT)
     assert '\n' not in str(caught.value)
 
 

@@ -11,6 +11,7 @@ from rich.console import Console
 
 from beetle_omni_ros import cli
 from beetle_omni_ros.evaluation import command, loop
+from beetle_omni_ros.evaluation.campaign import own_files
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.bag import read_bag
@@ -157,6 +158,12 @@ def test_faults_of_a_file_act_and_are_listed_in_the_results(tmp_path):
     assert 'fallback:controller_silent' in log.states
     assert log.meta['broken'] == results['hover']['crashed']
     assert not log.meta['broken'] or log.meta['impact']['speed'] > 1.0
+
+
+def test_flights_of_an_own_controller_are_kept_with_its_code(tmp_path):
+    own = tmp_path / 'own.py'
+    own.write_text(OPEN_LOOP)
+    assert own_files(f'{own}:Own') == (own,) and own_files('nmpc') == ()
 
 
 def test_a_task_beyond_the_declared_reach_of_a_controller_is_refused(tmp_path):

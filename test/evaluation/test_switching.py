@@ -35,7 +35,7 @@ class Switching(LogRecorder):
 def test_twenty_switches_at_random_times_of_random_poses():
     times = np.sort(np.random.default_rng(1).uniform(4.0, 3.8 + 8 * POSES, SWITCHES))
     recorder, task = Switching(times), make_task(f'random{POSES}', 1)
-    controllers = {name: registry.make(name, ROBOT) for name in ('nmpc', 'rl')}
+    controllers = {name: registry.find(name).make(ROBOT) for name in ('nmpc', 'rl')}
     flight = FlightLoop(ROBOT, ROBOT, controllers, recorder)
     recorder.supervisor = flight.supervisor
     assert flight.fly(task) and len(recorder.switched) == SWITCHES

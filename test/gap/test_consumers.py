@@ -7,9 +7,9 @@ from flights import KEYS, model, Motion
 import numpy as np
 import pytest
 
-from beetle_omni_ros.control.base import Command, State
-from beetle_omni_ros.control.disturbance import DisturbanceEstimator, redated
-from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
+from beetle_omni_ros.control.base import Command
+from beetle_omni_ros.control.disturbance import DisturbanceEstimator
+from beetle_omni_ros.control.nmpc import NmpcParameters
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf, ImuReading, PoseReading
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.robot import dynamics, effects
@@ -61,12 +61,10 @@ def nmpc(robot):
     derivative = dynamics.full_model(robot)
     settings = NmpcParameters.load()
     estimator = DisturbanceEstimator(robot, settings.disturbance, settings.model.command_delay,
-                                     None)
-    state = State(0.0, np.zeros(3), np.zeros(3), np.array([0, 0, 0, 1.0]), np.zeros(3),
-                  np.zeros(4), np.ones(4), 0.0)
+                                     dynamics.integrator(ROBOT))
     allocator = Allocator(robot)
     return [np.array([derivative(a, b, np.zeros(10)) for a, b in zip(x, u)]).ravel(),
-            [estimator.delay, *settings.actuators(robot)], [redated(state, robot).tilt_stamp],
+            [estimator.delay, estimator.encoder_delay, *settings.actuators(robot)],
             allocator.matrix.ravel(), np.array(allocator.weight).ravel()]
 
 

@@ -28,7 +28,8 @@ def plan_of(controller, **options):
 
 
 def test_the_node_publishes_the_commands_of_the_policy(make, tmp_path):
-    policy = write(tmp_path / 'policy.onnx', hidden=(32, 16), seed=5)
+    weights = 0.05 * np.random.default_rng(5).normal(size=(33, 8))
+    policy = write(tmp_path / 'policy.onnx', weights=weights)
     node, sent = make(RlNode, f'policy:={policy}'), []
     node._publisher = SimpleNamespace(publish=sent.append)
     controller = PolicyController(RobotParameters.load(), replace(
@@ -51,7 +52,7 @@ def test_files_reach_their_nodes_and_an_unusable_policy_is_not_on_standby(tmp_pa
     policy = str(write(tmp_path / 'policy.onnx'))
     other = str(share_path('params/robot_weak_and_heavy.yaml'))
     nmpc = tmp_path / 'nmpc.yaml'
-    nmpc.write_text('limits: {tilt_rate_share: 0.5}\n')
+    nmpc.write_text('limits: {velocity: 2.0}\n')
     nodes, _ = plan_of('nmpc', policy=policy, nmpc=str(nmpc))
     assert list(nodes) == ['nmpc_node', 'rl_node']
     assert nodes['nmpc_node'] == {'nmpc_file': str(nmpc)}
