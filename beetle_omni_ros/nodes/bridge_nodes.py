@@ -17,7 +17,7 @@ from beetle_omni_ros.drivers.servo_bus import ServoBus
 from beetle_omni_ros.drivers.servo_link import ServoBusError
 from beetle_omni_ros.drivers.servo_loop import ServoLoop
 from beetle_omni_ros.nodes.graph import AUTOSTART
-from beetle_omni_ros.nodes.node import CommandSource, Distribution, ERROR, FlightNode, OK, WARN
+from beetle_omni_ros.nodes.node import Distribution, ERROR, FlightNode, OK, WARN
 from beetle_omni_ros.nodes.parameters import file_parameter
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters
 from beetle_omni_ros.robot.readings import JointReading, RotorReading
@@ -29,6 +29,7 @@ COMMAND_AGE = 0.1       # [s] older commands are not written to the servos
 LOST_AFTER = 0.3        # [s] after which a servo without response or torque is lost
 CHECK_PERIOD = 0.05     # [s] between checks of the bus thread's events
 RPM = math.pi / 30      # [rad/s]
+LATENCY = 'stamp of the answered IMU sample to the last byte of its command'
 POLL_CYCLES = 2         # the board sends its rotors' speeds 100 times a second
 
 
@@ -41,8 +42,6 @@ class BridgeNode(LifecycleNodeMixin, FlightNode):
     after each transition. ServoBusError and SerialPortError refuse a transition. Their text goes
     to the log and to ``refusal``, and the state stays as it was.
     """
-
-    real_time = True
 
     def __init__(self, *args, **kwargs):
         FlightNode.__init__(self, *args, **kwargs)
@@ -160,17 +159,15 @@ class JointBridgeNode(BridgeNode):
         self._travel = RobotParameters.load(self.parameters.robot_file or None).joints
         self._bus = self._loop = None
         self._lost_reason = ''
-        self._latency, self._since = Distribution(), 'publication'
+        self._latency = Distribution()
         self._state = self.publisher('joint_bridge/state')
         self._published = ''
         self._joints = self.publisher('joint_states')
-        self.listen('command', self._on_command, read=CommandSource(self).read,
-                    max_age=COMMAND_AGE, stale_after=None, published=True)
+        self.listen('command', self._on_command, max_age=COMMAND_AGE, stale_after=None)
         # loop, its cycles and missed cycles, and the time of the last bus status
         self._counted = (None, 0, 0, time.monotonic())
         self.health.report('bus', self._bus_status)
-        self.health.report('latency', lambda: self._latency.status(
-            f'{self._since} of command to its last byte written'))
+        self.health.report('latency', lambda: self._latency.status(LATENCY))
         for k, name in enumerate(JOINT_NAMES):
             self.health.report(name, partial(self._servo_status, k))
             self.create_service(Trigger, f'~/reboot_{name}', partial(self._on_reboot, [k]))
@@ -178,10 +175,6 @@ class JointBridgeNode(BridgeNode):
         self.create_timer(CHECK_PERIOD, self.changed, clock=self.steady_clock)
         self.start_by_itself()
         self.changed()
-
-    def waits_for(self):
-        """Return the state of the servos."""
-        return self._published.replace('waiting:', 'its servos:')
 
     def configure(self):
         """Open the port, check and write the servos' settings, and start to read angles."""
@@ -248,15 +241,13 @@ class JointBridgeNode(BridgeNode):
         response.message = f"restarting {', '.join(JOINT_NAMES[k] for k in which)}"
         return response
 
-    def _on_command(self, command, published):
+    def _on_command(self, command):
         if self._loop is not None:
-            if math.isnan(published):
-                self._since, published = 'arrival', time.time()
             left = COMMAND_AGE - max(0.0, self.now() - command.stamp)
-            self._loop.offer(command.tilt, published, time.monotonic() + left)
+            self._loop.offer(command.tilt, command.stamp, time.monotonic() + left)
 
-    def _on_written(self, published):
-        self._latency.add(time.time() - published)
+    def _on_written(self, stamp):
+        self._latency.add(self.now() - stamp)
 
     def _publish(self, readings, good):
         if good.any():
@@ -368,29 +359,22 @@ class RotorBridgeNode(BridgeNode):
         self._last_target = None
         self._cycles = self._missed = self._missed_reported = 0
         self._unsent = Counter()
-        self._latency, self._since, self._age = Distribution(), 'no command yet', Distribution()
+        self._latency = Distribution()
         self._normalised = np.zeros(4)
         self._saturated, self._saturated_reported = np.zeros((2, 4), dtype=int)
         self._states = self.publisher('rotor_bridge/state')
         self._batteries = self.publisher('battery_state')
         self._rotors = self.publisher('rotor_states')
         self.health.report('board', self._board_status)
-        self.health.report('latency', lambda: self._latency.status(
-            f'from {self._since} to the last byte written', **self._age.milliseconds('age_')))
+        self.health.report('latency', lambda: self._latency.status(LATENCY))
         for k in range(4):
             self.health.report(f'rotor{k + 1}', partial(self._rotor_status, k))
-        self.listen('command', self._on_command, read=CommandSource(self).read,
-                    max_age=given.stamp_age_limit, stale_after=None, published=True)
+        self.listen('command', self._on_command, max_age=given.stamp_age_limit, stale_after=None)
         self.follow('supervisor/state', self._on_supervisor)
         self._timer = self.create_timer(self._period, self._on_timer, clock=self.steady_clock)
         self.start_by_itself()
         if given.autostart != 'none':
             self.try_to_start()     # at once; nothing is refused here
-
-    def waits_for(self):
-        """Return the state of the motor board."""
-        self.changed()
-        return self._state.replace('waiting:', 'the motor board:')
 
     def configure(self):
         """Open the port, now or as soon as it exists; then battery and rotors are published."""
@@ -417,19 +401,11 @@ class RotorBridgeNode(BridgeNode):
         self._states.publish(self._arming.text)
         self._board.close()
 
-    def _on_command(self, command, published):
+    def _on_command(self, command):
         self._command = command
-        if not self._send():
-            return
-        self._timer.reset()     # sends this command again after a period without a newer one
-        age = self.now() - command.stamp
-        self._age.add(age)
-        if math.isnan(published):
-            self._since = 'the stamp of the command'
-            self._latency.add(age)
-        else:
-            self._since = 'the publication of the command'
-            self._latency.add(time.time() - published)
+        if self._send():
+            self._timer.reset()     # sends this command again after a period without a newer one
+            self._latency.add(self.now() - command.stamp)
 
     def _on_supervisor(self, state):
         self._arming.follow(state)

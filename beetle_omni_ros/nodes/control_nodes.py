@@ -17,8 +17,10 @@ from beetle_omni_ros.control.registry import ControllerEntry
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.estimation.state import pose_covariance, twist_covariance
-from beetle_omni_ros.messages.values import HealthReport, MessageError, Odom, TargetOverride
-from beetle_omni_ros.nodes.node import CommandSource, ERROR, FlightNode, IDENTITY, OK, WARN
+from beetle_omni_ros.messages.topics import TARGETS
+from beetle_omni_ros.messages.values import MessageError, Odom
+from beetle_omni_ros.nodes.graph import GENERIC, NODES
+from beetle_omni_ros.nodes.node import ERROR, FlightNode, IDENTITY, OK, WARN
 from beetle_omni_ros.nodes.parameters import file_parameter
 from beetle_omni_ros.robot.allocation import ALL_HEALTHY
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -35,7 +37,6 @@ OTHER_CLOCK = 3600.0
 STEP_TOLERANCE = 0.0025     # s, half of the smallest interval between estimates
 REPEAT = 1.0            # s between two log lines about a controller
 WATCH_PERIOD = 0.01     # s between checks for silent inputs
-NAME = 'controller_node'    # of the executable, before its controller is known
 
 
 # --- estimator ----------------------------------------------------------------------------------
@@ -50,8 +51,6 @@ class EkfNodeParameters(EkfParameters):
 
 class EkfNode(FlightNode):
     """Publishes odom for every IMU sample, corrected by MoCap poses at their capture time."""
-
-    real_time = True
 
     def __init__(self):
         super().__init__('ekf_node', EkfNodeParameters, 'params/ekf.yaml', 'ekf_file')
@@ -92,20 +91,14 @@ class ControllerNode(FlightNode):
     An exception of the controller is logged and reported in diagnostics.
     """
 
-    real_time = True
-
-    def __init__(self, controller: ControllerEntry | str = ''):
+    def __init__(self, entry: ControllerEntry | None = None):
         """
-        Build the controller and subscribe its inputs.
+        Build the controller and subscribe its inputs; commands go to '<name>/command'.
 
-        Args:
-            controller: registry entry, name or ``package.module:Class``; '' reads the node's
-                parameter ``controller``. Commands go to '<name>/command'.
-
+        Without ``entry``, the node's parameter ``controller`` names it.
         """
-        entry = controller if isinstance(controller, ControllerEntry) else \
-            registry.find(controller or _requested_controller())
-        is_own = isinstance(controller, str) and controller     # the executable has one controller
+        is_own = entry and f'{entry.name}_node' in NODES    # of an executable of this name
+        entry = entry or registry.find(_requested_controller())
         super().__init__(f'{entry.name}_node', node_parameters(entry, not is_own),
                          entry.parameters_file, entry.file_key, completed=entry.completed)
         self._entry = entry
@@ -120,16 +113,12 @@ class ControllerNode(FlightNode):
         self._publisher = self.publisher(f'{entry.name}/command')
         self.listen('odom', self._on_odom, max_age=ODOM_AGE)
         self.listen('joint_states', self._on_joints, max_age=JOINT_AGE)
-        self.listen('command', partial(setattr, self, '_command'), read=CommandSource(self).read,
-                    stale_after=None)
-        # Publishers that follow INTERFACES latch targets; `ros2 topic pub` does not.
-        for topic in ('target_pose', 'target_trajectory'):
-            self.listen(topic, self._on_target, any_qos=True, stale_after=None,
-                        published=True, check=self._check_target)
+        self.listen('command', partial(setattr, self, '_command'), stale_after=None)
+        for topic in TARGETS:
+            self.listen(topic, self._on_target, stale_after=None)
         self.follow('supervisor/state', self._on_mode)
-        self.listen('supervisor/target', self._on_override, stale_after=None)
-        self.listen('supervisor/actuators', lambda report: self._host.on_health(report.health),
-                    stale_after=None)
+        self.follow('supervisor/target', partial(setattr, self._host, 'override'))
+        self.follow('supervisor/actuators', self._host.on_health)
         self.health.track_compute(controller.period)
         self.health.report('controller', self._controller_status)
 
@@ -150,7 +139,8 @@ class ControllerNode(FlightNode):
         if reason:
             raise MessageError(reason, 'cannot be flown')
 
-    def _on_target(self, target, _=math.nan):
+    def _on_target(self, target, published):
+        self._check_target(target, published)
         now = self.now()
         if target.stamp == 0.0:     # `ros2 topic pub` sets no stamp: valid from now on
             target = replace(target, stamp=now, **(
@@ -162,9 +152,6 @@ class ControllerNode(FlightNode):
         old = self._host.target
         if old is None or not target.stamp < old.stamp <= now:
             self._host.target = target
-
-    def _on_override(self, override):
-        self._host.override = override.target
 
     def _on_mode(self, mode):
         if mode.partition(':')[0] in MOTORS_OFF:
@@ -219,28 +206,9 @@ class ControllerNode(FlightNode):
         return OK, getattr(controller, 'name', self._entry.name), values
 
 
-class NmpcNode(ControllerNode):
-    """Publishes nmpc/command, stamped with the state that it answers."""
-
-    def __init__(self):
-        super().__init__('nmpc')
-
-
-class RlNode(ControllerNode):
-    """Publishes rl/command, stamped with the state that it answers."""
-
-    def __init__(self):
-        super().__init__('rl')
-
-
-@dataclass(frozen=True, kw_only=True)
-class NoParameters:
-    """Parameters of a controller that has none."""
-
-
 def node_parameters(entry: ControllerEntry, selectable: bool) -> type:
     """Make the parameter class of a controller's node: controller, robot and controller file."""
-    base = entry.parameter_class or NoParameters
+    base = entry.parameter_class or make_dataclass('NoParameters', (), frozen=True)
     more = {'robot_file': ('', 'robot file of the controller; empty: the shipped one'),
             entry.file_key: ('', f"controller file; empty: {entry.parameters_file or 'none'}")}
     if selectable:
@@ -254,12 +222,12 @@ def node_parameters(entry: ControllerEntry, selectable: bool) -> type:
 
 def _requested_controller() -> str:
     """Read the parameter ``controller`` by a temporary node, before the real one is made."""
-    probe = Node(NAME, start_parameter_services=False, enable_rosout=False)
+    probe = Node(GENERIC, start_parameter_services=False, enable_rosout=False)
     given, name = probe._parameter_overrides.get('controller'), probe.get_name()
     probe.destroy_node()
     if given is not None:
         return str(given.value)
-    if name != NAME:
+    if name != GENERIC:
         return name.removesuffix('_node')
     raise ParameterError("key 'controller': missing; expected a registered controller "
                          f"({', '.join(registry.names())}) or {registry.CLASS}")
@@ -285,8 +253,6 @@ class SupervisorNode(FlightNode):
     Services ~/arm, ~/disarm, ~/land and ~/emergency_stop; the parameter controller selects the
     active controller, also in flight.
     """
-
-    real_time = True
 
     def __init__(self):
         super().__init__('supervisor_node', SupervisorNodeParameters, 'params/supervisor.yaml',
@@ -318,10 +284,6 @@ class SupervisorNode(FlightNode):
         self.health.report('supervisor', self._supervisor_status)
         self.create_timer(WATCH_PERIOD, self._update, clock=self.flight_clock)
         self._update()
-
-    def waits_for(self):
-        """Return the missing sensors and the arming."""
-        return f'{super().waits_for()}; then for ~/arm'
 
     def _listen(self):
         supervisor = self._supervisor
@@ -391,10 +353,10 @@ class SupervisorNode(FlightNode):
             self._states.publish(state)
         if supervisor.target_override is not self._override:
             self._override = supervisor.target_override
-            self._targets.publish(TargetOverride.of(self._override))
+            self._targets.publish(self._override)
         if supervisor.health is not self._health:
             self._health = supervisor.health
-            self._actuators.publish(HealthReport(self.now(), self._health))
+            self._actuators.publish(self._health)
         for event in supervisor.events:
             self.log_line(event.severity, event.text)
         supervisor.events.clear()

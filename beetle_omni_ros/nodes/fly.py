@@ -9,21 +9,17 @@ import tempfile
 import threading
 import time
 
-import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.estimation.ekf import ErrorStateEkf
-from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.nodes import runner
 from beetle_omni_ros.nodes.graph import (
     BRIDGES,
     child_environment,
     confine,
     Graph,
-    GraphOptions,
     plan,
     reserved_domain,
 )
@@ -38,13 +34,10 @@ from beetle_omni_ros.runs.files import check_writable, write_json
 from beetle_omni_ros.runs.metrics import failed, metrics
 from beetle_omni_ros.runs.tasks import make_task, Task
 from beetle_omni_ros.sim import fault_lists as listed
-from beetle_omni_ros.sim.parameters import SimulatorParameters
-from beetle_omni_ros.sim.simulator import Simulator
 
 INTERRUPTED = 130
 VIEWER_STOP_TIMEOUT = 3.0       # s
-ACTUATORS, CLOCKS = ('emulated', 'direct'), ('auto', 'system', 'simulated')
-
+ACTUATORS, CLOCKS = ('emulated', 'direct'), ('system', 'simulated')
 READY_TIMEOUT = 300.0   # s; the first start compiles the controller
 BRIDGES_TIMEOUT = 20.0  # s; the simulator makes their devices at its start
 ARM_TIMEOUT = 10.0      # s
@@ -56,10 +49,6 @@ SPARE_TIME = 10.0       # s beyond the task's duration before a flight counts as
 CHECK_PERIOD = 0.1      # s between checks of processes and progress
 ON_GROUND = ('disarmed', 'emergency_stop')
 
-MAX_LOAD = 0.9          # part of a core that the composed nodes may need in real time
-PROBED = 1.0            # s of simulated time
-# CPU of the seven nodes relative to plant and estimator, on two busy cores of a Xeon.
-RELATIVE_LOAD = 12.8
 # s lost by the simulator above which a failure is attributed to the slow computer: the actuators
 # stop after so long without a command.
 SLOW_TIME = 0.1
@@ -67,16 +56,15 @@ PACING = 'sim_node: pacing'
 # bridge -> (name of its status in diagnostics, prefix of the keys of a flight's measurements)
 MEASURED = {
     'joint_bridge_node': ('bus', 'servos'), 'rotor_bridge_node': ('board', 'motor_board')}
-QUANTILES = ('median_ms', 'p99_ms', 'max_ms')
 
 
 def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             bag: Path | None = None, compression: str = 'none',
             seed: int = 0, conditions: str = 'nominal',
             actuators: str | None = None,
-            clock: str = 'auto', robot: Path | None = None, plant: Path | None = None,
+            clock: str = 'system', robot: Path | None = None, plant: Path | None = None,
             nmpc: Path | None = None, policy: Path | None = None,
-            allow_other_robot: bool = False, standby: bool = True, composed: bool = True,
+            allow_other_robot: bool = False, standby: bool = True,
             faults: Path | None = None, json_path: Path | None = None,
             domain_id: int | None = None, discovery: str | None = None,
             view: bool = False, allow_targets: bool = False,
@@ -106,17 +94,17 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
                 RobotParameters.load(robot)))
             RobotParameters.load(plant or robot)
             injected = listed.load_faults(faults) if faults else []
-            actuators, clock = _actuators_and_clock(injected, actuators, clock, composed, console)
-            planned = plan(GraphOptions(
-                controller=controller, nmpc=_absolute(nmpc), policy=str(policy or ''),
+            actuators = _actuators(injected, actuators, clock)
+            nodes, left_out = plan(
+                controller, nmpc=_absolute(nmpc), policy=str(policy or ''),
                 standby=standby, allow_other_robot=allow_other_robot,
                 robot_file=_absolute(robot and find_robot(robot)),
                 plant_file=_absolute(plant and find_robot(plant)),
                 conditions=conditions, seed=int(seed),
                 task=_absolute(task) if Path(task).is_file() else str(task), bag=str(bag),
                 compression=compression, ports=str(folder), clock=clock,
-                actuators='bridges' if actuators == 'emulated' else 'direct'))
-            for name, reason in planned.left_out.items():
+                actuators='bridges' if actuators == 'emulated' else 'direct')
+            for name, reason in left_out.items():
                 _print(console, f'{name} does not stand by: {reason}')
             controller = registry.find(controller).name
             number = stack.enter_context(reserved_domain()) if domain_id is None else domain_id
@@ -125,11 +113,10 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             meta = {'task': task, 'conditions': conditions, 'seed': seed,
                     'robot': str(robot) if robot else 'params/robot.yaml',
                     'plant': str(plant) if plant else None, 'version': __version__,
-                    'controller': controller, 'composed': composed, 'clock': clock,
-                    'actuators': actuators}
+                    'controller': controller, 'clock': clock, 'actuators': actuators}
             if injected:
                 meta['faults'] = [str(fault) for fault in injected]
-            graph = Graph(planned.nodes, folder, number, composed)
+            graph = Graph(nodes, folder, number)
             try:
                 status = _fly(graph, controller, flown_task, meta, console, listed.text(injected))
             except KeyboardInterrupt:
@@ -147,14 +134,8 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
         return INTERRUPTED
 
 
-def _actuators_and_clock(faults, actuators, clock, composed, console):
-    """
-    Choose what the user left open: devices need real time, real time a fast computer.
-
-    Raises:
-        ParameterError: unknown values, or faults that the simulator cannot make so.
-
-    """
+def _actuators(faults, actuators, clock):
+    """Choose the actuators if the user left them open: devices need real time and no faults."""
     for key, value, known in (('actuators', actuators, (None, *ACTUATORS)),
                               ('clock', clock, CLOCKS)):
         if value not in known:
@@ -168,44 +149,11 @@ def _actuators_and_clock(faults, actuators, clock, composed, console):
                 raise ParameterError(f"--faults: '{fault.kind}' affects a device; expected "
                                      '--actuators direct')
             actuators = 'direct'
-    if clock == 'simulated' and actuators == 'emulated':
-        raise ParameterError("actuators 'emulated': serial devices keep real time; expected "
-                             "direct with clock 'simulated'")
-    if clock == 'auto':
-        clock = 'system'
-        if composed and actuators != 'emulated' and (load := needed_load()) > MAX_LOAD:
-            _print(console, 'this computer is too slow for real time: the nodes would need '
-                   f'{load:.0%} of a core; it flies in simulated time, which waits for the '
-                   'nodes, and without serial devices')
-            clock = 'simulated'
-    return actuators or ('direct' if clock == 'simulated' else 'emulated'), clock
+    return actuators or ('direct' if clock == 'simulated' else 'emulated')
 
 
 def _absolute(path):
     return str(Path(path).absolute()) if path else ''
-
-
-def needed_load() -> float:
-    """
-    Predict the CPU of a composed graph without bridges, as a part of a core.
-
-    Plant and estimator run in this process for a simulated second. The nodes do the same work and
-    move its messages, mostly in Python, too. So their CPU time is a multiple of it on any
-    computer. The median of CPU times ignores other programs.
-    """
-    robot = RobotParameters.load()
-    simulator = Simulator(robot, SimulatorParameters.load())
-    estimator = ErrorStateEkf(EkfParameters.load().of_robot(robot), robot.gravity)
-    used = []
-    for _ in range(round(PROBED / simulator.tick)):
-        begin = time.thread_time()
-        frame = simulator.step()
-        if frame.mocap is not None:
-            estimator.pose(frame.mocap)
-        if frame.imu is not None:
-            estimator.imu(frame.imu)
-        used.append(time.thread_time() - begin)
-    return RELATIVE_LOAD * float(np.median(used)) / simulator.tick
 
 
 @contextmanager
@@ -390,13 +338,13 @@ class Flight:
         return found
 
     def _take_latencies(self):
-        """Add the latencies of the loop, and of each bridge from `command` on."""
-        status, prefix = ('rotor_bridge_node', 'age_') if self._bridges else ('sim_node', '')
-        for name, node, prefix in (('latency', status, prefix), *(
-                (f'{name}_latency', node, '') for node, (_, name) in MEASURED.items())):
-            values = self._operator.values(f'{node}: latency')
-            self.measured.update({f'{name}_{key}': float(values[prefix + key])
-                                  for key in QUANTILES if prefix + key in values})
+        """Add the latencies from the IMU sample to the rotors, and to the servos."""
+        last = 'rotor_bridge_node' if self._bridges else 'sim_node'
+        for name, node in (('latency', last), ('servos_latency', 'joint_bridge_node')):
+            self.measured.update({
+                f'{name}_{key}': float(value)
+                for key, value in self._operator.values(f'{node}: latency').items()
+                if key.endswith('_ms')})
 
     def land(self) -> None:
         """Land if the robot flies, and wait for the motors to stop."""
@@ -457,24 +405,18 @@ def _report(bag, controller, task, meta, json_path, console) -> int:
 def _print_measured(meta, console):
     measured = meta.get('graph', {})
     if 'cpu_percent' in measured:
-        nodes = 'composed (all nodes in one process)' if meta['composed'] else 'separate processes'
-        console.print(f"graph: {nodes}, CPU {measured['cpu_percent']:.0f} % of one core while the "
-                      'task was flown'
-                      + (f", of it {measured['bridges_cpu_percent']:.0f} % in the bridges"
-                         if 'bridges_cpu_percent' in measured else ''))
+        console.print(f"graph: CPU {measured['cpu_percent']:.0f} % of one core while the task was "
+                      'flown' + (f", of it {measured['bridges_cpu_percent']:.0f} % in the bridges"
+                                 if 'bridges_cpu_percent' in measured else ''))
     if 'real_time_factor' in measured:
         console.print(f"simulated time: {measured['real_time_factor']:.2f} of real time")
-    if 'latency_p99_ms' in measured:
-        end = 'its command at the actuators' if meta['actuators'] == 'direct' \
-            else 'the last byte of its command to the motor board'
-        console.print(f"latency, stamp of the IMU sample to {end}: {_times(measured, 'latency')}")
     for name, text in (('servos', 'servo bus'), ('motor_board', 'motor board')):
         if f'{name}_cycles' in measured:
             console.print(f"{text}: {measured[f'{name}_cycles']} cycles of 5 ms, "
-                          f"{measured[f'{name}_missed_cycles']} missed; `command` to its last "
-                          f"byte: {_times(measured, f'{name}_latency')}")
-
-
-def _times(measured, key):
-    return (f"median {measured[f'{key}_median_ms']:.2f} ms, 99th percentile "
-            f"{measured[f'{key}_p99_ms']:.2f} ms, max {measured[f'{key}_max_ms']:.1f} ms")
+                          f"{measured[f'{name}_missed_cycles']} missed")
+    for name, text in (('latency', 'rotors'), ('servos_latency', 'servos')):
+        if f'{name}_p99_ms' in measured:
+            console.print(
+                f'latency, stamp of the IMU sample to its command at the {text}: median '
+                f"{measured[f'{name}_median_ms']:.2f} ms, 99th percentile "
+                f"{measured[f'{name}_p99_ms']:.2f} ms, max {measured[f'{name}_max_ms']:.1f} ms")

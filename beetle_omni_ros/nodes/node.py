@@ -12,22 +12,16 @@ import numpy as np
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
-from beetle_omni_ros.control.base import Command
-from beetle_omni_ros.messages.conversions import take_command
-from beetle_omni_ros.messages.topics import Qos, topic_of
+from beetle_omni_ros.messages.topics import Qos, TARGETS, topic_of
 from beetle_omni_ros.messages.values import Diagnostic, MessageError
 from beetle_omni_ros.nodes import parameters, wire
 from beetle_omni_ros.nodes.graph import claim
 
-OK, WARN, ERROR, STALE = range(4)   # of diagnostic_msgs/DiagnosticStatus
+OK, WARN, ERROR = range(3)   # of diagnostic_msgs/DiagnosticStatus
 PERIOD = 1.0            # s between two diagnostics
 FUTURE = 0.05           # s ahead of the clock above which a stamp is refused
 IDENTITY = 'supervisor/identity'
 TEXT_LIMIT = 40         # characters of a foreign frame_id in an error message
-
-
-class StartError(RuntimeError):
-    """A node cannot start or continue; the text is one line for the operator."""
 
 
 class FlightNode(Node):
@@ -35,13 +29,10 @@ class FlightNode(Node):
     A node with declared parameters, checked inputs and diagnostics.
 
     Attributes:
-        real_time: whether the node is part of the control loop and needs real-time priority.
         steady_clock: clock for timers that are independent of the flight.
         flight_clock: clock for timers of the flight; simulated time if ``use_sim_time`` is set.
 
     """
-
-    real_time = False
 
     def __init__(self, name: str, parameter_class: type, file: str | None = None,
                  file_key: str | None = None, on_change: Callable | None = None,
@@ -54,20 +45,21 @@ class FlightNode(Node):
 
         Raises:
             ParameterError: unusable parameters.
-            StartError: a node of this name runs already.
+            OSError: a node of this name runs already.
 
         """
         super().__init__(name)
         domain, name = self.context.get_domain_id(), self.get_fully_qualified_name()
         self._claim = claim(f'{domain}{name}')
         if self._claim is None:
-            raise StartError(f'{name} runs already (ROS domain {domain}); stop it first')
+            raise OSError(f'{name} runs already (ROS domain {domain}); stop it first')
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
         # Simulated time may stop, so timers of the flight must use it too.
         self.simulated = bool(self.get_parameter(parameters.CLOCK).value)
         self.flight_clock = self.get_clock() if self.simulated else self.steady_clock
         self.parameters = parameters.declare(self, parameter_class, file, file_key,
                                              on_change, changeable, completed)
+        self._supervisor_identity = ''
         self.health = Health(self)
         self.get_logger().debug('started')      # the first call is slow: not during a flight
 
@@ -94,57 +86,60 @@ class FlightNode(Node):
         """Make the publisher of a topic."""
         return wire.Publisher(self, topic)
 
-    def follow(self, topic: str, handle: Callable[[str], None]) -> None:
-        """Pass the texts of a latched topic to ``handle``."""
+    def follow(self, topic: str, handle: Callable[[Any], None]) -> None:
+        """Pass the values of a latched topic to ``handle``, without checks of age."""
         wire.subscribe(self, topic, handle)
 
-    def listen(self, topic: str, handle: Callable, *, read: Callable | None = None,
-               qos: Qos | None = None, any_qos: bool = False, max_age: float | None = None,
-               stale_after: float | None = 0.5, published: bool = False,
-               check: Callable | None = None) -> None:
+    def listen(self, topic: str, handle: Callable, *, qos: Qos | None = None,
+               max_age: float | None = None, stale_after: float | None = 0.5) -> None:
         """
         Subscribe ``topic``; pass valid values to ``handle`` and count refused messages.
 
+        Until a supervisor publishes its identity, every message of `command` is accepted. After
+        that, only those whose frame_id is the newest identity are accepted.
+
         Args:
             topic: relative name in the table of topics.
-            handle: called with each value.
-            read: message -> value with a ``stamp``, raises MessageError; default: the table's
-                ``take``.
-            qos: quality of service; default: the table's.
-            any_qos: receive from publishers of any quality of service.
+            handle: called with each value, and for targets with the time of publication [s,
+                system time, or nan]; may raise MessageError to refuse it.
+            qos: quality of service; default: the table's, any for targets.
             max_age: limit of a stamp's age [s], also refuses future stamps; None: no check.
             stale_after: silence after a message that is an error [s]; None: never.
-            published: whether ``check`` and ``handle`` also get the time of publication [s, system
-                time, or nan].
-            check: called with the value before ``handle``; raises MessageError.
 
         """
         entry, counts = topic_of(topic), Input(stale_after)
-        read = read or entry.take
         self.health.inputs[topic] = counts
+        if topic == 'command':
+            self.follow(IDENTITY, partial(setattr, self, '_supervisor_identity'))
 
         def callback(data, *publication):
             try:
-                value = read(wire.message(entry, data))
+                message = wire.message(entry, data)
+                if topic == 'command':
+                    self._check_source(message.header.frame_id)
+                value = entry.take(message)
                 age = self.now() - value.stamp
                 if max_age is not None and not -FUTURE <= age <= max_age:
                     raise MessageError('stale stamp' if age > 0 else 'stamp in the future')
-                if check is not None:
-                    check(value, *publication)
+                handle(value, *publication)
             except MessageError as error:
                 self.health.rejected(topic, str(error), error.kind)
                 return
             counts.received += 1
             counts.age, counts.seen = age, self.elapsed()
-            handle(value, *publication)
 
-        if any_qos:
-            wire.subscribe_any(self, topic, callback if published else
-                               lambda data, _: callback(data))
-            return
-        self.create_subscription(
-            wire.message_class(entry.type), topic, wire.with_publication(callback)
-            if published else callback, wire.profile(qos or entry.qos), raw=True)
+        if topic in TARGETS:
+            wire.subscribe_any(self, topic, callback)
+        else:
+            wire.subscribe_raw(self, topic, callback, qos)
+
+    def _check_source(self, source):
+        identity = self._supervisor_identity
+        if identity and source != identity:
+            name = f"'{source[:TEXT_LIMIT]}'" if source else 'no identity'
+            raise MessageError(
+                f"2nd publisher: frame_id has {name}, expected '{identity[:TEXT_LIMIT]}'",
+                'not from the supervisor')
 
     def timed(self, function: Callable, *args):
         """Call ``function`` and count its CPU and wall time."""
@@ -153,15 +148,12 @@ class FlightNode(Node):
         self.health.computed(time.thread_time() - cpu, time.perf_counter() - wall)
         return result
 
-    def waits_for(self) -> str:
-        """Return the required topics without a message so far; overridden by subclasses."""
-        return ', '.join(topic for topic, entry in self.health.inputs.items()
-                         if entry.seen is None and entry.stale_after is not None)
-
     def introduce(self) -> None:
         """Log in one line what the node does and which inputs are missing."""
-        what, waits = (type(self).__doc__ or '').strip().partition('\n')[0], self.waits_for()
-        self.get_logger().info(f"{what} Waits for {waits or 'nothing'}.")
+        what = (type(self).__doc__ or '').strip().partition('\n')[0]
+        waits = ', '.join(topic for topic, entry in self.health.inputs.items()
+                          if entry.seen is None and entry.stale_after is not None)
+        self.get_logger().info(f'{what} Waits for {waits}.' if waits else what)
 
     def close(self) -> None:
         """Release the resources of the node; overridden by subclasses."""
@@ -172,29 +164,6 @@ class FlightNode(Node):
         super().destroy_node()
         if self._claim:
             self._claim.close()
-
-
-class CommandSource:
-    """
-    Reads commands for a node that executes them.
-
-    Until a supervisor publishes its identity, every command is accepted. After that, only commands
-    whose frame_id is the newest identity are accepted.
-    """
-
-    def __init__(self, node):
-        self._identity = ''
-        wire.subscribe(node, IDENTITY, partial(setattr, self, '_identity'))
-
-    def read(self, message: Any) -> Command:
-        """Read a command; MessageError if it is malformed or not from the supervisor."""
-        source = message.header.frame_id
-        if self._identity and source != self._identity:
-            name = f"'{source[:TEXT_LIMIT]}'" if source else 'no identity'
-            raise MessageError(
-                f"2nd publisher: frame_id has {name}, expected '{self._identity[:TEXT_LIMIT]}'",
-                'not from the supervisor')
-        return take_command(message)
 
 
 # --- diagnostics ------------------------------------------------------------------------------
@@ -222,14 +191,11 @@ class Distribution:
         k = int(np.searchsorted(np.cumsum(self.counts), fraction * self.count))
         return min(self.LOW * self.RATIO ** (k + 0.5), self.max)
 
-    def milliseconds(self, prefix: str = '') -> dict[str, float]:
-        """Return median, 99th percentile and maximum [ms] under their keys in diagnostics."""
-        return {f'{prefix}median_ms': 1e3 * self.quantile(0.5),
-                f'{prefix}p99_ms': 1e3 * self.quantile(0.99), f'{prefix}max_ms': 1e3 * self.max}
-
-    def status(self, text: str, **more: float) -> tuple[int, str, dict]:
-        """Return the distribution as a diagnostic status."""
-        return OK, text, {**self.milliseconds(), 'count': self.count, **more}
+    def status(self, text: str, level: int = OK, **more: float) -> tuple[int, str, dict]:
+        """Return median, 99th percentile, maximum [ms] and number as a diagnostic status."""
+        return level, text, {
+            'median_ms': 1e3 * self.quantile(0.5), 'p99_ms': 1e3 * self.quantile(0.99),
+            'max_ms': 1e3 * self.max, 'count': self.count, **more}
 
 
 @dataclass
@@ -324,9 +290,9 @@ class Health:
         return level, '; '.join(faults) or 'all arriving', values
 
     def _compute_status(self):
-        return WARN if self._misses else OK, f'{self._misses} deadline misses', {
-            **self._compute.milliseconds(), 'deadline_misses': self._misses,
-            'count': self._compute.count, 'wall_max_ms': 1e3 * self._wall_max}
+        return self._compute.status(
+            f'{self._misses} deadline misses', WARN if self._misses else OK,
+            deadline_misses=self._misses, wall_max_ms=1e3 * self._wall_max)
 
 
 def texts(values: dict) -> dict[str, str]:

@@ -24,10 +24,10 @@ from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.messages.bag_types import from_bytes
 from beetle_omni_ros.messages.conversions import seconds as seconds_of
 from beetle_omni_ros.messages.topics import (
-    command_topic,
     controller_of,
     LOG,
     SENSOR,
+    TARGETS,
     topic_of,
     TOPICS,
 )
@@ -49,7 +49,6 @@ SENSORS = {'mocap/pose': 'position', 'imu/data_raw': 'specific_force',
 # Only the newest message of these is read for each picture; of the others, every message is read.
 SHOWN = ('odom', 'ground_truth/odom', 'joint_states', 'command', 'battery_state')
 EVENTS = ('supervisor/state', 'disturbance', 'diagnostics')
-TARGETS = ('target_pose', 'target_trajectory')      # with any quality of service
 MOST_EVENTS = 200       # of one topic that are kept until the next picture
 NICENESS = 10           # of the view; the nodes of the flight have precedence
 
@@ -116,9 +115,7 @@ class Operator:
         for bridge in BRIDGES:
             wire.subscribe(node, f"{bridge.removesuffix('_node')}/state",
                            partial(self.bridges.__setitem__, bridge))
-        node.create_subscription(wire.message_class(command_topic(controller).type),
-                                 f'{controller}/command', self._on_command, wire.profile(SENSOR),
-                                 raw=True)
+        wire.subscribe_raw(node, f'{controller}/command', self._on_command, SENSOR)
         wire.subscribe(node, 'diagnostics', lambda statuses: self.diagnostics.update(
             (status.name, status) for status in statuses))
         self._diagnostics = wire.Publisher(node, 'diagnostics')
@@ -231,10 +228,8 @@ def listen(seconds: float, namespace: str = '', discovery: str | None = None
         graph = findings.ObservedGraph(node.context.get_domain_id(), seconds,
                                        {topic: findings.Stream() for topic in SENSORS})
         for topic in SENSORS:
-            node.create_subscription(
-                wire.message_class(TOPICS[topic].type), topic,
-                partial(_observe, node, TOPICS[topic], graph.streams[topic]), wire.profile(LOG),
-                raw=True)
+            wire.subscribe_raw(node, topic, partial(
+                _observe, node, TOPICS[topic], graph.streams[topic]), LOG)
         for bridge in findings.BRIDGES:
             wire.subscribe(node, f'{bridge}/state', partial(graph.states.__setitem__, bridge))
         wire.subscribe(node, 'diagnostics', lambda statuses: graph.diagnostics.update(
@@ -289,9 +284,9 @@ class LiveGraph:
         self._newest: dict[str, bytes] = {}
         self._waiting: dict[str, list[bytes]] = defaultdict(list)
         for topic in SHOWN:
-            self._subscribe(topic, partial(self._keep, topic), SENSOR)
+            wire.subscribe_raw(node, topic, partial(self._keep, topic), SENSOR)
         for topic in EVENTS:
-            self._subscribe(topic, partial(self._queue, topic))
+            wire.subscribe_raw(node, topic, partial(self._queue, topic))
         for topic in TARGETS:
             wire.subscribe_any(node, topic, partial(self._queue, topic))
         self._targets = wire.Publisher(node, 'target_pose') if writable else None
@@ -308,11 +303,6 @@ class LiveGraph:
     def _keep(self, topic, data):
         with self._lock:
             self._newest[topic] = data
-
-    def _subscribe(self, topic, callback, qos=None):
-        entry = topic_of(topic)
-        self._node.create_subscription(wire.message_class(entry.type), topic, callback,
-                                       wire.profile(qos or entry.qos), raw=True)
 
     def _queue(self, topic, data, _=None):
         with self._lock:

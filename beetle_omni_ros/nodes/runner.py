@@ -25,7 +25,6 @@ from rclpy.utilities import remove_ros_args
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.nodes.graph import ARGUMENT, COMPOSED, confine, GENERIC, NODES
-from beetle_omni_ros.nodes.node import StartError
 from beetle_omni_ros.robot.schema import load_yaml, ParameterError
 
 OK, FAILED, UNUSABLE = 0, 1, 2
@@ -39,40 +38,38 @@ ENDING = (signal.SIGINT, signal.SIGTERM)
 
 
 def main(name: str) -> None:
-    """Entry point of a node's executable."""
-    kind = node_class(name)
+    """Entry point of an executable: of one node, or of `composed`."""
     usage = f'usage: {name} [{ARGUMENT} RANGE] [--ros-args -p KEY:=VALUE --params-file FILE ...]'
-    rest = _own_arguments(name, f'{usage}\n\n{(kind.__doc__ or "").strip()}')
-    if rest:
-        sys.exit(_fail(name, f"unknown argument '{rest[0]}'; {usage}", UNUSABLE))
-    sys.exit(run({name: kind}, sys.argv, name))
-
-
-def composed() -> None:
-    """Run the named nodes on one events executor."""
-    usage = ('usage: composed NODE... [--discovery RANGE] [--ros-args -p NODE:KEY:=VALUE ...]; '
-             f"NODE: {', '.join(NODES)}, a controller's name, {registry.CLASS}")
-    names = _own_arguments(COMPOSED, usage)
-    unknown = [name for name in names if name not in NODES and ':' not in name
-               and name not in registry.names()]
-    if unknown or not names or len(set(names)) < len(names):
-        problem = f"unknown node '{unknown[0]}'" if unknown else 'each node once, at least one'
-        sys.exit(_fail(COMPOSED, f'{problem}; {usage}', UNUSABLE))
+    if name == COMPOSED:
+        usage = (f'usage: {name} NODE... [{ARGUMENT} RANGE] [--ros-args -p NODE:KEY:=VALUE ...]; '
+                 f"NODE: {', '.join(NODES)}, a controller's name, {registry.CLASS}")
     try:
-        nodes = {name: node_class(name) if name in NODES else
-                 partial(node_class(GENERIC), registry.find(name)) for name in names}
-    except ModuleNotFoundError as error:
-        sys.exit(_fail(COMPOSED, f"a node needs the Python package '{error.name}'; what bridges "
-                       "need installs the extra 'hardware' of beetle_omni_ros", UNUSABLE))
+        rest = _own_arguments()
+        if rest and rest[0] in ('-h', '--help'):
+            print(usage)
+            sys.exit(OK)
+        names, unknown = (rest, []) if name == COMPOSED else ([name], rest)
+        unknown += [each for each in names if each not in NODES and ':' not in each
+                    and each not in registry.names()]
+        if unknown or not names or len(set(names)) < len(names):
+            raise ParameterError((f"unknown '{unknown[0]}'" if unknown else
+                                  'each node once, at least one') + f'; {usage}')
+        nodes = {each: maker(each) for each in names}
     except ParameterError as error:
-        sys.exit(_fail(COMPOSED, error, UNUSABLE))
-    sys.exit(run(nodes, [each for each in sys.argv if each not in names], COMPOSED))
+        sys.exit(_fail(name, error, UNUSABLE))
+    except ModuleNotFoundError as error:
+        sys.exit(_fail(name, f"a node needs the Python package '{error.name}'; what bridges "
+                       "need installs the extra 'hardware' of beetle_omni_ros", UNUSABLE))
+    sys.exit(run(nodes, [each for each in sys.argv if each not in names], name))
 
 
-def node_class(name: str) -> type:
-    """Import the class of a node's executable: ekf_node -> EkfNode."""
-    kind = ''.join(part.capitalize() for part in name.split('_'))
-    return getattr(import_module(f'{__package__}.{NODES[name]}'), kind)
+def maker(name: str) -> Callable:
+    """Import what makes the node of an executable, or of a controller by name or reference."""
+    module, _, kind = NODES.get(name, NODES[GENERIC]).partition(':')
+    made = getattr(import_module(f'{__package__}.{module}'), kind)
+    if name == GENERIC or NODES.get(name) not in (None, NODES[GENERIC]):
+        return made
+    return partial(made, registry.find(name.removesuffix('_node')))
 
 
 def run(nodes_to_make: Mapping[str, Callable], argv: Sequence[str], name: str) -> int:
@@ -105,18 +102,17 @@ def run(nodes_to_make: Mapping[str, Callable], argv: Sequence[str], name: str) -
         # garbage collector of some 10 ms in a control cycle.
         gc.collect()
         gc.freeze()
-        if any(node.real_time for node in nodes):
-            sys.setswitchinterval(THREAD_SWITCH)
-            # Not for a single node: real-time processes that wait for one another delayed the
-            # simulator by a third of a second.
-            if len(nodes) > 1:
-                use_real_time_priority()
+        sys.setswitchinterval(THREAD_SWITCH)
+        # Not for a single node: real-time processes that wait for one another delayed the
+        # simulator by a third of a second.
+        if len(nodes) > 1:
+            use_real_time_priority()
         executor.spin_until_future_complete(_stop_on_signal(), FOREVER)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except ParameterError as error:
         status = _fail(name, error, UNUSABLE)
-    except (StartError, OSError) as error:
+    except OSError as error:
         status = _fail(name, error, FAILED)
     finally:
         # A second signal, forwarded by a launch system, must not interrupt the clean-up.
@@ -128,27 +124,24 @@ def run(nodes_to_make: Mapping[str, Callable], argv: Sequence[str], name: str) -
     return status
 
 
-def _own_arguments(name, help_text):
-    """Apply ``--discovery RANGE``, print the help; return what is not for ROS either."""
+def _own_arguments():
+    """Apply ``--discovery RANGE``; return what is not for ROS either."""
+    for flag, path in zip(sys.argv, sys.argv[1:]):
+        if flag == '--params-file':     # by file and line; ROS would print a traceback
+            load_yaml(path)
     try:
-        for flag, path in zip(sys.argv, sys.argv[1:]):
-            if flag == '--params-file':     # by file and line; ROS would print a traceback
-                load_yaml(path)
-        rest, left = [], iter(remove_ros_args(list(sys.argv))[1:])
-        for argument in left:
-            flag, equals, value = argument.partition('=')
-            if flag == ARGUMENT:
-                confine(requested=(value if equals else next(left, '')) or 'nothing')
-            else:
-                rest.append(argument)
-    except Exception as error:
-        # rclpy does not export the class of its error on bad arguments.
-        if not isinstance(error, ParameterError) and 'ROSArgs' not in type(error).__name__:
+        given = remove_ros_args(list(sys.argv))[1:]
+    except Exception as error:      # rclpy does not export the class
+        if 'ROSArgs' not in type(error).__name__:
             raise
-        sys.exit(_fail(name, error, UNUSABLE))
-    if rest and rest[0] in ('-h', '--help'):
-        print(help_text)
-        sys.exit(OK)
+        raise ParameterError(str(error)) from None
+    rest, left = [], iter(given)
+    for argument in left:
+        flag, equals, value = argument.partition('=')
+        if flag == ARGUMENT:
+            confine(requested=(value if equals else next(left, '')) or 'nothing')
+        else:
+            rest.append(argument)
     return rest
 
 

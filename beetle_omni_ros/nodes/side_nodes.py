@@ -14,7 +14,15 @@ from visualization_msgs.msg import Marker, MarkerArray
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
 from beetle_omni_ros.messages.conversions import BODY, set_parts, set_time, WORLD
-from beetle_omni_ros.messages.topics import ALL, EVENT, LATCHED_LOG, LOG, SENSOR, topics_with
+from beetle_omni_ros.messages.topics import (
+    ALL,
+    EVENT,
+    LATCHED_LOG,
+    LOG,
+    SENSOR,
+    TARGETS,
+    topics_with,
+)
 from beetle_omni_ros.messages.values import Wrench
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.node import ERROR, FlightNode, OK, WARN
@@ -40,7 +48,8 @@ WINDOW, WINDOW_PERIOD, WINDOW_SAMPLE = 3.0, 1.5, 0.05   # s
 WRITE_PERIOD = 0.02     # s between writes of the received messages, so that no callback waits
 FLUSH_WRITES = 20       # writes between flushes; a crash loses only messages after the last one
 HELD = 1000             # messages at most that wait for the first simulated time
-ANY_QOS = 'target_pose', 'target_trajectory'    # recorded with any quality of service
+FRAME_PERIOD, MARKER_PERIOD = 0.02, 0.05      # s between two frames, two sets of markers
+NEWTON_PER_METRE = 40.0     # N of thrust that are drawn as one metre
 BODY_COLOUR, THRUST_COLOUR, TARGET_COLOUR = (0.3, 0.3, 0.35), (0.9, 0.5, 0.1), (0.2, 0.7, 0.3)
 
 
@@ -81,10 +90,6 @@ class ReferenceNode(FlightNode):
         self.health.report('task', lambda: (OK, self._state, {'task': self._task.name}))
         self.create_timer(IMPULSE_PERIOD if disturbed else PERIOD, self._on_timer,
                           clock=self.flight_clock)
-
-    def waits_for(self):
-        """Return the trigger of the task."""
-        return f"'flying' on supervisor/state; then flies task '{self._task.name}'"
 
     def _set_state(self, state):
         if state != self._state:
@@ -156,8 +161,6 @@ class RecorderNodeParameters:
 class RecorderNode(FlightNode):
     """Writes the messages of every topic of the package into a bag, like ``ros2 bag record``."""
 
-    real_time = True        # the times of receipt in the bag are measurements
-
     def __init__(self):
         super().__init__('recorder_node', RecorderNodeParameters)
         topics = topics_with(self.parameters.controllers)
@@ -175,19 +178,15 @@ class RecorderNode(FlightNode):
         prefix = self.get_namespace().rstrip('/') + '/'
         for name, topic in {**ALL, **topics}.items():
             keep = partial(self._keep, prefix + name, topic.type)
-            if name in ANY_QOS:
+            if name in TARGETS:
                 wire.subscribe_any(self, name, keep, depth=50, on_lost=self._on_lost)
-                continue
-            self.create_subscription(
-                wire.message_class(topic.type), name, lambda data, keep=keep: keep(data),
-                wire.profile(LATCHED_LOG if topic.qos.latched else LOG), raw=True,
-                event_callbacks=SubscriptionEventCallbacks(message_lost=self._on_lost))
+            else:
+                wire.subscribe_raw(
+                    self, name, lambda data, keep=keep: keep(data),
+                    LATCHED_LOG if topic.qos.latched else LOG,
+                    event_callbacks=SubscriptionEventCallbacks(message_lost=self._on_lost))
         self.health.report('bag', self._bag_status)
         self.create_timer(WRITE_PERIOD, self._write, clock=self.steady_clock)
-
-    def waits_for(self):
-        """Return what is recorded where; a recorder needs no particular input."""
-        return f'messages, and writes them to {self.parameters.bag}'
 
     def _keep(self, topic, message_type, data, _=None):
         self._received.append((topic, message_type, data, self.now()))
@@ -236,12 +235,6 @@ class ViewerNodeParameters:
     """Parameters of viewer_node."""
 
     robot_file: str = file_parameter()
-    frame_rate: float = parameter(50.0, doc='rate of the frame', unit='Hz', low=0.5, high=200,
-                                  read_only=True)
-    rate: float = parameter(20.0, doc='rate of the markers', unit='Hz', low=0.5, high=100,
-                            read_only=True)
-    newton_per_metre: float = parameter(40.0, doc='thrust that is drawn as one metre',
-                                        unit='N/m', low=1, high=1000, read_only=True)
 
 
 class ViewerNode(FlightNode):
@@ -249,20 +242,19 @@ class ViewerNode(FlightNode):
 
     def __init__(self):
         super().__init__('viewer_node', ViewerNodeParameters)
-        given = self.parameters
-        self._robot = RobotParameters.load(given.robot_file or None)
+        self._robot = RobotParameters.load(self.parameters.robot_file or None)
         if TFMessage is not None:
             self._transforms = self.create_publisher(TFMessage, '/tf', wire.profile(EVENT))
-            self.create_timer(1 / given.frame_rate, self._move, clock=self.steady_clock)
+            self.create_timer(FRAME_PERIOD, self._move, clock=self.steady_clock)
         self._markers = self.create_publisher(MarkerArray, 'markers', wire.profile(EVENT))
         self._odom = self._joints = self._command = self._target = None
         self._moved = None      # stamp of the estimate that the frame shows
         self.listen('odom', partial(setattr, self, '_odom'), qos=SENSOR)
         self.listen('joint_states', partial(setattr, self, '_joints'))
         self.listen('command', partial(setattr, self, '_command'), qos=SENSOR, stale_after=None)
-        self.listen('target_pose', partial(setattr, self, '_target'), any_qos=True,
+        self.listen('target_pose', lambda target, _: setattr(self, '_target', target),
                     stale_after=None)
-        self.create_timer(1 / given.rate, self._draw, clock=self.steady_clock)
+        self.create_timer(MARKER_PERIOD, self._draw, clock=self.steady_clock)
 
     def _move(self):
         """Publish the frame of the body, if there is a subscription."""
@@ -287,7 +279,7 @@ class ViewerNode(FlightNode):
         lines = [point for centre in centres for point in (odom.position, centre)]
         markers.markers.append(self._marker('body', Marker.LINE_LIST, lines, 0.02, BODY_COLOUR))
         if self._joints is not None and self._command is not None:
-            thrust = self._command.thrust / self.parameters.newton_per_metre
+            thrust = self._command.thrust / NEWTON_PER_METRE
             for k, axis in enumerate(self._robot.tilt_axes):
                 tilt = rotations.matrix(rotations.exp(axis * self._joints.position[k]))
                 tip = centres[k] + thrust[k] * to_world @ tilt[:, 2]

@@ -13,7 +13,7 @@ from beetle_omni_ros.messages.conversions import set_time
 from beetle_omni_ros.messages.topics import SENSOR
 from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes import wire
-from beetle_omni_ros.nodes.node import CommandSource, Distribution, ERROR, FlightNode, OK, WARN
+from beetle_omni_ros.nodes.node import Distribution, ERROR, FlightNode, OK, WARN
 from beetle_omni_ros.nodes.parameters import file_parameter
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import group, parameter, ParameterError
@@ -181,8 +181,6 @@ class SimNode(FlightNode):
     and supervisor have answered the newest samples.
     """
 
-    real_time = True
-
     def __init__(self):
         self._devices: EmulatedActuators | None = None
         self._clock_publisher = None
@@ -231,8 +229,7 @@ class SimNode(FlightNode):
         self._publish_to['joints'] = self.publisher('joint_states')
         self._publish_to['battery'] = self.publisher('battery_state')
         self._publish_to['rotors'] = self.publisher('rotor_states')
-        self.listen('command', self._on_command, read=CommandSource(self).read,
-                    max_age=COMMAND_AGE)
+        self.listen('command', self._on_command, max_age=COMMAND_AGE)
         self.health.report('latency', lambda: self._latency.status(
             'stamp of the answered IMU sample to the arrival of its command'))
 

@@ -9,14 +9,7 @@ from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.messages import bag_types
 from beetle_omni_ros.messages.bag_types import from_bytes, read_all, to_bytes
 from beetle_omni_ros.messages.topics import ALL
-from beetle_omni_ros.messages.values import (
-    Diagnostic,
-    HealthReport,
-    MessageError,
-    Odom,
-    TargetOverride,
-    Wrench,
-)
+from beetle_omni_ros.messages.values import Diagnostic, MessageError, Odom, Wrench
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import ActuatorHealth
 from beetle_omni_ros.robot.readings import (
@@ -48,9 +41,8 @@ def value(topic, seed=0, stamp=STAMP):
         PoseTarget: lambda: PoseTarget(draw(size=3), turn, stamp),
         TrajectoryTarget: lambda: path,
         Command: lambda: Command(stamp, draw(size=4), draw(size=4)),
-        TargetOverride: lambda: TargetOverride.of(path),
-        HealthReport: lambda: HealthReport(stamp, ActuatorHealth(
-            (True, False, True, True), (None, 0.5, None, None), thrust_limit=8.75)),
+        ActuatorHealth: lambda: ActuatorHealth(
+            (True, False, True, True), (None, 0.5, None, None), thrust_limit=8.75),
         Wrench: lambda: Wrench(stamp, draw(size=3), draw(size=3)),
         str: lambda: 'flying:nmpc',
         Diagnostic: lambda: [Diagnostic(stamp, 'ekf_node: inputs', 2, 'silent', {'a': '1'}),

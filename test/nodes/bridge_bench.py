@@ -132,8 +132,8 @@ class BridgeOperator(Operator):
 def running_bridge(folder, bridge, others=(), **parameters):
     """Run a bridge in a separate process, or composed with others; yield graph and operator."""
     with reserved_domain() as number:
-        graph = Graph({bridge: {**PATIENT[bridge], **parameters}, **{name: {} for name in others}},
-                      folder, number, composed=bool(others))
+        nodes = {bridge: {**PATIENT[bridge], **parameters}, **{name: {} for name in others}}
+        graph = Graph(nodes, folder, number, {bridge: list(nodes)})
         operator = None
         try:
             graph.start()

@@ -113,9 +113,9 @@ def test_the_newest_target_is_used_an_unset_stamp_means_now_and_a_landing_resets
         return follower.follower.received[-1][1]
 
     for stamp, x in ((50.0, 1.0), (60.0, 2.0), (50.0, 3.0)):
-        follower._on_target(PoseTarget(np.array([x, 0, 0]), LEVEL, stamp))
+        follower._on_target(PoseTarget(np.array([x, 0, 1.0]), LEVEL, stamp), np.nan)
     assert target().position[0] == 2.0
-    follower._on_target(PoseTarget(np.array([4.0, 0, 0]), LEVEL, 0.0))
+    follower._on_target(PoseTarget(np.array([4.0, 0, 1.0]), LEVEL, 0.0), np.nan)
     assert target().position[0] == 4.0
     assert target().stamp == pytest.approx(follower.now(), abs=5)
     for mode in ('flying:nmpc', 'disarmed'):
@@ -160,13 +160,12 @@ def test_an_active_controller_outside_the_supervisors_list_is_refused(make):
 
 
 def test_the_plan_of_a_graph_with_another_controller():
-    nodes = graph.plan(graph.GraphOptions(controller=OWN, actuators='direct', bag='/b',
-                                        task='hover')).nodes
+    nodes, _ = graph.plan(OWN, actuators='direct', bag='/b', task='hover')
     known = ['pose_controller', *registry.standing_by()]
     assert nodes['pose_controller_node'] == {'controller': OWN}
     assert nodes['supervisor_node']['controller'] == 'pose_controller'
     for name in ('supervisor_node', 'recorder_node'):
         assert nodes[name]['controllers'] == known
     assert graph.arguments(nodes, ['ekf_node', 'pose_controller_node']) == ['ekf_node', OWN]
-    alone = graph.plan(graph.GraphOptions(controller=OWN, actuators='direct', standby=False)).nodes
+    alone, _ = graph.plan(OWN, actuators='direct', standby=False)
     assert list(alone) == ['sim_node', 'ekf_node', 'pose_controller_node', 'supervisor_node']

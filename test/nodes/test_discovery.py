@@ -23,8 +23,7 @@ def test_the_users_setting_has_precedence(given, holds):
         graph.confine({'BEETLE_OMNI_DISCOVERY': 'world'})
 
 
-@pytest.mark.parametrize('composed', [True, False])
-def test_an_argument_of_fly_reaches_every_node_of_the_plan(tmp_path, monkeypatch, composed):
+def test_an_argument_of_fly_reaches_both_processes(tmp_path, monkeypatch):
     for name in (*graph.ROS_SETTINGS, graph.VARIABLE):
         monkeypatch.setenv(name, '')        # put back afterwards
     ranges = []
@@ -36,10 +35,9 @@ def test_an_argument_of_fly_reaches_every_node_of_the_plan(tmp_path, monkeypatch
     monkeypatch.setattr(subprocess, 'Popen', start)
     monkeypatch.setattr(os.path, 'exists', lambda _: True)
     graph.confine(requested='subnet')
-    nodes = graph.plan(graph.GraphOptions(controller='hover', ports=str(tmp_path), task='hover',
-                                        bag=str(tmp_path / 'bag'))).nodes
-    graph.Graph(nodes, tmp_path, 7, composed).start()
-    assert ranges == ['SUBNET'] * (2 if composed else len(nodes))
+    nodes, _ = graph.plan('hover', ports=str(tmp_path))
+    graph.Graph(nodes, tmp_path, 7).start()
+    assert ranges == ['SUBNET'] * 2
 
 
 def test_two_reserved_domains_differ(monkeypatch):

@@ -99,6 +99,6 @@ def test_a_composed_bridge_waits_for_its_port_and_reports_why(tmp_path):
             assert emulated.torque_enabled.all()
             graph.stop()
             assert not emulated.torque_enabled.any()
-        log = graph.log('composed').read_text()
+        log = graph.log(JOINT).read_text()
         assert log.count('no such port') <= 2, 'an attempt a second, but not a line'
         assert 'Traceback' not in log

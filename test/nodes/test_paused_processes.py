@@ -6,7 +6,7 @@ import time
 import pytest
 from witness import running_graph
 
-from beetle_omni_ros.nodes.graph import COMPOSED, GraphOptions, plan
+from beetle_omni_ros.nodes.graph import COMPOSED, plan
 
 pytestmark = pytest.mark.real_time
 PAUSE = 0.5     # [s]
@@ -15,9 +15,8 @@ SOFT = 0.6      # [m/s] of a touchdown; a fall by 0.1 m is faster
 
 def test_a_pause_of_the_computer_in_flight_is_not_reported_as_a_crash(ros_domain,
                                                                       tmp_path):
-    options = GraphOptions(controller='nmpc', task='hover', actuators='direct',
-                           ports=str(tmp_path), bag=str(tmp_path / 'bag'), standby=False)
-    with running_graph(plan(options).nodes, tmp_path, ros_domain) as (graph, witness):
+    nodes, _ = plan('nmpc', task='hover', actuators='direct', standby=False)
+    with running_graph(nodes, tmp_path, ros_domain) as (graph, witness):
         witness.can_judge(graph)
         witness.take_off(lambda: witness.state.startswith('flying'))
         witness.spin(2.0)

@@ -7,7 +7,7 @@ import pytest
 
 from beetle_omni_ros.control.base import Command, PoseTarget
 from beetle_omni_ros.messages.values import Odom
-from beetle_omni_ros.nodes.side_nodes import ViewerNode
+from beetle_omni_ros.nodes.side_nodes import NEWTON_PER_METRE, ViewerNode
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.readings import JointReading
 
@@ -34,7 +34,7 @@ def test_thrust_arrows_point_along_the_tilted_rotors(viewer):
     arrows = np.array([[[p.x, p.y, p.z] for p in markers[f'rotor{k}'].points]
                        for k in (1, 2, 3, 4)])
     thrust = (arrows[:, 1] - arrows[:, 0]) @ rotations.matrix(rotation) \
-        * viewer.parameters.newton_per_metre
+        * NEWTON_PER_METRE
     assert np.linalg.norm(thrust, axis=1) == pytest.approx([8, 4, 0, 20])
     assert thrust[0] == pytest.approx([0, 0, 8])                        # q = 0: up
     axis = viewer._robot.tilt_axes[1]
