@@ -233,8 +233,7 @@ def listen(seconds: float, namespace: str = '', discovery: str | None = None
         for bridge in findings.BRIDGES:
             wire.subscribe(node, f'{bridge}/state', partial(graph.states.__setitem__, bridge))
         wire.subscribe(node, 'diagnostics', lambda statuses: graph.diagnostics.update(
-            (status.name, findings.Status(status.level, status.message, status.values))
-            for status in statuses))
+            (status.name, status) for status in statuses))
         deadline = time.monotonic() + seconds
         while (left := deadline - time.monotonic()) > 0:
             executor.spin_once(timeout_sec=left)

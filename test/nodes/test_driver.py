@@ -141,14 +141,16 @@ def test_sticks_and_buttons_are_actions_until_the_joystick_is_silent():
     p = DriveParameters.load()
     pilot = SimpleNamespace(axes=[0.0] * 8, buttons=[0] * 11, joy_at=5.0, steering=object(),
                             time=lambda: 5.0)
-    joystick = driver._Joystick(pilot, p, {}, print)
-    assert joystick.actions(0.1) == []
+    actions = driver.joystick(pilot, p, {}, print)
+    assert next(actions) == []
     pilot.axes[int(p.axes[0])], pilot.buttons[p.buttons['arm']] = float(p.signs[0]), 1
-    order, shift = joystick.actions(0.1)
+    pilot.time = lambda: 5.1
+    order, shift = next(actions)
     assert order.name == 'arm' and shift.way == pytest.approx([0.1 * p.speed, 0, 0])
-    assert len(joystick.actions(0.1)) == 1      # the button is still pressed
-    pilot.time = lambda: 5.0 + 2 * p.joystick_timeout
-    assert joystick.actions(0.1) == []
+    pilot.time = lambda: 5.2
+    assert len(next(actions)) == 1      # the button is still pressed
+    pilot.time = lambda: 5.2 + 2 * p.joystick_timeout
+    assert next(actions) == []
 
 
 @pytest.mark.parametrize(('arguments', 'expected'), [
