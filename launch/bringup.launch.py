@@ -40,9 +40,7 @@ ARGUMENTS = {
     'allow_other_robot': ('false', ['true', 'false'],
                           'fly a policy that was trained for other robot parameters'),
     'namespace': ('', None, 'namespace of every node and topic'),
-    'discovery': ('', ['', 'LOCALHOST', 'SUBNET', 'OFF', 'SYSTEM_DEFAULT'],
-                  'who can find the nodes; empty: programs of this computer alone'),
-    'viewer': ('false', ['true', 'false'], 'description, tf and markers for RViz and Foxglove'),
+    'viewer': ('false', ['true', 'false'], 'description and tf for RViz and Foxglove'),
     'robot_file': ('', None, 'robot file that estimator and controller believe'),
     'plant_file': ('', None, 'robot file that is true in the simulation'),
     'conditions': ('nominal', ['nominal', 'published'], 'of the simulation'),
@@ -97,7 +95,7 @@ def actions(context):
     """Turn the arguments into processes."""
     from beetle_omni_ros.nodes import graph
     given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
-    graph.confine(requested=given['discovery'])
+    graph.confine()
     nodes, left_out = graph.plan(**options(given))
     for name, reason in left_out.items():
         print(f'{name} does not stand by: {reason}', file=sys.stderr)

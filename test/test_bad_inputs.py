@@ -95,7 +95,7 @@ CASES = {
         ('--faults device.yaml --actuators emulated', 'expected --actuators direct'),
         ('--actuators steam', "actuators 'steam': expected emulated or direct"),
         ('--clock sun', "clock 'sun': expected system or simulated"),
-        ('--domain-id 102', "--domain-id '102': expected"), ('--discovery OFF', '--discovery OFF'),
+        ('--domain-id 102', "--domain-id '102': expected"),
         ('--clock simulated --actuators emulated', 'serial devices keep real')],
     COMPARE: [
         ("--controllers ''", "--controllers '': expected"), ('--tasks hovr', 'hovr'),

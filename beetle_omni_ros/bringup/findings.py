@@ -182,14 +182,14 @@ def _absent(findings, topic, source, stream, graph):
     if stream.publishers:
         findings.add(topic, f"nothing in {graph.seconds:g} s, although "
                      f"{', '.join(stream.publishers)} publishes it", fail='check the sensor, '
-                     'multicast and MTU of the network, BEETLE_OMNI_DISCOVERY')
+                     'multicast and MTU of the network, ROS_AUTOMATIC_DISCOVERY_RANGE')
     elif stream.other_types:
         findings.add(topic, f"published as {', '.join(stream.other_types)}",
                      fail=f'{source} must publish another type: set or remap it')
     else:
         findings.add(topic, f'no publisher in ROS domain {graph.domain}',
                      fail=f'start {source}, remap its topic, set the same ROS_DOMAIN_ID on all '
-                     'computers, and BEETLE_OMNI_DISCOVERY=SUBNET if it runs on another one')
+                     'computers, and ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET')
 
 
 def _rate_of(findings, topic, stream, nominal):

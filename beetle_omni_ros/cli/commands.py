@@ -16,7 +16,6 @@ from beetle_omni_ros.cli.options import (
     CONDITIONS,
     ConditionsOption,
     ControllerOption,
-    DiscoveryOption,
     FAILED,
     FaultsOption,
     JobsOption,
@@ -76,7 +75,6 @@ def fly(controller: ControllerOption = DEFAULT,
         faults: FaultsOption = None,
         domain_id: Annotated[Optional[int], typer.Option(
             '--domain-id', min=0, max=101, help='ROS domain. Default: a free one.')] = None,
-        discovery: DiscoveryOption = None,
         view: Annotated[bool, typer.Option(
             '--view', help='Show the flight in the browser, as beetle_omni view does.')] = False,
         allow_targets: Annotated[bool, typer.Option(
@@ -101,8 +99,7 @@ def fly(controller: ControllerOption = DEFAULT,
                    robot=robot, plant=plant, nmpc=nmpc_file, policy=policy,
                    allow_other_robot=allow_other_robot, standby=standby,
                    faults=faults, json_path=json_path,
-                   domain_id=domain_id, discovery=discovery,
-                   view=view, allow_targets=allow_targets)
+                   domain_id=domain_id, view=view, allow_targets=allow_targets)
     raise typer.Exit(code if isinstance(code, int) else 0)
 
 

@@ -208,7 +208,7 @@ class ControllerNode(FlightNode):
 
 def node_parameters(entry: ControllerEntry, selectable: bool) -> type:
     """Make the parameter class of a controller's node: controller, robot and controller file."""
-    base = entry.parameter_class or make_dataclass('NoParameters', (), frozen=True)
+    base = entry.parameter_class
     more = {'robot_file': ('', 'robot file of the controller; empty: the shipped one'),
             entry.file_key: ('', f"controller file; empty: {entry.parameters_file or 'none'}")}
     if selectable:
@@ -217,7 +217,8 @@ def node_parameters(entry: ControllerEntry, selectable: bool) -> type:
         f'{entry.name}_parameters',
         [(name, str, parameter(default, doc=doc, read_only=True))
          for name, (default, doc) in more.items()],
-        bases=(base,), frozen=base.__dataclass_params__.frozen, kw_only=True)
+        bases=(base,) if base else (),
+        frozen=base is None or base.__dataclass_params__.frozen, kw_only=True)
 
 
 def _requested_controller() -> str:

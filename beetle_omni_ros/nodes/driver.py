@@ -28,7 +28,6 @@ from beetle_omni_ros.drive import (
 from beetle_omni_ros.messages.topics import SENSOR
 from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes import wire
-from beetle_omni_ros.nodes.graph import confine
 from beetle_omni_ros.nodes.operator import Operator
 from beetle_omni_ros.nodes.runner import sigterm_as_interrupt
 from beetle_omni_ros.robot import rotations
@@ -146,7 +145,7 @@ class Driver(Operator):
 
 def run_drive(source: str, *, parameters: Path | None = None, poses: Path | None = None,
               robot: Path | None = None, domain_id: int | None = None,
-              discovery: str | None = None, console: Console | None = None) -> int:
+              console: Console | None = None) -> int:
     """
     Drive until the user quits; arguments as of `beetle_omni drive`.
 
@@ -165,7 +164,6 @@ def run_drive(source: str, *, parameters: Path | None = None, poses: Path | None
     if source == 'keyboard' and not sys.stdin.isatty():
         raise ParameterError('keyboard: standard input is no terminal; expected one, or the '
                              "source 'terminal', which reads lines")
-    confine(requested=discovery)
     console = console or Console()
     domain = int(os.environ.get('ROS_DOMAIN_ID') or 0) if domain_id is None else domain_id
     with ExitStack() as stack:

@@ -18,7 +18,6 @@ from beetle_omni_ros.nodes import runner
 from beetle_omni_ros.nodes.graph import (
     BRIDGES,
     child_environment,
-    confine,
     Graph,
     plan,
     reserved_domain,
@@ -66,8 +65,7 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             nmpc: Path | None = None, policy: Path | None = None,
             allow_other_robot: bool = False, standby: bool = True,
             faults: Path | None = None, json_path: Path | None = None,
-            domain_id: int | None = None, discovery: str | None = None,
-            view: bool = False, allow_targets: bool = False,
+            domain_id: int | None = None, view: bool = False, allow_targets: bool = False,
             console: Console | None = None) -> int:
     """
     Fly a task through the ROS graph and print the results of the bag.
@@ -80,10 +78,6 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
     """
     console = console or table.Terminal()
     try:
-        if (discovery or '').strip().upper() == 'OFF':
-            raise ParameterError('--discovery OFF: the nodes of a flight would not find each '
-                                 'other; expected LOCALHOST, SUBNET or SYSTEM_DEFAULT')
-        confine(requested=discovery)
         with ExitStack() as stack:
             stack.enter_context(runner.sigterm_as_interrupt())
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix='beetle_omni_')))

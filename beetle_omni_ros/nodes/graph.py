@@ -47,11 +47,9 @@ Parameters = dict[str, dict]        # node name -> parameters that differ from t
 
 # --- discovery --------------------------------------------------------------------------------
 
-VARIABLE, ARGUMENT = 'BEETLE_OMNI_DISCOVERY', '--discovery'
 RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 # Settings of ROS; if the user set one of them, it has precedence over the default.
 ROS_SETTINGS = (RANGE, 'ROS_LOCALHOST_ONLY', 'ROS_STATIC_PEERS')
-RANGES = ('LOCALHOST', 'SUBNET', 'OFF', 'SYSTEM_DEFAULT')
 # The ports of domains up to 101 are below the ephemeral ports of Linux; 0 is the default domain.
 DOMAINS = range(101, 0, -1)
 # Ports of the RTPS standard: base + gain * domain + offset. Offset 0: discovery, shared by all
@@ -60,31 +58,10 @@ PORT_BASE, DOMAIN_GAIN, USER_UNICAST = 7400, 250, 11
 _starts = count(os.getpid())
 
 
-def confine(environment: MutableMapping[str, str] | None = None,
-            requested: str | None = None) -> None:
-    """
-    Set the range of discovery; must run before the first context is made.
-
-    Args:
-        environment: variables to change; None: those of this process.
-        requested: one of ``RANGES``, for this process and its children; '' or None: the value of
-            ``BEETLE_OMNI_DISCOVERY``, else this computer only.
-
-    Raises:
-        ParameterError: not one of ``RANGES``.
-
-    """
-    environment = os.environ if environment is None else environment
-    source, wanted = (ARGUMENT, requested) if requested else \
-        (VARIABLE, environment.get(VARIABLE, ''))
-    wanted = wanted.strip().upper()
-    if wanted and wanted not in RANGES:
-        raise ParameterError(f"{source}: expected one of {', '.join(RANGES)}, "
-                             f'found {wanted[:40]!r}')
-    if wanted:
-        environment[VARIABLE] = environment[RANGE] = wanted
-    elif not any(environment.get(name) for name in ROS_SETTINGS):
-        environment[RANGE] = RANGES[0]
+def confine(environment: MutableMapping[str, str] = os.environ) -> None:
+    """Limit discovery to this computer by default; must run before the first context is made."""
+    if not any(environment.get(name) for name in ROS_SETTINGS):
+        environment[RANGE] = 'LOCALHOST'
 
 
 def claim(name: str) -> socket.socket | None:
@@ -198,7 +175,7 @@ def plan(controller: str = registry.DEFAULT, *, standby: bool = True, nmpc: str 
         *((name, True, values) for name, values in controllers.items()),
         ('supervisor_node', True, {**robot, 'controller': active, **others}),
         ('reference_node', task, {'task': task, 'seed': seed}),
-        ('viewer_node', viewer, robot),
+        ('viewer_node', viewer, {}),
         *((name, bridges, bridges.get(name)) for name in BRIDGES))
     # Copies: YAML would write a shared list as an alias, which ROS cannot read.
     nodes = {name: deepcopy(values) for name, is_used, values in table if is_used}

@@ -34,7 +34,7 @@ class FlightNode(Node):
 
     """
 
-    def __init__(self, name: str, parameter_class: type, file: str | None = None,
+    def __init__(self, name: str, parameter_class: type | None = None, file: str | None = None,
                  file_key: str | None = None, on_change: Callable | None = None,
                  changeable: tuple[str, ...] | None = None,
                  completed: Callable[[dict, bool], dict] | None = None):

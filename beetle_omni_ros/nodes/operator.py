@@ -53,16 +53,15 @@ MOST_EVENTS = 200       # of one topic that are kept until the next picture
 NICENESS = 10           # of the view; the nodes of the flight have precedence
 
 
-def join(name: str, domain: int | None = None, namespace: str = '',
-         discovery: str | None = None):
+def join(name: str, domain: int | None = None, namespace: str = ''):
     """
     Make a node with its own context and executor; return (node, executor).
 
     Raises:
-        ParameterError: invalid namespace or range of discovery.
+        ParameterError: invalid namespace.
 
     """
-    confine(requested=discovery)
+    confine()
     context = rclpy.Context()
     rclpy.init(args=[], context=context, domain_id=domain,
                signal_handler_options=SignalHandlerOptions.NO)
@@ -214,16 +213,15 @@ class Operator:
 
 # --- beetle_omni check --------------------------------------------------------------------------
 
-def listen(seconds: float, namespace: str = '', discovery: str | None = None
-           ) -> findings.ObservedGraph:
+def listen(seconds: float, namespace: str = '') -> findings.ObservedGraph:
     """
     Record the traffic of a graph for ``seconds``; publishes nothing.
 
     Raises:
-        ParameterError: invalid namespace or range of discovery.
+        ParameterError: invalid namespace.
 
     """
-    node, executor = join('check', namespace=namespace, discovery=discovery)
+    node, executor = join('check', namespace=namespace)
     try:
         graph = findings.ObservedGraph(node.context.get_domain_id(), seconds,
                                        {topic: findings.Stream() for topic in SENSORS})
@@ -271,13 +269,12 @@ class LiveGraph:
     Targets and selections of a controller are sent only if ``writable``.
 
     Raises:
-        ParameterError: invalid namespace or range of discovery.
+        ParameterError: invalid namespace.
 
     """
 
-    def __init__(self, namespace: str = '', domain: int | None = None,
-                 discovery: str | None = None, writable: bool = False):
-        self._node, self._executor = join('view', domain, namespace, discovery)
+    def __init__(self, namespace: str = '', domain: int | None = None, writable: bool = False):
+        self._node, self._executor = join('view', domain, namespace)
         node = self._node
         self._lock = threading.Lock()
         self._newest: dict[str, bytes] = {}
@@ -350,8 +347,8 @@ class LiveGraph:
         leave(self._node)
 
 
-def run_live(*, namespace: str = '', domain_id: int | None = None, discovery: str | None = None,
-             robot: Path | None = None, urdf: Path | None = None, host: str, port: int,
+def run_live(*, namespace: str = '', domain_id: int | None = None, robot: Path | None = None,
+             urdf: Path | None = None, host: str, port: int,
              dark: bool = False, allow_targets: bool = False,
              console: Console | None = None) -> None:
     """
@@ -368,7 +365,7 @@ def run_live(*, namespace: str = '', domain_id: int | None = None, discovery: st
     runner.end_with_parent()
     model, parameters = Model.load(urdf), RobotParameters.load(robot)
     with ExitStack() as stack:
-        graph = LiveGraph(namespace, domain_id, discovery, allow_targets)
+        graph = LiveGraph(namespace, domain_id, allow_targets)
         stack.callback(graph.close)
         os.nice(NICENESS)
         server = serve(host, port, dark)

@@ -6,6 +6,7 @@ of the parameter files refuse both at the start of the node, in one line that na
 """
 
 from collections.abc import Callable
+from dataclasses import make_dataclass
 import types
 from typing import get_args, get_origin, Union
 
@@ -28,7 +29,7 @@ def file_parameter(what: str = 'robot file'):
     return schema.parameter('', doc=f'{what}; empty: the shipped one', read_only=True)
 
 
-def declare(node: Node, cls: type, file: str | None = None, file_key: str | None = None,
+def declare(node: Node, cls: type | None, file: str | None = None, file_key: str | None = None,
             on_change: Callable | None = None, changeable: tuple[str, ...] | None = None,
             completed: Callable[[dict, bool], dict] | None = None):
     """
@@ -39,7 +40,8 @@ def declare(node: Node, cls: type, file: str | None = None, file_key: str | None
 
     Args:
         node: node with automatically_declare_parameters_from_overrides off.
-        cls: dataclass of :func:`schema.parameter` and :func:`schema.group` fields.
+        cls: dataclass of :func:`schema.parameter` and :func:`schema.group` fields; None: no
+            parameters.
         file: shipped parameter file, such as ``params/ekf.yaml``.
         file_key: parameter that names another file.
         on_change: called with the new instance when parameters are set in flight; may raise
@@ -54,6 +56,7 @@ def declare(node: Node, cls: type, file: str | None = None, file_key: str | None
         ParameterError: unusable value; names file, key and expectation.
 
     """
+    cls = cls or make_dataclass('NoParameters', ())
     overrides = {name: value.value for name, value in node._parameter_overrides.items()
                  if name not in ROS_OWN and not name.startswith(ROS_OWN_PREFIX)}
     own_file = overrides.get(file_key)

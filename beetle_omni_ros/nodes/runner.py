@@ -5,7 +5,7 @@ Runs nodes in one process: start, spin, stop; errors are one line and an exit st
 registered controller name, or the reference of a controller's class.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import contextmanager
 import ctypes
 from functools import partial
@@ -24,7 +24,7 @@ from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
 
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.nodes.graph import ARGUMENT, COMPOSED, confine, GENERIC, NODES
+from beetle_omni_ros.nodes.graph import COMPOSED, confine, GENERIC, NODES
 from beetle_omni_ros.robot.schema import load_yaml, ParameterError
 
 OK, FAILED, UNUSABLE = 0, 1, 2
@@ -39,10 +39,10 @@ ENDING = (signal.SIGINT, signal.SIGTERM)
 
 def main(name: str) -> None:
     """Entry point of an executable: of one node, or of `composed`."""
-    usage = f'usage: {name} [{ARGUMENT} RANGE] [--ros-args -p KEY:=VALUE --params-file FILE ...]'
+    usage = f'usage: {name} [--ros-args -p KEY:=VALUE --params-file FILE ...]'
     if name == COMPOSED:
-        usage = (f'usage: {name} NODE... [{ARGUMENT} RANGE] [--ros-args -p NODE:KEY:=VALUE ...]; '
-                 f"NODE: {', '.join(NODES)}, a controller's name, {registry.CLASS}")
+        usage = (f"usage: {name} NODE... [--ros-args -p NODE:KEY:=VALUE ...]; NODE: "
+                 f"{', '.join(NODES)}, a controller's name, {registry.CLASS}")
     try:
         rest = _own_arguments()
         if rest and rest[0] in ('-h', '--help'):
@@ -54,13 +54,9 @@ def main(name: str) -> None:
         if unknown or not names or len(set(names)) < len(names):
             raise ParameterError((f"unknown '{unknown[0]}'" if unknown else
                                   'each node once, at least one') + f'; {usage}')
-        nodes = {each: maker(each) for each in names}
     except ParameterError as error:
         sys.exit(_fail(name, error, UNUSABLE))
-    except ModuleNotFoundError as error:
-        sys.exit(_fail(name, f"a node needs the Python package '{error.name}'; what bridges "
-                       "need installs the extra 'hardware' of beetle_omni_ros", UNUSABLE))
-    sys.exit(run(nodes, [each for each in sys.argv if each not in names], name))
+    sys.exit(run(names, [each for each in sys.argv if each not in names], name))
 
 
 def maker(name: str) -> Callable:
@@ -72,12 +68,12 @@ def maker(name: str) -> Callable:
     return partial(made, registry.find(name.removesuffix('_node')))
 
 
-def run(nodes_to_make: Mapping[str, Callable], argv: Sequence[str], name: str) -> int:
+def run(names: Sequence[str], argv: Sequence[str], name: str) -> int:
     """
     Run nodes on one events executor until a signal or a fatal error.
 
     Args:
-        nodes_to_make: name of each node -> its class, called without arguments.
+        names: nodes, see :func:`maker`.
         argv: program name and ROS arguments.
         name: name of the process in messages.
 
@@ -93,8 +89,8 @@ def run(nodes_to_make: Mapping[str, Callable], argv: Sequence[str], name: str) -
         # rclpy's handlers would end the context while a callback still publishes.
         rclpy.init(args=list(argv), signal_handler_options=SignalHandlerOptions.NO)
         executor = make_executor()
-        for name, make in nodes_to_make.items():
-            node = make()
+        for name in names:
+            node = maker(name)()
             nodes.append(node)
             node.introduce()
             executor.add_node(node)
@@ -112,6 +108,9 @@ def run(nodes_to_make: Mapping[str, Callable], argv: Sequence[str], name: str) -
         pass
     except ParameterError as error:
         status = _fail(name, error, UNUSABLE)
+    except ModuleNotFoundError as error:
+        status = _fail(name, f"needs the Python package '{error.name}': "
+                       'docs/how-to/install.md', UNUSABLE)
     except OSError as error:
         status = _fail(name, error, FAILED)
     finally:
@@ -125,24 +124,16 @@ def run(nodes_to_make: Mapping[str, Callable], argv: Sequence[str], name: str) -
 
 
 def _own_arguments():
-    """Apply ``--discovery RANGE``; return what is not for ROS either."""
+    """Return the arguments that are not for ROS."""
     for flag, path in zip(sys.argv, sys.argv[1:]):
         if flag == '--params-file':     # by file and line; ROS would print a traceback
             load_yaml(path)
     try:
-        given = remove_ros_args(list(sys.argv))[1:]
+        return remove_ros_args(list(sys.argv))[1:]
     except Exception as error:      # rclpy does not export the class
         if 'ROSArgs' not in type(error).__name__:
             raise
         raise ParameterError(str(error)) from None
-    rest, left = [], iter(given)
-    for argument in left:
-        flag, equals, value = argument.partition('=')
-        if flag == ARGUMENT:
-            confine(requested=(value if equals else next(left, '')) or 'nothing')
-        else:
-            rest.append(argument)
-    return rest
 
 
 def make_executor(context=None):

@@ -1,15 +1,13 @@
-"""ROS nodes beside the control loop: targets of a task, recorder, markers for viewers."""
+"""ROS nodes beside the control loop: targets of a task, recorder, the frame for viewers."""
 
 from dataclasses import dataclass
 from functools import partial
 import sys
 
-from geometry_msgs.msg import Point, TransformStamped
+from geometry_msgs.msg import TransformStamped
 import numpy as np
 from rcl_interfaces.srv import SetParameters
 from rclpy.event_handler import SubscriptionEventCallbacks
-from std_msgs.msg import ColorRGBA
-from visualization_msgs.msg import Marker, MarkerArray
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
@@ -27,18 +25,11 @@ from beetle_omni_ros.messages.values import Wrench
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.node import ERROR, FlightNode, OK, WARN
 from beetle_omni_ros.nodes.parameters import file_parameter
-from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import NAMES, parameter, ParameterError
 from beetle_omni_ros.robot.urdf import description
 from beetle_omni_ros.runs.bag import BagError
 from beetle_omni_ros.runs.bag_writer import BagWriter, COMPRESSIONS
 from beetle_omni_ros.runs.tasks import make_task, TaskPlayer
-
-try:
-    from tf2_msgs.msg import TFMessage
-except ImportError:     # a ROS from PyPI, for which there is no viewer of frames either
-    TFMessage = None
 
 PERIOD = 0.02           # s between updates of the task
 IMPULSE_PERIOD = 0.005  # s, the same for tasks with impulses of 50 ms
@@ -48,9 +39,7 @@ WINDOW, WINDOW_PERIOD, WINDOW_SAMPLE = 3.0, 1.5, 0.05   # s
 WRITE_PERIOD = 0.02     # s between writes of the received messages, so that no callback waits
 FLUSH_WRITES = 20       # writes between flushes; a crash loses only messages after the last one
 HELD = 1000             # messages at most that wait for the first simulated time
-FRAME_PERIOD, MARKER_PERIOD = 0.02, 0.05      # s between two frames, two sets of markers
-NEWTON_PER_METRE = 40.0     # N of thrust that are drawn as one metre
-BODY_COLOUR, THRUST_COLOUR, TARGET_COLOUR = (0.3, 0.3, 0.35), (0.9, 0.5, 0.1), (0.2, 0.7, 0.3)
+FRAME_PERIOD = 0.02     # s between two transforms
 
 
 # --- targets ------------------------------------------------------------------------------------
@@ -228,39 +217,21 @@ class RecorderNode(FlightNode):
             print(f'recorder_node: error: {error}', file=sys.stderr)
 
 
-# --- markers ------------------------------------------------------------------------------------
-
-@dataclass(frozen=True, kw_only=True)
-class ViewerNodeParameters:
-    """Parameters of viewer_node."""
-
-    robot_file: str = file_parameter()
-
+# --- viewers ------------------------------------------------------------------------------------
 
 class ViewerNode(FlightNode):
-    """Publishes the transform from world to base_link, and markers, for RViz and Foxglove."""
+    """Publishes the transform from world to base_link for RViz and Foxglove."""
 
     def __init__(self):
-        super().__init__('viewer_node', ViewerNodeParameters)
-        self._robot = RobotParameters.load(self.parameters.robot_file or None)
-        if TFMessage is not None:
-            self._transforms = self.create_publisher(TFMessage, '/tf', wire.profile(EVENT))
-            self.create_timer(FRAME_PERIOD, self._move, clock=self.steady_clock)
-        self._markers = self.create_publisher(MarkerArray, 'markers', wire.profile(EVENT))
-        self._odom = self._joints = self._command = self._target = None
-        self._moved = None      # stamp of the estimate that the frame shows
-        self.listen('odom', partial(setattr, self, '_odom'), qos=SENSOR)
-        self.listen('joint_states', partial(setattr, self, '_joints'))
-        self.listen('command', partial(setattr, self, '_command'), qos=SENSOR, stale_after=None)
-        self.listen('target_pose', lambda target, _: setattr(self, '_target', target),
-                    stale_after=None)
-        self.create_timer(MARKER_PERIOD, self._draw, clock=self.steady_clock)
+        super().__init__('viewer_node')
+        self._message = wire.message_class('tf2_msgs/msg/TFMessage')    # not on PyPI
+        self._transforms = self.create_publisher(self._message, '/tf', wire.profile(EVENT))
+        self._moved = 0.0       # stamp of the estimate that the frame shows
+        self.listen('odom', self._on_odom, qos=SENSOR)
 
-    def _move(self):
-        """Publish the frame of the body, if there is a subscription."""
-        odom = self._odom
-        if odom is None or odom.stamp == self._moved or \
-                not self._transforms.get_subscription_count():
+    def _on_odom(self, odom):
+        if not self._transforms.get_subscription_count() \
+                or 0 <= odom.stamp - self._moved < FRAME_PERIOD:
             return
         self._moved = odom.stamp
         frame = TransformStamped(child_frame_id=BODY)
@@ -268,38 +239,4 @@ class ViewerNode(FlightNode):
         frame.header.frame_id = WORLD
         set_parts(frame.transform.translation, odom.position)
         set_parts(frame.transform.rotation, odom.quaternion)
-        self._transforms.publish(TFMessage(transforms=[frame]))
-
-    def _draw(self):
-        if self._odom is None or not self._markers.get_subscription_count():
-            return
-        odom, markers = self._odom, MarkerArray()
-        to_world = rotations.matrix(odom.quaternion)
-        centres = odom.position + self._robot.rotors.positions @ to_world.T
-        lines = [point for centre in centres for point in (odom.position, centre)]
-        markers.markers.append(self._marker('body', Marker.LINE_LIST, lines, 0.02, BODY_COLOUR))
-        if self._joints is not None and self._command is not None:
-            thrust = self._command.thrust / NEWTON_PER_METRE
-            for k, axis in enumerate(self._robot.tilt_axes):
-                tilt = rotations.matrix(rotations.exp(axis * self._joints.position[k]))
-                tip = centres[k] + thrust[k] * to_world @ tilt[:, 2]
-                markers.markers.append(self._marker(
-                    f'rotor{k + 1}', Marker.ARROW, [centres[k], tip], 0.03, THRUST_COLOUR))
-        if self._target is not None:
-            axes = rotations.matrix(self._target.quaternion)
-            ends = [end for axis in axes.T
-                    for end in (self._target.position, self._target.position + 0.3 * axis)]
-            markers.markers.append(
-                self._marker('target', Marker.LINE_LIST, ends, 0.01, TARGET_COLOUR))
-        self._markers.publish(markers)
-
-    def _marker(self, name, kind, points, width, colour):
-        marker = Marker(ns=name, type=kind, action=Marker.ADD)
-        marker.header.frame_id = WORLD
-        set_time(marker.header.stamp, self._odom.stamp)
-        marker.scale.x = width
-        marker.scale.y = marker.scale.z = 2 * width
-        marker.pose.orientation.w = 1.0
-        marker.color = ColorRGBA(**dict(zip('rgb', colour)), a=1.0)
-        marker.points = [Point(**dict(zip('xyz', map(float, p)))) for p in points]
-        return marker
+        self._transforms.publish(self._message(transforms=[frame]))

@@ -7,25 +7,18 @@ from types import SimpleNamespace
 import pytest
 
 from beetle_omni_ros.nodes import graph
-from beetle_omni_ros.robot.schema import ParameterError
 
 
 @pytest.mark.parametrize('given, holds', [
-    ({}, 'LOCALHOST'), ({'BEETLE_OMNI_DISCOVERY': ''}, 'LOCALHOST'),
-    ({'BEETLE_OMNI_DISCOVERY': 'SUBNET'}, 'SUBNET'),
-    ({'BEETLE_OMNI_DISCOVERY': 'subnet', 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}, 'SUBNET'),
-    ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}, 'SUBNET'),
+    ({}, 'LOCALHOST'), ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}, 'SUBNET'),
     ({'ROS_STATIC_PEERS': '192.168.1.2'}, None), ({'ROS_LOCALHOST_ONLY': '0'}, None)])
 def test_the_users_setting_has_precedence(given, holds):
     graph.confine(given)
     assert given.get('ROS_AUTOMATIC_DISCOVERY_RANGE') == holds
-    with pytest.raises(ParameterError, match='expected one of LOCALHOST, SUBNET'):
-        graph.confine({'BEETLE_OMNI_DISCOVERY': 'world'})
 
 
-def test_an_argument_of_fly_reaches_both_processes(tmp_path, monkeypatch):
-    for name in (*graph.ROS_SETTINGS, graph.VARIABLE):
-        monkeypatch.setenv(name, '')        # put back afterwards
+def test_the_setting_reaches_both_processes_of_a_flight(tmp_path, monkeypatch):
+    monkeypatch.setenv(graph.RANGE, 'SUBNET')
     ranges = []
 
     def start(arguments, env, **_):
@@ -34,7 +27,6 @@ def test_an_argument_of_fly_reaches_both_processes(tmp_path, monkeypatch):
 
     monkeypatch.setattr(subprocess, 'Popen', start)
     monkeypatch.setattr(os.path, 'exists', lambda _: True)
-    graph.confine(requested='subnet')
     nodes, _ = graph.plan('hover', ports=str(tmp_path))
     graph.Graph(nodes, tmp_path, 7).start()
     assert ranges == ['SUBNET'] * 2
