@@ -1,8 +1,8 @@
 """ROS lifecycle nodes between the topics and the actuators: tilt servos and motor board."""
 
 from collections import Counter
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import replace
+from functools import partial, partialmethod
 import math
 import time
 
@@ -31,6 +31,12 @@ CHECK_PERIOD = 0.05     # [s] between checks of the bus thread's events
 RPM = math.pi / 30      # [rad/s]
 LATENCY = 'stamp of the answered IMU sample to the last byte of its command'
 POLL_CYCLES = 2         # the board sends its rotors' speeds 100 times a second
+
+
+def autostart(default: str):
+    """Make the parameter of the automatic start."""
+    return parameter(default, choices=tuple(AUTOSTART), read_only=True,
+                     doc='transition at the start, repeated until it succeeds')
 
 
 class BridgeNode(LifecycleNodeMixin, FlightNode):
@@ -76,53 +82,36 @@ class BridgeNode(LifecycleNodeMixin, FlightNode):
         self._starts = False
         self.changed()
 
-    # --- called by rclpy ----------------------------------------------------------------------
-
-    def on_configure(self, state):
-        """Open the device."""
-        return self._attempt('configure', self.configure, self.release)
-
-    def on_activate(self, state):
-        """Power the device."""
-        return self._attempt('activate', self.activate)
-
-    def on_deactivate(self, state):
-        """Switch the power off; ends the automatic start."""
-        return self._end('deactivate', self.deactivate)
-
-    def on_cleanup(self, state):
-        """Close the device; ends the automatic start."""
-        return self._end('clean up', self.release)
-
-    def on_shutdown(self, state):
-        """Close the device."""
-        return self._end('shut down', self.release)
-
-    def on_error(self, state):
-        """Close the device after an unexpected exception; it can be configured again."""
-        self.release()
-        return TransitionCallbackReturn.SUCCESS
-
-    def _end(self, what, action):
-        if self._start_timer is not None:
+    def _attempt(self, what, action, state):
+        """Make a transition by a method; any but the first two ends the automatic start."""
+        if what not in ('configure', 'activate') and self._start_timer is not None:
             self._start_timer.cancel()
-        return self._attempt(what, action)
-
-    def _attempt(self, what, action, undo=lambda: None):
         before, self.refusal = self.refusal, ''
         try:
-            action()
+            getattr(self, action)()
         except (ServoBusError, SerialPortError) as error:
-            undo()
+            if what == 'configure':
+                self.release()
             self.refusal = ' '.join(str(error).split())
             if self.refusal != before:      # attempts are repeated, lines are not
                 self.log_line('warning' if self._starts else 'error',
                               f'cannot {what}: {self.refusal}'
                               + ('; tries again' if self._starts else ''))
             return TransitionCallbackReturn.FAILURE
-        except Exception as error:
+        except Exception as error:      # rclpy does not log it
             self.get_logger().fatal(f'cannot {what}: {type(error).__name__}: {error}')
             raise
+        return TransitionCallbackReturn.SUCCESS
+
+    on_configure = partialmethod(_attempt, 'configure', 'configure')
+    on_activate = partialmethod(_attempt, 'activate', 'activate')
+    on_deactivate = partialmethod(_attempt, 'deactivate', 'deactivate')
+    on_cleanup = partialmethod(_attempt, 'clean up', 'release')
+    on_shutdown = partialmethod(_attempt, 'shut down', 'release')
+
+    def on_error(self, state):
+        """Close the device after an unexpected exception; it can be configured again."""
+        self.release()
         return TransitionCallbackReturn.SUCCESS
 
     def _on_change_state(self, request, response):
@@ -139,23 +128,14 @@ class BridgeNode(LifecycleNodeMixin, FlightNode):
 
 # --- servos -------------------------------------------------------------------------------------
 
-@dataclass(frozen=True, kw_only=True)
-class JointBridgeNodeParameters(ServoBusParameters):
-    """Parameters of joint_bridge_node: the bus's parameters, the files, and autostart."""
-
-    robot_file: str = file_parameter()
-    servo_bus_file: str = file_parameter('servo file to start from')
-    autostart: str = parameter('none', choices=tuple(AUTOSTART), read_only=True,
-                               doc='transition at the start, repeated until it succeeds')
-
-
 class JointBridgeNode(BridgeNode):
     """Lifecycle node: configure checks the servos, activate switches their torque on."""
 
     def __init__(self):
-        super().__init__('joint_bridge_node', JointBridgeNodeParameters, 'params/servo_bus.yaml',
+        super().__init__('joint_bridge_node', ServoBusParameters, 'params/servo_bus.yaml',
                          'servo_bus_file', on_change=self._changed,
-                         changeable=('confirm_tilts', 'confirmed_tilts'))
+                         changeable=('confirm_tilts', 'confirmed_tilts'),
+                         robot_file=file_parameter(), autostart=autostart('none'))
         self._travel = RobotParameters.load(self.parameters.robot_file or None).joints
         self._bus = self._loop = None
         self._lost_reason = ''
@@ -164,14 +144,11 @@ class JointBridgeNode(BridgeNode):
         self._published = ''
         self._joints = self.publisher('joint_states')
         self.listen('command', self._on_command, max_age=COMMAND_AGE, stale_after=None)
-        # loop, its cycles and missed cycles, and the time of the last bus status
-        self._counted = (None, 0, 0, time.monotonic())
         self.health.report('bus', self._bus_status)
         self.health.report('latency', lambda: self._latency.status(LATENCY))
         for k, name in enumerate(JOINT_NAMES):
             self.health.report(name, partial(self._servo_status, k))
-            self.create_service(Trigger, f'~/reboot_{name}', partial(self._on_reboot, [k]))
-        self.create_service(Trigger, '~/reboot', partial(self._on_reboot, None))
+        self.create_service(Trigger, '~/reboot', self._on_reboot)
         self.create_timer(CHECK_PERIOD, self.changed, clock=self.steady_clock)
         self.start_by_itself()
         self.changed()
@@ -227,13 +204,13 @@ class JointBridgeNode(BridgeNode):
             with self._loop.exclusive() as bus:
                 bus.parameters = new
 
-    def _on_reboot(self, which, _, response):
+    def _on_reboot(self, _, response):
+        """Restart the servos that have switched themselves off, or all if none has."""
         if self._loop is None:
             response.success, response.message = False, 'not configured'
             return response
-        if which is None:
-            which = [k for k, servo in enumerate(self._bus.servos)
-                     if servo.errors and not servo.torque] or range(4)
+        which = [k for k, servo in enumerate(self._bus.servos)
+                 if servo.errors and not servo.torque] or range(4)
         with self._loop.exclusive() as bus:
             for k in which:
                 bus.reboot(int(self.parameters.ids[k]))
@@ -282,25 +259,15 @@ class JointBridgeNode(BridgeNode):
             else 'waiting: not configured'
 
     def _bus_status(self):
-        loop, bus, text, now = self._loop, self._bus, self._published, time.monotonic()
+        loop, bus, text = self._loop, self._bus, self._published
         if loop is None:
             return WARN if self.stage == ACTIVE else OK, text, {'stage': self.stage}
-        before, cycles, missed, then = self._counted
-        if loop is not before:
-            cycles = missed = 0
-        self._counted = (loop, loop.cycles, loop.missed, now)
-        missed = loop.missed - missed
-        values = {
+        level = ERROR if text.startswith('lost') else OK if bus.link.is_open else WARN
+        return level, 'no connection' if level == WARN else text, {
             'stage': self.stage, 'cycles': loop.cycles, 'missed_cycles': loop.missed,
-            'rate_hz': (loop.cycles - cycles) / max(now - then, 1e-3),
             'connected': bus.link.is_open, 'goals_written': loop.written,
             'goals_stale': loop.stale, 'goals_clipped': bus.clipped,
             'incomplete': loop.incomplete, **bus.link.counts}
-        if text.startswith('lost'):
-            return ERROR, text, values
-        if not bus.link.is_open:
-            return WARN, 'no connection', values
-        return (WARN, f'{missed} cycles missed', values) if missed else (OK, text, values)
 
     def _servo_status(self, k):
         if self._bus is None:
@@ -320,16 +287,6 @@ class JointBridgeNode(BridgeNode):
 
 # --- motor board --------------------------------------------------------------------------------
 
-@dataclass(frozen=True, kw_only=True)
-class RotorBridgeNodeParameters(MotorBoardParameters):
-    """Parameters of rotor_bridge_node: the driver's parameters, the files, and autostart."""
-
-    robot_file: str = file_parameter('robot file with the rotor map')
-    motor_board_file: str = file_parameter('motor board file')
-    autostart: str = parameter('activate', choices=tuple(AUTOSTART), read_only=True,
-                               doc='transition at the start')
-
-
 class RotorBridgeNode(BridgeNode):
     """
     Executes the thrusts of command; publishes battery_state, rotor_states and its own state.
@@ -341,8 +298,9 @@ class RotorBridgeNode(BridgeNode):
     """
 
     def __init__(self):
-        super().__init__('rotor_bridge_node', RotorBridgeNodeParameters,
-                         'params/motor_board.yaml', 'motor_board_file')
+        super().__init__('rotor_bridge_node', MotorBoardParameters, 'params/motor_board.yaml',
+                         'motor_board_file', robot_file=file_parameter(),
+                         autostart=autostart('activate'))
         given = self.parameters
         robot = RobotParameters.load(given.robot_file or None)
         self._cells = robot.battery.cells
@@ -355,9 +313,6 @@ class RotorBridgeNode(BridgeNode):
         self._state, self._port_error = '', None
         self._updated = self._next_try = time.monotonic()
         self._cycle, self._sent_at = 0, 0.0
-        # Counts of the targets: one is due in each period while the robot flies.
-        self._last_target = None
-        self._cycles = self._missed = self._missed_reported = 0
         self._unsent = Counter()
         self._latency = Distribution()
         self._normalised = np.zeros(4)
@@ -446,19 +401,12 @@ class RotorBridgeNode(BridgeNode):
         command = self._command
         if self._arming.phase != FLIES or command is None \
                 or self.now() - command.stamp > self.parameters.stamp_age_limit:
-            self._last_target = None    # no period counts as missed before the next target
             return False
         sent = self._board.send(command.thrust, command.stamp)
-        self._sent_at = now = time.monotonic()
+        self._sent_at = time.monotonic()
         if sent.reason:
             self._unsent[sent.reason] += 1
             return False
-        if self._last_target is not None:
-            # A gap nearer to one period than to two was in time.
-            cycles = round((now - self._last_target) / self._period)
-            self._cycles += cycles
-            self._missed += max(cycles - 1, 0)
-        self._last_target = now
         self._normalised = sent.command
         self._saturated += sent.saturated
         return True
@@ -488,13 +436,9 @@ class RotorBridgeNode(BridgeNode):
 
     def _board_status(self):
         arming, text = self._arming, self._arming.text
-        values = {'phase': arming.phase, 'cycles': self._cycles, 'missed_cycles': self._missed,
+        values = {'phase': arming.phase,
                   **{f'not sent: {reason}': n for reason, n in self._unsent.items()}}
-        missed, self._missed_reported = self._missed - self._missed_reported, self._missed
-        level = ERROR if arming.phase == LOST else \
-            OK if text == 'ready' and not missed else WARN
-        if missed and text == 'ready':
-            text = f'{missed} cycles missed'
+        level = ERROR if arming.phase == LOST else OK if text == 'ready' else WARN
         if status := self._board.state.status:
             values.update({'armed': int(status.armed), 'state': status.state,
                            'last disarmed': status.stop_reason,

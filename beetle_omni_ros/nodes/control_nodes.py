@@ -1,6 +1,6 @@
 """ROS nodes of the control loop: state estimator, any registered controller, supervisor."""
 
-from dataclasses import dataclass, make_dataclass, replace
+from dataclasses import replace
 from functools import partial
 import math
 import secrets
@@ -24,7 +24,7 @@ from beetle_omni_ros.nodes.node import ERROR, FlightNode, IDENTITY, OK, WARN
 from beetle_omni_ros.nodes.parameters import file_parameter
 from beetle_omni_ros.robot.allocation import ALL_HEALTHY
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import NAMES, parameter, ParameterError
+from beetle_omni_ros.robot.schema import parameter, ParameterError
 from beetle_omni_ros.runs.targets import TargetChecks
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.supervisor import DISARMED, FALLBACK, FLYING, STOPPED, Supervisor
@@ -41,19 +41,12 @@ WATCH_PERIOD = 0.01     # s between checks for silent inputs
 
 # --- estimator ----------------------------------------------------------------------------------
 
-@dataclass(frozen=True, kw_only=True)
-class EkfNodeParameters(EkfParameters):
-    """Parameters of ekf_node: the estimator's parameters and the files."""
-
-    robot_file: str = file_parameter()
-    ekf_file: str = file_parameter('estimator file to start from')
-
-
 class EkfNode(FlightNode):
     """Publishes odom for every IMU sample, corrected by MoCap poses at their capture time."""
 
     def __init__(self):
-        super().__init__('ekf_node', EkfNodeParameters, 'params/ekf.yaml', 'ekf_file')
+        super().__init__('ekf_node', EkfParameters, 'params/ekf.yaml', 'ekf_file',
+                         robot_file=file_parameter())
         robot = RobotParameters.load(self.parameters.robot_file or None)
         self._ekf = ErrorStateEkf(self.parameters.of_robot(robot), robot.gravity)
         self._status = self._ekf.status
@@ -99,8 +92,11 @@ class ControllerNode(FlightNode):
         """
         is_own = entry and f'{entry.name}_node' in NODES    # of an executable of this name
         entry = entry or registry.find(_requested_controller())
-        super().__init__(f'{entry.name}_node', node_parameters(entry, not is_own),
-                         entry.parameters_file, entry.file_key, completed=entry.completed)
+        more = {} if is_own else {'controller': parameter(
+            entry.reference, doc='controller that this node runs', read_only=True)}
+        super().__init__(f'{entry.name}_node', entry.parameter_class, entry.parameters_file,
+                         entry.file_key, completed=entry.completed,
+                         robot_file=file_parameter(), **more)
         self._entry = entry
         robot = RobotParameters.load(self.parameters.robot_file or None)
         controller = entry.make(
@@ -206,21 +202,6 @@ class ControllerNode(FlightNode):
         return OK, getattr(controller, 'name', self._entry.name), values
 
 
-def node_parameters(entry: ControllerEntry, selectable: bool) -> type:
-    """Make the parameter class of a controller's node: controller, robot and controller file."""
-    base = entry.parameter_class
-    more = {'robot_file': ('', 'robot file of the controller; empty: the shipped one'),
-            entry.file_key: ('', f"controller file; empty: {entry.parameters_file or 'none'}")}
-    if selectable:
-        more['controller'] = (entry.reference, 'controller that this node runs')
-    return make_dataclass(
-        f'{entry.name}_parameters',
-        [(name, str, parameter(default, doc=doc, read_only=True))
-         for name, (default, doc) in more.items()],
-        bases=(base,) if base else (),
-        frozen=base is None or base.__dataclass_params__.frozen, kw_only=True)
-
-
 def _requested_controller() -> str:
     """Read the parameter ``controller`` by a temporary node, before the real one is made."""
     probe = Node(GENERIC, start_parameter_services=False, enable_rosout=False)
@@ -236,17 +217,6 @@ def _requested_controller() -> str:
 
 # --- supervisor ---------------------------------------------------------------------------------
 
-@dataclass(frozen=True, kw_only=True)
-class SupervisorNodeParameters(SupervisorParameters):
-    """Parameters of supervisor_node: the supervisor's parameters, controllers and files."""
-
-    controllers: NAMES = parameter(
-        tuple(registry.standing_by()), read_only=True,
-        doc='controllers that may be active: registered names, or FILE.py:Class')
-    robot_file: str = file_parameter()
-    supervisor_file: str = file_parameter('supervisor file')
-
-
 class SupervisorNode(FlightNode):
     """
     Publishes command, the only topic that actuators execute, and supervisor/state (latched).
@@ -256,8 +226,12 @@ class SupervisorNode(FlightNode):
     """
 
     def __init__(self):
-        super().__init__('supervisor_node', SupervisorNodeParameters, 'params/supervisor.yaml',
-                         'supervisor_file', self._changed, changeable=('controller',))
+        controllers = parameter(
+            tuple(registry.standing_by()), read_only=True,
+            doc='controllers that may be active: registered names, or FILE.py:Class')
+        super().__init__('supervisor_node', SupervisorParameters, 'params/supervisor.yaml',
+                         'supervisor_file', self._changed, changeable=('controller',),
+                         controllers=controllers, robot_file=file_parameter())
         robot = RobotParameters.load(self.parameters.robot_file or None)
         self._sensors = robot.sensors
         self._controllers = [registry.find(name).name if ':' in name else name

@@ -1,16 +1,14 @@
 """`beetle_omni fly`: fly the ROS graph, record a bag, and print the results from the bag."""
 
+from collections.abc import Callable
 from contextlib import contextmanager, ExitStack
 from pathlib import Path
-import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.control import registry
@@ -35,7 +33,6 @@ from beetle_omni_ros.runs.tasks import make_task, Task
 from beetle_omni_ros.sim import fault_lists as listed
 
 INTERRUPTED = 130
-VIEWER_STOP_TIMEOUT = 3.0       # s
 ACTUATORS, CLOCKS = ('emulated', 'direct'), ('system', 'simulated')
 READY_TIMEOUT = 300.0   # s; the first start compiles the controller
 BRIDGES_TIMEOUT = 20.0  # s; the simulator makes their devices at its start
@@ -52,9 +49,6 @@ ON_GROUND = ('disarmed', 'emergency_stop')
 # stop after so long without a command.
 SLOW_TIME = 0.1
 PACING = 'sim_node: pacing'
-# bridge -> (name of its status in diagnostics, prefix of the keys of a flight's measurements)
-MEASURED = {
-    'joint_bridge_node': ('bus', 'servos'), 'rotor_bridge_node': ('board', 'motor_board')}
 
 
 def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
@@ -152,25 +146,17 @@ def _absolute(path):
 
 @contextmanager
 def viewer_process(domain_id: int, robot: Path | None, allow_targets: bool, console: Console):
-    """Run `beetle_omni view` during a flight and print its lines on the console."""
-    process = subprocess.Popen(
-        [sys.executable, '-m', 'beetle_omni_ros.start', 'beetle_omni', 'view',
-         '--domain-id', str(domain_id),
-         *(['--robot', str(robot)] if robot else []),
-         *(['--allow-targets'] if allow_targets else [])],
-        env=child_environment(domain_id), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-        text=True, start_new_session=True)
-    threading.Thread(target=lambda: [_print(console, line.rstrip()) for line in process.stdout],
-                     daemon=True).start()
-    try:
-        yield process
-    finally:
-        process.send_signal(signal.SIGINT)
+    """Run `beetle_omni view` during a flight, and print its address."""
+    command = [sys.executable, '-m', 'beetle_omni_ros.start', 'beetle_omni', 'view', '--domain-id',
+               str(domain_id), *(['--robot', str(robot)] if robot else []),
+               *(['--allow-targets'] if allow_targets else [])]
+    with subprocess.Popen(command, env=child_environment(domain_id), stdin=subprocess.DEVNULL,
+                          stdout=subprocess.PIPE, text=True, start_new_session=True) as process:
         try:
-            process.wait(VIEWER_STOP_TIMEOUT)
-        except subprocess.TimeoutExpired:
+            _print(console, process.stdout.readline().rstrip())
+            yield
+        finally:
             process.kill()
-            process.wait()
 
 
 def _print(console, text, **style):
@@ -187,10 +173,8 @@ def _fly(graph: Graph, controller: str, task: Task, meta: dict, console: Console
     try:
         graph.start()
         operator = Operator(graph.domain, controller)
-        columns = (TextColumn('{task.description}'), BarColumn(),
-                   TextColumn('{task.fields[at]}'), TimeElapsedColumn())
-        with Progress(*columns, console=console, transient=True) as bars:
-            flight = Flight(graph, operator, task, bars, faults)
+        with console.status('starting') as status:
+            flight = Flight(graph, operator, task, status.update, faults)
             try:
                 flight.fly()
             except RunError as error:
@@ -198,10 +182,6 @@ def _fly(graph: Graph, controller: str, task: Task, meta: dict, console: Console
                 failure = str(error)
             flight.land()
         meta['graph'] = flight.measured
-        operator.report('fly: run', 'what is flown', {k: v for k, v in meta.items()
-                                                      if not isinstance(v, dict)})
-        operator.report('fly: graph', 'CPU of all nodes, latency of commands', flight.measured)
-        operator.spin(0.2)
     finally:
         stubborn = graph.stop()
         if operator:
@@ -222,22 +202,20 @@ class Flight:
         graph: started nodes.
         operator: operator in the same ROS domain.
         task: task to fly.
-        progress: display of the progress.
+        show: displays a line about the progress.
         faults: value of sim_node's parameter ``faults`` from the task's start on.
 
     Attributes:
-        measured: CPU of the graph and of its bridges [% of one core], latencies [ms], cycles of
-            the bridges; with simulated time, its ratio to real time and no latencies.
+        measured: CPU of the graph and of its bridges [% of one core], cycles of the servo bus,
+            latencies [ms]; with simulated time, its ratio to real time and no latencies.
 
     """
 
-    def __init__(self, graph: Graph, operator: Operator, task: Task, progress: Progress,
-                 faults: str = ''):
+    def __init__(self, graph: Graph, operator: Operator, task: Task,
+                 show: Callable[[str], None], faults: str = ''):
         self._graph, self._operator, self._task = graph, operator, task
         self._bridges = [node for node in graph.nodes if node in BRIDGES]
-        self._progress, self._faults = progress, faults
-        self._bar = progress.add_task('', total=task.duration, at='')
-        self._reported: set[str] = set()
+        self._show, self._faults = show, faults
         self.measured: dict[str, float] = {}
 
     def fly(self) -> None:
@@ -270,75 +248,61 @@ class Flight:
 
     def _take_off(self):
         """Arm and take off; repeat if the supervisor disarms on the ground."""
-        operator = self._operator
+        operator, answers = self._operator, []
         for _ in range(TAKEOFF_ATTEMPTS):
-            self._show('arming')
-            left = operator.countdown(ARM_TIMEOUT)
             self._spin(SETTLE_TIME)
-            while not (answer := operator.call('arm'))[0]:
-                if next(left, None) is None:
-                    raise RunError(f'supervisor_node refuses to arm: {answer[1]}')
-                self._spin()
+            self._await('arming', lambda: answers.append(operator.call('arm')) or answers[-1][0],
+                        ARM_TIMEOUT, lambda: f'; supervisor_node: {answers[-1][1]}')
             operator.states.clear()
             # The state may name a fault: disarmed:joint1_astray.
             self._await('taking off', lambda: operator.state.startswith('flying') or any(
-                state.partition(':')[0] == 'disarmed' for state in operator.states),
-                        TAKEOFF_TIMEOUT)
+                state.startswith('disarmed') for state in operator.states), TAKEOFF_TIMEOUT)
             if operator.state.startswith('flying'):
                 return
         raise RunError(f'no take-off in {TAKEOFF_ATTEMPTS} attempts; see the warnings below')
 
     def _fly_task(self):
-        operator, graph = self._operator, self._graph
+        operator, name = self._operator, self._task.name
         before, start, steady = self._counts(), operator.time(), time.monotonic()
-        if self._faults:
-            self._inject_faults()
-        left = operator.countdown(self._task.duration + SPARE_TIME)
-        while not operator.progress.startswith('done'):
-            self._spin()
-            self._show(f'{self._task.name} ({operator.state})', operator.progress,
-                       operator.time() - start)
+        if self._faults:        # as the task begins, so that their times count from there
+            self._await(name, lambda: operator.progress.startswith('flying'), TAKEOFF_TIMEOUT)
+            accepted, answer = operator.set('sim_node', 'faults', self._faults)
+            if not accepted:
+                raise RunError(f'sim_node refuses the faults: {answer}')
+
+        def is_done():
+            self._show(f'{name}: {operator.progress}, {operator.time() - start:.0f} of '
+                       f'{self._task.duration:.0f} s ({operator.state})')
             if operator.state in ON_GROUND:
                 raise RunError(f"the flight ended early, supervisor in '{operator.state}'")
-            if next(left, None) is None:
-                raise RunError(f"the task does not continue at '{operator.progress}'")
+            return operator.progress.startswith('done')
+
+        self._await(name, is_done, self._task.duration + SPARE_TIME,
+                    lambda: f"; the task does not continue at '{operator.progress}'")
         passed = time.monotonic() - steady
         counts = {key: value - before.get(key, 0) for key, value in self._counts().items()}
         self.measured = {key: 100 * value / passed if key.endswith('percent') else value
                          for key, value in counts.items()}
-        if graph.simulated:
+        if self._graph.simulated:
             self.measured['real_time_factor'] = (operator.time() - start) / passed
-        else:
-            self._take_latencies()
-
-    def _inject_faults(self):
-        """Set the faults as the task begins, so that their times count from there."""
-        operator = self._operator
-        if not operator.wait(lambda: operator.progress.startswith('flying'), TAKEOFF_TIMEOUT):
-            raise RunError(f"the task does not begin: '{operator.progress}'")
-        accepted, answer = operator.set('sim_node', 'faults', self._faults)
-        if not accepted:
-            raise RunError(f'sim_node refuses the faults: {answer}')
-
-    def _counts(self):
-        """CPU seconds so far, and counts of the bridges' cycles from their diagnostics."""
-        found = {'cpu_percent': self._graph.cpu_seconds()}
-        if self._bridges:
-            found['bridges_cpu_percent'] = self._graph.cpu_seconds(bridges=True)
-        for node, (status, name) in MEASURED.items():
-            values = self._operator.values(f'{node}: {status}')
-            found |= {f'{name}_{key}': int(values[key])
-                      for key in ('cycles', 'missed_cycles') if key in values}
-        return found
-
-    def _take_latencies(self):
-        """Add the latencies from the IMU sample to the rotors, and to the servos."""
+            return
+        # Latencies from the IMU sample to the rotors, and to the servos.
         last = 'rotor_bridge_node' if self._bridges else 'sim_node'
         for name, node in (('latency', last), ('servos_latency', 'joint_bridge_node')):
             self.measured.update({
                 f'{name}_{key}': float(value)
-                for key, value in self._operator.values(f'{node}: latency').items()
+                for key, value in operator.values(f'{node}: latency').items()
                 if key.endswith('_ms')})
+
+    def _counts(self):
+        """CPU seconds so far, and cycles of the servo bus."""
+        found = {'cpu_percent': self._graph.cpu_seconds()}
+        if self._bridges:
+            found['bridges_cpu_percent'] = self._graph.cpu_seconds(bridges=True)
+            values = self._operator.values('joint_bridge_node: bus')
+            found |= {f'servos_{key}': int(values[key])
+                      for key in ('cycles', 'missed_cycles') if key in values}
+        return found
 
     def land(self) -> None:
         """Land if the robot flies, and wait for the motors to stop."""
@@ -353,7 +317,7 @@ class Flight:
             operator.wait(lambda: operator.state in ON_GROUND, LANDING_TIMEOUT)
             operator.spin(1.1)      # the last diagnostics
 
-    def _await(self, text, condition, timeout):
+    def _await(self, text, condition, timeout, why=lambda: ''):
         self._show(text)
         left = self._operator.countdown(timeout)
         while not condition():
@@ -361,56 +325,30 @@ class Flight:
             if next(left, None) is None:
                 waits = self._operator.waits_for(self._bridges)
                 raise RunError(f'{text}: nothing after {timeout:g} s, supervisor in '
-                               f"'{self._operator.state}'" + (waits and f'; {waits}'))
+                               f"'{self._operator.state}'{why()}" + (waits and f'; {waits}'))
 
     def _spin(self, seconds=CHECK_PERIOD):
         """Process messages; an ended process and a failing controller end the flight."""
         operator = self._operator
         operator.spin(seconds)
-        dead = {name: how for name, how in self._graph.dead().items()
-                if name not in self._reported}
-        self._reported |= set(dead)
-        if dead:
+        if dead := self._graph.dead():
             raise RunError('; '.join(f'{name} died ({how})' for name, how in dead.items()))
         status = operator.diagnostics.get(f'{operator.controller}_node: controller')
         if status is not None and status.level >= ERROR \
                 and not operator.state.startswith('flying'):
             raise RunError(status.message)
 
-    def _show(self, text, at='', completed=0.0):
-        self._progress.update(self._bar, description=text, at=at,
-                              completed=min(completed, self._task.duration))
-
 
 def _report(bag, controller, task, meta, json_path, console) -> int:
     if (bag / 'metadata.yaml').exists():
-        add_meta(bag, {k: v for k, v in meta.items() if k != 'graph'})
+        add_meta(bag, meta)
     log = read_bag(bag)
     for line in log.warnings:
         _print(console, line, style='yellow')
     results = {'meta': meta, controller: metrics(log, task)}
     if log.controllers():       # a controller flew
         table.print_results(results, console)
-    _print_measured(meta, console)
+    _print(console, 'graph: ' + ', '.join(f"{key.replace('_', ' ')} {value:.4g}"
+                                          for key, value in meta.get('graph', {}).items()))
     write_json(json_path, results)
     return runner.FAILED if failed(results[controller]) else runner.OK
-
-
-def _print_measured(meta, console):
-    measured = meta.get('graph', {})
-    if 'cpu_percent' in measured:
-        console.print(f"graph: CPU {measured['cpu_percent']:.0f} % of one core while the task was "
-                      'flown' + (f", of it {measured['bridges_cpu_percent']:.0f} % in the bridges"
-                                 if 'bridges_cpu_percent' in measured else ''))
-    if 'real_time_factor' in measured:
-        console.print(f"simulated time: {measured['real_time_factor']:.2f} of real time")
-    for name, text in (('servos', 'servo bus'), ('motor_board', 'motor board')):
-        if f'{name}_cycles' in measured:
-            console.print(f"{text}: {measured[f'{name}_cycles']} cycles of 5 ms, "
-                          f"{measured[f'{name}_missed_cycles']} missed")
-    for name, text in (('latency', 'rotors'), ('servos_latency', 'servos')):
-        if f'{name}_p99_ms' in measured:
-            console.print(
-                f'latency, stamp of the IMU sample to its command at the {text}: median '
-                f"{measured[f'{name}_median_ms']:.2f} ms, 99th percentile "
-                f"{measured[f'{name}_p99_ms']:.2f} ms, max {measured[f'{name}_max_ms']:.1f} ms")

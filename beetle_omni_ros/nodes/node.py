@@ -16,6 +16,7 @@ from beetle_omni_ros.messages.topics import Qos, TARGETS, topic_of
 from beetle_omni_ros.messages.values import Diagnostic, MessageError
 from beetle_omni_ros.nodes import parameters, wire
 from beetle_omni_ros.nodes.graph import claim
+from beetle_omni_ros.nodes.parameters import file_parameter
 
 OK, WARN, ERROR = range(3)   # of diagnostic_msgs/DiagnosticStatus
 PERIOD = 1.0            # s between two diagnostics
@@ -34,14 +35,15 @@ class FlightNode(Node):
 
     """
 
-    def __init__(self, name: str, parameter_class: type | None = None, file: str | None = None,
+    def __init__(self, name: str, base: type | None = None, file: str | None = None,
                  file_key: str | None = None, on_change: Callable | None = None,
                  changeable: tuple[str, ...] | None = None,
-                 completed: Callable[[dict, bool], dict] | None = None):
+                 completed: Callable[[dict, bool], dict] | None = None, **more):
         """
         Claim the name, read the parameters, start diagnostics.
 
-        The arguments after ``name`` are those of :func:`parameters.declare`.
+        The parameters are those of the class ``base``, ``file_key`` and ``more`` (name -> field).
+        The arguments from ``file`` on are those of :func:`parameters.declare`.
 
         Raises:
             ParameterError: unusable parameters.
@@ -57,8 +59,11 @@ class FlightNode(Node):
         # Simulated time may stop, so timers of the flight must use it too.
         self.simulated = bool(self.get_parameter(parameters.CLOCK).value)
         self.flight_clock = self.get_clock() if self.simulated else self.steady_clock
-        self.parameters = parameters.declare(self, parameter_class, file, file_key,
-                                             on_change, changeable, completed)
+        if file_key:
+            more[file_key] = file_parameter('parameter file')
+        self.parameters = parameters.declare(
+            self, parameters.extended(f'{name}_parameters', base, more), file, file_key,
+            on_change, changeable, completed)
         self._supervisor_identity = ''
         self.health = Health(self)
         self.get_logger().debug('started')      # the first call is slow: not during a flight

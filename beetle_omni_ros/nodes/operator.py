@@ -32,7 +32,6 @@ from beetle_omni_ros.messages.topics import (
     TOPICS,
 )
 from beetle_omni_ros.messages.values import Diagnostic, MessageError
-from beetle_omni_ros.nodes import node as nodes
 from beetle_omni_ros.nodes import runner, wire
 from beetle_omni_ros.nodes.graph import BRIDGES, confine, READY
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -117,7 +116,6 @@ class Operator:
         wire.subscribe_raw(node, f'{controller}/command', self._on_command, SENSOR)
         wire.subscribe(node, 'diagnostics', lambda statuses: self.diagnostics.update(
             (status.name, status) for status in statuses))
-        self._diagnostics = wire.Publisher(node, 'diagnostics')
         self._clients = {name: node.create_client(Trigger, f'{SUPERVISOR}/{name}')
                          for name in SERVICES}
 
@@ -199,12 +197,6 @@ class Operator:
         """Return the values of a diagnostic status, empty before the first message."""
         found = self.diagnostics.get(status)
         return found.values if found else {}
-
-    def report(self, name: str, text: str, values: dict) -> None:
-        """Publish a status on ``diagnostics``, from where it gets into the bag."""
-        self._diagnostics.publish([Diagnostic(
-            self._node.get_clock().now().nanoseconds * 1e-9, name, nodes.OK, text,
-            nodes.texts(values))])
 
     def close(self) -> None:
         """Leave the graph."""

@@ -6,7 +6,7 @@ of the parameter files refuse both at the start of the node, in one line that na
 """
 
 from collections.abc import Callable
-from dataclasses import make_dataclass
+from dataclasses import make_dataclass, MISSING
 import types
 from typing import get_args, get_origin, Union
 
@@ -29,7 +29,17 @@ def file_parameter(what: str = 'robot file'):
     return schema.parameter('', doc=f'{what}; empty: the shipped one', read_only=True)
 
 
-def declare(node: Node, cls: type | None, file: str | None = None, file_key: str | None = None,
+def extended(name: str, base: type | None, fields: dict) -> type:
+    """Make a parameter class: ``base`` with more texts, numbers or lists of names."""
+    return make_dataclass(
+        name, [(key, NAMES if isinstance(entry.default, tuple) else
+                str if entry.default is MISSING else type(entry.default), entry)
+               for key, entry in fields.items()],
+        bases=(base,) if base else (), kw_only=True,
+        frozen=base is None or base.__dataclass_params__.frozen)
+
+
+def declare(node: Node, cls: type, file: str | None = None, file_key: str | None = None,
             on_change: Callable | None = None, changeable: tuple[str, ...] | None = None,
             completed: Callable[[dict, bool], dict] | None = None):
     """
@@ -40,8 +50,7 @@ def declare(node: Node, cls: type | None, file: str | None = None, file_key: str
 
     Args:
         node: node with automatically_declare_parameters_from_overrides off.
-        cls: dataclass of :func:`schema.parameter` and :func:`schema.group` fields; None: no
-            parameters.
+        cls: dataclass of :func:`schema.parameter` and :func:`schema.group` fields.
         file: shipped parameter file, such as ``params/ekf.yaml``.
         file_key: parameter that names another file.
         on_change: called with the new instance when parameters are set in flight; may raise
@@ -56,7 +65,6 @@ def declare(node: Node, cls: type | None, file: str | None = None, file_key: str
         ParameterError: unusable value; names file, key and expectation.
 
     """
-    cls = cls or make_dataclass('NoParameters', ())
     overrides = {name: value.value for name, value in node._parameter_overrides.items()
                  if name not in ROS_OWN and not name.startswith(ROS_OWN_PREFIX)}
     own_file = overrides.get(file_key)

@@ -1,6 +1,5 @@
 """ROS nodes beside the control loop: targets of a task, recorder, the frame for viewers."""
 
-from dataclasses import dataclass
 from functools import partial
 import sys
 
@@ -25,7 +24,7 @@ from beetle_omni_ros.messages.values import Wrench
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.node import ERROR, FlightNode, OK, WARN
 from beetle_omni_ros.nodes.parameters import file_parameter
-from beetle_omni_ros.robot.schema import NAMES, parameter, ParameterError
+from beetle_omni_ros.robot.schema import parameter, ParameterError
 from beetle_omni_ros.robot.urdf import description
 from beetle_omni_ros.runs.bag import BagError
 from beetle_omni_ros.runs.bag_writer import BagWriter, COMPRESSIONS
@@ -44,14 +43,6 @@ FRAME_PERIOD = 0.02     # s between two transforms
 
 # --- targets ------------------------------------------------------------------------------------
 
-@dataclass(frozen=True, kw_only=True)
-class ReferenceNodeParameters:
-    """Parameters of reference_node."""
-
-    task: str = parameter('hover', doc='name of a task, or a CSV file of poses', read_only=True)
-    seed: int = parameter(0, doc='seed of random poses', low=0, high=2**31 - 1, read_only=True)
-
-
 class ReferenceNode(FlightNode):
     """
     Publishes the targets of a task, beginning when the supervisor reports 'flying'.
@@ -61,7 +52,10 @@ class ReferenceNode(FlightNode):
     """
 
     def __init__(self):
-        super().__init__('reference_node', ReferenceNodeParameters)
+        super().__init__(
+            'reference_node',
+            task=parameter('hover', doc='name of a task, or a CSV file of poses', read_only=True),
+            seed=parameter(0, doc='seed of random poses', low=0, high=2**31 - 1, read_only=True))
         self._task = make_task(self.parameters.task, self.parameters.seed)
         self._player = self._odom = self._trajectory = None
         self._window_end = 0.0
@@ -134,24 +128,18 @@ class ReferenceNode(FlightNode):
 
 # --- recorder -----------------------------------------------------------------------------------
 
-@dataclass(frozen=True, kw_only=True)
-class RecorderNodeParameters:
-    """Parameters of recorder_node."""
-
-    bag: str = parameter(doc='folder to create for the bag', read_only=True)
-    controllers: NAMES = parameter(
-        tuple(registry.standing_by()), read_only=True,
-        doc='registered controllers whose commands are recorded')
-    urdf_file: str = file_parameter('robot description for the recorded frames')
-    compression: str = parameter('none', choices=COMPRESSIONS, read_only=True,
-                                 doc='compression of the chunks in the MCAP file')
-
-
 class RecorderNode(FlightNode):
     """Writes the messages of every topic of the package into a bag, like ``ros2 bag record``."""
 
     def __init__(self):
-        super().__init__('recorder_node', RecorderNodeParameters)
+        super().__init__(
+            'recorder_node',
+            bag=parameter(doc='folder to create for the bag', read_only=True),
+            controllers=parameter(tuple(registry.standing_by()), read_only=True,
+                                  doc='registered controllers whose commands are recorded'),
+            urdf_file=file_parameter('robot description for the recorded frames'),
+            compression=parameter('none', choices=COMPRESSIONS, read_only=True,
+                                  doc='compression of the chunks in the MCAP file'))
         topics = topics_with(self.parameters.controllers)
         self._bag = None
         try:
