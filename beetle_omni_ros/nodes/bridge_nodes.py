@@ -16,9 +16,9 @@ from beetle_omni_ros.drivers.serial_port import SerialPortError
 from beetle_omni_ros.drivers.servo_bus import ServoBus
 from beetle_omni_ros.drivers.servo_link import ServoBusError
 from beetle_omni_ros.drivers.servo_loop import ServoLoop
+from beetle_omni_ros.nodes import parameters
 from beetle_omni_ros.nodes.graph import AUTOSTART
 from beetle_omni_ros.nodes.node import Distribution, ERROR, FlightNode, OK, WARN
-from beetle_omni_ros.nodes.parameters import file_parameter
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters
 from beetle_omni_ros.robot.readings import JointReading, RotorReading
 from beetle_omni_ros.robot.schema import parameter
@@ -29,14 +29,7 @@ COMMAND_AGE = 0.1       # [s] older commands are not written to the servos
 LOST_AFTER = 0.3        # [s] after which a servo without response or torque is lost
 CHECK_PERIOD = 0.05     # [s] between checks of the bus thread's events
 RPM = math.pi / 30      # [rad/s]
-LATENCY = 'stamp of the answered IMU sample to the last byte of its command'
 POLL_CYCLES = 2         # the board sends its rotors' speeds 100 times a second
-
-
-def autostart(default: str):
-    """Make the parameter of the automatic start."""
-    return parameter(default, choices=tuple(AUTOSTART), read_only=True,
-                     doc='transition at the start, repeated until it succeeds')
 
 
 class BridgeNode(LifecycleNodeMixin, FlightNode):
@@ -44,14 +37,22 @@ class BridgeNode(LifecycleNodeMixin, FlightNode):
     Base of a node that opens a device when configured and powers it when activated.
 
     A subclass overrides ``configure`` (open the device), ``activate`` (power it), ``deactivate``,
-    ``release`` (switch the power off and close it, in any state) and ``changed``, which is called
-    after each transition. ServoBusError and SerialPortError refuse a transition. Their text goes
-    to the log and to ``refusal``, and the state stays as it was.
+    ``release`` (switch the power off and close it, in any state) and ``state_text`` ('ready',
+    'waiting: WHY' or 'lost: WHY'). ServoBusError and SerialPortError refuse a transition. Their
+    text goes to the log and to ``refusal``, and the state stays as it was.
     """
 
-    def __init__(self, *args, **kwargs):
-        FlightNode.__init__(self, *args, **kwargs)
+    def __init__(self, name, *args, autostart, **kwargs):
+        FlightNode.__init__(
+            self, name, *args, robot_file=parameters.file_parameter(), autostart=parameter(
+                autostart, choices=tuple(AUTOSTART), read_only=True,
+                doc='transition at the start, repeated until it succeeds'), **kwargs)
         LifecycleNodeMixin.__init__(self)
+        self._states = self.publisher(f"{name.removesuffix('_node')}/state")
+        self.state = ''         # the published one
+        self.latency = Distribution()
+        self.report('latency', lambda: self.latency.status(
+            'stamp of the answered IMU sample to the last byte of its command'))
         self.refusal = ''       # why the last transition was refused, '' if it was not
         self._start_timer = None
         self._starts = False    # during an automatic transition
@@ -69,6 +70,15 @@ class BridgeNode(LifecycleNodeMixin, FlightNode):
         if AUTOSTART[self.parameters.autostart]:
             self._start_timer = self.create_timer(RETRY, self.try_to_start,
                                                   clock=self.steady_clock)
+
+    def changed(self) -> None:
+        """Publish and log the state if it changed."""
+        text = self.state_text()
+        if text != self.state:
+            self.state = text
+            self.log_line('error' if text.startswith('lost') and self.stage == ACTIVE else 'info',
+                          text)
+            self._states.publish(text)
 
     def try_to_start(self) -> None:
         """Make the next transitions of the automatic start."""
@@ -134,22 +144,17 @@ class JointBridgeNode(BridgeNode):
     def __init__(self):
         super().__init__('joint_bridge_node', ServoBusParameters, 'params/servo_bus.yaml',
                          'servo_bus_file', on_change=self._changed,
-                         changeable=('confirm_tilts', 'confirmed_tilts'),
-                         robot_file=file_parameter(), autostart=autostart('none'))
+                         changeable=('confirm_tilts', 'confirmed_tilts'), autostart='none')
         self._travel = RobotParameters.load(self.parameters.robot_file or None).joints
         self._bus = self._loop = None
         self._lost_reason = ''
-        self._latency = Distribution()
-        self._state = self.publisher('joint_bridge/state')
-        self._published = ''
         self._joints = self.publisher('joint_states')
         self.listen('command', self._on_command, max_age=COMMAND_AGE, stale_after=None)
-        self.health.report('bus', self._bus_status)
-        self.health.report('latency', lambda: self._latency.status(LATENCY))
+        self.report('bus', self._bus_status)
         for k, name in enumerate(JOINT_NAMES):
-            self.health.report(name, partial(self._servo_status, k))
+            self.report(name, partial(self._servo_status, k))
         self.create_service(Trigger, '~/reboot', self._on_reboot)
-        self.create_timer(CHECK_PERIOD, self.changed, clock=self.steady_clock)
+        self.create_timer(CHECK_PERIOD, self._on_timer, clock=self.steady_clock)
         self.start_by_itself()
         self.changed()
 
@@ -196,7 +201,7 @@ class JointBridgeNode(BridgeNode):
     def close(self):
         """Switch the torque off and publish the state."""
         self.release()
-        self.changed()
+        self._states.publish(self.state_text())
 
     def _changed(self, new):
         self.parameters = new
@@ -224,7 +229,7 @@ class JointBridgeNode(BridgeNode):
             self._loop.offer(command.tilt, command.stamp, time.monotonic() + left)
 
     def _on_written(self, stamp):
-        self._latency.add(self.now() - stamp)
+        self.latency.add(self.now() - stamp)
 
     def _publish(self, readings, good):
         if good.any():
@@ -232,22 +237,17 @@ class JointBridgeNode(BridgeNode):
                 readings.stamp, readings.position[good], readings.velocity[good],
                 readings.effort[good], [n for n, is_good in zip(JOINT_NAMES, good) if is_good]))
 
-    def changed(self):
-        """Log the thread's events; publish the state if it changed."""
+    def _on_timer(self):
         if self._loop is not None:
             self._log(self._bus)
-        text = self._state_text()
-        if text != self._published:
-            self.log_line('error' if text.startswith('lost') and not self._lost_reason
-                          else 'info', text)
-            self._published = text
-            self._state.publish(text)
+        self.changed()
 
     def _log(self, bus):
         for line in bus.take_events():
             self.get_logger().warning(line)
 
-    def _state_text(self):
+    def state_text(self):
+        """Return the state of the servos."""
         if self.stage == ACTIVE and self._loop is not None:
             lost = self._loop.lost(LOST_AFTER)
             return f'lost: {lost}' if lost else 'ready'
@@ -259,7 +259,7 @@ class JointBridgeNode(BridgeNode):
             else 'waiting: not configured'
 
     def _bus_status(self):
-        loop, bus, text = self._loop, self._bus, self._published
+        loop, bus, text = self._loop, self._bus, self.state
         if loop is None:
             return WARN if self.stage == ACTIVE else OK, text, {'stage': self.stage}
         level = ERROR if text.startswith('lost') else OK if bus.link.is_open else WARN
@@ -293,14 +293,12 @@ class RotorBridgeNode(BridgeNode):
 
     A lifecycle node: configure opens the port, activate permits arming. The node arms the motor
     board when the supervisor takes off. It disarms the board when the supervisor disarms or stops,
-    and when this process ends. rotor_bridge/state (latched) is 'ready', 'waiting: WHY' or
-    'lost: WHY'.
+    and when this process ends.
     """
 
     def __init__(self):
         super().__init__('rotor_bridge_node', MotorBoardParameters, 'params/motor_board.yaml',
-                         'motor_board_file', robot_file=file_parameter(),
-                         autostart=autostart('activate'))
+                         'motor_board_file', autostart='activate')
         given = self.parameters
         robot = RobotParameters.load(given.robot_file or None)
         self._cells = robot.battery.cells
@@ -310,20 +308,17 @@ class RotorBridgeNode(BridgeNode):
         self._arming.inhibit('not configured')
         self._command = self._battery = self._speeds = None
         # _port_error: why the port is closed, '' if not yet known; None: open, or not configured.
-        self._state, self._port_error = '', None
+        self._port_error = None
         self._updated = self._next_try = time.monotonic()
         self._cycle, self._sent_at = 0, 0.0
         self._unsent = Counter()
-        self._latency = Distribution()
         self._normalised = np.zeros(4)
         self._saturated, self._saturated_reported = np.zeros((2, 4), dtype=int)
-        self._states = self.publisher('rotor_bridge/state')
         self._batteries = self.publisher('battery_state')
         self._rotors = self.publisher('rotor_states')
-        self.health.report('board', self._board_status)
-        self.health.report('latency', lambda: self._latency.status(LATENCY))
+        self.report('board', self._board_status)
         for k in range(4):
-            self.health.report(f'rotor{k + 1}', partial(self._rotor_status, k))
+            self.report(f'rotor{k + 1}', partial(self._rotor_status, k))
         self.listen('command', self._on_command, max_age=given.stamp_age_limit, stale_after=None)
         self.follow('supervisor/state', self._on_supervisor)
         self._timer = self.create_timer(self._period, self._on_timer, clock=self.steady_clock)
@@ -360,7 +355,7 @@ class RotorBridgeNode(BridgeNode):
         self._command = command
         if self._send():
             self._timer.reset()     # sends this command again after a period without a newer one
-            self._latency.add(self.now() - command.stamp)
+            self.latency.add(self.now() - command.stamp)
 
     def _on_supervisor(self, state):
         self._arming.follow(state)
@@ -390,9 +385,7 @@ class RotorBridgeNode(BridgeNode):
         try:
             self._board.open()
         except SerialPortError as error:
-            if str(error) != self._port_error:
-                self._port_error = str(error)
-                self.get_logger().warning(f'{error}; searching for it')
+            self._port_error = str(error)
         else:
             self._port_error = None
 
@@ -422,17 +415,11 @@ class RotorBridgeNode(BridgeNode):
         for event in events:
             self.log_line(*event)
 
-    def changed(self):
-        """Publish the state if it changed."""
+    def state_text(self):
+        """Return the state of the board, or why its port is closed."""
         text = self._arming.text
-        if self._port_error and text.startswith('waiting'):
-            text = f'waiting: {self._port_error}'
-        if text != self._state:
-            if not text.startswith('waiting'):
-                self.log_line('error' if text.startswith('lost') else 'info',
-                              f'motor board: {text}')
-            self._state = text
-            self._states.publish(text)
+        return f'waiting: {self._port_error}' if self._port_error and text.startswith('waiting') \
+            else text
 
     def _board_status(self):
         arming, text = self._arming, self._arming.text

@@ -53,8 +53,8 @@ class EkfNode(FlightNode):
         self._publisher = self.publisher('odom')
         self.listen('imu/data_raw', self._on_imu, max_age=SENSOR_AGE)
         self.listen('mocap/pose', partial(self.timed, self._ekf.pose), max_age=SENSOR_AGE)
-        self.health.track_compute(1 / self.parameters.imu.rate)
-        self.health.report('estimator', self._estimator_status)
+        self.track_compute(1 / self.parameters.imu.rate)
+        self.report('estimator', self._estimator_status)
 
     def _on_imu(self, sample):
         accepted = self.timed(self._ekf.imu, sample)
@@ -115,8 +115,8 @@ class ControllerNode(FlightNode):
         self.follow('supervisor/state', self._on_mode)
         self.follow('supervisor/target', partial(setattr, self._host, 'override'))
         self.follow('supervisor/actuators', self._host.on_health)
-        self.health.track_compute(controller.period)
-        self.health.report('controller', self._controller_status)
+        self.track_compute(controller.period)
+        self.report('controller', self._controller_status)
 
     def _on_joints(self, joints):
         if not np.isnan(joints.position).any():     # a bridge has lost a servo for the moment
@@ -153,12 +153,13 @@ class ControllerNode(FlightNode):
         if mode.partition(':')[0] in MOTORS_OFF:
             self._command = None
         if reason := self._host.on_mode(mode, self.now()):
-            self.health.rejected('target_pose', f'{reason}; the present pose is held',
+            self.reject('target_pose', f'{reason}; the present pose is held',
                                  'cannot be flown')
 
     def _on_odom(self, odom):
         self._host.on_estimate(odom)
-        if self._joints is None or not self._is_due(odom.stamp):
+        since = odom.stamp - self._last_step        # < 0: the clock was set back
+        if self._joints is None or 0 <= since < self._host.controller.period - STEP_TOLERANCE:
             return
         self._last_step = odom.stamp
         command = self._host.step(State.join(odom, self._joints, self._command))
@@ -170,25 +171,6 @@ class ControllerNode(FlightNode):
         if text != error and not 0 <= (now := self.elapsed()) - at < REPEAT:
             self._logged = error, now
             self.get_logger().error(error)
-
-    def _is_due(self, stamp):
-        period = self._host.controller.period
-        since = stamp - self._last_step
-        if since < 0:
-            return True     # the clock was set back
-        if self._coincides_with_active(stamp):
-            # One estimate later: from then on this node computes between the steps of the active
-            # controller, whose command would otherwise be delayed.
-            period *= 1.5
-        return since >= period - STEP_TOLERANCE
-
-    def _coincides_with_active(self, stamp):
-        """Whether the active controller is another one and answers the same estimates."""
-        host = self._host
-        if self._command is None or not host.mode.startswith('flying:') or host.active:
-            return False
-        part = (stamp - self._command.stamp) / host.controller.period % 1.0
-        return not 0.25 < part < 0.75
 
     def _controller_status(self):
         host, controller = self._host, self._host.controller
@@ -253,14 +235,6 @@ class SupervisorNode(FlightNode):
         self._targets = self.publisher('supervisor/target')
         self._actuators = self.publisher('supervisor/actuators')
         self._override, self._health = None, ALL_HEALTHY
-        self._listen()
-        for name in ('arm', 'disarm', 'land', 'emergency_stop'):
-            self.create_service(Trigger, f'~/{name}', partial(self._on_request, name))
-        self.health.report('supervisor', self._supervisor_status)
-        self.create_timer(WATCH_PERIOD, self._update, clock=self.flight_clock)
-        self._update()
-
-    def _listen(self):
         supervisor = self._supervisor
         self.listen('odom', self._on_odom)
         self.listen('joint_states', self._on_joints, max_age=SENSOR_AGE)
@@ -275,6 +249,11 @@ class SupervisorNode(FlightNode):
             self.listen(f'{name}/command', partial(self._on_command, name), stale_after=None)
         for name in ('joint', 'rotor'):
             self.follow(f'{name}_bridge/state', partial(self._on_bridge, name))
+        for name in ('arm', 'disarm', 'land', 'emergency_stop'):
+            self.create_service(Trigger, f'~/{name}', partial(self._on_request, name))
+        self.report('supervisor', self._supervisor_status)
+        self.create_timer(WATCH_PERIOD, self._update, clock=self.flight_clock)
+        self._update()
 
     def _changed(self, new):
         answer = self._supervisor.select(new.controller, self.now())

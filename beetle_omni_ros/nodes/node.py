@@ -16,20 +16,72 @@ from beetle_omni_ros.messages.topics import Qos, TARGETS, topic_of
 from beetle_omni_ros.messages.values import Diagnostic, MessageError
 from beetle_omni_ros.nodes import parameters, wire
 from beetle_omni_ros.nodes.graph import claim
-from beetle_omni_ros.nodes.parameters import file_parameter
 
-OK, WARN, ERROR = range(3)   # of diagnostic_msgs/DiagnosticStatus
+OK, WARN, ERROR = range(3)      # of diagnostic_msgs/DiagnosticStatus
 PERIOD = 1.0            # s between two diagnostics
 FUTURE = 0.05           # s ahead of the clock above which a stamp is refused
 IDENTITY = 'supervisor/identity'
 TEXT_LIMIT = 40         # characters of a foreign frame_id in an error message
 
 
+class Distribution:
+    """Quantiles of durations in constant memory: a histogram with 2 % wide bins."""
+
+    LOW, RATIO, BINS = 1e-6, 1.02, 1000     # 1 us to 400 s
+
+    def __init__(self):
+        self.counts = np.zeros(self.BINS, dtype=np.int64)
+        self.count, self.max = 0, 0.0
+
+    def add(self, seconds: float) -> None:
+        """Count one duration [s]."""
+        k = int(math.log(max(seconds, self.LOW) / self.LOW) / math.log(self.RATIO))
+        self.counts[min(k, self.BINS - 1)] += 1
+        self.count += 1
+        self.max = max(self.max, seconds)
+
+    def quantile(self, fraction: float) -> float:
+        """Return a quantile [s], accurate to 1 %; NaN if nothing was counted."""
+        if not self.count:
+            return float('nan')
+        k = int(np.searchsorted(np.cumsum(self.counts), fraction * self.count))
+        return min(self.LOW * self.RATIO ** (k + 0.5), self.max)
+
+    def status(self, text: str, level: int = OK, **more: float) -> tuple[int, str, dict]:
+        """Return median, 99th percentile, maximum [ms] and number as a diagnostic status."""
+        return level, text, {
+            'median_ms': 1e3 * self.quantile(0.5), 'p99_ms': 1e3 * self.quantile(0.99),
+            'max_ms': 1e3 * self.max, 'count': self.count, **more}
+
+
+@dataclass
+class Input:
+    """Counts of one subscribed topic; silence of ``stale_after`` [s] is an error, None never."""
+
+    stale_after: float | None
+    received: int = 0
+    reported: int = 0
+    age: float = float('nan')
+    seen: float | None = None           # elapsed() at the last good message
+    rejected: Counter = field(default_factory=Counter)
+    rejected_reported: int = 0
+    last_refusal: str = ''
+
+    @property
+    def is_missing(self) -> bool:
+        """Whether a message is expected and none has come yet."""
+        return self.seen is None and self.stale_after is not None
+
+
 class FlightNode(Node):
     """
     A node with declared parameters, checked inputs and diagnostics.
 
+    Every second it publishes on ``diagnostics``. An input that stops is an error; an input that
+    has never come is not.
+
     Attributes:
+        inputs: topic -> its counts.
         steady_clock: clock for timers that are independent of the flight.
         flight_clock: clock for timers of the flight; simulated time if ``use_sim_time`` is set.
 
@@ -60,12 +112,17 @@ class FlightNode(Node):
         self.simulated = bool(self.get_parameter(parameters.CLOCK).value)
         self.flight_clock = self.get_clock() if self.simulated else self.steady_clock
         if file_key:
-            more[file_key] = file_parameter('parameter file')
+            more[file_key] = parameters.file_parameter('parameter file')
         self.parameters = parameters.declare(
             self, parameters.extended(f'{name}_parameters', base, more), file, file_key,
             on_change, changeable, completed)
+        self.inputs: dict[str, Input] = {}
         self._supervisor_identity = ''
-        self.health = Health(self)
+        self._diagnostics = self.publisher('diagnostics')
+        self._reports = [('inputs', self._input_status)]
+        self._compute, self._deadline, self._misses = Distribution(), math.inf, 0
+        self._reported_at = self.elapsed()
+        self.create_timer(PERIOD, self._publish_diagnostics, clock=self.steady_clock)
         self.get_logger().debug('started')      # the first call is slow: not during a flight
 
     def now(self) -> float:
@@ -113,7 +170,7 @@ class FlightNode(Node):
 
         """
         entry, counts = topic_of(topic), Input(stale_after)
-        self.health.inputs[topic] = counts
+        self.inputs[topic] = counts
         if topic == 'command':
             self.follow(IDENTITY, partial(setattr, self, '_supervisor_identity'))
 
@@ -128,7 +185,7 @@ class FlightNode(Node):
                     raise MessageError('stale stamp' if age > 0 else 'stamp in the future')
                 handle(value, *publication)
             except MessageError as error:
-                self.health.rejected(topic, str(error), error.kind)
+                self.reject(topic, str(error), error.kind)
                 return
             counts.received += 1
             counts.age, counts.seen = age, self.elapsed()
@@ -146,18 +203,42 @@ class FlightNode(Node):
                 f"2nd publisher: frame_id has {name}, expected '{identity[:TEXT_LIMIT]}'",
                 'not from the supervisor')
 
+    def reject(self, topic: str, reason: str, kind: str) -> None:
+        """
+        Count a refused message under ``kind``; log the first of a kind.
+
+        Old stamps before the first accepted message are not logged.
+        """
+        entry = self.inputs[topic]
+        if kind not in entry.rejected and (entry.received or 'stamp' not in kind):
+            self.get_logger().warning(f'{topic}: message refused, {reason}')
+        entry.rejected[kind] += 1
+        entry.last_refusal = reason
+
+    def report(self, name: str, source: Callable[[], tuple[int, str, dict]]) -> None:
+        """Add a diagnostic status '<node>: <name>': (level, message, values)."""
+        self._reports.append((name, source))
+
+    def track_compute(self, deadline: float) -> None:
+        """Report the CPU times of :meth:`timed` against a deadline [s]."""
+        self._deadline = deadline
+        self.report('compute', lambda: self._compute.status(
+            f'{self._misses} deadline misses', WARN if self._misses else OK,
+            deadline_misses=self._misses))
+
     def timed(self, function: Callable, *args):
-        """Call ``function`` and count its CPU and wall time."""
-        cpu, wall = time.thread_time(), time.perf_counter()
+        """Call ``function`` and count its CPU time."""
+        begin = time.thread_time()
         result = function(*args)
-        self.health.computed(time.thread_time() - cpu, time.perf_counter() - wall)
+        used = time.thread_time() - begin
+        self._compute.add(used)
+        self._misses += used > self._deadline
         return result
 
     def introduce(self) -> None:
         """Log in one line what the node does and which inputs are missing."""
         what = (type(self).__doc__ or '').strip().partition('\n')[0]
-        waits = ', '.join(topic for topic, entry in self.health.inputs.items()
-                          if entry.seen is None and entry.stale_after is not None)
+        waits = ', '.join(topic for topic, entry in self.inputs.items() if entry.is_missing)
         self.get_logger().info(f'{what} Waits for {waits}.' if waits else what)
 
     def close(self) -> None:
@@ -170,111 +251,19 @@ class FlightNode(Node):
         if self._claim:
             self._claim.close()
 
-
-# --- diagnostics ------------------------------------------------------------------------------
-
-class Distribution:
-    """Quantiles of durations in constant memory: a histogram with 2 % wide bins."""
-
-    LOW, RATIO, BINS = 1e-6, 1.02, 1000     # 1 us to 400 s
-
-    def __init__(self):
-        self.counts = np.zeros(self.BINS, dtype=np.int64)
-        self.count, self.max = 0, 0.0
-
-    def add(self, seconds: float) -> None:
-        """Count one duration [s]."""
-        k = int(math.log(max(seconds, self.LOW) / self.LOW) / math.log(self.RATIO))
-        self.counts[min(k, self.BINS - 1)] += 1
-        self.count += 1
-        self.max = max(self.max, seconds)
-
-    def quantile(self, fraction: float) -> float:
-        """Return a quantile [s], accurate to 1 %; NaN if nothing was counted."""
-        if not self.count:
-            return float('nan')
-        k = int(np.searchsorted(np.cumsum(self.counts), fraction * self.count))
-        return min(self.LOW * self.RATIO ** (k + 0.5), self.max)
-
-    def status(self, text: str, level: int = OK, **more: float) -> tuple[int, str, dict]:
-        """Return median, 99th percentile, maximum [ms] and number as a diagnostic status."""
-        return level, text, {
-            'median_ms': 1e3 * self.quantile(0.5), 'p99_ms': 1e3 * self.quantile(0.99),
-            'max_ms': 1e3 * self.max, 'count': self.count, **more}
-
-
-@dataclass
-class Input:
-    """Counts of one subscribed topic; silence of ``stale_after`` [s] is an error, None never."""
-
-    stale_after: float | None
-    received: int = 0
-    reported: int = 0
-    age: float = float('nan')
-    seen: float | None = None           # elapsed() at the last good message
-    rejected: Counter = field(default_factory=Counter)
-    rejected_reported: int = 0
-    last_refusal: str = ''
-
-
-class Health:
-    """
-    Collects counts and status values and publishes them on ``diagnostics`` once a second.
-
-    An input that stops is an error; an input that has never come is not.
-    """
-
-    def __init__(self, node: FlightNode):
-        self._node = node
-        self.inputs: dict[str, Input] = {}
-        self._compute: Distribution | None = None
-        self._deadline = float('inf')
-        self._misses = 0
-        self._wall_max = 0.0
-        self._extra = []
-        self._publisher = wire.Publisher(node, 'diagnostics')
-        node.create_timer(PERIOD, self._publish, clock=node.steady_clock)
-        self._last = node.elapsed()
-
-    def rejected(self, topic: str, reason: str, kind: str = '') -> None:
-        """
-        Count a refused message under ``kind``, or under its reason; log the first of a kind.
-
-        Old stamps before the first accepted message are not logged.
-        """
-        entry, kind = self.inputs[topic], kind or reason
-        if kind not in entry.rejected and (entry.received or 'stamp' not in kind):
-            self._node.get_logger().warning(f'{topic}: message refused, {reason}')
-        entry.rejected[kind] += 1
-        entry.last_refusal = reason
-
-    def track_compute(self, deadline: float) -> None:
-        """Report compute times against a ``deadline`` [s] under '<node>: compute'."""
-        self._compute, self._deadline = Distribution(), deadline
-
-    def computed(self, cpu: float, wall: float) -> None:
-        """Count one cycle: CPU time and wall time [s]."""
-        self._compute.add(cpu)
-        self._misses += cpu > self._deadline
-        self._wall_max = max(self._wall_max, wall)
-
-    def report(self, name: str, source) -> None:
-        """Add a status '<node>: <name>'; ``source()`` returns (level, message, values)."""
-        self._extra.append((name, source))
-
-    def _publish(self):
-        statuses = [('inputs', self._input_status)] if self.inputs else []
-        if self._compute is not None:
-            statuses.append(('compute', self._compute_status))
-        statuses = [*statuses, *self._extra] or [('node', lambda: (OK, 'running', {}))]
-        stamp, name = self._node.now(), self._node.get_name()
-        found = [(part, *source()) for part, source in statuses]
-        self._publisher.publish([Diagnostic(stamp, f'{name}: {part}', level, text, texts(values))
-                                 for part, level, text, values in found])
+    def _publish_diagnostics(self):
+        found = []
+        for part, source in self._reports:
+            level, text, values = source()
+            found.append(Diagnostic(
+                self.now(), f'{self.get_name()}: {part}', level, text,
+                {key: f'{value:.6g}' if isinstance(value, float) else str(value)
+                 for key, value in values.items()}))
+        self._diagnostics.publish(found)
 
     def _input_status(self):
-        level, faults, values, now = OK, [], {}, self._node.elapsed()
-        passed, self._last = max(now - self._last, 1e-9), now
+        level, faults, values, now = OK, [], {}, self.elapsed()
+        passed, self._reported_at = max(now - self._reported_at, 1e-9), now
         for topic, entry in self.inputs.items():
             count = entry.rejected.total()
             values |= {f'{topic} rate_hz': (entry.received - entry.reported) / passed,
@@ -289,18 +278,7 @@ class Health:
                 level = max(level, WARN)
                 faults.append(f'{topic}: {count - entry.rejected_reported} rejected, '
                               f'{entry.last_refusal}')
-            elif entry.seen is None and entry.stale_after is not None:
+            elif entry.is_missing:
                 faults.append(f'waiting for {topic}')
             entry.reported, entry.rejected_reported = entry.received, count
         return level, '; '.join(faults) or 'all arriving', values
-
-    def _compute_status(self):
-        return self._compute.status(
-            f'{self._misses} deadline misses', WARN if self._misses else OK,
-            deadline_misses=self._misses, wall_max_ms=1e3 * self._wall_max)
-
-
-def texts(values: dict) -> dict[str, str]:
-    """Return the values of a status as text, floats with six digits."""
-    return {key: f'{value:.6g}' if isinstance(value, float) else str(value)
-            for key, value in values.items()}

@@ -70,7 +70,7 @@ class ReferenceNode(FlightNode):
         disturbed = self._task.kind in ('force', 'torque')
         if disturbed:       # the loss of control ends these tasks
             self.listen('odom', partial(setattr, self, '_odom'), qos=SENSOR)
-        self.health.report('task', lambda: (OK, self._state, {'task': self._task.name}))
+        self.report('task', lambda: (OK, self._state, {'task': self._task.name}))
         self.create_timer(IMPULSE_PERIOD if disturbed else PERIOD, self._on_timer,
                           clock=self.flight_clock)
 
@@ -162,7 +162,7 @@ class RecorderNode(FlightNode):
                     self, name, lambda data, keep=keep: keep(data),
                     LATCHED_LOG if topic.qos.latched else LOG,
                     event_callbacks=SubscriptionEventCallbacks(message_lost=self._on_lost))
-        self.health.report('bag', self._bag_status)
+        self.report('bag', self._bag_status)
         self.create_timer(WRITE_PERIOD, self._write, clock=self.steady_clock)
 
     def _keep(self, topic, message_type, data, _=None):

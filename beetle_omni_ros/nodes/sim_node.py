@@ -182,9 +182,9 @@ class SimNode(FlightNode):
             'mocap': self.publisher('mocap/pose'), 'imu': self.publisher('imu/data_raw')}
         self._truth = self.publisher('ground_truth/odom')
         self.listen('disturbance', self._on_wrench, stale_after=None)
-        self.health.track_compute(self._simulator.tick)
-        self.health.report('pacing', self._pacing_status)
-        self.health.report('robot', self._robot_status)
+        self.track_compute(self._simulator.tick)
+        self.report('pacing', self._pacing_status)
+        self.report('robot', self._robot_status)
         if given.actuators == 'emulated':
             self._make_devices()
         else:
@@ -214,7 +214,7 @@ class SimNode(FlightNode):
         self._publish_to['battery'] = self.publisher('battery_state')
         self._publish_to['rotors'] = self.publisher('rotor_states')
         self.listen('command', self._on_command, max_age=COMMAND_AGE)
-        self.health.report('latency', lambda: self._latency.status(
+        self.report('latency', lambda: self._latency.status(
             'stamp of the answered IMU sample to the arrival of its command'))
 
     def _make_devices(self):
@@ -230,7 +230,7 @@ class SimNode(FlightNode):
         board = EmulatedMotorBoard(self._robot, seed=given.seed, port=given.board_port or None)
         self._devices = EmulatedActuators(self._simulator, bus, board)
         self._step = self._devices.step
-        self.health.report('devices', self._devices_status)
+        self.report('devices', self._devices_status)
         self.get_logger().info(f'servos at {bus.port}, motor board at {board.port}')
         self._devices.set_faults(given.servo_faults, given.board_faults)
         self._reset_events([self.get_parameter(name) for name in EVENTS])

@@ -82,29 +82,6 @@ def test_the_controller_steps_once_a_period_and_stamps_with_the_state(follower):
     assert len(follower._publisher) == 102
 
 
-@pytest.mark.parametrize('rate', [100, 200])
-def test_a_controller_on_standby_steps_between_the_steps_of_the_one_that_flies(follower, rate):
-    def steps_from(begin):
-        before = len(follower._publisher)
-        for stamp in begin + np.arange(rate) / rate:
-            due = round((stamp - begin) * rate) % (rate // 100) == 0
-            if due and follower._host.mode == 'flying:rl':
-                follower._command = Command(stamp, np.zeros(4), np.full(4, 7.5))
-            fly(follower, stamp)
-        return follower._publisher.stamps()[before:]
-
-    assert np.allclose(steps_from(100.0) - 100.0, 0.01 * np.arange(100), atol=1e-6)
-    follower._on_mode('flying:rl')
-    standby = steps_from(101.0)[5:]
-    if rate > 100:
-        assert np.all(np.abs((standby - 101.0) / 0.01 % 1.0 - 0.5) < 0.26)
-        assert np.allclose(np.diff(standby), 0.01, atol=1e-6)
-    else:       # no estimate in between: half the rate, within the timeout
-        assert np.allclose(np.diff(standby), 0.02, atol=1e-6)
-    follower._on_mode('flying:nmpc')
-    assert np.allclose(np.diff(steps_from(102.0)), 0.01, atol=1e-6)
-
-
 def test_the_newest_target_is_used_an_unset_stamp_means_now_and_a_landing_resets(follower):
     stamps = count(100)
 

@@ -71,14 +71,14 @@ def test_a_bad_target_pose_is_refused_with_its_reason_and_the_old_one_stays(benc
     assert bench.wait(lambda: node._host.target.position[2] == 1.4)
     poses.publish(pose(1.5, time.time()))
     assert bench.wait(lambda: node._host.target.position[2] == 1.5)
-    kinds = node.health.inputs['target_pose'].rejected
+    kinds = node.inputs['target_pose'].rejected
     assert kinds['cannot be flown'] == 4 and kinds.total() == 5
 
 
 def test_bad_and_stale_samples_are_refused_and_counted_by_reason(bench):
     node = bench.add(EkfNode())
     samples = bench.publisher(Imu, 'imu/data_raw', wire.profile(SENSOR))
-    rejected = node.health.inputs['imu/data_raw'].rejected
+    rejected = node.inputs['imu/data_raw'].rejected
     for specific_force, age in (([np.nan, 0, 9.8], 0.0), ([0, 0, 9.8], 30.0)):
         before = rejected.total()
         samples.publish(wire.serialized('imu/data_raw', ImuReading(
@@ -98,7 +98,7 @@ def test_only_the_supervisors_commands_are_executed_and_others_are_named(make_be
         DiagnosticArray, 'diagnostics', lambda m: texts.extend(s.message for s in m.status), 10)
     commands = bench.publisher(JointState, 'command', wire.profile(COMMAND))
     identities = bench.publisher(String, IDENTITY, wire.profile(LATCHED))
-    entry = node.health.inputs['command']
+    entry = node.inputs['command']
 
     def answer(source):
         before = entry.received, entry.rejected.total()

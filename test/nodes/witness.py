@@ -110,8 +110,8 @@ class Bench:
     def add(self, node):
         """Spin this node too; log lines of its refusals are kept in ``node.refusals``."""
         node.refusals = []
-        before = node.health.rejected
-        node.health.rejected = lambda topic, reason, kind='': (
+        before = node.reject
+        node.reject = lambda topic, reason, kind: (
             node.refusals.append(f'{topic}: {reason}'), before(topic, reason, kind))
         self.executor.add_node(node)
         self.nodes.append(node)
