@@ -8,8 +8,9 @@ message.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from math import floor, isfinite, isnan
+from dataclasses import asdict, replace
+import json
+from math import floor, isfinite
 from operator import attrgetter
 from typing import Any
 
@@ -32,7 +33,6 @@ from beetle_omni_ros.robot.readings import (
 WORLD, BODY = 'world', 'base_link'
 JOINTS, ROTORS = list(JOINT_NAMES), list(ROTOR_NAMES)
 COMMAND_NAMES = [*JOINTS, *ROTORS]
-HEALTH_NAMES = [*COMMAND_NAMES, *(f'{name}_zero' for name in JOINT_NAMES)]
 NO_VALUE = [float('nan')] * 4
 UNIT_TOLERANCE = 0.01   # of a quaternion's length; above the rounding of any publisher
 POINTS = 10_000     # of a trajectory: 100 s at 100 Hz; more would block the reading node
@@ -294,38 +294,6 @@ def write_command(value: Command) -> Any:
                         effort=[*NO_VALUE, *value.thrust])
 
 
-def read_health(message: Any) -> ActuatorHealth:
-    """Read the health of the actuators, as :func:`write_health` describes it."""
-    if len(message.position) != len(HEALTH_NAMES) or len(message.effort) != len(HEALTH_NAMES):
-        raise MessageError('expected four joints, four rotors and four zeros')
-    stuck, zeros, efforts = message.position[:4], message.position[8:], message.effort[4:8]
-    if any(abs(angle) > np.pi * 2 for angle in stuck) or not all(map(isfinite, zeros)):
-        raise MessageError('expected angles within one turn and finite zeros')
-    return ActuatorHealth(
-        rotors=tuple(effort != 0 for effort in efforts),
-        stuck=tuple(None if isnan(a) else float(a) for a in stuck),
-        held=tuple(None if isnan(f) or f == 0 else float(f) for f in efforts),
-        zeros=tuple(map(float, zeros)),
-        thrust_limit=None if isnan(message.effort[8]) else float(message.effort[8]))
-
-
-def write_health(health: ActuatorHealth) -> Any:
-    """
-    Write the health of the actuators.
-
-    Positions: angles of stuck joints (NaN: the joint moves), unused values of the rotors, then
-    zeros of the encoders. Efforts: unused values of the joints, then NaN for a working rotor, 0
-    for a lost one, else the thrust at which it is stuck. The last four efforts are the thrust
-    limit of each rotor by the battery, NaN for none.
-    """
-    stuck = [np.nan if angle is None else angle for angle in health.stuck]
-    efforts = [0.0 if not works else np.nan if held is None else held
-               for works, held in zip(health.rotors, health.held)]
-    limit = np.nan if health.thrust_limit is None else health.thrust_limit
-    return _joint_state(0.0, HEALTH_NAMES, position=[*stuck, *NO_VALUE, *health.zeros],
-                        effort=[*NO_VALUE, *efforts, *[limit] * 4])
-
-
 # --- trajectories -------------------------------------------------------------------------------
 
 def read_trajectory(message: Any) -> TrajectoryTarget:
@@ -389,6 +357,25 @@ def write_text(value: str) -> Any:
     message = new('std_msgs/msg/String')
     message.data = value
     return message
+
+
+def read_health(message: Any) -> ActuatorHealth:
+    """Read the health of the actuators."""
+    try:
+        health = ActuatorHealth(**{name: tuple(value) if isinstance(value, list) else value
+                                   for name, value in json.loads(message.data).items()})
+        numbers = (*health.rotors, *health.stuck, *health.held, *health.zeros)
+        known = [n for n in (*numbers, health.thrust_limit) if n is not None]
+        if len(numbers) == 16 and np.isfinite(np.array(known, dtype=float)).all():
+            return health
+    except (ValueError, TypeError, AttributeError):
+        pass
+    raise MessageError('expected the fields of ActuatorHealth as JSON')
+
+
+def write_health(health: ActuatorHealth) -> Any:
+    """Write the health of the actuators as JSON."""
+    return write_text(json.dumps(asdict(health)))
 
 
 def read_diagnostics(message: Any) -> list[Diagnostic]:

@@ -138,12 +138,9 @@ TABLE = (
           c.write_override,
           'target of the supervisor, which replaces that of the operator; without points: no '
           'replacement', in_flight=False),
-    Topic('supervisor/actuators', c.JOINT_STATE, LATCHED, ActuatorHealth, c.read_health,
-          c.write_health,
-          'health of `gimbal1..4` and `rotor1..4`, and `gimbal1_zero..4_zero`: `position` is the '
-          'true angle of a stuck joint (NaN: the joint moves), or the zero of an encoder that '
-          'jumped, reading minus true tilt; `effort` is NaN for a rotor that follows its command, '
-          '0 for a lost one, else the thrust at which it is stuck', in_flight=False),
+    Topic('supervisor/actuators', 'std_msgs/msg/String', LATCHED, ActuatorHealth, c.read_health,
+          c.write_health, 'health of joints and rotors as JSON: the fields of `ActuatorHealth`',
+          in_flight=False),
     _text('reference/state', '`waiting`, `flying 3/15`, `done`, `done: control lost at level 60`, '
           'or `aborted` if the flight ended before the task'),
     _text('joint_bridge/state', '`ready`, `waiting: WHY` or `lost: WHY`'),

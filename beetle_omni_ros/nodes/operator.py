@@ -1,13 +1,12 @@
 """ROS clients outside the flight: operator, listener of `check`, live graph of `view`."""
 
-from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
 import os
 from pathlib import Path
-import threading
 import time
+from typing import Any
 
 import numpy as np
 from rcl_interfaces.srv import SetParameters
@@ -21,11 +20,11 @@ from std_srvs.srv import Trigger
 from beetle_omni_ros.bringup import findings
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import PoseTarget
-from beetle_omni_ros.messages.bag_types import from_bytes
 from beetle_omni_ros.messages.conversions import seconds as seconds_of
 from beetle_omni_ros.messages.topics import (
     controller_of,
     LOG,
+    Qos,
     SENSOR,
     TARGETS,
     topic_of,
@@ -48,43 +47,49 @@ SENSORS = {'mocap/pose': 'position', 'imu/data_raw': 'specific_force',
 # Only the newest message of these is read for each picture; of the others, every message is read.
 SHOWN = ('odom', 'ground_truth/odom', 'joint_states', 'command', 'battery_state')
 EVENTS = ('supervisor/state', 'disturbance', 'diagnostics')
-MOST_EVENTS = 200       # of one topic that are kept until the next picture
+NEWEST = Qos(1, reliable=False)
+SPIN = 0.01             # s of a picture's 33 ms in which messages are received
 NICENESS = 10           # of the view; the nodes of the flight have precedence
 
 
-def join(name: str, domain: int | None = None, namespace: str = ''):
+class Client:
     """
-    Make a node with its own context and executor; return (node, executor).
+    A node with its own context; it receives messages only while it spins.
 
     Raises:
         ParameterError: invalid namespace.
 
     """
-    confine()
-    context = rclpy.Context()
-    rclpy.init(args=[], context=context, domain_id=domain,
-               signal_handler_options=SignalHandlerOptions.NO)
-    try:
-        node = rclpy.create_node(name, context=context, namespace=namespace)
-    except NameValidationException as error:
-        context.try_shutdown()
-        raise ParameterError(f"--namespace '{namespace}': {str(error).splitlines()[0]}") from None
-    executor = runner.make_executor(context)
-    executor.add_node(node)
-    return node, executor
+
+    def __init__(self, name: str, domain: int | None = None, namespace: str = ''):
+        confine()
+        context = rclpy.Context()
+        rclpy.init(args=[], context=context, domain_id=domain,
+                   signal_handler_options=SignalHandlerOptions.NO)
+        try:
+            self._node = rclpy.create_node(name, context=context, namespace=namespace)
+        except NameValidationException as error:
+            context.try_shutdown()
+            raise ParameterError(f"--namespace '{namespace}': "
+                                 f'{str(error).splitlines()[0]}') from None
+        self._executor = runner.make_executor(context)
+        self._executor.add_node(self._node)
+
+    def spin_steadily(self, seconds: float) -> None:
+        """Process messages for ``seconds`` of steady time."""
+        deadline = time.monotonic() + seconds
+        while (left := deadline - time.monotonic()) > 0:
+            self._executor.spin_once(timeout_sec=left)
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._node.destroy_node()
+        self._node.context.try_shutdown()
 
 
-def leave(node) -> None:
-    """Destroy a node of :func:`join` and its context."""
-    node.destroy_node()
-    node.context.try_shutdown()
-
-
-class Operator:
+class Operator(Client):
     """
-    A node with its own context; it receives messages only during calls of its methods.
-
-    With simulated time, seconds are those of /clock.
+    Calls services and watches states; with simulated time, seconds are those of /clock.
 
     Attributes:
         controller: name of the watched controller.
@@ -98,8 +103,8 @@ class Operator:
 
     def __init__(self, domain: int, controller: str = registry.DEFAULT):
         """Join ``domain`` and count the commands of ``controller``."""
+        super().__init__('operator', domain)
         self.controller = controller
-        self._node, self._executor = join('operator', domain)
         self.state = self.progress = ''
         self.states: list[str] = []
         self.bridges: dict[str, str] = {}
@@ -198,10 +203,6 @@ class Operator:
         found = self.diagnostics.get(status)
         return found.values if found else {}
 
-    def close(self) -> None:
-        """Leave the graph."""
-        leave(self._node)
-
 
 # --- beetle_omni check --------------------------------------------------------------------------
 
@@ -213,7 +214,8 @@ def listen(seconds: float, namespace: str = '') -> findings.ObservedGraph:
         ParameterError: invalid namespace.
 
     """
-    node, executor = join('check', namespace=namespace)
+    client = Client('check', namespace=namespace)
+    node = client._node
     try:
         graph = findings.ObservedGraph(node.context.get_domain_id(), seconds,
                                        {topic: findings.Stream() for topic in SENSORS})
@@ -224,9 +226,7 @@ def listen(seconds: float, namespace: str = '') -> findings.ObservedGraph:
             wire.subscribe(node, f'{bridge}/state', partial(graph.states.__setitem__, bridge))
         wire.subscribe(node, 'diagnostics', lambda statuses: graph.diagnostics.update(
             (status.name, status) for status in statuses))
-        deadline = time.monotonic() + seconds
-        while (left := deadline - time.monotonic()) > 0:
-            executor.spin_once(timeout_sec=left)
+        client.spin_steadily(seconds)
         for topic, stream in graph.streams.items():
             for publisher in node.get_publishers_info_by_topic(topic):
                 if publisher.topic_type == TOPICS[topic].type:
@@ -234,7 +234,7 @@ def listen(seconds: float, namespace: str = '') -> findings.ObservedGraph:
                 elif publisher.topic_type not in stream.other_types:
                     stream.other_types.append(publisher.topic_type)
     finally:
-        leave(node)
+        client.close()
     return graph
 
 
@@ -254,59 +254,37 @@ def _observe(node, topic, stream, data):
 
 # --- beetle_omni view ---------------------------------------------------------------------------
 
-class LiveGraph:
+class LiveGraph(Client):
     """
     ROS side of the page; implements :class:`~beetle_omni_ros.view.live.Graph`.
 
     Targets and selections of a controller are sent only if ``writable``.
-
-    Raises:
-        ParameterError: invalid namespace.
-
     """
 
     def __init__(self, namespace: str = '', domain: int | None = None, writable: bool = False):
-        self._node, self._executor = join('view', domain, namespace)
+        super().__init__('view', domain, namespace)
         node = self._node
-        self._lock = threading.Lock()
-        self._newest: dict[str, bytes] = {}
-        self._waiting: dict[str, list[bytes]] = defaultdict(list)
-        for topic in SHOWN:
-            wire.subscribe_raw(node, topic, partial(self._keep, topic), SENSOR)
-        for topic in EVENTS:
-            wire.subscribe_raw(node, topic, partial(self._queue, topic))
+        self._write: Callable[[str, Any], None] = lambda topic, value: None
+        for topic in (*SHOWN, *EVENTS):
+            wire.subscribe(node, topic, partial(self._take, topic),
+                           NEWEST if topic in SHOWN else None)
         for topic in TARGETS:
-            wire.subscribe_any(node, topic, partial(self._queue, topic))
+            wire.subscribe_any(node, topic, partial(self._take_target, topic_of(topic)))
         self._targets = wire.Publisher(node, 'target_pose') if writable else None
         self._setting = node.create_client(SetParameters, f'{SUPERVISOR}/set_parameters') \
             if writable else None
-        self._stopped = threading.Event()
-        self._thread = threading.Thread(target=self._spin, daemon=True)
-        self._thread.start()
 
-    def _spin(self):
-        while not self._stopped.is_set():
-            self._executor.spin_once(timeout_sec=0.2)
+    def _take(self, topic, value):
+        self._write(topic, value)
 
-    def _keep(self, topic, data):
-        with self._lock:
-            self._newest[topic] = data
-
-    def _queue(self, topic, data, _=None):
-        with self._lock:
-            if len(self._waiting[topic]) < MOST_EVENTS:
-                self._waiting[topic].append(data)
+    def _take_target(self, topic, data, _):
+        with suppress(MessageError):    # the nodes report refusals
+            self._write(topic.name, topic.take(wire.message(topic, data)))
 
     def take(self, newest) -> None:
         """Write the messages since the last call to a view.live.Newest."""
-        with self._lock:
-            latest, self._newest = self._newest, {}
-            waiting, self._waiting = self._waiting, defaultdict(list)
-        for topic, data in (*latest.items(), *((topic, data) for topic, queue in waiting.items()
-                                               for data in queue)):
-            known = topic_of(topic)
-            with suppress(Exception):   # broken bytes raise anything; the nodes report refusals
-                newest.write(topic, known.take(from_bytes(data, known.type)))
+        self._write = newest.write
+        self.spin_steadily(SPIN)
 
     def controllers(self) -> list[str]:
         """Return the names of the controllers whose command topic exists."""
@@ -331,12 +309,6 @@ class LiveGraph:
             answer('' if result.successful else result.reason or 'no reason given')
         request = wire.parameter_request('controller', controller)
         self._setting.call_async(request).add_done_callback(done)
-
-    def close(self) -> None:
-        """Leave the graph."""
-        self._stopped.set()
-        self._thread.join(2.0)
-        leave(self._node)
 
 
 def run_live(*, namespace: str = '', domain_id: int | None = None, robot: Path | None = None,
