@@ -1,8 +1,7 @@
 """
 CPU and latency of the ROS graph: ``python benchmarks/graph.py [--seconds 24]``.
 
-Flies poses in real time, with all nodes in one process, with a process for each, and with all
-but the bridges in one process, and prints for each
+Flies poses in real time, without and with the bridges, and prints for each
 
 - CPU: user and system time of all node processes (simulator and recorder included) while
   the task is flown, in % of one core;
@@ -31,39 +30,32 @@ from rich.table import Table
 from beetle_omni_ros.nodes.fly import run_fly
 from beetle_omni_ros.nodes.runner import use_real_time_priority
 
-# name -> (composed, actuators, targets)
+# actuators -> targets
 ARRANGEMENTS = {
-    'one process, direct': (True, 'direct', {'cpu_percent': 60.0, 'latency_p99_ms': 5.0}),
-    'separate processes, direct': (False, 'direct', {}),
-    'composed, with bridges': (True, 'emulated', {
-        'bridges_cpu_percent': 30.0, 'servos_missed_cycles': 0, 'servos_latency_p99_ms': 2.0,
-        'motor_board_missed_cycles': 0, 'motor_board_latency_p99_ms': 2.0})}
+    'direct': {'cpu_percent': 60.0, 'latency_p99_ms': 5.0},
+    'emulated': {'bridges_cpu_percent': 30.0, 'servos_missed_cycles': 0}}
 ROWS = {'cpu_percent': 'CPU of all nodes [%]', 'latency_median_ms': 'latency, median [ms]',
         'latency_p99_ms': '99 %', 'latency_max_ms': 'max',
         'bridges_cpu_percent': 'CPU of the bridges [%]',
         'servos_cycles': 'servo bus: cycles', 'servos_missed_cycles': 'missed',
-        'servos_latency_p99_ms': 'command to last byte, 99 % [ms]',
-        'motor_board_cycles': 'motor board: cycles', 'motor_board_missed_cycles': 'missed',
-        'motor_board_latency_p99_ms': 'command to last byte, 99 % [ms]',
+        'servos_latency_p99_ms': 'IMU sample to last byte, 99 % [ms]',
         'bare_cycles': 'bare timer: cycles', 'bare_missed_cycles': 'missed'}
 PERIOD = 0.005     # s
 POSES = ['0,0,1,0,0,0', '0.5,0,1,30,0,0', '0,0.5,1.2,0,-25,45']
 POSE_SECONDS = 8
 
 
-def measure(folder: Path, name: str, seconds: float) -> dict:
+def measure(folder: Path, actuators: str, seconds: float) -> dict:
     """Fly once; return what was measured."""
-    composed, actuators, _ = ARRANGEMENTS[name]
     rows = [POSES[k % len(POSES)] for k in range(max(1, round(seconds / POSE_SECONDS)))]
     task, result = folder / 'poses.csv', folder / 'result.json'
     task.write_text('\n'.join(['x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg', *rows]) + '\n')
     result.unlink(missing_ok=True)
     with bare_timer() as counted:
-        status = run_fly(task=str(task), composed=composed, actuators=actuators, clock='system',
-                         json_path=result,
+        status = run_fly(task=str(task), actuators=actuators, json_path=result,
                          console=Console(quiet=True))
     if status or not result.exists():
-        sys.exit(f'flight with {name} failed (status {status})')
+        sys.exit(f'flight with {actuators} failed (status {status})')
     return {**json.loads(result.read_text())['meta']['graph'], **counted}
 
 
@@ -112,7 +104,7 @@ def main():
             measured[name] = measure(Path(folder), name, given.seconds)
     for key, text in ROWS.items():
         table.add_row(text, *(_cell(measured[name].get(key), targets.get(key))
-                              for name, (_, _, targets) in ARRANGEMENTS.items()))
+                              for name, targets in ARRANGEMENTS.items()))
     Console().print(table)
     if given.json:
         given.json.write_text(json.dumps(measured, indent=1) + '\n')
