@@ -99,6 +99,23 @@ def test_messages_read_together_equal_those_read_one_by_one(topic, one_by_one, m
                                            rtol=1e-14, atol=1e-14)
 
 
+def test_odometry_carries_the_twist_in_base_link():
+    sent = value('odom')
+    message = from_bytes(cdr('odom', sent), ALL['odom'].type)
+    twist = message.twist.twist.linear
+    assert np.allclose(rotations.matrix(sent.quaternion) @ [twist.x, twist.y, twist.z],
+                       sent.velocity)
+
+
+@pytest.mark.parametrize(('topic', 'written', 'bad', 'reason'), [
+    ('rotor_states', 'joint_states', JointReading(1.0, np.zeros(1), None), 'names are not'),
+    ('joint_states', 'joint_states', JointReading(1.0, np.zeros(1), None), 'too few'),
+    ('target_pose', 'target_pose', PoseTarget(np.zeros(3), [0, 0, 0, 0.9]), 'unit quaternion')])
+def test_a_bad_message_is_refused_with_a_reason(topic, written, bad, reason):
+    with pytest.raises(MessageError, match=reason):
+        ALL[topic].take(ALL[written].write(bad))
+
+
 def test_messages_of_several_layouts_keep_their_order():
     entry = ALL['joint_states']
     whole = [value('joint_states', seed, STAMP + seed) for seed in range(12)]

@@ -1,7 +1,6 @@
 """Manual driving through ROS: keys, lines of text, a joystick, and refusals."""
 
-from contextlib import closing
-import fcntl
+from contextlib import closing, suppress
 import os
 import pty
 import select
@@ -48,44 +47,36 @@ def flight(graph):
 
 
 class Terminal:
-    """A terminal with `beetle_omni drive keyboard`, started like by a shell."""
+    """A terminal with `beetle_omni drive keyboard`, which Ctrl-C in it interrupts."""
 
     def __init__(self, domain):
-        self.mine, self.its = pty.openpty()
-        self.before = termios.tcgetattr(self.its)
-        self.process = subprocess.Popen(
-            [sys.executable, '-m', 'beetle_omni_ros.start', 'beetle_omni', 'drive', 'keyboard',
-             '--domain-id', str(domain)], stdin=self.its, stdout=self.its, stderr=self.its,
-            env={**os.environ, 'COLUMNS': '300', 'TERM': 'xterm'}, preexec_fn=self._control)
-        self.text = ''
-
-    def _control(self):
-        """Make it the controlling terminal, so that Ctrl-C reaches the program."""
-        os.setsid()
-        fcntl.ioctl(self.its, termios.TIOCSCTTY, 0)
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        pid, self.mine = pty.fork()
+        if not pid:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+            os.environ.update(COLUMNS='300', TERM='xterm')
+            os.execv(sys.executable, [
+                sys.executable, '-m', 'beetle_omni_ros.start', 'beetle_omni', 'drive', 'keyboard',
+                '--domain-id', str(domain)])
+        self.pid, self.before, self.text = pid, termios.tcgetattr(self.mine), ''
 
     def press(self, keys):
         os.write(self.mine, keys.encode())
 
     def shows(self, text):
-        while select.select([self.mine], [], [], 0)[0]:
-            self.text += os.read(self.mine, 4096).decode()
+        with suppress(OSError):     # it has ended
+            while select.select([self.mine], [], [], 0)[0]:
+                self.text += os.read(self.mine, 4096).decode()
         return text in self.text
 
     @property
     def state(self):
-        return termios.tcgetattr(self.its)
-
-    @property
-    def echoes(self):
-        return bool(self.state[LOCAL_FLAGS] & termios.ECHO)
+        return termios.tcgetattr(self.mine)
 
     def close(self):
-        self.process.kill()
-        self.process.wait()
+        with suppress(ProcessLookupError, ChildProcessError):
+            os.kill(self.pid, signal.SIGKILL)
+            os.waitpid(self.pid, 0)
         os.close(self.mine)
-        os.close(self.its)
 
 
 def test_keys_become_targets_and_ctrl_c_restores_the_terminal(flight):
@@ -94,7 +85,7 @@ def test_keys_become_targets_and_ctrl_c_restores_the_terminal(flight):
         assert witness.wait(lambda: terminal.shows('q quit'), PATIENCE), terminal.text
         targets = []
         wire.subscribe(witness._node, 'target_pose', targets.append, qos=EVENT)
-        assert witness.wait(lambda: not terminal.echoes, 10)
+        assert witness.wait(lambda: not terminal.state[LOCAL_FLAGS] & termios.ECHO, 10)
         terminal.press('w')
         assert witness.wait(lambda: terminal.shows('arm first'), PATIENCE), terminal.text
         terminal.press('t')
@@ -110,9 +101,9 @@ def test_keys_become_targets_and_ctrl_c_restores_the_terminal(flight):
         assert witness.wait(lambda: abs(
             witness.truth.position[2] - targets[-1].position[2]) < 0.1, PATIENCE)
         terminal.press('\x03')
-        assert witness.wait(lambda: terminal.shows('its last target')
-                            and terminal.process.poll() is not None, PATIENCE), terminal.text
-        assert terminal.process.poll() == 130 and 'Traceback' not in terminal.text
+        assert witness.wait(lambda: terminal.shows('its last target'), PATIENCE), terminal.text
+        assert os.waitstatus_to_exitcode(os.waitpid(terminal.pid, 0)[1]) == 130
+        assert 'Traceback' not in terminal.text
         assert terminal.state == terminal.before and witness.state.startswith('flying')
 
 

@@ -4,7 +4,6 @@ import re
 import time
 from types import SimpleNamespace
 
-from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 import numpy as np
@@ -14,7 +13,6 @@ pytest.importorskip('pymavlink')
 pytest.importorskip('serial')
 
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import String
 
@@ -28,7 +26,7 @@ from beetle_omni_ros.nodes.node import IDENTITY
 from beetle_omni_ros.nodes.side_nodes import RecorderNode
 from beetle_omni_ros.nodes.sim_node import SimNode
 from beetle_omni_ros.robot.readings import ImuReading
-from beetle_omni_ros.runs.bag import read_bag, read_messages
+from beetle_omni_ros.runs.bag import read_bag
 
 pytestmark = pytest.mark.real_time
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
@@ -134,24 +132,6 @@ def test_the_supervisor_signs_its_commands_and_publishes_its_identity(bench):
     node._update()
     assert wire.message(ALL['command'], sent[0]).header.frame_id == received[0]
     assert re.fullmatch('supervisor_node:[0-9a-f]{8}', received[0])
-
-
-def test_messages_from_before_the_first_simulated_time_are_recorded_with_that_time(
-        make_bench, tmp_path):
-    bench = make_bench('use_sim_time:=true', f'bag:={tmp_path}/bag')
-    node = bench.add(RecorderNode())
-    bench.publisher(String, 'supervisor/state', wire.profile(LATCHED)).publish(
-        String(data='disarmed'))
-    assert bench.wait(lambda: node._received) and not node.now()
-    bench.publisher(Clock, '/clock', wire.profile(EVENT)).publish(
-        Clock(clock=Time(sec=1_700_000_000)))
-    assert bench.wait(node.now)
-    bench.publisher(String, 'reference/state', wire.profile(LATCHED)).publish(
-        String(data='waiting'))
-    assert bench.wait(lambda: not node._received)
-    node.close()
-    assert [(one.topic, one.received) for one in read_messages(tmp_path / 'bag')] == [
-        ('/supervisor/state', 1.7e9), ('/reference/state', 1.7e9)]
 
 
 BEST_EFFORT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)

@@ -11,7 +11,6 @@ import pytest
 from beetle_omni_ros.nodes import graph
 from beetle_omni_ros.nodes.graph import BRIDGES
 from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import ParameterError
 
 
 class Recorded:
@@ -53,15 +52,12 @@ def bringup(monkeypatch):
     return module
 
 
-def test_composed_is_one_process_and_one_for_the_bridges(bringup):
-    process, bridges = bringup.start(seed='7', namespace='/robot1')
-    command = bridges.kwargs['cmd']
-    assert command[4:command.index('--ros-args')] == ['joint_bridge_node', 'rotor_bridge_node']
-    assert command[-2:] == ['-r', '__ns:=/robot1']
-    command = process.kwargs['cmd']
-    assert command[4:command.index('--ros-args')] == [
+def test_the_bridges_have_their_own_process(bringup):
+    process, bridges = (one.kwargs['cmd'] for one in bringup.start(seed='7', namespace='/robot1'))
+    assert bridges[4:6] == list(BRIDGES) and bridges[-2:] == ['-r', '__ns:=/robot1']
+    assert process[4:process.index('--ros-args')] == [
         'sim_node', 'ekf_node', 'nmpc_node', 'rl_node', 'supervisor_node']
-    assert 'sim_node:seed:=7' in command
+    assert 'sim_node:seed:=7' in process
 
 
 def given_to(processes):
@@ -90,20 +86,3 @@ def test_simulator_and_bridges_meet_at_the_same_ports_in_a_private_folder(bringu
     assert not set(BRIDGES) & set(direct) and 'actuators' not in direct['sim_node']
     assert [direct[name]['robot_file'] for name in ('sim_node', 'ekf_node')] == [
         'b.yaml', 'a.yaml']
-
-
-def test_each_controller_can_be_active_with_the_other_on_standby(bringup, capsys, monkeypatch):
-    def controllers(**arguments):
-        nodes = given_to(bringup.start(**arguments))
-        return nodes['supervisor_node']['controller'], {
-            name: nodes[name] for name in ('nmpc_node', 'rl_node') if name in nodes}
-
-    assert controllers() == ('nmpc', {'nmpc_node': {}, 'rl_node': {}})
-    assert controllers(controller='rl', standby='false') == ('rl', {'rl_node': {}})
-    assert controllers(controller='rl', policy='/p.onnx', allow_other_robot='true') == (
-        'rl', {'rl_node': {'policy': '/p.onnx', 'allow_other_robot': 'True'}, 'nmpc_node': {}})
-    monkeypatch.setattr(graph, 'unfit', lambda *_: 'robot_hash: another robot')
-    assert controllers() == ('nmpc', {'nmpc_node': {}})
-    assert 'rl does not stand by: robot_hash' in capsys.readouterr().err
-    with pytest.raises(ParameterError, match='robot_hash'):
-        controllers(controller='rl')
