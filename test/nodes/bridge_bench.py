@@ -90,10 +90,9 @@ class BridgeOperator(Operator):
         return self.ask('get_state', GetState).current_state.label
 
     def go_to(self, stage):
-        path = {'unconfigured': 0, 'inactive': 1, 'active': 2}
-        end = time.monotonic() + WITHIN
-        while (here := path[self.stage]) != path[stage]:
-            name = ('configure', 'activate')[here] if here < path[stage] \
+        stages, end = ['unconfigured', 'inactive', 'active'], time.monotonic() + WITHIN
+        while (here := stages.index(self.stage)) != (there := stages.index(stage)):
+            name = ('configure', 'activate')[here] if here < there \
                 else ('cleanup', 'deactivate')[here - 1]
             # An answer may be late on a busy machine.
             assert self.change(name) or time.monotonic() < end, f'{name}: {self.now}'
