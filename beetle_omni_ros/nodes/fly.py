@@ -196,14 +196,9 @@ def _fly(graph: Graph, controller: str, task: Task, meta: dict, console: Console
 
 class Flight:
     """
-    One flight of a running graph: start, arm, take off, fly the task, land.
+    One flight of a started graph: arm, take off, fly the task, land.
 
-    Args:
-        graph: started nodes.
-        operator: operator in the same ROS domain.
-        task: task to fly.
-        show: displays a line about the progress.
-        faults: value of sim_node's parameter ``faults`` from the task's start on.
+    ``faults`` is the value of sim_node's parameter from the task's start on.
 
     Attributes:
         measured: CPU of the graph and of its bridges [% of one core], cycles of the servo bus,

@@ -65,16 +65,10 @@ def confine(environment: MutableMapping[str, str] = os.environ) -> None:
 
 
 def claim(name: str) -> socket.socket | None:
-    """
-    Take a name on this computer, until the socket is closed or the process ends.
-
-    Returns:
-        A socket of Linux' abstract namespace, which leaves no file; None: the name is taken.
-
-    """
+    """Take a name on this computer until the socket is closed; None: it is taken."""
     holder = socket.socket(socket.AF_UNIX)
     try:
-        holder.bind(f'\0beetle_omni/{name}')
+        holder.bind(f'\0beetle_omni/{name}')     # of the abstract namespace, which leaves no file
     except OSError:
         holder.close()
         return None
@@ -83,16 +77,9 @@ def claim(name: str) -> socket.socket | None:
 
 @contextmanager
 def reserved_domain():
-    """
-    Yield the number of a free ROS domain, reserved while the context lasts.
-
-    Each call begins its search at another number, because participants that are shutting down may
-    still send discovery data to new ones in the same domain.
-
-    Raises:
-        OSError: no domain is free.
-
-    """
+    """Yield the number of a free ROS domain, reserved while the context lasts; else OSError."""
+    # Each call begins at another number: participants that are shutting down may still send
+    # discovery data to new ones in the same domain.
     first = next(_starts) % len(DOMAINS)
     for number in [*DOMAINS[first:], *DOMAINS[:first]]:
         holder = claim(f'domain/{number}')
@@ -267,12 +254,8 @@ class Graph:
     """
     Processes that run nodes.
 
-    Args:
-        nodes: parameters of each node.
-        folder: existing folder for the parameter file and the output of the processes.
-        domain: ROS domain.
-        groups: process -> its nodes; default: those of :func:`processes`.
-
+    ``folder`` receives the parameter file and the output of the processes. ``groups`` are process
+    -> its nodes, by default those of :func:`processes`.
     """
 
     def __init__(self, nodes: Parameters, folder: Path, domain: int,

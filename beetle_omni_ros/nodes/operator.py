@@ -92,17 +92,15 @@ class Operator(Client):
     Calls services and watches states; with simulated time, seconds are those of /clock.
 
     Attributes:
-        controller: name of the watched controller.
-        state: state of the supervisor, '' before the first message.
+        state, states: newest state of the supervisor, '' before the first message; all of them.
         progress: state of reference_node, '' before the first message.
         bridges: bridge node -> its newest state.
-        commands: number of commands of the watched controller.
+        commands: number of commands of ``controller``.
         diagnostics: status name -> newest :class:`Diagnostic`.
 
     """
 
     def __init__(self, domain: int, controller: str = registry.DEFAULT):
-        """Join ``domain`` and count the commands of ``controller``."""
         super().__init__('operator', domain)
         self.controller = controller
         self.state = self.progress = ''
@@ -207,13 +205,7 @@ class Operator(Client):
 # --- beetle_omni check --------------------------------------------------------------------------
 
 def listen(seconds: float, namespace: str = '') -> findings.ObservedGraph:
-    """
-    Record the traffic of a graph for ``seconds``; publishes nothing.
-
-    Raises:
-        ParameterError: invalid namespace.
-
-    """
+    """Record the traffic of a graph for ``seconds``; publishes nothing."""
     client = Client('check', namespace=namespace)
     node = client._node
     try:
@@ -315,13 +307,7 @@ def run_live(*, namespace: str = '', domain_id: int | None = None, robot: Path |
              urdf: Path | None = None, host: str, port: int,
              dark: bool = False, allow_targets: bool = False,
              console: Console | None = None) -> None:
-    """
-    Show a running graph until Ctrl-C; arguments are the options of `beetle_omni view`.
-
-    Raises:
-        ParameterError: unusable input.
-
-    """
+    """Show a running graph until Ctrl-C; arguments are the options of `beetle_omni view`."""
     from beetle_omni_ros.robot.urdf import Model
     from beetle_omni_ros.view.live import Live
     from beetle_omni_ros.view.recorded import announce

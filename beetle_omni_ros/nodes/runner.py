@@ -72,11 +72,6 @@ def run(names: Sequence[str], argv: Sequence[str], name: str) -> int:
     """
     Run nodes on one events executor until a signal or a fatal error.
 
-    Args:
-        names: nodes, see :func:`maker`.
-        argv: program name and ROS arguments.
-        name: name of the process in messages.
-
     Returns:
         Exit status: 0 stopped by a signal, 1 failed, 2 unusable parameters.
 
@@ -169,12 +164,7 @@ def _stop_on_signal() -> Future:
 
 
 def use_real_time_priority():
-    """
-    Give all present threads real-time priority, if the system permits it.
-
-    This keeps commands in time on a busy computer. It is called after the start-up, which may
-    compile for seconds. Linux reserves 5 % of the processor for other processes.
-    """
+    """Give all present threads real-time priority, if the system permits it."""
     try:
         for thread in os.listdir('/proc/self/task'):
             os.sched_setscheduler(int(thread), os.SCHED_RR, os.sched_param(REAL_TIME_PRIORITY))
@@ -199,16 +189,8 @@ def _fail(name, error, status):
 
 @contextmanager
 def sigterm_as_interrupt():
-    """
-    Raise KeyboardInterrupt on SIGTERM too, so that the block is cleaned up.
-
-    Further signals are ignored, so that they do not interrupt the clean-up.
-
-    Raises:
-        KeyboardInterrupt: a signal came, even if a library turned it into another exception.
-
-    """
-    received = []
+    """Raise KeyboardInterrupt on SIGTERM too, and ignore further signals during the clean-up."""
+    received = []       # a library may turn the interrupt into another exception
 
     def interrupt(number, _):
         received.append(number)

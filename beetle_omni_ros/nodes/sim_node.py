@@ -85,18 +85,8 @@ class SimulatedTimePacing:
     Ticks of simulated time: one each time the timer fires, none while a node is late.
 
     On a slow computer, time passes more slowly and no deadline is missed. For a node that has
-    stopped, simulated time waits once.
-
-    Args:
-        tick: period [s].
-        epoch: time of the stamps at which simulated time is zero [s].
-        steady: steady clock [s].
-
-    Attributes:
-        ticks: number of ticks so far.
-        lost_ticks: 0, as no tick is lost.
-        sent: stamp of the newest published sample.
-
+    stopped, simulated time waits once. ``epoch`` is the time of the stamps at which simulated time
+    is zero, ``sent`` the stamp of the newest published sample.
     """
 
     lost_ticks = 0

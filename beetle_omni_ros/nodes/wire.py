@@ -102,16 +102,9 @@ def subscribe_any(node: Node, topic: str, callback: Callable[[bytes, float], Non
 
     A subscription of latched messages is incompatible with a volatile publisher, such as
     `ros2 topic pub`; a volatile subscription misses messages latched earlier. So there are both.
-    A message that both receive is passed on once, by its time of publication.
-
-    Args:
-        node: subscribing node.
-        topic: name.
-        callback: called with (CDR, time of publication [s, system time, set by the middleware of
-            the publisher; nan if unknown]).
-        depth: depth of the queues.
-        on_lost: called with rclpy's event of lost messages.
-
+    A message that both receive is passed on once, by its time of publication [s, system time, set
+    by the middleware of the publisher; nan if unknown]. ``on_lost`` gets rclpy's event of lost
+    messages.
     """
     seen: deque[float] = deque(maxlen=COPIES)
 
