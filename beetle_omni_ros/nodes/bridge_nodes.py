@@ -104,7 +104,7 @@ class BridgeNode(LifecycleNodeMixin, FlightNode):
                 self.release()
             self.refusal = ' '.join(str(error).split())
             if self.refusal != before:      # attempts are repeated, lines are not
-                self.log_line('warning' if self._starts else 'error',
+                self.log_line('info' if self._starts else 'error',
                               f'cannot {what}: {self.refusal}'
                               + ('; tries again' if self._starts else ''))
             return TransitionCallbackReturn.FAILURE

@@ -101,11 +101,12 @@ class ControllerNode(FlightNode):
         robot = RobotParameters.load(self.parameters.robot_file or None)
         controller = entry.make(
             robot, parameters=self.parameters if entry.parameter_class else None)
-        self._host = ControllerHost(entry.name, controller, self.timed, self._log)
+        self._host = ControllerHost(entry.name, controller, self.timed, partial(
+            self.get_logger().error, throttle_duration_sec=REPEAT))
         self._checks, self._sensors = TargetChecks(robot), robot.sensors
         self._joints = self._command = None
         self._last_step = 0.0
-        self._reported_errors, self._logged = 0, ('', -math.inf)    # text, time of the line
+        self._reported_errors = 0
         self._publisher = self.publisher(f'{entry.name}/command')
         self.listen('odom', self._on_odom, max_age=ODOM_AGE)
         self.listen('joint_states', self._on_joints, max_age=JOINT_AGE)
@@ -165,12 +166,6 @@ class ControllerNode(FlightNode):
         command = self._host.step(State.join(odom, self._joints, self._command))
         if command is not None:
             self._publisher.publish(command)
-
-    def _log(self, error):
-        text, at = self._logged
-        if text != error and not 0 <= (now := self.elapsed()) - at < REPEAT:
-            self._logged = error, now
-            self.get_logger().error(error)
 
     def _controller_status(self):
         host, controller = self._host, self._host.controller

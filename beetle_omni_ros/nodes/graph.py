@@ -41,7 +41,6 @@ GENERIC = 'controller_node'
 # Parameter autostart of a bridge -> lifecycle state to reach.
 AUTOSTART = {'none': '', 'configure': 'inactive', 'activate': 'active'}
 COMPOSED, BRIDGES_COMPOSED = 'composed', 'bridges'      # processes
-PORT_TIMEOUT = 30.0     # s for the simulator to make its serial ports
 STOP_TIMEOUT = 8.0      # s from SIGINT to SIGKILL
 Parameters = dict[str, dict]        # node name -> parameters that differ from the shipped ones
 
@@ -263,9 +262,7 @@ class Graph:
         self.folder, self.domain, self.nodes = Path(folder), domain, list(nodes)
         groups = groups or processes(nodes)
         self._bridges = [name for name, group in groups.items() if set(group) <= set(BRIDGES)]
-        simulator = nodes.get('sim_node', {})
-        self.simulated = simulator.get('clock') == 'simulated'
-        self._ports = [port for port in map(simulator.get, ('servo_port', 'board_port')) if port]
+        self.simulated = nodes.get('sim_node', {}).get('clock') == 'simulated'
         self._file = self.folder / 'parameters.yaml'
         self._file.write_text(yaml.safe_dump(
             {f'/**/{node}': {'ros__parameters': values} for node, values in nodes.items()
@@ -276,20 +273,8 @@ class Graph:
         self.processes: dict[str, subprocess.Popen] = {}
 
     def start(self) -> None:
-        """
-        Start every process; the bridges after the simulator has made its serial ports.
-
-        Each process ends with this one, even if this one is killed.
-        """
+        """Start every process; each ends with this one, even if this one is killed."""
         for name in self._commands:
-            if name not in self._bridges:
-                self.start_process(name)
-        # Bridges also wait for their ports, but log a warning.
-        deadline = time.monotonic() + PORT_TIMEOUT
-        while not all(map(os.path.exists, self._ports)) and time.monotonic() < deadline \
-                and not self.dead():
-            time.sleep(0.05)
-        for name in self._bridges:
             self.start_process(name)
 
     def start_process(self, name: str) -> None:

@@ -95,7 +95,7 @@ class Operator(Client):
         state, states: newest state of the supervisor, '' before the first message; all of them.
         progress: state of reference_node, '' before the first message.
         bridges: bridge node -> its newest state.
-        commands: number of commands of ``controller``.
+        controller: name of the watched controller.
         diagnostics: status name -> newest :class:`Diagnostic`.
 
     """
@@ -106,7 +106,6 @@ class Operator(Client):
         self.state = self.progress = ''
         self.states: list[str] = []
         self.bridges: dict[str, str] = {}
-        self.commands = 0
         self.diagnostics: dict[str, Diagnostic] = {}
         self._simulated: float | None = None
         node = self._node
@@ -116,7 +115,6 @@ class Operator(Client):
         for bridge in BRIDGES:
             wire.subscribe(node, f"{bridge.removesuffix('_node')}/state",
                            partial(self.bridges.__setitem__, bridge))
-        wire.subscribe_raw(node, f'{controller}/command', self._on_command, SENSOR)
         wire.subscribe(node, 'diagnostics', lambda statuses: self.diagnostics.update(
             (status.name, status) for status in statuses))
         self._clients = {name: node.create_client(Trigger, f'{SUPERVISOR}/{name}')
@@ -130,9 +128,6 @@ class Operator(Client):
         self.state = text if state == 'flying' else state
         self.states.append(text)
 
-    def _on_command(self, _):
-        self.commands += 1
-
     def time(self) -> float:
         """Return simulated time if it is used, else steady time [s]."""
         return time.monotonic() if self._simulated is None else self._simulated
@@ -144,8 +139,8 @@ class Operator(Client):
 
     @property
     def ready(self) -> bool:
-        """Whether the supervisor can be called and the controller commands."""
-        return self.commands > 0 and self.answers
+        """Whether the supervisor can be called and the controller runs."""
+        return f'{self.controller}_node: controller' in self.diagnostics and self.answers
 
     def waits_for(self, bridges: Sequence[str]) -> str:
         """Return the states of the bridges that are not ready, '' if all are."""
