@@ -6,7 +6,6 @@ from pathlib import Path
 import subprocess
 import sys
 import tempfile
-import time
 
 from rich.console import Console
 
@@ -181,7 +180,6 @@ def _fly(graph: Graph, controller: str, task: Task, meta: dict, console: Console
                 _complain(error)
                 failure = str(error)
             flight.land()
-        meta['graph'] = flight.measured
     finally:
         stubborn = graph.stop()
         if operator:
@@ -199,11 +197,6 @@ class Flight:
     One flight of a started graph: arm, take off, fly the task, land.
 
     ``faults`` is the value of sim_node's parameter from the task's start on.
-
-    Attributes:
-        measured: CPU of the graph and of its bridges [% of one core], cycles of the servo bus,
-            latencies [ms]; with simulated time, its ratio to real time and no latencies.
-
     """
 
     def __init__(self, graph: Graph, operator: Operator, task: Task,
@@ -211,7 +204,6 @@ class Flight:
         self._graph, self._operator, self._task = graph, operator, task
         self._bridges = [node for node in graph.nodes if node in BRIDGES]
         self._show, self._faults = show, faults
-        self.measured: dict[str, float] = {}
 
     def fly(self) -> None:
         """
@@ -258,7 +250,7 @@ class Flight:
 
     def _fly_task(self):
         operator, name = self._operator, self._task.name
-        before, start, steady = self._counts(), operator.time(), time.monotonic()
+        start = operator.time()
         if self._faults:        # as the task begins, so that their times count from there
             self._await(name, lambda: operator.progress.startswith('flying'), TAKEOFF_TIMEOUT)
             accepted, answer = operator.set('sim_node', 'faults', self._faults)
@@ -274,30 +266,6 @@ class Flight:
 
         self._await(name, is_done, self._task.duration + SPARE_TIME,
                     lambda: f"; the task does not continue at '{operator.progress}'")
-        passed = time.monotonic() - steady
-        counts = {key: value - before.get(key, 0) for key, value in self._counts().items()}
-        self.measured = {key: 100 * value / passed if key.endswith('percent') else value
-                         for key, value in counts.items()}
-        if self._graph.simulated:
-            self.measured['real_time_factor'] = (operator.time() - start) / passed
-            return
-        # Latencies from the IMU sample to the rotors, and to the servos.
-        last = 'rotor_bridge_node' if self._bridges else 'sim_node'
-        for name, node in (('latency', last), ('servos_latency', 'joint_bridge_node')):
-            self.measured.update({
-                f'{name}_{key}': float(value)
-                for key, value in operator.values(f'{node}: latency').items()
-                if key.endswith('_ms')})
-
-    def _counts(self):
-        """CPU seconds so far, and cycles of the servo bus."""
-        found = {'cpu_percent': self._graph.cpu_seconds()}
-        if self._bridges:
-            found['bridges_cpu_percent'] = self._graph.cpu_seconds(bridges=True)
-            values = self._operator.values('joint_bridge_node: bus')
-            found |= {f'servos_{key}': int(values[key])
-                      for key in ('cycles', 'missed_cycles') if key in values}
-        return found
 
     def land(self) -> None:
         """Land if the robot flies, and wait for the motors to stop."""
@@ -343,7 +311,5 @@ def _report(bag, controller, task, meta, json_path, console) -> int:
     results = {'meta': meta, controller: metrics(log, task)}
     if log.controllers():       # a controller flew
         table.print_results(results, console)
-    _print(console, 'graph: ' + ', '.join(f"{key.replace('_', ' ')} {value:.4g}"
-                                          for key, value in meta.get('graph', {}).items()))
     write_json(json_path, results)
     return runner.FAILED if failed(results[controller]) else runner.OK

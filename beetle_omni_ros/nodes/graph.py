@@ -262,7 +262,6 @@ class Graph:
         self.folder, self.domain, self.nodes = Path(folder), domain, list(nodes)
         groups = groups or processes(nodes)
         self._bridges = [name for name, group in groups.items() if set(group) <= set(BRIDGES)]
-        self.simulated = nodes.get('sim_node', {}).get('clock') == 'simulated'
         self._file = self.folder / 'parameters.yaml'
         self._file.write_text(yaml.safe_dump(
             {f'/**/{node}': {'ros__parameters': values} for node, values in nodes.items()
@@ -293,11 +292,6 @@ class Graph:
         """Return name -> exit status or signal of each process that has ended."""
         return {name: _ending(process.returncode, self.log(name))
                 for name, process in self.processes.items() if process.poll() is not None}
-
-    def cpu_seconds(self, bridges: bool = False) -> float:
-        """Return the CPU time of the running processes, or of the bridges only [s]."""
-        return sum(_cpu_seconds(p.pid) for name, p in self.processes.items() if p.poll() is None
-                   and (not bridges or name in self._bridges))
 
     def kill(self, name: str) -> None:
         """Kill one process."""
@@ -353,12 +347,3 @@ def _ending(code, log):
         return f'ended by {signal.Signals(-code).name}'
     lines = log.read_text(errors='replace').strip().splitlines()
     return f"exit status {code}{': ' + lines[-1] if lines else ''}"
-
-
-def _cpu_seconds(pid):
-    """User and system time from /proc; 0 for a process that has just ended."""
-    try:
-        fields = Path(f'/proc/{pid}/stat').read_text().rsplit(')', 1)[1].split()
-    except OSError:
-        return 0.0
-    return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
