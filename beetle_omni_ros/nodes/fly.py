@@ -105,7 +105,7 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
                 meta['faults'] = [str(fault) for fault in injected]
             graph = Graph(nodes, folder, number)
             try:
-                status = _fly(graph, controller, flown_task, meta, console, listed.text(injected))
+                status = _fly(graph, controller, flown_task, console, listed.text(injected))
             except KeyboardInterrupt:
                 if (bag / 'metadata.yaml').exists():
                     add_meta(bag, {**meta, 'interrupted': True})
@@ -166,24 +166,22 @@ def _complain(error):
     print(f'beetle_omni fly: error: {error}', file=sys.stderr)
 
 
-def _fly(graph: Graph, controller: str, task: Task, meta: dict, console: Console,
-         faults: str) -> int:
-    failure, operator = '', None
+def _fly(graph: Graph, controller: str, task: Task, console: Console, faults: str) -> int:
+    failure, flight = '', None
     try:
         graph.start()
-        operator = Operator(graph.domain, controller)
         with console.status('starting') as status:
-            flight = Flight(graph, operator, task, status.update, faults)
+            flight = Flight(graph, controller, task, status.update)
             try:
-                flight.fly()
+                flight.fly(faults)
             except RunError as error:
                 _complain(error)
                 failure = str(error)
             flight.land()
     finally:
         stubborn = graph.stop()
-        if operator:
-            operator.close()
+        if flight:
+            flight.close()
     for name in stubborn:
         _complain(f'{name} did not stop and was killed')
     for line in graph.warnings():
@@ -192,37 +190,30 @@ def _fly(graph: Graph, controller: str, task: Task, meta: dict, console: Console
     return runner.FAILED if failure else runner.OK
 
 
-class Flight:
-    """
-    One flight of a started graph: arm, take off, fly the task, land.
+class Flight(Operator):
+    """One flight of a started graph: arm, take off, fly the task, land."""
 
-    ``faults`` is the value of sim_node's parameter from the task's start on.
-    """
-
-    def __init__(self, graph: Graph, operator: Operator, task: Task,
-                 show: Callable[[str], None], faults: str = ''):
-        self._graph, self._operator, self._task = graph, operator, task
+    def __init__(self, graph: Graph, controller: str, task: Task, show: Callable[[str], None]):
+        super().__init__(graph.domain, controller)
+        self._graph, self._task, self._show = graph, task, show
         self._bridges = [node for node in graph.nodes if node in BRIDGES]
-        self._show, self._faults = show, faults
 
-    def fly(self) -> None:
+    def fly(self, faults: str) -> None:
         """
-        Wait for the graph, take off and fly the task to its end.
+        Wait for the graph, take off and fly the task, with faults of sim_node, to its end.
 
         Raises:
             RunError: a failure; the text states whether the computer was too slow.
 
         """
-        operator = self._operator
         self._await('starting (the first time compiles the controller)',
-                    lambda: operator.ready and operator.progress, READY_TIMEOUT)
-        self._await('actuators', lambda: not operator.waits_for(self._bridges), BRIDGES_TIMEOUT)
-        self._await('watching the simulator', lambda: PACING in operator.diagnostics,
-                    BRIDGES_TIMEOUT)
+                    lambda: self.ready and self.progress, READY_TIMEOUT)
+        self._await('actuators and simulator', lambda: not self.waits_for(self._bridges)
+                    and PACING in self.diagnostics, BRIDGES_TIMEOUT)
         lost = self._lost_time()
         try:
             self._take_off()
-            self._fly_task()
+            self._fly_task(faults)
         except RunError as error:
             if (late := self._lost_time() - lost) < SLOW_TIME:
                 raise
@@ -231,74 +222,70 @@ class Flight:
 
     def _lost_time(self):
         """Return the time that the simulator skipped because it was late [s]."""
-        return float(self._operator.values(PACING).get('lost_s', 0.0))
+        return float(self.values(PACING).get('lost_s', 0.0))
 
     def _take_off(self):
         """Arm and take off; repeat if the supervisor disarms on the ground."""
-        operator, answers = self._operator, []
+        answers = []
         for _ in range(TAKEOFF_ATTEMPTS):
             self._spin(SETTLE_TIME)
-            self._await('arming', lambda: answers.append(operator.call('arm')) or answers[-1][0],
+            self._await('arming', lambda: answers.append(self.call('arm')) or answers[-1][0],
                         ARM_TIMEOUT, lambda: f'; supervisor_node: {answers[-1][1]}')
-            operator.states.clear()
+            self.states.clear()
             # The state may name a fault: disarmed:joint1_astray.
-            self._await('taking off', lambda: operator.state.startswith('flying') or any(
-                state.startswith('disarmed') for state in operator.states), TAKEOFF_TIMEOUT)
-            if operator.state.startswith('flying'):
+            self._await('taking off', lambda: self.state.startswith('flying') or any(
+                state.startswith('disarmed') for state in self.states), TAKEOFF_TIMEOUT)
+            if self.state.startswith('flying'):
                 return
         raise RunError(f'no take-off in {TAKEOFF_ATTEMPTS} attempts; see the warnings below')
 
-    def _fly_task(self):
-        operator, name = self._operator, self._task.name
-        start = operator.time()
-        if self._faults:        # as the task begins, so that their times count from there
-            self._await(name, lambda: operator.progress.startswith('flying'), TAKEOFF_TIMEOUT)
-            accepted, answer = operator.set('sim_node', 'faults', self._faults)
+    def _fly_task(self, faults):
+        name, start = self._task.name, self.time()
+        if faults:      # as the task begins, so that their times count from there
+            self._await(name, lambda: self.progress.startswith('flying'), TAKEOFF_TIMEOUT)
+            accepted, answer = self.set('sim_node', 'faults', faults)
             if not accepted:
                 raise RunError(f'sim_node refuses the faults: {answer}')
 
         def is_done():
-            self._show(f'{name}: {operator.progress}, {operator.time() - start:.0f} of '
-                       f'{self._task.duration:.0f} s ({operator.state})')
-            if operator.state in ON_GROUND:
-                raise RunError(f"the flight ended early, supervisor in '{operator.state}'")
-            return operator.progress.startswith('done')
+            self._show(f'{name}: {self.progress}, {self.time() - start:.0f} of '
+                       f'{self._task.duration:.0f} s ({self.state})')
+            if self.state in ON_GROUND:
+                raise RunError(f"the flight ended early, supervisor in '{self.state}'")
+            return self.progress.startswith('done')
 
         self._await(name, is_done, self._task.duration + SPARE_TIME,
-                    lambda: f"; the task does not continue at '{operator.progress}'")
+                    lambda: f"; the task does not continue at '{self.progress}'")
 
     def land(self) -> None:
         """Land if the robot flies, and wait for the motors to stop."""
-        operator = self._operator
-        if operator.state in ('', *ON_GROUND):
+        if self.state in ('', *ON_GROUND):
             return
         self._show('landing')
-        accepted, answer = operator.call('land')
+        accepted, answer = self.call('land')
         if not accepted:
             _complain(f'no landing: {answer}')
         else:
-            operator.wait(lambda: operator.state in ON_GROUND, LANDING_TIMEOUT)
-            operator.spin(1.1)      # the last diagnostics
+            self.wait(lambda: self.state in ON_GROUND, LANDING_TIMEOUT)
+            self.spin(1.1)      # the last diagnostics
 
     def _await(self, text, condition, timeout, why=lambda: ''):
         self._show(text)
-        left = self._operator.countdown(timeout)
+        left = self.countdown(timeout)
         while not condition():
             self._spin()
             if next(left, None) is None:
-                waits = self._operator.waits_for(self._bridges)
+                waits = self.waits_for(self._bridges)
                 raise RunError(f'{text}: nothing after {timeout:g} s, supervisor in '
-                               f"'{self._operator.state}'{why()}" + (waits and f'; {waits}'))
+                               f"'{self.state}'{why()}" + (waits and f'; {waits}'))
 
     def _spin(self, seconds=CHECK_PERIOD):
         """Process messages; an ended process and a failing controller end the flight."""
-        operator = self._operator
-        operator.spin(seconds)
+        self.spin(seconds)
         if dead := self._graph.dead():
             raise RunError('; '.join(f'{name} died ({how})' for name, how in dead.items()))
-        status = operator.diagnostics.get(f'{operator.controller}_node: controller')
-        if status is not None and status.level >= ERROR \
-                and not operator.state.startswith('flying'):
+        status = self.diagnostics.get(f'{self.controller}_node: controller')
+        if status is not None and status.level >= ERROR and not self.state.startswith('flying'):
             raise RunError(status.message)
 
 

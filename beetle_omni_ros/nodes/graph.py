@@ -155,13 +155,14 @@ def plan(controller: str = registry.DEFAULT, *, standby: bool = True, nmpc: str 
     bridges = bridge_parameters(Path(ports), robot) if emulated else {}
     table = (
         ('recorder_node', bag, {'bag': bag, **packed, **others}),
-        ('sim_node', simulated, {**plant, 'conditions': conditions, 'seed': seed,
-                                 **bridges.get('sim_node', {})}),
         ('ekf_node', True, robot),
         *((name, True, values) for name, values in controllers.items()),
         ('supervisor_node', True, {**robot, 'controller': active, **others}),
         ('reference_node', task, {'task': task, 'seed': seed}),
         ('viewer_node', viewer, {}),
+        # After the controllers, whose start would keep its emulated devices from answering.
+        ('sim_node', simulated, {**plant, 'conditions': conditions, 'seed': seed,
+                                 **bridges.get('sim_node', {})}),
         *((name, bridges, bridges.get(name)) for name in BRIDGES))
     # Copies: YAML would write a shared list as an alias, which ROS cannot read.
     nodes = {name: deepcopy(values) for name, is_used, values in table if is_used}

@@ -145,4 +145,4 @@ def test_the_plan_of_a_graph_with_another_controller():
         assert nodes[name]['controllers'] == known
     assert graph.arguments(nodes, ['ekf_node', 'pose_controller_node']) == ['ekf_node', OWN]
     alone, _ = graph.plan(OWN, actuators='direct', standby=False)
-    assert list(alone) == ['sim_node', 'ekf_node', 'pose_controller_node', 'supervisor_node']
+    assert list(alone) == ['ekf_node', 'pose_controller_node', 'supervisor_node', 'sim_node']

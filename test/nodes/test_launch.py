@@ -56,7 +56,7 @@ def test_the_bridges_have_their_own_process(bringup):
     process, bridges = (one.kwargs['cmd'] for one in bringup.start(seed='7', namespace='/robot1'))
     assert bridges[4:6] == list(BRIDGES) and bridges[-2:] == ['-r', '__ns:=/robot1']
     assert process[4:process.index('--ros-args')] == [
-        'sim_node', 'ekf_node', 'nmpc_node', 'rl_node', 'supervisor_node']
+        'ekf_node', 'nmpc_node', 'rl_node', 'supervisor_node', 'sim_node']
     assert 'sim_node:seed:=7' in process
 
 
