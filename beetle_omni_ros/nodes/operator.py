@@ -27,7 +27,6 @@ from beetle_omni_ros.messages.topics import (
     Qos,
     SENSOR,
     TARGETS,
-    topic_of,
     TOPICS,
 )
 from beetle_omni_ros.messages.values import Diagnostic, MessageError
@@ -252,21 +251,15 @@ class LiveGraph(Client):
         super().__init__('view', domain, namespace)
         node = self._node
         self._write: Callable[[str, Any], None] = lambda topic, value: None
-        for topic in (*SHOWN, *EVENTS):
+        for topic in (*SHOWN, *EVENTS, *TARGETS):
             wire.subscribe(node, topic, partial(self._take, topic),
                            NEWEST if topic in SHOWN else None)
-        for topic in TARGETS:
-            wire.subscribe_any(node, topic, partial(self._take_target, topic_of(topic)))
         self._targets = wire.Publisher(node, 'target_pose') if writable else None
         self._setting = node.create_client(SetParameters, f'{SUPERVISOR}/set_parameters') \
             if writable else None
 
     def _take(self, topic, value):
         self._write(topic, value)
-
-    def _take_target(self, topic, data, _):
-        with suppress(MessageError):    # the nodes report refusals
-            self._write(topic.name, topic.take(wire.message(topic, data)))
 
     def take(self, newest) -> None:
         """Write the messages since the last call to a view.live.Newest."""

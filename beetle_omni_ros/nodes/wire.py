@@ -15,7 +15,7 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from beetle_omni_ros.messages.bag_types import from_bytes, to_bytes
-from beetle_omni_ros.messages.topics import Qos, Topic, topic_of
+from beetle_omni_ros.messages.topics import Qos, TARGETS, Topic, topic_of
 from beetle_omni_ros.messages.values import MessageError
 
 COPIES = 64             # newest messages that are compared to detect a copy
@@ -75,16 +75,19 @@ class Publisher:
 
 def subscribe(node: Node, topic: str, handle: Callable[[Any], None],
               qos: Qos | None = None) -> None:
-    """Subscribe a topic without checks of age; ``qos`` replaces that of the table."""
+    """Subscribe without checks of age; ``qos`` replaces that of the table, or any of targets."""
     entry = topic_of(topic)
 
-    def callback(data):
+    def callback(data, _=None):
         try:
             handle(entry.take(message(entry, data)))
         except MessageError as error:
             node.get_logger().warning(f'{topic}: message refused, {error}')
 
-    subscribe_raw(node, topic, callback, qos)
+    if topic in TARGETS and qos is None:
+        subscribe_any(node, topic, callback)
+    else:
+        subscribe_raw(node, topic, lambda data: callback(data), qos)
 
 
 def subscribe_raw(node: Node, topic: str, callback: Callable[[bytes], None],
