@@ -182,14 +182,12 @@ class ControllerNode(FlightNode):
 def _requested_controller() -> str:
     """Read the parameter ``controller`` by a temporary node, before the real one is made."""
     probe = Node(GENERIC, start_parameter_services=False, enable_rosout=False)
-    given, name = probe._parameter_overrides.get('controller'), probe.get_name()
+    given = probe._parameter_overrides.get('controller')
     probe.destroy_node()
-    if given is not None:
-        return str(given.value)
-    if name != GENERIC:
-        return name.removesuffix('_node')
-    raise ParameterError("key 'controller': missing; expected a registered controller "
-                         f"({', '.join(registry.names())}) or {registry.CLASS}")
+    if given is None:
+        raise ParameterError("key 'controller': missing; expected a registered controller "
+                             f"({', '.join(registry.names())}) or {registry.CLASS}")
+    return str(given.value)
 
 
 # --- supervisor ---------------------------------------------------------------------------------

@@ -171,7 +171,8 @@ class SimNode(FlightNode):
         self._publish_to = {
             'mocap': self.publisher('mocap/pose'), 'imu': self.publisher('imu/data_raw')}
         self._truth = self.publisher('ground_truth/odom')
-        self.listen('disturbance', self._on_wrench, stale_after=None)
+        self.listen('disturbance', lambda wrench: self._simulator.set_wrench(
+            wrench.force, wrench.torque), stale_after=None)
         self.track_compute(self._simulator.tick)
         self.report('pacing', self._pacing_status)
         self.report('robot', self._robot_status)
@@ -299,9 +300,6 @@ class SimNode(FlightNode):
             self._pacing.answered('command', command.stamp)
         if self._pacing.epoch is not None:
             self._simulator.command(replace(command, stamp=command.stamp - self._pacing.epoch))
-
-    def _on_wrench(self, wrench):
-        self._simulator.set_wrench(wrench.force, wrench.torque)
 
     def _pacing_status(self):
         pacing = self._pacing
