@@ -1,9 +1,5 @@
 """Discovery is limited to this computer unless another range is requested."""
 
-import os
-import subprocess
-from types import SimpleNamespace
-
 import pytest
 
 from beetle_omni_ros.nodes import graph
@@ -15,21 +11,6 @@ from beetle_omni_ros.nodes import graph
 def test_the_users_setting_has_precedence(given, holds):
     graph.confine(given)
     assert given.get('ROS_AUTOMATIC_DISCOVERY_RANGE') == holds
-
-
-def test_the_setting_reaches_both_processes_of_a_flight(tmp_path, monkeypatch):
-    monkeypatch.setenv(graph.RANGE, 'SUBNET')
-    ranges = []
-
-    def start(arguments, env, **_):
-        ranges.append(env[graph.RANGE])
-        return SimpleNamespace(poll=lambda: 0, returncode=0)
-
-    monkeypatch.setattr(subprocess, 'Popen', start)
-    monkeypatch.setattr(os.path, 'exists', lambda _: True)
-    nodes, _ = graph.plan('hover', ports=str(tmp_path))
-    graph.Graph(nodes, tmp_path, 7).start()
-    assert ranges == ['SUBNET'] * 2
 
 
 def test_two_reserved_domains_differ(monkeypatch):
