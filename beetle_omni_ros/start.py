@@ -13,15 +13,13 @@ import sys
 
 PACKAGE = 'beetle_omni_ros'
 INTERRUPTED = 130
-# Executables with a function; all others are nodes.
-PROGRAMS = {'beetle_omni': f'{PACKAGE}.cli:main', 'composed': f'{PACKAGE}.nodes.runner:composed'}
+TOOL = 'beetle_omni'    # all other executables are nodes
 
 
 def load(name: str):
     """Import an executable and return its entry point."""
-    if name in PROGRAMS:
-        module, _, function = PROGRAMS[name].partition(':')
-        return getattr(import_module(module), function)
+    if name == TOOL:
+        return import_module(f'{PACKAGE}.cli').main
     return partial(import_module(f'{PACKAGE}.nodes.runner').main, name)
 
 

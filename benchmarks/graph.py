@@ -1,8 +1,7 @@
 """
 CPU and latency of the ROS graph: ``python benchmarks/graph.py [--seconds 24]``.
 
-Flies poses in real time, with all nodes in one process, with a process for each, and with all
-but the bridges in one process, and prints for each
+Flies poses in real time, without and with the bridges, and prints for each
 
 - CPU: user and system time of all node processes (simulator and recorder included) while
   the task is flown, in % of one core;
@@ -16,55 +15,84 @@ timer process measures the delays of the machine: it has the same priority and o
 """
 
 import argparse
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 import json
+import os
 from pathlib import Path
 import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
 from beetle_omni_ros.nodes.fly import run_fly
+from beetle_omni_ros.nodes.graph import BRIDGES, BRIDGES_COMPOSED, COMPOSED
 from beetle_omni_ros.nodes.runner import use_real_time_priority
+from beetle_omni_ros.runs.bag import read_bag
 
-# name -> (composed, actuators, targets)
+# actuators -> targets
 ARRANGEMENTS = {
-    'one process, direct': (True, 'direct', {'cpu_percent': 60.0, 'latency_p99_ms': 5.0}),
-    'separate processes, direct': (False, 'direct', {}),
-    'composed, with bridges': (True, 'emulated', {
-        'bridges_cpu_percent': 30.0, 'servos_missed_cycles': 0, 'servos_latency_p99_ms': 2.0,
-        'motor_board_missed_cycles': 0, 'motor_board_latency_p99_ms': 2.0})}
+    'direct': {'cpu_percent': 60.0, 'latency_p99_ms': 5.0},
+    'emulated': {'bridges_cpu_percent': 30.0, 'servos_missed_cycles': 0}}
 ROWS = {'cpu_percent': 'CPU of all nodes [%]', 'latency_median_ms': 'latency, median [ms]',
         'latency_p99_ms': '99 %', 'latency_max_ms': 'max',
         'bridges_cpu_percent': 'CPU of the bridges [%]',
         'servos_cycles': 'servo bus: cycles', 'servos_missed_cycles': 'missed',
-        'servos_latency_p99_ms': 'command to last byte, 99 % [ms]',
-        'motor_board_cycles': 'motor board: cycles', 'motor_board_missed_cycles': 'missed',
-        'motor_board_latency_p99_ms': 'command to last byte, 99 % [ms]',
+        'servos_latency_p99_ms': 'IMU sample to last byte, 99 % [ms]',
         'bare_cycles': 'bare timer: cycles', 'bare_missed_cycles': 'missed'}
 PERIOD = 0.005     # s
 POSES = ['0,0,1,0,0,0', '0.5,0,1,30,0,0', '0,0.5,1.2,0,-25,45']
 POSE_SECONDS = 8
 
 
-def measure(folder: Path, name: str, seconds: float) -> dict:
-    """Fly once; return what was measured."""
-    composed, actuators, _ = ARRANGEMENTS[name]
+def measure(folder: Path, actuators: str, seconds: float) -> dict:
+    """Fly once; return what was measured while the task was flown."""
     rows = [POSES[k % len(POSES)] for k in range(max(1, round(seconds / POSE_SECONDS)))]
-    task, result = folder / 'poses.csv', folder / 'result.json'
+    task, bag = folder / 'poses.csv', folder / f'bag_{actuators}'
     task.write_text('\n'.join(['x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg', *rows]) + '\n')
-    result.unlink(missing_ok=True)
+    samples, stop = [], threading.Event()       # (time [s], CPU of all nodes, of the bridges [s])
+    sampler = threading.Thread(target=sample_cpu, args=(samples, stop))
+    sampler.start()
     with bare_timer() as counted:
-        status = run_fly(task=str(task), composed=composed, actuators=actuators, clock='system',
-                         json_path=result,
+        status = run_fly(task=str(task), actuators=actuators, bag=bag,
                          console=Console(quiet=True))
-    if status or not result.exists():
-        sys.exit(f'flight with {name} failed (status {status})')
-    return {**json.loads(result.read_text())['meta']['graph'], **counted}
+    stop.set()
+    sampler.join()
+    if status:
+        sys.exit(f'flight with {actuators} failed (status {status})')
+    log = read_bag(bag)
+    t, *used = np.array(samples).T
+    begin, end = log.targets[0].stamp, log.state_t[log.states.index('landing')]
+    found = {key: 100 * (np.interp(end, t, cpu) - np.interp(begin, t, cpu)) / (end - begin)
+             for key, cpu in zip(('cpu_percent', 'bridges_cpu_percent'), used, strict=True)}
+    newest = {status.name: status.values for status in log.diagnostics}
+    for name, node in (('latency', 'rotor_bridge_node' if actuators == 'emulated' else 'sim_node'),
+                       ('servos_latency', 'joint_bridge_node')):
+        found |= {f'{name}_{key}': float(value)
+                  for key, value in newest.get(f'{node}: latency', {}).items()}
+    found |= {f'servos_{key}': int(newest['joint_bridge_node: bus'][key])
+              for key in ('cycles', 'missed_cycles') if 'joint_bridge_node: bus' in newest}
+    return {**found, **counted}
+
+
+def sample_cpu(samples: list, stop: threading.Event) -> None:
+    """Add the CPU time of the processes of nodes, ten times a second."""
+    while not stop.wait(0.1):
+        used = {COMPOSED: 0.0, BRIDGES_COMPOSED: 0.0}
+        for file in Path('/proc/self/task').glob('*/children'):
+            for pid in file.read_text().split():
+                with suppress(OSError):
+                    words = Path(f'/proc/{pid}/cmdline').read_text().split('\0')
+                    stat = Path(f'/proc/{pid}/stat').read_text().rsplit(')', 1)[1].split()
+                    if COMPOSED in words:
+                        used[BRIDGES_COMPOSED if BRIDGES[0] in words else COMPOSED] += (
+                            int(stat[11]) + int(stat[12])) / os.sysconf('SC_CLK_TCK')
+        samples.append((time.time(), sum(used.values()), used[BRIDGES_COMPOSED]))
 
 
 @contextmanager
@@ -112,7 +140,7 @@ def main():
             measured[name] = measure(Path(folder), name, given.seconds)
     for key, text in ROWS.items():
         table.add_row(text, *(_cell(measured[name].get(key), targets.get(key))
-                              for name, (_, _, targets) in ARRANGEMENTS.items()))
+                              for name, targets in ARRANGEMENTS.items()))
     Console().print(table)
     if given.json:
         given.json.write_text(json.dumps(measured, indent=1) + '\n')

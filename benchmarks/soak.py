@@ -122,7 +122,7 @@ def make_graph(folder: Path, number: int, given) -> Graph:
             parameters[node] = {**parameters.get(node, {}), **values}
     if given.clock == 'simulated':
         parameters = in_simulated_time(parameters)
-    return Graph(parameters, folder, number, composed=not given.separate)
+    return Graph(parameters, folder, number)
 
 
 def take_off(operator: Operator, bridges: list[str]) -> None:
@@ -217,7 +217,6 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument('--actuators', choices=('emulated', 'direct'), default='emulated')
     parser.add_argument('--clock', choices=('system', 'simulated'), default='system',
                         help='simulated needs --actuators direct; minutes are of real time')
-    parser.add_argument('--separate', action='store_true', help='a process for each node')
     parser.add_argument('--json', type=Path, help='file for the numbers')
     given = parser.parse_args(arguments)
     if given.clock == 'simulated' and given.actuators == 'emulated':

@@ -84,8 +84,7 @@ OTHERS = {
             'tilting module; 50 Hz, in each bag'),
     '/tf_static': ('tf2_msgs/TFMessage', 'LATCHED',
                    'fixed frames: rotors, main body, end effector, IMU'),
-    'robot_description': ('std_msgs/String', 'LATCHED', 'URDF for viewers'),
-    'markers': ('visualization_msgs/MarkerArray', 'EVENT', 'targets and thrusts for viewers')}
+    'robot_description': ('std_msgs/String', 'LATCHED', 'URDF for viewers')}
 
 
 CONVENTIONS = """Names are relative; a launch argument sets a namespace. On the robot, the drivers

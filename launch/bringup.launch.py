@@ -6,7 +6,6 @@ The robot stays on the ground until ``supervisor_node/arm`` is called.
 
 import atexit
 import shutil
-import subprocess
 import sys
 import tempfile
 
@@ -41,27 +40,12 @@ ARGUMENTS = {
     'allow_other_robot': ('false', ['true', 'false'],
                           'fly a policy that was trained for other robot parameters'),
     'namespace': ('', None, 'namespace of every node and topic'),
-    'discovery': ('', ['', 'LOCALHOST', 'SUBNET', 'OFF', 'SYSTEM_DEFAULT'],
-                  'who can find the nodes; empty: programs of this computer alone'),
-    'composed': ('true', ['true', 'false'], 'all nodes in one process'),
-    'viewer': ('false', ['true', 'false'], 'description, tf and markers for RViz and Foxglove'),
-    'view': ('false', ['true', 'false'], 'the flight in 3D in the browser; prints the address'),
-    'allow_targets': ('false', ['true', 'false'],
-                      'with view: poses dragged there become targets, and controllers can be '
-                      'selected there'),
+    'viewer': ('false', ['true', 'false'], 'description and tf for RViz and Foxglove'),
     'robot_file': ('', None, 'robot file that estimator and controller believe'),
     'plant_file': ('', None, 'robot file that is true in the simulation'),
     'conditions': ('nominal', ['nominal', 'published'], 'of the simulation'),
     'seed': ('0', None, 'of simulation and task'),
 }
-
-
-def has_ros2_bag():
-    """Whether ``ros2 bag record`` can be called here."""
-    if not shutil.which('ros2'):
-        return False
-    return subprocess.run(['ros2', 'bag', 'record', '--help'], capture_output=True,
-                          check=False).returncode == 0
 
 
 def ports():
@@ -73,16 +57,13 @@ def ports():
 
 def options(given):
     """Put the arguments into the terms of the graph's plan."""
-    from beetle_omni_ros.nodes.graph import GraphOptions
     simulated = given['backend'] == 'sim'
     actuators = given['actuators'] or (
         'direct' if given['clock'] == 'simulated' else 'bridges')
     emulated = simulated and actuators == 'bridges'
-    return GraphOptions(
-        simulated=simulated, actuators=actuators,
-        ports=ports() if emulated else '',
-        bag=given['record'] if given['record'] and not has_ros2_bag() else '',
-        seed=int(given['seed']),
+    return dict(
+        simulated=simulated, actuators=actuators, ports=ports() if emulated else '',
+        bag=given['record'], seed=int(given['seed']),
         **{key: given[key] == 'true' for key in ('standby', 'allow_other_robot', 'viewer')},
         **{key: given[key] for key in (
             'clock', 'compression', 'conditions', 'controller', 'plant_file', 'policy',
@@ -100,14 +81,6 @@ def state_publisher(namespace):
                     'publish_frequency': 50.0}])
 
 
-def recorded_topics(namespace, controllers):
-    """Absolute names of the topics of INTERFACES, of these controllers, and of the frames."""
-    from beetle_omni_ros.messages.topics import ALL, topics_with
-    prefix = f"/{namespace.strip('/')}/" if namespace.strip('/') else '/'
-    return ['/tf', '/tf_static', *(prefix + topic for topic in (
-        *{**topics_with(controllers), **ALL}, 'robot_description'))]
-
-
 def composed(arguments, nodes, namespace):
     """One process that runs ``nodes``."""
     overrides = [argument for node, values in nodes.items() for key, value in values.items()
@@ -118,53 +91,22 @@ def composed(arguments, nodes, namespace):
                                '--ros-args', *overrides], output='screen')
 
 
-def viewing(given):
-    """Viewer in a process of its own."""
-    return ExecuteProcess(
-        cmd=[sys.executable, '-m', f'{PACKAGE}.start', 'beetle_omni', 'view',
-             *(['--namespace', given['namespace']] if given['namespace'] else []),
-             *(['--robot', given['robot_file']] if given['robot_file'] else []),
-             *(['--allow-targets'] if given['allow_targets'] == 'true' else [])],
-        output='screen')
-
-
 def actions(context):
     """Turn the arguments into processes."""
     from beetle_omni_ros.nodes import graph
     given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
-    graph.confine(requested=given['discovery'])
-    planned = graph.plan(options(given))
-    nodes = planned.nodes
-    for name, reason in planned.left_out.items():
+    graph.confine()
+    nodes, left_out = graph.plan(**options(given))
+    for name, reason in left_out.items():
         print(f'{name} does not stand by: {reason}', file=sys.stderr)
-    processes = []
-    if 'viewer_node' in nodes:
-        processes.append(state_publisher(given['namespace']))
-    if given['record'] and 'recorder_node' not in nodes:
-        controllers = nodes['supervisor_node'].get('controllers', ())
-        processes.append(ExecuteProcess(
-            cmd=['ros2', 'bag', 'record', '-s', 'mcap', '-o', given['record'], *(
-                     ['--storage-preset-profile', 'zstd_fast']
-                     if given['compression'] == 'zstd' else []),
-                 *recorded_topics(given['namespace'], controllers)], output='screen'))
-    if given['view'] == 'true':
-        processes.append(viewing(given))
-    if given['composed'] == 'true':
-        processes += [composed(graph.arguments(nodes, names),
-                               {name: nodes[name] for name in names},
-                               given['namespace'].strip('/'))
-                      for names in graph.processes(nodes).values()]
-    else:
-        processes += [Node(package=PACKAGE, executable=graph.executable(name), name=name,
-                           parameters=[values], namespace=given['namespace'], output='screen')
-                      for name, values in nodes.items()]
-    return processes
+    return [*([state_publisher(given['namespace'])] if 'viewer_node' in nodes else []),
+            *(composed(graph.arguments(nodes, names), {name: nodes[name] for name in names},
+                       given['namespace'].strip('/'))
+              for names in graph.processes(nodes).values())]
 
 
 def generate_launch_description():
     """Declare the arguments; the rest follows from them."""
-    from beetle_omni_ros.nodes.graph import confine
-    confine()       # here, so that it holds for `ros2 bag record` too
     declared = []
     for name, (default, choices, description) in ARGUMENTS.items():
         options = {'choices': choices} if choices else {}

@@ -26,7 +26,7 @@ ALLOWED = {
     'faults': ('robot', 'pages', 'control', 'estimation', 'sim', 'safety', 'runs', 'evaluation'),
     'comparison': ('robot', 'pages', 'control', 'runs', 'evaluation'),
     'identify': ('robot', 'pages', 'runs', 'messages'),
-    'bringup': ('robot', 'drivers', 'runs.files'),
+    'bringup': ('robot', 'drivers', 'runs.files', 'messages.values'),
     'drive': ('robot',),
     'view': ('robot', 'control.base', 'pages', 'runs', 'messages'),
     'nodes': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs', 'drivers', 'drive',

@@ -55,25 +55,22 @@ def run_check(*, listen: Callable[[float], ObservedGraph], servo_port: str | Non
     robot_parameters = RobotParameters.load(robot)
     bus = replace(bus, port=servo_port or bus.port)
     link = replace(link, port=board_port or link.port)
-    graph, of_ros = None, Findings()
+    graph, found = None, {}
     if 'ros' not in skip:
+        found['ros'] = Findings()
         with console.status(f'listening to ROS for {seconds:g} s'):
-            graph = _observed(listen, seconds, of_ros)
-    checks = {
-        'servos': (f'checking the servos on {bus.port}',
-                   lambda: check_servos(bus, robot_parameters.joints, graph)),
-        'board': (f'listening to the motor board on {link.port}',
-                  lambda: check_board(link, robot_parameters, seconds, graph))}
-    found: dict[str, Findings] = {}
-    for part, (doing, check) in checks.items():
-        if part not in skip:
-            with console.status(doing):
-                found[part] = check()
-    if 'ros' not in skip:
-        items = [finding.item for rows in found.values() for finding in rows]
-        found['ros'] = of_ros if graph is None else check_topics(
-            graph, robot_parameters.gravity,
-            frozenset(bridge for bridge in BRIDGES if f'{bridge} state' in items))
+            graph = _observed(listen, seconds, found['ros'])
+    if 'servos' not in skip:
+        with console.status(f'checking the servos on {bus.port}'):
+            found['servos'] = check_servos(bus, robot_parameters.joints, graph)
+    if 'board' not in skip:
+        with console.status(f'listening to the motor board on {link.port}'):
+            found['board'] = check_board(link, robot_parameters, seconds, graph)
+    if graph is not None:
+        items = {finding.item for rows in found.values() for finding in rows}
+        found['ros'] = check_topics(graph, robot_parameters.gravity,
+                                    {bridge for bridge in BRIDGES if f'{bridge} state' in items})
+    found = {part: found[part] for part in PARTS if part in found}
     _print(console, found, skip)
     is_ok = all(finding.level != FAIL for rows in found.values() for finding in rows)
     write_json(json_path, {

@@ -6,6 +6,7 @@ to by its driver; no rotor turns, and an armed board is disarmed at the end.
 """
 
 import grp
+from math import inf
 import os
 from pathlib import Path
 import pwd
@@ -14,25 +15,26 @@ import time
 
 import numpy as np
 
-from beetle_omni_ros.bringup.findings import closed_port, Findings, ObservedGraph
+from beetle_omni_ros.bringup.findings import Findings, ObservedGraph, reported
 from beetle_omni_ros.drivers import servo_registers as registers
 from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters, ServoBusParameters
 from beetle_omni_ros.robot.parameters import JointParameters, RobotParameters
 
 SYS = Path('/sys')
+GUIDE = 'docs/how-to/hardware.md'
 BUS, BOARD = 'servo bus', 'motor board'
 ROUNDS = 50             # reads of each servo to measure answer time and loss
 POLL_PERIOD = 0.02      # [s] between polls of the board
 SETTLING = 0.3          # [s] until the board has received several of our packets
 LATENCY_TIMER = 1       # [ms] of FTDI adapters, docs/how-to/hardware.md
-LOSS, LOSS_FAIL = 0.01, 0.1     # [-] share of lost answers or packets; at 0.1 the joints jerk
-# [V] supply of a servo: the smallest of the XC330-T181-T by its manual; half a volt below the
-# recommended 11.1 V, it is weaker and slower; 5 % above the largest.
-SUPPLY_FAIL_LOW, SUPPLY_LOW, SUPPLY_HIGH = 6.5, 10.5, 12.6
-TEMPERATURE_HIGH = 55.0     # [C] at rest a servo has nearly room temperature; at 70 it shuts down
-# [V] cell at rest: smallest for arming (supervisor.yaml); about half empty; above a full LiPo
+LOSS, LOSS_FAIL = (0, 0.01), (0, 0.1)       # [-] lost answers or packets; at 0.1 the joints jerk
+# [V] supply of a servo: the smallest of the XC330-T181-T by its manual, to 5 % above the largest;
+# half a volt below the recommended 11.1 V, it is weaker and slower.
+SUPPLY, SUPPLY_FAIL = (10.5, 12.6), (6.5, 12.6)
+TEMPERATURE = (-inf, 55.0)  # [C] at rest a servo has nearly room temperature; it stops at 70
+# [V] cell at rest: about half empty; smallest for arming (supervisor.yaml). Above a full LiPo
 # cell, 4.2 V, the calibration or the number of cells is wrong.
-CELL_FAIL_LOW, CELL_LOW, CELL_HIGH = 3.5, 3.7, 4.25
+CELL, CELL_FAIL = (3.7, 4.25), (3.5, 4.25)
 
 
 # --- ports --------------------------------------------------------------------------------------
@@ -48,37 +50,53 @@ def unusable_port(path: str) -> tuple[str, str]:
             return (f'{path}: the link leads to {os.readlink(path)}, which does not exist',
                     'plug the adapter in again')
         from beetle_omni_ros.drivers.serial_port import usb_ports
-        if ports := '; '.join(f'{device}: {product}' for device, product in usb_ports().items()):
-            return (f'{path}: no such port', f'name one of the present ports ({ports}), or give '
-                    'it this name by the udev rule of docs/how-to/hardware.md')
-        return (f'{path}: no such port', 'no USB serial port is present: plug the adapter in, '
-                'check `dmesg`')
+        ports = '; '.join(f'{device}: {product}' for device, product in usb_ports().items())
+        return f'{path}: no such port', (
+            f'name one of the present ports ({ports}), or give it this name by the udev rule of '
+            f'{GUIDE}' if ports else 'no USB serial port is present: plug the adapter in, check '
+            '`dmesg`')
     if not stat.S_ISCHR(status.st_mode):
         return f'{path}: no serial port', 'name the device, such as /dev/ttyUSB0'
     if not os.access(path, os.R_OK | os.W_OK):
         user, group = pwd.getpwuid(os.geteuid()).pw_name, grp.getgrgid(status.st_gid).gr_name
         return (f'{path}: no permission for {user} ({stat.filemode(status.st_mode)}, group '
                 f'{group})', f'sudo usermod -aG {group} {user}, then log out and in again; or '
-                'install the udev rule of docs/how-to/hardware.md: GROUP="dialout", MODE="0660"')
+                f'install the udev rule of {GUIDE}: GROUP="dialout", MODE="0660"')
     return '', ''
 
 
-def _opened_port(findings, device, path):
-    """Add findings about an open port: its name, and the latency timer of a USB adapter."""
-    from beetle_omni_ros.drivers.serial_port import usb_ports
+def open_port(findings, device, name, path, bridge, graph):
+    """
+    Open ``device`` on its port ``path``; return whether it is open.
+
+    Adds the port and the latency timer of a USB adapter, or why it is closed. A port that a
+    running bridge has open is judged by the reports of this bridge in ``graph``.
+    """
+    from beetle_omni_ros.drivers.serial_port import SerialPortError, usb_ports
+    item = f'{name} port'
+    found, remedy = unusable_port(path)
+    if not found:
+        try:
+            device.open()
+        except SerialPortError as error:
+            found, remedy = str(error), GUIDE
+    if found and graph and graph.runs(bridge) and 'another process' in found:
+        findings.add(item, f'{found}; not opened, judged by what {bridge}_node reports')
+        findings += reported(bridge, graph)
+    elif found:
+        findings.add(item, found, fail=remedy)
+    if found:
+        return False
     real = os.path.realpath(path)
     names = [path if real == path else f'{path} ({real})', usb_ports().get(real)]
-    findings.add(f'{device} port', ', '.join(filter(None, names)))
+    findings.add(item, ', '.join(filter(None, names)))
     file = SYS / 'bus' / 'usb-serial' / 'devices' / Path(real).name / 'latency_timer'
-    try:
-        timer = int(file.read_text())
-    except (OSError, ValueError):
-        findings.add(f'{device} port latency timer', 'none: no FTDI adapter')
-        return
-    findings.add(f'{device} port latency timer', f'{timer} ms', latency_timer_ms=timer,
-                 fail=f'each answer waits for it: echo {LATENCY_TIMER} | sudo tee {file}; '
-                 'permanently: the udev rule of docs/how-to/hardware.md'
-                 if timer > LATENCY_TIMER else '')
+    if file.is_file() and (text := file.read_text().strip()):
+        findings.grade(f'{item} latency timer', f'{text} ms', float(text),
+                       f'each answer waits for it: echo {LATENCY_TIMER} | sudo tee {file}; '
+                       f'permanently: the udev rule of {GUIDE}', fail=(0, LATENCY_TIMER),
+                       latency_timer_ms=int(text))
+    return True
 
 
 # --- servos -------------------------------------------------------------------------------------
@@ -97,22 +115,14 @@ def check_servos(parameters: ServoBusParameters, joints: JointParameters,
     except ModuleNotFoundError as error:
         findings.missing(BUS, error, 'hardware')
         return findings
-    found, remedy = unusable_port(parameters.port)
-    if found:
-        return closed_port('servo port', found, remedy, 'joint_bridge', graph)
     link = ServoLink(parameters.port, parameters.baud_rate, parameters.timing.reply)
-    try:
-        link.open()
-    except SerialPortError as error:
-        return closed_port('servo port', str(error), 'docs/how-to/hardware.md', 'joint_bridge',
-                           graph)
-    try:
-        _opened_port(findings, 'servo', parameters.port)
-        _check_bus(findings, link, parameters, joints)
-    except SerialPortError as error:
-        findings.add(BUS, str(error), fail='check cable and adapter: docs/how-to/hardware.md')
-    finally:
-        link.close()
+    if open_port(findings, link, 'servo', parameters.port, 'joint_bridge', graph):
+        try:
+            _check_bus(findings, link, parameters, joints)
+        except SerialPortError as error:
+            findings.add(BUS, str(error), fail=f'check cable and adapter: {GUIDE}')
+        finally:
+            link.close()
     return findings
 
 
@@ -128,66 +138,55 @@ def _check_bus(findings, link, parameters, joints):
                 servo.torque = bool(link.read(servo.identifier, registers.TORQUE_ENABLE))
             except ServoBusError:
                 servo.torque = None
-    if present:
-        _check_answers(findings, link, present)
-    else:
+    if not present:
         findings.add(BUS, f'no servo answers at {link.baud_rate} bit/s', fail="check the servos' "
                      'supply (their LEDs blink once at power-up), the data cable, and with '
                      'DYNAMIXEL Wizard their baud rates')
         return
+    _check_answers(findings, link, present)
     for k, (servo, (problem, remedy)) in enumerate(zip(servos, problems, strict=True)):
         if servo.model is None:
             findings.add(servo.name, f'id {servo.identifier} {problem}',
                          fail='check its connector, and those before it in the chain; search '
                          'for its id and baud rate with DYNAMIXEL Wizard', id=servo.identifier)
             continue
-        read = servo.firmware is not None
-        facts = f'id {servo.identifier}, model {servo.model}, firmware {servo.firmware}, ' \
-            f'{servo.voltage:.1f} V, {servo.temperature:.0f} C, {servo.position:+.2f} rad' \
-            if read else f'id {servo.identifier}'
+        facts, values = f'id {servo.identifier}', {}
+        if servo.firmware is not None:
+            facts += f', model {servo.model}, firmware {servo.firmware}, {servo.voltage:.1f} V, ' \
+                f'{servo.temperature:.0f} C, {servo.position:+.2f} rad'
+            values = {'supply_V': servo.voltage, 'temperature_C': servo.temperature,
+                      'position_rad': servo.position}
         findings.add(servo.name, f'{problem}; {facts}' if problem else facts,
                      fail=remedy if problem else '', id=servo.identifier, model=servo.model,
-                     firmware=servo.firmware, baud_rate=link.baud_rate, **({
-                         'supply_V': servo.voltage, 'temperature_C': servo.temperature,
-                         'position_rad': servo.position} if read else {}))
-        if read:
-            _check_health(findings, servo)
-            _check_turn(findings, servo, parameters, joints, k)
+                     firmware=servo.firmware, baud_rate=link.baud_rate, **values)
+        if values:
+            _check_servo(findings, servo, parameters, joints, k)
 
 
-def _check_health(findings, servo):
-    """Add findings about supply, temperature and torque; none without a problem."""
-    name = servo.name
-    if not SUPPLY_FAIL_LOW <= servo.voltage <= SUPPLY_HIGH:
-        findings.add(f'{name} supply', f'{servo.voltage:.1f} V, allowed are '
-                     f'{SUPPLY_FAIL_LOW:g} to {SUPPLY_HIGH:g} V',
-                     fail='set the regulator to 11.1 to 12 V', supply_V=servo.voltage)
-    elif servo.voltage < SUPPLY_LOW:
-        findings.add(f'{name} supply', f'{servo.voltage:.1f} V: slower and weaker than identified',
-                     warn='set the regulator to 11.1 to 12 V; check the drop over thin cables',
-                     supply_V=servo.voltage)
-    if servo.temperature > TEMPERATURE_HIGH:
-        findings.add(f'{name} temperature', f'{servo.temperature:.0f} C', warn='let it cool; '
-                     'check what blocks the joint', temperature_C=servo.temperature)
-    if servo.torque:
-        findings.add(f'{name} torque', 'its torque is on, although no driver has the port open',
-                     warn='a program left it on: switch it off with the joint bridge, or cut its '
-                     'supply')
-
-
-def _check_turn(findings, servo, parameters, joints, k):
-    """Add a finding if the turn of the joint is ambiguous, by the rule of the driver."""
-    read = servo.position
+def _check_servo(findings, servo, parameters, joints, k):
+    """Add a finding for each problem of supply, temperature, torque and turn."""
+    name, volts, angle = servo.name, servo.voltage, servo.position
+    limit = registers.unambiguous_limit(joints.position_limit)
     confirmed = [parameters.confirmed_tilts[k]] if parameters.confirm_tilts else None
-    if doubts := registers.settle([servo], joints.position_limit, confirmed):
-        limit = registers.unambiguous_limit(joints.position_limit)
-        findings.add(f'{servo.name} turn', f'ambiguous: {doubts}', fail='turn it by hand to '
-                     f'within +-{limit:.2f} rad, cables untwisted; or set confirmed_tilts and '
-                     'confirm_tilts: docs/how-to/hardware.md', position_rad=read)
-    elif confirmed:
-        findings.add(f'{servo.name} turn', f'taken as {servo.position:+.2f} rad because '
-                     'confirm_tilts is set', warn='reset confirm_tilts once it is parked',
-                     position_rad=servo.position)
+    doubts = registers.settle([servo], joints.position_limit, confirmed)    # the driver's rule
+    rows = Findings()
+    rows.grade(f'{name} supply', f'{volts:.1f} V, allowed are {SUPPLY_FAIL[0]:g} to '
+               f'{SUPPLY_FAIL[1]:g} V, below {SUPPLY[0]:g} V it is slower and weaker than '
+               'identified', volts, 'set the regulator to 11.1 to 12 V; check the drop over thin '
+               'cables', warn=SUPPLY, fail=SUPPLY_FAIL, supply_V=volts)
+    rows.grade(f'{name} temperature', f'{servo.temperature:.0f} C', servo.temperature,
+               'let it cool; check what blocks the joint', warn=TEMPERATURE,
+               temperature_C=servo.temperature)
+    rows.add(f'{name} torque', 'its torque is on, although no driver has the port open',
+             warn='a program left it on: switch it off with the joint bridge, or cut its supply'
+             if servo.torque else '')
+    rows.add(f'{name} turn', f'ambiguous: {doubts}' if doubts else
+             f'taken as {servo.position:+.2f} rad because confirm_tilts is set',
+             fail=f'turn it by hand to within +-{limit:.2f} rad, cables untwisted; or set '
+             f'confirmed_tilts and confirm_tilts: {GUIDE}' if doubts else '',
+             warn='reset confirm_tilts once it is parked' if confirmed else '',
+             position_rad=angle if doubts else servo.position)
+    findings += [row for row in rows if row.remedy]
 
 
 def _check_answers(findings, link, servos):
@@ -224,35 +223,30 @@ def check_board(parameters: MotorBoardParameters, robot: RobotParameters, second
     findings = Findings()
     try:
         from beetle_omni_ros.drivers.motor_board import MotorBoard
-        from beetle_omni_ros.drivers.serial_port import SerialPortError
     except ModuleNotFoundError as error:
         findings.missing(BOARD, error, 'hardware')
         return findings
-    found, remedy = unusable_port(parameters.port)
-    if found:
-        return closed_port('board port', found, remedy, 'rotor_bridge', graph)
     board = MotorBoard(parameters, robot)
-    try:
-        board.open()
-    except SerialPortError as error:
-        return closed_port('board port', str(error), 'docs/how-to/hardware.md', 'rotor_bridge',
-                           graph)
+    if not open_port(findings, board, 'board', parameters.port, 'rotor_bridge', graph):
+        return findings
     try:
         battery, rotors, receptions = _listen(board, seconds)
-        _opened_port(findings, 'board', parameters.port)
         status, link = board.state.status, board.link()
     finally:
         board.close()
     if status is None:
         findings.add(BOARD, f"no heartbeat; {link['bytes']} bytes, {link['received']} good "
-                     f"packets, {link['foreign']} of other senders",
-                     fail=_remedy_of_silence(link, parameters))
+                     f"packets, {link['foreign']} of other senders", fail=(
+                         'another device sends MAVLink; expected system '
+                         f'{parameters.board_system}, component {parameters.board_component}: '
+                         'params/motor_board.yaml' if link['foreign'] else
+                         f'wrong baud rate (here {parameters.baud} bit/s), or another firmware or '
+                         'device' if link['bytes'] else
+                         "check the board's power, the cable, TX and RX swapped, another port"))
         return findings
     _check_status(findings, status)
-    _check_battery(findings, battery, robot.battery.cells)
-    _check_escs(findings, rotors)
-    _check_clock(findings, link, parameters)
-    _check_link(findings, link, receptions)
+    _check_power(findings, battery, rotors, robot.battery.cells)
+    _check_link(findings, link, receptions, parameters.clock_uncertainty_limit)
     return findings
 
 
@@ -268,36 +262,24 @@ def _listen(board, seconds):
     rotors = battery = None
     receptions = []
     started = time.monotonic()
-    while True:
-        (new_battery, new_rotors, _), now = board.poll(), time.monotonic()
+    while (passed := time.monotonic() - started) < seconds:
+        new_battery, new_rotors, _ = board.poll()
         rotors, battery = new_rotors or rotors, new_battery or battery
         reception = board.state.reception
         # The restart of our sequence numbers looks like lost packets to the board.
-        if reception and now - started > SETTLING and \
+        if reception and passed > SETTLING and \
                 (not receptions or reception is not receptions[-1][1]):
             receptions.append((board.link()['sent'], reception))
-        if now - started >= seconds:
-            return battery, rotors, receptions
         time.sleep(POLL_PERIOD)
-
-
-def _remedy_of_silence(link, parameters):
-    if link['foreign']:
-        return (f'another device sends MAVLink; expected system '
-                f'{parameters.board_system}, component {parameters.board_component}: '
-                'params/motor_board.yaml')
-    if link['bytes']:
-        return f'wrong baud rate (here {parameters.baud} bit/s), or another firmware or device'
-    return "check the board's power, the cable, TX and RX swapped, another port"
+    return battery, rotors, receptions
 
 
 def _check_status(findings, status):
     from beetle_omni_ros.drivers.motor_board_state import CONTRACT_VERSION, NO_HOST_HEARTBEAT
-    found = f'contract {status.contract}, {status.state}'
-    if status.stop_reason != 'none':
-        found += f', last disarmed: {status.stop_reason}'
+    stopped = '' if status.stop_reason == 'none' else f', last disarmed: {status.stop_reason}'
     findings.add(
-        'board firmware', found, contract=status.contract, state=status.state,
+        'board firmware', f'contract {status.contract}, {status.state}{stopped}',
+        contract=status.contract, state=status.state,
         fail='' if status.contract == CONTRACT_VERSION else
         f'flash a firmware of contract {CONTRACT_VERSION}: docs/reference/firmware.md',
         warn='it was armed by another program and is disarmed now: find that program'
@@ -312,22 +294,19 @@ def _check_status(findings, status):
                  if blocking else '')
 
 
-def _check_battery(findings, battery, cells):
+def _check_power(findings, battery, rotors, cells):
     if battery is None:
         findings.add('battery', 'no plausible voltage',
                      fail="check the board's voltage divider and its calibration")
-        return
-    cell = battery.voltage / cells
-    current = '' if np.isnan(battery.current) else f', {battery.current:.2f} A'
-    findings.add(
-        'battery', f'{battery.voltage:.2f} V, {cell:.2f} V a cell of {cells}{current}',
-        fail='calibrate the voltage, or correct battery.cells in the robot file'
-        if cell > CELL_HIGH else 'charge it' if cell < CELL_FAIL_LOW else '',
-        warn='charge it' if cell < CELL_LOW else '',
-        voltage_V=battery.voltage, cell_V=cell, current_A=battery.current)
-
-
-def _check_escs(findings, rotors):
+    else:
+        cell = battery.voltage / cells
+        current = '' if np.isnan(battery.current) else f', {battery.current:.2f} A'
+        findings.grade(
+            'battery', f'{battery.voltage:.2f} V, {cell:.2f} V a cell of {cells}{current}', cell,
+            'charge it' if cell < CELL[0] else
+            'calibrate the voltage, or correct battery.cells in the robot file',
+            warn=CELL, fail=CELL_FAIL, voltage_V=battery.voltage, cell_V=cell,
+            current_A=battery.current)
     if rotors is None:
         findings.add('ESC telemetry', 'no ESC_STATUS',
                      fail='the firmware must send it: docs/reference/firmware.md')
@@ -344,29 +323,26 @@ def _check_escs(findings, rotors):
             error_count=int(rotors.error_count[k]))
 
 
-def _check_clock(findings, link, parameters):
+def _check_link(findings, link, receptions, limit):
+    """Add findings about the clock and the packets in both directions."""
     offset, uncertainty = link['clock_offset_s'], link['clock_uncertainty_ms'] / 1e3
-    limit = parameters.clock_uncertainty_limit
     findings.grade(
         'board clock', f'offset {offset:.3f} s +- {1e3 * uncertainty:.2f} ms'
         if np.isfinite(uncertainty) else 'offset unknown: no answer to TIMESYNC', uncertainty,
         "check the computer's TX wire, the latency timer of the adapter and the load of the "
-        'computer; the firmware must answer TIMESYNC', warn=limit / 2, fail=limit,
+        'computer; the firmware must answer TIMESYNC', warn=(0, limit / 2), fail=(0, limit),
         offset_s=offset, uncertainty_s=uncertainty)
-
-
-def _check_link(findings, link, receptions):
     counts = [('link from the board', link['lost'], link['bad_crc'], link['received'])]
     if len(receptions) > 1:
         (before, first), (after, last) = receptions[0], receptions[-1]
         lost, bad_crc = (last[name] - first[name] for name in ('lost', 'bad_crc'))
         counts.append(('link to the board', lost, bad_crc, max(0, after - before - lost)))
+    else:
+        findings.add('link to the board', f"{len(receptions)} reports of the board's reception, "
+                     'two are needed', warn='increase the time: --seconds 4')
     for item, lost, bad_crc, good in counts:
         bad = max(lost, bad_crc)    # a corrupt packet also leaves a gap in the sequence numbers
         findings.grade(
             item, f'{bad} of {good + bad} packets lost or corrupt', bad / max(1, good + bad),
             'check cable, ground, distance to the motor wires, baud rate', warn=LOSS,
             fail=LOSS_FAIL, lost=lost, bad_crc=bad_crc, good=good)
-    if len(receptions) < 2:
-        findings.add('link to the board', f"{len(receptions)} reports of the board's reception, "
-                     'two are needed', warn='increase the time: --seconds 4')

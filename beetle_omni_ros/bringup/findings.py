@@ -1,44 +1,34 @@
 """Findings of `beetle_omni check`, and those about the observed ROS graph."""
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass, field
+from math import inf
 from statistics import fmean, median
-from typing import NamedTuple
+
+from beetle_omni_ros.messages.values import Diagnostic
 
 OK, WARN, FAIL = 'ok', 'warn', 'fail'
-# Bridge -> device whose port it opens, page about its faults.
-BRIDGES = {'joint_bridge': 'the servo bus', 'rotor_bridge': 'the motor board'}
-FAULT_PAGES = {'joint_bridge': 'docs/reference/hardware_faults.md: what happens when',
-               'rotor_bridge': 'docs/reference/firmware.md: outcome of faults'}
+# Bridge -> page about its faults.
+BRIDGES = {'joint_bridge': 'docs/reference/hardware_faults.md: what happens when',
+           'rotor_bridge': 'docs/reference/firmware.md: outcome of faults'}
 UNUSED = ('node', 'inputs', 'compute')      # statuses of every node; the topics cover them
-MOCAP, IMU, JOINTS, BATTERY = 'mocap/pose', 'imu/data_raw', 'joint_states', 'battery_state'
+MOCAP, IMU = 'mocap/pose', 'imu/data_raw'
 MISSED = 3              # missing messages in a row that count as a pause
 CLOCK_SPREAD = 0.2      # relative spread of large ages below which clocks are the cause
-RATE_LOW, RATE_FAIL = 0.95, 0.8     # [-] of the nominal rate; below a warning, a failure
-RATE_HIGH = 1.2         # [-] of MoCap and IMU; above it the estimator is tuned for another rate
+# [-] of the nominal rate; above the upper limit the estimator is tuned for another rate
+RATE, RATE_FAIL = (0.95, 1.2), (0.8, inf)
 AHEAD = 0.001           # [s] stamps farther ahead of this clock: clocks not synchronised
 GAP = 0.1               # [s] longest pause between two messages without a warning
 GRAVITY_TOLERANCE = 1.0     # [m/s^2] mean specific force at rest minus gravity
-
-
-class Expected(NamedTuple):
-    """What is expected of a topic."""
-
-    source: str             # publisher in words
-    bridge: str             # that publishes it, or ''
-    rate: float             # [Hz]
-    age_warn: float         # [s] of the freshest message
-    age_fail: float         # [s]
-
-
-# A MoCap needs about 10 ms, and the network; at 0.1 s the estimator is dead reckoning. The other
-# ages that fail are those after which the supervisor acts. The board reports its battery at 50 Hz,
-# the simulator at 10 Hz.
-TOPICS = {MOCAP: Expected('the MoCap driver', '', 100.0, 0.03, 0.1),
-          IMU: Expected('the IMU driver', '', 200.0, 0.01, 0.05),
-          JOINTS: Expected('joint_bridge_node', 'joint_bridge', 200.0, 0.02, 0.2),
-          BATTERY: Expected('rotor_bridge_node', 'rotor_bridge', 10.0, 0.1, 2.0)}
+# Topic -> publisher, the bridge that publishes it, rate [Hz], ages of the freshest message that
+# warn and fail [s]. A MoCap needs about 10 ms, and the network; at 0.1 s the estimator is dead
+# reckoning. The other ages that fail are those after which the supervisor acts. The board reports
+# its battery at 50 Hz, the simulator at 10 Hz.
+TOPICS = {MOCAP: ('the MoCap driver', '', 100.0, 0.03, 0.1),
+          IMU: ('the IMU driver', '', 200.0, 0.01, 0.05),
+          'joint_states': ('joint_bridge_node', 'joint_bridge', 200.0, 0.02, 0.2),
+          'battery_state': ('rotor_bridge_node', 'rotor_bridge', 10.0, 0.1, 2.0)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,11 +61,12 @@ class Findings(list[Finding]):
         level = FAIL if fail else WARN if warn else OK
         self.append(Finding(item, level, found, fail or warn, values))
 
-    def grade(self, item: str, found: str, value: float, remedy: str, *, warn: float,
-              fail: float, **values) -> None:
-        """Add a finding about ``value``: 'warn' above ``warn``, 'fail' above ``fail`` or NaN."""
-        self.add(item, found, fail=remedy if not value <= fail else '',
-                 warn=remedy if value > warn else '', **values)
+    def grade(self, item: str, found: str, value: float, remedy: str, *,
+              warn: tuple[float, float] = (-inf, inf), fail: tuple[float, float] = (-inf, inf),
+              **values) -> None:
+        """Add a finding about ``value``: 'warn' or 'fail' outside these limits."""
+        self.add(item, found, fail='' if fail[0] <= value <= fail[1] else remedy,
+                 warn='' if warn[0] <= value <= warn[1] else remedy, **values)
 
     def missing(self, item: str, error: ModuleNotFoundError, extra: str, remedy: str = '') -> None:
         """Add a finding about an item that needs a library of the pip extra ``extra``."""
@@ -110,15 +101,6 @@ class Stream:
     other_types: list[str] = field(default_factory=list)
 
 
-@dataclass(frozen=True)
-class Status:
-    """A diagnostic status; ``level`` is 0 (ok), 1 (warning), 2 (error) or 3 (stale)."""
-
-    level: int
-    message: str
-    values: dict[str, str]
-
-
 @dataclass
 class ObservedGraph:
     """
@@ -137,9 +119,9 @@ class ObservedGraph:
     seconds: float = 0.0
     streams: dict[str, Stream] = field(default_factory=dict)
     states: dict[str, str] = field(default_factory=dict)
-    diagnostics: dict[str, Status] = field(default_factory=dict)
+    diagnostics: dict[str, Diagnostic] = field(default_factory=dict)
 
-    def of_bridge(self, bridge: str) -> dict[str, Status]:
+    def of_bridge(self, bridge: str) -> dict[str, Diagnostic]:
         """Diagnostics of a bridge's node: name without the prefix 'NODE: ' -> status."""
         start = f'{bridge}_node: '
         return {name.removeprefix(start): status for name, status in self.diagnostics.items()
@@ -148,19 +130,6 @@ class ObservedGraph:
     def runs(self, bridge: str) -> bool:
         """Whether a state or a diagnostic of the bridge arrived."""
         return bridge in self.states or bool(self.of_bridge(bridge))
-
-
-def closed_port(item: str, found: str, remedy: str, bridge: str, graph: ObservedGraph | None
-                ) -> Findings:
-    """Findings about a device whose port cannot be opened: the reports of a running bridge."""
-    findings = Findings()
-    if graph and graph.runs(bridge) and 'another process' in found:
-        findings.add(item, f'{found}; not opened, judged by what {bridge}_node reports about '
-                     f'{BRIDGES[bridge]}')
-        findings += reported(bridge, graph)
-    else:
-        findings.add(item, found, fail=remedy)
-    return findings
 
 
 def reported(bridge: str, graph: ObservedGraph) -> Findings:
@@ -179,7 +148,7 @@ def reported(bridge: str, graph: ObservedGraph) -> Findings:
         if name not in UNUSED:
             level = {0: OK, 1: WARN}.get(status.level, FAIL)
             findings.append(Finding(f'{bridge} {name}', level, status.message or 'no message',
-                                    '' if level == OK else FAULT_PAGES[bridge], status.values))
+                                    '' if level == OK else BRIDGES[bridge], status.values))
     if len(findings) == 1:
         findings.add(f'{bridge} diagnostics', f'none within {graph.seconds:g} s',
                      warn='increase the time: --seconds 5')
@@ -187,26 +156,23 @@ def reported(bridge: str, graph: ObservedGraph) -> Findings:
 
 
 def check_topics(graph: ObservedGraph, gravity: float,
-                 reported_bridges: frozenset[str] = frozenset()) -> Findings:
+                 reported_bridges: Container[str] = ()) -> Findings:
     """
     Check rates, ages and contents of the sensor topics; ``gravity`` in m/s^2.
 
     Reports of a running bridge are added unless it is in ``reported_bridges``.
     """
     findings = Findings()
-    for topic, expected in TOPICS.items():
-        stream, bridge = graph.streams.get(topic, Stream()), expected.bridge
-        runs = bool(bridge) and graph.runs(bridge)
+    for topic, (source, bridge, rate, *ages) in TOPICS.items():
+        stream, runs = graph.streams.get(topic, Stream()), bool(bridge) and graph.runs(bridge)
         if bridge and not runs and not stream.publishers and not stream.arrivals:
-            findings.add(topic, f'not published: {expected.source} does not run')
+            findings.add(topic, f'not published: {source} does not run')
         elif not stream.arrivals:
-            _absent(findings, topic, expected.source, stream, graph)
+            _absent(findings, topic, source, stream, graph)
         else:
-            _rate_of(findings, topic, stream, expected.rate)
-            _age_of(findings, topic, stream, expected)
-            _content_of(findings, topic, expected.source, stream)
-        if topic == IMU:
-            _gravity_of(findings, stream, gravity)
+            _rate_of(findings, topic, stream, rate)
+            _age_of(findings, topic, stream, *ages)
+            _content_of(findings, topic, source, stream, gravity)
         if runs and bridge not in reported_bridges:
             findings += reported(bridge, graph)
     return findings
@@ -216,51 +182,46 @@ def _absent(findings, topic, source, stream, graph):
     if stream.publishers:
         findings.add(topic, f"nothing in {graph.seconds:g} s, although "
                      f"{', '.join(stream.publishers)} publishes it", fail='check the sensor, '
-                     'multicast and MTU of the network, BEETLE_OMNI_DISCOVERY')
+                     'multicast and MTU of the network, ROS_AUTOMATIC_DISCOVERY_RANGE')
     elif stream.other_types:
         findings.add(topic, f"published as {', '.join(stream.other_types)}",
-                     fail=f'{source} must publish another type: '
-                     'set or remap it')
+                     fail=f'{source} must publish another type: set or remap it')
     else:
         findings.add(topic, f'no publisher in ROS domain {graph.domain}',
                      fail=f'start {source}, remap its topic, set the same ROS_DOMAIN_ID on all '
-                     'computers, and BEETLE_OMNI_DISCOVERY=SUBNET if it runs on another one')
+                     'computers, and ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET')
 
 
 def _rate_of(findings, topic, stream, nominal):
     pauses = [b - a for a, b in zip(stream.arrivals, stream.arrivals[1:])]
     rate, gap = 1 / fmean(pauses) if sum(pauses) else 0.0, max(pauses, default=0.0)
-    low = rate < RATE_LOW * nominal
-    slow = f'expected are {nominal:g} Hz: check settings of its driver, network, load'
-    fast = f'expected are {nominal:g} Hz: set its driver'
-    findings.add(
-        f'{topic} rate', f'{rate:.1f} Hz, longest pause {1e3 * gap:.0f} ms',
-        fail=slow if rate < RATE_FAIL * nominal else '',
-        warn=slow if low else fast if rate > RATE_HIGH * nominal and topic in (MOCAP, IMU)
-        else 'check network (cable instead of Wi-Fi), load of the computers'
-        if gap > max(GAP, MISSED / nominal) else '',
+    findings.grade(
+        f'{topic} rate', f'{rate:.1f} Hz, longest pause {1e3 * gap:.0f} ms', rate / nominal,
+        f'expected are {nominal:g} Hz: check settings of its driver, network, load',
+        warn=RATE if topic in (MOCAP, IMU) else (RATE[0], inf), fail=RATE_FAIL,
         rate_Hz=rate, gap_s=gap, messages=len(stream.arrivals))
+    if gap > max(GAP, MISSED / nominal):
+        findings.add(f'{topic} pause', f'{1e3 * gap:.0f} ms without a message', gap_s=gap,
+                     warn='check network (cable instead of Wi-Fi), load of the computers')
 
 
-def _age_of(findings, topic, stream, expected):
+def _age_of(findings, topic, stream, warn, fail):
     freshest, middle, oldest = min(stream.ages), median(stream.ages), max(stream.ages)
     found = (f'{1e3 * freshest:.1f} ms at least, {1e3 * middle:.1f} ms (median), '
              f'{1e3 * oldest:.1f} ms at most')
-    values = {'freshest_s': freshest, 'median_s': middle, 'oldest_s': oldest}
+    remedy = 'check buffers or filters of its driver, network, load'
     if freshest < -AHEAD:
-        findings.add(f'{topic} age', f'{found}: stamped in the future', fail='clocks are not '
-                     'synchronised: run chrony or PTP on the computers; the driver must '
-                     'stamp with the system clock', **values)
-        return
-    remedy = 'nearly the same for all: clocks are not synchronised (run chrony or PTP on the ' \
-        'computers), or the stamps are of another clock' \
-        if oldest - freshest < CLOCK_SPREAD * freshest else \
-        'check buffers or filters of its driver, network, load'
-    findings.grade(f'{topic} age', found, freshest, remedy,
-                   warn=expected.age_warn, fail=expected.age_fail, **values)
+        found += ': stamped in the future'
+        remedy = 'clocks are not synchronised: run chrony or PTP on the computers; the driver ' \
+            'must stamp with the system clock'
+    elif oldest - freshest < CLOCK_SPREAD * freshest:
+        remedy = 'nearly the same for all: clocks are not synchronised (run chrony or PTP on ' \
+            'the computers), or the stamps are of another clock'
+    findings.grade(f'{topic} age', found, freshest, remedy, warn=(-AHEAD, warn),
+                   fail=(-AHEAD, fail), freshest_s=freshest, median_s=middle, oldest_s=oldest)
 
 
-def _content_of(findings, topic, source, stream):
+def _content_of(findings, topic, source, stream, gravity):
     if len(stream.publishers) > 1:
         findings.add(f'{topic} publishers', f"{len(stream.publishers)}: "
                      f"{', '.join(sorted(stream.publishers))}", fail='stop all but one (often a '
@@ -269,17 +230,12 @@ def _content_of(findings, topic, source, stream):
         reasons = ', '.join(f'{reason} ({count})' for reason, count in stream.refused.items())
         findings.add(f'{topic} content', f'{stream.refused.total()} of {len(stream.arrivals)} '
                      f'messages cannot be used: {reasons}', fail=f'check {source}')
-    elif topic in (MOCAP, IMU) and len(stream.norms) > 2 and len(set(stream.norms)) == 1:
+        return
+    if topic in (MOCAP, IMU) and len(stream.norms) > 2 and len(set(stream.norms)) == 1:
         findings.add(f'{topic} content', 'all messages are equal', fail='the sensor has stopped '
                      'or lost the robot, and its driver repeats the last value')
-
-
-def _gravity_of(findings, stream, gravity):
-    """Check the unit of the specific force, which equals gravity at rest."""
-    if len(stream.norms) < 2 or stream.refused:
-        return
-    mean = fmean(stream.norms)
-    if abs(mean - gravity) > GRAVITY_TOLERANCE:
+    # The specific force equals gravity at rest.
+    if topic == IMU and abs((mean := fmean(stream.norms)) - gravity) > GRAVITY_TOLERANCE:
         findings.add(f'{IMU} specific force', f'{mean:.2f} m/s^2 on average; at rest it must be '
                      f'{gravity:.2f}', warn='its unit is g: the driver must convert to m/s^2'
                      if abs(mean * gravity - gravity) <= GRAVITY_TOLERANCE else

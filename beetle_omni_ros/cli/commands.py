@@ -16,7 +16,6 @@ from beetle_omni_ros.cli.options import (
     CONDITIONS,
     ConditionsOption,
     ControllerOption,
-    DiscoveryOption,
     FAILED,
     FaultsOption,
     JobsOption,
@@ -61,10 +60,10 @@ def fly(controller: ControllerOption = DEFAULT,
                  'serial ports and emulated devices; direct: they go straight to the simulated '
                  'plant.')] = None,
         clock: Annotated[str, typer.Option(
-            '--clock', metavar='auto|system|simulated',
+            '--clock', metavar='system|simulated',
             help='system: real time; simulated: simulated time on /clock, which waits for late '
-                 'nodes, with direct actuators; auto: simulated if the computer is too slow for '
-                 'real time.')] = 'auto',
+                 'nodes, with direct actuators, for a computer that is too slow for real '
+                 'time.')] = 'system',
         robot: RobotOption = None,
         plant: PlantOption = None,
         nmpc_file: NmpcOption = None,
@@ -73,13 +72,9 @@ def fly(controller: ControllerOption = DEFAULT,
         standby: Annotated[bool, typer.Option(
             '--standby/--alone', help='Run the other controllers on standby, to be selected in '
                                       'flight, or only the active controller.')] = True,
-        composed: Annotated[bool, typer.Option(
-            '--composed/--separate', help='One process for all nodes and one for the bridges, or '
-                                          'one process for each node.')] = True,
         faults: FaultsOption = None,
         domain_id: Annotated[Optional[int], typer.Option(
             '--domain-id', min=0, max=101, help='ROS domain. Default: a free one.')] = None,
-        discovery: DiscoveryOption = None,
         view: Annotated[bool, typer.Option(
             '--view', help='Show the flight in the browser, as beetle_omni view does.')] = False,
         allow_targets: Annotated[bool, typer.Option(
@@ -103,9 +98,8 @@ def fly(controller: ControllerOption = DEFAULT,
                    seed=seed, conditions=conditions, actuators=actuators, clock=clock,
                    robot=robot, plant=plant, nmpc=nmpc_file, policy=policy,
                    allow_other_robot=allow_other_robot, standby=standby,
-                   composed=composed, faults=faults, json_path=json_path,
-                   domain_id=domain_id, discovery=discovery,
-                   view=view, allow_targets=allow_targets)
+                   faults=faults, json_path=json_path,
+                   domain_id=domain_id, view=view, allow_targets=allow_targets)
     raise typer.Exit(code if isinstance(code, int) else 0)
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Optional
 
 import typer
 
-from beetle_omni_ros.cli.options import DiscoveryOption, JsonOption, PublishedOption, RobotOption
+from beetle_omni_ros.cli.options import JsonOption, PublishedOption, RobotOption
 from beetle_omni_ros.robot.schema import ParameterError
 
 
@@ -33,7 +33,6 @@ def check(servo_port: Annotated[Optional[str], typer.Option(
                                                          'repeated.')] = None,
           namespace: Annotated[str, typer.Option(
               '--namespace', metavar='NAME', help="Namespace of the robot's topics.")] = '',
-          discovery: DiscoveryOption = None,
           json_path: JsonOption = None):
     """
     Check the real robot before a flight: ports, servos, motor board, MoCap, IMU, clocks.
@@ -43,7 +42,7 @@ def check(servo_port: Annotated[Optional[str], typer.Option(
     """
     def listen(duration):
         from beetle_omni_ros.nodes.operator import listen as listen_to_ros
-        return listen_to_ros(duration, namespace, discovery)
+        return listen_to_ros(duration, namespace)
 
     from beetle_omni_ros.bringup.command import run_check
     raise typer.Exit(run_check(
@@ -63,8 +62,7 @@ def drive(source: Annotated[str, typer.Argument(
           robot: RobotOption = None,
           domain_id: Annotated[Optional[int], typer.Option(
               '--domain-id', min=0, max=232, help='ROS domain. Default: ROS_DOMAIN_ID, or '
-                                                  '0.')] = None,
-          discovery: DiscoveryOption = None):
+                                                  '0.')] = None):
     """
     Drive a running graph by hand: the target moves at limited speed, within all supervisor checks.
 
@@ -72,7 +70,7 @@ def drive(source: Annotated[str, typer.Argument(
     """
     from beetle_omni_ros.nodes.driver import run_drive
     raise typer.Exit(run_drive(source, parameters=parameters, poses=poses, robot=robot,
-                               domain_id=domain_id, discovery=discovery))
+                               domain_id=domain_id))
 
 
 def view(runs: Annotated[Optional[list[Path]], typer.Argument(
@@ -87,7 +85,6 @@ def view(runs: Annotated[Optional[list[Path]], typer.Argument(
          domain_id: Annotated[Optional[int], typer.Option(
              '--domain-id', min=0, max=101,
              help='ROS domain of a running graph. Default: ROS_DOMAIN_ID.')] = None,
-         discovery: DiscoveryOption = None,
          robot: Annotated[Optional[Path], typer.Option(
              '--robot', metavar='FILE', help='For a running graph: robot file, for the '
                                              'checks of targets.')] = None,
@@ -110,12 +107,12 @@ def view(runs: Annotated[Optional[list[Path]], typer.Argument(
     if runs:
         for option, given in (('--allow-targets', allow_targets), ('--namespace', namespace),
                               ('--domain-id', domain_id is not None),
-                              ('--discovery', discovery), ('--robot', robot)):
+                              ('--robot', robot)):
             if given:
                 raise ParameterError(f'{option}: expected without RUN, which is a recording')
         from beetle_omni_ros.view.recorded import run_view
         run_view(runs, **shared)
         return
     from beetle_omni_ros.nodes.operator import run_live
-    run_live(namespace=namespace, domain_id=domain_id, discovery=discovery, robot=robot,
+    run_live(namespace=namespace, domain_id=domain_id, robot=robot,
              allow_targets=allow_targets, **shared)

@@ -48,9 +48,6 @@ PolicyOption = Annotated[Optional[Path], typer.Option(
 OtherRobotOption = Annotated[bool, typer.Option(
     '--allow-other-robot', help='Fly a policy although it was trained for other robot '
                                 'parameters.')]
-DiscoveryOption = Annotated[Optional[str], typer.Option(
-    '--discovery', metavar='LOCALHOST|SUBNET|OFF|SYSTEM_DEFAULT',
-    help='Range in which nodes are visible. Default: programs on this computer only.')]
 CompressionOption = Annotated[str, typer.Option(
     '--compression', metavar='none|zstd', help='Compression of the chunks in the bag.')]
 FaultsOption = Annotated[Optional[Path], typer.Option(

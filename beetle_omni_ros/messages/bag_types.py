@@ -147,79 +147,77 @@ def _alike(name, messages, refused) -> Iterator[tuple[np.ndarray, SimpleNamespac
             alike = np.zeros(len(rows), dtype=bool)
             alike[0] = True
             try:
-                walk = _Walk(block[0].tobytes())
-                walk.message(name)
+                columns, fixed = _layout(name, block[0].tobytes())
                 if tried < LAYOUTS:
-                    fixed = walk.fixed
                     alike = (block[:, fixed] == block[0, fixed]).all(axis=1)
-                walk = _Walk(block[0].tobytes(), block[alike])
-                yield rows[alike], walk.message(name)
+                yield rows[alike], columns(block[alike])
             except Exception as error:      # broken bytes raise anything
                 refused[str(error) or type(error).__name__] += int(alike.sum())
             block, rows = block[~alike], rows[~alike]
 
 
-class _Walk:
+def _layout(name, data) -> tuple[Callable[[np.ndarray], SimpleNamespace], list[int]]:
     """
-    Parser of one message; numbers are read from all rows of ``block``.
+    Find the layout of one message.
 
-    Attributes:
-        fixed: offsets of the bytes that define the layout: encapsulation, lengths and texts.
+    Returns:
+        Function that reads messages of this layout, (N, length) bytes, into one message with
+        columns; offsets of the bytes that define the layout: encapsulation, lengths and texts.
 
     """
+    if len(data) < HEADER or data[0] or data[1] not in (0, 1):
+        raise ValueError('not plain CDR')
+    order, at, fixed = '<' if data[1] else '>', HEADER, list(range(HEADER))
 
-    def __init__(self, first: bytes, block: np.ndarray | None = None):
-        if len(first) < HEADER or first[0] or first[1] not in (0, 1):
-            raise ValueError('not plain CDR')
-        self._order = '<' if first[1] else '>'
-        self._first, self._block, self._at = first, block, HEADER
-        self.fixed = list(range(HEADER))
-
-    def message(self, name) -> SimpleNamespace:
-        """Parse a message of a ROS type."""
-        return SimpleNamespace(**{field: self._field(*description)
-                                  for field, description in TYPESTORE.fielddefs[name][1]})
-
-    def _field(self, node, what):
-        if node == Nodetype.NAME:
-            return self.message(what)
-        if node == Nodetype.BASE:
-            return self._text() if what[0] == 'string' else self._numbers(what[0], 1)[0]
-        (element, inner), count = what
-        if node == Nodetype.SEQUENCE:
-            count = self._count()
-        if element == Nodetype.BASE and inner[0] != 'string':
-            return self._numbers(inner[0], count)
-        if count > len(self._first):
-            raise ValueError('the message is shorter than its array length')
-        return [self._field(element, inner) for _ in range(count)]
-
-    def _take(self, size, unit):
+    def take(size, unit):
         """Offset of the next ``size`` bytes, aligned to ``unit``."""
-        begin = HEADER + -(-(self._at - HEADER) // unit) * unit
-        if begin + size > len(self._first):
+        nonlocal at
+        begin = HEADER + -(-(at - HEADER) // unit) * unit
+        if begin + size > len(data):
             raise ValueError('the message is shorter than its type')
-        self._at = begin + size
+        at = begin + size
         return begin
 
-    def _count(self):
-        begin = self._take(4, 4)
-        self.fixed.extend(range(begin, begin + 4))
-        return struct.unpack_from(f'{self._order}I', self._first, begin)[0]
+    def count():
+        begin = take(4, 4)
+        fixed.extend(range(begin, begin + 4))
+        return struct.unpack_from(f'{order}I', data, begin)[0]
 
-    def _text(self):
-        size = self._count()
-        begin = self._take(size, 1)
-        self.fixed.extend(range(begin, begin + size))
-        return self._first[begin:begin + max(0, size - 1)].decode()
+    def text():
+        size = count()
+        begin = take(size, 1)
+        fixed.extend(range(begin, begin + size))
+        found = data[begin:begin + max(0, size - 1)].decode()
+        return lambda block: found
 
-    def _numbers(self, kind, count):
-        """(count, N) numbers."""
-        dtype = np.dtype(self._order + SIZES[kind])
-        if not count:
-            return np.zeros((0, 1))
-        begin = self._take(dtype.itemsize * count, dtype.itemsize)
-        if self._block is None:
-            return [0] * count
-        part = np.ascontiguousarray(self._block[:, begin:begin + dtype.itemsize * count])
-        return part.view(dtype).T
+    def numbers(kind, size):
+        """Reader of (size, N) numbers."""
+        dtype = np.dtype(order + SIZES[kind])
+        if not size:
+            return lambda block: np.zeros((0, 1))
+        begin = take(dtype.itemsize * size, dtype.itemsize)
+        part = slice(begin, begin + dtype.itemsize * size)
+        return lambda block: np.ascontiguousarray(block[:, part]).view(dtype).T
+
+    def field(node, what):
+        if node == Nodetype.NAME:
+            parts = {name: field(*definition)
+                     for name, definition in TYPESTORE.fielddefs[what][1]}
+            return lambda block: SimpleNamespace(**{
+                name: read(block) for name, read in parts.items()})
+        if node == Nodetype.BASE and what[0] == 'string':
+            return text()
+        if node == Nodetype.BASE:
+            column = numbers(what[0], 1)
+            return lambda block: column(block)[0]
+        (element, inner), size = what
+        if node == Nodetype.SEQUENCE:
+            size = count()
+        if element == Nodetype.BASE and inner[0] != 'string':
+            return numbers(inner[0], size)
+        if size > len(data):
+            raise ValueError('the message is shorter than its array length')
+        entries = [field(element, inner) for _ in range(size)]
+        return lambda block: [read(block) for read in entries]
+
+    return field(Nodetype.NAME, name), fixed

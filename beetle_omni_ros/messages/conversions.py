@@ -3,11 +3,14 @@ Conversion between messages and values, by attribute access only.
 
 ``read_*`` converts a message of :mod:`~.bag_types`, also one of ``read_all``, whose numbers are
 arrays over N messages, so vectors have the shape (N, 3). ``take_*`` converts one message for use
-in flight and raises MessageError for unusable values. ``write_*`` makes a message.
+in flight, where :class:`~.topics.Topic` does not. Both raise MessageError. ``write_*`` makes a
+message.
 """
 
 from collections.abc import Callable, Sequence
-from math import floor, isfinite, isnan
+from dataclasses import asdict, replace
+import json
+from math import floor, isfinite
 from operator import attrgetter
 from typing import Any
 
@@ -15,14 +18,7 @@ import numpy as np
 
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.messages.bag_types import new
-from beetle_omni_ros.messages.values import (
-    Diagnostic,
-    HealthReport,
-    MessageError,
-    Odom,
-    TargetOverride,
-    Wrench,
-)
+from beetle_omni_ros.messages.values import Diagnostic, MessageError, Odom, Wrench
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import ActuatorHealth
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, ROTOR_NAMES
@@ -37,10 +33,10 @@ from beetle_omni_ros.robot.readings import (
 WORLD, BODY = 'world', 'base_link'
 JOINTS, ROTORS = list(JOINT_NAMES), list(ROTOR_NAMES)
 COMMAND_NAMES = [*JOINTS, *ROTORS]
-HEALTH_NAMES = [*COMMAND_NAMES, *(f'{name}_zero' for name in JOINT_NAMES)]
 NO_VALUE = [float('nan')] * 4
 UNIT_TOLERANCE = 0.01   # of a quaternion's length; above the rounding of any publisher
 POINTS = 10_000     # of a trajectory: 100 s at 100 Hz; more would block the reading node
+POSE = 'geometry_msgs/msg/PoseStamped'
 JOINT_STATE = 'sensor_msgs/msg/JointState'
 TRAJECTORY = 'trajectory_msgs/msg/MultiDOFJointTrajectory'
 
@@ -115,88 +111,70 @@ def _check_frame(message):
 
 # --- messages of vectors ------------------------------------------------------------------------
 
-class Vectors:
+def vectors(value: type, name: str, frame: str, **places: str
+            ) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
     """
-    A stamped message whose value has vectors at fixed places of the message.
+    Return ``read`` and ``write`` of a stamped message with vectors at fixed places.
 
     Args:
         value: class of the value, with a ``stamp``.
-        message: ROS message type.
+        name: ROS message type.
         frame: frame_id.
         places: attribute of the value -> path of its vector in the message, followed by the names
             of its parts, 'pose.position xyz'; without parts it is a number.
 
     """
+    found = []      # attribute, path, getter of the vector, getter of its parts
+    for attribute, place in places.items():
+        path, _, parts = place.partition(' ')
+        found.append((attribute, path, attrgetter(path), attrgetter(
+            *(f'{path}.{part}' for part in parts)) if parts else None))
 
-    def __init__(self, value: type, message: str, frame: str, **places: str):
-        self.value, self.type, self._frame = value, message, frame
-        self._places = []       # attribute, path, getter of the vector, getter of its parts
-        for attribute, place in places.items():
-            path, _, parts = place.partition(' ')
-            self._places.append((attribute, path, attrgetter(path), attrgetter(
-                *(f'{path}.{part}' for part in parts)) if parts else None))
+    def read(message):
+        return value(stamp=seconds(message.header.stamp), **{
+            attribute: np.array(parts(message)).T if parts else whole(message)
+            for attribute, _, whole, parts in found})
 
-    def fields(self, message: Any, check: bool = False) -> dict[str, Any]:
-        """Read the fields of the value; with ``check``, MessageError if one is not finite."""
-        found = {'stamp': seconds(message.header.stamp)}
-        for attribute, path, whole, parts in self._places:
-            found[attribute] = np.array(parts(message)).T if parts else whole(message)
-            if check:
-                finite(found[attribute], path)
-        return found
-
-    def read(self, message: Any) -> Any:
-        """Read the value of one message, or of a message with columns."""
-        return self.value(**self.fields(message))
-
-    def take(self, message: Any) -> Any:
-        """Read a value for flight; MessageError if one of its numbers is not finite."""
-        return self.value(**self.fields(message, True))
-
-    def write(self, value: Any) -> Any:
-        """Write a value."""
-        message = _begin(self.type, value.stamp, self._frame)
-        for attribute, path, whole, parts in self._places:
+    def write(value):
+        message = _begin(name, value.stamp, frame)
+        for attribute, path, whole, parts in found:
             if parts:
                 set_parts(whole(message), getattr(value, attribute))
             else:
                 setattr(message, path, float(getattr(value, attribute)))
         return message
 
+    return read, write
 
-POSE = Vectors(PoseReading, 'geometry_msgs/msg/PoseStamped', WORLD,
-               position='pose.position xyz', quaternion='pose.orientation xyzw')
-POSE_TARGET = Vectors(PoseTarget, 'geometry_msgs/msg/PoseStamped', WORLD,
-                      position='pose.position xyz', quaternion='pose.orientation xyzw')
-IMU = Vectors(ImuReading, 'sensor_msgs/msg/Imu', BODY, specific_force='linear_acceleration xyz',
-              angular_velocity='angular_velocity xyz')
-WRENCH = Vectors(Wrench, 'geometry_msgs/msg/WrenchStamped', WORLD,
-                 force='wrench.force xyz', torque='wrench.torque xyz')
-BATTERY = Vectors(BatteryReading, 'sensor_msgs/msg/BatteryState', '',
-                  voltage='voltage', current='current')
+
+POSE_PLACES = {'position': 'pose.position xyz', 'quaternion': 'pose.orientation xyzw'}
+read_pose, write_pose = vectors(PoseReading, POSE, WORLD, **POSE_PLACES)
+_read_target, write_pose_target = vectors(PoseTarget, POSE, WORLD, **POSE_PLACES)
+read_imu, _write_imu = vectors(
+    ImuReading, 'sensor_msgs/msg/Imu', BODY, specific_force='linear_acceleration xyz',
+    angular_velocity='angular_velocity xyz')
+read_wrench, write_wrench = vectors(Wrench, 'geometry_msgs/msg/WrenchStamped', WORLD,
+                                    force='wrench.force xyz', torque='wrench.torque xyz')
+read_battery, _write_battery = vectors(BatteryReading, 'sensor_msgs/msg/BatteryState', '',
+                                       voltage='voltage', current='current')
 # The twist of the message is in base_link, the velocity of the value in world.
-ODOM = Vectors(Odom, 'nav_msgs/msg/Odometry', WORLD, position='pose.pose.position xyz',
-               velocity='twist.twist.linear xyz', quaternion='pose.pose.orientation xyzw',
-               angular_velocity='twist.twist.angular xyz')
+_read_odom, _write_odom = vectors(
+    Odom, 'nav_msgs/msg/Odometry', WORLD, position='pose.pose.position xyz',
+    velocity='twist.twist.linear xyz', quaternion='pose.pose.orientation xyzw',
+    angular_velocity='twist.twist.angular xyz')
 
 
 def write_imu(value: ImuReading) -> Any:
     """Write specific force and angular rates, without orientation (REP-145)."""
-    message = IMU.write(value)
+    message = _write_imu(value)
     message.orientation.w = 1.0
     message.orientation_covariance[0] = -1.0
     return message
 
 
-def take_battery(message: Any) -> BatteryReading:
-    """Read voltage and current for flight; the current may be unknown."""
-    finite(message.voltage, 'voltage')
-    return BATTERY.read(message)
-
-
 def write_battery(value: BatteryReading) -> Any:
     """Write voltage and current; unmeasured fields are NaN."""
-    message = BATTERY.write(value)
+    message = _write_battery(value)
     message.temperature = message.charge = message.capacity = message.design_capacity \
         = message.percentage = float('nan')
     message.power_supply_status = message.POWER_SUPPLY_STATUS_DISCHARGING
@@ -208,25 +186,24 @@ def write_battery(value: BatteryReading) -> Any:
 
 def read_odom(message: Any) -> Odom:
     """Read pose and velocity; the velocity is rotated from base_link to world."""
-    return _in_world(ODOM.fields(message))
+    odom = _read_odom(message)
+    q, velocity = odom.quaternion, odom.velocity
+    return replace(odom, velocity=rotations.matrix(q) @ velocity if velocity.ndim == 1 else
+                   np.einsum('ijn,nj->ni', rotations.matrix(tuple(q.T)), velocity))
 
 
 def take_odom(message: Any) -> Odom:
     """Read pose and velocity for flight."""
-    fields = ODOM.fields(message, True)
-    return _in_world({**fields, 'quaternion': unit(fields['quaternion'])})
-
-
-def _in_world(fields):
-    q, velocity = fields['quaternion'], fields['velocity']
-    fields['velocity'] = rotations.matrix(q) @ velocity if velocity.ndim == 1 else \
-        np.einsum('ijn,nj->ni', rotations.matrix(tuple(q.T)), velocity)
-    return Odom(**fields)
+    odom = read_odom(message)
+    for name in ('position', 'velocity', 'quaternion', 'angular_velocity'):
+        finite(getattr(odom, name), name)
+    unit(odom.quaternion)
+    return odom
 
 
 def write_odom(value: Odom) -> Any:
     """Write pose in world, twist in base_link, and covariances."""
-    message = ODOM.write(value)
+    message = _write_odom(value)
     message.child_frame_id = BODY
     set_parts(message.twist.twist.linear, rotations.matrix(value.quaternion).T @ value.velocity)
     for field, matrix in ((message.pose, value.pose_covariance),
@@ -236,11 +213,12 @@ def write_odom(value: Odom) -> Any:
     return message
 
 
-def take_pose_target(message: Any) -> PoseTarget:
-    """Read a pose target; MessageError for another frame than world."""
-    fields = POSE_TARGET.fields(message, True)
+def read_pose_target(message: Any) -> PoseTarget:
+    """Read a pose target; MessageError if it is not finite or in another frame than world."""
+    target = _read_target(message)
+    finite(target.position, 'position')
     _check_frame(message)
-    return PoseTarget(**{**fields, 'quaternion': unit(fields['quaternion'])})
+    return replace(target, quaternion=unit(target.quaternion))
 
 
 # --- messages of joints -------------------------------------------------------------------------
@@ -258,6 +236,16 @@ def _of(message, field, names):
         raise MessageError(f'{field} has {len(values)} values, too few for the names') from None
 
 
+def _joint_state(stamp, names, **fields):
+    """Make a JointState; a field of None stays empty."""
+    message = _begin(JOINT_STATE, stamp)
+    message.name = list(names)
+    for field, numbers in fields.items():
+        if numbers is not None:
+            setattr(message, field, np.array(numbers, dtype=float))
+    return message
+
+
 def read_joints(message: Any) -> JointReading:
     """Read the four tilt joints, in any order of names."""
     return JointReading(
@@ -269,25 +257,19 @@ def read_joints(message: Any) -> JointReading:
 def take_joints(message: Any) -> JointReading:
     """Read the tilt joints for flight: NaN for a joint that is not named, 0 for missing rates."""
     names = [name for name in JOINTS if name in message.name]
-    position = _of(message, 'position', names)
-    velocity = _of(message, 'velocity', names) if len(message.velocity) else np.zeros(len(names))
-    finite(position, 'position')
-    finite(velocity, 'velocity')
-    if len(names) < len(JOINTS):
-        known, measured = np.isin(JOINTS, names), (position, velocity)
-        position, velocity = np.full((2, 4), np.nan)
-        position[known], velocity[known] = measured
+    known = [name in names for name in JOINTS]
+    position, velocity = np.full((2, 4), np.nan)
+    position[known] = _of(message, 'position', names)
+    velocity[known] = _of(message, 'velocity', names) if len(message.velocity) else 0.0
+    finite(position[known], 'position')
+    finite(velocity[known], 'velocity')
     return JointReading(seconds(message.header.stamp), position, velocity)
 
 
 def write_joints(value: JointReading) -> Any:
     """Write the joints that the value names."""
-    message = _begin(JOINT_STATE, value.stamp)
-    message.name = list(value.names)
-    for field in ('position', 'velocity', 'effort'):
-        if (numbers := getattr(value, field)) is not None:
-            setattr(message, field, np.array(numbers, dtype=float))
-    return message
+    return _joint_state(value.stamp, value.names, position=value.position,
+                        velocity=value.velocity, effort=value.effort)
 
 
 def read_rotors(message: Any) -> RotorReading:
@@ -297,10 +279,7 @@ def read_rotors(message: Any) -> RotorReading:
 
 def write_rotors(value: RotorReading) -> Any:
     """Write the speeds."""
-    message = _begin(JOINT_STATE, value.stamp)
-    message.name = ROTORS
-    message.velocity = np.array(value.speed, dtype=float)
-    return message
+    return _joint_state(value.stamp, ROTORS, velocity=value.speed)
 
 
 def read_command(message: Any) -> Command:
@@ -309,62 +288,15 @@ def read_command(message: Any) -> Command:
                    _of(message, 'effort', ROTORS))
 
 
-def take_command(message: Any) -> Command:
-    """Read four tilts and four thrusts for flight."""
-    command = read_command(message)
-    finite(command.tilt, 'tilt')
-    finite(command.thrust, 'thrust')
-    return command
-
-
 def write_command(value: Command) -> Any:
     """Write tilts as positions and thrusts as efforts, NaN for unused values."""
-    message = _begin(JOINT_STATE, value.stamp)
-    message.name = COMMAND_NAMES
-    message.position = np.array([*map(float, value.tilt), *NO_VALUE])
-    message.effort = np.array([*NO_VALUE, *map(float, value.thrust)])
-    return message
-
-
-def read_health(message: Any) -> HealthReport:
-    """Read the health of the actuators, as :func:`write_health` describes it."""
-    if len(message.position) != len(HEALTH_NAMES) or len(message.effort) != len(HEALTH_NAMES):
-        raise MessageError('expected four joints, four rotors and four zeros')
-    stuck, zeros, efforts = message.position[:4], message.position[8:], message.effort[4:8]
-    if any(abs(angle) > np.pi * 2 for angle in stuck) or not all(map(isfinite, zeros)):
-        raise MessageError('expected angles within one turn and finite zeros')
-    return HealthReport(seconds(message.header.stamp), ActuatorHealth(
-        rotors=tuple(effort != 0 for effort in efforts),
-        stuck=tuple(None if isnan(a) else float(a) for a in stuck),
-        held=tuple(None if isnan(f) or f == 0 else float(f) for f in efforts),
-        zeros=tuple(map(float, zeros)),
-        thrust_limit=None if isnan(message.effort[8]) else float(message.effort[8])))
-
-
-def write_health(value: HealthReport) -> Any:
-    """
-    Write the health of the actuators.
-
-    Positions: angles of stuck joints (NaN: the joint moves), unused values of the rotors, then
-    zeros of the encoders. Efforts: unused values of the joints, then NaN for a working rotor, 0
-    for a lost one, else the thrust at which it is stuck. The last four efforts are the thrust
-    limit of each rotor by the battery, NaN for none.
-    """
-    health = value.health
-    stuck = [np.nan if angle is None else float(angle) for angle in health.stuck]
-    efforts = [0.0 if not works else np.nan if held is None else float(held)
-               for works, held in zip(health.rotors, health.held)]
-    message = _begin(JOINT_STATE, value.stamp)
-    message.name = HEALTH_NAMES
-    message.position = np.array([*stuck, *NO_VALUE, *map(float, health.zeros)])
-    limit = np.nan if health.thrust_limit is None else float(health.thrust_limit)
-    message.effort = np.array([*NO_VALUE, *efforts, *[limit] * 4])
-    return message
+    return _joint_state(value.stamp, COMMAND_NAMES, position=[*value.tilt, *NO_VALUE],
+                        effort=[*NO_VALUE, *value.thrust])
 
 
 # --- trajectories -------------------------------------------------------------------------------
 
-def take_trajectory(message: Any) -> TrajectoryTarget:
+def read_trajectory(message: Any) -> TrajectoryTarget:
     """Read a trajectory in world; the times of the points count from the header's stamp."""
     start, points = seconds(message.header.stamp), message.points
     if not 2 <= len(points) <= POINTS:
@@ -405,16 +337,14 @@ def write_trajectory(value: TrajectoryTarget) -> Any:
     return message
 
 
-def take_override(message: Any) -> TargetOverride:
+def read_override(message: Any) -> TrajectoryTarget | None:
     """Read the supervisor's target; None for a message without points."""
-    return TargetOverride(seconds(message.header.stamp),
-                          take_trajectory(message) if message.points else None)
+    return read_trajectory(message) if message.points else None
 
 
-def write_override(value: TargetOverride) -> Any:
+def write_override(target: TrajectoryTarget | None) -> Any:
     """Write the supervisor's target; a message without points for None."""
-    return new(TRAJECTORY) if value.target is None \
-        else write_trajectory(value.target)
+    return new(TRAJECTORY) if target is None else write_trajectory(target)
 
 
 # --- text ---------------------------------------------------------------------------------------
@@ -427,6 +357,25 @@ def write_text(value: str) -> Any:
     message = new('std_msgs/msg/String')
     message.data = value
     return message
+
+
+def read_health(message: Any) -> ActuatorHealth:
+    """Read the health of the actuators."""
+    try:
+        health = ActuatorHealth(**{name: tuple(value) if isinstance(value, list) else value
+                                   for name, value in json.loads(message.data).items()})
+        numbers = (*health.rotors, *health.stuck, *health.held, *health.zeros)
+        known = [n for n in (*numbers, health.thrust_limit) if n is not None]
+        if len(numbers) == 16 and np.isfinite(np.array(known, dtype=float)).all():
+            return health
+    except (ValueError, TypeError, AttributeError):
+        pass
+    raise MessageError('expected the fields of ActuatorHealth as JSON')
+
+
+def write_health(health: ActuatorHealth) -> Any:
+    """Write the health of the actuators as JSON."""
+    return write_text(json.dumps(asdict(health)))
 
 
 def read_diagnostics(message: Any) -> list[Diagnostic]:

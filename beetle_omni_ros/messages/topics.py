@@ -8,13 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, NamedTuple
 
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.control.base import Command, TrajectoryTarget
+from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.messages import conversions as c
-from beetle_omni_ros.messages.values import Diagnostic, HealthReport, TargetOverride
-from beetle_omni_ros.robot.readings import JointReading, RotorReading
+from beetle_omni_ros.messages.values import Diagnostic, Odom, Wrench
+from beetle_omni_ros.robot.allocation import ActuatorHealth
+from beetle_omni_ros.robot.readings import (
+    BatteryReading,
+    ImuReading,
+    JointReading,
+    PoseReading,
+    RotorReading,
+)
 
 
 class Qos(NamedTuple):
@@ -50,7 +58,9 @@ class Topic:
         read: message -> value; MessageError for another layout.
         write: value -> message.
         meaning: description for the reference page.
-        take: message -> value for use in flight; MessageError for unusable values. Default: read.
+        finite: attributes that must be finite in flight.
+        take: message -> value for use in flight; MessageError for unusable values. Default: read,
+            with the check of ``finite``.
         required: whether a bag without it gets a warning.
         in_flight: whether every bag declares it.
 
@@ -63,20 +73,21 @@ class Topic:
     read: Callable[[Any], Any]
     write: Callable[[Any], Any]
     meaning: str
-    take: Callable[[Any], Any] | None = None
+    finite: tuple[str, ...] = ()
+    take: Callable[[Any], Any] = None
     required: bool = False
     in_flight: bool = True
 
     def __post_init__(self):
         if self.take is None:
-            object.__setattr__(self, 'take', self.read)
+            object.__setattr__(self, 'take', partial(_checked, self.read, self.finite))
 
 
-def _vectors(name, vectors, qos, meaning, **more):
-    """Topic of a message of vectors."""
-    return Topic(name, vectors.type, qos, vectors.value, **{
-        'read': vectors.read, 'take': vectors.take, 'write': vectors.write,
-        'meaning': meaning, **more})
+def _checked(read, names, message):
+    value = read(message)
+    for name in names:
+        c.finite(getattr(value, name), name)
+    return value
 
 
 def _text(name, meaning, in_flight=False):
@@ -84,66 +95,68 @@ def _text(name, meaning, in_flight=False):
                  in_flight=in_flight)
 
 
+def _command(name, meaning, required=False):
+    return Topic(name, c.JOINT_STATE, COMMAND, Command, c.read_command, c.write_command, meaning,
+                 ('tilt', 'thrust'), required=required)
+
+
+def _odom(name, meaning, required=False):
+    return Topic(name, 'nav_msgs/msg/Odometry', ESTIMATE, Odom, c.read_odom, c.write_odom, meaning,
+                 take=c.take_odom, required=required)
+
+
 def command_topic(controller: str) -> Topic:
     """Return the command topic of a controller."""
-    return Topic(f'{controller}/command', c.JOINT_STATE, COMMAND, Command, c.read_command,
-                 c.write_command, 'command of a controller, before the supervisor',
-                 c.take_command)
+    return _command(f'{controller}/command', 'command of a controller, before the supervisor')
 
 
 TABLE = (
-    _vectors('mocap/pose', c.POSE, SENSOR,
-             'pose of base_link in world, stamped at capture, 100 Hz', required=True),
-    _vectors('imu/data_raw', c.IMU, SENSOR, 'specific force and angular rate in base_link, '
-             'without orientation (REP-145), 200 Hz', write=c.write_imu, required=True),
+    Topic('mocap/pose', c.POSE, SENSOR, PoseReading, c.read_pose, c.write_pose,
+          'pose of base_link in world, stamped at capture, 100 Hz', ('position', 'quaternion'),
+          required=True),
+    Topic('imu/data_raw', 'sensor_msgs/msg/Imu', SENSOR, ImuReading, c.read_imu, c.write_imu,
+          'specific force and angular rate in base_link, without orientation (REP-145), 200 Hz',
+          ('specific_force', 'angular_velocity'), required=True),
     Topic('joint_states', c.JOINT_STATE, SENSOR, JointReading, c.read_joints, c.write_joints,
-          'position, velocity and effort of `gimbal1..4`', c.take_joints, required=True),
-    _vectors('battery_state', c.BATTERY, SENSOR,
-             'pack voltage and current, negative when discharging', take=c.take_battery,
-             write=c.write_battery),
+          'position, velocity and effort of `gimbal1..4`', take=c.take_joints, required=True),
+    Topic('battery_state', 'sensor_msgs/msg/BatteryState', SENSOR, BatteryReading, c.read_battery,
+          c.write_battery, 'pack voltage and current, negative when discharging', ('voltage',)),
     Topic('rotor_states', c.JOINT_STATE, SENSOR, RotorReading, c.read_rotors, c.write_rotors,
           '`velocity` of `rotor1..4` [rad/s], positive for both spins, NaN where unknown',
           in_flight=False),
-    _vectors('odom', c.ODOM, ESTIMATE,
-             'estimate: pose in world, twist in base_link, both covariances', read=c.read_odom,
-             take=c.take_odom, write=c.write_odom, required=True),
-    _vectors('target_pose', c.POSE_TARGET, LATCHED,
-             'target pose in world; `reference_node` or a user publishes it',
-             read=c.take_pose_target, take=None, required=True),
-    Topic('target_trajectory', c.TRAJECTORY, LATCHED, TrajectoryTarget, c.take_trajectory,
+    _odom('odom', 'estimate: pose in world, twist in base_link, both covariances', required=True),
+    Topic('target_pose', c.POSE, LATCHED, PoseTarget, c.read_pose_target, c.write_pose_target,
+          'target pose in world; `reference_node` or a user publishes it', required=True),
+    Topic('target_trajectory', c.TRAJECTORY, LATCHED, TrajectoryTarget, c.read_trajectory,
           c.write_trajectory,
           'time-parameterised reference; `reference_node` or a user publishes it'),
     *map(command_topic, registry.standing_by()),      # topic_of() makes those of other controllers
-    Topic('command', c.JOINT_STATE, COMMAND, Command, c.read_command, c.write_command,
-          'selected and checked command, which the actuators execute', c.take_command,
-          required=True),
+    _command('command', 'selected and checked command, which the actuators execute', True),
     _text('supervisor/identity',
           'identity of the supervisor; the actuators execute commands with this identity only'),
-    Topic('supervisor/target', c.TRAJECTORY, LATCHED, TargetOverride, c.take_override,
+    Topic('supervisor/target', c.TRAJECTORY, LATCHED, TrajectoryTarget, c.read_override,
           c.write_override,
           'target of the supervisor, which replaces that of the operator; without points: no '
           'replacement', in_flight=False),
-    Topic('supervisor/actuators', c.JOINT_STATE, LATCHED, HealthReport, c.read_health,
-          c.write_health,
-          'health of `gimbal1..4` and `rotor1..4`, and `gimbal1_zero..4_zero`: `position` is the '
-          'true angle of a stuck joint (NaN: the joint moves), or the zero of an encoder that '
-          'jumped, reading minus true tilt; `effort` is NaN for a rotor that follows its command, '
-          '0 for a lost one, else the thrust at which it is stuck', in_flight=False),
+    Topic('supervisor/actuators', 'std_msgs/msg/String', LATCHED, ActuatorHealth, c.read_health,
+          c.write_health, 'health of joints and rotors as JSON: the fields of `ActuatorHealth`',
+          in_flight=False),
     _text('reference/state', '`waiting`, `flying 3/15`, `done`, `done: control lost at level 60`, '
           'or `aborted` if the flight ended before the task'),
     _text('joint_bridge/state', '`ready`, `waiting: WHY` or `lost: WHY`'),
     _text('rotor_bridge/state', '`ready`, `waiting: WHY`, `silent: WHY` or `lost: WHY`'),
-    _vectors('ground_truth/odom', c.ODOM, ESTIMATE, 'true state of the simulated robot',
-             read=c.read_odom, take=c.take_odom, write=c.write_odom),
-    _vectors('disturbance', c.WRENCH, EVENT, 'external wrench on the simulated robot until the '
-             'next message: force in world, torque in base_link; a user or an experiment '
-             'publishes it'),
+    _odom('ground_truth/odom', 'true state of the simulated robot'),
+    Topic('disturbance', 'geometry_msgs/msg/WrenchStamped', EVENT, Wrench, c.read_wrench,
+          c.write_wrench,
+          'external wrench on the simulated robot until the next message: force in world, torque '
+          'in base_link; a user or an experiment publishes it', ('force', 'torque')),
     _text('supervisor/state', 'state, a colon, and the active controller or the last fault',
           in_flight=True),
     Topic('diagnostics', 'diagnostic_msgs/msg/DiagnosticArray', EVENT, Diagnostic,
           c.read_diagnostics, c.write_diagnostics,
           'health, rates, ages, timing and faults of each node'),
 )
+TARGETS = ('target_pose', 'target_trajectory')      # received with any quality of service
 ALL: dict[str, Topic] = {topic.name: topic for topic in TABLE}
 TOPICS: dict[str, Topic] = {topic.name: topic for topic in TABLE if topic.in_flight}
 """Topics that every bag declares, with the commands of the standby controllers."""
@@ -168,10 +181,8 @@ def topic_of(name: str) -> Topic:
         KeyError: unknown name.
 
     """
-    known = ALL.get(name)
-    if known is None and controller_of(name):
-        return command_topic(controller_of(name))
-    return ALL[name] if known is None else known
+    controller = controller_of(name)
+    return command_topic(controller) if controller and name not in ALL else ALL[name]
 
 
 def is_ambiguous(topic: str) -> bool:

@@ -7,9 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from beetle_omni_ros.control.base import TrajectoryTarget
-from beetle_omni_ros.robot.allocation import ActuatorHealth
-
 
 class MessageError(ValueError):
     """
@@ -64,27 +61,6 @@ class Wrench:
     stamp: float
     force: np.ndarray
     torque: np.ndarray
-
-
-@dataclass(frozen=True)
-class HealthReport:
-    """Health of the actuators, as the supervisor has determined it."""
-
-    stamp: float
-    health: ActuatorHealth
-
-
-@dataclass(frozen=True)
-class TargetOverride:
-    """Target of the supervisor instead of the operator's target; None: no such target."""
-
-    stamp: float
-    target: TrajectoryTarget | None
-
-    @classmethod
-    def of(cls, target: TrajectoryTarget | None) -> TargetOverride:
-        """Take the stamp of the target; 0 for None."""
-        return cls(target.stamp if target else 0.0, target)
 
 
 @dataclass(frozen=True)

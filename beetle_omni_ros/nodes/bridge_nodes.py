@@ -1,8 +1,8 @@
 """ROS lifecycle nodes between the topics and the actuators: tilt servos and motor board."""
 
 from collections import Counter
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import replace
+from functools import partial, partialmethod
 import math
 import time
 
@@ -16,9 +16,9 @@ from beetle_omni_ros.drivers.serial_port import SerialPortError
 from beetle_omni_ros.drivers.servo_bus import ServoBus
 from beetle_omni_ros.drivers.servo_link import ServoBusError
 from beetle_omni_ros.drivers.servo_loop import ServoLoop
+from beetle_omni_ros.nodes import parameters
 from beetle_omni_ros.nodes.graph import AUTOSTART
-from beetle_omni_ros.nodes.node import CommandSource, Distribution, ERROR, FlightNode, OK, WARN
-from beetle_omni_ros.nodes.parameters import file_parameter
+from beetle_omni_ros.nodes.node import Distribution, ERROR, FlightNode, OK, WARN
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters
 from beetle_omni_ros.robot.readings import JointReading, RotorReading
 from beetle_omni_ros.robot.schema import parameter
@@ -37,16 +37,22 @@ class BridgeNode(LifecycleNodeMixin, FlightNode):
     Base of a node that opens a device when configured and powers it when activated.
 
     A subclass overrides ``configure`` (open the device), ``activate`` (power it), ``deactivate``,
-    ``release`` (switch the power off and close it, in any state) and ``changed``, which is called
-    after each transition. ServoBusError and SerialPortError refuse a transition. Their text goes
-    to the log and to ``refusal``, and the state stays as it was.
+    ``release`` (switch the power off and close it, in any state) and ``state_text`` ('ready',
+    'waiting: WHY' or 'lost: WHY'). ServoBusError and SerialPortError refuse a transition. Their
+    text goes to the log and to ``refusal``, and the state stays as it was.
     """
 
-    real_time = True
-
-    def __init__(self, *args, **kwargs):
-        FlightNode.__init__(self, *args, **kwargs)
+    def __init__(self, name, *args, autostart, **kwargs):
+        FlightNode.__init__(
+            self, name, *args, robot_file=parameters.file_parameter(), autostart=parameter(
+                autostart, choices=tuple(AUTOSTART), read_only=True,
+                doc='transition at the start, repeated until it succeeds'), **kwargs)
         LifecycleNodeMixin.__init__(self)
+        self._states = self.publisher(f"{name.removesuffix('_node')}/state")
+        self.state = ''         # the published one
+        self.latency = Distribution()
+        self.report('latency', lambda: self.latency.status(
+            'stamp of the answered IMU sample to the last byte of its command'))
         self.refusal = ''       # why the last transition was refused, '' if it was not
         self._start_timer = None
         self._starts = False    # during an automatic transition
@@ -65,6 +71,15 @@ class BridgeNode(LifecycleNodeMixin, FlightNode):
             self._start_timer = self.create_timer(RETRY, self.try_to_start,
                                                   clock=self.steady_clock)
 
+    def changed(self) -> None:
+        """Publish and log the state if it changed."""
+        text = self.state_text()
+        if text != self.state:
+            self.state = text
+            self.log_line('error' if text.startswith('lost') and self.stage == ACTIVE else 'info',
+                          text)
+            self._states.publish(text)
+
     def try_to_start(self) -> None:
         """Make the next transitions of the automatic start."""
         self._starts, goal = True, AUTOSTART[self.parameters.autostart]
@@ -77,53 +92,36 @@ class BridgeNode(LifecycleNodeMixin, FlightNode):
         self._starts = False
         self.changed()
 
-    # --- called by rclpy ----------------------------------------------------------------------
+    def _attempt(self, what, action, state):
+        """Make a transition by a method; any but the first two ends the automatic start."""
+        if what not in ('configure', 'activate') and self._start_timer is not None:
+            self._start_timer.cancel()
+        before, self.refusal = self.refusal, ''
+        try:
+            getattr(self, action)()
+        except (ServoBusError, SerialPortError) as error:
+            if what == 'configure':
+                self.release()
+            self.refusal = ' '.join(str(error).split())
+            if self.refusal != before:      # attempts are repeated, lines are not
+                self.log_line('info' if self._starts else 'error',
+                              f'cannot {what}: {self.refusal}'
+                              + ('; tries again' if self._starts else ''))
+            return TransitionCallbackReturn.FAILURE
+        except Exception as error:      # rclpy does not log it
+            self.get_logger().fatal(f'cannot {what}: {type(error).__name__}: {error}')
+            raise
+        return TransitionCallbackReturn.SUCCESS
 
-    def on_configure(self, state):
-        """Open the device."""
-        return self._attempt('configure', self.configure, self.release)
-
-    def on_activate(self, state):
-        """Power the device."""
-        return self._attempt('activate', self.activate)
-
-    def on_deactivate(self, state):
-        """Switch the power off; ends the automatic start."""
-        return self._end('deactivate', self.deactivate)
-
-    def on_cleanup(self, state):
-        """Close the device; ends the automatic start."""
-        return self._end('clean up', self.release)
-
-    def on_shutdown(self, state):
-        """Close the device."""
-        return self._end('shut down', self.release)
+    on_configure = partialmethod(_attempt, 'configure', 'configure')
+    on_activate = partialmethod(_attempt, 'activate', 'activate')
+    on_deactivate = partialmethod(_attempt, 'deactivate', 'deactivate')
+    on_cleanup = partialmethod(_attempt, 'clean up', 'release')
+    on_shutdown = partialmethod(_attempt, 'shut down', 'release')
 
     def on_error(self, state):
         """Close the device after an unexpected exception; it can be configured again."""
         self.release()
-        return TransitionCallbackReturn.SUCCESS
-
-    def _end(self, what, action):
-        if self._start_timer is not None:
-            self._start_timer.cancel()
-        return self._attempt(what, action)
-
-    def _attempt(self, what, action, undo=lambda: None):
-        before, self.refusal = self.refusal, ''
-        try:
-            action()
-        except (ServoBusError, SerialPortError) as error:
-            undo()
-            self.refusal = ' '.join(str(error).split())
-            if self.refusal != before:      # attempts are repeated, lines are not
-                self.log_line('warning' if self._starts else 'error',
-                              f'cannot {what}: {self.refusal}'
-                              + ('; tries again' if self._starts else ''))
-            return TransitionCallbackReturn.FAILURE
-        except Exception as error:
-            self.get_logger().fatal(f'cannot {what}: {type(error).__name__}: {error}')
-            raise
         return TransitionCallbackReturn.SUCCESS
 
     def _on_change_state(self, request, response):
@@ -140,48 +138,25 @@ class BridgeNode(LifecycleNodeMixin, FlightNode):
 
 # --- servos -------------------------------------------------------------------------------------
 
-@dataclass(frozen=True, kw_only=True)
-class JointBridgeNodeParameters(ServoBusParameters):
-    """Parameters of joint_bridge_node: the bus's parameters, the files, and autostart."""
-
-    robot_file: str = file_parameter()
-    servo_bus_file: str = file_parameter('servo file to start from')
-    autostart: str = parameter('none', choices=tuple(AUTOSTART), read_only=True,
-                               doc='transition at the start, repeated until it succeeds')
-
-
 class JointBridgeNode(BridgeNode):
     """Lifecycle node: configure checks the servos, activate switches their torque on."""
 
     def __init__(self):
-        super().__init__('joint_bridge_node', JointBridgeNodeParameters, 'params/servo_bus.yaml',
+        super().__init__('joint_bridge_node', ServoBusParameters, 'params/servo_bus.yaml',
                          'servo_bus_file', on_change=self._changed,
-                         changeable=('confirm_tilts', 'confirmed_tilts'))
+                         changeable=('confirm_tilts', 'confirmed_tilts'), autostart='none')
         self._travel = RobotParameters.load(self.parameters.robot_file or None).joints
         self._bus = self._loop = None
         self._lost_reason = ''
-        self._latency, self._since = Distribution(), 'publication'
-        self._state = self.publisher('joint_bridge/state')
-        self._published = ''
         self._joints = self.publisher('joint_states')
-        self.listen('command', self._on_command, read=CommandSource(self).read,
-                    max_age=COMMAND_AGE, stale_after=None, published=True)
-        # loop, its cycles and missed cycles, and the time of the last bus status
-        self._counted = (None, 0, 0, time.monotonic())
-        self.health.report('bus', self._bus_status)
-        self.health.report('latency', lambda: self._latency.status(
-            f'{self._since} of command to its last byte written'))
+        self.listen('command', self._on_command, max_age=COMMAND_AGE, stale_after=None)
+        self.report('bus', self._bus_status)
         for k, name in enumerate(JOINT_NAMES):
-            self.health.report(name, partial(self._servo_status, k))
-            self.create_service(Trigger, f'~/reboot_{name}', partial(self._on_reboot, [k]))
-        self.create_service(Trigger, '~/reboot', partial(self._on_reboot, None))
-        self.create_timer(CHECK_PERIOD, self.changed, clock=self.steady_clock)
+            self.report(name, partial(self._servo_status, k))
+        self.create_service(Trigger, '~/reboot', self._on_reboot)
+        self.create_timer(CHECK_PERIOD, self._on_timer, clock=self.steady_clock)
         self.start_by_itself()
         self.changed()
-
-    def waits_for(self):
-        """Return the state of the servos."""
-        return self._published.replace('waiting:', 'its servos:')
 
     def configure(self):
         """Open the port, check and write the servos' settings, and start to read angles."""
@@ -226,7 +201,7 @@ class JointBridgeNode(BridgeNode):
     def close(self):
         """Switch the torque off and publish the state."""
         self.release()
-        self.changed()
+        self._states.publish(self.state_text())
 
     def _changed(self, new):
         self.parameters = new
@@ -234,13 +209,13 @@ class JointBridgeNode(BridgeNode):
             with self._loop.exclusive() as bus:
                 bus.parameters = new
 
-    def _on_reboot(self, which, _, response):
+    def _on_reboot(self, _, response):
+        """Restart the servos that have switched themselves off, or all if none has."""
         if self._loop is None:
             response.success, response.message = False, 'not configured'
             return response
-        if which is None:
-            which = [k for k, servo in enumerate(self._bus.servos)
-                     if servo.errors and not servo.torque] or range(4)
+        which = [k for k, servo in enumerate(self._bus.servos)
+                 if servo.errors and not servo.torque] or range(4)
         with self._loop.exclusive() as bus:
             for k in which:
                 bus.reboot(int(self.parameters.ids[k]))
@@ -248,15 +223,13 @@ class JointBridgeNode(BridgeNode):
         response.message = f"restarting {', '.join(JOINT_NAMES[k] for k in which)}"
         return response
 
-    def _on_command(self, command, published):
+    def _on_command(self, command):
         if self._loop is not None:
-            if math.isnan(published):
-                self._since, published = 'arrival', time.time()
             left = COMMAND_AGE - max(0.0, self.now() - command.stamp)
-            self._loop.offer(command.tilt, published, time.monotonic() + left)
+            self._loop.offer(command.tilt, command.stamp, time.monotonic() + left)
 
-    def _on_written(self, published):
-        self._latency.add(time.time() - published)
+    def _on_written(self, stamp):
+        self.latency.add(self.now() - stamp)
 
     def _publish(self, readings, good):
         if good.any():
@@ -264,22 +237,17 @@ class JointBridgeNode(BridgeNode):
                 readings.stamp, readings.position[good], readings.velocity[good],
                 readings.effort[good], [n for n, is_good in zip(JOINT_NAMES, good) if is_good]))
 
-    def changed(self):
-        """Log the thread's events; publish the state if it changed."""
+    def _on_timer(self):
         if self._loop is not None:
             self._log(self._bus)
-        text = self._state_text()
-        if text != self._published:
-            self.log_line('error' if text.startswith('lost') and not self._lost_reason
-                          else 'info', text)
-            self._published = text
-            self._state.publish(text)
+        self.changed()
 
     def _log(self, bus):
         for line in bus.take_events():
             self.get_logger().warning(line)
 
-    def _state_text(self):
+    def state_text(self):
+        """Return the state of the servos."""
         if self.stage == ACTIVE and self._loop is not None:
             lost = self._loop.lost(LOST_AFTER)
             return f'lost: {lost}' if lost else 'ready'
@@ -291,25 +259,15 @@ class JointBridgeNode(BridgeNode):
             else 'waiting: not configured'
 
     def _bus_status(self):
-        loop, bus, text, now = self._loop, self._bus, self._published, time.monotonic()
+        loop, bus, text = self._loop, self._bus, self.state
         if loop is None:
             return WARN if self.stage == ACTIVE else OK, text, {'stage': self.stage}
-        before, cycles, missed, then = self._counted
-        if loop is not before:
-            cycles = missed = 0
-        self._counted = (loop, loop.cycles, loop.missed, now)
-        missed = loop.missed - missed
-        values = {
+        level = ERROR if text.startswith('lost') else OK if bus.link.is_open else WARN
+        return level, 'no connection' if level == WARN else text, {
             'stage': self.stage, 'cycles': loop.cycles, 'missed_cycles': loop.missed,
-            'rate_hz': (loop.cycles - cycles) / max(now - then, 1e-3),
             'connected': bus.link.is_open, 'goals_written': loop.written,
             'goals_stale': loop.stale, 'goals_clipped': bus.clipped,
             'incomplete': loop.incomplete, **bus.link.counts}
-        if text.startswith('lost'):
-            return ERROR, text, values
-        if not bus.link.is_open:
-            return WARN, 'no connection', values
-        return (WARN, f'{missed} cycles missed', values) if missed else (OK, text, values)
 
     def _servo_status(self, k):
         if self._bus is None:
@@ -329,29 +287,18 @@ class JointBridgeNode(BridgeNode):
 
 # --- motor board --------------------------------------------------------------------------------
 
-@dataclass(frozen=True, kw_only=True)
-class RotorBridgeNodeParameters(MotorBoardParameters):
-    """Parameters of rotor_bridge_node: the driver's parameters, the files, and autostart."""
-
-    robot_file: str = file_parameter('robot file with the rotor map')
-    motor_board_file: str = file_parameter('motor board file')
-    autostart: str = parameter('activate', choices=tuple(AUTOSTART), read_only=True,
-                               doc='transition at the start')
-
-
 class RotorBridgeNode(BridgeNode):
     """
     Executes the thrusts of command; publishes battery_state, rotor_states and its own state.
 
     A lifecycle node: configure opens the port, activate permits arming. The node arms the motor
     board when the supervisor takes off. It disarms the board when the supervisor disarms or stops,
-    and when this process ends. rotor_bridge/state (latched) is 'ready', 'waiting: WHY' or
-    'lost: WHY'.
+    and when this process ends.
     """
 
     def __init__(self):
-        super().__init__('rotor_bridge_node', RotorBridgeNodeParameters,
-                         'params/motor_board.yaml', 'motor_board_file')
+        super().__init__('rotor_bridge_node', MotorBoardParameters, 'params/motor_board.yaml',
+                         'motor_board_file', autostart='activate')
         given = self.parameters
         robot = RobotParameters.load(given.robot_file or None)
         self._cells = robot.battery.cells
@@ -361,36 +308,23 @@ class RotorBridgeNode(BridgeNode):
         self._arming.inhibit('not configured')
         self._command = self._battery = self._speeds = None
         # _port_error: why the port is closed, '' if not yet known; None: open, or not configured.
-        self._state, self._port_error = '', None
+        self._port_error = None
         self._updated = self._next_try = time.monotonic()
         self._cycle, self._sent_at = 0, 0.0
-        # Counts of the targets: one is due in each period while the robot flies.
-        self._last_target = None
-        self._cycles = self._missed = self._missed_reported = 0
         self._unsent = Counter()
-        self._latency, self._since, self._age = Distribution(), 'no command yet', Distribution()
         self._normalised = np.zeros(4)
         self._saturated, self._saturated_reported = np.zeros((2, 4), dtype=int)
-        self._states = self.publisher('rotor_bridge/state')
         self._batteries = self.publisher('battery_state')
         self._rotors = self.publisher('rotor_states')
-        self.health.report('board', self._board_status)
-        self.health.report('latency', lambda: self._latency.status(
-            f'from {self._since} to the last byte written', **self._age.milliseconds('age_')))
+        self.report('board', self._board_status)
         for k in range(4):
-            self.health.report(f'rotor{k + 1}', partial(self._rotor_status, k))
-        self.listen('command', self._on_command, read=CommandSource(self).read,
-                    max_age=given.stamp_age_limit, stale_after=None, published=True)
+            self.report(f'rotor{k + 1}', partial(self._rotor_status, k))
+        self.listen('command', self._on_command, max_age=given.stamp_age_limit, stale_after=None)
         self.follow('supervisor/state', self._on_supervisor)
         self._timer = self.create_timer(self._period, self._on_timer, clock=self.steady_clock)
         self.start_by_itself()
         if given.autostart != 'none':
             self.try_to_start()     # at once; nothing is refused here
-
-    def waits_for(self):
-        """Return the state of the motor board."""
-        self.changed()
-        return self._state.replace('waiting:', 'the motor board:')
 
     def configure(self):
         """Open the port, now or as soon as it exists; then battery and rotors are published."""
@@ -417,19 +351,11 @@ class RotorBridgeNode(BridgeNode):
         self._states.publish(self._arming.text)
         self._board.close()
 
-    def _on_command(self, command, published):
+    def _on_command(self, command):
         self._command = command
-        if not self._send():
-            return
-        self._timer.reset()     # sends this command again after a period without a newer one
-        age = self.now() - command.stamp
-        self._age.add(age)
-        if math.isnan(published):
-            self._since = 'the stamp of the command'
-            self._latency.add(age)
-        else:
-            self._since = 'the publication of the command'
-            self._latency.add(time.time() - published)
+        if self._send():
+            self._timer.reset()     # sends this command again after a period without a newer one
+            self.latency.add(self.now() - command.stamp)
 
     def _on_supervisor(self, state):
         self._arming.follow(state)
@@ -459,9 +385,7 @@ class RotorBridgeNode(BridgeNode):
         try:
             self._board.open()
         except SerialPortError as error:
-            if str(error) != self._port_error:
-                self._port_error = str(error)
-                self.get_logger().warning(f'{error}; searching for it')
+            self._port_error = str(error)
         else:
             self._port_error = None
 
@@ -470,19 +394,12 @@ class RotorBridgeNode(BridgeNode):
         command = self._command
         if self._arming.phase != FLIES or command is None \
                 or self.now() - command.stamp > self.parameters.stamp_age_limit:
-            self._last_target = None    # no period counts as missed before the next target
             return False
         sent = self._board.send(command.thrust, command.stamp)
-        self._sent_at = now = time.monotonic()
+        self._sent_at = time.monotonic()
         if sent.reason:
             self._unsent[sent.reason] += 1
             return False
-        if self._last_target is not None:
-            # A gap nearer to one period than to two was in time.
-            cycles = round((now - self._last_target) / self._period)
-            self._cycles += cycles
-            self._missed += max(cycles - 1, 0)
-        self._last_target = now
         self._normalised = sent.command
         self._saturated += sent.saturated
         return True
@@ -498,27 +415,17 @@ class RotorBridgeNode(BridgeNode):
         for event in events:
             self.log_line(*event)
 
-    def changed(self):
-        """Publish the state if it changed."""
+    def state_text(self):
+        """Return the state of the board, or why its port is closed."""
         text = self._arming.text
-        if self._port_error and text.startswith('waiting'):
-            text = f'waiting: {self._port_error}'
-        if text != self._state:
-            if not text.startswith('waiting'):
-                self.log_line('error' if text.startswith('lost') else 'info',
-                              f'motor board: {text}')
-            self._state = text
-            self._states.publish(text)
+        return f'waiting: {self._port_error}' if self._port_error and text.startswith('waiting') \
+            else text
 
     def _board_status(self):
         arming, text = self._arming, self._arming.text
-        values = {'phase': arming.phase, 'cycles': self._cycles, 'missed_cycles': self._missed,
+        values = {'phase': arming.phase,
                   **{f'not sent: {reason}': n for reason, n in self._unsent.items()}}
-        missed, self._missed_reported = self._missed - self._missed_reported, self._missed
-        level = ERROR if arming.phase == LOST else \
-            OK if text == 'ready' and not missed else WARN
-        if missed and text == 'ready':
-            text = f'{missed} cycles missed'
+        level = ERROR if arming.phase == LOST else OK if text == 'ready' else WARN
         if status := self._board.state.status:
             values.update({'armed': int(status.armed), 'state': status.state,
                            'last disarmed': status.stop_reason,

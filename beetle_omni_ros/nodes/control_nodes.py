@@ -1,6 +1,6 @@
 """ROS nodes of the control loop: state estimator, any registered controller, supervisor."""
 
-from dataclasses import dataclass, make_dataclass, replace
+from dataclasses import replace
 from functools import partial
 import math
 import secrets
@@ -22,12 +22,14 @@ from beetle_omni_ros.control.registry import ControllerEntry
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.estimation.state import pose_covariance, twist_covariance
-from beetle_omni_ros.messages.values import HealthReport, MessageError, Odom, TargetOverride
-from beetle_omni_ros.nodes.node import CommandSource, ERROR, FlightNode, IDENTITY, OK, WARN
+from beetle_omni_ros.messages.topics import TARGETS
+from beetle_omni_ros.messages.values import MessageError, Odom
+from beetle_omni_ros.nodes.graph import GENERIC, NODES
+from beetle_omni_ros.nodes.node import ERROR, FlightNode, IDENTITY, OK, WARN
 from beetle_omni_ros.nodes.parameters import file_parameter
 from beetle_omni_ros.robot.allocation import ALL_HEALTHY
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import NAMES, parameter, ParameterError
+from beetle_omni_ros.robot.schema import parameter, ParameterError
 from beetle_omni_ros.runs.targets import TargetChecks
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.supervisor import DISARMED, FALLBACK, FLYING, STOPPED, Supervisor
@@ -40,34 +42,24 @@ OTHER_CLOCK = 3600.0
 STEP_TOLERANCE = 0.0025     # s, half of the smallest interval between estimates
 REPEAT = 1.0            # s between two log lines about a controller
 WATCH_PERIOD = 0.01     # s between checks for silent inputs
-NAME = 'controller_node'    # of the executable, before its controller is known
 
 
 # --- estimator ----------------------------------------------------------------------------------
 
-@dataclass(frozen=True, kw_only=True)
-class EkfNodeParameters(EkfParameters):
-    """Parameters of ekf_node: the estimator's parameters and the files."""
-
-    robot_file: str = file_parameter()
-    ekf_file: str = file_parameter('estimator file to start from')
-
-
 class EkfNode(FlightNode):
     """Publishes odom for every IMU sample, corrected by MoCap poses at their capture time."""
 
-    real_time = True
-
     def __init__(self):
-        super().__init__('ekf_node', EkfNodeParameters, 'params/ekf.yaml', 'ekf_file')
+        super().__init__('ekf_node', EkfParameters, 'params/ekf.yaml', 'ekf_file',
+                         robot_file=file_parameter())
         robot = RobotParameters.load(self.parameters.robot_file or None)
         self._ekf = ErrorStateEkf(self.parameters.of_robot(robot), robot.gravity)
         self._status = self._ekf.status
         self._publisher = self.publisher('odom')
         self.listen('imu/data_raw', self._on_imu, max_age=SENSOR_AGE)
         self.listen('mocap/pose', partial(self.timed, self._ekf.pose), max_age=SENSOR_AGE)
-        self.health.track_compute(1 / self.parameters.imu.rate)
-        self.health.report('estimator', self._estimator_status)
+        self.track_compute(1 / self.parameters.imu.rate)
+        self.report('estimator', self._estimator_status)
 
     def _on_imu(self, sample):
         accepted = self.timed(self._ekf.imu, sample)
@@ -97,46 +89,39 @@ class ControllerNode(FlightNode):
     An exception of the controller is logged and reported in diagnostics.
     """
 
-    real_time = True
-
-    def __init__(self, controller: ControllerEntry | str = ''):
+    def __init__(self, entry: ControllerEntry | None = None):
         """
-        Build the controller and subscribe its inputs.
+        Build the controller and subscribe its inputs; commands go to '<name>/command'.
 
-        Args:
-            controller: registry entry, name or ``package.module:Class``; '' reads the node's
-                parameter ``controller``. Commands go to '<name>/command'.
-
+        Without ``entry``, the node's parameter ``controller`` names it.
         """
-        entry = controller if isinstance(controller, ControllerEntry) else \
-            registry.find(controller or _requested_controller())
-        is_own = isinstance(controller, str) and controller     # the executable has one controller
-        super().__init__(f'{entry.name}_node', node_parameters(entry, not is_own),
-                         entry.parameters_file, entry.file_key)
+        is_own = entry and f'{entry.name}_node' in NODES    # of an executable of this name
+        entry = entry or registry.find(_requested_controller())
+        more = {} if is_own else {'controller': parameter(
+            entry.reference, doc='controller that this node runs', read_only=True)}
+        super().__init__(f'{entry.name}_node', entry.parameter_class, entry.parameters_file,
+                         entry.file_key, robot_file=file_parameter(), **more)
         self._entry = entry
         robot = RobotParameters.load(self.parameters.robot_file or None)
         controller = entry.make(
             robot, parameters=self.parameters if entry.parameter_class else None)
-        self._host = ControllerHost(entry.name, controller, self.timed, self._log)
+        self._host = ControllerHost(entry.name, controller, self.timed, partial(
+            self.get_logger().error, throttle_duration_sec=REPEAT))
         self._checks, self._sensors = TargetChecks(robot), robot.sensors
         self._joints = self._command = None
         self._last_step = 0.0
-        self._reported_errors, self._logged = 0, ('', -math.inf)    # text, time of the line
+        self._reported_errors = 0
         self._publisher = self.publisher(f'{entry.name}/command')
         self.listen('odom', self._on_odom, max_age=ODOM_AGE)
         self.listen('joint_states', self._on_joints, max_age=JOINT_AGE)
-        self.listen('command', partial(setattr, self, '_command'), read=CommandSource(self).read,
-                    stale_after=None)
-        # Publishers that follow INTERFACES latch targets; `ros2 topic pub` does not.
-        for topic in ('target_pose', 'target_trajectory'):
-            self.listen(topic, self._on_target, any_qos=True, stale_after=None,
-                        published=True, check=self._check_target)
+        self.listen('command', partial(setattr, self, '_command'), stale_after=None)
+        for topic in TARGETS:
+            self.listen(topic, self._on_target, stale_after=None)
         self.follow('supervisor/state', self._on_mode)
-        self.listen('supervisor/target', self._on_override, stale_after=None)
-        self.listen('supervisor/actuators', lambda report: self._host.on_health(report.health),
-                    stale_after=None)
-        self.health.track_compute(controller.period)
-        self.health.report('controller', self._controller_status)
+        self.follow('supervisor/target', partial(setattr, self._host, 'override'))
+        self.follow('supervisor/actuators', self._host.on_health)
+        self.track_compute(controller.period)
+        self.report('controller', self._controller_status)
 
     def _on_joints(self, joints):
         if not np.isnan(joints.position).any():     # a bridge has lost a servo for the moment
@@ -155,7 +140,8 @@ class ControllerNode(FlightNode):
         if reason:
             raise MessageError(reason, 'cannot be flown')
 
-    def _on_target(self, target, _=math.nan):
+    def _on_target(self, target, published):
+        self._check_target(target, published)
         now = self.now()
         if target.stamp == 0.0:     # `ros2 topic pub` sets no stamp: valid from now on
             target = replace(target, stamp=now, **(
@@ -168,49 +154,22 @@ class ControllerNode(FlightNode):
         if old is None or not target.stamp < old.stamp <= now:
             self._host.target = target
 
-    def _on_override(self, override):
-        self._host.override = override.target
-
     def _on_mode(self, mode):
         if mode.partition(':')[0] in MOTORS_OFF:
             self._command = None
         if reason := self._host.on_mode(mode, self.now()):
-            self.health.rejected('target_pose', f'{reason}; the present pose is held',
+            self.reject('target_pose', f'{reason}; the present pose is held',
                                  'cannot be flown')
 
     def _on_odom(self, odom):
         self._host.on_estimate(odom)
-        if self._joints is None or not self._is_due(odom.stamp):
+        since = odom.stamp - self._last_step        # < 0: the clock was set back
+        if self._joints is None or 0 <= since < self._host.controller.period - STEP_TOLERANCE:
             return
         self._last_step = odom.stamp
         command = self._host.step(State.join(odom, self._joints, self._command))
         if command is not None:
             self._publisher.publish(command)
-
-    def _log(self, error):
-        text, at = self._logged
-        if text != error and not 0 <= (now := self.elapsed()) - at < REPEAT:
-            self._logged = error, now
-            self.get_logger().error(error)
-
-    def _is_due(self, stamp):
-        period = self._host.controller.period
-        since = stamp - self._last_step
-        if since < 0:
-            return True     # the clock was set back
-        if self._coincides_with_active(stamp):
-            # One estimate later: from then on this node computes between the steps of the active
-            # controller, whose command would otherwise be delayed.
-            period *= 1.5
-        return since >= period - STEP_TOLERANCE
-
-    def _coincides_with_active(self, stamp):
-        """Whether the active controller is another one and answers the same estimates."""
-        host = self._host
-        if self._command is None or not host.mode.startswith('flying:') or host.active:
-            return False
-        part = (stamp - self._command.stamp) / host.controller.period % 1.0
-        return not 0.25 < part < 0.75
 
     def _controller_status(self):
         host, controller = self._host, self._host.controller
@@ -224,64 +183,18 @@ class ControllerNode(FlightNode):
         return OK, getattr(controller, 'name', self._entry.name), values
 
 
-class NmpcNode(ControllerNode):
-    """Publishes nmpc/command, stamped with the state that it answers."""
-
-    def __init__(self):
-        super().__init__('nmpc')
-
-
-class RlNode(ControllerNode):
-    """Publishes rl/command, stamped with the state that it answers."""
-
-    def __init__(self):
-        super().__init__('rl')
-
-
-@dataclass(frozen=True, kw_only=True)
-class NoParameters:
-    """Parameters of a controller that has none."""
-
-
-def node_parameters(entry: ControllerEntry, selectable: bool) -> type:
-    """Make the parameter class of a controller's node: controller, robot and controller file."""
-    base = entry.parameter_class or NoParameters
-    more = {'robot_file': ('', 'robot file of the controller; empty: the shipped one'),
-            entry.file_key: ('', f"controller file; empty: {entry.parameters_file or 'none'}")}
-    if selectable:
-        more['controller'] = (entry.reference, 'controller that this node runs')
-    return make_dataclass(
-        f'{entry.name}_parameters',
-        [(name, str, parameter(default, doc=doc, read_only=True))
-         for name, (default, doc) in more.items()],
-        bases=(base,), frozen=base.__dataclass_params__.frozen, kw_only=True)
-
-
 def _requested_controller() -> str:
     """Read the parameter ``controller`` by a temporary node, before the real one is made."""
-    probe = Node(NAME, start_parameter_services=False, enable_rosout=False)
-    given, name = probe._parameter_overrides.get('controller'), probe.get_name()
+    probe = Node(GENERIC, start_parameter_services=False, enable_rosout=False)
+    given = probe._parameter_overrides.get('controller')
     probe.destroy_node()
-    if given is not None:
-        return str(given.value)
-    if name != NAME:
-        return name.removesuffix('_node')
-    raise ParameterError("key 'controller': missing; expected a registered controller "
-                         f"({', '.join(registry.names())}) or {registry.CLASS}")
+    if given is None:
+        raise ParameterError("key 'controller': missing; expected a registered controller "
+                             f"({', '.join(registry.names())}) or {registry.CLASS}")
+    return str(given.value)
 
 
 # --- supervisor ---------------------------------------------------------------------------------
-
-@dataclass(frozen=True, kw_only=True)
-class SupervisorNodeParameters(SupervisorParameters):
-    """Parameters of supervisor_node: the supervisor's parameters, controllers and files."""
-
-    controllers: NAMES = parameter(
-        tuple(registry.standing_by()), read_only=True,
-        doc='controllers that may be active: registered names, or FILE.py:Class')
-    robot_file: str = file_parameter()
-    supervisor_file: str = file_parameter('supervisor file')
-
 
 class SupervisorNode(FlightNode):
     """
@@ -291,11 +204,13 @@ class SupervisorNode(FlightNode):
     active controller, also in flight.
     """
 
-    real_time = True
-
     def __init__(self):
-        super().__init__('supervisor_node', SupervisorNodeParameters, 'params/supervisor.yaml',
-                         'supervisor_file', self._changed, changeable=('controller',))
+        controllers = parameter(
+            tuple(registry.standing_by()), read_only=True,
+            doc='controllers that may be active: registered names, or FILE.py:Class')
+        super().__init__('supervisor_node', SupervisorParameters, 'params/supervisor.yaml',
+                         'supervisor_file', self._changed, changeable=('controller',),
+                         controllers=controllers, robot_file=file_parameter())
         robot = RobotParameters.load(self.parameters.robot_file or None)
         self._sensors = robot.sensors
         self._controllers = [registry.find(name).name if ':' in name else name
@@ -317,18 +232,6 @@ class SupervisorNode(FlightNode):
         self._targets = self.publisher('supervisor/target')
         self._actuators = self.publisher('supervisor/actuators')
         self._override, self._health = None, ALL_HEALTHY
-        self._listen()
-        for name in ('arm', 'disarm', 'land', 'emergency_stop'):
-            self.create_service(Trigger, f'~/{name}', partial(self._on_request, name))
-        self.health.report('supervisor', self._supervisor_status)
-        self.create_timer(WATCH_PERIOD, self._update, clock=self.flight_clock)
-        self._update()
-
-    def waits_for(self):
-        """Return the missing sensors and the arming."""
-        return f'{super().waits_for()}; then for ~/arm'
-
-    def _listen(self):
         supervisor = self._supervisor
         self.listen('odom', self._on_odom)
         self.listen('joint_states', self._on_joints, max_age=SENSOR_AGE)
@@ -343,6 +246,11 @@ class SupervisorNode(FlightNode):
             self.listen(f'{name}/command', partial(self._on_command, name), stale_after=None)
         for name in ('joint', 'rotor'):
             self.follow(f'{name}_bridge/state', partial(self._on_bridge, name))
+        for name in ('arm', 'disarm', 'land', 'emergency_stop'):
+            self.create_service(Trigger, f'~/{name}', partial(self._on_request, name))
+        self.report('supervisor', self._supervisor_status)
+        self.create_timer(WATCH_PERIOD, self._update, clock=self.flight_clock)
+        self._update()
 
     def _changed(self, new):
         answer = self._supervisor.select(new.controller, self.now())
@@ -396,10 +304,10 @@ class SupervisorNode(FlightNode):
             self._states.publish(state)
         if supervisor.target_override is not self._override:
             self._override = supervisor.target_override
-            self._targets.publish(TargetOverride.of(self._override))
+            self._targets.publish(self._override)
         if supervisor.health is not self._health:
             self._health = supervisor.health
-            self._actuators.publish(HealthReport(self.now(), self._health))
+            self._actuators.publish(self._health)
         for event in supervisor.events:
             self.log_line(event.severity, event.text)
         supervisor.events.clear()

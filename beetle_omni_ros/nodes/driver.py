@@ -1,6 +1,6 @@
 """`beetle_omni drive`: targets from the keyboard, a joystick or lines of text."""
 
-from contextlib import contextmanager, ExitStack, nullcontext
+from contextlib import closing, ExitStack
 from functools import partial
 import os
 from pathlib import Path
@@ -28,7 +28,6 @@ from beetle_omni_ros.drive import (
 from beetle_omni_ros.messages.topics import SENSOR
 from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes import wire
-from beetle_omni_ros.nodes.graph import confine
 from beetle_omni_ros.nodes.operator import Operator
 from beetle_omni_ros.nodes.runner import sigterm_as_interrupt
 from beetle_omni_ros.robot import rotations
@@ -41,7 +40,6 @@ PERIOD = 0.05           # s between two targets
 SUPERVISOR_TIMEOUT = 10.0   # s until the supervisor and the estimate must have appeared
 SETTLE_TIME = 0.5       # s that `wait` takes at least, so that the motion has begun
 NEAR, ALIGNED = 0.1, np.radians(10)     # [m], [rad] within which the robot is at its target
-SOURCES = ('keyboard', 'joystick', 'terminal')
 RESTING = ('disarmed', 'emergency_stop')
 
 
@@ -84,6 +82,13 @@ class Driver(Operator):
         return steering is not None and steering.arrived and self.odom is not None and bool(
             np.linalg.norm(self.odom.position - steering.position) < NEAR) and \
             rotations.geodesic_angle(self.odom.quaternion, steering.quaternion) < ALIGNED
+
+    def is_under_way(self, begin: float, seconds: float | None) -> bool:
+        """Whether a `wait` since ``begin`` continues, for ``seconds`` or until the goal [s]."""
+        passed = self.time() - begin
+        if seconds is None:
+            return passed <= SETTLE_TIME or not self.at_goal
+        return passed < seconds
 
     def follow(self, seconds: float) -> str:
         """Move the target for ``seconds`` and publish it if it changed; return '' or a refusal."""
@@ -140,7 +145,7 @@ class Driver(Operator):
 
 def run_drive(source: str, *, parameters: Path | None = None, poses: Path | None = None,
               robot: Path | None = None, domain_id: int | None = None,
-              discovery: str | None = None, console: Console | None = None) -> int:
+              console: Console | None = None) -> int:
     """
     Drive until the user quits; arguments as of `beetle_omni drive`.
 
@@ -159,7 +164,6 @@ def run_drive(source: str, *, parameters: Path | None = None, poses: Path | None
     if source == 'keyboard' and not sys.stdin.isatty():
         raise ParameterError('keyboard: standard input is no terminal; expected one, or the '
                              "source 'terminal', which reads lines")
-    confine(requested=discovery)
     console = console or Console()
     domain = int(os.environ.get('ROS_DOMAIN_ID') or 0) if domain_id is None else domain_id
     with ExitStack() as stack:
@@ -178,24 +182,22 @@ def run_drive(source: str, *, parameters: Path | None = None, poses: Path | None
                   'expected a running graph (bringup.launch.py, or beetle_omni fly)',
                   file=sys.stderr)
             return FAILED
-        readers = {'keyboard': _Keyboard, 'joystick': _Joystick, 'terminal': _Terminal}
-        source_reader = readers[source](driver, p, named, say)
-        stack.enter_context(source_reader.open())
-        say(source_reader.help)
         say(driver.where())
         before = driver.time()
         try:
-            while not source_reader.done:
-                driver.spin(PERIOD)
-                now = driver.time()
-                for action in source_reader.actions(now - before):
+            for actions in stack.enter_context(closing(SOURCES[source](driver, p, named, say))):
+                for action in actions:
                     say(driver.execute(action))
+                now = driver.time()
                 say(driver.follow(now - before))
                 before = now
+                driver.spin(PERIOD)
         finally:    # also at Ctrl-C
             say('left; the robot holds its last target')
     return OK
 
+
+# Each source is a generator of the actions since its last step; it ends when the user leaves.
 
 def _typed(size=4096) -> str | None:
     """Return what was typed since the last call, '' at the end of the input, or None."""
@@ -204,104 +206,75 @@ def _typed(size=4096) -> str | None:
     return os.read(sys.stdin.fileno(), size).decode(errors='replace')
 
 
-class _Keyboard:
-    """Actions from single keys of a terminal."""
-
-    help = drive.KEY_HELP
-
-    def __init__(self, driver, p, poses, say):
-        self._p, self._poses, self.done = p, poses, False
-
-    @contextmanager
-    def open(self):
-        """Switch the terminal to single keys without echo, and restore it."""
-        before = termios.tcgetattr(sys.stdin)
-        try:
-            tty.setcbreak(sys.stdin)
-            yield
-        finally:
-            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
-
-    def actions(self, seconds):
-        """Return the actions of the keys since the last call."""
-        found, typed = [], _typed(64)
-        for key in 'q' if typed == '' else typed or '':
-            shift, word = drive.shift_of_key(key, self._p), drive.KEY_WORDS.get(key)
-            if word == 'quit':
-                self.done = True
-                break
-            if shift:
-                found.append(Shift(*shift))
-            elif word:
-                found.append(drive.parse(word, self._poses) if word in self._poses
-                             else Order(word))
-        return found
+def keyboard(driver, p, poses, say):
+    """Yield the actions of single keys of a terminal, which does not echo meanwhile."""
+    before = termios.tcgetattr(sys.stdin)
+    try:
+        tty.setcbreak(sys.stdin)
+        say(drive.KEY_HELP)
+        while True:
+            found, typed = [], _typed(64)
+            for key in 'q' if typed == '' else typed or '':
+                shift, word = drive.shift_of_key(key, p), drive.KEY_WORDS.get(key)
+                if word == 'quit':
+                    yield found
+                    return
+                if shift:
+                    found.append(Shift(*shift))
+                elif word:
+                    found.append(drive.parse(word, poses) if word in poses else Order(word))
+            yield found
+    finally:
+        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
 
 
-class _Joystick:
-    """Actions from the topic joy."""
-
-    help = 'joy: sticks move and turn, buttons arm, land, hold, home; Ctrl-C leaves'
-    done, open = False, staticmethod(nullcontext)
-
-    def __init__(self, driver, p, poses, say):
-        self._driver, self._p, self._poses, self._buttons = driver, p, poses, ()
-
-    def actions(self, seconds):
-        """Return the actions of sticks and buttons."""
-        driver, p = self._driver, self._p
-        if driver.time() - driver.joy_at > p.joystick_timeout:
-            return []
-        before, self._buttons = self._buttons, tuple(driver.buttons)
-        found = [drive.parse(name, self._poses)
-                 for name in drive.pressed(before, self._buttons, p)]
-        way, turn = drive.shift_of_sticks(driver.axes, seconds, p)
-        if driver.steering is not None and (way.any() or turn.any()):
-            found.append(Shift(way, turn))
-        return found
+def joystick(driver, p, poses, say):
+    """Yield the actions of the topic joy until Ctrl-C."""
+    say('joy: sticks move and turn, buttons arm, land, hold, home; Ctrl-C leaves')
+    buttons, before = (), driver.time()
+    while True:
+        found, now = [], driver.time()
+        if now - driver.joy_at <= p.joystick_timeout:
+            found += [drive.parse(name, poses)
+                      for name in drive.pressed(buttons, driver.buttons, p)]
+            buttons = tuple(driver.buttons)
+            way, turn = drive.shift_of_sticks(driver.axes, now - before, p)
+            if driver.steering is not None and (way.any() or turn.any()):
+                found.append(Shift(way, turn))
+        before = now
+        yield found
 
 
-class _Terminal:
-    """Actions from lines of standard input; its end acts as `wait` and `quit`."""
-
-    help = f'{drive.HELP}, or the name of a pose'
-    open = staticmethod(nullcontext)
-
-    def __init__(self, driver, p, poses, say):
-        self._driver, self._poses, self._say = driver, poses, say
-        self._text, self._ended, self.done = '', False, False
-        self._waits = None      # returns whether `wait` is not over; None without one
-
-    def actions(self, seconds):
-        """Return the actions of the next lines, up to the next `wait`."""
+def terminal(driver, p, poses, say):
+    """Yield the actions of lines of standard input; its end acts as `wait` and `quit`."""
+    options = f'{drive.HELP}, or the name of a pose'
+    say(options)
+    text, wait = '', None       # `wait` in progress: its begin [s] and duration [s] or None
+    while True:
         found = []
-        while not self.done and not (self._waits and self._waits()):
-            self._waits = None
-            if '\n' not in self._text and not self._ended and (read := _typed()) is not None:
-                self._ended = not read
-                self._text += read or '\nwait\nquit\n'
-            if '\n' not in self._text:
+        while wait is None or not driver.is_under_way(*wait):
+            wait = None
+            if '\n' not in text and (typed := _typed()) is not None:
+                text += typed or '\nwait\nquit\n'
+            if '\n' not in text:
                 break
-            line, _, self._text = self._text.partition('\n')
+            line, _, text = text.partition('\n')
             try:
-                action = drive.parse(line, self._poses)
+                action = drive.parse(line, poses)
             except WordError as error:
-                self._say(str(error))
+                say(str(error))
                 continue
             name = action.name if isinstance(action, Order) else ''
             if name == 'quit':
-                self.done = True
-            elif name == 'help':
-                self._say(f"{self.help}: {', '.join(self._poses)}")
+                yield found
+                return
+            if name == 'help':
+                say(f"{options}: {', '.join(poses)}")
             elif name == 'wait':
-                self._waits = partial(self._is_waiting, self._driver.time(),
-                                      float(action.value) if action.value else None)
+                wait = driver.time(), float(action.value) if action.value else None
             elif action is not None:
                 found.append(action)
-        return found
+        yield found
 
-    def _is_waiting(self, begin, seconds):
-        passed = self._driver.time() - begin
-        if seconds is None:
-            return passed <= SETTLE_TIME or not self._driver.at_goal
-        return passed < seconds
+
+SOURCES = {'keyboard': keyboard, 'joystick': joystick, 'terminal': terminal}

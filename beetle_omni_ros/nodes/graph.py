@@ -9,7 +9,6 @@ in the same network would publish on the same topics.
 from collections.abc import Iterable, MutableMapping
 from contextlib import contextmanager
 from copy import deepcopy
-from dataclasses import dataclass
 from itertools import count
 import os
 from pathlib import Path
@@ -18,7 +17,6 @@ import socket
 import subprocess
 import sys
 import time
-from typing import NamedTuple
 
 import yaml
 
@@ -30,29 +28,27 @@ from beetle_omni_ros.robot.schema import ParameterError
 
 BRIDGES = ('joint_bridge_node', 'rotor_bridge_node')
 READY = 'ready'         # begin of a bridge's state
-# Executable -> module of this folder with its class; `controller_node` runs any controller as
-# `<controller>_node`.
-NODES = {'sim_node': 'sim_node', 'ekf_node': 'control_nodes', 'nmpc_node': 'control_nodes',
-         'rl_node': 'control_nodes', 'controller_node': 'control_nodes',
-         'supervisor_node': 'control_nodes', **dict.fromkeys(BRIDGES, 'bridge_nodes'),
-         'reference_node': 'side_nodes', 'recorder_node': 'side_nodes',
-         'viewer_node': 'side_nodes'}
+# Executable -> module of this folder and class.
+NODES = {'sim_node': 'sim_node:SimNode', 'ekf_node': 'control_nodes:EkfNode',
+         **dict.fromkeys(('nmpc_node', 'rl_node', 'controller_node'),
+                         'control_nodes:ControllerNode'),
+         'supervisor_node': 'control_nodes:SupervisorNode',
+         'joint_bridge_node': 'bridge_nodes:JointBridgeNode',
+         'rotor_bridge_node': 'bridge_nodes:RotorBridgeNode',
+         'reference_node': 'side_nodes:ReferenceNode', 'recorder_node': 'side_nodes:RecorderNode',
+         'viewer_node': 'side_nodes:ViewerNode'}
 GENERIC = 'controller_node'
 # Parameter autostart of a bridge -> lifecycle state to reach.
 AUTOSTART = {'none': '', 'configure': 'inactive', 'activate': 'active'}
-COMPOSED, BRIDGES_COMPOSED = 'composed', 'bridges'      # processes of several nodes
-BRIDGE_PROCESSES = (BRIDGES_COMPOSED, *BRIDGES)
-PORT_TIMEOUT = 30.0     # s for the simulator to make its serial ports
+COMPOSED, BRIDGES_COMPOSED = 'composed', 'bridges'      # processes
 STOP_TIMEOUT = 8.0      # s from SIGINT to SIGKILL
 Parameters = dict[str, dict]        # node name -> parameters that differ from the shipped ones
 
 # --- discovery --------------------------------------------------------------------------------
 
-VARIABLE, ARGUMENT = 'BEETLE_OMNI_DISCOVERY', '--discovery'
 RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 # Settings of ROS; if the user set one of them, it has precedence over the default.
 ROS_SETTINGS = (RANGE, 'ROS_LOCALHOST_ONLY', 'ROS_STATIC_PEERS')
-RANGES = ('LOCALHOST', 'SUBNET', 'OFF', 'SYSTEM_DEFAULT')
 # The ports of domains up to 101 are below the ephemeral ports of Linux; 0 is the default domain.
 DOMAINS = range(101, 0, -1)
 # Ports of the RTPS standard: base + gain * domain + offset. Offset 0: discovery, shared by all
@@ -61,44 +57,17 @@ PORT_BASE, DOMAIN_GAIN, USER_UNICAST = 7400, 250, 11
 _starts = count(os.getpid())
 
 
-def confine(environment: MutableMapping[str, str] | None = None,
-            requested: str | None = None) -> None:
-    """
-    Set the range of discovery; must run before the first context is made.
-
-    Args:
-        environment: variables to change; None: those of this process.
-        requested: one of ``RANGES``, for this process and its children; '' or None: the value of
-            ``BEETLE_OMNI_DISCOVERY``, else this computer only.
-
-    Raises:
-        ParameterError: not one of ``RANGES``.
-
-    """
-    environment = os.environ if environment is None else environment
-    source, wanted = (ARGUMENT, requested) if requested else \
-        (VARIABLE, environment.get(VARIABLE, ''))
-    wanted = wanted.strip().upper()
-    if wanted and wanted not in RANGES:
-        raise ParameterError(f"{source}: expected one of {', '.join(RANGES)}, "
-                             f'found {wanted[:40]!r}')
-    if wanted:
-        environment[VARIABLE] = environment[RANGE] = wanted
-    elif not any(environment.get(name) for name in ROS_SETTINGS):
-        environment[RANGE] = RANGES[0]
+def confine(environment: MutableMapping[str, str] = os.environ) -> None:
+    """Limit discovery to this computer by default; must run before the first context is made."""
+    if not any(environment.get(name) for name in ROS_SETTINGS):
+        environment[RANGE] = 'LOCALHOST'
 
 
 def claim(name: str) -> socket.socket | None:
-    """
-    Take a name on this computer, until the socket is closed or the process ends.
-
-    Returns:
-        A socket of Linux' abstract namespace, which leaves no file; None: the name is taken.
-
-    """
+    """Take a name on this computer until the socket is closed; None: it is taken."""
     holder = socket.socket(socket.AF_UNIX)
     try:
-        holder.bind(f'\0beetle_omni/{name}')
+        holder.bind(f'\0beetle_omni/{name}')     # of the abstract namespace, which leaves no file
     except OSError:
         holder.close()
         return None
@@ -107,16 +76,9 @@ def claim(name: str) -> socket.socket | None:
 
 @contextmanager
 def reserved_domain():
-    """
-    Yield the number of a free ROS domain, reserved while the context lasts.
-
-    Each call begins its search at another number, because participants that are shutting down may
-    still send discovery data to new ones in the same domain.
-
-    Raises:
-        OSError: no domain is free.
-
-    """
+    """Yield the number of a free ROS domain, reserved while the context lasts; else OSError."""
+    # Each call begins at another number: participants that are shutting down may still send
+    # discovery data to new ones in the same domain.
     first = next(_starts) % len(DOMAINS)
     for number in [*DOMAINS[first:], *DOMAINS[:first]]:
         holder = claim(f'domain/{number}')
@@ -140,15 +102,20 @@ def _ports_are_free(domain):
 
 # --- nodes ------------------------------------------------------------------------------------
 
-@dataclass(frozen=True, kw_only=True)
-class GraphOptions:
+def plan(controller: str = registry.DEFAULT, *, standby: bool = True, nmpc: str = '',
+         policy: str = '', allow_other_robot: bool = False, simulated: bool = True,
+         actuators: str = 'bridges', ports: str = '', robot_file: str = '', plant_file: str = '',
+         conditions: str = 'nominal', seed: int = 0, task: str = '', bag: str = '',
+         compression: str = 'none', viewer: bool = False, clock: str = 'system'
+         ) -> tuple[Parameters, dict[str, str]]:
     """
-    Options of a graph; a file '' is the shipped one.
+    List the nodes of a graph; a file '' is the shipped one.
 
-    Attributes:
+    Args:
         controller: active controller: a name, or a reference to a class.
         standby: whether the standby controllers run too, so that they can be selected in flight.
-        nmpc, policy: files of the controllers that have the options `--nmpc` and `--policy`.
+        nmpc: file of the controller that has the option `--nmpc`.
+        policy: file of the controller that has the option `--policy`.
         allow_other_robot: whether a policy trained for other robot parameters may fly.
         simulated: whether sim_node provides sensors and actuators. Otherwise nodes started
             elsewhere do; on the robot deploy/install.sh starts the bridges.
@@ -156,74 +123,50 @@ class GraphOptions:
         ports: folder of the names of the emulated devices' ports.
         robot_file: robot file of estimator and controllers.
         plant_file: robot file of the simulation; '': the same.
+        conditions: of the simulation.
+        seed: of the simulation and the task.
         task: task of reference_node; '': targets from elsewhere.
-        bag, compression: folder of the bag, '' for no recording; 'none' or 'zstd'.
+        bag: folder of the bag, '' for no recording.
+        compression: of the bag, 'none' or 'zstd'.
+        viewer: whether viewer_node runs.
         clock: 'system', or 'simulated': time on /clock that waits for nodes that are late.
 
-    """
-
-    controller: str = registry.DEFAULT
-    standby: bool = True
-    nmpc: str = ''
-    policy: str = ''
-    allow_other_robot: bool = False
-    simulated: bool = True
-    actuators: str = 'bridges'
-    ports: str = ''
-    robot_file: str = ''
-    plant_file: str = ''
-    conditions: str = 'nominal'
-    seed: int = 0
-    task: str = ''
-    bag: str = ''
-    compression: str = 'none'
-    viewer: bool = False
-    clock: str = 'system'
-
-
-class Plan(NamedTuple):
-    """Nodes of a graph, and the reasons of the standby controllers that are left out."""
-
-    nodes: Parameters
-    left_out: dict[str, str]
-
-
-def plan(options: GraphOptions) -> Plan:
-    """
-    List the nodes of a graph.
+    Returns:
+        Node name -> parameters; omitted standby controller -> reason.
 
     Raises:
         ParameterError: the active controller is unusable, or the clock does not fit the actuators.
 
     """
-    if options.clock == 'simulated' and (
-            not options.simulated or options.actuators == 'bridges'):
+    emulated = simulated and actuators == 'bridges'
+    if clock == 'simulated' and (emulated or not simulated):
         raise ParameterError("clock 'simulated': serial devices keep real time; expected the "
                              'simulator, with direct actuators')
-    robot = {'robot_file': options.robot_file} if options.robot_file else {}
-    plant = {'robot_file': options.plant_file} if options.plant_file else robot
-    controllers, left_out = controller_nodes(options)
-    active = registry.find(options.controller).name
+    robot = {'robot_file': robot_file} if robot_file else {}
+    plant = {'robot_file': plant_file} if plant_file else robot
+    controllers, left_out = controller_nodes(
+        controller, robot, standby=standby, nmpc=nmpc, policy=policy,
+        allow_other_robot=allow_other_robot)
+    active = registry.find(controller).name
     # The default of these nodes is the list of standby controllers.
     others = {} if active in registry.standing_by() else {
         'controllers': [active, *registry.standing_by()]}
-    packed = {} if options.compression == 'none' else {'compression': options.compression}
-    bridges = bridge_parameters(Path(options.ports), robot) \
-        if options.simulated and options.actuators == 'bridges' else {}
+    packed = {} if compression == 'none' else {'compression': compression}
+    bridges = bridge_parameters(Path(ports), robot) if emulated else {}
     table = (
-        ('recorder_node', options.bag, {'bag': options.bag, **packed, **others}),
-        ('sim_node', options.simulated, {
-            **plant, 'conditions': options.conditions, 'seed': options.seed,
-            **bridges.get('sim_node', {})}),
+        ('recorder_node', bag, {'bag': bag, **packed, **others}),
         ('ekf_node', True, robot),
         *((name, True, values) for name, values in controllers.items()),
         ('supervisor_node', True, {**robot, 'controller': active, **others}),
-        ('reference_node', options.task, {'task': options.task, 'seed': options.seed}),
-        ('viewer_node', options.viewer, robot),
+        ('reference_node', task, {'task': task, 'seed': seed}),
+        ('viewer_node', viewer, {}),
+        # After the controllers, whose start would keep its emulated devices from answering.
+        ('sim_node', simulated, {**plant, 'conditions': conditions, 'seed': seed,
+                                 **bridges.get('sim_node', {})}),
         *((name, bridges, bridges.get(name)) for name in BRIDGES))
     # Copies: YAML would write a shared list as an alias, which ROS cannot read.
     nodes = {name: deepcopy(values) for name, is_used, values in table if is_used}
-    return Plan(in_simulated_time(nodes) if options.clock == 'simulated' else nodes, left_out)
+    return in_simulated_time(nodes) if clock == 'simulated' else nodes, left_out
 
 
 def bridge_parameters(folder: Path, robot: dict) -> Parameters:
@@ -232,7 +175,7 @@ def bridge_parameters(folder: Path, robot: dict) -> Parameters:
 
     The names of the pseudo-terminals are in ``folder``; ``robot`` holds the parameter robot_file.
     """
-    servos, board = str(Path(folder) / 'servo_bus'), str(Path(folder) / 'motor_board')
+    servos, board = str(folder / 'servo_bus'), str(folder / 'motor_board')
     return {'sim_node': {'actuators': 'emulated', 'servo_port': servos, 'board_port': board},
             'joint_bridge_node': {**robot, 'port': servos, 'autostart': 'activate'},
             'rotor_bridge_node': {**robot, 'port': board}}
@@ -245,41 +188,36 @@ def in_simulated_time(nodes: Parameters) -> Parameters:
             for name, values in nodes.items()}
 
 
-def controller_nodes(options: GraphOptions) -> tuple[Parameters, dict[str, str]]:
+def controller_nodes(controller: str, robot: dict, *, standby: bool = True, nmpc: str = '',
+                     policy: str = '', allow_other_robot: bool = False
+                     ) -> tuple[Parameters, dict[str, str]]:
     """
-    Return the parameters of the controllers' nodes.
+    Return the parameters of the controllers' nodes, the active one first.
 
     A standby policy that is not for this robot is omitted, because a node that refuses its
-    parameters ends the shared process.
-
-    Returns:
-        Node name -> parameters, the active one first; omitted standby controller -> reason.
-
-    Raises:
-        ParameterError: the active controller cannot be built, or its policy is unusable.
-
+    parameters ends the shared process. ``robot`` holds the parameter robot_file; the other
+    arguments, results and errors are those of :func:`plan`.
     """
-    first, nmpc = registry.find(options.controller), options.nmpc
+    first, robot_file = registry.find(controller), robot.get('robot_file')
     if first.reference not in registry.SHIPPED:     # in one line here, not in another process
-        first.make(RobotParameters.load(options.robot_file or None))
+        first.make(RobotParameters.load(robot_file))
     entries = [first, *(registry.find(name) for name in registry.standing_by()
-                        if options.standby and name != first.name)]
+                        if standby and name != first.name)]
     if nmpc and not any(entry.option == '--nmpc' for entry in entries):
         raise ParameterError(f"--nmpc {nmpc}: for the controller '{registry.owner('--nmpc')}', "
                              'which does not run')
     nodes, left_out = {}, {}
     for entry in entries:
         node = f'{entry.name}_node'
-        values = {} if node in NODES else {'controller': entry.reference}
-        values |= {'robot_file': options.robot_file} if options.robot_file else {}
+        values = {**({} if node in NODES else {'controller': entry.reference}), **robot}
         if nmpc and entry.option == '--nmpc' and entry.parameter_class:
             schema.load(entry.parameter_class, nmpc)    # an error here, not in another process
             values[entry.file_key] = nmpc
         if entry.policy_file:
-            given = options.policy if entry.name == registry.owner('--policy') else ''
+            given = policy if entry.name == registry.owner('--policy') else ''
             values |= {'policy': str(Path(given).absolute())} if given else {}
-            values |= {'allow_other_robot': True} if options.allow_other_robot else {}
-            if reason := unfit(given or entry.policy_file, options):
+            values |= {'allow_other_robot': True} if allow_other_robot else {}
+            if reason := unfit(given or entry.policy_file, robot_file, allow_other_robot):
                 if entry is first:
                     raise ParameterError(reason)
                 left_out[entry.name] = reason
@@ -288,26 +226,19 @@ def controller_nodes(options: GraphOptions) -> tuple[Parameters, dict[str, str]]
     return nodes, left_out
 
 
-def unfit(policy: str, options: GraphOptions) -> str:
+def unfit(policy: str, robot_file: str | None, allow_other_robot: bool) -> str:
     """Return why a policy is unusable for the robot file, or ''."""
     try:
         from beetle_omni_ros.control.policy_file import PolicyNetwork
-        PolicyNetwork(policy, RobotParameters.load(options.robot_file or None),
-                      options.allow_other_robot)
+        PolicyNetwork(policy, RobotParameters.load(robot_file), allow_other_robot)
     except (ParameterError, ImportError) as error:
         return str(error)
     return ''
 
 
-def executable(node: str) -> str:
-    """Return the executable of a node."""
-    return node if node in NODES else GENERIC
-
-
 def arguments(nodes: Parameters, names: Iterable[str]) -> list[str]:
     """Return the arguments of `composed`: executables, and references of other controllers."""
-    return [name if name in NODES else nodes[name].get(
-        'controller', name.removesuffix('_node')) for name in names]
+    return [name if name in NODES else nodes[name]['controller'] for name in names]
 
 
 def processes(nodes: Parameters) -> dict[str, list[str]]:
@@ -323,60 +254,36 @@ class Graph:
     """
     Processes that run nodes.
 
-    Args:
-        nodes: parameters of each node.
-        folder: existing folder for the parameter file and the output of the processes.
-        domain: ROS domain.
-        composed: one process for the bridges and one for all other nodes; otherwise one process
-            for each node.
-
+    ``folder`` receives the parameter file and the output of the processes. ``groups`` are process
+    -> its nodes, by default those of :func:`processes`.
     """
 
-    def __init__(self, nodes: Parameters, folder: Path, domain: int, composed: bool = True):
-        self.folder, self.domain, self.composed = Path(folder), domain, composed
-        self.nodes = list(nodes)
-        simulator = nodes.get('sim_node', {})
-        self.simulated = simulator.get('clock') == 'simulated'
-        self._ports = [port for port in map(simulator.get, ('servo_port', 'board_port')) if port]
+    def __init__(self, nodes: Parameters, folder: Path, domain: int,
+                 groups: dict[str, list[str]] | None = None):
+        self.folder, self.domain, self.nodes = Path(folder), domain, list(nodes)
+        groups = groups or processes(nodes)
+        self._bridges = [name for name, group in groups.items() if set(group) <= set(BRIDGES)]
         self._file = self.folder / 'parameters.yaml'
         self._file.write_text(yaml.safe_dump(
             {f'/**/{node}': {'ros__parameters': values} for node, values in nodes.items()
              if values} or {'/**': {'ros__parameters': {}}}))
-        if composed:
-            self._commands = {name: [COMPOSED, *arguments(nodes, names), '--ros-args']
-                              for name, names in processes(nodes).items()}
-        else:
-            self._commands = {node: [executable(node), '--ros-args', *(
-                () if node in NODES else ('-r', f'__node:={node}'))] for node in nodes}
+        self._commands = {name: [COMPOSED, *arguments(nodes, group), '--ros-args',
+                                 '--params-file', str(self._file)]
+                          for name, group in groups.items()}
         self.processes: dict[str, subprocess.Popen] = {}
 
     def start(self) -> None:
-        """
-        Start every process; the bridges after the simulator has made its serial ports.
-
-        Each process ends with this one, even if this one is killed.
-        """
-        bridges = [name for name in self._commands if name in BRIDGE_PROCESSES]
+        """Start every process; each ends with this one, even if this one is killed."""
         for name in self._commands:
-            if name not in bridges:
-                self.start_process(name)
-        # Bridges also wait for their ports, but log a warning.
-        deadline = time.monotonic() + PORT_TIMEOUT
-        while not all(map(os.path.exists, self._ports)) and time.monotonic() < deadline \
-                and not self.dead():
-            time.sleep(0.05)
-        for name in bridges:
             self.start_process(name)
 
-    def start_process(self, name: str) -> subprocess.Popen:
+    def start_process(self, name: str) -> None:
         """Start one process, or start it again."""
         with open(self.log(name), 'a') as log:
             self.processes[name] = subprocess.Popen(
-                [sys.executable, '-m', 'beetle_omni_ros.start', *self._commands[name],
-                 '--params-file', str(self._file)],
+                [sys.executable, '-m', 'beetle_omni_ros.start', *self._commands[name]],
                 env=child_environment(self.domain), stdin=subprocess.DEVNULL, stdout=log,
                 stderr=log, start_new_session=True)     # Ctrl-C reaches this process only
-        return self.processes[name]
 
     def log(self, name: str) -> Path:
         """Return the file with the output of a process."""
@@ -386,11 +293,6 @@ class Graph:
         """Return name -> exit status or signal of each process that has ended."""
         return {name: _ending(process.returncode, self.log(name))
                 for name, process in self.processes.items() if process.poll() is not None}
-
-    def cpu_seconds(self, bridges: bool = False) -> float:
-        """Return the CPU time of the running processes, or of the bridges only [s]."""
-        return sum(_cpu_seconds(p.pid) for name, p in self.processes.items() if p.poll() is None
-                   and (not bridges or name in BRIDGE_PROCESSES))
 
     def kill(self, name: str) -> None:
         """Kill one process."""
@@ -402,12 +304,10 @@ class Graph:
         Stop all processes; return the names of those that had to be killed.
 
         Bridges stop first, because they switch off the actuators, which the simulator emulates.
-        The recorder stops last, so that the bag contains the end.
         """
-        first = [name for name in self.processes if name in BRIDGE_PROCESSES]
-        last = [name for name in self.processes if name == 'recorder_node']
-        others = [name for name in self.processes if name not in (*first, *last)]
-        return self._end(first) + self._end(others) + self._end(last)
+        others = [name for name in self.processes if name not in self._bridges]
+        return self._end([name for name in self.processes if name in self._bridges]) \
+            + self._end(others)
 
     def _end(self, names):
         """Send SIGINT every second: a process that still imports may lose the first one."""
@@ -448,12 +348,3 @@ def _ending(code, log):
         return f'ended by {signal.Signals(-code).name}'
     lines = log.read_text(errors='replace').strip().splitlines()
     return f"exit status {code}{': ' + lines[-1] if lines else ''}"
-
-
-def _cpu_seconds(pid):
-    """User and system time from /proc; 0 for a process that has just ended."""
-    try:
-        fields = Path(f'/proc/{pid}/stat').read_text().rsplit(')', 1)[1].split()
-    except OSError:
-        return 0.0
-    return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')

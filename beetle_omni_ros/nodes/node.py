@@ -12,62 +12,116 @@ import numpy as np
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
-from beetle_omni_ros.control.base import Command
-from beetle_omni_ros.messages.conversions import take_command
-from beetle_omni_ros.messages.topics import Qos, topic_of
+from beetle_omni_ros.messages.topics import Qos, TARGETS, topic_of
 from beetle_omni_ros.messages.values import Diagnostic, MessageError
 from beetle_omni_ros.nodes import parameters, wire
 from beetle_omni_ros.nodes.graph import claim
 
-OK, WARN, ERROR, STALE = range(4)   # of diagnostic_msgs/DiagnosticStatus
+OK, WARN, ERROR = range(3)      # of diagnostic_msgs/DiagnosticStatus
 PERIOD = 1.0            # s between two diagnostics
 FUTURE = 0.05           # s ahead of the clock above which a stamp is refused
 IDENTITY = 'supervisor/identity'
 TEXT_LIMIT = 40         # characters of a foreign frame_id in an error message
 
 
-class StartError(RuntimeError):
-    """A node cannot start or continue; the text is one line for the operator."""
+class Distribution:
+    """Quantiles of durations in constant memory: a histogram with 2 % wide bins."""
+
+    LOW, RATIO, BINS = 1e-6, 1.02, 1000     # 1 us to 400 s
+
+    def __init__(self):
+        self.counts = np.zeros(self.BINS, dtype=np.int64)
+        self.count, self.max = 0, 0.0
+
+    def add(self, seconds: float) -> None:
+        """Count one duration [s]."""
+        k = int(math.log(max(seconds, self.LOW) / self.LOW) / math.log(self.RATIO))
+        self.counts[min(k, self.BINS - 1)] += 1
+        self.count += 1
+        self.max = max(self.max, seconds)
+
+    def quantile(self, fraction: float) -> float:
+        """Return a quantile [s], accurate to 1 %; NaN if nothing was counted."""
+        if not self.count:
+            return float('nan')
+        k = int(np.searchsorted(np.cumsum(self.counts), fraction * self.count))
+        return min(self.LOW * self.RATIO ** (k + 0.5), self.max)
+
+    def status(self, text: str, level: int = OK, **more: float) -> tuple[int, str, dict]:
+        """Return median, 99th percentile, maximum [ms] and number as a diagnostic status."""
+        return level, text, {
+            'median_ms': 1e3 * self.quantile(0.5), 'p99_ms': 1e3 * self.quantile(0.99),
+            'max_ms': 1e3 * self.max, 'count': self.count, **more}
+
+
+@dataclass
+class Input:
+    """Counts of one subscribed topic; silence of ``stale_after`` [s] is an error, None never."""
+
+    stale_after: float | None
+    received: int = 0
+    reported: int = 0
+    age: float = float('nan')
+    seen: float | None = None           # elapsed() at the last good message
+    rejected: Counter = field(default_factory=Counter)
+    rejected_reported: int = 0
+    last_refusal: str = ''
+
+    @property
+    def is_missing(self) -> bool:
+        """Whether a message is expected and none has come yet."""
+        return self.seen is None and self.stale_after is not None
 
 
 class FlightNode(Node):
     """
     A node with declared parameters, checked inputs and diagnostics.
 
+    Every second it publishes on ``diagnostics``. An input that stops is an error; an input that
+    has never come is not.
+
     Attributes:
-        real_time: whether the node is part of the control loop and needs real-time priority.
+        inputs: topic -> its counts.
         steady_clock: clock for timers that are independent of the flight.
         flight_clock: clock for timers of the flight; simulated time if ``use_sim_time`` is set.
 
     """
 
-    real_time = False
-
-    def __init__(self, name: str, parameter_class: type, file: str | None = None,
+    def __init__(self, name: str, base: type | None = None, file: str | None = None,
                  file_key: str | None = None, on_change: Callable | None = None,
-                 changeable: tuple[str, ...] | None = None):
+                 changeable: tuple[str, ...] | None = None, **more):
         """
         Claim the name, read the parameters, start diagnostics.
 
-        The arguments after ``name`` are those of :func:`parameters.declare`.
+        The parameters are those of the class ``base``, ``file_key`` and ``more`` (name -> field).
+        The arguments from ``file`` on are those of :func:`parameters.declare`.
 
         Raises:
             ParameterError: unusable parameters.
-            StartError: a node of this name runs already.
+            OSError: a node of this name runs already.
 
         """
         super().__init__(name)
         domain, name = self.context.get_domain_id(), self.get_fully_qualified_name()
         self._claim = claim(f'{domain}{name}')
         if self._claim is None:
-            raise StartError(f'{name} runs already (ROS domain {domain}); stop it first')
+            raise OSError(f'{name} runs already (ROS domain {domain}); stop it first')
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
         # Simulated time may stop, so timers of the flight must use it too.
         self.simulated = bool(self.get_parameter(parameters.CLOCK).value)
         self.flight_clock = self.get_clock() if self.simulated else self.steady_clock
-        self.parameters = parameters.declare(self, parameter_class, file, file_key,
-                                             on_change, changeable)
-        self.health = Health(self)
+        if file_key:
+            more[file_key] = parameters.file_parameter('parameter file')
+        self.parameters = parameters.declare(
+            self, parameters.extended(f'{name}_parameters', base, more), file, file_key,
+            on_change, changeable)
+        self.inputs: dict[str, Input] = {}
+        self._supervisor_identity = ''
+        self._diagnostics = self.publisher('diagnostics')
+        self._reports = [('inputs', self._input_status)]
+        self._compute, self._deadline, self._misses = Distribution(), math.inf, 0
+        self._reported_at = self.elapsed()
+        self.create_timer(PERIOD, self._publish_diagnostics, clock=self.steady_clock)
         self.get_logger().debug('started')      # the first call is slow: not during a flight
 
     def now(self) -> float:
@@ -93,74 +147,98 @@ class FlightNode(Node):
         """Make the publisher of a topic."""
         return wire.Publisher(self, topic)
 
-    def follow(self, topic: str, handle: Callable[[str], None]) -> None:
-        """Pass the texts of a latched topic to ``handle``."""
+    def follow(self, topic: str, handle: Callable[[Any], None]) -> None:
+        """Pass the values of a latched topic to ``handle``, without checks of age."""
         wire.subscribe(self, topic, handle)
 
-    def listen(self, topic: str, handle: Callable, *, read: Callable | None = None,
-               qos: Qos | None = None, any_qos: bool = False, max_age: float | None = None,
-               stale_after: float | None = 0.5, published: bool = False,
-               check: Callable | None = None) -> None:
+    def listen(self, topic: str, handle: Callable, *, qos: Qos | None = None,
+               max_age: float | None = None, stale_after: float | None = 0.5) -> None:
         """
         Subscribe ``topic``; pass valid values to ``handle`` and count refused messages.
 
+        Until a supervisor publishes its identity, every message of `command` is accepted. After
+        that, only those whose frame_id is the newest identity are accepted.
+
         Args:
             topic: relative name in the table of topics.
-            handle: called with each value.
-            read: message -> value with a ``stamp``, raises MessageError; default: the table's
-                ``take``.
-            qos: quality of service; default: the table's.
-            any_qos: receive from publishers of any quality of service.
+            handle: called with each value, and for targets with the time of publication [s,
+                system time, or nan]; may raise MessageError to refuse it.
+            qos: quality of service; default: the table's, any for targets.
             max_age: limit of a stamp's age [s], also refuses future stamps; None: no check.
             stale_after: silence after a message that is an error [s]; None: never.
-            published: whether ``check`` and ``handle`` also get the time of publication [s, system
-                time, or nan].
-            check: called with the value before ``handle``; raises MessageError.
 
         """
         entry, counts = topic_of(topic), Input(stale_after)
-        read = read or entry.take
-        self.health.inputs[topic] = counts
+        self.inputs[topic] = counts
+        if topic == 'command':
+            self.follow(IDENTITY, partial(setattr, self, '_supervisor_identity'))
 
         def callback(data, *publication):
             try:
-                value = read(wire.message(entry, data))
+                message = wire.message(entry, data)
+                if topic == 'command':
+                    self._check_source(message.header.frame_id)
+                value = entry.take(message)
                 age = self.now() - value.stamp
                 if max_age is not None and not -FUTURE <= age <= max_age:
                     raise MessageError('stale stamp' if age > 0 else 'stamp in the future')
-                if check is not None:
-                    check(value, *publication)
+                handle(value, *publication)
             except MessageError as error:
-                self.health.rejected(topic, str(error), error.kind)
+                self.reject(topic, str(error), error.kind)
                 return
             counts.received += 1
             counts.age, counts.seen = age, self.elapsed()
-            handle(value, *publication)
 
-        if any_qos:
-            wire.subscribe_any(self, topic, callback if published else
-                               lambda data, _: callback(data))
-            return
-        self.create_subscription(
-            wire.message_class(entry.type), topic, wire.with_publication(callback)
-            if published else callback, wire.profile(qos or entry.qos), raw=True)
+        if topic in TARGETS:
+            wire.subscribe_any(self, topic, callback)
+        else:
+            wire.subscribe_raw(self, topic, callback, qos)
+
+    def _check_source(self, source):
+        identity = self._supervisor_identity
+        if identity and source != identity:
+            name = f"'{source[:TEXT_LIMIT]}'" if source else 'no identity'
+            raise MessageError(
+                f"2nd publisher: frame_id has {name}, expected '{identity[:TEXT_LIMIT]}'",
+                'not from the supervisor')
+
+    def reject(self, topic: str, reason: str, kind: str) -> None:
+        """
+        Count a refused message under ``kind``; log the first of a kind.
+
+        Old stamps before the first accepted message are not logged.
+        """
+        entry = self.inputs[topic]
+        if kind not in entry.rejected and (entry.received or 'stamp' not in kind):
+            self.get_logger().warning(f'{topic}: message refused, {reason}')
+        entry.rejected[kind] += 1
+        entry.last_refusal = reason
+
+    def report(self, name: str, source: Callable[[], tuple[int, str, dict]]) -> None:
+        """Add a diagnostic status '<node>: <name>': (level, message, values)."""
+        self._reports.append((name, source))
+
+    def track_compute(self, deadline: float) -> None:
+        """Report the CPU times of :meth:`timed` against a deadline [s]."""
+        self._deadline = deadline
+        self.report('compute', lambda: self._compute.status(
+            f'{self._misses} deadline misses', WARN if self._misses else OK,
+            deadline_misses=self._misses))
 
     def timed(self, function: Callable, *args):
-        """Call ``function`` and count its CPU and wall time."""
-        cpu, wall = time.thread_time(), time.perf_counter()
+        """Call ``function`` and count its CPU time."""
+        begin = time.thread_time()
         result = function(*args)
-        self.health.computed(time.thread_time() - cpu, time.perf_counter() - wall)
+        used = time.thread_time() - begin
+        self._compute.add(used)
+        self._misses += used > self._deadline
         return result
-
-    def waits_for(self) -> str:
-        """Return the required topics without a message so far; overridden by subclasses."""
-        return ', '.join(topic for topic, entry in self.health.inputs.items()
-                         if entry.seen is None and entry.stale_after is not None)
 
     def introduce(self) -> None:
         """Log in one line what the node does and which inputs are missing."""
-        what, waits = (type(self).__doc__ or '').strip().partition('\n')[0], self.waits_for()
-        self.get_logger().info(f"{what} Waits for {waits or 'nothing'}.")
+        what = (type(self).__doc__ or '').strip().partition('\n')[0]
+        waits = ', '.join(topic for topic, entry in self.inputs.items() if entry.is_missing)
+        self.get_logger().info(f'{what} Waits for {waits}.' if waits else what)
 
     def close(self) -> None:
         """Release the resources of the node; overridden by subclasses."""
@@ -172,137 +250,19 @@ class FlightNode(Node):
         if self._claim:
             self._claim.close()
 
-
-class CommandSource:
-    """
-    Reads commands for a node that executes them.
-
-    Until a supervisor publishes its identity, every command is accepted. After that, only commands
-    whose frame_id is the newest identity are accepted.
-    """
-
-    def __init__(self, node):
-        self._identity = ''
-        wire.subscribe(node, IDENTITY, partial(setattr, self, '_identity'))
-
-    def read(self, message: Any) -> Command:
-        """Read a command; MessageError if it is malformed or not from the supervisor."""
-        source = message.header.frame_id
-        if self._identity and source != self._identity:
-            name = f"'{source[:TEXT_LIMIT]}'" if source else 'no identity'
-            raise MessageError(
-                f"2nd publisher: frame_id has {name}, expected '{self._identity[:TEXT_LIMIT]}'",
-                'not from the supervisor')
-        return take_command(message)
-
-
-# --- diagnostics ------------------------------------------------------------------------------
-
-class Distribution:
-    """Quantiles of durations in constant memory: a histogram with 2 % wide bins."""
-
-    LOW, RATIO, BINS = 1e-6, 1.02, 1000     # 1 us to 400 s
-
-    def __init__(self):
-        self.counts = np.zeros(self.BINS, dtype=np.int64)
-        self.count, self.max = 0, 0.0
-
-    def add(self, seconds: float) -> None:
-        """Count one duration [s]."""
-        k = int(math.log(max(seconds, self.LOW) / self.LOW) / math.log(self.RATIO))
-        self.counts[min(k, self.BINS - 1)] += 1
-        self.count += 1
-        self.max = max(self.max, seconds)
-
-    def quantile(self, fraction: float) -> float:
-        """Return a quantile [s], accurate to 1 %; NaN if nothing was counted."""
-        if not self.count:
-            return float('nan')
-        k = int(np.searchsorted(np.cumsum(self.counts), fraction * self.count))
-        return min(self.LOW * self.RATIO ** (k + 0.5), self.max)
-
-    def milliseconds(self, prefix: str = '') -> dict[str, float]:
-        """Return median, 99th percentile and maximum [ms] under their keys in diagnostics."""
-        return {f'{prefix}median_ms': 1e3 * self.quantile(0.5),
-                f'{prefix}p99_ms': 1e3 * self.quantile(0.99), f'{prefix}max_ms': 1e3 * self.max}
-
-    def status(self, text: str, **more: float) -> tuple[int, str, dict]:
-        """Return the distribution as a diagnostic status."""
-        return OK, text, {**self.milliseconds(), 'count': self.count, **more}
-
-
-@dataclass
-class Input:
-    """Counts of one subscribed topic; silence of ``stale_after`` [s] is an error, None never."""
-
-    stale_after: float | None
-    received: int = 0
-    reported: int = 0
-    age: float = float('nan')
-    seen: float | None = None           # elapsed() at the last good message
-    rejected: Counter = field(default_factory=Counter)
-    rejected_reported: int = 0
-    last_refusal: str = ''
-
-
-class Health:
-    """
-    Collects counts and status values and publishes them on ``diagnostics`` once a second.
-
-    An input that stops is an error; an input that has never come is not.
-    """
-
-    def __init__(self, node: FlightNode):
-        self._node = node
-        self.inputs: dict[str, Input] = {}
-        self._compute: Distribution | None = None
-        self._deadline = float('inf')
-        self._misses = 0
-        self._wall_max = 0.0
-        self._extra = []
-        self._publisher = wire.Publisher(node, 'diagnostics')
-        node.create_timer(PERIOD, self._publish, clock=node.steady_clock)
-        self._last = node.elapsed()
-
-    def rejected(self, topic: str, reason: str, kind: str = '') -> None:
-        """
-        Count a refused message under ``kind``, or under its reason; log the first of a kind.
-
-        Old stamps before the first accepted message are not logged.
-        """
-        entry, kind = self.inputs[topic], kind or reason
-        if kind not in entry.rejected and (entry.received or 'stamp' not in kind):
-            self._node.get_logger().warning(f'{topic}: message refused, {reason}')
-        entry.rejected[kind] += 1
-        entry.last_refusal = reason
-
-    def track_compute(self, deadline: float) -> None:
-        """Report compute times against a ``deadline`` [s] under '<node>: compute'."""
-        self._compute, self._deadline = Distribution(), deadline
-
-    def computed(self, cpu: float, wall: float) -> None:
-        """Count one cycle: CPU time and wall time [s]."""
-        self._compute.add(cpu)
-        self._misses += cpu > self._deadline
-        self._wall_max = max(self._wall_max, wall)
-
-    def report(self, name: str, source) -> None:
-        """Add a status '<node>: <name>'; ``source()`` returns (level, message, values)."""
-        self._extra.append((name, source))
-
-    def _publish(self):
-        statuses = [('inputs', self._input_status)] if self.inputs else []
-        if self._compute is not None:
-            statuses.append(('compute', self._compute_status))
-        statuses = [*statuses, *self._extra] or [('node', lambda: (OK, 'running', {}))]
-        stamp, name = self._node.now(), self._node.get_name()
-        found = [(part, *source()) for part, source in statuses]
-        self._publisher.publish([Diagnostic(stamp, f'{name}: {part}', level, text, texts(values))
-                                 for part, level, text, values in found])
+    def _publish_diagnostics(self):
+        found = []
+        for part, source in self._reports:
+            level, text, values = source()
+            found.append(Diagnostic(
+                self.now(), f'{self.get_name()}: {part}', level, text,
+                {key: f'{value:.6g}' if isinstance(value, float) else str(value)
+                 for key, value in values.items()}))
+        self._diagnostics.publish(found)
 
     def _input_status(self):
-        level, faults, values, now = OK, [], {}, self._node.elapsed()
-        passed, self._last = max(now - self._last, 1e-9), now
+        level, faults, values, now = OK, [], {}, self.elapsed()
+        passed, self._reported_at = max(now - self._reported_at, 1e-9), now
         for topic, entry in self.inputs.items():
             count = entry.rejected.total()
             values |= {f'{topic} rate_hz': (entry.received - entry.reported) / passed,
@@ -317,18 +277,7 @@ class Health:
                 level = max(level, WARN)
                 faults.append(f'{topic}: {count - entry.rejected_reported} rejected, '
                               f'{entry.last_refusal}')
-            elif entry.seen is None and entry.stale_after is not None:
+            elif entry.is_missing:
                 faults.append(f'waiting for {topic}')
             entry.reported, entry.rejected_reported = entry.received, count
         return level, '; '.join(faults) or 'all arriving', values
-
-    def _compute_status(self):
-        return WARN if self._misses else OK, f'{self._misses} deadline misses', {
-            **self._compute.milliseconds(), 'deadline_misses': self._misses,
-            'count': self._compute.count, 'wall_max_ms': 1e3 * self._wall_max}
-
-
-def texts(values: dict) -> dict[str, str]:
-    """Return the values of a status as text, floats with six digits."""
-    return {key: f'{value:.6g}' if isinstance(value, float) else str(value)
-            for key, value in values.items()}

@@ -1,13 +1,12 @@
 """ROS clients outside the flight: operator, listener of `check`, live graph of `view`."""
 
-from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
 import os
 from pathlib import Path
-import threading
 import time
+from typing import Any
 
 import numpy as np
 from rcl_interfaces.srv import SetParameters
@@ -21,18 +20,16 @@ from std_srvs.srv import Trigger
 from beetle_omni_ros.bringup import findings
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import PoseTarget
-from beetle_omni_ros.messages.bag_types import from_bytes
 from beetle_omni_ros.messages.conversions import seconds as seconds_of
 from beetle_omni_ros.messages.topics import (
-    command_topic,
     controller_of,
     LOG,
+    Qos,
     SENSOR,
-    topic_of,
+    TARGETS,
     TOPICS,
 )
 from beetle_omni_ros.messages.values import Diagnostic, MessageError
-from beetle_omni_ros.nodes import node as nodes
 from beetle_omni_ros.nodes import runner, wire
 from beetle_omni_ros.nodes.graph import BRIDGES, confine, READY
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -49,64 +46,65 @@ SENSORS = {'mocap/pose': 'position', 'imu/data_raw': 'specific_force',
 # Only the newest message of these is read for each picture; of the others, every message is read.
 SHOWN = ('odom', 'ground_truth/odom', 'joint_states', 'command', 'battery_state')
 EVENTS = ('supervisor/state', 'disturbance', 'diagnostics')
-TARGETS = ('target_pose', 'target_trajectory')      # with any quality of service
-MOST_EVENTS = 200       # of one topic that are kept until the next picture
+NEWEST = Qos(1, reliable=False)
+SPIN = 0.01             # s of a picture's 33 ms in which messages are received
 NICENESS = 10           # of the view; the nodes of the flight have precedence
 
 
-def join(name: str, domain: int | None = None, namespace: str = '',
-         discovery: str | None = None):
+class Client:
     """
-    Make a node with its own context and executor; return (node, executor).
+    A node with its own context; it receives messages only while it spins.
 
     Raises:
-        ParameterError: invalid namespace or range of discovery.
+        ParameterError: invalid namespace.
 
     """
-    confine(requested=discovery)
-    context = rclpy.Context()
-    rclpy.init(args=[], context=context, domain_id=domain,
-               signal_handler_options=SignalHandlerOptions.NO)
-    try:
-        node = rclpy.create_node(name, context=context, namespace=namespace)
-    except NameValidationException as error:
-        context.try_shutdown()
-        raise ParameterError(f"--namespace '{namespace}': {str(error).splitlines()[0]}") from None
-    executor = runner.make_executor(context)
-    executor.add_node(node)
-    return node, executor
+
+    def __init__(self, name: str, domain: int | None = None, namespace: str = ''):
+        confine()
+        context = rclpy.Context()
+        rclpy.init(args=[], context=context, domain_id=domain,
+                   signal_handler_options=SignalHandlerOptions.NO)
+        try:
+            self._node = rclpy.create_node(name, context=context, namespace=namespace)
+        except NameValidationException as error:
+            context.try_shutdown()
+            raise ParameterError(f"--namespace '{namespace}': "
+                                 f'{str(error).splitlines()[0]}') from None
+        self._executor = runner.make_executor(context)
+        self._executor.add_node(self._node)
+
+    def spin_steadily(self, seconds: float) -> None:
+        """Process messages for ``seconds`` of steady time."""
+        deadline = time.monotonic() + seconds
+        while (left := deadline - time.monotonic()) > 0:
+            self._executor.spin_once(timeout_sec=left)
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._node.destroy_node()
+        self._node.context.try_shutdown()
 
 
-def leave(node) -> None:
-    """Destroy a node of :func:`join` and its context."""
-    node.destroy_node()
-    node.context.try_shutdown()
-
-
-class Operator:
+class Operator(Client):
     """
-    A node with its own context; it receives messages only during calls of its methods.
-
-    With simulated time, seconds are those of /clock.
+    Calls services and watches states; with simulated time, seconds are those of /clock.
 
     Attributes:
-        controller: name of the watched controller.
-        state: state of the supervisor, '' before the first message.
+        state, states: newest state of the supervisor, '' before the first message; all of them.
         progress: state of reference_node, '' before the first message.
         bridges: bridge node -> its newest state.
-        commands: number of commands of the watched controller.
+        controller: name of the watched controller.
         diagnostics: status name -> newest :class:`Diagnostic`.
 
     """
 
     def __init__(self, domain: int, controller: str = registry.DEFAULT):
-        """Join ``domain`` and count the commands of ``controller``."""
+        super().__init__('operator', domain)
         self.controller = controller
-        self._node, self._executor = join('operator', domain)
         self.state = self.progress = ''
         self.states: list[str] = []
         self.bridges: dict[str, str] = {}
-        self.commands = 0
         self.diagnostics: dict[str, Diagnostic] = {}
         self._simulated: float | None = None
         node = self._node
@@ -116,12 +114,8 @@ class Operator:
         for bridge in BRIDGES:
             wire.subscribe(node, f"{bridge.removesuffix('_node')}/state",
                            partial(self.bridges.__setitem__, bridge))
-        node.create_subscription(wire.message_class(command_topic(controller).type),
-                                 f'{controller}/command', self._on_command, wire.profile(SENSOR),
-                                 raw=True)
         wire.subscribe(node, 'diagnostics', lambda statuses: self.diagnostics.update(
             (status.name, status) for status in statuses))
-        self._diagnostics = wire.Publisher(node, 'diagnostics')
         self._clients = {name: node.create_client(Trigger, f'{SUPERVISOR}/{name}')
                          for name in SERVICES}
 
@@ -132,9 +126,6 @@ class Operator:
         state = text.partition(':')[0]
         self.state = text if state == 'flying' else state
         self.states.append(text)
-
-    def _on_command(self, _):
-        self.commands += 1
 
     def time(self) -> float:
         """Return simulated time if it is used, else steady time [s]."""
@@ -147,8 +138,8 @@ class Operator:
 
     @property
     def ready(self) -> bool:
-        """Whether the supervisor can be called and the controller commands."""
-        return self.commands > 0 and self.answers
+        """Whether the supervisor can be called and the controller runs."""
+        return f'{self.controller}_node: controller' in self.diagnostics and self.answers
 
     def waits_for(self, bridges: Sequence[str]) -> str:
         """Return the states of the bridges that are not ready, '' if all are."""
@@ -204,45 +195,24 @@ class Operator:
         found = self.diagnostics.get(status)
         return found.values if found else {}
 
-    def report(self, name: str, text: str, values: dict) -> None:
-        """Publish a status on ``diagnostics``, from where it gets into the bag."""
-        self._diagnostics.publish([Diagnostic(
-            self._node.get_clock().now().nanoseconds * 1e-9, name, nodes.OK, text,
-            nodes.texts(values))])
-
-    def close(self) -> None:
-        """Leave the graph."""
-        leave(self._node)
-
 
 # --- beetle_omni check --------------------------------------------------------------------------
 
-def listen(seconds: float, namespace: str = '', discovery: str | None = None
-           ) -> findings.ObservedGraph:
-    """
-    Record the traffic of a graph for ``seconds``; publishes nothing.
-
-    Raises:
-        ParameterError: invalid namespace or range of discovery.
-
-    """
-    node, executor = join('check', namespace=namespace, discovery=discovery)
+def listen(seconds: float, namespace: str = '') -> findings.ObservedGraph:
+    """Record the traffic of a graph for ``seconds``; publishes nothing."""
+    client = Client('check', namespace=namespace)
+    node = client._node
     try:
         graph = findings.ObservedGraph(node.context.get_domain_id(), seconds,
                                        {topic: findings.Stream() for topic in SENSORS})
         for topic in SENSORS:
-            node.create_subscription(
-                wire.message_class(TOPICS[topic].type), topic,
-                partial(_observe, node, TOPICS[topic], graph.streams[topic]), wire.profile(LOG),
-                raw=True)
+            wire.subscribe_raw(node, topic, partial(
+                _observe, node, TOPICS[topic], graph.streams[topic]), LOG)
         for bridge in findings.BRIDGES:
             wire.subscribe(node, f'{bridge}/state', partial(graph.states.__setitem__, bridge))
         wire.subscribe(node, 'diagnostics', lambda statuses: graph.diagnostics.update(
-            (status.name, findings.Status(status.level, status.message, status.values))
-            for status in statuses))
-        deadline = time.monotonic() + seconds
-        while (left := deadline - time.monotonic()) > 0:
-            executor.spin_once(timeout_sec=left)
+            (status.name, status) for status in statuses))
+        client.spin_steadily(seconds)
         for topic, stream in graph.streams.items():
             for publisher in node.get_publishers_info_by_topic(topic):
                 if publisher.topic_type == TOPICS[topic].type:
@@ -250,7 +220,7 @@ def listen(seconds: float, namespace: str = '', discovery: str | None = None
                 elif publisher.topic_type not in stream.other_types:
                     stream.other_types.append(publisher.topic_type)
     finally:
-        leave(node)
+        client.close()
     return graph
 
 
@@ -270,65 +240,31 @@ def _observe(node, topic, stream, data):
 
 # --- beetle_omni view ---------------------------------------------------------------------------
 
-class LiveGraph:
+class LiveGraph(Client):
     """
     ROS side of the page; implements :class:`~beetle_omni_ros.view.live.Graph`.
 
     Targets and selections of a controller are sent only if ``writable``.
-
-    Raises:
-        ParameterError: invalid namespace or range of discovery.
-
     """
 
-    def __init__(self, namespace: str = '', domain: int | None = None,
-                 discovery: str | None = None, writable: bool = False):
-        self._node, self._executor = join('view', domain, namespace, discovery)
+    def __init__(self, namespace: str = '', domain: int | None = None, writable: bool = False):
+        super().__init__('view', domain, namespace)
         node = self._node
-        self._lock = threading.Lock()
-        self._newest: dict[str, bytes] = {}
-        self._waiting: dict[str, list[bytes]] = defaultdict(list)
-        for topic in SHOWN:
-            self._subscribe(topic, partial(self._keep, topic), SENSOR)
-        for topic in EVENTS:
-            self._subscribe(topic, partial(self._queue, topic))
-        for topic in TARGETS:
-            wire.subscribe_any(node, topic, partial(self._queue, topic))
+        self._write: Callable[[str, Any], None] = lambda topic, value: None
+        for topic in (*SHOWN, *EVENTS, *TARGETS):
+            wire.subscribe(node, topic, partial(self._take, topic),
+                           NEWEST if topic in SHOWN else None)
         self._targets = wire.Publisher(node, 'target_pose') if writable else None
         self._setting = node.create_client(SetParameters, f'{SUPERVISOR}/set_parameters') \
             if writable else None
-        self._stopped = threading.Event()
-        self._thread = threading.Thread(target=self._spin, daemon=True)
-        self._thread.start()
 
-    def _spin(self):
-        while not self._stopped.is_set():
-            self._executor.spin_once(timeout_sec=0.2)
-
-    def _keep(self, topic, data):
-        with self._lock:
-            self._newest[topic] = data
-
-    def _subscribe(self, topic, callback, qos=None):
-        entry = topic_of(topic)
-        self._node.create_subscription(wire.message_class(entry.type), topic, callback,
-                                       wire.profile(qos or entry.qos), raw=True)
-
-    def _queue(self, topic, data, _=None):
-        with self._lock:
-            if len(self._waiting[topic]) < MOST_EVENTS:
-                self._waiting[topic].append(data)
+    def _take(self, topic, value):
+        self._write(topic, value)
 
     def take(self, newest) -> None:
         """Write the messages since the last call to a view.live.Newest."""
-        with self._lock:
-            latest, self._newest = self._newest, {}
-            waiting, self._waiting = self._waiting, defaultdict(list)
-        for topic, data in (*latest.items(), *((topic, data) for topic, queue in waiting.items()
-                                               for data in queue)):
-            known = topic_of(topic)
-            with suppress(Exception):   # broken bytes raise anything; the nodes report refusals
-                newest.write(topic, known.take(from_bytes(data, known.type)))
+        self._write = newest.write
+        self.spin_steadily(SPIN)
 
     def controllers(self) -> list[str]:
         """Return the names of the controllers whose command topic exists."""
@@ -354,24 +290,12 @@ class LiveGraph:
         request = wire.parameter_request('controller', controller)
         self._setting.call_async(request).add_done_callback(done)
 
-    def close(self) -> None:
-        """Leave the graph."""
-        self._stopped.set()
-        self._thread.join(2.0)
-        leave(self._node)
 
-
-def run_live(*, namespace: str = '', domain_id: int | None = None, discovery: str | None = None,
-             robot: Path | None = None, urdf: Path | None = None, host: str, port: int,
+def run_live(*, namespace: str = '', domain_id: int | None = None, robot: Path | None = None,
+             urdf: Path | None = None, host: str, port: int,
              dark: bool = False, allow_targets: bool = False,
              console: Console | None = None) -> None:
-    """
-    Show a running graph until Ctrl-C; arguments are the options of `beetle_omni view`.
-
-    Raises:
-        ParameterError: unusable input.
-
-    """
+    """Show a running graph until Ctrl-C; arguments are the options of `beetle_omni view`."""
     from beetle_omni_ros.robot.urdf import Model
     from beetle_omni_ros.view.live import Live
     from beetle_omni_ros.view.recorded import announce
@@ -379,7 +303,7 @@ def run_live(*, namespace: str = '', domain_id: int | None = None, discovery: st
     runner.end_with_parent()
     model, parameters = Model.load(urdf), RobotParameters.load(robot)
     with ExitStack() as stack:
-        graph = LiveGraph(namespace, domain_id, discovery, allow_targets)
+        graph = LiveGraph(namespace, domain_id, allow_targets)
         stack.callback(graph.close)
         os.nice(NICENESS)
         server = serve(host, port, dark)

@@ -6,6 +6,7 @@ of the parameter files refuse both at the start of the node, in one line that na
 """
 
 from collections.abc import Callable
+from dataclasses import make_dataclass, MISSING
 import types
 from typing import get_args, get_origin, Union
 
@@ -26,6 +27,16 @@ ROS_OWN_PREFIX = 'qos_overrides.'
 def file_parameter(what: str = 'robot file'):
     """Make the parameter of a node that names a file."""
     return schema.parameter('', doc=f'{what}; empty: the shipped one', read_only=True)
+
+
+def extended(name: str, base: type | None, fields: dict) -> type:
+    """Make a parameter class: ``base`` with more texts, numbers or lists of names."""
+    return make_dataclass(
+        name, [(key, NAMES if isinstance(entry.default, tuple) else
+                str if entry.default is MISSING else type(entry.default), entry)
+               for key, entry in fields.items()],
+        bases=(base,) if base else (), kw_only=True,
+        frozen=base is None or base.__dataclass_params__.frozen)
 
 
 def declare(node: Node, cls: type, file: str | None = None, file_key: str | None = None,

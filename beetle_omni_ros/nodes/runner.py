@@ -5,7 +5,7 @@ Runs nodes in one process: start, spin, stop; errors are one line and an exit st
 registered controller name, or the reference of a controller's class.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import contextmanager
 import ctypes
 from functools import partial
@@ -24,8 +24,7 @@ from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
 
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.nodes.graph import ARGUMENT, COMPOSED, confine, GENERIC, NODES
-from beetle_omni_ros.nodes.node import StartError
+from beetle_omni_ros.nodes.graph import COMPOSED, confine, GENERIC, NODES
 from beetle_omni_ros.robot.schema import load_yaml, ParameterError
 
 OK, FAILED, UNUSABLE = 0, 1, 2
@@ -39,50 +38,39 @@ ENDING = (signal.SIGINT, signal.SIGTERM)
 
 
 def main(name: str) -> None:
-    """Entry point of a node's executable."""
-    kind = node_class(name)
-    usage = f'usage: {name} [{ARGUMENT} RANGE] [--ros-args -p KEY:=VALUE --params-file FILE ...]'
-    rest = _own_arguments(name, f'{usage}\n\n{(kind.__doc__ or "").strip()}')
-    if rest:
-        sys.exit(_fail(name, f"unknown argument '{rest[0]}'; {usage}", UNUSABLE))
-    sys.exit(run({name: kind}, sys.argv, name))
-
-
-def composed() -> None:
-    """Run the named nodes on one events executor."""
-    usage = ('usage: composed NODE... [--discovery RANGE] [--ros-args -p NODE:KEY:=VALUE ...]; '
-             f"NODE: {', '.join(NODES)}, a controller's name, {registry.CLASS}")
-    names = _own_arguments(COMPOSED, usage)
-    unknown = [name for name in names if name not in NODES and ':' not in name
-               and name not in registry.names()]
-    if unknown or not names or len(set(names)) < len(names):
-        problem = f"unknown node '{unknown[0]}'" if unknown else 'each node once, at least one'
-        sys.exit(_fail(COMPOSED, f'{problem}; {usage}', UNUSABLE))
+    """Entry point of an executable: of one node, or of `composed`."""
+    usage = f'usage: {name} [--ros-args -p KEY:=VALUE --params-file FILE ...]'
+    if name == COMPOSED:
+        usage = (f"usage: {name} NODE... [--ros-args -p NODE:KEY:=VALUE ...]; NODE: "
+                 f"{', '.join(NODES)}, a controller's name, {registry.CLASS}")
     try:
-        nodes = {name: node_class(name) if name in NODES else
-                 partial(node_class(GENERIC), registry.find(name)) for name in names}
-    except ModuleNotFoundError as error:
-        sys.exit(_fail(COMPOSED, f"a node needs the Python package '{error.name}'; what bridges "
-                       "need installs the extra 'hardware' of beetle_omni_ros", UNUSABLE))
+        rest = _own_arguments()
+        if rest and rest[0] in ('-h', '--help'):
+            print(usage)
+            sys.exit(OK)
+        names, unknown = (rest, []) if name == COMPOSED else ([name], rest)
+        unknown += [each for each in names if each not in NODES and ':' not in each
+                    and each not in registry.names()]
+        if unknown or not names or len(set(names)) < len(names):
+            raise ParameterError((f"unknown '{unknown[0]}'" if unknown else
+                                  'each node once, at least one') + f'; {usage}')
     except ParameterError as error:
-        sys.exit(_fail(COMPOSED, error, UNUSABLE))
-    sys.exit(run(nodes, [each for each in sys.argv if each not in names], COMPOSED))
+        sys.exit(_fail(name, error, UNUSABLE))
+    sys.exit(run(names, [each for each in sys.argv if each not in names], name))
 
 
-def node_class(name: str) -> type:
-    """Import the class of a node's executable: ekf_node -> EkfNode."""
-    kind = ''.join(part.capitalize() for part in name.split('_'))
-    return getattr(import_module(f'{__package__}.{NODES[name]}'), kind)
+def maker(name: str) -> Callable:
+    """Import what makes the node of an executable, or of a controller by name or reference."""
+    module, _, kind = NODES.get(name, NODES[GENERIC]).partition(':')
+    made = getattr(import_module(f'{__package__}.{module}'), kind)
+    if name == GENERIC or NODES.get(name) not in (None, NODES[GENERIC]):
+        return made
+    return partial(made, registry.find(name.removesuffix('_node')))
 
 
-def run(nodes_to_make: Mapping[str, Callable], argv: Sequence[str], name: str) -> int:
+def run(names: Sequence[str], argv: Sequence[str], name: str) -> int:
     """
     Run nodes on one events executor until a signal or a fatal error.
-
-    Args:
-        nodes_to_make: name of each node -> its class, called without arguments.
-        argv: program name and ROS arguments.
-        name: name of the process in messages.
 
     Returns:
         Exit status: 0 stopped by a signal, 1 failed, 2 unusable parameters.
@@ -96,8 +84,8 @@ def run(nodes_to_make: Mapping[str, Callable], argv: Sequence[str], name: str) -
         # rclpy's handlers would end the context while a callback still publishes.
         rclpy.init(args=list(argv), signal_handler_options=SignalHandlerOptions.NO)
         executor = make_executor()
-        for name, make in nodes_to_make.items():
-            node = make()
+        for name in names:
+            node = maker(name)()
             nodes.append(node)
             node.introduce()
             executor.add_node(node)
@@ -105,18 +93,20 @@ def run(nodes_to_make: Mapping[str, Callable], argv: Sequence[str], name: str) -
         # garbage collector of some 10 ms in a control cycle.
         gc.collect()
         gc.freeze()
-        if any(node.real_time for node in nodes):
-            sys.setswitchinterval(THREAD_SWITCH)
-            # Not for a single node: real-time processes that wait for one another delayed the
-            # simulator by a third of a second.
-            if len(nodes) > 1:
-                use_real_time_priority()
+        sys.setswitchinterval(THREAD_SWITCH)
+        # Not for a single node: real-time processes that wait for one another delayed the
+        # simulator by a third of a second.
+        if len(nodes) > 1:
+            use_real_time_priority()
         executor.spin_until_future_complete(_stop_on_signal(), FOREVER)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except ParameterError as error:
         status = _fail(name, error, UNUSABLE)
-    except (StartError, OSError) as error:
+    except ModuleNotFoundError as error:
+        status = _fail(name, f"needs the Python package '{error.name}': "
+                       'docs/how-to/install.md', UNUSABLE)
+    except OSError as error:
         status = _fail(name, error, FAILED)
     finally:
         # A second signal, forwarded by a launch system, must not interrupt the clean-up.
@@ -128,28 +118,17 @@ def run(nodes_to_make: Mapping[str, Callable], argv: Sequence[str], name: str) -
     return status
 
 
-def _own_arguments(name, help_text):
-    """Apply ``--discovery RANGE``, print the help; return what is not for ROS either."""
+def _own_arguments():
+    """Return the arguments that are not for ROS."""
+    for flag, path in zip(sys.argv, sys.argv[1:]):
+        if flag == '--params-file':     # by file and line; ROS would print a traceback
+            load_yaml(path)
     try:
-        for flag, path in zip(sys.argv, sys.argv[1:]):
-            if flag == '--params-file':     # by file and line; ROS would print a traceback
-                load_yaml(path)
-        rest, left = [], iter(remove_ros_args(list(sys.argv))[1:])
-        for argument in left:
-            flag, equals, value = argument.partition('=')
-            if flag == ARGUMENT:
-                confine(requested=(value if equals else next(left, '')) or 'nothing')
-            else:
-                rest.append(argument)
-    except Exception as error:
-        # rclpy does not export the class of its error on bad arguments.
-        if not isinstance(error, ParameterError) and 'ROSArgs' not in type(error).__name__:
+        return remove_ros_args(list(sys.argv))[1:]
+    except Exception as error:      # rclpy does not export the class
+        if 'ROSArgs' not in type(error).__name__:
             raise
-        sys.exit(_fail(name, error, UNUSABLE))
-    if rest and rest[0] in ('-h', '--help'):
-        print(help_text)
-        sys.exit(OK)
-    return rest
+        raise ParameterError(str(error)) from None
 
 
 def make_executor(context=None):
@@ -185,12 +164,7 @@ def _stop_on_signal() -> Future:
 
 
 def use_real_time_priority():
-    """
-    Give all present threads real-time priority, if the system permits it.
-
-    This keeps commands in time on a busy computer. It is called after the start-up, which may
-    compile for seconds. Linux reserves 5 % of the processor for other processes.
-    """
+    """Give all present threads real-time priority, if the system permits it."""
     try:
         for thread in os.listdir('/proc/self/task'):
             os.sched_setscheduler(int(thread), os.SCHED_RR, os.sched_param(REAL_TIME_PRIORITY))
@@ -215,16 +189,8 @@ def _fail(name, error, status):
 
 @contextmanager
 def sigterm_as_interrupt():
-    """
-    Raise KeyboardInterrupt on SIGTERM too, so that the block is cleaned up.
-
-    Further signals are ignored, so that they do not interrupt the clean-up.
-
-    Raises:
-        KeyboardInterrupt: a signal came, even if a library turned it into another exception.
-
-    """
-    received = []
+    """Raise KeyboardInterrupt on SIGTERM too, and ignore further signals during the clean-up."""
+    received = []       # a library may turn the interrupt into another exception
 
     def interrupt(number, _):
         received.append(number)

@@ -1,36 +1,34 @@
-"""ROS nodes beside the control loop: targets of a task, recorder, markers for viewers."""
+"""ROS nodes beside the control loop: targets of a task, recorder, the frame for viewers."""
 
-from dataclasses import dataclass
 from functools import partial
 import sys
 
-from geometry_msgs.msg import Point, TransformStamped
+from geometry_msgs.msg import TransformStamped
 import numpy as np
 from rcl_interfaces.srv import SetParameters
 from rclpy.event_handler import SubscriptionEventCallbacks
-from std_msgs.msg import ColorRGBA
-from visualization_msgs.msg import Marker, MarkerArray
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
 from beetle_omni_ros.messages.conversions import BODY, set_parts, set_time, WORLD
-from beetle_omni_ros.messages.topics import ALL, EVENT, LATCHED_LOG, LOG, SENSOR, topics_with
+from beetle_omni_ros.messages.topics import (
+    ALL,
+    EVENT,
+    LATCHED_LOG,
+    LOG,
+    SENSOR,
+    TARGETS,
+    topics_with,
+)
 from beetle_omni_ros.messages.values import Wrench
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.node import ERROR, FlightNode, OK, WARN
 from beetle_omni_ros.nodes.parameters import file_parameter
-from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import NAMES, parameter, ParameterError
+from beetle_omni_ros.robot.schema import parameter, ParameterError
 from beetle_omni_ros.robot.urdf import description
 from beetle_omni_ros.runs.bag import BagError
 from beetle_omni_ros.runs.bag_writer import BagWriter, COMPRESSIONS
 from beetle_omni_ros.runs.tasks import make_task, TaskPlayer, WITH_WRENCHES
-
-try:
-    from tf2_msgs.msg import TFMessage
-except ImportError:     # a ROS from PyPI, for which there is no viewer of frames either
-    TFMessage = None
 
 PERIOD = 0.02           # s between updates of the task
 IMPULSE_PERIOD = 0.005  # s, the same for tasks with impulses of 50 ms
@@ -40,19 +38,10 @@ WINDOW, WINDOW_PERIOD, WINDOW_SAMPLE = 3.0, 1.5, 0.05   # s
 WRITE_PERIOD = 0.02     # s between writes of the received messages, so that no callback waits
 FLUSH_WRITES = 20       # writes between flushes; a crash loses only messages after the last one
 HELD = 1000             # messages at most that wait for the first simulated time
-ANY_QOS = 'target_pose', 'target_trajectory'    # recorded with any quality of service
-BODY_COLOUR, THRUST_COLOUR, TARGET_COLOUR = (0.3, 0.3, 0.35), (0.9, 0.5, 0.1), (0.2, 0.7, 0.3)
+FRAME_PERIOD = 0.02     # s between two transforms
 
 
 # --- targets ------------------------------------------------------------------------------------
-
-@dataclass(frozen=True, kw_only=True)
-class ReferenceNodeParameters:
-    """Parameters of reference_node."""
-
-    task: str = parameter('hover', doc='name of a task, or a CSV file of poses', read_only=True)
-    seed: int = parameter(0, doc='seed of random poses', low=0, high=2**31 - 1, read_only=True)
-
 
 class ReferenceNode(FlightNode):
     """
@@ -63,7 +52,10 @@ class ReferenceNode(FlightNode):
     """
 
     def __init__(self):
-        super().__init__('reference_node', ReferenceNodeParameters)
+        super().__init__(
+            'reference_node',
+            task=parameter('hover', doc='name of a task, or a CSV file of poses', read_only=True),
+            seed=parameter(0, doc='seed of random poses', low=0, high=2**31 - 1, read_only=True))
         self._task = make_task(self.parameters.task, self.parameters.seed)
         self._player = self._odom = self._trajectory = None
         self._window_end = 0.0
@@ -78,13 +70,9 @@ class ReferenceNode(FlightNode):
         disturbed = self._task.kind in WITH_WRENCHES
         if disturbed:       # the loss of control ends tasks with rising levels
             self.listen('odom', partial(setattr, self, '_odom'), qos=SENSOR)
-        self.health.report('task', lambda: (OK, self._state, {'task': self._task.name}))
+        self.report('task', lambda: (OK, self._state, {'task': self._task.name}))
         self.create_timer(IMPULSE_PERIOD if disturbed else PERIOD, self._on_timer,
                           clock=self.flight_clock)
-
-    def waits_for(self):
-        """Return the trigger of the task."""
-        return f"'flying' on supervisor/state; then flies task '{self._task.name}'"
 
     def _set_state(self, state):
         if state != self._state:
@@ -140,26 +128,18 @@ class ReferenceNode(FlightNode):
 
 # --- recorder -----------------------------------------------------------------------------------
 
-@dataclass(frozen=True, kw_only=True)
-class RecorderNodeParameters:
-    """Parameters of recorder_node."""
-
-    bag: str = parameter(doc='folder to create for the bag', read_only=True)
-    controllers: NAMES = parameter(
-        tuple(registry.standing_by()), read_only=True,
-        doc='registered controllers whose commands are recorded')
-    urdf_file: str = file_parameter('robot description for the recorded frames')
-    compression: str = parameter('none', choices=COMPRESSIONS, read_only=True,
-                                 doc='compression of the chunks in the MCAP file')
-
-
 class RecorderNode(FlightNode):
     """Writes the messages of every topic of the package into a bag, like ``ros2 bag record``."""
 
-    real_time = True        # the times of receipt in the bag are measurements
-
     def __init__(self):
-        super().__init__('recorder_node', RecorderNodeParameters)
+        super().__init__(
+            'recorder_node',
+            bag=parameter(doc='folder to create for the bag', read_only=True),
+            controllers=parameter(tuple(registry.standing_by()), read_only=True,
+                                  doc='registered controllers whose commands are recorded'),
+            urdf_file=file_parameter('robot description for the recorded frames'),
+            compression=parameter('none', choices=COMPRESSIONS, read_only=True,
+                                  doc='compression of the chunks in the MCAP file'))
         topics = topics_with(self.parameters.controllers)
         self._bag = None
         try:
@@ -175,19 +155,15 @@ class RecorderNode(FlightNode):
         prefix = self.get_namespace().rstrip('/') + '/'
         for name, topic in {**ALL, **topics}.items():
             keep = partial(self._keep, prefix + name, topic.type)
-            if name in ANY_QOS:
+            if name in TARGETS:
                 wire.subscribe_any(self, name, keep, depth=50, on_lost=self._on_lost)
-                continue
-            self.create_subscription(
-                wire.message_class(topic.type), name, lambda data, keep=keep: keep(data),
-                wire.profile(LATCHED_LOG if topic.qos.latched else LOG), raw=True,
-                event_callbacks=SubscriptionEventCallbacks(message_lost=self._on_lost))
-        self.health.report('bag', self._bag_status)
+            else:
+                wire.subscribe_raw(
+                    self, name, lambda data, keep=keep: keep(data),
+                    LATCHED_LOG if topic.qos.latched else LOG,
+                    event_callbacks=SubscriptionEventCallbacks(message_lost=self._on_lost))
+        self.report('bag', self._bag_status)
         self.create_timer(WRITE_PERIOD, self._write, clock=self.steady_clock)
-
-    def waits_for(self):
-        """Return what is recorded where; a recorder needs no particular input."""
-        return f'messages, and writes them to {self.parameters.bag}'
 
     def _keep(self, topic, message_type, data, _=None):
         self._received.append((topic, message_type, data, self.now()))
@@ -229,46 +205,21 @@ class RecorderNode(FlightNode):
             print(f'recorder_node: error: {error}', file=sys.stderr)
 
 
-# --- markers ------------------------------------------------------------------------------------
-
-@dataclass(frozen=True, kw_only=True)
-class ViewerNodeParameters:
-    """Parameters of viewer_node."""
-
-    robot_file: str = file_parameter()
-    frame_rate: float = parameter(50.0, doc='rate of the frame', unit='Hz', low=0.5, high=200,
-                                  read_only=True)
-    rate: float = parameter(20.0, doc='rate of the markers', unit='Hz', low=0.5, high=100,
-                            read_only=True)
-    newton_per_metre: float = parameter(40.0, doc='thrust that is drawn as one metre',
-                                        unit='N/m', low=1, high=1000, read_only=True)
-
+# --- viewers ------------------------------------------------------------------------------------
 
 class ViewerNode(FlightNode):
-    """Publishes the transform from world to base_link, and markers, for RViz and Foxglove."""
+    """Publishes the transform from world to base_link for RViz and Foxglove."""
 
     def __init__(self):
-        super().__init__('viewer_node', ViewerNodeParameters)
-        given = self.parameters
-        self._robot = RobotParameters.load(given.robot_file or None)
-        if TFMessage is not None:
-            self._transforms = self.create_publisher(TFMessage, '/tf', wire.profile(EVENT))
-            self.create_timer(1 / given.frame_rate, self._move, clock=self.steady_clock)
-        self._markers = self.create_publisher(MarkerArray, 'markers', wire.profile(EVENT))
-        self._odom = self._joints = self._command = self._target = None
-        self._moved = None      # stamp of the estimate that the frame shows
-        self.listen('odom', partial(setattr, self, '_odom'), qos=SENSOR)
-        self.listen('joint_states', partial(setattr, self, '_joints'))
-        self.listen('command', partial(setattr, self, '_command'), qos=SENSOR, stale_after=None)
-        self.listen('target_pose', partial(setattr, self, '_target'), any_qos=True,
-                    stale_after=None)
-        self.create_timer(1 / given.rate, self._draw, clock=self.steady_clock)
+        super().__init__('viewer_node')
+        self._message = wire.message_class('tf2_msgs/msg/TFMessage')    # not on PyPI
+        self._transforms = self.create_publisher(self._message, '/tf', wire.profile(EVENT))
+        self._moved = 0.0       # stamp of the estimate that the frame shows
+        self.listen('odom', self._on_odom, qos=SENSOR)
 
-    def _move(self):
-        """Publish the frame of the body, if there is a subscription."""
-        odom = self._odom
-        if odom is None or odom.stamp == self._moved or \
-                not self._transforms.get_subscription_count():
+    def _on_odom(self, odom):
+        if not self._transforms.get_subscription_count() \
+                or 0 <= odom.stamp - self._moved < FRAME_PERIOD:
             return
         self._moved = odom.stamp
         frame = TransformStamped(child_frame_id=BODY)
@@ -276,38 +227,4 @@ class ViewerNode(FlightNode):
         frame.header.frame_id = WORLD
         set_parts(frame.transform.translation, odom.position)
         set_parts(frame.transform.rotation, odom.quaternion)
-        self._transforms.publish(TFMessage(transforms=[frame]))
-
-    def _draw(self):
-        if self._odom is None or not self._markers.get_subscription_count():
-            return
-        odom, markers = self._odom, MarkerArray()
-        to_world = rotations.matrix(odom.quaternion)
-        centres = odom.position + self._robot.rotors.positions @ to_world.T
-        lines = [point for centre in centres for point in (odom.position, centre)]
-        markers.markers.append(self._marker('body', Marker.LINE_LIST, lines, 0.02, BODY_COLOUR))
-        if self._joints is not None and self._command is not None:
-            thrust = self._command.thrust / self.parameters.newton_per_metre
-            for k, axis in enumerate(self._robot.tilt_axes):
-                tilt = rotations.matrix(rotations.exp(axis * self._joints.position[k]))
-                tip = centres[k] + thrust[k] * to_world @ tilt[:, 2]
-                markers.markers.append(self._marker(
-                    f'rotor{k + 1}', Marker.ARROW, [centres[k], tip], 0.03, THRUST_COLOUR))
-        if self._target is not None:
-            axes = rotations.matrix(self._target.quaternion)
-            ends = [end for axis in axes.T
-                    for end in (self._target.position, self._target.position + 0.3 * axis)]
-            markers.markers.append(
-                self._marker('target', Marker.LINE_LIST, ends, 0.01, TARGET_COLOUR))
-        self._markers.publish(markers)
-
-    def _marker(self, name, kind, points, width, colour):
-        marker = Marker(ns=name, type=kind, action=Marker.ADD)
-        marker.header.frame_id = WORLD
-        set_time(marker.header.stamp, self._odom.stamp)
-        marker.scale.x = width
-        marker.scale.y = marker.scale.z = 2 * width
-        marker.pose.orientation.w = 1.0
-        marker.color = ColorRGBA(**dict(zip('rgb', colour)), a=1.0)
-        marker.points = [Point(**dict(zip('xyz', map(float, p)))) for p in points]
-        return marker
+        self._transforms.publish(self._message(transforms=[frame]))

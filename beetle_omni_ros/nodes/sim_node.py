@@ -13,7 +13,7 @@ from beetle_omni_ros.messages.conversions import set_time
 from beetle_omni_ros.messages.topics import SENSOR
 from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes import wire
-from beetle_omni_ros.nodes.node import CommandSource, Distribution, ERROR, FlightNode, OK, WARN
+from beetle_omni_ros.nodes.node import Distribution, ERROR, FlightNode, OK, WARN
 from beetle_omni_ros.nodes.parameters import file_parameter
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import group, parameter, ParameterError
@@ -32,8 +32,7 @@ from beetle_omni_ros.sim.simulator import Simulator
 # Ticks that are caught up after a stall of the computer; more would delay the next ones.
 CATCH_UP_TICKS = 8
 EARLY = 0.3             # part of a tick that the timer may come before the tick
-PHASE_WINDOW = 50       # calls of the timer from which its phase is estimated
-SLEW = 0.01             # largest shift of a tick towards the timer's phase, in ticks
+SLEW = 0.01             # largest shift of a tick to a later time, in ticks
 # Simulated time waits for a node that is farther behind than in real time, where the newest sample
 # is one period old. It does not wait for a node that has stopped.
 LAG = 0.02              # s between the newest sample and the newest answered one
@@ -58,8 +57,6 @@ class RealTimePacing:
     def __init__(self, tick: float, clock: Callable[[], float]):
         self._tick, self._clock = tick, clock
         self.epoch: float | None = None
-        self._lateness: list[float] = []
-        self._slew = 0.0
         self.ticks = self.lost_ticks = 0
 
     def due(self) -> int:
@@ -74,26 +71,13 @@ class RealTimePacing:
             self.epoch += lost * tick
             due -= lost
         due = max(due, 0)
-        self._follow_timer(now, due)
         self.ticks += due
-        return due
-
-    def _follow_timer(self, now, due):
-        """
-        Shift the ticks towards the times at which the timer fires.
-
-        The phase of the timer is unknown at first. If ticks were always due some milliseconds
-        before the timer, every stamp would be too old by this time.
-        """
         if due:
-            self._lateness.append(now - self.epoch - (self.ticks + due) * self._tick)
-        if len(self._lateness) == PHASE_WINDOW:
-            self._slew = min(self._lateness)
-            self._lateness.clear()
-        limit = SLEW * self._tick
-        step = min(max(self._slew, -limit), limit)
-        self._slew -= step
-        self.epoch += step
+            # The phase of the timer is unknown. If ticks were always due some milliseconds before
+            # it fires, every stamp would be too old by this time. So ticks come earlier at once,
+            # and later slowly.
+            self.epoch += min(now - self.epoch - self.ticks * tick, SLEW * tick)
+        return due
 
 
 class SimulatedTimePacing:
@@ -101,18 +85,8 @@ class SimulatedTimePacing:
     Ticks of simulated time: one each time the timer fires, none while a node is late.
 
     On a slow computer, time passes more slowly and no deadline is missed. For a node that has
-    stopped, simulated time waits once.
-
-    Args:
-        tick: period [s].
-        epoch: time of the stamps at which simulated time is zero [s].
-        steady: steady clock [s].
-
-    Attributes:
-        ticks: number of ticks so far.
-        lost_ticks: 0, as no tick is lost.
-        sent: stamp of the newest published sample.
-
+    stopped, simulated time waits once. ``epoch`` is the time of the stamps at which simulated time
+    is zero, ``sent`` the stamp of the newest published sample.
     """
 
     lost_ticks = 0
@@ -181,8 +155,6 @@ class SimNode(FlightNode):
     and supervisor have answered the newest samples.
     """
 
-    real_time = True
-
     def __init__(self):
         self._devices: EmulatedActuators | None = None
         self._clock_publisher = None
@@ -199,10 +171,11 @@ class SimNode(FlightNode):
         self._publish_to = {
             'mocap': self.publisher('mocap/pose'), 'imu': self.publisher('imu/data_raw')}
         self._truth = self.publisher('ground_truth/odom')
-        self.listen('disturbance', self._on_wrench, stale_after=None)
-        self.health.track_compute(self._simulator.tick)
-        self.health.report('pacing', self._pacing_status)
-        self.health.report('robot', self._robot_status)
+        self.listen('disturbance', lambda wrench: self._simulator.set_wrench(
+            wrench.force, wrench.torque), stale_after=None)
+        self.track_compute(self._simulator.tick)
+        self.report('pacing', self._pacing_status)
+        self.report('robot', self._robot_status)
         if given.actuators == 'emulated':
             self._make_devices()
         else:
@@ -231,9 +204,8 @@ class SimNode(FlightNode):
         self._publish_to['joints'] = self.publisher('joint_states')
         self._publish_to['battery'] = self.publisher('battery_state')
         self._publish_to['rotors'] = self.publisher('rotor_states')
-        self.listen('command', self._on_command, read=CommandSource(self).read,
-                    max_age=COMMAND_AGE)
-        self.health.report('latency', lambda: self._latency.status(
+        self.listen('command', self._on_command, max_age=COMMAND_AGE)
+        self.report('latency', lambda: self._latency.status(
             'stamp of the answered IMU sample to the arrival of its command'))
 
     def _make_devices(self):
@@ -246,21 +218,12 @@ class SimNode(FlightNode):
             servos.ids.astype(int).tolist(), port=given.servo_port or None,
             baud_rate=servos.baud_rate, signs=servos.signs.astype(int).tolist(),
             zeros=servos.zeros.astype(int).tolist(), seed=given.seed)
-        try:
-            board = EmulatedMotorBoard(self._robot, seed=given.seed,
-                                       port=given.board_port or None)
-        except Exception:
-            bus.close()
-            raise
+        board = EmulatedMotorBoard(self._robot, seed=given.seed, port=given.board_port or None)
         self._devices = EmulatedActuators(self._simulator, bus, board)
         self._step = self._devices.step
-        self.health.report('devices', self._devices_status)
+        self.report('devices', self._devices_status)
         self.get_logger().info(f'servos at {bus.port}, motor board at {board.port}')
-        try:
-            self._devices.set_faults(given.servo_faults, given.board_faults)
-        except ParameterError:
-            self.close()
-            raise
+        self._devices.set_faults(given.servo_faults, given.board_faults)
         self._reset_events([self.get_parameter(name) for name in EVENTS])
         self.add_post_set_parameters_callback(self._reset_events)
 
@@ -298,12 +261,9 @@ class SimNode(FlightNode):
     @staticmethod
     def _refuse_faults(given):
         """Refuse faults of emulated devices if there are none."""
-        for group_name, events in (('servo_faults', SERVO_EVENTS), ('board_faults', BOARD_EVENTS)):
-            faults = getattr(given, group_name)
-            wanted = switched_on(faults) + [name for name in events if getattr(faults, name)]
-            if wanted:
-                raise ParameterError(f'{group_name}: {wanted[0]}: there are no devices with '
-                                     'actuators direct; start with actuators:=emulated')
+        for fault in (*switched_on(given.servo_faults), *switched_on(given.board_faults)):
+            raise ParameterError(f'{fault}: there are no devices with actuators direct; start '
+                                 'with actuators:=emulated')
 
     def _reset_events(self, changed):
         """Reset the parameters of events that have happened, so that they can be set again."""
@@ -340,9 +300,6 @@ class SimNode(FlightNode):
             self._pacing.answered('command', command.stamp)
         if self._pacing.epoch is not None:
             self._simulator.command(replace(command, stamp=command.stamp - self._pacing.epoch))
-
-    def _on_wrench(self, wrench):
-        self._simulator.set_wrench(wrench.force, wrench.torque)
 
     def _pacing_status(self):
         pacing = self._pacing

@@ -15,7 +15,7 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from beetle_omni_ros.messages.bag_types import from_bytes, to_bytes
-from beetle_omni_ros.messages.topics import Qos, Topic, topic_of
+from beetle_omni_ros.messages.topics import Qos, TARGETS, Topic, topic_of
 from beetle_omni_ros.messages.values import MessageError
 
 COPIES = 64             # newest messages that are compared to detect a copy
@@ -75,61 +75,54 @@ class Publisher:
 
 def subscribe(node: Node, topic: str, handle: Callable[[Any], None],
               qos: Qos | None = None) -> None:
-    """Subscribe a topic without checks of age; ``qos`` replaces that of the table."""
+    """Subscribe without checks of age; ``qos`` replaces that of the table, or any of targets."""
     entry = topic_of(topic)
-    node.create_subscription(message_class(entry.type), topic,
-                             lambda data: handle(entry.take(message(entry, data))),
-                             profile(qos or entry.qos), raw=True)
+
+    def callback(data, _=None):
+        try:
+            handle(entry.take(message(entry, data)))
+        except MessageError as error:
+            node.get_logger().warning(f'{topic}: message refused, {error}')
+
+    if topic in TARGETS and qos is None:
+        subscribe_any(node, topic, callback)
+    else:
+        subscribe_raw(node, topic, lambda data: callback(data), qos)
 
 
-def with_publication(callback: Callable) -> Callable:
-    """
-    Make a subscription callback that also gets the time of publication.
-
-    rclpy passes the message's info if the signature has two arguments. The single-threaded
-    executor then passes two arguments, the events executor of Jazzy one tuple of both.
-
-    Args:
-        callback: called with (message, time of publication [s, system time, set by the middleware
-            of the publisher; nan if unknown]).
-
-    """
-    def take(*given):
-        message, info = given if len(given) == 2 else given[0]
-        stamp = info.get('source_timestamp')
-        callback(message, stamp * 1e-9 if stamp and stamp > 0 else math.nan)
-
-    take.__signature__ = TWO_ARGUMENTS
-    return take
+def subscribe_raw(node: Node, topic: str, callback: Callable[[bytes], None],
+                  qos: Qos | None = None, **more) -> None:
+    """Pass the CDR messages of a topic; ``qos`` replaces that of the table."""
+    entry = topic_of(topic)
+    node.create_subscription(message_class(entry.type), topic, callback,
+                             profile(qos or entry.qos), raw=True, **more)
 
 
-def subscribe_any(node: Node, topic: str, callback: Callable, *, depth: int = 10,
-                  on_lost: Callable | None = None) -> None:
+def subscribe_any(node: Node, topic: str, callback: Callable[[bytes, float], None], *,
+                  depth: int = 10, on_lost: Callable | None = None) -> None:
     """
     Receive the messages of publishers with any quality of service, each message once.
 
     A subscription of latched messages is incompatible with a volatile publisher, such as
     `ros2 topic pub`; a volatile subscription misses messages latched earlier. So there are both.
-    A message that both receive is passed on once, by its time of publication.
-
-    Args:
-        node: subscribing node.
-        topic: name.
-        callback: called with (CDR, time of publication [s, system time, or nan]).
-        depth: depth of the queues.
-        on_lost: called with rclpy's event of lost messages.
-
+    A message that both receive is passed on once, by its time of publication [s, system time, set
+    by the middleware of the publisher; nan if unknown]. ``on_lost`` gets rclpy's event of lost
+    messages.
     """
     seen: deque[float] = deque(maxlen=COPIES)
 
-    def take(data, publication):
+    def take(*given):
+        # The single-threaded executor passes two arguments, the events executor of Jazzy one
+        # tuple of both.
+        data, info = given if len(given) == 2 else given[0]
+        stamp = info.get('source_timestamp')
+        publication = stamp * 1e-9 if stamp and stamp > 0 else math.nan
         if publication not in seen:     # nan never is
             seen.append(publication)
             callback(data, publication)
 
+    take.__signature__ = TWO_ARGUMENTS      # rclpy passes the info of the message by this
     for is_latched in (False, True):
-        node.create_subscription(
-            message_class(topic_of(topic).type), topic, with_publication(take),
-            profile(Qos(depth, reliable=is_latched, latched=is_latched)), raw=True,
-            event_callbacks=SubscriptionEventCallbacks(
-                incompatible_qos=lambda event: None, message_lost=on_lost))
+        subscribe_raw(node, topic, take, Qos(depth, reliable=is_latched, latched=is_latched),
+                      event_callbacks=SubscriptionEventCallbacks(
+                          incompatible_qos=lambda event: None, message_lost=on_lost))

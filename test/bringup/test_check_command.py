@@ -13,7 +13,8 @@ import serial
 
 from beetle_omni_ros import cli
 from beetle_omni_ros.bringup.command import run_check
-from beetle_omni_ros.bringup.findings import ObservedGraph, Status
+from beetle_omni_ros.bringup.findings import ObservedGraph
+from beetle_omni_ros.messages.values import Diagnostic
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
 
@@ -77,7 +78,7 @@ def test_without_ros_the_other_parts_are_checked(robot, tmp_path, monkeypatch):
 def test_a_port_in_use_by_the_bridge_is_not_opened(robot, tmp_path):
     bus, _, _ = robot
     graph = ObservedGraph(0, 1.0, {}, {'joint_bridge': 'ready'},
-                  {'joint_bridge_node: gimbal2': Status(2, 'overload', {})})
+                  {'joint_bridge_node: gimbal2': Diagnostic(0.0, 'status', 2, 'overload', {})})
     path, packets = tmp_path / 'result.json', []
     bus.handle = lambda packet, *_: packets.append(packet) or []
     with serial.Serial(bus.port, exclusive=True):

@@ -46,10 +46,13 @@ def test_a_port_without_permission_is_reported_with_the_remedy(monkeypatch):
     assert f'no permission for {user}' in found and f'usermod -aG dialout {user}' in remedy
 
 
-@pytest.mark.parametrize(('timer', 'level'), [('16', 'fail'), ('1', 'ok'), ('', 'ok')])
-def test_product_and_latency_timer_of_an_open_port_are_reported(adapter, timer, level):
+@pytest.mark.parametrize(('timer', 'levels'), [
+    ('16', ['ok', 'fail']), ('1', ['ok', 'ok']), ('', ['ok'])])
+def test_product_and_latency_timer_of_an_open_port_are_reported(adapter, monkeypatch, timer,
+                                                                levels):
     adapter.write_text(timer)
-    findings = Findings()
-    devices._opened_port(findings, 'servo', '/dev/ttyUSB0')
-    assert [finding.level for finding in findings] == ['ok', level]
+    monkeypatch.setattr(devices, 'unusable_port', lambda path: ('', ''))
+    findings, device = Findings(), SimpleNamespace(open=lambda: None)
+    assert devices.open_port(findings, device, 'servo', '/dev/ttyUSB0', 'joint_bridge', None)
+    assert [finding.level for finding in findings] == levels
     assert 'FTDI USB' in findings[0].found

@@ -28,7 +28,7 @@ def test_a_good_bus_passes_and_its_measurements_are_reported():
     with EmulatedServoBus() as emulated:
         found = servos(emulated.port)
     assert levels(found) == {}
-    assert list(found) == ['servo port', 'servo port latency timer', 'servo bus', *NAMES]
+    assert list(found) == ['servo port', 'servo bus', *NAMES]
     assert found['gimbal3'].values == pytest.approx({
         'id': 3, 'model': 1210, 'firmware': 52, 'baud_rate': 1_000_000, 'supply_V': 12.0,
         'temperature_C': 35.0, 'position_rad': 0.0})

@@ -4,12 +4,8 @@ from check_helpers import by_item, levels, ROBOT
 import numpy as np
 import pytest
 
-from beetle_omni_ros.bringup.findings import (
-    check_topics,
-    ObservedGraph,
-    Status,
-    Stream,
-)
+from beetle_omni_ros.bringup.findings import check_topics, ObservedGraph, Stream
+from beetle_omni_ros.messages.values import Diagnostic
 
 
 def stream(rate, age, jitter=0.001, size=9.81, seconds=3.0, seed=0):
@@ -53,7 +49,7 @@ def paused():
     ('mocap', stream(90, 0.01), {'mocap/pose rate': 'warn'}),
     ('mocap', stream(50, 0.01), {'mocap/pose rate': 'fail'}),
     ('mocap', stream(240, 0.01), {'mocap/pose rate': 'warn'}),
-    ('mocap', paused(), {'mocap/pose rate': 'warn'}),
+    ('mocap', paused(), {'mocap/pose pause': 'warn'}),
     ('battery', stream(50, 0.001), {})])
 def test_rates_outside_their_limits_fail(key, made, bad):
     assert levels(judged(**{key: made})) == bad
@@ -91,13 +87,17 @@ def test_wrong_units_duplicate_publishers_frozen_and_broken_messages_are_reporte
     assert found.level == 'fail' and '7 of 600' in found.found
 
 
+def status(level, text, values):
+    return Diagnostic(0.0, '', level, text, values)
+
+
 def running(state='ready', level=0):
     made = graph(joints=stream(200, 0.002))
     made.states['joint_bridge'] = state
     made.diagnostics = {
-        'joint_bridge_node: gimbal1': Status(level, 'overload', {'voltage': '11.9'}),
-        'joint_bridge_node: inputs': Status(2, 'command silent', {}),
-        'rl_node: compute': Status(1, '', {})}
+        'joint_bridge_node: gimbal1': status(level, 'overload', {'voltage': '11.9'}),
+        'joint_bridge_node: inputs': status(2, 'command silent', {}),
+        'rl_node: compute': status(1, '', {})}
     return made
 
 

@@ -18,9 +18,7 @@ from beetle_omni_ros.runs.bag_writer import BagWriter
 from beetle_omni_ros.runs.tasks import make_task
 
 VIEWERS = share_path('viewers')
-# Topics of viewer_node beside those of a flight.
-SHOWN = {'markers': 'visualization_msgs/msg/MarkerArray',
-         'robot_description': 'std_msgs/msg/String'}
+SHOWN = {'robot_description': 'std_msgs/msg/String'}       # beside the topics of a flight
 TYPES = {**{name: topic.type for name, topic in ALL.items()}, **SHOWN}
 JOINT_STATE = 'sensor_msgs/msg/JointState'
 
@@ -80,7 +78,6 @@ def test_rviz_shows_topics_of_the_graph_with_a_quality_of_service_that_matches()
     displays = content['Visualization Manager']['Displays']
     expected = {'rviz_default_plugins/Pose': 'geometry_msgs/msg/PoseStamped',
                 'rviz_default_plugins/Odometry': 'nav_msgs/msg/Odometry',
-                'rviz_default_plugins/MarkerArray': SHOWN['markers'],
                 'rviz_default_plugins/RobotModel': SHOWN['robot_description']}
     seen = set()
     for display in displays:

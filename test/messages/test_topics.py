@@ -9,14 +9,7 @@ from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.messages import bag_types
 from beetle_omni_ros.messages.bag_types import from_bytes, read_all, to_bytes
 from beetle_omni_ros.messages.topics import ALL
-from beetle_omni_ros.messages.values import (
-    Diagnostic,
-    HealthReport,
-    MessageError,
-    Odom,
-    TargetOverride,
-    Wrench,
-)
+from beetle_omni_ros.messages.values import Diagnostic, MessageError, Odom, Wrench
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import ActuatorHealth
 from beetle_omni_ros.robot.readings import (
@@ -48,9 +41,8 @@ def value(topic, seed=0, stamp=STAMP):
         PoseTarget: lambda: PoseTarget(draw(size=3), turn, stamp),
         TrajectoryTarget: lambda: path,
         Command: lambda: Command(stamp, draw(size=4), draw(size=4)),
-        TargetOverride: lambda: TargetOverride.of(path),
-        HealthReport: lambda: HealthReport(stamp, ActuatorHealth(
-            (True, False, True, True), (None, 0.5, None, None), thrust_limit=8.75)),
+        ActuatorHealth: lambda: ActuatorHealth(
+            (True, False, True, True), (None, 0.5, None, None), thrust_limit=8.75),
         Wrench: lambda: Wrench(stamp, draw(size=3), draw(size=3)),
         str: lambda: 'flying:nmpc',
         Diagnostic: lambda: [Diagnostic(stamp, 'ekf_node: inputs', 2, 'silent', {'a': '1'}),
@@ -105,6 +97,23 @@ def test_messages_read_together_equal_those_read_one_by_one(topic, one_by_one, m
             if isinstance(mine, (float, np.ndarray)):
                 np.testing.assert_allclose(getattr(at_once, field.name)[row], mine,
                                            rtol=1e-14, atol=1e-14)
+
+
+def test_odometry_carries_the_twist_in_base_link():
+    sent = value('odom')
+    message = from_bytes(cdr('odom', sent), ALL['odom'].type)
+    twist = message.twist.twist.linear
+    assert np.allclose(rotations.matrix(sent.quaternion) @ [twist.x, twist.y, twist.z],
+                       sent.velocity)
+
+
+@pytest.mark.parametrize(('topic', 'written', 'bad', 'reason'), [
+    ('rotor_states', 'joint_states', JointReading(1.0, np.zeros(1), None), 'names are not'),
+    ('joint_states', 'joint_states', JointReading(1.0, np.zeros(1), None), 'too few'),
+    ('target_pose', 'target_pose', PoseTarget(np.zeros(3), [0, 0, 0, 0.9]), 'unit quaternion')])
+def test_a_bad_message_is_refused_with_a_reason(topic, written, bad, reason):
+    with pytest.raises(MessageError, match=reason):
+        ALL[topic].take(ALL[written].write(bad))
 
 
 def test_messages_of_several_layouts_keep_their_order():

@@ -8,15 +8,12 @@ import time
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 import numpy as np
-from sensor_msgs.msg import BatteryState, JointState
 from std_srvs.srv import Trigger
 
 from beetle_omni_ros.control.base import Command
-from beetle_omni_ros.messages.topics import SENSOR
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.graph import Graph, reserved_domain
 from beetle_omni_ros.nodes.operator import Operator
-from beetle_omni_ros.robot.parameters import JOINT_NAMES
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedBoardParameters
 
 JOINT, ROTOR = 'joint_bridge_node', 'rotor_bridge_node'
@@ -51,10 +48,8 @@ class BridgeOperator(Operator):
         self._commands = wire.Publisher(node, 'command')
         self._clients_of_bridge = {}
         wire.subscribe(node, f'{bridge.removesuffix("_node")}/state', self.bridge_states.append)
-        node.create_subscription(BatteryState, 'battery_state', self.batteries.append,
-                                 wire.profile(SENSOR))
-        node.create_subscription(JointState, 'joint_states', lambda message: self.joints.append(
-            (message, time.time())), wire.profile(SENSOR))
+        wire.subscribe(node, 'battery_state', self.batteries.append)
+        wire.subscribe(node, 'joint_states', self.joints.append)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._command, daemon=True)
         self._thread.start()
@@ -90,10 +85,9 @@ class BridgeOperator(Operator):
         return self.ask('get_state', GetState).current_state.label
 
     def go_to(self, stage):
-        path = {'unconfigured': 0, 'inactive': 1, 'active': 2}
-        end = time.monotonic() + WITHIN
-        while (here := path[self.stage]) != path[stage]:
-            name = ('configure', 'activate')[here] if here < path[stage] \
+        stages, end = ['unconfigured', 'inactive', 'active'], time.monotonic() + WITHIN
+        while (here := stages.index(self.stage)) != (there := stages.index(stage)):
+            name = ('configure', 'activate')[here] if here < there \
                 else ('cleanup', 'deactivate')[here - 1]
             # An answer may be late on a busy machine.
             assert self.change(name) or time.monotonic() < end, f'{name}: {self.now}'
@@ -118,9 +112,7 @@ class BridgeOperator(Operator):
 
     def stands_at(self, goal):
         """Whether the newest message has these angles of all joints."""
-        message = self.joints[-1][0] if self.joints else JointState()
-        return list(message.name) == list(JOINT_NAMES) and np.allclose(
-            message.position, goal, atol=3 * COUNT)
+        return bool(self.joints) and np.allclose(self.joints[-1].position, goal, atol=3 * COUNT)
 
     def close(self):
         self._stop.set()
@@ -132,8 +124,8 @@ class BridgeOperator(Operator):
 def running_bridge(folder, bridge, others=(), **parameters):
     """Run a bridge in a separate process, or composed with others; yield graph and operator."""
     with reserved_domain() as number:
-        graph = Graph({bridge: {**PATIENT[bridge], **parameters}, **{name: {} for name in others}},
-                      folder, number, composed=bool(others))
+        nodes = {bridge: {**PATIENT[bridge], **parameters}, **{name: {} for name in others}}
+        graph = Graph(nodes, folder, number, {bridge: list(nodes)})
         operator = None
         try:
             graph.start()

@@ -10,8 +10,6 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-import rclpy
-
 from beetle_omni_ros.nodes import graph
 
 
@@ -24,25 +22,8 @@ def ros_domain(monkeypatch):
 
 
 @pytest.fixture
-def make(ros_domain):
-    """Make one node in this process, with parameters such as 'seed:=3'."""
-    nodes = []
-
-    def build(node_class, *overrides):
-        arguments = [a for override in overrides for a in ('-p', override)]
-        rclpy.init(args=['--ros-args', *arguments], domain_id=ros_domain)
-        nodes.append(node_class())
-        return nodes[0]
-
-    yield build
-    for node in nodes:
-        node.destroy_node()
-    rclpy.try_shutdown()
-
-
-@pytest.fixture
 def make_bench(ros_domain):
-    """Make a bench of nodes in this process, with parameters as for ``make``."""
+    """Make a bench of nodes in this process, with parameters such as 'seed:=3'."""
     from witness import Bench
     with ExitStack() as stack:
         def build(*overrides, **options):
@@ -50,6 +31,12 @@ def make_bench(ros_domain):
             stack.callback(made.close)
             return made
         yield build
+
+
+@pytest.fixture
+def make(make_bench):
+    """Make one node in this process, with parameters such as 'seed:=3'."""
+    return lambda node_class, *overrides: make_bench(*overrides).add(node_class())
 
 
 @pytest.fixture

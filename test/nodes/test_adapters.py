@@ -68,12 +68,12 @@ def test_trajectory_windows_join_without_a_gap_and_keep_to_the_path(reference):
         clock.now += 0.02
         assert clock.now < 2200
         if node._trajectories and clock.now < path.times[-1] - 0.1:
-            window = conversions.take_trajectory(node._trajectories[-1])
+            window = conversions.read_trajectory(node._trajectories[-1])
             assert window.times[0] <= clock.now and clock.now + 1.0 < max(
                 window.times[-1], path.times[-1] - 0.1 + 1.2)
             assert np.linalg.norm(window.at(clock.now).position
                                   - path.at(clock.now).position) < 1e-3
-    assert conversions.take_trajectory(node._trajectories[0]).times[0] == pytest.approx(2008.0)
+    assert conversions.read_trajectory(node._trajectories[0]).times[0] == pytest.approx(2008.0)
 
 
 def test_a_stick_push_of_the_task_is_published_for_its_duration(reference):

@@ -82,29 +82,6 @@ def test_the_controller_steps_once_a_period_and_stamps_with_the_state(follower):
     assert len(follower._publisher) == 102
 
 
-@pytest.mark.parametrize('rate', [100, 200])
-def test_a_controller_on_standby_steps_between_the_steps_of_the_one_that_flies(follower, rate):
-    def steps_from(begin):
-        before = len(follower._publisher)
-        for stamp in begin + np.arange(rate) / rate:
-            due = round((stamp - begin) * rate) % (rate // 100) == 0
-            if due and follower._host.mode == 'flying:rl':
-                follower._command = Command(stamp, np.zeros(4), np.full(4, 7.5))
-            fly(follower, stamp)
-        return follower._publisher.stamps()[before:]
-
-    assert np.allclose(steps_from(100.0) - 100.0, 0.01 * np.arange(100), atol=1e-6)
-    follower._on_mode('flying:rl')
-    standby = steps_from(101.0)[5:]
-    if rate > 100:
-        assert np.all(np.abs((standby - 101.0) / 0.01 % 1.0 - 0.5) < 0.26)
-        assert np.allclose(np.diff(standby), 0.01, atol=1e-6)
-    else:       # no estimate in between: half the rate, within the timeout
-        assert np.allclose(np.diff(standby), 0.02, atol=1e-6)
-    follower._on_mode('flying:nmpc')
-    assert np.allclose(np.diff(steps_from(102.0)), 0.01, atol=1e-6)
-
-
 def test_the_newest_target_is_used_an_unset_stamp_means_now_and_a_landing_resets(follower):
     stamps = count(100)
 
@@ -113,9 +90,9 @@ def test_the_newest_target_is_used_an_unset_stamp_means_now_and_a_landing_resets
         return follower.follower.received[-1][1]
 
     for stamp, x in ((50.0, 1.0), (60.0, 2.0), (50.0, 3.0)):
-        follower._on_target(PoseTarget(np.array([x, 0, 0]), LEVEL, stamp))
+        follower._on_target(PoseTarget(np.array([x, 0, 1.0]), LEVEL, stamp), np.nan)
     assert target().position[0] == 2.0
-    follower._on_target(PoseTarget(np.array([4.0, 0, 0]), LEVEL, 0.0))
+    follower._on_target(PoseTarget(np.array([4.0, 0, 1.0]), LEVEL, 0.0), np.nan)
     assert target().position[0] == 4.0
     assert target().stamp == pytest.approx(follower.now(), abs=5)
     for mode in ('flying:nmpc', 'disarmed'):
@@ -160,13 +137,12 @@ def test_an_active_controller_outside_the_supervisors_list_is_refused(make):
 
 
 def test_the_plan_of_a_graph_with_another_controller():
-    nodes = graph.plan(graph.GraphOptions(controller=OWN, actuators='direct', bag='/b',
-                                        task='hover')).nodes
+    nodes, _ = graph.plan(OWN, actuators='direct', bag='/b', task='hover')
     known = ['pose_controller', *registry.standing_by()]
     assert nodes['pose_controller_node'] == {'controller': OWN}
     assert nodes['supervisor_node']['controller'] == 'pose_controller'
     for name in ('supervisor_node', 'recorder_node'):
         assert nodes[name]['controllers'] == known
     assert graph.arguments(nodes, ['ekf_node', 'pose_controller_node']) == ['ekf_node', OWN]
-    alone = graph.plan(graph.GraphOptions(controller=OWN, actuators='direct', standby=False)).nodes
-    assert list(alone) == ['sim_node', 'ekf_node', 'pose_controller_node', 'supervisor_node']
+    alone, _ = graph.plan(OWN, actuators='direct', standby=False)
+    assert list(alone) == ['ekf_node', 'pose_controller_node', 'supervisor_node', 'sim_node']

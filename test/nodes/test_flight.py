@@ -6,7 +6,6 @@ time. The robot is observed through ground_truth/odom, which does not depend on 
 """
 
 from contextlib import contextmanager
-import io
 import os
 from pathlib import Path
 import signal
@@ -15,11 +14,8 @@ import sys
 import time
 
 import numpy as np
-import pytest
-from rich.console import Console
 from witness import HEADER, READY, running_graph
 
-from beetle_omni_ros.nodes import fly
 from beetle_omni_ros.nodes.graph import in_simulated_time
 from beetle_omni_ros.runs.bag import read_bag
 
@@ -34,7 +30,8 @@ def test_switches_and_the_loss_of_recorder_reference_controller_and_estimator(ro
     parameters = {name: {} for name in (*NODES, 'rl_node')}
     parameters['recorder_node'] = {'bag': str(bag)}
     parameters['reference_node'] = {'task': str(task)}
-    with running_graph(in_simulated_time(parameters), tmp_path, ros_domain, composed=False,
+    with running_graph(in_simulated_time(parameters), tmp_path, ros_domain,
+                       groups={name: [name] for name in parameters},
                        ready=lambda one: one.ready and one.progress) as (graph, witness):
         witness.take_off(lambda: witness.progress.startswith('flying'))
         switches(witness)
@@ -86,29 +83,15 @@ def loses_one_node_after_another(graph, witness, bag):
     assert 'SIGKILL' in graph.dead()['ekf_node']
 
 
-def children(pid):
-    """Node name -> process id of the nodes that a flight started."""
-    found = {}
-    for entry in Path('/proc').glob('[0-9]*'):
-        try:
-            parent = int(entry.joinpath('stat').read_text().rsplit(')', 1)[1].split()[1])
-            words = entry.joinpath('cmdline').read_text().split('\0')
-        except OSError:
-            continue
-        if parent == pid and '-m' in words:
-            found[words[words.index('-m') + 2]] = int(entry.name)
-    return found
-
-
 @contextmanager
-def flying(tmp_path, *options):
+def flying(tmp_path):
     """Fly by the command line; yield process and bag in flight."""
     task, bag, temporary = tmp_path / 'poses.csv', tmp_path / 'bag', tmp_path / 'tmp'
     task.write_text(HEADER + '0,0,1.2,0,0,0\n' * 10)
     temporary.mkdir()
     process = subprocess.Popen(
         [sys.executable, '-m', 'beetle_omni_ros.cli', 'fly', '--task', str(task), '--bag',
-         str(bag), '--alone', '--clock', 'simulated', *options], stderr=subprocess.PIPE,
+         str(bag), '--alone', '--clock', 'simulated'], stderr=subprocess.PIPE,
         stdout=subprocess.DEVNULL, text=True, env={**os.environ, 'TMPDIR': str(temporary)})
     deadline = time.monotonic() + READY
     try:
@@ -122,17 +105,13 @@ def flying(tmp_path, *options):
     assert not list(temporary.iterdir())
 
 
-def test_a_killed_node_is_named_and_all_processes_end(tmp_path):
-    with flying(tmp_path, '--separate') as (process, bag):
-        nodes = children(process.pid)
-        assert set(NODES) == set(nodes)
-        os.kill(nodes['nmpc_node'], signal.SIGKILL)
+def test_a_killed_process_is_named(tmp_path):
+    with flying(tmp_path) as (process, bag):
+        child, = Path(f'/proc/{process.pid}/task/{process.pid}/children').read_text().split()
+        os.kill(int(child), signal.SIGKILL)
         _, error = process.communicate(timeout=60)
     assert process.returncode == 1
-    assert 'nmpc_node died (ended by SIGKILL)' in error
-    assert not any(Path(f'/proc/{pid}').exists() for pid in nodes.values())
-    states = read_bag(bag).states
-    assert [state.partition(':')[0] for state in states[-2:]] == ['landing', 'disarmed']
+    assert 'composed died (ended by SIGKILL)' in error
 
 
 def test_sigterm_ends_a_flight_cleanly_and_the_bag_is_complete(tmp_path):
@@ -145,23 +124,3 @@ def test_sigterm_ends_a_flight_cleanly_and_the_bag_is_complete(tmp_path):
     assert process.returncode == 130
     log = read_bag(bag)
     assert not log.warnings and 'flying:nmpc' in log.states and log.meta['interrupted']
-
-
-@pytest.mark.parametrize(('load', 'options', 'simulated'), [
-    (0.99, {}, True), (0.5, {}, False), (0.99, {'clock': 'system'}, False),
-    (0.5, {'clock': 'simulated'}, True), (0.99, {'actuators': 'emulated'}, False)])
-def test_fly_leaves_real_time_only_if_asked_or_needed_and_reports_it(monkeypatch, tmp_path, load,
-                                                                     options, simulated):
-    flown = []
-    monkeypatch.setattr(fly, '_fly', lambda graph, controller, task, meta, console, faults:
-                        flown.append((graph, meta)) or 1)    # flown, but without a bag
-    monkeypatch.setattr(fly, 'needed_load', lambda: load)
-    text = io.StringIO()
-    assert fly.run_fly(bag=tmp_path / 'bag', domain_id=1, console=Console(file=text, width=300),
-                       **options) == 1
-    (graph, meta), = flown
-    assert graph.simulated == simulated and meta['clock'] == (
-        'simulated' if simulated else 'system')
-    assert ({'joint_bridge_node', 'rotor_bridge_node'} <= set(graph.nodes)) != simulated
-    assert ('the nodes would need 99% of a core' in text.getvalue()) == (
-        simulated and not options)

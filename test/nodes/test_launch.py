@@ -8,11 +8,9 @@ from types import ModuleType
 
 import pytest
 
-from beetle_omni_ros.messages.topics import TOPICS
 from beetle_omni_ros.nodes import graph
 from beetle_omni_ros.nodes.graph import BRIDGES
 from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import ParameterError
 
 
 class Recorded:
@@ -54,64 +52,37 @@ def bringup(monkeypatch):
     return module
 
 
-def test_composed_is_one_process_and_one_for_the_bridges(bringup):
-    process, bridges = bringup.start(seed='7', namespace='/robot1')
-    command = bridges.kwargs['cmd']
-    assert command[4:command.index('--ros-args')] == ['joint_bridge_node', 'rotor_bridge_node']
-    assert command[-2:] == ['-r', '__ns:=/robot1']
-    command = process.kwargs['cmd']
-    assert command[4:command.index('--ros-args')] == [
-        'sim_node', 'ekf_node', 'nmpc_node', 'rl_node', 'supervisor_node']
-    assert 'sim_node:seed:=7' in command
+def test_the_bridges_have_their_own_process(bringup):
+    process, bridges = (one.kwargs['cmd'] for one in bringup.start(seed='7', namespace='/robot1'))
+    assert bridges[4:6] == list(BRIDGES) and bridges[-2:] == ['-r', '__ns:=/robot1']
+    assert process[4:process.index('--ros-args')] == [
+        'ekf_node', 'nmpc_node', 'rl_node', 'supervisor_node', 'sim_node']
+    assert 'sim_node:seed:=7' in process
 
 
-def given_to(nodes):
-    """Name -> parameters of separate nodes."""
-    return {node.kwargs['name']: node.kwargs['parameters'][0] for node in nodes}
+def given_to(processes):
+    """Name -> parameters of the nodes of all processes, as texts."""
+    found = {}
+    for process in processes:
+        words = process.kwargs['cmd']
+        names = words[4:words.index('--ros-args')]
+        found |= {name: {} for name in names}
+        for word in (after for flag, after in zip(words, words[1:]) if flag == '-p'):
+            node, key, value = word.replace(':=', ':', 1).split(':', 2)
+            found[node][key] = value
+    return found
 
 
 def test_simulator_and_bridges_meet_at_the_same_ports_in_a_private_folder(bringup):
-    nodes = given_to(bringup.start(composed='false'))
+    nodes = given_to(bringup.start())
     assert nodes['sim_node']['actuators'] == 'emulated'
     assert nodes['sim_node']['servo_port'] == nodes['joint_bridge_node']['port']
     assert nodes['sim_node']['board_port'] == nodes['rotor_bridge_node']['port']
     assert nodes['joint_bridge_node']['autostart'] == 'activate'
     folder = Path(nodes['sim_node']['servo_port']).parent
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
-    direct = given_to(bringup.start(composed='false', actuators='direct', robot_file='a.yaml',
+    direct = given_to(bringup.start(actuators='direct', robot_file='a.yaml',
                                     plant_file='b.yaml'))
     assert not set(BRIDGES) & set(direct) and 'actuators' not in direct['sim_node']
     assert [direct[name]['robot_file'] for name in ('sim_node', 'ekf_node')] == [
         'b.yaml', 'a.yaml']
-
-
-def test_each_controller_can_be_active_with_the_other_on_standby(bringup, capsys, monkeypatch):
-    def controllers(**arguments):
-        nodes = given_to(bringup.start(composed='false', **arguments))
-        return nodes['supervisor_node']['controller'], {
-            name: nodes[name] for name in ('nmpc_node', 'rl_node') if name in nodes}
-
-    assert controllers() == ('nmpc', {'nmpc_node': {}, 'rl_node': {}})
-    assert controllers(controller='rl', standby='false') == ('rl', {'rl_node': {}})
-    assert controllers(controller='rl', policy='/p.onnx', allow_other_robot='true') == (
-        'rl', {'rl_node': {'policy': '/p.onnx', 'allow_other_robot': True}, 'nmpc_node': {}})
-    monkeypatch.setattr(graph, 'unfit', lambda *_: 'robot_hash: another robot')
-    assert controllers() == ('nmpc', {'nmpc_node': {}})
-    assert 'rl does not stand by: robot_hash' in capsys.readouterr().err
-    with pytest.raises(ParameterError, match='robot_hash'):
-        controllers(controller='rl')
-
-
-@pytest.mark.parametrize('installed', [True, False])
-def test_ros2_bag_records_where_it_is_installed_else_the_recorder(bringup, monkeypatch, installed):
-    monkeypatch.setattr(bringup, 'has_ros2_bag', lambda: installed)
-    processes = bringup.start(composed='false', record='/data/run', namespace='robot1')
-    names = [p.kwargs.get('executable') for p in processes]
-    if installed:
-        command = processes[0].kwargs['cmd']
-        assert command[:7] == ['ros2', 'bag', 'record', '-s', 'mcap', '-o', '/data/run']
-        assert {f'/robot1/{topic}' for topic in TOPICS} <= set(command[7:])
-        assert 'recorder_node' not in names
-    else:
-        recorder = processes[names.index('recorder_node')]
-        assert recorder.kwargs['parameters'] == [{'bag': '/data/run'}]

@@ -58,7 +58,7 @@ def test_the_supervisor_accepts_or_refuses_a_controller(bench, listener):
     assert bench.wait(lambda: listener.controllers() == ['rl'])
     assert bench.wait(lambda: listener._setting.service_is_ready())
     listener.select('rl', answers.append)
-    assert bench.wait(lambda: answers == [''])
+    assert bench.wait(lambda: listener.spin_steadily(0.01) or answers == [''])
     assert bench.user.get_parameter('controller').value == 'rl'
     listener.select('hover', answers.append)
-    assert bench.wait(lambda: answers == ['', 'rl alone'])
+    assert bench.wait(lambda: listener.spin_steadily(0.01) or answers == ['', 'rl alone'])

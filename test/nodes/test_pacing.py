@@ -74,20 +74,6 @@ def test_simulated_time_continues_while_all_nodes_answer_or_none_has_yet(waiting
     assert waiting.now == pytest.approx(ROS + 2.0)
 
 
-def test_simulated_time_is_as_slow_as_the_slowest_node(waiting, clock):
-    leads, slowness = [], 10
-
-    def answer(k):
-        # one sample in `slowness` periods, in their order
-        stamp = ROS + TICK * (k // slowness)
-        leads.append(waiting.now - stamp)
-        return stamp
-
-    fly(waiting, clock, 2.0, answer)
-    assert waiting.ticks == pytest.approx(400 / slowness, abs=LAG / TICK + 2)
-    assert max(leads) <= LAG + 2 * TICK
-
-
 def test_simulated_time_waits_once_for_each_silence_of_a_node(waiting, clock):
     fly(waiting, clock, 0.5, lambda k: waiting.now)
     fly(waiting, clock, 2.0, lambda k: None)

@@ -78,23 +78,14 @@ def test_a_node_ends_with_the_process_that_started_its_graph(ros_domain):
     script = ('import os, subprocess, sys, time\n'
               'os.environ["BEETLE_OMNI_PARENT"] = str(os.getpid())\n'
               'command = [sys.executable, "-m", "beetle_omni_ros.start", "ekf_node"]\n'
-              'child = subprocess.Popen(command)\n'
-              'print(child.pid, flush=True)\n'
+              'print(subprocess.Popen(command).pid, flush=True)\n'
               'time.sleep(60)\n')
     parent = subprocess.Popen([sys.executable, '-c', script], stdout=subprocess.PIPE, text=True)
-    child = int(parent.stdout.readline())
+    state = Path(f'/proc/{int(parent.stdout.readline())}/stat')
     wait_until_it_spins(parent)
     parent.kill()
     parent.communicate()
     deadline = time.monotonic() + 10
-    while running(child):
+    while state.exists() and ') Z' not in state.read_text():
         assert time.monotonic() < deadline, 'the node outlived its starter'
         time.sleep(0.05)
-
-
-def running(pid):
-    try:
-        with open(f'/proc/{pid}/stat') as file:
-            return file.read().rsplit(')', 1)[1].split()[0] != 'Z'
-    except OSError:
-        return False

@@ -35,7 +35,7 @@ def test_faults_are_switched_in_flight_and_reported(sim):
     published, subscribed = topics(node)
     assert {'/joint_states', '/battery_state'} <= published and '/command' in subscribed
     refused = put(node, servo_faults__silent=[2])
-    assert not refused.successful and 'servo_faults: silent [2]: there are no' in refused.reason
+    assert not refused.successful and 'silent [2]: there are no' in refused.reason
     assert node._robot_status()[0] == base.OK
     node._simulator.step()
     level, text, values = node._robot_status()
