@@ -46,8 +46,6 @@ FILES = {
     'servo_bus.yaml': ('drivers.device_parameters:ServoBusParameters', 'The bus of tilt servos.'),
     'motor_board.yaml': ('drivers.device_parameters:MotorBoardParameters',
                          'The motor board.'),
-    'emulated_board.yaml': ('sim.emulated.motor_board:EmulatedBoardParameters',
-                            'The emulated motor board.'),
     'simulator.yaml': ('sim.parameters:SimulatorParameters', 'The simulated world.'),
     'recording.yaml': ('identify.recording.limits:RecordingLimits',
                        'Limits of the checks of a recording against itself.'),

@@ -17,14 +17,8 @@ from beetle_omni_ros.nodes.node import CommandSource, Distribution, ERROR, Fligh
 from beetle_omni_ros.nodes.parameters import file_parameter
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import group, parameter, ParameterError
-from beetle_omni_ros.sim.emulated import (
-    BOARD_EVENTS,
-    BoardFaults,
-    SERVO_EVENTS,
-    ServoFaults,
-    switched_on,
-)
-from beetle_omni_ros.sim.emulated_actuators import EmulatedActuators
+from beetle_omni_ros.sim.emulated.actuators import EmulatedActuators
+from beetle_omni_ros.sim.emulated.device import BoardFaults, ServoFaults, switched_on
 from beetle_omni_ros.sim.fault_lists import DEVICES, parse_faults
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.simulator import Simulator
@@ -40,8 +34,7 @@ LAG = 0.02              # s between the newest sample and the newest answered on
 PATIENCE = 0.3          # s of steady time without an answer after which a node has stopped
 COMMAND_AGE = 0.1       # s, older commands are not executed
 # Switches of single events, which are reset after they happened.
-EVENTS = {*(f'servo_faults.{name}' for name in SERVO_EVENTS),
-          *(f'board_faults.{name}' for name in BOARD_EVENTS)}
+EVENTS = {'servo_faults.reboot', 'board_faults.reboot'}
 
 
 class RealTimePacing:
@@ -298,10 +291,8 @@ class SimNode(FlightNode):
     @staticmethod
     def _refuse_faults(given):
         """Refuse faults of emulated devices if there are none."""
-        for group_name, events in (('servo_faults', SERVO_EVENTS), ('board_faults', BOARD_EVENTS)):
-            faults = getattr(given, group_name)
-            wanted = switched_on(faults) + [name for name in events if getattr(faults, name)]
-            if wanted:
+        for group_name in ('servo_faults', 'board_faults'):
+            if wanted := switched_on(getattr(given, group_name), event=True):
                 raise ParameterError(f'{group_name}: {wanted[0]}: there are no devices with '
                                      'actuators direct; start with actuators:=emulated')
 

@@ -67,11 +67,11 @@ def test_faults_of_devices_change_in_flight_and_are_in_the_diagnostics(sim, tmp_
     bus = node._devices.bus
     assert set(bus.faults.overheated) == {3}
     assert put(node, servo_faults__overheated=[], servo_faults__silent=[2],
-               board_faults__voltage_sag=1.5).successful
+               board_faults__drop_in=0.5).successful
     level, text, values = node._devices_status()
-    assert level == base.WARN and text == 'faults: servo silent [2], board voltage_sag 1.5'
+    assert level == base.WARN and text == 'faults: servo silent [2], board drop_in 0.5'
     assert values['armed'] is False and values['torque'] == [False] * 4
-    assert put(node, servo_faults__silent=[], board_faults__voltage_sag=0.0).successful
+    assert put(node, servo_faults__silent=[], board_faults__drop_in=0.0).successful
     assert node._devices_status()[0] == base.OK
     refused = put(node, servo_faults__silent=[9])
     assert not refused.successful and 'servo_faults.silent: no servo has' in refused.reason

@@ -48,7 +48,7 @@ class ServoFaults:
 
 @dataclass(kw_only=True)
 class BoardFaults:
-    """Faults of motor board, rotors and cable. Levels may be changed at any time."""
+    """Faults of motor board, rotors and cable, as :class:`ServoFaults`."""
 
     corrupt_out: float = parameter(0.0, doc='share of packets of the board with a flipped bit',
                                    **SHARE)
@@ -60,18 +60,15 @@ class BoardFaults:
     delay_in: float = parameter(0.0, doc='delay of packets to the board', **DELAY)
     failed_escs: np.ndarray = parameter([], doc='rotors (1 to 4) that do not turn', low=1, high=4)
     unplugged: bool = parameter(False, doc='whether the cable of the board is unplugged')
-    hang: bool = parameter(False, doc='hang once, until the reset by the watchdog')
+    reboot: bool = parameter(False, doc='reset once')
 
 
-EVENTS = 'reboot', 'hang'
-
-
-def switched_on(faults: ServoFaults | BoardFaults, events: bool = False) -> list[str]:
-    """Levels, and events if asked, that differ from their defaults, such as 'silent [2]'."""
+def switched_on(faults: ServoFaults | BoardFaults, event: bool = False) -> list[str]:
+    """Levels, and the event if asked, that differ from their defaults, such as 'silent [2]'."""
     healthy, found = type(faults)(), []
     for name in (entry.name for entry in fields(faults)):
         value = getattr(faults, name)
-        if name == 'delay' or name in EVENTS and not events \
+        if name == 'delay' or name == 'reboot' and not event \
                 or np.array_equal(value, getattr(healthy, name)):
             continue
         if isinstance(value, np.ndarray):
