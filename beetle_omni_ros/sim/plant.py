@@ -10,8 +10,8 @@ from beetle_omni_ros.robot.allocation import clipped
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters, Variation
 from beetle_omni_ros.robot.servo import NUMPY
-from beetle_omni_ros.sim.mjcf import BASE, base_part, build_model, set_base_part
-from beetle_omni_ros.sim.parameters import PlantParameters
+from beetle_omni_ros.sim.mjcf import BASE, base_part, build_model, CONTACT_TIME, set_base_part
+from beetle_omni_ros.sim.parameters import SimulatorParameters
 
 # MuJoCo would write warnings into a file in the working directory; step() checks the state.
 mujoco.set_mju_user_warning(lambda text: None)
@@ -20,6 +20,8 @@ NO_CONSTRAINT = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
 WXYZ = np.array([6, 3, 4, 5])       # indices of w, x, y, z in (position, quaternion xyzw)
 XYZW = np.array([4, 5, 6, 3])       # indices of x, y, z, w in qpos
 DIVERGED = 1e9                      # bound of the sum of accelerations in a valid state
+FLOOR_SUBSTEPS = 2                  # integration steps in a tick at the floor: the solver is slow
+JAM_STIFFNESS = 20.0    # [-] relative to the servo: 1 mrad under load, stable at 1 kHz
 
 
 class Plant:
@@ -40,7 +42,7 @@ class Plant:
 
     """
 
-    def __init__(self, robot: RobotParameters, parameters: PlantParameters,
+    def __init__(self, robot: RobotParameters, parameters: SimulatorParameters,
                  variation: Variation | None = None):
         self._robot, self._parameters, self._variation = robot, parameters, variation
         # Effects that only change a number of the model are built into it.
@@ -62,7 +64,6 @@ class Plant:
         self.model = build_model(robot, parameters, variation)
         self.data = mujoco.MjData(self.model)
         self._tick, self._substeps = parameters.tick, parameters.substeps
-        self._floor_substeps = min(parameters.substeps, parameters.floor_substeps)
         self._flags = int(self.model.opt.disableflags)
         self._reach = _reach(self.model)
         # Largest change of a servo's rate in a tick for each rad of error.
@@ -120,7 +121,7 @@ class Plant:
         """Height of base_link at rest on its feet [m], simulated once."""
         if self._ground_height is None:
             self._place((0.0, 0.0, self._parameters.foot_depth), (0.0, 0.0, 0.0, 1.0))
-            settle = 100 * self._parameters.contact_time_constant
+            settle = 100 * CONTACT_TIME
             mujoco.mj_step(self.model, self.data, int(np.ceil(settle / self.model.opt.timestep)))
             self._ground_height = float(self.data.qpos[2])
         return self._ground_height
@@ -146,7 +147,7 @@ class Plant:
         self._servos = powered, jammed
         stuck = np.array(jammed)
         joints, model = self._robot.joints, self.model
-        hard = joints.kp * self._parameters.jam_stiffness
+        hard = joints.kp * JAM_STIFFNESS
         stiffness = np.where(stuck, hard, joints.kp * np.array(powered))
         damping = np.where(stuck, 2 * np.sqrt(hard * joints.inertia), joints.kd)
         model.actuator_gainprm[4:, 0] = stiffness
@@ -164,8 +165,7 @@ class Plant:
         """Set the mass [kg] of the payload, a ball below the body."""
         if mass != self._payload:
             self._payload = mass
-            set_base_part(self.model, base_part(self._robot, self._parameters, self._variation,
-                                                mass))
+            set_base_part(self.model, base_part(self._robot, self._variation, mass))
 
     def step(self) -> None:
         """
@@ -181,7 +181,7 @@ class Plant:
         touching = self._may_touch()
         model.opt.disableflags = self._flags if touching else self._flags | NO_CONSTRAINT
         fast = not self._may_reach_rate_limit()
-        substeps = self._floor_substeps if fast and data.ncon else self._substeps
+        substeps = min(FLOOR_SUBSTEPS, self._substeps) if fast and data.ncon else self._substeps
         model.opt.timestep = self._tick / substeps
         self._apply_forces(0.5 * self._tick)
         if fast and not self._has_friction:

@@ -14,11 +14,18 @@ from beetle_omni_ros.robot.readings import (
     RotorReading,
 )
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.sim.parameters import Conditions, SimulatorParameters
+from beetle_omni_ros.sim.parameters import Conditions, RPM_AT_1_NEWTON, SimulatorParameters
 from beetle_omni_ros.sim.plant import Plant
 from beetle_omni_ros.sim.readings import Truth
 
 BLOCK = 1024            # readings whose noise is drawn at once, for speed
+RESOLUTION = 2 * np.pi / 4096       # [rad] of the servos' positions
+RATE_RESOLUTION = 0.02398           # [rad/s] 0.229 rev/min, of their velocities
+BATTERY_PERIOD = 0.1                # [s] between two readings
+VOLTAGE_NOISE, CURRENT_NOISE = 0.01, 0.1    # [V], [A] standard deviations, chosen
+ROTOR_PERIOD = 0.02                 # [s] 50 Hz: ESC telemetry of a motor board
+ROTOR_LATENCY = 0.01                # [s] from capture to arrival, chosen
+ROTOR_NOISE = 0.01                  # [-] standard deviation relative to the speed, chosen
 
 
 class Noise:
@@ -59,40 +66,35 @@ class Sensors:
     def __init__(self, parameters: SimulatorParameters, conditions: Conditions,
                  seeds: list[np.random.SeedSequence], first: Truth, effort: np.ndarray,
                  errors: SensorErrors = SensorErrors()):
-        self._tick, self._errors = parameters.plant.tick, errors
+        self._tick, self._errors = parameters.tick, errors
         self._to_imu = rotations.matrix(rotations.exp(errors.imu_rotation)) \
             if any(errors.imu_rotation) else None
         self._lever_arm = np.array(errors.imu_position) if any(errors.imu_position) else None
-        imu, mocap, pack = parameters.imu, parameters.mocap, parameters.battery
-        rotors, encoders = parameters.rotor_speed, parameters.encoders
         generators = (np.random.Generator(np.random.PCG64(seed)) for seed in seeds)
         self._imu_noise = Noise(
             next(generators),
             conditions.imu_bias + np.array([*errors.accelerometer_bias, *errors.gyroscope_bias]),
-            np.repeat([imu.specific_force_noise, imu.angular_velocity_noise], 3),
+            np.repeat([parameters.specific_force_noise, parameters.angular_velocity_noise], 3),
             conditions.imu_uniform_noise)
         self._mocap_noise = Noise(
             next(generators), np.concatenate([
                 conditions.position_bias,
                 conditions.orientation_bias + np.array(errors.mocap_rotation)]),
-            np.repeat([mocap.position_noise, mocap.orientation_noise], 3),
+            np.repeat([parameters.position_noise, parameters.orientation_noise], 3),
             conditions.mocap_uniform_noise)
         self._tilt_noise = Noise(next(generators), conditions.tilt_bias, np.zeros(4),
                                  conditions.tilt_uniform_noise)
         self._battery_noise = Noise(next(generators), np.zeros(2),
-                                    np.array([pack.voltage_noise, pack.current_noise]), 0.0)
-        self._rotor_noise = Noise(next(generators), np.ones(4), np.full(4, rotors.noise), 0.0)
-        self._speed_at_1_newton = rotors.rpm_at_1_newton * np.pi / 30
-        self._resolution = 2 * np.pi / encoders.counts_per_turn
-        self._velocity_step = encoders.velocity_step
-        self._rotor_period = self._ticks('rotor_speed.period', rotors.period, least=1)
-        self._mocap_period = self._ticks('mocap.period', mocap.period, least=1)
-        self._battery_period = self._ticks('battery.period', pack.period, least=1)
-        self._rotors = self._line('rotor_speed.latency', rotors.latency)
+                                    np.array([VOLTAGE_NOISE, CURRENT_NOISE]), 0.0)
+        self._rotor_noise = Noise(next(generators), np.ones(4), np.full(4, ROTOR_NOISE), 0.0)
+        self._rotor_period = self._ticks('rotor period', ROTOR_PERIOD, least=1)
+        self._mocap_period = self._ticks('mocap_period', parameters.mocap_period, least=1)
+        self._battery_period = self._ticks('battery period', BATTERY_PERIOD, least=1)
+        self._rotors = self._line('rotor latency', ROTOR_LATENCY)
         self._imu = self._line('imu latency', conditions.imu_latency, errors.imu_delay)
         self._joints = self._line('encoder latency', conditions.tilt_latency,
                                   errors.encoder_delay)
-        self._mocap = self._line('mocap.latency', mocap.latency, errors.mocap_delay)
+        self._mocap = self._line('mocap_latency', parameters.mocap_latency, errors.mocap_delay)
         # The delay of the IMU is realised in whole ticks and corrected by the stamps.
         self._imu_shift = errors.imu_delay - self._tick * self._hidden_ticks(errors.imu_delay)
         for k in range(self._joints.maxlen):
@@ -171,7 +173,7 @@ class Sensors:
         """
         reading = None
         if tick % self._rotor_period == 0:
-            speed = self._speed_at_1_newton * np.sqrt(np.maximum(truth.thrust, 0.0) / wear)
+            speed = RPM_AT_1_NEWTON * np.pi / 30 * np.sqrt(np.maximum(truth.thrust, 0.0) / wear)
             reading = RotorReading(truth.stamp, speed * self._rotor_noise.next())
         self._rotors.append(reading)
         return self._rotors[0] if len(self._rotors) == self._rotors.maxlen else None
@@ -184,9 +186,8 @@ class Sensors:
 
     def _joint_reading(self):
         stamp, tilt, velocity, effort = self._joints[0]
-        tilt = np.rint((tilt + self._tilt_noise.next()) / self._resolution) * self._resolution
-        if self._velocity_step:
-            velocity = np.rint(velocity / self._velocity_step) * self._velocity_step
+        tilt = np.rint((tilt + self._tilt_noise.next()) / RESOLUTION) * RESOLUTION
+        velocity = np.rint(velocity / RATE_RESOLUTION) * RATE_RESOLUTION
         return JointReading(stamp + self._errors.encoder_delay, tilt, velocity, effort)
 
     def _pack_reading(self, stamp, battery):

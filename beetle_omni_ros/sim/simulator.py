@@ -13,20 +13,19 @@ from beetle_omni_ros.robot.allocation import clipped
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.sim.faults import Actuation, Fault, READINGS, Schedule
-from beetle_omni_ros.sim.parameters import (
-    ActuatorTimingParameters,
-    Conditions,
-    CrashParameters,
-    draw,
-    PackParameters,
-    SimulatorParameters,
-)
+from beetle_omni_ros.sim.parameters import Conditions, draw, SimulatorParameters
 from beetle_omni_ros.sim.plant import Plant, XYZW
 from beetle_omni_ros.sim.readings import Drive, Frame, Impact, Truth
 from beetle_omni_ros.sim.sensors import Sensors
 
 ROUNDING = 1e-9     # [s] bound of the rounding error of sums of ticks
 POWERED, INTACT = (True,) * 4, np.ones(4)
+FUTURE_LIMIT = 0.1  # [s] stamps further ahead come from a wrong clock and are refused
+AIRBORNE_TIME = 0.3     # [s] without contact, after which a contact is a touchdown; chosen
+# Charge of a pack, and its open-circuit voltage relative to a full one: a typical lithium-polymer
+# cell, over 4.2 V.
+CHARGES = [0.0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0]
+VOLTAGES = [0.78, 0.86, 0.88, 0.89, 0.90, 0.905, 0.915, 0.925, 0.94, 0.955, 0.975, 1.0]
 
 
 class Battery:
@@ -42,11 +41,10 @@ class Battery:
 
     """
 
-    def __init__(self, robot: RobotParameters, pack: PackParameters):
-        self._pack = pack
+    def __init__(self, robot: RobotParameters, parameters: SimulatorParameters):
+        self._parameters = parameters
         self._resistance = robot.battery.resistance
-        self._curve = pack.charge_levels.tolist(), \
-            (robot.battery.full_voltage * pack.relative_voltages).tolist()
+        self._curve = CHARGES, [robot.battery.full_voltage * part for part in VOLTAGES]
         rows = sorted(robot.rotors.map, key=lambda row: row.voltage)
         self._limits = [row.voltage for row in rows], [row.thrust_max for row in rows]
         self._thrust_max = robot.rotors.thrust_max
@@ -54,7 +52,7 @@ class Battery:
 
     def reset(self) -> None:
         """Set the initial charge and no load."""
-        self.charge = self._pack.initial_charge
+        self.charge = self._parameters.battery_charge
         self.extra_resistance = self.current = self.drawn = 0.0
         self.voltage = self.rest_voltage
 
@@ -65,8 +63,8 @@ class Battery:
 
     def step(self, thrust: np.ndarray, duration: float) -> None:
         """Supply the power for ``thrust`` (4,) [N] during ``duration`` [s]."""
-        pack = self._pack
-        power = pack.idle_power + pack.rotor_power * sum(
+        parameters = self._parameters
+        power = parameters.idle_power + parameters.rotor_power * sum(
             f * sqrt(f) for f in thrust.tolist() if f > 0)
         rest = self.rest_voltage
         # power = V (rest - V) / R, limited to the largest power, which is at V = rest / 2
@@ -76,7 +74,8 @@ class Battery:
         if resistance:
             self.current = min(self.current, (rest - self.voltage) / resistance)
         self.drawn += self.current * duration / 3600
-        self.charge = max(0.0, self.charge - self.current * duration / (3600 * pack.capacity))
+        self.charge = max(0.0, self.charge - self.current * duration
+                          / (3600 * parameters.battery_capacity))
 
     @property
     def thrust_limit(self) -> float:
@@ -108,11 +107,10 @@ class CommandLink:
     of refused commands by reason.
     """
 
-    def __init__(self, robot: RobotParameters, timing: ActuatorTimingParameters,
-                 conditions: Conditions):
+    def __init__(self, robot: RobotParameters, timeout: float, conditions: Conditions):
         self._limit = robot.joints.position_limit
         self._thrust_range = robot.rotors.thrust_min, robot.rotors.thrust_max
-        self._timing = timing
+        self._timeout = timeout
         self._delays = conditions.command_delays(robot)
         self._pending: tuple[deque, deque] = (deque(), deque())
         self._last_stamp = self._last_arrival = -np.inf
@@ -147,7 +145,7 @@ class CommandLink:
             return 'not finite'
         if command.stamp < self._last_stamp:
             return 'older than the last'
-        if command.stamp > now + self._timing.command_future_limit:
+        if command.stamp > now + FUTURE_LIMIT:
             return 'from the future'
         return None
 
@@ -159,21 +157,21 @@ class CommandLink:
             self.tilt = tilts.popleft()[1]
         while thrusts and thrusts[0][0] <= due:
             self.thrust = thrusts.popleft()[1]
-        if now - self._last_arrival >= self._timing.command_timeout - ROUNDING:
+        if now - self._last_arrival >= self._timeout - ROUNDING:
             self.thrust = np.zeros(4)
 
 
 class CrashWatch:
     """
-    Checks the true state once in each ``tick`` [s].
+    Checks the true state once in each tick.
 
     A robot that has flown breaks if its first contact is too fast, or a contact too inclined. A
     robot that has not flown does not break, so it may be placed on its side. ``impact`` is the
     last touchdown, ``broken`` whether the robot is broken.
     """
 
-    def __init__(self, parameters: CrashParameters, tick: float):
-        self._limits, self._tick = parameters, tick
+    def __init__(self, parameters: SimulatorParameters):
+        self._parameters = parameters
         self.impact: Impact | None = None
         self.broken = False
         self._airborne, self._flown = 0.0, False
@@ -188,15 +186,15 @@ class CrashWatch:
 
         """
         if not contact:
-            self._airborne += self._tick
-            self._flown = self._flown or self._airborne >= self._limits.airborne_time
+            self._airborne += self._parameters.tick
+            self._flown = self._flown or self._airborne >= AIRBORNE_TIME
             return
         vertical = rotations.up(before.quaternion)[2]   # cosine of the inclination
-        breaks = vertical < np.cos(self._limits.inclination)
+        breaks = vertical < np.cos(self._parameters.crash_inclination)
         if self._airborne > 0:
             speed = float(np.linalg.norm(before.velocity))
-            breaks = breaks or speed > self._limits.speed
-            if self._airborne >= self._limits.airborne_time:
+            breaks = breaks or speed > self._parameters.crash_speed
+            if self._airborne >= AIRBORNE_TIME:
                 self.impact = Impact(before.stamp, speed, max(0.0, -float(before.velocity[2])),
                                      float(np.arccos(np.clip(vertical, -1.0, 1.0))))
         self.broken = self.broken or bool(self._flown and breaks)
@@ -233,11 +231,11 @@ class Simulator:
         if not isinstance(seed, (int, np.integer)) or seed < 0:
             raise ParameterError(f'seed: expected a whole number from 0, found {seed!r}')
         self._seed = seed
-        self.tick = self._parameters.plant.tick
+        self.tick = self._parameters.tick
         self.conditions = draw(conditions, self._parameters,
                                np.random.default_rng(np.random.SeedSequence(seed).spawn(1)[0]))
-        self._plant = Plant(robot, self._parameters.plant, self.conditions.variation)
-        self.battery = Battery(robot, self._parameters.battery)
+        self._plant = Plant(robot, self._parameters, self.conditions.variation)
+        self.battery = Battery(robot, self._parameters)
         self.reset()
 
     def reset(self, position: np.ndarray | None = None,
@@ -252,10 +250,11 @@ class Simulator:
         self.time = 0.0
         self._plant.reset(position, quaternion)
         self.battery.reset()
-        self._crash = CrashWatch(self._parameters.crash, self.tick)
+        self._crash = CrashWatch(self._parameters)
         self._wrench, self._payload = np.zeros(6), 0.0
         self._wear = INTACT
-        self._link = CommandLink(self._robot, self._parameters.actuators, self.conditions)
+        self._link = CommandLink(self._robot, self._parameters.command_timeout,
+                                 self.conditions)
         self.truth = self._truth()
         *seeds, fault_seed = np.random.SeedSequence(self._seed).spawn(7)[1:]
         self._schedule = Schedule(self.tick, fault_seed, self.battery)
@@ -267,7 +266,7 @@ class Simulator:
                  angular_velocity: np.ndarray) -> None:
         """Repair the robot and set its motion, see :meth:`.plant.Plant.set_body`."""
         self._plant.set_body(position, quaternion, velocity, angular_velocity)
-        self._crash = CrashWatch(self._parameters.crash, self.tick)
+        self._crash = CrashWatch(self._parameters)
         self.truth = self._truth()
 
     def command(self, command) -> bool:

@@ -76,7 +76,7 @@ def test_each_controller_has_a_bag_that_gives_the_numbers_of_its_flight(poses, f
 
 def test_a_flight_ended_by_the_supervisor_is_reported_with_time_and_reason(poses, monkeypatch):
     small = SimulatorParameters.load()
-    small = replace(small, battery=replace(small.battery, capacity=0.04))
+    small = replace(small, battery_capacity=0.04)
     monkeypatch.setattr(SimulatorParameters, 'load', lambda: small)
     monkeypatch.setattr(loop, 'SWAP_CHARGE', 0.0)
     text = io.StringIO()
@@ -134,7 +134,7 @@ def test_an_exception_in_flight_falls_back_and_is_in_the_results(tmp_path):
 def test_an_empty_pack_is_swapped_at_the_next_target(monkeypatch):
     monkeypatch.setattr(loop, 'SWAP_CHARGE', 0.0)   # by the warning of the supervisor only
     small = SimulatorParameters.load()
-    small = replace(small, battery=replace(small.battery, capacity=CAPACITY))
+    small = replace(small, battery_capacity=CAPACITY)
     monkeypatch.setattr(SimulatorParameters, 'load', lambda: small)
     task = make_task('random2')
     log = command.fly('nmpc', task, robot=ROBOT, plant=ROBOT)

@@ -28,7 +28,7 @@ def immovable():
 
 
 def plant(robot=ROBOT, position=HIGH, quaternion=LEVEL, variation=None):
-    made = Plant(robot, WORLD.plant, variation)
+    made = Plant(robot, WORLD, variation)
     made.reset(position, quaternion)
     return made
 

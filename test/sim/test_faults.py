@@ -1,7 +1,5 @@
 """Faults of the simulated robot: each has its stated effect at its time only."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from sim_robots import HIGH, ROBOT, WORLD
@@ -9,6 +7,8 @@ from sim_robots import HIGH, ROBOT, WORLD
 from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.sim import sensors
+from beetle_omni_ros.sim import simulator as whole
 from beetle_omni_ros.sim.fault_lists import FaultList, load_faults, parse_faults
 from beetle_omni_ros.sim.fault_lists import text as text_of
 from beetle_omni_ros.sim.faults import Fault, KINDS, OF_PROCESSES, READINGS
@@ -123,12 +123,12 @@ def test_rotor_speeds_come_at_50_hz_and_are_those_of_the_thrust():
     stamps = [reading.stamp for reading in readings]
     np.testing.assert_allclose(np.diff(stamps), 0.02, atol=1e-9)
     late = [frame.time - frame.rotors.stamp for frame in frames if frame.rotors is not None]
-    np.testing.assert_allclose(late, WORLD.rotor_speed.latency, atol=1e-9)
+    np.testing.assert_allclose(late, sensors.ROTOR_LATENCY, atol=1e-9)
     thrust = {round(frame.time, 6): frame.truth.thrust for frame in frames}
-    rpm = WORLD.rotor_speed.rpm_at_1_newton
+    rpm = sensors.RPM_AT_1_NEWTON
     errors = [reading.speed / (rpm * np.pi / 30 * np.sqrt(thrust[round(reading.stamp, 6)])) - 1
               for reading in readings[5:]]
-    assert 0.5 < np.std(errors) / WORLD.rotor_speed.noise < 1.5
+    assert 0.5 < np.std(errors) / sensors.ROTOR_NOISE < 1.5
 
 
 def test_a_propeller_that_breaks_changes_no_speed():
@@ -200,7 +200,7 @@ def fallen(height, quaternion=(0, 0, 0, 1)):
 def test_the_impact_of_a_fall_has_its_speed():
     simulator = fallen(2.16)
     impact = simulator.truth.impact
-    drop = 2.16 - WORLD.plant.foot_depth
+    drop = 2.16 - WORLD.foot_depth
     assert np.isclose(impact.speed, np.sqrt(2 * ROBOT.gravity * drop), rtol=0.03)
     assert np.isclose(impact.vertical_speed, impact.speed, rtol=1e-3)
     assert impact.inclination < 0.05
@@ -228,10 +228,10 @@ def test_a_broken_robot_stays_down_until_reset():
     assert frame.truth.position[2] > 0.3
 
 
-def test_a_soft_touchdown_breaks_nothing():
-    tall = replace(WORLD, crash=replace(WORLD.crash, airborne_time=0.05))
-    simulator = Simulator(ROBOT, tall)
-    simulator.reset([0, 0, WORLD.plant.foot_depth + 0.03])
+def test_a_soft_touchdown_breaks_nothing(monkeypatch):
+    monkeypatch.setattr(whole, 'AIRBORNE_TIME', 0.05)
+    simulator = Simulator(ROBOT, WORLD)
+    simulator.reset([0, 0, WORLD.foot_depth + 0.03])
     for _ in range(200):
         simulator.step()
     assert 0.5 < simulator.truth.impact.speed < 1.0

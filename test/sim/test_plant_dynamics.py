@@ -8,6 +8,7 @@ import pytest
 from sim_robots import HIGH, LEVEL, momenta, plant, ROBOT, WORLD
 
 from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.sim.mjcf import PAYLOAD_DEPTH
 
 WEIGHTLESS = replace(ROBOT, gravity=0.0)
 
@@ -79,7 +80,7 @@ def test_wrench_acts_in_its_frames():
 def test_robot_rests_on_its_feet():
     made = plant(position=None)
     height = made.state[0][2]
-    assert WORLD.plant.foot_depth - 1e-3 < height < WORLD.plant.foot_depth
+    assert WORLD.foot_depth - 1e-3 < height < WORLD.foot_depth
     for _ in range(200):
         made.step()
     assert made.contact
@@ -94,7 +95,7 @@ def test_payload_adds_its_weight_below_the_centre():
     assert made.model.body_mass.sum() == pytest.approx(before + 0.75)
     mujoco.mj_forward(made.model, made.data)
     depth = HIGH[2] - made.data.subtree_com[1][2]
-    assert depth == pytest.approx(0.75 * WORLD.plant.payload_depth / (before + 0.75), rel=1e-6)
+    assert depth == pytest.approx(0.75 * PAYLOAD_DEPTH / (before + 0.75), rel=1e-6)
     lifted = made.acceleration(HIGH, LEVEL, np.zeros(3), np.zeros(3), np.zeros(4), np.zeros(4),
                                np.full(4, (before + 0.75) * ROBOT.gravity / 4))
     assert abs(lifted[2]) < 2e-3

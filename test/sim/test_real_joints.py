@@ -12,7 +12,7 @@ from beetle_omni_ros.sim.plant import Plant
 
 ROBOT = RobotParameters.load()
 KP = ROBOT.joints.kp
-PARAMETERS = SimulatorParameters.load().plant
+PARAMETERS = SimulatorParameters.load()
 
 
 def flown(targets, thrust=0.0, **effects):

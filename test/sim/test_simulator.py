@@ -40,7 +40,7 @@ def test_same_seed_same_numbers_other_seed_others(conditions):
 
 
 def test_weak_battery_caps_the_thrust():
-    weak = replace(WORLD, battery=replace(WORLD.battery, initial_charge=0.05))
+    weak = replace(WORLD, battery_charge=0.05)
     reached, voltages = [], []
     for world in (WORLD, weak):
         simulator = Simulator(ROBOT, world)

@@ -16,6 +16,7 @@ from beetle_omni_ros.drivers.mavlink import common, EscInfo, EscStatus, MavlinkR
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.thrust_map import duty_of_command, ThrustMap
 from beetle_omni_ros.sim.emulated.device import BoardFaults, Device
+from beetle_omni_ros.sim.parameters import RPM_AT_1_NEWTON
 
 BOOT, DISARMED, ARMED, RUNNING = range(4)
 NONE, ASKED, HEARTBEAT_LOST, IDLE, WATCHDOG = range(5)      # reasons of the last disarming
@@ -37,7 +38,6 @@ NUMBERS = {
     'throttle_low_time': 1.0, 'target_age_limit': 0.1, 'target_future_limit': 0.05,
     'boot_time': 0.3, 'arm_cell_voltage': 3.5, 'heartbeat_rate': 5.0, 'rotor_info_rate': 2.0,
     'rotor_rate': 100.0, 'battery_rate': 50.0, 'reception_rate': 1.0}
-RPM_AT_1_NEWTON = 2700.0        # [1/min] as in the simulator
 
 
 class BoardFirmware:
