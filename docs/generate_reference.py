@@ -50,7 +50,6 @@ FILES = {
     'recording.yaml': ('identify.recording.limits:RecordingLimits',
                        'Limits of the checks of a recording against itself.'),
     'train.yaml': ('train.parameters:TrainParameters', 'The training of a policy.'),
-    'faults.yaml': ('sim.fault_lists:FaultList', 'The listed faults.'),
     'identify.yaml': ('identify.parameters:IdentifyParameters',
                       'Identification of servos and rotors from logs.'),
     'gap.yaml': ('identify.gap.parameters:GapParameters', 'The gap finder.')}
@@ -181,8 +180,6 @@ def parameters() -> str:
     seen: dict[str, str] = {}
     for name, (kind, what) in FILES.items():
         text.append(f'\n## {name}\n\n{what}\n\n')
-        if name == 'faults.yaml':
-            text.append('[Safety](../safety.md#every-fault-of-the-list) lists the faults.\n\n')
         if name == 'robot.yaml':
             text.append(ROBOT_FILE)
         if kind in seen:

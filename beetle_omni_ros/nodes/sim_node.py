@@ -155,7 +155,7 @@ class SimNodeParameters:
                                 'one', read_only=True)
     board_port: str = parameter('', doc="path of the emulated motor board's port; empty: a "
                                 'temporary one', read_only=True)
-    servo_bus_file: str = file_parameter('ids, signs, zeros and baud rate of the emulated servos')
+    servo_bus_file: str = file_parameter('ids, signs and zeros of the emulated servos')
     clock: str = parameter('system', choices=('system', 'simulated'), read_only=True,
                            doc='real time, or simulated time on /clock, which waits for late '
                            'nodes; all other nodes then need use_sim_time')
@@ -237,8 +237,8 @@ class SimNode(FlightNode):
         servos = ServoBusParameters.load(given.servo_bus_file or None)
         bus = EmulatedServoBus(
             servos.ids.astype(int).tolist(), port=given.servo_port or None,
-            baud_rate=servos.baud_rate, signs=servos.signs.astype(int).tolist(),
-            zeros=servos.zeros.astype(int).tolist(), seed=given.seed)
+            signs=servos.signs.astype(int).tolist(), zeros=servos.zeros.astype(int).tolist(),
+            seed=given.seed)
         try:
             board = EmulatedMotorBoard(self._robot, seed=given.seed,
                                        port=given.board_port or None)

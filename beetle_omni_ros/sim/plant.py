@@ -31,15 +31,7 @@ class Plant:
     MuJoCo integrates by the Runge-Kutta method of order 4. The solver of contacts and joint stops
     runs only in ticks in which a contact is possible. The tilt rate is limited only in ticks in
     which a joint could reach the limit. Both conditions are conservative and together halve the
-    computing time.
-
-    Attributes:
-        voltage_ratio: battery voltage relative to a full one, set by the owner of the battery.
-        charge_drawn: charge drawn from the battery [A h], set by its owner.
-
-    Raises:
-        ParameterError: the plant lacks an effect, or impossible mass properties.
-
+    computing time. A ParameterError is raised for impossible mass properties.
     """
 
     def __init__(self, robot: RobotParameters, parameters: SimulatorParameters,
@@ -73,6 +65,7 @@ class Plant:
         self._tilt, self._rate, self._target = self._qpos[7:], self._qvel[6:], self.data.ctrl[4:]
         self._ground_height: float | None = None
         self._commanded_tilt = np.zeros(4)
+        # Of the battery, set by its owner: voltage relative to a full one, charge drawn [A h].
         self.voltage_ratio, self.charge_drawn = 1.0, 0.0
         self._wrench = np.zeros(6)
         self._payload: float | None = None      # not yet set
@@ -103,18 +96,6 @@ class Plant:
         self._shaft = np.zeros(4)
         self.data.qpos[:3] = position
         self.data.qpos[3:7] = rotations.normalized(quaternion)[[3, 0, 1, 2]]
-        self._update()
-
-    def set_body(self, position: np.ndarray, quaternion: np.ndarray, velocity: np.ndarray,
-                 angular_velocity: np.ndarray) -> None:
-        """
-        Set pose and velocity of base_link; joints and rotors keep their states.
-
-        Arguments as those of the same names in :class:`.readings.Truth`.
-        """
-        self._qpos[:3] = position
-        self._qpos[3:7] = rotations.normalized(quaternion)[[3, 0, 1, 2]]
-        self._qvel[:3], self._qvel[3:6] = velocity, angular_velocity
         self._update()
 
     def _standing_height(self):
@@ -168,13 +149,7 @@ class Plant:
             set_base_part(self.model, base_part(self._robot, self._variation, mass))
 
     def step(self) -> None:
-        """
-        Advance one tick with the present targets.
-
-        Raises:
-            RuntimeError: the state has diverged.
-
-        """
+        """Advance one tick with the present targets; a RuntimeError reports a diverged state."""
         model, data = self.model, self.data
         if self._has_servo_loads:
             self._load_servos()
@@ -369,7 +344,7 @@ class Plant:
         """
         Accelerations in a given state away from the floor; the plant remains in it.
 
-        Arguments as those of the same names in :class:`.readings.Truth`, with the ``thrust``
+        Arguments as those of the same names in :class:`.sensors.Truth`, with the ``thrust``
         before the effects' scales; ``tilt_target`` (4,) [rad] is by default the present tilt.
         Returned are (10,) linear in world [m/s^2], angular in base_link and of tilts [rad/s^2].
         """

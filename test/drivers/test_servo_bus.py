@@ -27,7 +27,6 @@ def test_configuring_writes_all_settings_and_eeprom_once(monkeypatch):
     with bench(gains=gains, current_limit=0.5) as (bus, emulated):
         for servo in emulated.servos:
             servo['Torque Enable'], servo['Drive Mode'] = 1, 5
-        emulated.servos[0]['Firmware Version'] = 45     # without startup configuration
         bus.configure()
         for servo in emulated.servos:
             assert not servo.torque

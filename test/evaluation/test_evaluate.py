@@ -150,7 +150,7 @@ def test_faults_of_a_file_act_and_are_listed_in_the_results(tmp_path):
     path = tmp_path / 'faults.yaml'
     path.write_text('faults: [{what: rotor_stops, at: 1.0, rotor: 2}, {what: controller_silent}]')
     results = evaluate(task, ('hover',), faults=path, bag=tmp_path / 'bag')
-    listed = ['rotor_stops(rotor=2) at 1 s', 'controller_silent at 0 s']
+    listed = ['rotor_stops at=1 rotor=2', 'controller_silent at=0']
     assert results['meta']['faults'] == listed
     log = read_bag(tmp_path / 'bag')
     assert log.meta['faults'] == listed

@@ -38,16 +38,14 @@ def test_late_command_acts_at_once_but_never_overtakes_a_newer_one():
     assert not made.push(command(1.010, thrust=6), 1.021)
     made.update(1.025)
     assert made.thrust[0] == 7
-    assert made.rejected == {'older than the last': 1}
 
 
-@pytest.mark.parametrize('field, value, reason', [
-    ('tilt', np.array([0, np.nan, 0, 0]), 'not finite'), ('stamp', 1e9, 'from the future')])
-def test_unusable_command_is_refused_and_counted(field, value, reason):
+@pytest.mark.parametrize('field, value', [
+    ('tilt', np.array([0, np.nan, 0, 0])), ('stamp', 1e9)], ids=['not finite', 'future'])
+def test_unusable_command_is_refused(field, value):
     made, bad = link(), command(0.0)
     setattr(bad, field, value)
     assert not made.push(bad, 0.0)
-    assert made.rejected == {reason: 1}
     assert made.push(command(0.0), 0.0)
 
 

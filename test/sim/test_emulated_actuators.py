@@ -35,8 +35,8 @@ class Board:
     def set_rotors(self, thrust):
         self.rotors = thrust
 
-    def set_battery(self, voltage, current, error=(0.0, 0.0)):
-        self.pack, self.error = (voltage, current), error
+    def set_battery(self, voltage, current):
+        self.pack = voltage, current
 
 
 def coupled(conditions='nominal', seed=0):

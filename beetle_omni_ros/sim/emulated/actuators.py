@@ -10,7 +10,8 @@ import numpy as np
 
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.sim.emulated.device import BoardFaults, ServoFaults, switched_on
-from beetle_omni_ros.sim.readings import Drive, Frame
+from beetle_omni_ros.sim.faults import Drive
+from beetle_omni_ros.sim.sensors import Frame
 from beetle_omni_ros.sim.simulator import ROUNDING, Simulator
 
 if TYPE_CHECKING:       # pymavlink is needed by an emulated board only
@@ -51,13 +52,11 @@ class EmulatedActuators:
         self._tilts.append((np.array(goals), powered))
         self._thrusts.append(self.board.thrust_targets)
         tilt, powered = self._tilts[0]
-        frame = self._simulator.step(Drive(tilt, powered, self._thrusts[0]))
-        joints, pack, battery = frame.joints, frame.battery, self._simulator.battery
+        frame = self._simulator.step(Drive(tilt, self._thrusts[0], powered))
+        joints, battery = frame.joints, self._simulator.battery
         # The current of a servo without torque is zero.
         self.bus.set_state(joints.position, joints.velocity, joints.effort * powered)
-        voltage, current = battery.voltage, battery.current
-        self.board.set_battery(voltage, current,
-                               (pack.voltage - voltage, -pack.current - current))
+        self.board.set_battery(battery.voltage, battery.current)
         self.board.set_rotors(frame.truth.thrust)
         return frame
 

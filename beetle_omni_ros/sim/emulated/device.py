@@ -11,7 +11,6 @@ from random import Random
 import select
 import shutil
 import tempfile
-import termios
 from threading import RLock, Thread
 import time
 import tty
@@ -20,8 +19,6 @@ import numpy as np
 
 from beetle_omni_ros.robot.schema import parameter
 
-SPEEDS = {getattr(termios, name): int(name[1:]) for name in dir(termios)
-          if name[0] == 'B' and name[1:].isdigit()}
 CHUNK = 4096    # [B] size of the kernel's buffer
 PERIOD = 0.01   # [s] longest sleep of the thread
 SHARE = {'low': 0, 'high': 1}
@@ -135,11 +132,7 @@ class Device:
         self._lock, self._device, self._line = RLock(), -1, -1
         self._incoming, self._outgoing = Line(seed), Line(seed + 1)
         self._running = True
-        try:
-            self.plug()
-        except OSError:
-            self._remove()
-            raise
+        self.plug()
         self._thread = Thread(target=self._run, name=f'emulated {name}', daemon=True)
         self._thread.start()
 
@@ -154,17 +147,9 @@ class Device:
         if self._running:
             self._running = False
             self._thread.join(2.0)
-            self._remove()
-
-    def _remove(self):
-        self.unplug()
-        if self._folder:
-            shutil.rmtree(self._folder, ignore_errors=True)
-
-    @property
-    def baud_rate(self) -> int:
-        """Baud rate set by the driver [bit/s]."""
-        return SPEEDS.get(termios.tcgetattr(self._line)[5], 0)
+            self.unplug()
+            if self._folder:
+                shutil.rmtree(self._folder, ignore_errors=True)
 
     def plug(self) -> None:
         """
@@ -174,27 +159,24 @@ class Device:
             OSError: the path exists and is not a link, or cannot be created.
 
         """
+        link = Path(self.port)
+        fresh = link.with_name(f'{link.name}.new')
         with self._lock:
-            if self._device < 0:
-                self._plug(Path(self.port))
-
-    def _plug(self, link):
-        if os.path.lexists(link) and not link.is_symlink():
-            raise OSError(f'{link}: cannot be used as a port, it exists and is no link')
-        # The driver's end is kept open, because a serial device cannot detect its driver.
-        device, line = os.openpty()
-        try:
-            tty.setraw(line)
-            os.set_blocking(device, False)
-            fresh = Path(f'{link}.new')
-            fresh.unlink(missing_ok=True)
-            fresh.symlink_to(os.ttyname(line))
-            fresh.replace(link)
-        except OSError as error:
-            os.close(device)
-            os.close(line)
-            raise OSError(f'{link}: cannot be used as a port ({error.strerror})') from None
-        self._device, self._line = device, line
+            if self._device >= 0:
+                return
+            if os.path.lexists(link) and not link.is_symlink():
+                raise OSError(f'{link}: cannot be used as a port, it exists and is no link')
+            # The driver's end is kept open, because a serial device cannot detect its driver.
+            self._device, self._line = os.openpty()
+            tty.setraw(self._line)
+            os.set_blocking(self._device, False)
+            try:
+                fresh.unlink(missing_ok=True)
+                fresh.symlink_to(os.ttyname(self._line))
+                fresh.replace(link)
+            except OSError as error:
+                self.unplug()
+                raise OSError(f'{link}: cannot be used as a port ({error.strerror})') from None
 
     def unplug(self) -> None:
         """Unplug the cable; a driver that has the port open gets an error or an end of file."""

@@ -49,7 +49,7 @@ class BoardFirmware:
 
     Attributes:
         voltage, current: of the battery [V, A]; set from outside, as the next two.
-        rpm, rotor_current: of the four rotors [1/min, A].
+        rpm: of the four rotors [1/min].
         failed: rotors (0 to 3) whose ESC has failed.
         refused: reason -> number of refused targets since the start.
         timeouts: number of target timeouts with turning rotors.
@@ -61,7 +61,7 @@ class BoardFirmware:
         self._clock_zero = now - CLOCK_START
         self._arm_voltage = cells * self.numbers.arm_cell_voltage
         self.voltage = self.current = 0.0
-        self.rpm, self.rotor_current = [0.0] * 4, [0.0] * 4
+        self.rpm = [0.0] * 4
         self.failed: frozenset[int] = frozenset()
         self._start(now, NONE)
 
@@ -187,7 +187,7 @@ class BoardFirmware:
         works = [k not in self.failed for k in range(4)]
         return EscStatus(0, stamp, [round(rpm) * on for rpm, on in zip(self.rpm, works)],
                          [self.voltage * on for on in works],
-                         [current * on for current, on in zip(self.rotor_current, works)])
+                         [self.current / 4 * on for on in works])
 
     def _esc_info(self, stamp):
         failed = [k in self.failed for k in range(4)]
@@ -310,7 +310,6 @@ class EmulatedMotorBoard(Device):
         self.on_target: Callable[[float, int], None] | None = None
         self._firmware = BoardFirmware(robot.battery.cells, time.monotonic(), **changes)
         self._voltage, self._current = robot.battery.full_voltage, 0.0
-        self._error = 0.0, 0.0
         self._thrust: np.ndarray | None = None
         self._clear_stream()
         super().__init__('motor_board', port, seed)
@@ -347,10 +346,9 @@ class EmulatedMotorBoard(Device):
         """Reason -> number of refused targets since the start of the board."""
         return dict(self._firmware.refused)
 
-    def set_battery(self, voltage: float, current: float,
-                    error: tuple[float, float] = (0.0, 0.0)) -> None:
-        """Set true voltage [V], drawn current [A] and errors of both measurements [V, A]."""
-        self._voltage, self._current, self._error = float(voltage), float(current), error
+    def set_battery(self, voltage: float, current: float) -> None:
+        """Set voltage [V] and drawn current [A]."""
+        self._voltage, self._current = float(voltage), float(current)
 
     def set_rotors(self, thrust: np.ndarray) -> None:
         """Set present thrusts (4,) [N] of the rotors."""
@@ -396,13 +394,8 @@ class EmulatedMotorBoard(Device):
     def _measure(self, now):
         """Set the measurements of the firmware."""
         firmware = self._firmware
-        firmware.voltage = self._voltage + self._error[0]
-        firmware.current = self._current + self._error[1]
+        firmware.voltage, firmware.current = self._voltage, self._current
         firmware.failed = frozenset(int(rotor) - 1 for rotor in self.faults.failed_escs)
         thrust = self._thrusts(np.array(firmware.outputs(now))) if self._thrust is None \
             else self._thrust
-        thrust = np.maximum(thrust, 0.0)
-        firmware.rpm = (RPM_AT_1_NEWTON * np.sqrt(thrust)).tolist()
-        # The battery current is divided among the rotors by aerodynamic power.
-        powers = thrust ** 1.5
-        firmware.rotor_current = (self._current * powers / (powers.sum() or 1.0)).tolist()
+        firmware.rpm = (RPM_AT_1_NEWTON * np.sqrt(np.maximum(thrust, 0.0))).tolist()

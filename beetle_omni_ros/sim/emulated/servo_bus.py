@@ -28,17 +28,14 @@ PING, READ, WRITE, REBOOT, STATUS, SYNC_READ, SYNC_WRITE = (
     0x01, 0x02, 0x03, 0x08, 0x55, 0x82, 0x83)
 
 EEPROM_END = 64     # registers below it keep their value without power
-STARTUP_FIRMWARE = 46   # first version with a startup configuration
-FIRMWARE = 52
 COUNTS_PER_TURN = 4096
 POSITION_UNIT = 2 * pi / COUNTS_PER_TURN    # [rad]
 ZERO = 2048         # position reading in the middle of the turn
 VELOCITY_UNIT = 0.229 * 2 * pi / 60         # [rad/s] 0.229 rev/min
-VOLTAGE_UNIT = 0.1  # [V]
+VOLTAGE_UNIT, VOLTAGE_LIMITS = 0.1, (5.5, 14.0)    # [V]
 WATCHDOG_UNIT, WATCHDOG_EXPIRED = 0.02, 255     # [s]
 # [N m] for one count (about 1 mA) of current: the maker's model file xc330_t181_fw52.model
 TORQUE_UNIT = 0.000670947
-BAUD_RATES = (9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
 # Hardware Error Status (70) and Shutdown (63)
 VOLTAGE_ERROR, OVERHEATING, OVERLOAD = 0x01, 0x04, 0x20
 # Errors in the lower seven bits of the error byte in a status packet; ALERT is the eighth bit.
@@ -60,17 +57,14 @@ class Register(NamedTuple):
 GAIN = range(16384)
 TABLE = {
     'Model Number': Register(0, 2, 1210),
-    'Firmware Version': Register(6, 1, FIRMWARE),
+    'Firmware Version': Register(6, 1, 52),
     'ID': Register(7, 1, 1, range(253)),
-    'Baud Rate': Register(8, 1, 1, range(7)),
     'Return Delay Time': Register(9, 1, 250, range(255)),
     'Drive Mode': Register(10, 1, 0, (0, 1, 4, 5, 8, 9, 12, 13)),
     'Operating Mode': Register(11, 1, 3, (0, 1, 3, 4, 5, 16)),
     'Secondary(Shadow) ID': Register(12, 1, 255, (*range(253), 255)),
     'Homing Offset': Register(20, 4, 0, range(-1_044_479, 1_044_480), True),
     'Temperature Limit': Register(31, 1, 70, range(101)),
-    'Max Voltage Limit': Register(32, 2, 140, range(55, 141)),
-    'Min Voltage Limit': Register(34, 2, 55, range(55, 141)),
     'Current Limit': Register(38, 2, 910, range(911)),
     'Startup Configuration': Register(60, 1, 0, range(4)),
     'Shutdown': Register(63, 1, 52, range(0x3E)),
@@ -99,8 +93,6 @@ TABLE = {
 NAMES = {register.address: name for name, register in TABLE.items()}
 DEFINED = frozenset(address for register in TABLE.values()
                     for address in range(register.address, register.address + register.size))
-# Registers that a change of the operating mode resets.
-RESET_BY_MODE = tuple(name for name in TABLE if 'Gain' in name or 'Profile' in name)
 
 
 # --- packets ----------------------------------------------------------------------------------
@@ -165,15 +157,15 @@ class EmulatedServo:
     owner sets ``angle``, ``velocity`` [rad/s] and ``effort`` [N m] of the shaft.
     """
 
-    def __init__(self, identifier: int, *, baud_rate: int = 1_000_000, sign: int = 1,
-                 zero: int = ZERO, reboot_time: float = 0.3):
+    def __init__(self, identifier: int, *, sign: int = 1, zero: int = ZERO,
+                 reboot_time: float = 0.3):
         self.sign, self.zero, self.reboot_time = sign, zero, reboot_time
         self.angle = self.velocity = self.effort = 0.0
         self.last_packet, self.boots_at = 0.0, -inf
         self._memory = bytearray(max(DEFINED) + 1)
         for name, register in TABLE.items():
             self[name] = register.initial
-        self['ID'], self['Baud Rate'] = identifier, BAUD_RATES.index(baud_rate)
+        self['ID'] = identifier
         self._to_one_turn()
 
     def __getitem__(self, name: str) -> int:
@@ -217,12 +209,10 @@ class EmulatedServo:
     def write(self, address: int, data: bytes) -> int:
         """Write one register; return the error."""
         name = NAMES.get(address)
-        if name is None or (name == 'Startup Configuration'
-                            and self['Firmware Version'] < STARTUP_FIRMWARE):
+        if name is None or (address < EEPROM_END and self.torque):
             return ACCESS
         register = TABLE[name]
-        if not register.legal or len(data) != register.size or (
-                address < EEPROM_END and self.torque):
+        if not register.legal or len(data) != register.size:
             return ACCESS
         value = int.from_bytes(data, 'little', signed=register.signed)
         if value not in register.legal or (self.expired and (
@@ -231,14 +221,12 @@ class EmulatedServo:
         # The manual defines the refusal, but not its error.
         if name == 'Torque Enable' and value and self['Hardware Error Status'] & self['Shutdown']:
             return RESULT_FAIL
-        self._apply(name, value)
-        return NONE
-
-    def _apply(self, name, value):
         if name == 'Operating Mode' and self[name] != value:
-            for other in RESET_BY_MODE:
-                self[other] = TABLE[other].initial
+            for other in TABLE:
+                if 'Gain' in other or 'Profile' in other:
+                    self[other] = TABLE[other].initial
         self[name] = value      # a goal remains, so torque without a new one causes a jump
+        return NONE
 
     def reboot(self, now: float):
         """Restart with initial RAM, torque off, position within one turn; silent until booted."""
@@ -256,8 +244,8 @@ class EmulatedServo:
         self['Present Temperature'] = temperature
         if temperature > self['Temperature Limit']:
             self.trip(OVERHEATING)
-        self['Present Input Voltage'] = counts = round(voltage / VOLTAGE_UNIT)
-        if not self['Min Voltage Limit'] <= counts <= self['Max Voltage Limit']:
+        self['Present Input Voltage'] = round(voltage / VOLTAGE_UNIT)
+        if not VOLTAGE_LIMITS[0] <= voltage <= VOLTAGE_LIMITS[1]:
             self.trip(VOLTAGE_ERROR)
 
     def expire(self):
@@ -292,7 +280,6 @@ class EmulatedServoBus(Device):
     Args:
         identifiers: IDs in the order of the joints.
         port: path of the created port; by default a temporary one.
-        baud_rate: baud rate of the servos [bit/s].
         signs: +1 or -1 for each servo: counts rise or fall with the joint's angle.
         zeros: counts at which the angle of each joint is zero.
         speed: of servos with torque without a plant [rad/s]; by default they do not move.
@@ -302,12 +289,10 @@ class EmulatedServoBus(Device):
     """
 
     def __init__(self, identifiers: Sequence[int] = (1, 2, 3, 4), *, port: str | None = None,
-                 baud_rate: int = 1_000_000, signs: Sequence[int] = (1,) * 4,
-                 zeros: Sequence[int] = (ZERO,) * 4, speed: float = 0.0,
-                 reboot_time: float = 0.3, seed: int = 0):
+                 signs: Sequence[int] = (1,) * 4, zeros: Sequence[int] = (ZERO,) * 4,
+                 speed: float = 0.0, reboot_time: float = 0.3, seed: int = 0):
         self.faults, self.refusals = ServoFaults(), 0
-        self.servos = [EmulatedServo(name, baud_rate=baud_rate, sign=sign, zero=zero,
-                                     reboot_time=reboot_time)
+        self.servos = [EmulatedServo(name, sign=sign, zero=zero, reboot_time=reboot_time)
                        for name, sign, zero in zip(identifiers, signs, zeros, strict=True)]
         self._speed, self._buffer = speed, bytearray()
         self._last_data = self._last_check = self._last_move = time.monotonic()
@@ -364,7 +349,7 @@ class EmulatedServoBus(Device):
             faults = self.faults
             for received in packets(self._buffer):
                 self._move(now)
-                for answer in self.handle(received, self.baud_rate, now):
+                for answer in self.handle(received, now):
                     self._outgoing.put(answer, now, faults.dropped, faults.bad_crc, faults.delay,
                                        faults.delayed)
         # After the data, so that waiting packets restart the watchdogs of a late thread.
@@ -385,11 +370,10 @@ class EmulatedServoBus(Device):
             if servo.torque:
                 servo.angle += max(-step, min(step, servo.goal - servo.angle))
 
-    def handle(self, received: tuple[int, int, bytes], baud_rate: int, now: float) -> list[bytes]:
+    def handle(self, received: tuple[int, int, bytes], now: float) -> list[bytes]:
         """Execute a packet in every servo that receives it; return the answers in order."""
         listening = {servo['ID']: servo for servo in self.servos
-                     if servo['ID'] not in self.faults.silent and now >= servo.boots_at
-                     and BAUD_RATES[servo['Baud Rate']] == baud_rate}
+                     if servo['ID'] not in self.faults.silent and now >= servo.boots_at}
         for servo in listening.values():
             servo.last_packet = now
         name, code, given = received
