@@ -31,7 +31,12 @@ from beetle_omni_ros.sim.sensors import Impact, Truth
 
 STARTS = ('hover', 'moving', 'upside_down')      # default
 ALL_STARTS = (*STARTS, 'random')
-LANDING, LANDING_BLIND, HEALTHY = 'landing', 'landing_without_mocap', 'healthy'
+# Landings from a random attitude and healthy flights, which are no faults of a list.
+LANDING = Case('landing', 'flies_on', 'landing from a random attitude', ())
+LANDING_BLIND = Case('landing_without_mocap', 'flies_on',
+                     'landing from a random attitude, motion capture is lost',
+                     (Fault('mocap_lost'),))
+HEALTHY = Case('healthy', 'flies_on', 'poses without a fault', ())
 CONDITIONS = ('nominal', 'published', 'effects')    # of healthy flights
 EFFECTS = {     # of the plant of healthy flights; sizes of docs/gap.md
     'thrust_coefficient': {'scale': 0.95},
@@ -84,8 +89,8 @@ PLAN = Plan()
 class Trial:
     """Parameters of a flight."""
 
-    case: str                   # name of the fault in the list, LANDING, LANDING_BLIND or HEALTHY
-    start: str = 'hover'        # one of ALL_STARTS, for a fault
+    case: str                   # name of the fault in the list, or of a landing or healthy flight
+    start: str = 'hover'        # one of ALL_STARTS, '' for a landing or healthy flight
     seed: int = 0               # of the simulation and, with ``case``, of the moves
     conditions: str = 'nominal'     # of CONDITIONS; 'effects' is nominal with EFFECTS in the plant
     controller: str = registry.DEFAULT
@@ -107,10 +112,9 @@ class Trial:
                           self.conditions, self.listed, plant=self.plant)
 
 
-def fly_trial(trial: Trial, case: Case | None = None, bags: Path | None = None,
-              plan: Plan = PLAN) -> dict:
+def fly_trial(trial: Trial, case: Case, bags: Path | None = None, plan: Plan = PLAN) -> dict:
     """
-    Fly one trial, with the fault ``case`` if it has one; ``bags`` is the folder for its bag.
+    Fly one trial of a case; ``bags`` is the folder for its bag.
 
     Returns:
         the trial's fields, flown_s, state, good, bag (its name or ''), error ('' without an
@@ -124,13 +128,8 @@ def fly_trial(trial: Trial, case: Case | None = None, bags: Path | None = None,
         with collector_off(), ExitStack() as stack:
             recorder = stack.enter_context(BagWriter(
                 bags / trial.name, asdict(trial), epoch=int(time()))) if bags else Tee()
-            if trial.case == HEALTHY:
-                flown = _fly_healthy(trial, recorder, plan)
-            elif case is None:
-                flown = _fly_landing(trial, recorder, plan)
-            else:
-                flown = _fly_fault(trial, case, recorder, plan)
-        result.update(flown)
+            result.update(_fly_healthy(trial, recorder, plan) if case == HEALTHY
+                          else _fly_fault(trial, case, recorder, plan))
     except Exception as error:          # the campaign continues and reports the error
         text = f'{type(error).__name__}: {error}'[:200]
         result.update(outcome='error', error=text, failure=text)
@@ -138,9 +137,10 @@ def fly_trial(trial: Trial, case: Case | None = None, bags: Path | None = None,
 
 
 def _fly_fault(trial, case, recorder, plan):
-    """Take off, start of the fault, flight with the fault, landing."""
-    flight = Flight(trial, plan, recorder, case.strike, moves=trial.case)
-    part, moving = flight.random.uniform(), trial.start in ('moving', 'random')
+    """Fly to the start, start the fault, fly on with it unless it is a landing, and land."""
+    flight = Flight(trial, case, plan, recorder)
+    left, moving = plan.watch_time, trial.start in ('moving', 'random')
+    part = flight.random.uniform()
     if moving:
         pose_time, later = (plan.pose_time, plan.pose_time) if trial.start == 'random' \
             else (plan.move_time, plan.jitter)
@@ -148,14 +148,18 @@ def _fly_fault(trial, case, recorder, plan):
         flight.fly(pose_time)
         flight.aim_randomly()
         flight.fly(part * later)
-    else:
+    elif trial.start:
         upside_down = trial.start == 'upside_down'
         flight.aim((0.0, 0.0, plan.height), (np.pi if upside_down else 0.0, 0, 0))
         flight.fly((plan.turn_time if upside_down else plan.hover_time) + plan.jitter * part)
+    else:
+        flight.aim((0.0, 0.0, plan.height), attitude(trial.seed))
+        flight.fly(plan.turn_time)
+        left = 0.0
     watcher = Watcher(flight)
     start = flight.simulator.time
     flight.loop.start_faults()
-    left, over = plan.watch_time, False
+    over = False
     while left > 0 and not over:
         period = min(left, plan.move_time) if moving else left
         over = flight.fly(period, watcher)
@@ -166,26 +170,12 @@ def _fly_fault(trial, case, recorder, plan):
     if not over:
         flight.land(watcher)
     seen = watcher.observed(asked=asked)
+    good = seen['outcome'] in BETTER[case.expected]
+    if good and not trial.start:
+        good = bool(seen['impact_m_s'] <= plan.landing_speed
+                    and np.radians(seen['inclination_deg']) <= plan.landing_inclination)
     return {**seen, 'expected': case.expected, 'flown_s': flight.simulator.time - start,
-            'good': seen['outcome'] in BETTER[case.expected]}
-
-
-def _fly_landing(trial, recorder, plan):
-    """Fly to an attitude and land."""
-    rpy = attitude(trial.seed)
-    flight = Flight(trial, plan, recorder,
-                    (Fault('mocap_lost'),) if trial.case == LANDING_BLIND else ())
-    flight.aim((0.0, 0.0, plan.height), rpy)
-    flight.fly(plan.turn_time)
-    watcher = Watcher(flight)
-    asked = flight.supervisor.state in IN_FLIGHT
-    flight.loop.start_faults()
-    flight.land(watcher)
-    seen = watcher.observed(asked=asked)
-    return {**seen, 'attitude_deg': np.degrees(rpy).tolist(), 'expected': 'flies_on',
-            'good': seen['outcome'] == 'flies_on' and bool(
-                seen['impact_m_s'] <= plan.landing_speed
-                and np.radians(seen['inclination_deg']) <= plan.landing_inclination)}
+            'good': good}
 
 
 def attitude(seed: int) -> np.ndarray:
@@ -198,7 +188,7 @@ def attitude(seed: int) -> np.ndarray:
 
 def _fly_healthy(trial, recorder, plan):
     """Fly random poses and land."""
-    flight = Flight(trial, plan, recorder)
+    flight = Flight(trial, HEALTHY, plan, recorder)
     simulator, supervisor = flight.simulator, flight.supervisor
     start = simulator.time
     while simulator.time - start < plan.healthy_time and supervisor.state in IN_FLIGHT:
@@ -216,15 +206,9 @@ def _fly_healthy(trial, recorder, plan):
 
 
 class Flight:
-    """
-    One robot with its flight stack, in the air.
+    """One robot with its flight stack, in the air; ``loop.start_faults`` starts its faults."""
 
-    ``loop.start_faults`` starts the faults ``strike``. The text ``moves`` decides the random
-    numbers of the plan beside the seed, so that a seed is not one move.
-    """
-
-    def __init__(self, trial: Trial, plan: Plan, recorder: Recorder,
-                 strike: tuple[Fault, ...] = (), moves: str = ''):
+    def __init__(self, trial: Trial, case: Case, plan: Plan, recorder: Recorder):
         nominal = RobotParameters.load()
         aboard = {entry.name: entry.make(nominal) for entry in map(
             registry.find, dict.fromkeys([trial.controller, registry.pilot()]))}
@@ -234,10 +218,11 @@ class Flight:
             true, conditions = replace(true, effects=true.effects | EFFECTS), 'nominal'
         self.plan = plan
         self.loop = FlightLoop(nominal, true, aboard, recorder, conditions=conditions,
-                               seed=trial.seed, faults=strike)
+                               seed=trial.seed, faults=case.strike)
         self.simulator, self.supervisor = self.loop.simulator, self.loop.supervisor
+        # With other moves for each fault, a seed is not one move.
         self.random = np.random.default_rng(
-            [trial.seed, crc32(moves.encode())] if moves else trial.seed)
+            [trial.seed, crc32(trial.case.encode())] if trial.start else trial.seed)
         self.loop.take_off()
 
     def aim(self, position, rpy) -> None:
@@ -323,25 +308,18 @@ class Watcher:
 
     def observed(self, *, asked: bool) -> dict:
         """Observations; ``asked``: whether the robot flew when the landing was commanded."""
-        worst = max((impact.speed for impact in self.impacts), default=None)
         inclined = max((impact.inclination for impact in self.impacts), default=None)
-        state = self._flight.supervisor.state
         return {
-            'outcome': self.outcome(asked=asked, stopped=state in OFF,
-                                    refused=bool(self._flight.loop.refusals)),
-            'impact_m_s': worst,
+            'outcome': self.outcome(asked), 'broken': self.crash is not None,
+            'impact_m_s': max((impact.speed for impact in self.impacts), default=None),
             'inclination_deg': None if inclined is None else float(np.degrees(inclined)),
-            'broken': self.crash is not None, 'overrun_s': self.overrun,
-            'flyaway': self.flyaway, 'takeoffs': self.takeoffs, 'named': self.named[0],
-            'named_s': self.named[1], 'said': self.said, 'state': state}
+            'overrun_s': self.overrun, 'flyaway': self.flyaway, 'takeoffs': self.takeoffs,
+            'named': self.named[0], 'named_s': self.named[1], 'said': self.said,
+            'state': self._flight.supervisor.state}
 
-    def outcome(self, *, asked: bool, stopped: bool, refused: bool) -> str:
-        """
-        Outcome of the flight as one word of :data:`.page.OUTCOMES`.
-
-        The arguments are whether the robot still flew when the landing was commanded, the motors
-        were off at the end, and a target was refused.
-        """
+    def outcome(self, asked: bool) -> str:
+        """Outcome of the flight as one word of :data:`.page.OUTCOMES`."""
+        stopped = self._flight.supervisor.state in OFF
         if self.flyaway:
             return 'flyaway'
         if self.takeoffs:
@@ -357,4 +335,4 @@ class Watcher:
             return 'tilted'
         if not asked:
             return 'lands'
-        return 'refused' if refused else 'flies_on'
+        return 'refused' if self._flight.loop.refusals else 'flies_on'

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from beetle_omni_ros.faults.flight import HEALTHY, LANDING, PLAN
+from beetle_omni_ros.faults.flight import PLAN
 from beetle_omni_ros.pages import page as shared
 from beetle_omni_ros.pages.page import (
     ABSENT,
@@ -49,7 +49,7 @@ def summary(flights: list[dict], cases: dict[str, Case]) -> dict:
     """
     groups: dict[str, list[dict]] = {}
     for one in flights:
-        name = one['case'] if one['case'] in cases else f"{one['case']}, {one['conditions']}"
+        name = one['case'] if one['start'] else f"{one['case']}, {one['conditions']}"
         groups.setdefault(name, []).append(one)
     return {'faults': {name: _row(flown, cases) for name, flown in groups.items()}, 'total': {
         'flights': len(flights), 'good': sum(one['good'] for one in flights),
@@ -67,18 +67,16 @@ def _row(flown, cases):
     def median(key):
         return float(np.median(known(key))) if known(key) else None
 
-    name = flown[0]['case']
-    case = cases.get(name)
-    what = case.what if case else 'poses without a fault' if name == HEALTHY else \
-        'landing from a random attitude' + ', motion capture is lost' * (name != LANDING)
+    case = cases[flown[0]['case']]
     alarms = Counter(text for one in flown for *_, text in one.get('alarms', ()))
     return {
-        'what': what, 'expected': case.expected if case else 'flies_on',
+        'what': case.what, 'expected': case.expected,
         'flights': len(flown), 'good': sum(one['good'] for one in flown),
         'outcomes': dict(Counter(one['outcome'] for one in flown).most_common()),
         'impact_median_m_s': median('impact_m_s'),
         'impact_worst_m_s': max(known('impact_m_s'), default=None),
-        'inclination_worst_deg': None if case else max(known('inclination_deg'), default=None),
+        'inclination_worst_deg': None if flown[0]['start'] else max(known('inclination_deg'),
+                                                                    default=None),
         'named': dict(Counter(filter(None, known('named'))).most_common()),
         'named_s': median('named_s'),
         'hours': sum(known('flown_s')) / 3600, 'alarms': dict(alarms.most_common())}
@@ -87,17 +85,17 @@ def _row(flown, cases):
 def grid(results: dict, narrow: bool = False) -> Grid:
     """Table of the summary; ``narrow``: for 80 columns. Columns without content are left out."""
     rows = results['summary']['faults']
-    columns = [[
-        name, *([] if narrow else [row['what']]), row['expected'],
-        f"{row['good']}/{row['flights']}", _counted(row['outcomes'], '\n' if narrow else ', '),
-        *([] if narrow else [number(row['impact_median_m_s'])]), number(row['impact_worst_m_s']),
-        number(row['inclination_worst_deg']), number(row['named_s']), _counted(row['alarms'])]
+    cells = [[
+        name, row['expected'], f"{row['good']}/{row['flights']}",
+        _counted(row['outcomes'], '\n' if narrow else ', '), number(row['impact_worst_m_s']),
+        number(row['inclination_worst_deg']), number(row['named_s']), _counted(row['alarms']),
+        *([] if narrow else [number(row['impact_median_m_s']), row['what']])]
         for name, row in rows.items()]
-    header = ['fault', *([] if narrow else ['what happens']), 'expected', 'good', 'outcomes',
-              *([] if narrow else ['impact median [m/s]']), 'impact worst [m/s]',
-              'inclination worst [deg]', 'named [s]', 'alarms']
-    shown = [k for k in range(len(header)) if any(row[k] not in ('', ABSENT) for row in columns)]
-    return Grid('', [header[k] for k in shown], [[row[k] for k in shown] for row in columns],
+    header = ['fault', 'expected', 'good', 'outcomes', 'impact worst [m/s]',
+              'inclination worst [deg]', 'named [s]', 'alarms', 'impact median [m/s]',
+              'what happens']
+    shown = [k for k in range(len(cells[0])) if any(row[k] not in ('', ABSENT) for row in cells)]
+    return Grid('', [header[k] for k in shown], [[row[k] for k in shown] for row in cells],
                 note=NOTE)
 
 

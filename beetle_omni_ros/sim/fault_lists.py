@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from difflib import get_close_matches
 from pathlib import Path
 from typing import NamedTuple
 
 from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError, quoted, shortened
-from beetle_omni_ros.sim.faults import Fault, KINDS
+from beetle_omni_ros.sim.faults import Fault, near
 
 # Signals without effect if the devices are emulated.
 DEVICES = 'joints', 'rotors', 'battery', 'command'
@@ -26,13 +25,7 @@ class Case(NamedTuple):
 
 
 def load_cases(path: str | Path | None = None) -> dict[str, Case]:
-    """
-    Read named faults, by default the shipped ones.
-
-    Raises:
-        ParameterError: unusable file; the message has file, key and the expected value.
-
-    """
+    """Read named faults, by default the shipped ones; a ParameterError has file and key."""
     path = path or share_path('params/faults.yaml')
     return {str(name): _case(str(name), entry, f"{path}: key 'faults.{shortened(str(name))}'")
             for name, entry in _content(path, dict, 'a mapping of names').items()}
@@ -61,17 +54,10 @@ def _case(name, entry, at):
 
 
 def chosen(cases: dict[str, Case], names: list[str]) -> list[Case]:
-    """
-    Cases by name.
-
-    Raises:
-        ParameterError: unknown name.
-
-    """
+    """Cases by name; a ParameterError reports an unknown one."""
     for name in names:
         if name not in cases:
-            raise ParameterError(f'fault {quoted(name)} is unknown, a name of the list is '
-                                 f'expected{_near(name, cases)}')
+            raise ParameterError(f'fault {quoted(name)} is unknown{near(name, cases)}')
     return [cases[name] for name in names]
 
 
@@ -90,11 +76,8 @@ def load_faults(path: str | Path) -> list[Fault]:
     """
     Read the faults of one flight, each with the keys what, at [s], duration [s] and numbers.
 
-    ``what`` is a name of the shipped list, or a kind.
-
-    Raises:
-        ParameterError: unusable file; the message has file, key and the expected value.
-
+    ``what`` is a name of the shipped list without numbers, or a kind. A ParameterError has file
+    and key.
     """
     named = load_cases()
     return [fault for k, entry in enumerate(_content(path, list, 'a list'), 1)
@@ -103,35 +86,15 @@ def load_faults(path: str | Path) -> list[Fault]:
 
 def _placed(entry, at, named):
     what = entry.get('what') if isinstance(entry, dict) else None
-    times = {key: value for key, value in entry.items() if key != 'what'} if what else {}
-    if not isinstance(what, str) or what in KINDS and not (
-            what in named and set(times) <= {'at', 'duration'}):
-        return [_fault(entry, at, 'what')]
-    if what not in named:
-        raise ParameterError(f"{at}: key 'what': {quoted(what)} is unknown, a kind or a name of "
-                             f'params/faults.yaml is expected{_near(what, [*KINDS, *named])}')
-    for key in times:
-        if key not in ('at', 'duration'):
-            raise ParameterError(f'{at}: key {quoted(key)}: a fault of the list takes at and '
-                                 'duration')
-    return [_fault({'kind': fault.kind, **fault.numbers, 'duration': fault.duration, **times}, at)
-            for fault in named[what].strike]
-
-
-def _near(name, known):
-    near = get_close_matches(name[:60], known, 8, 0.4)
-    return f"; near: {', '.join(dict.fromkeys(near))}" if near else \
-        f"; for example {', '.join([*known][:4])}"
+    if isinstance(what, str) and what in named and set(entry) <= {'what', 'at', 'duration'}:
+        times = {key: value for key, value in entry.items() if key != 'what'}
+        return [_fault({'kind': fault.kind, **fault.numbers, 'duration': fault.duration, **times},
+                       at) for fault in named[what].strike]
+    return [_fault(entry, at, 'what')]
 
 
 def parse_faults(text: str) -> list[Fault]:
-    """
-    Parse a text such as 'rotor_stops rotor=2; mocap_lost duration=3'.
-
-    Raises:
-        ParameterError: unusable part of the text.
-
-    """
+    """Parse a text such as 'rotor_stops rotor=2; mocap_lost duration=3'."""
     faults = []
     for part in filter(None, (part.strip() for part in text.split(';'))):
         kind, *given = part.split()

@@ -4,8 +4,8 @@ Faults of the simulated robot, its devices and the flight stack, as one table KI
 An example is ``Fault('rotor_weak', at=3.0, duration=1.0, rotor=2, share=0.5)``. Faults of robot
 and devices go to ``Simulator.set_faults``, those of processes to the in-process loop.
 
-A function of the table gets an active fault with the numbers of its kind and the attributes that
-:meth:`Schedule.update` sets. What else it gets and returns depends on its signal:
+A function of the table gets the state of an active fault, see :class:`Schedule`. What else it gets
+and returns depends on its signal:
 
 - ``imu``, ``mocap``, ``joints``, ``rotors``, ``battery``: the reading that arrives; returns the
   changed one, or None. ``command`` and ``request`` do the same for the commands to the actuators
@@ -23,8 +23,9 @@ The function of a ``late`` kind is also called without an item, and returns the 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, Field, MISSING, replace
+from difflib import get_close_matches
 from math import exp, inf
 from types import SimpleNamespace
 from typing import Any
@@ -71,10 +72,6 @@ def dropped(fault, item):
 def frozen(fault, item):
     fault.memory = fault.memory or item
     return replace(fault.memory, stamp=item.stamp)
-
-
-def stamped_wrongly(fault, item):
-    return replace(item, stamp=item.stamp + fault.step)
 
 
 def delayed(fault, item, most=inf):
@@ -316,10 +313,10 @@ KINDS = {
     'mocap_delayed': Kind(DELAY, late=True, mocap=lambda fault, pose: delayed(fault, pose, 1)),
     'mocap_lags': Kind(DELAY, late=True, mocap=mocap_lags),
     'mocap_slow': Kind({'period': number(unit='s', low=0.01, high=5)}, mocap=mocap_slow),
-    'mocap_clock': Kind(STEP, mocap=stamped_wrongly),
+    'mocap_clock': Kind(STEP, mocap=added('stamp', lambda fault: fault.step)),
     'imu_lost': Kind(imu=lost),
     'imu_frozen': Kind(imu=frozen),
-    'imu_clock': Kind(STEP, imu=stamped_wrongly),
+    'imu_clock': Kind(STEP, imu=added('stamp', lambda fault: fault.step)),
     'gyroscope_bias': Kind(vector('rad/s'), imu=added('angular_velocity', _axes)),
     'accelerometer_bias': Kind(vector('m/s^2'), imu=added('specific_force', _axes)),
     'imu_saturated': Kind(sizes(1000.0), imu=of_motion(lambda fault, motion: np.clip(
@@ -344,6 +341,12 @@ KINDS = {
 TIME = number(unit='s', low=0)
 
 
+def near(name: str, known: Collection[str]) -> str:
+    """Names that are like a wrong one, or some of the known, for a message."""
+    like = get_close_matches(name[:60], known, 8, 0.4)
+    return f"; near: {', '.join(like)}" if like else f"; for example {', '.join([*known][:4])}"
+
+
 @dataclass(frozen=True, init=False)
 class Fault:
     """One fault."""
@@ -354,16 +357,9 @@ class Fault:
     numbers: Mapping[str, float]    # all numbers of the kind, by name
 
     def __init__(self, kind: str, /, at: float = 0.0, duration: float = inf, **numbers: float):
-        """
-        Check all arguments; missing numbers have the defaults of the kind.
-
-        Raises:
-            ParameterError: illegal kind or number; the message has kind and key.
-
-        """
+        """Check all arguments; a ParameterError has kind and key of an illegal one."""
         if kind not in KINDS:
-            raise ParameterError(f'fault {quoted(kind)} is unknown; known: '
-                                 f"{', '.join(sorted(KINDS))}")
+            raise ParameterError(f'fault {quoted(kind)} is unknown{near(kind, KINDS)}')
         declared, prefix = KINDS[kind].numbers, f"fault '{kind}': key"
         for key in numbers:
             if key not in declared:
@@ -401,9 +397,8 @@ class Schedule:
     """
     Starts and ends faults by their times, updated once in each ``tick`` [s].
 
-    Equal faults, seeds and calls give equal results. A fault that is in the list before and after
-    a change continues unchanged. ``active`` are kind and state of the active faults, ``names``
-    their kinds, in the order of the list.
+    Equal faults, seeds and calls give equal results. ``active`` are kind and state of the active
+    faults, ``names`` their kinds, in the order of the list.
     """
 
     def __init__(self, tick: float, seed: np.random.SeedSequence, battery=None):
@@ -415,7 +410,7 @@ class Schedule:
         self.names: list[str] = []
 
     def set(self, faults: Sequence[Fault], now: float) -> None:
-        """Replace the faults; their ``at`` counts from ``now`` [s]."""
+        """Replace the faults, ``at`` counts from ``now`` [s]; one that stays continues."""
         before, self._states = self._states, []
         for fault in faults:
             state = next((state for state in before if state.fault == fault), None)
@@ -431,11 +426,7 @@ class Schedule:
         self._collect()
 
     def update(self, now: float, truth: Any = None, held: np.ndarray | None = None) -> None:
-        """
-        Start and end the faults that are due at ``now`` [s].
-
-        ``truth`` is the present state, ``held`` (4,) are the targets of the servos [rad].
-        """
+        """Start and end the faults due at ``now`` [s], with the true state and servo targets."""
         changed = False
         for state in self._states:
             if not (state.active or state.over) and now >= state.begin - ROUNDING:

@@ -26,7 +26,7 @@ JAM_STIFFNESS = 20.0    # [-] relative to the servo: 1 mrad under load, stable a
 
 class Plant:
     """
-    One true robot over a floor.
+    One true robot over a floor; :meth:`reset` places it.
 
     MuJoCo integrates by the Runge-Kutta method of order 4. The solver of contacts and joint stops
     runs only in ticks in which a contact is possible. The tilt rate is limited only in ticks in
@@ -52,7 +52,7 @@ class Plant:
         self._servo_terms = [dynamics.tilt_servo(robot, i, 0.0)[0] for i in range(4)]
         self._has_friction = self._servo_terms[0].coulomb is not None
         self._friction = np.zeros(4)
-        self._scale = robot.thrust_scale
+        self._scale, self.gravity = robot.thrust_scale, robot.gravity
         self.model = build_model(robot, parameters, variation)
         self.data = mujoco.MjData(self.model)
         self._tick, self._substeps = parameters.tick, parameters.substeps
@@ -63,29 +63,27 @@ class Plant:
         # Views of MuJoCo's state, stored because each access takes time.
         self._qpos, self._qvel = self.data.qpos, self.data.qvel
         self._tilt, self._rate, self._target = self._qpos[7:], self._qvel[6:], self.data.ctrl[4:]
-        self._ground_height: float | None = None
         self._commanded_tilt = np.zeros(4)
         # Of the battery, set by its owner: voltage relative to a full one, charge drawn [A h].
         self.voltage_ratio, self.charge_drawn = 1.0, 0.0
         self._wrench = np.zeros(6)
-        self._payload: float | None = None      # not yet set
+        self._payload = 0.0
         self._servos = (True,) * 4, (False,) * 4
         self._powered = (True,) * 4     # whether the motor and its limits act
-        self.reset()
+        self._shaft = np.zeros(4)
 
     def reset(self, position: np.ndarray | None = None,
               quaternion: np.ndarray | None = None) -> None:
-        """
-        Place the robot at rest: tilts zero, rotors off, servos powered, no wrench, no payload.
-
-        ``position`` (3,) is that of base_link in world [m], by default standing at the origin;
-        ``quaternion`` (4,) is base_link to world, xyzw, by default level.
-        """
+        """Place an intact robot at rest, see :meth:`.simulator.Simulator.reset`."""
         self.set_payload(0.0)
         self.set_powered((True,) * 4)
         self._wrench[:] = 0.0
         if position is None:
-            position = (0.0, 0.0, self._standing_height())
+            # At rest on its feet.
+            self._place((0.0, 0.0, self._parameters.foot_depth), (0.0, 0.0, 0.0, 1.0))
+            settle = 100 * CONTACT_TIME
+            mujoco.mj_step(self.model, self.data, int(np.ceil(settle / self.model.opt.timestep)))
+            position = (0.0, 0.0, float(self.data.qpos[2]))
         self._place(position, (0.0, 0.0, 0.0, 1.0) if quaternion is None else quaternion)
 
     def _place(self, position, quaternion):
@@ -97,15 +95,6 @@ class Plant:
         self.data.qpos[:3] = position
         self.data.qpos[3:7] = rotations.normalized(quaternion)[[3, 0, 1, 2]]
         self._update()
-
-    def _standing_height(self):
-        """Height of base_link at rest on its feet [m], simulated once."""
-        if self._ground_height is None:
-            self._place((0.0, 0.0, self._parameters.foot_depth), (0.0, 0.0, 0.0, 1.0))
-            settle = 100 * CONTACT_TIME
-            mujoco.mj_step(self.model, self.data, int(np.ceil(settle / self.model.opt.timestep)))
-            self._ground_height = float(self.data.qpos[2])
-        return self._ground_height
 
     def set_targets(self, tilt: np.ndarray, thrust: np.ndarray) -> None:
         """Set tilt targets (4,) [rad] and thrust commands (4,) [N], both within their limits."""
@@ -219,8 +208,7 @@ class Plant:
         """
         Apply the external wrench and the effects' forces, predicted ``ahead`` [s] from now.
 
-        Evaluated in the middle of a tick and held during it, forces that depend on the motion are
-        accurate to second order with a single evaluation.
+        Those in the middle of a tick, held during it, are accurate to second order.
         """
         data = self.data
         applied = data.qfrc_applied[:6]
@@ -273,9 +261,8 @@ class Plant:
 
     def _rub(self, others):
         """
-        Set the friction of the joints for one substep.
+        Set the friction of the joints for one substep: what stops them, within its limit.
 
-        It is the torque that stops the joint within the substep, at most the friction at its rate.
         So a joint below its stiction rests without the solver of contacts.
         """
         joints, model, rate = self._robot.joints, self.model, self._rate
@@ -327,26 +314,21 @@ class Plant:
         return self.data.ncon > 0
 
     @property
-    def gravity(self) -> float:
-        """Gravitational acceleration along world -z [m/s^2]."""
-        return self._robot.gravity
-
-    @property
     def specific_force(self) -> np.ndarray:
         """(3,) acceleration of base_link minus gravity, in base_link [m/s^2]."""
         acceleration = self.data.qacc[:3].copy()
-        acceleration[2] += self._robot.gravity
+        acceleration[2] += self.gravity
         return self.data.xmat[BASE].reshape(3, 3).T @ acceleration
 
     def acceleration(self, position: np.ndarray, quaternion: np.ndarray, velocity: np.ndarray,
                      angular_velocity: np.ndarray, tilt: np.ndarray, tilt_velocity: np.ndarray,
                      thrust: np.ndarray, tilt_target: np.ndarray | None = None) -> np.ndarray:
         """
-        Accelerations in a given state away from the floor; the plant remains in it.
+        Accelerations in a given state away from the floor, as of :class:`.sensors.Truth`.
 
-        Arguments as those of the same names in :class:`.sensors.Truth`, with the ``thrust``
-        before the effects' scales; ``tilt_target`` (4,) [rad] is by default the present tilt.
-        Returned are (10,) linear in world [m/s^2], angular in base_link and of tilts [rad/s^2].
+        The ``thrust`` is before the effects' scales, ``tilt_target`` (4,) [rad] by default the
+        present tilt. Returned are (10,) linear in world [m/s^2], angular in base_link and of
+        tilts [rad/s^2]. The plant remains in the state.
         """
         data = self.data
         data.qpos[:] = np.concatenate([position, quaternion, tilt])[
@@ -382,15 +364,7 @@ class AddedWrench:
 
 
 def _reach(model):
-    """Largest distance of the robot's geometry from base_link with any tilts [m]."""
-    reach = 0.0
-    for geom in range(model.ngeom):
-        body = int(model.geom_bodyid[geom])
-        if body == 0:
-            continue
-        distance = np.linalg.norm(model.geom_pos[geom]) + model.geom_rbound[geom]
-        while body != BASE:
-            distance += np.linalg.norm(model.body_pos[body])
-            body = int(model.body_parentid[body])
-        reach = max(reach, float(distance))
-    return reach
+    """Bound of the distance of the robot's geometry from base_link with any tilts [m]."""
+    joints = np.linalg.norm(model.body_pos[BASE + 1:], axis=1)
+    sizes = np.linalg.norm(model.geom_pos[1:], axis=1) + model.geom_rbound[1:]
+    return float(joints.max() + sizes.max())

@@ -85,16 +85,11 @@ def noise(generator: np.random.Generator, bias: Sequence[float] | np.ndarray,
 
 class Sensors:
     """
-    All sensors of one robot in one flight.
+    All sensors of one robot in one flight, which begins at rest in the state ``first``.
 
-    Args:
-        seeds: five seeds, for IMU, MoCap, encoders, battery and rotor speeds, so that the noise of
-            a sensor does not depend on the rate of another one.
-        first: state at reset, in which the robot has been at rest.
-
-    Raises:
-        ParameterError: a period or latency is not a multiple of the tick.
-
+    IMU, MoCap, encoders, battery and rotor speeds have each its seed, so that the noise of a
+    sensor does not depend on the rate of another one. A ParameterError reports a period or latency
+    that is not a multiple of the tick.
     """
 
     def __init__(self, parameters: SimulatorParameters, conditions: Conditions,
@@ -172,11 +167,10 @@ class Sensors:
     def read(self, tick: int, truth: Truth, battery, wear: np.ndarray,
              devices: bool = False) -> Frame:
         """
-        Readings that arrive at ``truth.stamp``.
+        Readings that arrive at ``truth.stamp``, the end of the tick number ``tick``.
 
-        ``tick`` is the number of the tick that ends then, ``wear`` (4,) the thrust relative to
-        that of an intact propeller at the same speed. With ``devices``, joints are inputs of
-        emulated devices.
+        ``wear`` is that of :class:`.faults.Drive`; with ``devices``, joints are inputs of emulated
+        devices.
         """
         self._imu.append(self._motion(truth))
         imu = self._imu[0] + next(self._imu_noise)

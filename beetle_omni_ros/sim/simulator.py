@@ -13,7 +13,7 @@ from beetle_omni_ros.robot.allocation import clipped
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.sim.faults import Drive, Fault, READINGS, Schedule
-from beetle_omni_ros.sim.parameters import Conditions, draw, SimulatorParameters
+from beetle_omni_ros.sim.parameters import draw, SimulatorParameters
 from beetle_omni_ros.sim.plant import Plant, XYZW
 from beetle_omni_ros.sim.sensors import Frame, Impact, Sensors, Truth
 
@@ -91,11 +91,10 @@ class CommandLink:
     ``tilt`` (4,) [rad] and ``thrust`` (4,) [N] are the present targets.
     """
 
-    def __init__(self, robot: RobotParameters, timeout: float, conditions: Conditions):
+    def __init__(self, robot: RobotParameters, timeout: float, delays: tuple[float, float]):
         self._limit = robot.joints.position_limit
         self._thrust_range = robot.rotors.thrust_min, robot.rotors.thrust_max
-        self._timeout = timeout
-        self._delays = conditions.command_delays(robot)
+        self._timeout, self._delays = timeout, delays
         self._pending: tuple[deque, deque] = (deque(), deque())
         self._last_stamp = self._last_arrival = -np.inf
         self.tilt, self.thrust = np.zeros((2, 4))
@@ -128,43 +127,6 @@ class CommandLink:
             self.thrust = np.zeros(4)
 
 
-class CrashWatch:
-    """
-    Checks the true state once in each tick.
-
-    A robot that has flown breaks if its first contact is too fast, or a contact too inclined. A
-    robot that has not flown does not break, so it may be placed on its side. ``impact`` is the
-    last touchdown, ``broken`` whether the robot is broken.
-    """
-
-    def __init__(self, parameters: SimulatorParameters):
-        self._parameters = parameters
-        self.impact: Impact | None = None
-        self.broken = False
-        self._airborne, self._flown = 0.0, False
-
-    def step(self, before: Truth, contact: bool) -> None:
-        """
-        Update after a tick by the contact after it.
-
-        The floor has not slowed the robot yet in the state ``before``.
-        """
-        if not contact:
-            self._airborne += self._parameters.tick
-            self._flown = self._flown or self._airborne >= AIRBORNE_TIME
-            return
-        vertical = rotations.up(before.quaternion)[2]   # cosine of the inclination
-        breaks = vertical < np.cos(self._parameters.crash_inclination)
-        if self._airborne > 0:
-            speed = float(np.linalg.norm(before.velocity))
-            breaks = breaks or speed > self._parameters.crash_speed
-            if self._airborne >= AIRBORNE_TIME:
-                self.impact = Impact(before.stamp, speed,
-                                     float(np.arccos(np.clip(vertical, -1.0, 1.0))))
-        self.broken = self.broken or bool(self._flown and breaks)
-        self._airborne = 0.0
-
-
 class Simulator:
     """
     Plant, actuator timing, battery and sensors of the true robot, advanced tick by tick.
@@ -187,6 +149,8 @@ class Simulator:
         self.tick = self._parameters.tick
         self.conditions = draw(conditions, self._parameters,
                                np.random.default_rng(np.random.SeedSequence(seed).spawn(1)[0]))
+        # Of tilt and thrust commands from their stamps [s], effects included.
+        self.command_delays = self.conditions.command_delays(robot)
         self._plant = Plant(robot, self._parameters, self.conditions.variation)
         self.battery = Battery(robot, self._parameters)
         self.reset()
@@ -203,11 +167,12 @@ class Simulator:
         self.time = 0.0
         self._plant.reset(position, quaternion)
         self.battery.reset()
-        self._crash = CrashWatch(self._parameters)
+        self._impact: Impact | None = None
+        self._airborne, self._flown, self._broken = 0.0, False, False
         self._wrench, self._payload = np.zeros(6), 0.0
         self._wear = INTACT
         self._link = CommandLink(self._robot, self._parameters.command_timeout,
-                                 self.conditions)
+                                 self.command_delays)
         self.truth = self._truth()
         *seeds, fault_seed = np.random.SeedSequence(self._seed).spawn(7)[1:]
         self._schedule = Schedule(self.tick, fault_seed, self.battery)
@@ -245,11 +210,6 @@ class Simulator:
         """(4,) thrusts commanded to the rotors [N]; zero after the command timeout."""
         return self._link.thrust
 
-    @property
-    def command_delays(self) -> tuple[float, float]:
-        """Delays of tilt and thrust commands from their stamps [s], effects included."""
-        return self.conditions.command_delays(self._robot)
-
     def _apply_wrench(self):
         """Set wrench and payload of the plant: those of the task and those of the faults."""
         wrench = sum(self._schedule.each('wrench'), self._wrench)
@@ -275,7 +235,12 @@ class Simulator:
         """
         plant, link, battery, devices = self._plant, self._link, self.battery, True
         if not self._schedule.empty:
-            self._switch_faults()
+            before = self._schedule.active
+            self._schedule.update(self.time, self.truth, link.tilt)
+            if self._schedule.active is not before:
+                self._apply_wrench()
+            for late in self._schedule.through('command', None, self.time):
+                link.push(late, self.time)
         if drive is None:
             link.update(self.time)
             drive = Drive(link.tilt, np.minimum(link.thrust, battery.thrust_limit))
@@ -289,7 +254,7 @@ class Simulator:
                 -self.tick / self._robot.rotors.time_constant) * (wear - self._wear)
         self._ticks += 1
         self.time = self._ticks * self.tick
-        self._crash.step(self.truth, plant.contact)
+        self._watch_contact(self.truth, plant.contact)
         self.truth = self._truth()
         battery.step(self.truth.thrust, self.tick)
         frame = self._sensors.read(self._ticks, self.truth, battery, wear, devices)
@@ -298,18 +263,9 @@ class Simulator:
                 name, getattr(frame, name), self.time)), None) for name in READINGS})
         return frame
 
-    def _switch_faults(self):
-        """Start and end faults, and send commands that faults have delayed."""
-        before = self._schedule.active
-        self._schedule.update(self.time, self.truth, self._link.tilt)
-        if self._schedule.active is not before:
-            self._apply_wrench()
-        for command in self._schedule.through('command', None, self.time):
-            self._link.push(command, self.time)
-
     def _actuate(self, drive):
         """Set the inputs of servos and rotors with faults and damage; return the rotors' wear."""
-        plant, broken = self._plant, self._crash.broken
+        plant, broken = self._plant, self._broken
         if not (self._schedule.active or broken):
             plant.set_powered(drive.powered)
             plant.set_targets(drive.tilt, drive.thrust)
@@ -324,8 +280,31 @@ class Simulator:
         plant.set_targets(clipped(drive.tilt, -limit, limit), drive.thrust)
         return drive.wear
 
+    def _watch_contact(self, before, contact):
+        """
+        Update touchdown and damage by the contact after a tick.
+
+        A robot that has flown breaks if its first contact is too fast, or a contact too inclined.
+        One that has not flown may be placed on its side. In the state ``before`` the tick the
+        floor has not slowed the robot yet.
+        """
+        limits = self._parameters
+        if not contact:
+            self._airborne += self.tick
+            self._flown = self._flown or self._airborne >= AIRBORNE_TIME
+            return
+        vertical = rotations.up(before.quaternion)[2]   # cosine of the inclination
+        breaks = vertical < np.cos(limits.crash_inclination)
+        if self._airborne > 0:
+            speed = float(np.linalg.norm(before.velocity))
+            breaks = breaks or speed > limits.crash_speed
+            if self._airborne >= AIRBORNE_TIME:
+                self._impact = Impact(before.stamp, speed,
+                                      float(np.arccos(np.clip(vertical, -1.0, 1.0))))
+        self._broken = self._broken or bool(self._flown and breaks)
+        self._airborne = 0.0
+
     def _truth(self):
         qpos, qvel = self._plant.state
         return Truth(self.time, qpos[:3], qvel[:3], qpos[XYZW], qvel[3:6], self._plant.tilt,
-                     qvel[6:], self._plant.thrust, self._plant.contact, self._crash.impact,
-                     self._crash.broken)
+                     qvel[6:], self._plant.thrust, self._plant.contact, self._impact, self._broken)

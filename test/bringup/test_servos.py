@@ -58,8 +58,8 @@ def turned(emulated):
 
 
 def hot(emulated):
-    emulated.servos[3]['Temperature Limit'] = 50    # also at 60
-    emulated.faults.overheated = {4}
+    emulated.servos[3]['Temperature Limit'] = 50
+    emulated.servos[3]['Present Temperature'] = 80
 
 
 def put(**faults):

@@ -87,16 +87,16 @@ def test_expired_watchdogs_are_cleared_and_goals_are_followed_again():
     with running() as (bus, emulated):
         until(arrived(GOAL), bus, GOAL)
         emulated.servos[1].expire()
-        assert emulated.stopped[1]
-        until(lambda *_: not emulated.stopped[1], bus, HOME)
+        assert emulated.servos[1].expired
+        until(lambda *_: not emulated.servos[1].expired, bus, HOME)
         until(arrived(HOME), bus, HOME)
         assert any('stopped by its watchdog' in line for line in bus.take_events())
         time.sleep(0.15)        # a pause of the driver
-        assert emulated.stopped.all()
+        assert all(servo.expired for servo in emulated.servos)
         assert bus.write_goals(GOAL)
         bus.read()  # answered after the goals
         assert emulated.goals == pytest.approx(GOAL, abs=COUNT)
-        assert not emulated.stopped.any()
+        assert not any(servo.expired for servo in emulated.servos)
 
 
 def test_after_an_unplugged_cable_is_back_goals_are_followed_again():

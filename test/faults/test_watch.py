@@ -20,23 +20,25 @@ def truth(t, height=1.0, x=0.0, contact=False, impact=None, broken=False):
 def watch():
     return Watcher(SimpleNamespace(
         plan=PLAN, simulator=SimpleNamespace(truth=truth(0.0, 0.0), time=0.0),
-        supervisor=SimpleNamespace(events=[], faults={})))
+        supervisor=SimpleNamespace(events=[], faults={}, state='disarmed'),
+        loop=SimpleNamespace(refusals=[])))
 
 
 def soft(t=1.0, speed=0.3, inclination=0.05):
     return Impact(t, speed, inclination)
 
 
-def judged(watch, asked=True, stopped=True, refused=False):
-    return watch.outcome(asked=asked, stopped=stopped, refused=refused)
+def judged(watch, asked=True, state='disarmed', refusals=()):
+    watch._flight.supervisor.state, watch._flight.loop.refusals = state, refusals
+    return watch.outcome(asked)
 
 
 def test_a_soft_landing_counts_as_flies_on_lands_or_refused(watch):
     watch.step(truth(1.0, 0.15, contact=True, impact=soft()), 0.0, TICK)
     assert judged(watch) == 'flies_on'
     assert judged(watch, asked=False) == 'lands'
-    assert judged(watch, refused=True) == 'refused'
-    assert judged(watch, stopped=False) == 'does not land'
+    assert judged(watch, refusals=['far']) == 'refused'
+    assert judged(watch, state='flying') == 'does not land'
 
 
 def test_a_hard_or_tilted_touchdown_is_not_a_landing(watch):
@@ -54,7 +56,7 @@ def test_motors_must_stop_soon_after_a_crash(watch, late, outcome):
                    20.0 if t <= 0.1 + late else 0.0, TICK)
     assert judged(watch) == outcome
     assert np.isclose(watch.overrun, late, atol=2 * TICK)
-    assert judged(watch, stopped=False) == 'crash, motors on'
+    assert judged(watch, state='flying') == 'crash, motors on'
 
 
 def test_a_flyaway_is_a_position_far_outside(watch):

@@ -61,12 +61,12 @@ def test_the_simulator_publishes_simulated_time_only_without_serial_devices(sim)
 def test_faults_of_devices_change_in_flight_and_are_in_the_diagnostics(sim, tmp_path):
     servos, board = tmp_path / 'servos', tmp_path / 'board'
     servos.symlink_to('/nowhere')           # left by a process that was killed
-    node = sim(f'servo_port:={servos}', f'board_port:={board}', 'servo_faults.overheated:=[3]')
+    node = sim(f'servo_port:={servos}', f'board_port:={board}', 'servo_faults.overload:=[3]')
     published, subscribed = topics(node)
     assert not {'/joint_states', '/battery_state'} & published and '/command' not in subscribed
     bus = node._devices.bus
-    assert set(bus.faults.overheated) == {3}
-    assert put(node, servo_faults__overheated=[], servo_faults__silent=[2],
+    assert set(bus.faults.overload) == {3}
+    assert put(node, servo_faults__overload=[], servo_faults__silent=[2],
                board_faults__drop_in=0.5).successful
     level, text, values = node._devices_status()
     assert level == base.WARN and text == 'faults: servo silent [2], board drop_in 0.5'

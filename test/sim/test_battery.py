@@ -1,6 +1,5 @@
 """The battery: sag under load, voltage by charge, thrust limit."""
 
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -44,12 +43,3 @@ def test_the_thrust_limit_equals_that_of_the_map_and_falls_below_it():
     below = battery.thrust_limit
     battery.voltage = 21.40
     assert 0 < below < battery.thrust_limit
-
-
-def test_overload_and_empty_pack_stay_finite():
-    battery = Battery(ROBOT, replace(WORLD, battery_capacity=0.02))
-    for _ in range(200):
-        battery.step(np.full(4, 60.0), 0.1)
-        assert np.isfinite([battery.voltage, battery.current, battery.thrust_limit]).all()
-        assert battery.voltage > 0 and battery.thrust_limit >= 0
-    assert battery.charge == 0

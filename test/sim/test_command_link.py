@@ -6,14 +6,12 @@ import numpy as np
 import pytest
 from sim_robots import ROBOT, WORLD
 
-from beetle_omni_ros.sim.parameters import draw
 from beetle_omni_ros.sim.simulator import CommandLink
 
 
 def link():
     """A link under nominal conditions: 10 ms delay, 100 ms timeout."""
-    return CommandLink(ROBOT, WORLD.command_timeout,
-                       draw('nominal', WORLD, np.random.default_rng(0)))
+    return CommandLink(ROBOT, WORLD.command_timeout, (0.01, 0.01))
 
 
 def command(stamp, tilt=0.1, thrust=5.0):

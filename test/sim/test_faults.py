@@ -95,12 +95,6 @@ def test_a_fault_kind_changes_its_quantity_from_its_start_only(kind, healthy):
         assert changed == SENSING[kind]
 
 
-@pytest.mark.parametrize('kind', ['imu_spikes', 'commands_drop'])
-def test_a_random_kind_is_deterministic(kind):
-    fault = some(kind, at=0.1)
-    assert differing(flight(fault, ticks=80)[0], flight(fault, ticks=80)[0]) == set()
-
-
 @pytest.mark.parametrize('kind', sorted(
     kind for kind in set(ROBOT_KINDS) - PHYSICAL if SENSING[kind]))
 def test_after_a_sensor_fault_the_readings_are_unchanged(kind, healthy):

@@ -50,21 +50,9 @@ def test_tilting_modules_react_on_the_body_and_keep_momenta(target):
         turned = max(turned, np.abs(made.state[1][3:6]).max())
     linear, angular, centre = momenta(made)
     np.testing.assert_allclose(linear, 0, atol=1e-7)
-    np.testing.assert_allclose(angular - np.cross(centre, linear), 0, atol=1e-7)
+    np.testing.assert_allclose(angular, 0, atol=1e-7)
     np.testing.assert_allclose(centre, HIGH, atol=1e-6)
     assert turned > 1e-3
-
-
-def test_energy_equals_the_work_of_the_wrench():
-    made = plant(WEIGHTLESS)
-    force = np.array([2.0, -1.0, 3.0])
-    made.set_wrench(force, np.zeros(3))
-    for _ in range(100):
-        made.step()
-    mujoco.mj_energyVel(made.model, made.data)
-    work = force @ (made.state[0][:3] - HIGH)
-    # The modules hang a little off the axis and swing against their servos' damping.
-    assert made.data.energy[1] == pytest.approx(work, rel=2e-3)
 
 
 def test_wrench_acts_in_its_frames():
@@ -74,7 +62,7 @@ def test_wrench_acts_in_its_frames():
         made.step()
     linear, angular, centre = momenta(made)
     np.testing.assert_allclose(linear, [0.3, 0, 0], atol=1e-4)
-    np.testing.assert_allclose(angular - np.cross(centre, linear), [0, 0, 0.05], atol=1e-4)
+    np.testing.assert_allclose(angular, [0, 0, 0.05], atol=1e-4)
 
 
 def test_robot_rests_on_its_feet():

@@ -25,8 +25,7 @@ class EmulatedActuators:
 
     The devices run in real time, so :meth:`step` is called once in each tick of real time. Their
     outputs act after the command delay of the conditions. A command for the IMU sample of one
-    tick, received before the next tick, then acts at the same time as without devices. The bus
-    has four servos without motion model. :meth:`close` closes both devices.
+    tick, received before the next tick, then acts at the same time as without devices.
     """
 
     def __init__(self, simulator: Simulator, bus: EmulatedServoBus, board: EmulatedMotorBoard):
@@ -64,23 +63,15 @@ class EmulatedActuators:
         """
         Switch faults on and off, and trigger the events that are set.
 
-        Raises:
-            ParameterError: unknown servo, without any change, or a port whose path is in use when
-                it is plugged in.
-
+        A ParameterError reports an unknown servo, without any change.
         """
         ids = [one['ID'] for one in self.bus.servos]
-        for name in ('silent', 'overload', 'overheated', 'reboot'):
+        for name in ('silent', 'overload', 'reboot'):
             for wanted in np.ravel(getattr(servo, name)):
                 if wanted not in (*ids, *[0] * (name == 'reboot')):
                     raise ParameterError(f'servo_faults.{name}: no servo has the id {wanted:g}; '
                                          f'ids are {ids}')
         self._faults = self.bus.faults, self.board.faults = servo, board
-        try:
-            for device, faults in ((self.bus, servo), (self.board, board)):
-                (device.unplug if faults.unplugged else device.plug)()
-        except OSError as error:
-            raise ParameterError(str(error)) from None
         if servo.reboot:
             self.bus.reboot(ids.index(servo.reboot))
         if board.reboot:

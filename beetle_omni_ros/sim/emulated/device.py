@@ -36,10 +36,8 @@ class ServoFaults:
     delay: float = parameter(0.02, doc='delay of late answers', **DELAY)
     silent: np.ndarray = parameter([], doc='IDs that receive and answer nothing', **LISTED)
     overload: np.ndarray = parameter([], doc='IDs with a permanent overload', **LISTED)
-    overheated: np.ndarray = parameter([], doc='IDs above their temperature limit', **LISTED)
     supply_voltage: float = parameter(12.0, doc='supply voltage of the servos', unit='V', low=0,
                                       high=30)
-    unplugged: bool = parameter(False, doc='whether the cable of the adapter is unplugged')
     reboot: int = parameter(0, doc='ID to restart once', low=0, high=252)
 
 
@@ -56,7 +54,6 @@ class BoardFaults:
     delay_out: float = parameter(0.0, doc='delay of packets of the board', **DELAY)
     delay_in: float = parameter(0.0, doc='delay of packets to the board', **DELAY)
     failed_escs: np.ndarray = parameter([], doc='rotors (1 to 4) that do not turn', low=1, high=4)
-    unplugged: bool = parameter(False, doc='whether the cable of the board is unplugged')
     reboot: bool = parameter(False, doc='reset once')
 
 
@@ -115,15 +112,8 @@ class Device:
     The device's end of a serial cable, as a context manager.
 
     A thread calls ``_serve(now)`` of the subclass, at the latest at the time ``_due()`` [s]. The
-    path ``port`` for the driver is a link to the present terminal, which exists while plugged in.
-
-    Args:
-        name: name of the port in a temporary folder.
-        port: path of the port in place of it.
-
-    Raises:
-        OSError: the path cannot be created; the message has the path.
-
+    path ``port`` for the driver, by default ``name`` in a temporary folder, is a link to the
+    present terminal. It exists while plugged in; an OSError reports that it cannot be created.
     """
 
     def __init__(self, name: str, port: str | Path | None, seed: int):
@@ -152,13 +142,7 @@ class Device:
                 shutil.rmtree(self._folder, ignore_errors=True)
 
     def plug(self) -> None:
-        """
-        Plug the cable in, unless it is.
-
-        Raises:
-            OSError: the path exists and is not a link, or cannot be created.
-
-        """
+        """Plug the cable in, unless it is."""
         link = Path(self.port)
         fresh = link.with_name(f'{link.name}.new')
         with self._lock:

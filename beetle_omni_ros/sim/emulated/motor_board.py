@@ -4,7 +4,7 @@ The emulated motor board: the firmware of docs/reference/firmware.md on a pseudo
 The framing is that of the driver. ``test/drivers/reference_packets.py`` checks it independently.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 import math
 from pathlib import Path
 import time
@@ -46,20 +46,13 @@ class BoardFirmware:
 
     All times are arguments on a clock without steps. Each call first advances the state to its
     time, so that the results do not depend on the frequency of calls. ``changes`` are of NUMBERS.
-
-    Attributes:
-        voltage, current: of the battery [V, A]; set from outside, as the next two.
-        rpm: of the four rotors [1/min].
-        failed: rotors (0 to 3) whose ESC has failed.
-        refused: reason -> number of refused targets since the start.
-        timeouts: number of target timeouts with turning rotors.
-
     """
 
     def __init__(self, cells: int, now: float, **changes: float):
         self.numbers = SimpleNamespace(**NUMBERS | changes)
         self._clock_zero = now - CLOCK_START
         self._arm_voltage = cells * self.numbers.arm_cell_voltage
+        # Measurements, set from outside: battery [V, A], rotors [1/min], failed ESCs (0 to 3).
         self.voltage = self.current = 0.0
         self.rpm = [0.0] * 4
         self.failed: frozenset[int] = frozenset()
@@ -72,12 +65,13 @@ class BoardFirmware:
         self._stop_reason = reason
         self._heartbeat_at = self._nonzero_target_at = self._target_at = -math.inf
         self._target, self._target_stamp, self._saturated = STOP, -math.inf, False
-        self.refused: dict[str, int] = {}
-        self.timeouts = 0
-        self._next = {name: self._booted_at for name in NUMBERS if name.endswith('_rate')}
+        self.refused: dict[str, int] = {}   # reason -> number of refused targets
+        self.timeouts = 0                   # of targets with turning rotors
+        # Rate -> time at which its message is due [s].
+        self.next = {name: self._booted_at for name in NUMBERS if name.endswith('_rate')}
         self._sent_mode, self._sent_at = None, -math.inf
         self._sent_failed: frozenset[int] | None = None
-        self._errors, self._packets = [0] * 4, 0
+        self._errors = [0] * 4
 
     def reboot(self, now: float) -> None:
         """Reset by the watchdog: outputs off, initial state, clock at zero."""
@@ -103,7 +97,7 @@ class BoardFirmware:
         return RUNNING if self._fresh(now) else ARMED
 
     def outputs(self, now: float) -> tuple[float, ...]:
-        """Normalised commands of the four PWM outputs, 0 to 1."""
+        """Present normalised PWM commands, 0 (stop) to 1."""
         return self._target if self.state(now) == RUNNING else STOP
 
     def conditions(self, now: float) -> int:
@@ -133,10 +127,6 @@ class BoardFirmware:
             return [self._command(message, now)]
         return []
 
-    def next_due(self) -> float:
-        """Time of the next periodic message [s]."""
-        return min(self._next.values())
-
     def due(self, now: float, received: dict[str, int]) -> list:
         """Periodic messages due at ``now``; ``received`` has the counts of the receiver."""
         if not self.runs(now):
@@ -151,11 +141,19 @@ class BoardFirmware:
             self._sent_mode, self._sent_at = beat.custom_mode, now
             messages.append(beat)
         stamp = round(1e6 * self.clock(now))
+        failed = [k in self.failed for k in range(4)]
+        works = [not bad for bad in failed]
         if self._is_due('rotor_info_rate', now) or self.failed != self._sent_failed:
             self._sent_failed = self.failed
-            messages.append(self._esc_info(stamp))
+            self._errors = [count + bad for count, bad in zip(self._errors, failed)]
+            messages.append(EscInfo(
+                0, stamp, 0, 4, 0, sum(on << k for k, on in enumerate(works)),
+                [GENERIC_FAILURE * bad for bad in failed], self._errors,
+                [UNKNOWN_TEMPERATURE if bad else round(100 * ESC_TEMPERATURE) for bad in failed]))
         if self._is_due('rotor_rate', now):
-            messages.append(self._esc_status(stamp))
+            messages.append(EscStatus(
+                0, stamp, [round(rpm) * on for rpm, on in zip(self.rpm, works)],
+                [self.voltage * on for on in works], [self.current / 4 * on for on in works]))
         total, current = max(0, round(1000 * self.voltage)), round(100 * self.current)
         if self._is_due('battery_rate', now):
             messages.append(common.MAVLink_battery_status_message(
@@ -170,10 +168,10 @@ class BoardFirmware:
 
     def _is_due(self, rate, now):
         """Whether a message with this rate is due: without drift, and once after a pause."""
-        if now < self._next[rate]:
+        if now < self.next[rate]:
             return False
         period = 1 / getattr(self.numbers, rate)
-        self._next[rate] += period * (1 + math.floor((now - self._next[rate]) / period))
+        self.next[rate] += period * (1 + math.floor((now - self.next[rate]) / period))
         return True
 
     def _heartbeat(self, state, now):
@@ -181,21 +179,6 @@ class BoardFirmware:
         armed = state in (ARMED, RUNNING)
         status = 1 if state == BOOT else 5 if self.failed else 4 if armed else 3
         return common.MAVLink_heartbeat_message(2, 0, 1 | 128 * armed, mode, status, 3)
-
-    def _esc_status(self, stamp):
-        self._packets += 1
-        works = [k not in self.failed for k in range(4)]
-        return EscStatus(0, stamp, [round(rpm) * on for rpm, on in zip(self.rpm, works)],
-                         [self.voltage * on for on in works],
-                         [self.current / 4 * on for on in works])
-
-    def _esc_info(self, stamp):
-        failed = [k in self.failed for k in range(4)]
-        self._errors = [count + bad for count, bad in zip(self._errors, failed)]
-        return EscInfo(
-            0, stamp, self._packets % 65536, 4, 0, sum(1 << k for k in range(4) if not failed[k]),
-            [GENERIC_FAILURE * bad for bad in failed], self._errors,
-            [UNKNOWN_TEMPERATURE if bad else round(100 * ESC_TEMPERATURE) for bad in failed])
 
     def _fresh(self, now):
         return now - self._target_at < self.numbers.target_timeout
@@ -272,34 +255,22 @@ class BoardFirmware:
                                                   message.get_srcComponent())
 
 
-def frames(data: bytes) -> list[bytes]:
+def frames(data: bytes) -> Iterator[bytes]:
     """Split a sequence of valid MAVLink 2 packets; an incomplete rest is one more piece."""
-    pieces = []
     while data:
         size = 12 + data[1] if len(data) > 1 and data[0] == 0xFD else len(data)
-        pieces.append(data[:size])
+        yield data[:size]
         data = data[size:]
-    return pieces
 
 
 class EmulatedMotorBoard(Device):
     """
-    A motor board that a driver can open by its ``port``.
+    A motor board whose PWM the rotor map of the true ``robot`` converts to thrust.
 
     A plant reads :attr:`thrust_targets` and sets the sensors, from any thread. Before
     :meth:`set_battery` the battery is full, and before :meth:`set_rotors` the rotors follow their
-    targets without lag.
-
-    Args:
-        robot: the true robot, whose rotor map converts PWM to thrust.
-        port: path of the created port; by default a temporary one.
-        changes: of NUMBERS.
-
-    Attributes:
-        faults: present faults; their attributes may be set at any time.
-        on_target: called in the board's thread after each target with its arrival
-            [s, monotonic] and its stamp [us], for measurements.
-
+    targets without lag. ``changes`` are of NUMBERS. ``on_target`` is called in the board's thread
+    after each target with its arrival [s, monotonic] and its stamp [us], for measurements.
     """
 
     def __init__(self, robot: RobotParameters | None = None, *, seed: int = 0,
@@ -332,8 +303,7 @@ class EmulatedMotorBoard(Device):
     @property
     def thrust_targets(self) -> np.ndarray:
         """(4,) targets of the rotors [N] for the PWM commands at the true voltage."""
-        with self._lock:
-            return self._thrusts(self.commands)
+        return self._thrusts(self.commands)
 
     def _thrusts(self, commands):
         thrust = self._map.thrust(duty_of_command(commands), self._voltage)
@@ -364,7 +334,7 @@ class EmulatedMotorBoard(Device):
         self._receiver, self._packer = MavlinkReceiver(*HOST), common.MAVLink(None, *BOARD)
 
     def _due(self):
-        telemetry = self._firmware.next_due()
+        telemetry = min(self._firmware.next.values())
         return min(super()._due(), telemetry if telemetry > time.monotonic() else math.inf)
 
     def _serve(self, now):
@@ -377,11 +347,12 @@ class EmulatedMotorBoard(Device):
         data = self._incoming.take(now)
         if self._firmware.runs(now):
             self._measure(now)
+            # Before any answer: the first frame after a reset is a heartbeat.
+            self._send(self._firmware.due(now, self._receiver.counts), now)
             for message in self._receiver.feed(data):
                 self._send(self._firmware.receive(message, now), now)
                 if self.on_target and message.get_type() == 'SET_ACTUATOR_CONTROL_TARGET':
                     self.on_target(now, message.time_usec)
-            self._send(self._firmware.due(now, self._receiver.counts), now)
         self._flush(now)
 
     def _send(self, messages, now):

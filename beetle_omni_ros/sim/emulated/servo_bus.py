@@ -97,16 +97,13 @@ DEFINED = frozenset(address for register in TABLE.values()
 
 # --- packets ----------------------------------------------------------------------------------
 
-def _crc_table():
-    """Remainders of the polynomial x^16 + x^15 + x^2 + 1 for each leading byte."""
-    for byte in range(256):
-        remainder = byte << 8
-        for _ in range(8):
-            remainder = (remainder << 1) ^ (0x8005 if remainder & 0x8000 else 0)
-        yield remainder & 0xFFFF
-
-
-CRC_TABLE = tuple(_crc_table())
+# Remainders of the polynomial x^16 + x^15 + x^2 + 1 for each leading byte.
+CRC_TABLE = []
+for byte in range(256):
+    remainder = byte << 8
+    for _ in range(8):
+        remainder = (remainder << 1) ^ (0x8005 if remainder & 0x8000 else 0)
+    CRC_TABLE.append(remainder & 0xFFFF)
 
 
 def sealed(data: bytes) -> bytes:
@@ -121,11 +118,6 @@ def packet(identifier: int, instruction: int, parameters: bytes = b'') -> bytes:
     """Build a packet."""
     body = (bytes((instruction,)) + parameters).replace(b'\xff\xff\xfd', b'\xff\xff\xfd\xfd')
     return sealed(HEADER + bytes((identifier,)) + (len(body) + 2).to_bytes(2, 'little') + body)
-
-
-def status(identifier: int, error: int, data: bytes = b'') -> bytes:
-    """Build the answer of one servo."""
-    return packet(identifier, STATUS, bytes((error,)) + data)
 
 
 def packets(buffer: bytearray) -> Iterator[tuple[int, int, bytes]]:
@@ -236,13 +228,12 @@ class EmulatedServo:
         self.boots_at = now + self.reboot_time
         self._to_one_turn()
 
-    def advance(self, now: float, temperature: int, voltage: float):
-        """Check watchdog, temperature [deg C] and supply voltage [V]."""
+    def advance(self, now: float, voltage: float):
+        """Check watchdog, temperature and supply voltage [V]."""
         limit, silence = self['Bus Watchdog'], now - self.last_packet
         if self.torque and 0 < limit < WATCHDOG_EXPIRED and silence > limit * WATCHDOG_UNIT:
             self.expire()
-        self['Present Temperature'] = temperature
-        if temperature > self['Temperature Limit']:
+        if self['Present Temperature'] > self['Temperature Limit']:
             self.trip(OVERHEATING)
         self['Present Input Voltage'] = round(voltage / VOLTAGE_UNIT)
         if not VOLTAGE_LIMITS[0] <= voltage <= VOLTAGE_LIMITS[1]:
@@ -258,34 +249,24 @@ class EmulatedServo:
         if error & self['Shutdown']:
             self['Torque Enable'] = 0
 
-    def _counts(self):
-        return round(self.zero + self.sign * self.angle / POSITION_UNIT)
-
     def _present(self):
-        return self._counts() - COUNTS_PER_TURN * self._turns
+        counts = round(self.zero + self.sign * self.angle / POSITION_UNIT)
+        return counts - COUNTS_PER_TURN * self._turns
 
     def _to_one_turn(self):
-        self._turns = floor(self._counts() / COUNTS_PER_TURN)
+        self._turns = 0
+        self._turns = floor(self._present() / COUNTS_PER_TURN)
 
 
 # --- the line ---------------------------------------------------------------------------------
 
 class EmulatedServoBus(Device):
     """
-    XC330 servos on one serial port.
+    XC330 servos on one serial port, with IDs, signs and zeros [counts] in the order of the joints.
 
-    A plant reads :meth:`drive` and calls :meth:`set_state`. ``refusals`` is the number of refused
-    instructions.
-
-    Args:
-        identifiers: IDs in the order of the joints.
-        port: path of the created port; by default a temporary one.
-        signs: +1 or -1 for each servo: counts rise or fall with the joint's angle.
-        zeros: counts at which the angle of each joint is zero.
-        speed: of servos with torque without a plant [rad/s]; by default they do not move.
-        reboot_time: time without answers after a reboot [s].
-        seed: seed of the faults.
-
+    A plant reads :meth:`drive` and calls :meth:`set_state`. Without a plant servos with torque
+    move at ``speed`` [rad/s]. After a reboot they are silent for ``reboot_time`` [s]. ``refusals``
+    is the number of refused instructions.
     """
 
     def __init__(self, identifiers: Sequence[int] = (1, 2, 3, 4), *, port: str | None = None,
@@ -315,12 +296,6 @@ class EmulatedServoBus(Device):
     def torque_enabled(self) -> np.ndarray:
         """(n,) bool: whether a motor is powered; without power the joint is free."""
         return np.array(self.drive()[1])
-
-    @property
-    def stopped(self) -> np.ndarray:
-        """(n,) bool: whether the bus watchdog has stopped a servo, which then refuses goals."""
-        self.drive()
-        return np.array([servo.expired for servo in self.servos])
 
     def set_state(self, position: np.ndarray, velocity: np.ndarray, effort: np.ndarray):
         """Set the joints' true angles [rad], rates [rad/s] and torques [N m], each (n,)."""
@@ -356,9 +331,7 @@ class EmulatedServoBus(Device):
         if now - self._last_check >= PERIOD:
             self._last_check = now
             for servo in self.servos:
-                hot = servo['ID'] in self.faults.overheated
-                servo.advance(now, servo['Temperature Limit'] + 10 if hot else 35,
-                              self.faults.supply_voltage)
+                servo.advance(now, self.faults.supply_voltage)
                 if servo['ID'] in self.faults.overload and servo.torque:
                     servo.trip(OVERLOAD)
             self._move(now)
@@ -410,4 +383,5 @@ class EmulatedServoBus(Device):
 
     def _answer(self, servo, error, data):
         self.refusals += error != NONE
-        return status(servo['ID'], error | ALERT * bool(servo['Hardware Error Status']), data)
+        return packet(servo['ID'], STATUS, bytes((
+            error | ALERT * bool(servo['Hardware Error Status']),)) + data)
