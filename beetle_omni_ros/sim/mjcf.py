@@ -38,7 +38,6 @@ def build_model(robot: RobotParameters, plant: SimulatorParameters,
     targets [rad]; activations: the four lagged thrusts [N].
     """
     model = mujoco.MjModel.from_xml_string(_mjcf(robot, plant, variation))
-    set_base_part(model, base_part(robot, variation, 0.0))
     _reflect_servo_inertia(model, robot)
     return model
 
@@ -84,6 +83,12 @@ def _reflect_servo_inertia(model, robot):
 
 def _text(*numbers):
     return ' '.join(repr(float(x)) for x in np.ravel(numbers))
+
+
+def _inertial(part: RigidPart) -> str:
+    i = part.inertia
+    return (f'<inertial pos="{_text(part.centre)}" mass="{part.mass!r}" '
+            f'fullinertia="{_text(i[0, 0], i[1, 1], i[2, 2], i[0, 1], i[0, 2], i[1, 2])}"/>')
 
 
 def _module(robot, plant, parts, k):
@@ -143,7 +148,7 @@ def _mjcf(robot, plant, variation):
     <geom name="floor" type="plane" size="0 0 1" contype="0" conaffinity="1"/>
     <body name="base_link">
       <freejoint name="base"/>
-      <inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>
+      {_inertial(base_part(robot, variation, 0.0))}
       <geom name="main_body" type="cylinder" size="{_text(0.5 * plant.foot_spread, 0.03)}"/>
       <geom name="end_effector" type="sphere" size="{plant.end_effector_radius!r}"
             pos="{_text(ball)}"/>

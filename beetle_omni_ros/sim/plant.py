@@ -67,7 +67,7 @@ class Plant:
         # Of the battery, set by its owner: voltage relative to a full one, charge drawn [A h].
         self.voltage_ratio, self.charge_drawn = 1.0, 0.0
         self._wrench = np.zeros(6)
-        self._payload = 0.0
+        self._payload: float | None = None      # not yet set
         self._servos = (True,) * 4, (False,) * 4
         self._powered = (True,) * 4     # whether the motor and its limits act
         self._shaft = np.zeros(4)

@@ -179,12 +179,10 @@ class Simulator:
         self._sensors = Sensors(self._parameters, self.conditions, seeds, self.truth,
                                 self._plant, self._robot.sensors)
 
-    def command(self, command) -> bool:
-        """Send a command, see :meth:`CommandLink.push`; return whether it was accepted."""
-        accepted = True
+    def command(self, command) -> None:
+        """Send a command, see :meth:`CommandLink.push`."""
         for one in self._schedule.through('command', command, self.time):
-            accepted = self._link.push(one, self.time)
-        return accepted
+            self._link.push(one, self.time)
 
     def set_faults(self, faults: Sequence[Fault]) -> None:
         """
