@@ -87,10 +87,8 @@ def test_faults_of_devices_change_in_flight_and_are_in_the_diagnostics(sim, tmp_
 def test_the_emulated_servos_are_those_of_the_bus_file(sim, tmp_path):
     file = tmp_path / 'bus.yaml'
     file.write_text('port: x\nids: [11, 12, 13, 14]\nsigns: [1, -1, 1, -1]\n'
-                    'zeros: [2000, 2100, 2048, 1900]\nbaud_rate: 3000000\n'
-                    'torque_per_current: 0.671\n')
+                    'zeros: [2000, 2100, 2048, 1900]\n')
     servos = sim(f'servo_bus_file:={file}')._devices.bus.servos
     assert [servo['ID'] for servo in servos] == [11, 12, 13, 14]
     assert [servo.sign for servo in servos] == [1, -1, 1, -1]
     assert [servo.zero for servo in servos] == [2000, 2100, 2048, 1900]
-    assert {servo['Baud Rate'] for servo in servos} == {5}      # 3 Mbit/s
