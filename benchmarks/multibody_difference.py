@@ -37,7 +37,7 @@ def held_target(plant, state, tilt):
 
 def differences(robot, count, tilt_span, rate, joint_rate, held, seed):
     """Force [N] and torque [N m] differences (count,) at random states."""
-    plant, model = Plant(robot, SimulatorParameters.load().plant), body_acceleration(robot)
+    plant, model = Plant(robot, SimulatorParameters.load()), body_acceleration(robot)
     generator = np.random.default_rng(seed)
     force, torque = np.empty(count), np.empty(count)
     for k in range(count):
@@ -69,7 +69,7 @@ def main():
         force, torque = differences(robot, given.states, *case, seed=0)
         print(f'{name:<30}{np.sqrt((force ** 2).mean()):>8.3f}{force.max():>8.3f}'
               f'{np.sqrt((torque ** 2).mean()):>10.4f}{torque.max():>8.4f}')
-    plant = Plant(robot, SimulatorParameters.load().plant)
+    plant = Plant(robot, SimulatorParameters.load())
     module = robot.multibody.module
     aligned = np.pi / 2 * np.array([1, 1, -1, -1])
     plant.acceleration(HEIGHT, [0, 0, 0, 1], np.zeros(3), np.zeros(3), aligned, np.zeros(4),

@@ -36,7 +36,7 @@ def fly(simulator: Simulator, robot: RobotParameters, seconds: float, airborne: 
 
 def end_state(robot: RobotParameters, refinement: int) -> tuple[np.ndarray, np.ndarray]:
     """Position and quaternion after an open-loop flight with ``refinement`` times the substeps."""
-    parameters = SimulatorParameters.load().plant
+    parameters = SimulatorParameters.load()
     plant = Plant(robot, replace(parameters, substeps=refinement * parameters.substeps))
     plant.reset((0.0, 0.0, 4 * HEIGHT))
     generator = np.random.default_rng(0)

@@ -107,7 +107,7 @@ def growth(process: str, samples: list[Sample], warm_up: float) -> Growth | None
 def make_graph(folder: Path, number: int, given) -> Graph:
     """Make the graph of ``fly`` in ``folder``, with a larger pack."""
     simulator = yaml.safe_load(share_path('params/simulator.yaml').read_text())
-    simulator['/**/sim_node']['ros__parameters']['battery']['capacity'] = CAPACITY
+    simulator['/**/sim_node']['ros__parameters']['battery_capacity'] = CAPACITY
     (folder / 'simulator.yaml').write_text(yaml.safe_dump(simulator))
     count = int(60 * given.minutes / POSE_DURATION) + 2
     rows = [','.join(f'{v:g}' for v in WAYPOINTS[k % len(WAYPOINTS)]) for k in range(count)]

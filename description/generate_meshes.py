@@ -114,7 +114,7 @@ def main():
     given = parser.parse_args()
     given.output.mkdir(parents=True, exist_ok=True)
     for name, mesh in meshes(RobotParameters.load(given.robot),
-                             SimulatorParameters.load().plant).items():
+                             SimulatorParameters.load()).items():
         (given.output / f'{name}.stl').write_bytes(mesh.export(file_type='stl'))
 
 

@@ -131,7 +131,7 @@ def main():
     parser.add_argument('--output', type=Path, default=OUTPUT)
     given = parser.parse_args()
     given.output.write_text(urdf(RobotParameters.load(given.robot),
-                                 SimulatorParameters.load().plant))
+                                 SimulatorParameters.load()))
 
 
 if __name__ == '__main__':

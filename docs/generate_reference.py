@@ -49,15 +49,12 @@ FILES = {
     'servo_bus.yaml': ('drivers.device_parameters:ServoBusParameters', 'The bus of tilt servos.'),
     'motor_board.yaml': ('drivers.device_parameters:MotorBoardParameters',
                          'The motor board.'),
-    'emulated_board.yaml': ('sim.emulated.motor_board:EmulatedBoardParameters',
-                            'The emulated motor board.'),
     'simulator.yaml': ('sim.parameters:SimulatorParameters', 'The simulated world.'),
     'recording.yaml': ('identify.recording.limits:RecordingLimits',
                        'Limits of the checks of a recording against itself.'),
     'train.yaml': ('train.parameters:TrainParameters', 'The training of a policy.'),
     'train_published.yaml': ('train.parameters:TrainParameters',
                              'The training with the settings of the publication.'),
-    'faults.yaml': ('sim.fault_lists:FaultList', 'The listed faults.'),
     'identify.yaml': ('identify.parameters:IdentifyParameters',
                       'Identification of servos and rotors from logs.'),
     'gap.yaml': ('identify.gap.parameters:GapParameters', 'The gap finder.')}
@@ -187,8 +184,6 @@ def parameters() -> str:
     seen: dict[str, str] = {}
     for name, (kind, what) in FILES.items():
         text.append(f'\n## {name}\n\n{what}\n\n')
-        if name == 'faults.yaml':
-            text.append('[Safety](../safety.md#every-fault-of-the-list) lists the faults.\n\n')
         if name == 'robot.yaml':
             text.append(ROBOT_FILE)
         if kind in seen:

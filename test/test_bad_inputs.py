@@ -106,8 +106,7 @@ CASES = {
         ('--json no/result.json', 'there is no folder')],
     FAULTS: [
         ('--faults no_list.yaml', "'faults'"),
-        ('--only rotor_9_stops', "fault 'rotor_9_stops' is unknown, a name of the list is "
-                                 'expected; near: rotor_4_stops'),
+        ('--only rotor_9_stops', "fault 'rotor_9_stops' is unknown; near: rotor_4_stops"),
         ('--from bed', "--from 'bed': expected hover, moving, upside_down"),
         ('--seeds 0', "--seeds '0': expected"), ('--healthy nan', "--healthy 'nan'"),
         ('--controller npmc', 'npmc'), ('--output notes.txt', 'notes.txt'),

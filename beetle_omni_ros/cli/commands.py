@@ -235,7 +235,7 @@ def faults(faults: Annotated[Optional[Path], typer.Option(
                     'effects, and count false alarms, instead of the list.')] = 0.0,
            jobs: JobsOption = None,
            bags: Annotated[bool, typer.Option(
-               '--bags', help='Record each flight in --output, and read its bag.')] = False,
+               '--bags', help='Record each flight in --output.')] = False,
            output: Annotated[Optional[Path], typer.Option(
                '--output', '-o', metavar='DIR', help='Folder for page, Markdown and JSON.')]
            = None,

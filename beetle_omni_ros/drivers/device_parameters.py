@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beetle_omni_ros.drivers.servo_registers import BAUD_CODES, MODE_CODES
+from beetle_omni_ros.drivers.servo_registers import BAUD_CODES
 from beetle_omni_ros.robot.schema import group, parameter, ParameterError, ParameterFile
 
 
@@ -52,11 +52,8 @@ class ServoBusParameters(ParameterFile, file='servo_bus.yaml'):
                                   low=-1, high=1, read_only=True)
     zeros: np.ndarray = parameter(doc='reading at zero tilt', unit='counts', shape=(4,), low=0,
                                   high=4095, read_only=True)
-    mode: str = parameter('extended_position', doc='operating mode',
-                          choices=tuple(MODE_CODES), read_only=True)
-    current_limit: float = parameter(
-        0.91, doc='largest current; in current_based_position the torque cap', unit='A',
-        low=0.02, high=0.91, read_only=True)
+    current_limit: float = parameter(0.91, doc='largest current', unit='A', low=0.02, high=0.91,
+                                     read_only=True)
     torque_per_current: float = parameter(
         0.671, doc='torque in joint_states for each ampere', unit='N m/A', low=0, high=100)
     gains: ServoGains = group(ServoGains, 'position controller')

@@ -414,7 +414,7 @@ class ServoBus:
     def _apply_settings(self, servo):
         given, identifier = self.parameters, servo.identifier
         permanent = [       # in EEPROM; the mode is first, because it resets the gains
-            (registers.OPERATING_MODE, registers.MODE_CODES[given.mode]),
+            (registers.OPERATING_MODE, registers.EXTENDED_POSITION),
             (registers.DRIVE_MODE, 0), (registers.HOMING_OFFSET, 0), (registers.RETURN_DELAY, 0),
             (registers.CURRENT_LIMIT, round(given.current_limit / registers.CURRENT_UNIT))]
         if servo.firmware >= registers.STARTUP_FIRMWARE:
@@ -435,13 +435,9 @@ class ServoBus:
 
     def _volatile_settings(self):
         """RAM settings, lost by a restart, except torque and watchdog."""
-        settings = [MARK, (registers.STATUS_LEVEL, 2),
-                    *zip(GAINS, astuple(self.parameters.gains), strict=True),
-                    (registers.PROFILE_ACCELERATION, 0), (registers.PROFILE_VELOCITY, 0)]
-        if self.parameters.mode == 'current_based_position':
-            settings.append((registers.GOAL_CURRENT, round(
-                self.parameters.current_limit / registers.CURRENT_UNIT)))
-        return settings
+        return [MARK, (registers.STATUS_LEVEL, 2),
+                *zip(GAINS, astuple(self.parameters.gains), strict=True),
+                (registers.PROFILE_ACCELERATION, 0), (registers.PROFILE_VELOCITY, 0)]
 
     def _is_marked(self, servo):
         return self.link.read(servo.identifier, MARK[0], ATTEMPTS) == MARK[1]

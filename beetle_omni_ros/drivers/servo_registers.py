@@ -51,7 +51,6 @@ POSITION_P = Register('Position P Gain', 84, 2)
 FEEDFORWARD_2 = Register('Feedforward 2nd Gain', 88, 2)
 FEEDFORWARD_1 = Register('Feedforward 1st Gain', 90, 2)
 WATCHDOG = Register('Bus Watchdog', 98, 1)
-GOAL_CURRENT = Register('Goal Current', 102, 2, True)
 PROFILE_ACCELERATION = Register('Profile Acceleration', 108, 4)
 PROFILE_VELOCITY = Register('Profile Velocity', 112, 4)
 GOAL_POSITION = Register('Goal Position', 116, 4, True)
@@ -75,7 +74,7 @@ WATCHDOG_EXPIRED = 255      # -1 in one byte
 
 BAUD_CODES = {9600: 0, 57600: 1, 115200: 2, 1_000_000: 3, 2_000_000: 4, 3_000_000: 5,
               4_000_000: 6}
-MODE_CODES = {'extended_position': 4, 'current_based_position': 5}
+EXTENDED_POSITION = 4       # operating mode
 
 # Bits of Hardware Error Status (70) and Shutdown (63).
 OVERHEATING = 0x04

@@ -43,7 +43,7 @@ from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.supervisor import Supervisor
 from beetle_omni_ros.sim.faults import Fault, Schedule
 from beetle_omni_ros.sim.parameters import SimulatorParameters
-from beetle_omni_ros.sim.readings import Frame
+from beetle_omni_ros.sim.sensors import Frame
 from beetle_omni_ros.sim.simulator import Simulator
 
 START_TIMEOUT = 5.0      # [s] for the estimator; noisy poses can need longer than SETTLE_TIME

@@ -1,9 +1,10 @@
 """`beetle_omni faults`: flies listed faults, landings or healthy flights; writes one page."""
 
-from dataclasses import asdict
 from datetime import datetime, timezone
 from math import ceil
 from pathlib import Path
+import shlex
+import sys
 
 from rich.console import Console
 
@@ -19,6 +20,7 @@ from beetle_omni_ros.faults.flight import (
     HEALTHY,
     LANDING,
     LANDING_BLIND,
+    PLAN,
     STARTS,
     Trial,
 )
@@ -26,7 +28,7 @@ from beetle_omni_ros.pages.page import print_grids
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.files import check_writable, write_json, write_text
-from beetle_omni_ros.sim.fault_lists import FaultList
+from beetle_omni_ros.sim.fault_lists import chosen, load_cases
 
 PAGE, FLIGHTS = 'faults.html', '.flights'
 
@@ -41,19 +43,12 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
     """
     Fly the list of faults, or landings or healthy flights if requested.
 
-    Arguments are the options of `beetle_omni faults`. ``starts`` are of ALL_STARTS, ``healthy`` is
-    in hours.
-
-    Returns:
-        ``meta``, ``flights`` and ``summary``.
-
-    Raises:
-        ParameterError: unusable input, one line.
-
+    Arguments are the options of `beetle_omni faults`. Returned are ``meta``, ``flights`` and
+    ``summary``; a ParameterError reports unusable input.
     """
     console = console or Console()
-    listed = FaultList.load(faults)
-    cases = listed.chosen(only)
+    cases = load_cases(faults)
+    struck = chosen(cases, only or list(cases))
     entry = registry.find(controller)
     for start in starts or ():
         if start not in ALL_STARTS:
@@ -65,33 +60,25 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
     guidance = guidance_of(entry.make(RobotParameters.load()))  # refuses an unusable controller
     common = {'controller': entry.reference, 'plant': str(plant or ''),
               'listed': file_digest(faults) if faults else ''}
+    under, begins, count = (conditions,), starts or STARTS, seeds
     if landings:
-        trials = [Trial(LANDING_BLIND if without_mocap else LANDING, '', k, conditions, **common)
-                  for k in range(seed, seed + landings)]
+        struck, begins, count = [LANDING_BLIND if without_mocap else LANDING], ('',), landings
     elif healthy:
-        number = ceil(3600 * healthy / listed.healthy.flight_time)
-        trials = [Trial(HEALTHY, '', k, name, **common) for name in CONDITIONS
-                  for k in range(seed, seed + number)]
-    else:
-        trials = [Trial(case.name, start, k, conditions, **common) for case in cases
-                  for start in starts or STARTS for k in range(seed, seed + seeds)]
-    given = {'--faults': faults, '--only': ','.join(only or ()), '--from': ','.join(starts or ()),
-             '--landings': landings, '--healthy': healthy, '--conditions': conditions,
-             '--seeds': seeds, '--seed': seed, '--plant': plant,
-             '--controller': entry.reference}
-    command = ' '.join(['beetle_omni faults', *(f'{option} {value}' for option, value in
-                                                given.items() if value)])
+        struck, begins, under = [HEALTHY], ('',), CONDITIONS
+        count = ceil(3600 * healthy / PLAN.healthy_time)
+    calls = [(Trial(case.name, start, k, name, **common), case, output / 'bags' if bags else None)
+             for case in struck for start in begins for name in under
+             for k in range(seed, seed + count)]
     store = Store(output / FLIGHTS) if output else None
-    flown = sweep(fly_trial, [(trial, listed, output / 'bags' if bags else None)
-                              for trial in trials], store=None if bags else store,
-                  jobs=jobs, console=console)   # a stored flight records no bag
+    flown = sweep(fly_trial, calls, store=None if bags else store, jobs=jobs,
+                  console=console)      # a stored flight records no bag
     results = {'meta': {
-        'command': command + ' --without-mocap' * without_mocap, 'version': __version__,
+        'command': shlex.join(['beetle_omni', *sys.argv[1:]]), 'version': __version__,
         'commit': commit(), 'date': datetime.now(timezone.utc).strftime('%Y-%m-%d'),
-        'guidance': guidance, 'plant': str(plant) if plant else None,
-        'limits': asdict(listed.limits)},
+        'guidance': guidance, 'plant': str(plant) if plant else None},
         'flights': [{key: value for key, value in one.items() if key != 'trace'}
-                    for one in flown], 'summary': page.summary(flown, listed)}
+                    for one in flown],
+        'summary': page.summary(flown, {case.name: case for case in struck})}
     write_json(json_path, results)
     if output:
         write_json(output / 'faults.json', results)

@@ -21,19 +21,30 @@ from beetle_omni_ros.evaluation.campaign import flight_key
 from beetle_omni_ros.evaluation.loop import collector_off, FlightLoop
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.runs.bag import read_bag
 from beetle_omni_ros.runs.bag_writer import BagWriter
 from beetle_omni_ros.runs.log import Recorder, Tee
 from beetle_omni_ros.safety.events import INFO
 from beetle_omni_ros.safety.parameters import SupervisorParameters
-from beetle_omni_ros.sim.fault_lists import FaultList, FlightPlan
+from beetle_omni_ros.sim.fault_lists import Case
 from beetle_omni_ros.sim.faults import Fault
-from beetle_omni_ros.sim.readings import Impact, Truth
+from beetle_omni_ros.sim.sensors import Impact, Truth
 
 STARTS = ('hover', 'moving', 'upside_down')      # default
 ALL_STARTS = (*STARTS, 'random')
-LANDING, LANDING_BLIND, HEALTHY = 'landing', 'landing_without_mocap', 'healthy'
+# Landings from a random attitude and healthy flights, which are no faults of a list.
+LANDING = Case('landing', 'flies_on', 'landing from a random attitude', ())
+LANDING_BLIND = Case('landing_without_mocap', 'flies_on',
+                     'landing from a random attitude, motion capture is lost',
+                     (Fault('mocap_lost'),))
+HEALTHY = Case('healthy', 'flies_on', 'poses without a fault', ())
 CONDITIONS = ('nominal', 'published', 'effects')    # of healthy flights
+EFFECTS = {     # of the plant of healthy flights; sizes of docs/gap.md
+    'thrust_coefficient': {'scale': 0.95},
+    'rotor_thrust_coefficient': {'scale': [0.96, 1.0, 1.04, 1.0]},      # half the size
+    'rotor_drag': {'coefficient': 0.4}, 'body_drag': {'coefficient': 0.05},
+    'tilt_thrust_loss': {'loss_at_60deg': 0.06}, 'axial_inflow': {'per_rotor': 0.4},
+    'wind': {'force': [1.0, 0.0, 0.0]}, 'ground_effect': {'gain_at_0.25m': 0.08},
+    'command_latency': {'delay': 0.01}}                                 # half the size
 FRESH = 0.5     # [-] charge below which the pack is replaced before the next pose
 OFF = ('disarmed', 'emergency_stop')
 IN_FLIGHT = ('flying', 'fallback')
@@ -43,28 +54,48 @@ BETTER = {'flies_on': ('flies_on', 'refused'), 'lands': ('flies_on', 'refused', 
 
 
 @dataclass(frozen=True)
+class Plan:
+    """Flights of the campaign, and limits of their outcomes."""
+
+    height: float = 1.5             # [m] of hover and inverted hover
+    spread: float = 2.0             # [m] largest |x| and |y| of poses on the move, as random100
+    lowest: float = 0.6             # [m] of poses on the move, as random100
+    highest: float = 2.0            # [m] the same
+    hover_time: float = 3.0         # [s] until the fault in hover
+    turn_time: float = 6.0          # [s] until the fault upside down; half a turn takes 4 s
+    move_time: float = 4.0          # [s] of a pose on the move; the fault occurs in the second
+    pose_time: float = 8.0          # [s] of a pose at a random moment, and in healthy flights
+    jitter: float = 1.0             # [s] range of the random delay of the fault
+    watch_time: float = 8.0         # [s] from the fault to the landing request
+    landing_time: float = 30.0      # [s] largest duration of a landing
+    end_time: float = 1.5           # [s] of flight after the motors stopped or the robot broke
+    healthy_time: float = 120.0     # [s] of a healthy flight before it lands
+    impact_speed: float = 1.0       # [m/s] largest impact of a landing; above it the robot breaks
+    inclination: float = 0.5235988  # [rad] 30 deg at touchdown: harmless for the feet; chosen
+    stop_time: float = 0.3          # [s] from a crash until the motors are off
+    fence_margin: float = 5.0       # [m] outside the fence: a flyaway
+    distance: float = 30.0          # [m] from the start: also a flyaway
+    rise: float = 0.5               # [m] above the floor after a rest there: a take-off; chosen
+    rest_time: float = 0.5          # [s] of contact after which it lies on the floor; chosen
+    idle_thrust: float = 0.5        # [N] of all rotors together; less means motors off; chosen
+    landing_speed: float = 0.6      # [m/s] largest impact in the landing campaign
+    landing_inclination: float = 0.3490659  # [rad] 20 deg, in the landing campaign
+
+
+PLAN = Plan()
+
+
+@dataclass(frozen=True)
 class Trial:
-    """
-    Parameters of a flight.
+    """Parameters of a flight."""
 
-    Attributes:
-        case: name of the fault in the list, LANDING, LANDING_BLIND or HEALTHY.
-        start: one of ALL_STARTS, for a fault.
-        seed: seed of the simulation and, together with ``case``, of poses and time of the fault.
-        conditions: one of CONDITIONS; 'effects' is nominal with the list's effects in the plant.
-        controller: the active controller.
-        plant: robot file of the simulated robot; '' for the shipped one.
-        listed: digest of an own list of faults, '' for the shipped one.
-
-    """
-
-    case: str
-    start: str = 'hover'
-    seed: int = 0
-    conditions: str = 'nominal'
+    case: str                   # name of the fault in the list, or of a landing or healthy flight
+    start: str = 'hover'        # one of ALL_STARTS, '' for a landing or healthy flight
+    seed: int = 0               # of the simulation and, with ``case``, of the moves
+    conditions: str = 'nominal'     # of CONDITIONS; 'effects' is nominal with EFFECTS in the plant
     controller: str = registry.DEFAULT
-    plant: str = ''
-    listed: str = ''
+    plant: str = ''             # robot file of the simulated robot; '' for the shipped one
+    listed: str = ''            # digest of an own list of faults, '' for the shipped one
     cost = 1.0
 
     @property
@@ -81,105 +112,70 @@ class Trial:
                           self.conditions, self.listed, plant=self.plant)
 
 
-def fly_trial(trial: Trial, listed: FaultList, bags: Path | None = None) -> dict:
+def fly_trial(trial: Trial, case: Case, bags: Path | None = None, plan: Plan = PLAN) -> dict:
     """
-    Fly one trial.
-
-    Args:
-        trial: the trial.
-        listed: list with its case, limits and plan.
-        bags: folder for its bag; None: no bag is recorded.
+    Fly one trial of a case; ``bags`` is the folder for its bag.
 
     Returns:
-        the trial's fields, flown_s, state, good, bag_lost (None without a bag), error ('' without
-        an exception), and the fields of :meth:`Watcher.observed` or, of a healthy flight, alarms
+        the trial's fields, flown_s, state, good, bag (its name or ''), error ('' without an
+        exception), and the fields of :meth:`Watcher.observed` or, of a healthy flight, alarms
         (stamp, severity and text of every event above information and of every named fault).
 
     """
-    result = {**asdict(trial), 'good': False, 'bag_lost': None, 'error': '', 'flown_s': 0.0}
-    folder = bags / trial.name if bags else None
+    result = {**asdict(trial), 'good': False, 'bag': trial.name if bags else '', 'error': '',
+              'flown_s': 0.0}
     try:
         with collector_off(), ExitStack() as stack:
-            recorder = Tee()
-            if folder:
-                recorder = stack.enter_context(BagWriter(folder, asdict(trial), epoch=int(time())))
-            result.update(_FLOWN.get(trial.case, _fly_fault)(trial, listed, recorder))
+            recorder = stack.enter_context(BagWriter(
+                bags / trial.name, asdict(trial), epoch=int(time()))) if bags else Tee()
+            result.update(_fly_healthy(trial, recorder, plan) if case == HEALTHY
+                          else _fly_fault(trial, case, recorder, plan))
     except Exception as error:          # the campaign continues and reports the error
         text = f'{type(error).__name__}: {error}'[:200]
-        result.update(outcome='error', error=text, failure=text, good=False)
-    if folder:
-        result['bag_lost'] = _is_lost(folder)
-        result['good'] = result['good'] and not result['bag_lost']
+        result.update(outcome='error', error=text, failure=text)
     return result
 
 
-def _is_lost(folder):
-    """Whether a bag is unreadable or does not contain the flight."""
-    try:
-        return not len(read_bag(folder).truth_t)
-    except Exception:       # any error means an unusable bag
-        return True
-
-
-def _fly_fault(trial, listed, recorder):
-    """Take off, start of the fault, flight with the fault, landing."""
-    plan, case = listed.flight, listed.cases[trial.case]
-    flight = Flight(controller=trial.controller, conditions=trial.conditions, seed=trial.seed,
-                    plant=trial.plant, strike=case.strike, recorder=recorder, moves=trial.case)
-    flight.loop.take_off()
-    fly_to_start(flight, trial.start, plan)
-    watcher = Watcher(flight, listed)
+def _fly_fault(trial, case, recorder, plan):
+    """Fly to the start, start the fault, fly on with it unless it is a landing, and land."""
+    flight = Flight(trial, case, plan, recorder)
+    left, moving = plan.watch_time, trial.start in ('moving', 'random')
+    part = flight.random.uniform()
+    if moving:
+        pose_time, later = (plan.pose_time, plan.pose_time) if trial.start == 'random' \
+            else (plan.move_time, plan.jitter)
+        flight.aim_randomly()
+        flight.fly(pose_time)
+        flight.aim_randomly()
+        flight.fly(part * later)
+    elif trial.start:
+        upside_down = trial.start == 'upside_down'
+        flight.aim((0.0, 0.0, plan.height), (np.pi if upside_down else 0.0, 0, 0))
+        flight.fly((plan.turn_time if upside_down else plan.hover_time) + plan.jitter * part)
+    else:
+        flight.aim((0.0, 0.0, plan.height), attitude(trial.seed))
+        flight.fly(plan.turn_time)
+        left = 0.0
+    watcher = Watcher(flight)
     start = flight.simulator.time
     flight.loop.start_faults()
-    left, over, moving = plan.watch_time, False, trial.start in ('moving', 'random')
+    over = False
     while left > 0 and not over:
         period = min(left, plan.move_time) if moving else left
         over = flight.fly(period, watcher)
         left -= period
         if left > 0 and not over:
-            flight.aim_randomly(plan)
+            flight.aim_randomly()
     asked = flight.supervisor.state in IN_FLIGHT
     if not over:
-        flight.land(plan.landing_time, watcher)
+        flight.land(watcher)
     seen = watcher.observed(asked=asked)
+    good = seen['outcome'] in BETTER[case.expected]
+    if good and not trial.start:
+        good = bool(seen['impact_m_s'] <= plan.landing_speed
+                    and np.radians(seen['inclination_deg']) <= plan.landing_inclination)
     return {**seen, 'expected': case.expected, 'flown_s': flight.simulator.time - start,
-            'good': seen['outcome'] in BETTER[case.expected]}
-
-
-def fly_to_start(flight: Flight, start: str, plan: FlightPlan):
-    """Fly to the state in which the fault starts."""
-    part = flight.random.uniform()
-    later = plan.jitter * part
-    if start in ('moving', 'random'):
-        random = start == 'random'
-        flight.aim_randomly(plan)
-        flight.fly(plan.pose_time if random else plan.move_time)
-        flight.aim_randomly(plan)
-        flight.fly(part * plan.pose_time if random else later)
-        return
-    upside_down = start == 'upside_down'
-    flight.aim((0.0, 0.0, plan.height), rotations.from_rpy(np.pi if upside_down else 0.0, 0, 0))
-    flight.fly((plan.turn_time if upside_down else plan.hover_time) + later)
-
-
-def _fly_landing(trial, listed, recorder):
-    """Fly to an attitude and land."""
-    plan, limits, rpy = listed.flight, listed.limits, attitude(trial.seed)
-    flight = Flight(controller=trial.controller, conditions=trial.conditions, seed=trial.seed,
-                    plant=trial.plant, recorder=recorder,
-                    strike=(Fault('mocap_lost'),) if trial.case == LANDING_BLIND else ())
-    flight.loop.take_off()
-    flight.aim((0.0, 0.0, plan.height), rotations.from_rpy(*rpy))
-    flight.fly(plan.turn_time)
-    watcher = Watcher(flight, listed)
-    asked = flight.supervisor.state in IN_FLIGHT
-    flight.loop.start_faults()
-    flight.land(plan.landing_time, watcher)
-    seen = watcher.observed(asked=asked)
-    return {**seen, 'attitude_deg': np.degrees(rpy).tolist(), 'expected': 'flies_on',
-            'good': seen['outcome'] == 'flies_on' and bool(
-                seen['impact_m_s'] <= limits.landing_speed
-                and np.radians(seen['inclination_deg']) <= limits.landing_inclination)}
+            'good': good}
 
 
 def attitude(seed: int) -> np.ndarray:
@@ -190,21 +186,17 @@ def attitude(seed: int) -> np.ndarray:
     return rpy
 
 
-def _fly_healthy(trial, listed, recorder):
+def _fly_healthy(trial, recorder, plan):
     """Fly random poses and land."""
-    effects, plan = trial.conditions == 'effects', listed.healthy
-    flight = Flight(controller=trial.controller, seed=trial.seed, plant=trial.plant,
-                    recorder=recorder, effects=plan.effects if effects else None,
-                    conditions='nominal' if effects else trial.conditions)
+    flight = Flight(trial, HEALTHY, plan, recorder)
     simulator, supervisor = flight.simulator, flight.supervisor
-    flight.loop.take_off()
     start = simulator.time
-    while simulator.time - start < plan.flight_time and supervisor.state in IN_FLIGHT:
+    while simulator.time - start < plan.healthy_time and supervisor.state in IN_FLIGHT:
         if simulator.battery.charge < FRESH:
             simulator.battery.reset()
-        flight.aim_randomly(listed.flight)
+        flight.aim_randomly()
         flight.fly(plan.pose_time)
-    flight.land(listed.flight.landing_time, lambda: supervisor.state == 'disarmed')
+    flight.land(lambda: supervisor.state == 'disarmed')
     alarms = [[event.stamp, event.severity, event.text] for event in supervisor.events
               if event.severity != INFO]
     alarms += [[stamp, 'fault', name] for name, stamp in supervisor.faults.items()]
@@ -213,56 +205,37 @@ def _fly_healthy(trial, listed, recorder):
             'outcome': 'flies_on' if landed else 'does not land', 'good': landed and not alarms}
 
 
-_FLOWN = {LANDING: _fly_landing, LANDING_BLIND: _fly_landing, HEALTHY: _fly_healthy}
-
-
 class Flight:
-    """
-    One robot with its flight stack.
+    """One robot with its flight stack, in the air; ``loop.start_faults`` starts its faults."""
 
-    Attributes:
-        simulator, supervisor, loop: parts of the stack.
-        random: random numbers of the plan of the flight.
-
-    """
-
-    def __init__(self, *, controller: str, conditions: str, seed: int, plant: str = '',
-                 effects: dict | None = None, strike: tuple[Fault, ...] = (),
-                 recorder: Recorder | None = None, moves: str = ''):
-        """
-        Build robot and flight stack.
-
-        Args:
-            controller: the active controller.
-            conditions: 'nominal' or 'published'.
-            seed: seed of the plan and the simulation.
-            plant: robot file of the simulated robot; '' for that of the flight stack.
-            effects: further effects of the simulated robot.
-            strike: faults, started by ``loop.start_faults``.
-            recorder: recorder of the loop; by default nothing is recorded.
-            moves: text that, beside the seed, decides the random numbers of the plan.
-
-        """
+    def __init__(self, trial: Trial, case: Case, plan: Plan, recorder: Recorder):
         nominal = RobotParameters.load()
         aboard = {entry.name: entry.make(nominal) for entry in map(
-            registry.find, dict.fromkeys([controller, registry.pilot()]))}
-        true = RobotParameters.load(plant) if plant else nominal
-        self.loop = FlightLoop(
-            nominal, replace(true, effects=true.effects | (effects or {})), aboard,
-            recorder or Tee(), conditions=conditions, seed=seed, faults=strike)
+            registry.find, dict.fromkeys([trial.controller, registry.pilot()]))}
+        true = RobotParameters.load(trial.plant) if trial.plant else nominal
+        conditions = trial.conditions
+        if conditions == 'effects':
+            true, conditions = replace(true, effects=true.effects | EFFECTS), 'nominal'
+        self.plan = plan
+        self.loop = FlightLoop(nominal, true, aboard, recorder, conditions=conditions,
+                               seed=trial.seed, faults=case.strike)
         self.simulator, self.supervisor = self.loop.simulator, self.loop.supervisor
-        self.random = drawn(seed, moves)
+        # With other moves for each fault, a seed is not one move.
+        self.random = np.random.default_rng(
+            [trial.seed, crc32(trial.case.encode())] if trial.start else trial.seed)
+        self.loop.take_off()
 
-    def aim(self, position, quaternion=(0.0, 0.0, 0.0, 1.0)) -> None:
-        """Set the target pose: (3,) in world [m], (4,) xyzw."""
-        self.loop.aim(PoseTarget(np.array(position, dtype=float), np.array(quaternion),
+    def aim(self, position, rpy) -> None:
+        """Set the target pose: (3,) in world [m], roll, pitch and yaw [rad]."""
+        self.loop.aim(PoseTarget(np.array(position, dtype=float), rotations.from_rpy(*rpy),
                                  self.loop.now))
 
-    def aim_randomly(self, plan: FlightPlan) -> None:
+    def aim_randomly(self) -> None:
         """Set a random target pose of any attitude."""
-        x, y, z = self.random.uniform([-plan.spread, -plan.spread, plan.lowest],
-                                      [plan.spread, plan.spread, plan.highest])
-        self.aim((x, y, z), rotations.from_rpy(*self.random.uniform(-np.pi, np.pi, 3)))
+        plan = self.plan
+        self.aim(self.random.uniform([-plan.spread, -plan.spread, plan.lowest],
+                                     [plan.spread, plan.spread, plan.highest]),
+                 self.random.uniform(-np.pi, np.pi, 3))
 
     def fly(self, duration: float, over: Callable[[], bool] = lambda: False) -> bool:
         """Fly for ``duration`` [s] or until ``over`` is true; returns whether it became true."""
@@ -273,80 +246,60 @@ class Flight:
                 return True
         return False
 
-    def land(self, duration: float, over: Callable[[], bool]) -> None:
+    def land(self, over: Callable[[], bool]) -> None:
         """Request a landing and fly on."""
         self.supervisor.land(self.loop.now)
-        self.fly(duration, over)
-
-
-def drawn(seed: int, moves: str) -> np.random.Generator:
-    """Random numbers of a plan: other ones for each fault, so that a seed is not one move."""
-    return np.random.default_rng([seed, crc32(moves.encode())] if moves else seed)
+        self.fly(self.plan.landing_time, over)
 
 
 class Watcher:
-    """
-    Follows a flight from the onset of its fault; a call returns whether the flight is over.
+    """Follows a flight from the onset of its fault; a call returns whether the flight is over."""
 
-    Attributes:
-        impacts: touchdowns.
-        crash: time at which the robot broke [s], or None.
-        overrun: longest time after the crash with motors still commanded [s].
-        flyaway: whether it left the fence, or its place by too much.
-        takeoffs: number of take-offs after it had lain on the floor.
-        farthest: largest distance from the start [m].
-        said: first warning of the supervisor and its time [s].
-        named: name of the first fault that the supervisor named, and its time [s].
-
-    """
-
-    def __init__(self, flight: Flight, listed: FaultList):
+    def __init__(self, flight: Flight):
         """Start now."""
         envelope = SupervisorParameters.load().envelope
-        self._flight, self._limits, self._end_time = flight, listed.limits, listed.flight.end_time
+        self._flight, self._plan = flight, flight.plan
         self._fence = np.array([envelope.half_width, envelope.half_width, envelope.height])
         self._place, self._start = flight.simulator.truth.position.copy(), flight.simulator.time
         self._past_events = len(flight.supervisor.events)
         self._past_faults = set(flight.supervisor.faults)
         self._still = self._down = 0.0
         self._floor: float | None = None
-        self.impacts: list[Impact] = []
-        self.crash: float | None = None
-        self.overrun, self.farthest, self.flyaway, self.takeoffs = 0.0, 0.0, False, 0
-        self.said: tuple[str, float | None] = ('', None)
-        self.named: tuple[str, float | None] = ('', None)
+        self.impacts: list[Impact] = []             # touchdowns
+        self.crash: float | None = None             # time at which the robot broke [s]
+        self.overrun = 0.0      # longest time after the crash with motors still commanded [s]
+        self.flyaway = False    # whether it left the fence, or its place by too much
+        self.takeoffs = 0       # after it had lain on the floor
+        self.said = ''          # first warning of the supervisor
+        self.named: tuple[str, float | None] = ('', None)   # its first named fault, after [s]
 
     def __call__(self) -> bool:
         """Observe the last tick; returns whether the flight is over."""
         simulator, supervisor = self._flight.simulator, self._flight.supervisor
         truth, tick = simulator.truth, simulator.tick
         self.step(truth, float(simulator.thrust_command.sum()), tick)
-        after = simulator.time - self._start
-        if not self.said[0]:
-            self.said = next(((event.text, after) for event in
-                              supervisor.events[self._past_events:] if event.severity != INFO),
-                             self.said)
+        self.said = self.said or next((event.text for event in supervisor.events[
+            self._past_events:] if event.severity != INFO), '')
         if not self.named[0]:
-            self.named = next(((name, after) for name in supervisor.faults
+            self.named = next(((name, simulator.time - self._start) for name in supervisor.faults
                                if name not in self._past_faults), self.named)
         ended = supervisor.state in OFF or truth.broken
         self._still = self._still + tick if ended else 0.0
-        return self.flyaway or self._still >= self._end_time
+        return self.flyaway or self._still >= self._plan.end_time
 
     def step(self, truth: Truth, thrust: float, tick: float) -> None:
         """Process a tick [s]: true state, commanded thrust of all rotors together [N]."""
-        limits, place = self._limits, truth.position
+        limits, place = self._plan, truth.position
         if truth.impact is not None and truth.impact not in self.impacts[-1:]:
             self.impacts.append(truth.impact)
         if truth.broken and self.crash is None:
             self.crash = truth.stamp
         if self.crash is not None and thrust > limits.idle_thrust:
             self.overrun = max(self.overrun, truth.stamp - self.crash)
-        self.farthest = max(self.farthest, float(np.linalg.norm(place - self._place)))
         outside = max(abs(place[0]) - self._fence[0], abs(place[1]) - self._fence[1],
                       place[2] - self._fence[2])
         self.flyaway = self.flyaway or bool(outside > limits.fence_margin) \
-            or self.farthest > limits.distance
+            or bool(np.linalg.norm(place - self._place) > limits.distance)
         self._down = self._down + tick if truth.contact else 0.0
         if self._down >= limits.rest_time:
             self._floor = float(place[2])
@@ -355,46 +308,31 @@ class Watcher:
 
     def observed(self, *, asked: bool) -> dict:
         """Observations; ``asked``: whether the robot flew when the landing was commanded."""
-        worst = max((impact.speed for impact in self.impacts), default=None)
         inclined = max((impact.inclination for impact in self.impacts), default=None)
-        state = self._flight.supervisor.state
         return {
-            'outcome': self.outcome(asked=asked, stopped=state in OFF,
-                                    refused=bool(self._flight.loop.refusals)),
-            'impact_m_s': worst,
+            'outcome': self.outcome(asked), 'broken': self.crash is not None,
+            'impact_m_s': max((impact.speed for impact in self.impacts), default=None),
             'inclination_deg': None if inclined is None else float(np.degrees(inclined)),
-            'broken': self.crash is not None, 'overrun_s': self.overrun,
-            'flyaway': self.flyaway, 'takeoffs': self.takeoffs, 'named': self.named[0],
-            'named_s': self.named[1], 'said': self.said[0], 'said_s': self.said[1],
-            'state': state, 'farthest_m': self.farthest}
+            'overrun_s': self.overrun, 'flyaway': self.flyaway, 'takeoffs': self.takeoffs,
+            'named': self.named[0], 'named_s': self.named[1], 'said': self.said,
+            'state': self._flight.supervisor.state}
 
-    def outcome(self, *, asked: bool, stopped: bool, refused: bool) -> str:
-        """
-        Outcome of the flight as one word.
-
-        Args:
-            asked: whether the robot still flew when the landing was commanded.
-            stopped: whether the motors were off at the end.
-            refused: whether a target was refused, as expected.
-
-        Returns:
-            'flies_on', 'refused', 'lands' or 'stops'; or an outcome that is never expected:
-            'flyaway', 'takes off', 'crash, motors on', 'hard', 'tilted' or 'does not land'.
-
-        """
+    def outcome(self, asked: bool) -> str:
+        """Outcome of the flight as one word of :data:`.page.OUTCOMES`."""
+        stopped = self._flight.supervisor.state in OFF
         if self.flyaway:
             return 'flyaway'
         if self.takeoffs:
             return 'takes off'
         if self.crash is not None:
-            late = self.overrun > self._limits.stop_time
+            late = self.overrun > self._plan.stop_time
             return 'crash, motors on' if late or not stopped else 'stops'
         if not stopped or not self.impacts:
             return 'does not land'
-        if max(impact.speed for impact in self.impacts) > self._limits.impact_speed:
+        if max(impact.speed for impact in self.impacts) > self._plan.impact_speed:
             return 'hard'
-        if max(impact.inclination for impact in self.impacts) > self._limits.inclination:
+        if max(impact.inclination for impact in self.impacts) > self._plan.inclination:
             return 'tilted'
         if not asked:
             return 'lands'
-        return 'refused' if refused else 'flies_on'
+        return 'refused' if self._flight.loop.refusals else 'flies_on'

@@ -105,7 +105,8 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
                 meta['faults'] = [str(fault) for fault in injected]
             graph = Graph(nodes, folder, number)
             try:
-                status = _fly(graph, controller, flown_task, console, listed.text(injected))
+                status = _fly(graph, controller, flown_task, console,
+                              '; '.join(map(str, injected)))
             except KeyboardInterrupt:
                 if (bag / 'metadata.yaml').exists():
                     add_meta(bag, {**meta, 'interrupted': True})

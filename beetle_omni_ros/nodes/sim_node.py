@@ -17,14 +17,8 @@ from beetle_omni_ros.nodes.node import Distribution, ERROR, FlightNode, OK, WARN
 from beetle_omni_ros.nodes.parameters import file_parameter
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import group, parameter, ParameterError
-from beetle_omni_ros.sim.emulated import (
-    BOARD_EVENTS,
-    BoardFaults,
-    SERVO_EVENTS,
-    ServoFaults,
-    switched_on,
-)
-from beetle_omni_ros.sim.emulated_actuators import EmulatedActuators
+from beetle_omni_ros.sim.emulated.actuators import EmulatedActuators
+from beetle_omni_ros.sim.emulated.device import BoardFaults, ServoFaults, switched_on
 from beetle_omni_ros.sim.fault_lists import DEVICES, parse_faults
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.simulator import Simulator
@@ -39,8 +33,7 @@ LAG = 0.02              # s between the newest sample and the newest answered on
 PATIENCE = 0.3          # s of steady time without an answer after which a node has stopped
 COMMAND_AGE = 0.1       # s, older commands are not executed
 # Switches of single events, which are reset after they happened.
-EVENTS = {*(f'servo_faults.{name}' for name in SERVO_EVENTS),
-          *(f'board_faults.{name}' for name in BOARD_EVENTS)}
+EVENTS = {'servo_faults.reboot', 'board_faults.reboot'}
 
 
 class RealTimePacing:
@@ -136,7 +129,7 @@ class SimNodeParameters:
                                 'one', read_only=True)
     board_port: str = parameter('', doc="path of the emulated motor board's port; empty: a "
                                 'temporary one', read_only=True)
-    servo_bus_file: str = file_parameter('ids, signs, zeros and baud rate of the emulated servos')
+    servo_bus_file: str = file_parameter('ids, signs and zeros of the emulated servos')
     clock: str = parameter('system', choices=('system', 'simulated'), read_only=True,
                            doc='real time, or simulated time on /clock, which waits for late '
                            'nodes; all other nodes then need use_sim_time')
@@ -216,8 +209,8 @@ class SimNode(FlightNode):
         servos = ServoBusParameters.load(given.servo_bus_file or None)
         bus = EmulatedServoBus(
             servos.ids.astype(int).tolist(), port=given.servo_port or None,
-            baud_rate=servos.baud_rate, signs=servos.signs.astype(int).tolist(),
-            zeros=servos.zeros.astype(int).tolist(), seed=given.seed)
+            signs=servos.signs.astype(int).tolist(), zeros=servos.zeros.astype(int).tolist(),
+            seed=given.seed)
         board = EmulatedMotorBoard(self._robot, seed=given.seed, port=given.board_port or None)
         self._devices = EmulatedActuators(self._simulator, bus, board)
         self._step = self._devices.step
@@ -261,9 +254,10 @@ class SimNode(FlightNode):
     @staticmethod
     def _refuse_faults(given):
         """Refuse faults of emulated devices if there are none."""
-        for fault in (*switched_on(given.servo_faults), *switched_on(given.board_faults)):
-            raise ParameterError(f'{fault}: there are no devices with actuators direct; start '
-                                 'with actuators:=emulated')
+        for group_name in ('servo_faults', 'board_faults'):
+            if wanted := switched_on(getattr(given, group_name), event=True):
+                raise ParameterError(f'{group_name}: {wanted[0]}: there are no devices with '
+                                     'actuators direct; start with actuators:=emulated')
 
     def _reset_events(self, changed):
         """Reset the parameters of events that have happened, so that they can be set again."""

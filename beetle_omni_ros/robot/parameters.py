@@ -266,10 +266,10 @@ class RobotParameters:
                         for joint in (True, False))
         low, high = self.intervals.get(TILT_LAG, (-np.inf, np.inf))
         for _ in range(DRAWS):
-            drawn = {key: _between(*pair, rng.random(np.shape(pair[0])))
+            drawn = {key: _between(pair, rng.random(np.shape(pair[0])))
                      for key, pair in shared.items()}
             places = rng.random((DRAWS, 4))
-            made = {key: _between(*pair, places) for key, pair in each.items()}
+            made = {key: _between(pair, places) for key, pair in each.items()}
             kp, kd = (made.get(f'effects.joint_bandwidth.{name}', getattr(self.joints, name))
                       for name in ('kp', 'kd'))
             lag = kd / kp + drawn.get('effects.joint_command_latency.delay',
@@ -470,9 +470,9 @@ def _unchecked(multibody: dict, own: dict) -> dict:
     return kept
 
 
-def _between(low, high, share):
+def _between(interval, share):
     """Value at a share of an interval, of a positive one by ratio."""
-    low, high = np.array(low), np.array(high)
+    low, high = map(np.array, interval)
     return low * (high / low)**share if np.all(low > 0) else low + (high - low) * share
 
 

@@ -10,19 +10,25 @@ from beetle_omni_ros.robot.parameters import (
     RobotParameters,
     Variation,
 )
-from beetle_omni_ros.sim.parameters import PlantParameters
+from beetle_omni_ros.sim.parameters import SimulatorParameters
 
 BASE = 1                        # body index of base_link; 0 is the world
 TINY_MASS = 1e-12               # [kg] MuJoCo requires mass and inertia of a moving body
 TINY_INERTIA = 1e-13            # [kg m^2]
 MOTOR_HEIGHT = 0.02             # [m] half height of the contact disc of a propeller
+FLOOR_FRICTION = 0.8            # [-] rubber foot on a gym mat, chosen
+CONTACT_TIME = 0.01             # [s] time constant of the contact with the floor: soft enough for
+                                # 1 kHz, sinks less than 1 mm at rest; chosen
+CONTACT_DAMPING = 1.0           # [-] damping ratio: lands without bouncing, chosen
+PAYLOAD_DEPTH = 0.08            # [m] a payload's centre below base_link, between the legs; chosen
+PAYLOAD_DENSITY = 2700.0        # [kg/m^3] an aluminium ball
 
 # solref and solimp of the joint stops, as stiff as is stable with steps of 1 ms.
 STOP_SOFTNESS = 0.002, 1.0
 STOP_IMPEDANCE = 0.99, 0.999, 0.001
 
 
-def build_model(robot: RobotParameters, plant: PlantParameters,
+def build_model(robot: RobotParameters, plant: SimulatorParameters,
                 variation: Variation | None = None) -> mujoco.MjModel:
     """
     Compile the plant.
@@ -36,14 +42,13 @@ def build_model(robot: RobotParameters, plant: PlantParameters,
     return model
 
 
-def base_part(robot: RobotParameters, plant: PlantParameters, variation: Variation | None,
-              payload: float) -> RigidPart:
+def base_part(robot: RobotParameters, variation: Variation | None, payload: float) -> RigidPart:
     """All parts fixed to base_link: main body, end-effector, payload of ``payload`` [kg]."""
     parts = mass_properties(robot, variation)
     rigid = [parts.main_body, parts.end_effector]
     if payload:
-        radius = (3 * payload / (4 * np.pi * plant.payload_density)) ** (1 / 3)
-        rigid.append(RigidPart(payload, np.array([0.0, 0.0, -plant.payload_depth]),
+        radius = (3 * payload / (4 * np.pi * PAYLOAD_DENSITY)) ** (1 / 3)
+        rigid.append(RigidPart(payload, np.array([0.0, 0.0, -PAYLOAD_DEPTH]),
                                0.4 * payload * radius ** 2 * np.eye(3)))
     return combined(rigid)
 
@@ -135,15 +140,15 @@ def _mjcf(robot, plant, variation):
   </option>
   <default>
     <geom contype="1" conaffinity="0" condim="3"
-          friction="{_text(plant.floor_friction, 0.005, 1e-4)}"
-          solref="{_text(plant.contact_time_constant, plant.contact_damping_ratio)}"
+          friction="{_text(FLOOR_FRICTION, 0.005, 1e-4)}"
+          solref="{_text(CONTACT_TIME, CONTACT_DAMPING)}"
           rgba="0.3 0.3 0.32 1"/>
   </default>
   <worldbody>
     <geom name="floor" type="plane" size="0 0 1" contype="0" conaffinity="1"/>
     <body name="base_link">
       <freejoint name="base"/>
-      {_inertial(base_part(robot, plant, variation, 0.0))}
+      {_inertial(base_part(robot, variation, 0.0))}
       <geom name="main_body" type="cylinder" size="{_text(0.5 * plant.foot_spread, 0.03)}"/>
       <geom name="end_effector" type="sphere" size="{plant.end_effector_radius!r}"
             pos="{_text(ball)}"/>

@@ -10,8 +10,8 @@ from beetle_omni_ros.robot.allocation import clipped
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters, Variation
 from beetle_omni_ros.robot.servo import NUMPY
-from beetle_omni_ros.sim.mjcf import BASE, base_part, build_model, set_base_part
-from beetle_omni_ros.sim.parameters import PlantParameters
+from beetle_omni_ros.sim.mjcf import BASE, base_part, build_model, CONTACT_TIME, set_base_part
+from beetle_omni_ros.sim.parameters import SimulatorParameters
 
 # MuJoCo would write warnings into a file in the working directory; step() checks the state.
 mujoco.set_mju_user_warning(lambda text: None)
@@ -20,27 +20,21 @@ NO_CONSTRAINT = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
 WXYZ = np.array([6, 3, 4, 5])       # indices of w, x, y, z in (position, quaternion xyzw)
 XYZW = np.array([4, 5, 6, 3])       # indices of x, y, z, w in qpos
 DIVERGED = 1e9                      # bound of the sum of accelerations in a valid state
+FLOOR_SUBSTEPS = 2                  # integration steps in a tick at the floor: the solver is slow
+JAM_STIFFNESS = 20.0    # [-] relative to the servo: 1 mrad under load, stable at 1 kHz
 
 
 class Plant:
     """
-    One true robot over a floor.
+    One true robot over a floor; :meth:`reset` places it.
 
     MuJoCo integrates by the Runge-Kutta method of order 4. The solver of contacts and joint stops
     runs only in ticks in which a contact is possible. The tilt rate is limited only in ticks in
     which a joint could reach the limit. Both conditions are conservative and together halve the
-    computing time.
-
-    Attributes:
-        voltage_ratio: battery voltage relative to a full one, set by the owner of the battery.
-        charge_drawn: charge drawn from the battery [A h], set by its owner.
-
-    Raises:
-        ParameterError: the plant lacks an effect, or impossible mass properties.
-
+    computing time. A ParameterError is raised for impossible mass properties.
     """
 
-    def __init__(self, robot: RobotParameters, parameters: PlantParameters,
+    def __init__(self, robot: RobotParameters, parameters: SimulatorParameters,
                  variation: Variation | None = None):
         self._robot, self._parameters, self._variation = robot, parameters, variation
         # Effects that only change a number of the model are built into it.
@@ -58,11 +52,10 @@ class Plant:
         self._servo_terms = [dynamics.tilt_servo(robot, i, 0.0)[0] for i in range(4)]
         self._has_friction = self._servo_terms[0].coulomb is not None
         self._friction = np.zeros(4)
-        self._scale = robot.thrust_scale
+        self._scale, self.gravity = robot.thrust_scale, robot.gravity
         self.model = build_model(robot, parameters, variation)
         self.data = mujoco.MjData(self.model)
         self._tick, self._substeps = parameters.tick, parameters.substeps
-        self._floor_substeps = min(parameters.substeps, parameters.floor_substeps)
         self._flags = int(self.model.opt.disableflags)
         self._reach = _reach(self.model)
         # Largest change of a servo's rate in a tick for each rad of error.
@@ -70,28 +63,27 @@ class Plant:
         # Views of MuJoCo's state, stored because each access takes time.
         self._qpos, self._qvel = self.data.qpos, self.data.qvel
         self._tilt, self._rate, self._target = self._qpos[7:], self._qvel[6:], self.data.ctrl[4:]
-        self._ground_height: float | None = None
         self._commanded_tilt = np.zeros(4)
+        # Of the battery, set by its owner: voltage relative to a full one, charge drawn [A h].
         self.voltage_ratio, self.charge_drawn = 1.0, 0.0
         self._wrench = np.zeros(6)
         self._payload: float | None = None      # not yet set
         self._servos = (True,) * 4, (False,) * 4
         self._powered = (True,) * 4     # whether the motor and its limits act
-        self.reset()
+        self._shaft = np.zeros(4)
 
     def reset(self, position: np.ndarray | None = None,
               quaternion: np.ndarray | None = None) -> None:
-        """
-        Place the robot at rest: tilts zero, rotors off, servos powered, no wrench, no payload.
-
-        ``position`` (3,) is that of base_link in world [m], by default standing at the origin;
-        ``quaternion`` (4,) is base_link to world, xyzw, by default level.
-        """
+        """Place an intact robot at rest, see :meth:`.simulator.Simulator.reset`."""
         self.set_payload(0.0)
         self.set_powered((True,) * 4)
         self._wrench[:] = 0.0
         if position is None:
-            position = (0.0, 0.0, self._standing_height())
+            # At rest on its feet.
+            self._place((0.0, 0.0, self._parameters.foot_depth), (0.0, 0.0, 0.0, 1.0))
+            settle = 100 * CONTACT_TIME
+            mujoco.mj_step(self.model, self.data, int(np.ceil(settle / self.model.opt.timestep)))
+            position = (0.0, 0.0, float(self.data.qpos[2]))
         self._place(position, (0.0, 0.0, 0.0, 1.0) if quaternion is None else quaternion)
 
     def _place(self, position, quaternion):
@@ -103,27 +95,6 @@ class Plant:
         self.data.qpos[:3] = position
         self.data.qpos[3:7] = rotations.normalized(quaternion)[[3, 0, 1, 2]]
         self._update()
-
-    def set_body(self, position: np.ndarray, quaternion: np.ndarray, velocity: np.ndarray,
-                 angular_velocity: np.ndarray) -> None:
-        """
-        Set pose and velocity of base_link; joints and rotors keep their states.
-
-        Arguments as those of the same names in :class:`.readings.Truth`.
-        """
-        self._qpos[:3] = position
-        self._qpos[3:7] = rotations.normalized(quaternion)[[3, 0, 1, 2]]
-        self._qvel[:3], self._qvel[3:6] = velocity, angular_velocity
-        self._update()
-
-    def _standing_height(self):
-        """Height of base_link at rest on its feet [m], simulated once."""
-        if self._ground_height is None:
-            self._place((0.0, 0.0, self._parameters.foot_depth), (0.0, 0.0, 0.0, 1.0))
-            settle = 100 * self._parameters.contact_time_constant
-            mujoco.mj_step(self.model, self.data, int(np.ceil(settle / self.model.opt.timestep)))
-            self._ground_height = float(self.data.qpos[2])
-        return self._ground_height
 
     def set_targets(self, tilt: np.ndarray, thrust: np.ndarray) -> None:
         """Set tilt targets (4,) [rad] and thrust commands (4,) [N], both within their limits."""
@@ -146,7 +117,7 @@ class Plant:
         self._servos = powered, jammed
         stuck = np.array(jammed)
         joints, model = self._robot.joints, self.model
-        hard = joints.kp * self._parameters.jam_stiffness
+        hard = joints.kp * JAM_STIFFNESS
         stiffness = np.where(stuck, hard, joints.kp * np.array(powered))
         damping = np.where(stuck, 2 * np.sqrt(hard * joints.inertia), joints.kd)
         model.actuator_gainprm[4:, 0] = stiffness
@@ -164,24 +135,17 @@ class Plant:
         """Set the mass [kg] of the payload, a ball below the body."""
         if mass != self._payload:
             self._payload = mass
-            set_base_part(self.model, base_part(self._robot, self._parameters, self._variation,
-                                                mass))
+            set_base_part(self.model, base_part(self._robot, self._variation, mass))
 
     def step(self) -> None:
-        """
-        Advance one tick with the present targets.
-
-        Raises:
-            RuntimeError: the state has diverged.
-
-        """
+        """Advance one tick with the present targets; a RuntimeError reports a diverged state."""
         model, data = self.model, self.data
         if self._has_servo_loads:
             self._load_servos()
         touching = self._may_touch()
         model.opt.disableflags = self._flags if touching else self._flags | NO_CONSTRAINT
         fast = not self._may_reach_rate_limit()
-        substeps = self._floor_substeps if fast and data.ncon else self._substeps
+        substeps = min(FLOOR_SUBSTEPS, self._substeps) if fast and data.ncon else self._substeps
         model.opt.timestep = self._tick / substeps
         self._apply_forces(0.5 * self._tick)
         if fast and not self._has_friction:
@@ -244,8 +208,7 @@ class Plant:
         """
         Apply the external wrench and the effects' forces, predicted ``ahead`` [s] from now.
 
-        Evaluated in the middle of a tick and held during it, forces that depend on the motion are
-        accurate to second order with a single evaluation.
+        Those in the middle of a tick, held during it, are accurate to second order.
         """
         data = self.data
         applied = data.qfrc_applied[:6]
@@ -298,9 +261,8 @@ class Plant:
 
     def _rub(self, others):
         """
-        Set the friction of the joints for one substep.
+        Set the friction of the joints for one substep: what stops them, within its limit.
 
-        It is the torque that stops the joint within the substep, at most the friction at its rate.
         So a joint below its stiction rests without the solver of contacts.
         """
         joints, model, rate = self._robot.joints, self.model, self._rate
@@ -352,26 +314,21 @@ class Plant:
         return self.data.ncon > 0
 
     @property
-    def gravity(self) -> float:
-        """Gravitational acceleration along world -z [m/s^2]."""
-        return self._robot.gravity
-
-    @property
     def specific_force(self) -> np.ndarray:
         """(3,) acceleration of base_link minus gravity, in base_link [m/s^2]."""
         acceleration = self.data.qacc[:3].copy()
-        acceleration[2] += self._robot.gravity
+        acceleration[2] += self.gravity
         return self.data.xmat[BASE].reshape(3, 3).T @ acceleration
 
     def acceleration(self, position: np.ndarray, quaternion: np.ndarray, velocity: np.ndarray,
                      angular_velocity: np.ndarray, tilt: np.ndarray, tilt_velocity: np.ndarray,
                      thrust: np.ndarray, tilt_target: np.ndarray | None = None) -> np.ndarray:
         """
-        Accelerations in a given state away from the floor; the plant remains in it.
+        Accelerations in a given state away from the floor, as of :class:`.sensors.Truth`.
 
-        Arguments as those of the same names in :class:`.readings.Truth`, with the ``thrust``
-        before the effects' scales; ``tilt_target`` (4,) [rad] is by default the present tilt.
-        Returned are (10,) linear in world [m/s^2], angular in base_link and of tilts [rad/s^2].
+        The ``thrust`` is before the effects' scales, ``tilt_target`` (4,) [rad] by default the
+        present tilt. Returned are (10,) linear in world [m/s^2], angular in base_link and of
+        tilts [rad/s^2]. The plant remains in the state.
         """
         data = self.data
         data.qpos[:] = np.concatenate([position, quaternion, tilt])[
@@ -407,15 +364,7 @@ class AddedWrench:
 
 
 def _reach(model):
-    """Largest distance of the robot's geometry from base_link with any tilts [m]."""
-    reach = 0.0
-    for geom in range(model.ngeom):
-        body = int(model.geom_bodyid[geom])
-        if body == 0:
-            continue
-        distance = np.linalg.norm(model.geom_pos[geom]) + model.geom_rbound[geom]
-        while body != BASE:
-            distance += np.linalg.norm(model.body_pos[body])
-            body = int(model.body_parentid[body])
-        reach = max(reach, float(distance))
-    return reach
+    """Bound of the distance of the robot's geometry from base_link with any tilts [m]."""
+    joints = np.linalg.norm(model.body_pos[BASE + 1:], axis=1)
+    sizes = np.linalg.norm(model.geom_pos[1:], axis=1) + model.geom_rbound[1:]
+    return float(joints.max() + sizes.max())

@@ -1,7 +1,7 @@
 """The simulated robot with the interface of a real one: commands in, sensor readings out."""
 
 from bisect import bisect_right
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 from math import isfinite, sqrt
@@ -12,41 +12,28 @@ from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import clipped
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.sim.faults import Actuation, Fault, READINGS, Schedule
-from beetle_omni_ros.sim.parameters import (
-    ActuatorTimingParameters,
-    Conditions,
-    CrashParameters,
-    draw,
-    PackParameters,
-    SimulatorParameters,
-)
+from beetle_omni_ros.sim.faults import Drive, Fault, READINGS, Schedule
+from beetle_omni_ros.sim.parameters import draw, SimulatorParameters
 from beetle_omni_ros.sim.plant import Plant, XYZW
-from beetle_omni_ros.sim.readings import Drive, Frame, Impact, Truth
-from beetle_omni_ros.sim.sensors import Sensors
+from beetle_omni_ros.sim.sensors import Frame, Impact, Sensors, Truth
 
 ROUNDING = 1e-9     # [s] bound of the rounding error of sums of ticks
-POWERED, INTACT = (True,) * 4, np.ones(4)
+INTACT = np.ones(4)
+FUTURE_LIMIT = 0.1  # [s] stamps further ahead come from a wrong clock and are refused
+AIRBORNE_TIME = 0.3     # [s] without contact, after which a contact is a touchdown; chosen
+# Charge of a pack, and its open-circuit voltage relative to a full one: a typical lithium-polymer
+# cell, over 4.2 V.
+CHARGES = [0.0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0]
+VOLTAGES = [0.78, 0.86, 0.88, 0.89, 0.90, 0.905, 0.915, 0.925, 0.94, 0.955, 0.975, 1.0]
 
 
 class Battery:
-    """
-    Charge, voltage and current of one battery.
+    """Charge, voltage and current of one battery."""
 
-    Attributes:
-        charge: charge as a fraction of a full battery.
-        voltage: voltage under the present load [V].
-        extra_resistance: additional resistance of a bad contact or cell [ohm].
-        current: drawn current [A], positive.
-        drawn: charge drawn since the reset [A h].
-
-    """
-
-    def __init__(self, robot: RobotParameters, pack: PackParameters):
-        self._pack = pack
+    def __init__(self, robot: RobotParameters, parameters: SimulatorParameters):
+        self._parameters = parameters
         self._resistance = robot.battery.resistance
-        self._curve = pack.charge_levels.tolist(), \
-            (robot.battery.full_voltage * pack.relative_voltages).tolist()
+        self._curve = CHARGES, [robot.battery.full_voltage * part for part in VOLTAGES]
         rows = sorted(robot.rotors.map, key=lambda row: row.voltage)
         self._limits = [row.voltage for row in rows], [row.thrust_max for row in rows]
         self._thrust_max = robot.rotors.thrust_max
@@ -54,9 +41,10 @@ class Battery:
 
     def reset(self) -> None:
         """Set the initial charge and no load."""
-        self.charge = self._pack.initial_charge
-        self.extra_resistance = self.current = self.drawn = 0.0
-        self.voltage = self.rest_voltage
+        self.charge = self._parameters.battery_charge   # [-] of a full battery
+        self.extra_resistance = 0.0         # [ohm] of a bad contact or cell
+        self.current = self.drawn = 0.0     # [A] positive; [A h] since the reset
+        self.voltage = self.rest_voltage    # [V] under the present load
 
     @property
     def rest_voltage(self) -> float:
@@ -65,8 +53,8 @@ class Battery:
 
     def step(self, thrust: np.ndarray, duration: float) -> None:
         """Supply the power for ``thrust`` (4,) [N] during ``duration`` [s]."""
-        pack = self._pack
-        power = pack.idle_power + pack.rotor_power * sum(
+        parameters = self._parameters
+        power = parameters.idle_power + parameters.rotor_power * sum(
             f * sqrt(f) for f in thrust.tolist() if f > 0)
         rest = self.rest_voltage
         # power = V (rest - V) / R, limited to the largest power, which is at V = rest / 2
@@ -76,16 +64,12 @@ class Battery:
         if resistance:
             self.current = min(self.current, (rest - self.voltage) / resistance)
         self.drawn += self.current * duration / 3600
-        self.charge = max(0.0, self.charge - self.current * duration / (3600 * pack.capacity))
+        self.charge = max(0.0, self.charge - self.current * duration
+                          / (3600 * parameters.battery_capacity))
 
     @property
     def thrust_limit(self) -> float:
-        """
-        Largest thrust of a rotor at the present voltage [N].
-
-        It is interpolated between the voltages of the rotor map, and extrapolated below the
-        lowest. Without a map it is the limit of the robot.
-        """
+        """Largest thrust of a rotor at the present voltage [N], by the rotor map if given."""
         voltages, thrusts = self._limits
         if not voltages:
             return self._thrust_max
@@ -104,36 +88,26 @@ class CommandLink:
     """
     Checks and delays commands, and stops the rotors if none arrives.
 
-    ``tilt`` (4,) [rad] and ``thrust`` (4,) [N] are the present targets, ``rejected`` the numbers
-    of refused commands by reason.
+    ``tilt`` (4,) [rad] and ``thrust`` (4,) [N] are the present targets.
     """
 
-    def __init__(self, robot: RobotParameters, timing: ActuatorTimingParameters,
-                 conditions: Conditions):
+    def __init__(self, robot: RobotParameters, timeout: float, delays: tuple[float, float]):
         self._limit = robot.joints.position_limit
         self._thrust_range = robot.rotors.thrust_min, robot.rotors.thrust_max
-        self._timing = timing
-        self._delays = conditions.command_delays(robot)
+        self._timeout, self._delays = timeout, delays
         self._pending: tuple[deque, deque] = (deque(), deque())
         self._last_stamp = self._last_arrival = -np.inf
         self.tilt, self.thrust = np.zeros((2, 4))
-        self.rejected: Counter = Counter()
 
     def push(self, command, now: float) -> bool:
         """
-        Accept or refuse a command. A command with the stamp of the last one replaces it.
+        Accept or refuse a command (stamp, tilt (4,), thrust (4,)) at ``now`` [s].
 
-        Args:
-            command: has ``stamp`` [s], ``tilt`` (4,) [rad], ``thrust`` (4,) [N].
-            now: [s]; the command acts at its stamp plus the delay, or now if that has passed.
-
-        Returns:
-            whether it was accepted.
-
+        It acts at its stamp plus the delay, or now if that has passed. It is refused if it is not
+        finite, older than the last one or from the future. One with the same stamp replaces it.
         """
-        reason = self._refusal(command, now)
-        if reason:
-            self.rejected[reason] += 1
+        if not all(map(isfinite, (command.stamp, *command.tilt, *command.thrust))) \
+                or not self._last_stamp <= command.stamp <= now + FUTURE_LIMIT:
             return False
         self._last_stamp, self._last_arrival = command.stamp, now
         tilt = clipped(np.asarray(command.tilt), -self._limit, self._limit)
@@ -142,87 +116,28 @@ class CommandLink:
             queue.append((max(command.stamp + delay, now), value))
         return True
 
-    def _refusal(self, command, now):
-        if not all(map(isfinite, (command.stamp, *command.tilt, *command.thrust))):
-            return 'not finite'
-        if command.stamp < self._last_stamp:
-            return 'older than the last'
-        if command.stamp > now + self._timing.command_future_limit:
-            return 'from the future'
-        return None
-
     def update(self, now: float) -> None:
         """Set the targets that are due at ``now``; stop the rotors after the timeout."""
-        due = now + ROUNDING
         tilts, thrusts = self._pending
-        while tilts and tilts[0][0] <= due:
+        while tilts and tilts[0][0] <= now + ROUNDING:
             self.tilt = tilts.popleft()[1]
-        while thrusts and thrusts[0][0] <= due:
+        while thrusts and thrusts[0][0] <= now + ROUNDING:
             self.thrust = thrusts.popleft()[1]
-        if now - self._last_arrival >= self._timing.command_timeout - ROUNDING:
+        if now - self._last_arrival >= self._timeout - ROUNDING:
             self.thrust = np.zeros(4)
-
-
-class CrashWatch:
-    """
-    Checks the true state once in each ``tick`` [s].
-
-    A robot that has flown breaks if its first contact is too fast, or a contact too inclined. A
-    robot that has not flown does not break, so it may be placed on its side. ``impact`` is the
-    last touchdown, ``broken`` whether the robot is broken.
-    """
-
-    def __init__(self, parameters: CrashParameters, tick: float):
-        self._limits, self._tick = parameters, tick
-        self.impact: Impact | None = None
-        self.broken = False
-        self._airborne, self._flown = 0.0, False
-
-    def step(self, before: Truth, contact: bool) -> None:
-        """
-        Update after a tick.
-
-        Args:
-            before: state before the tick, in which the floor has not slowed the robot yet.
-            contact: whether any part touches the floor after the tick.
-
-        """
-        if not contact:
-            self._airborne += self._tick
-            self._flown = self._flown or self._airborne >= self._limits.airborne_time
-            return
-        vertical = rotations.up(before.quaternion)[2]   # cosine of the inclination
-        breaks = vertical < np.cos(self._limits.inclination)
-        if self._airborne > 0:
-            speed = float(np.linalg.norm(before.velocity))
-            breaks = breaks or speed > self._limits.speed
-            if self._airborne >= self._limits.airborne_time:
-                self.impact = Impact(before.stamp, speed, max(0.0, -float(before.velocity[2])),
-                                     float(np.arccos(np.clip(vertical, -1.0, 1.0))))
-        self.broken = self.broken or bool(self._flown and breaks)
-        self._airborne = 0.0
 
 
 class Simulator:
     """
-    Plant, actuator timing, battery and sensors, advanced tick by tick.
+    Plant, actuator timing, battery and sensors of the true robot, advanced tick by tick.
 
-    Equal robots, parameters, conditions, seeds and calls give equal results.
-
-    Args:
-        robot: the true robot.
-        parameters: simulator parameters; default: params/simulator.yaml.
-        conditions: 'nominal' or 'published'.
-
-    Attributes:
-        time: time since reset [s].
-        tick: duration of one step [s].
-        conditions: biases, latencies and variation of the robot, drawn from the seed.
-        battery: true battery; its reset() inserts a new one, also in flight.
+    Equal robots, parameters, conditions ('nominal' or 'published'), seeds and calls give equal
+    results. ``time`` is that since reset [s], ``tick`` the duration of one step [s]. The reset of
+    ``battery`` inserts a new one, also in flight.
 
     Raises:
-        ParameterError: the plant lacks an effect, impossible mass properties, unknown conditions,
-            or a latency that is not a multiple of the tick.
+        ParameterError: impossible mass properties, unknown conditions, or a latency that is not a
+            multiple of the tick.
 
     """
 
@@ -230,14 +145,14 @@ class Simulator:
                  conditions: str = 'nominal', seed: int = 0):
         self._robot = robot
         self._parameters = parameters or SimulatorParameters.load()
-        if not isinstance(seed, (int, np.integer)) or seed < 0:
-            raise ParameterError(f'seed: expected a whole number from 0, found {seed!r}')
         self._seed = seed
-        self.tick = self._parameters.plant.tick
+        self.tick = self._parameters.tick
         self.conditions = draw(conditions, self._parameters,
                                np.random.default_rng(np.random.SeedSequence(seed).spawn(1)[0]))
-        self._plant = Plant(robot, self._parameters.plant, self.conditions.variation)
-        self.battery = Battery(robot, self._parameters.battery)
+        # Of tilt and thrust commands from their stamps [s], effects included.
+        self.command_delays = self.conditions.command_delays(robot)
+        self._plant = Plant(robot, self._parameters, self.conditions.variation)
+        self.battery = Battery(robot, self._parameters)
         self.reset()
 
     def reset(self, position: np.ndarray | None = None,
@@ -252,45 +167,29 @@ class Simulator:
         self.time = 0.0
         self._plant.reset(position, quaternion)
         self.battery.reset()
-        self._crash = CrashWatch(self._parameters.crash, self.tick)
+        self._impact: Impact | None = None
+        self._airborne, self._flown, self._broken = 0.0, False, False
         self._wrench, self._payload = np.zeros(6), 0.0
         self._wear = INTACT
-        self._link = CommandLink(self._robot, self._parameters.actuators, self.conditions)
+        self._link = CommandLink(self._robot, self._parameters.command_timeout,
+                                 self.command_delays)
         self.truth = self._truth()
         *seeds, fault_seed = np.random.SeedSequence(self._seed).spawn(7)[1:]
         self._schedule = Schedule(self.tick, fault_seed, self.battery)
         self._sensors = Sensors(self._parameters, self.conditions, seeds, self.truth,
-                                self._plant.effort, self._robot.sensors)
-        self._sensors.start_imu(self.truth, self._plant.specific_force)
+                                self._plant, self._robot.sensors)
 
-    def set_body(self, position: np.ndarray, quaternion: np.ndarray, velocity: np.ndarray,
-                 angular_velocity: np.ndarray) -> None:
-        """Repair the robot and set its motion, see :meth:`.plant.Plant.set_body`."""
-        self._plant.set_body(position, quaternion, velocity, angular_velocity)
-        self._crash = CrashWatch(self._parameters.crash, self.tick)
-        self.truth = self._truth()
-
-    def command(self, command) -> bool:
-        """
-        Send a command (stamp, tilt (4,), thrust (4,)), which acts at its stamp plus the delay.
-
-        Return whether it was accepted; :attr:`rejected` counts refusals.
-        """
-        accepted = True
+    def command(self, command) -> None:
+        """Send a command, see :meth:`CommandLink.push`."""
         for one in self._schedule.through('command', command, self.time):
-            accepted = self._link.push(one, self.time)
-        return accepted
+            self._link.push(one, self.time)
 
     def set_faults(self, faults: Sequence[Fault]) -> None:
         """
-        Replace the faults; a fault that is also in the present list continues.
+        Replace the faults of robot and devices; ``at`` counts from now.
 
-        Args:
-            faults: faults of robot and devices; ``at`` counts from now.
-
-        Raises:
-            ParameterError: a fault of a process, which is not simulated here.
-
+        A fault that is also in the present list continues. A ParameterError is raised for a fault
+        of a process, which is not simulated here.
         """
         for fault in faults:
             if fault.is_process:
@@ -309,21 +208,11 @@ class Simulator:
         """(4,) thrusts commanded to the rotors [N]; zero after the command timeout."""
         return self._link.thrust
 
-    @property
-    def command_delays(self) -> tuple[float, float]:
-        """Delays of tilt and thrust commands from their stamps [s], effects included."""
-        return self.conditions.command_delays(self._robot)
-
     def _apply_wrench(self):
         """Set wrench and payload of the plant: those of the task and those of the faults."""
         wrench = sum(self._schedule.each('wrench'), self._wrench)
         self._plant.set_wrench(wrench[:3], wrench[3:])
         self._plant.set_payload(sum(self._schedule.each('payload'), self._payload))
-
-    @property
-    def rejected(self) -> Counter:
-        """Reason -> number of refused commands since reset."""
-        return self._link.rejected
 
     def set_wrench(self, force_world: np.ndarray, torque_body: np.ndarray) -> None:
         """Apply an external force (3,) in world [N] and torque (3,) in base_link [N m] there."""
@@ -342,14 +231,19 @@ class Simulator:
         Servos and rotors follow :meth:`command`, or ``drive`` of external actuators, without
         delay or timeout.
         """
-        plant, link, battery = self._plant, self._link, self.battery
+        plant, link, battery, devices = self._plant, self._link, self.battery, True
         if not self._schedule.empty:
-            self._switch_faults()
+            before = self._schedule.active
+            self._schedule.update(self.time, self.truth, link.tilt)
+            if self._schedule.active is not before:
+                self._apply_wrench()
+            for late in self._schedule.through('command', None, self.time):
+                link.push(late, self.time)
         if drive is None:
             link.update(self.time)
-            wear = self._actuate(link.tilt, np.minimum(link.thrust, battery.thrust_limit), POWERED)
-        else:
-            wear = self._actuate(drive.tilt, drive.thrust, drive.powered)
+            drive = Drive(link.tilt, np.minimum(link.thrust, battery.thrust_limit))
+            devices = False
+        wear = self._actuate(drive)
         plant.voltage_ratio = battery.voltage / self._robot.battery.full_voltage
         plant.charge_drawn = battery.drawn
         plant.step()
@@ -358,33 +252,24 @@ class Simulator:
                 -self.tick / self._robot.rotors.time_constant) * (wear - self._wear)
         self._ticks += 1
         self.time = self._ticks * self.tick
-        self._crash.step(self.truth, plant.contact)
-        self.truth = truth = self._truth()
-        battery.step(truth.thrust, self.tick)
-        imu, mocap, joints, pack = self._sensors.read(self._ticks, truth, plant, battery,
-                                                        devices=drive is not None)
-        frame = Frame(self.time, imu, mocap, joints, pack, truth,
-                      self._sensors.rotor_speeds(self._ticks, truth, wear))
-        return self._with_sensor_faults(frame) if self._schedule.active else frame
+        self._watch_contact(self.truth, plant.contact)
+        self.truth = self._truth()
+        battery.step(self.truth.thrust, self.tick)
+        frame = self._sensors.read(self._ticks, self.truth, battery, wear, devices)
+        if self._schedule.active:
+            frame = replace(frame, **{name: next(iter(self._schedule.through(
+                name, getattr(frame, name), self.time)), None) for name in READINGS})
+        return frame
 
-    def _switch_faults(self):
-        """Start and end faults, and send commands that faults have delayed."""
-        before = self._schedule.active
-        self._schedule.update(self.time, self.truth, self._link.tilt)
-        if self._schedule.active is not before:
-            self._apply_wrench()
-        for command in self._schedule.through('command', None, self.time):
-            self._link.push(command, self.time)
-
-    def _actuate(self, tilt, thrust, powered):
+    def _actuate(self, drive):
         """Set the inputs of servos and rotors with faults and damage; return the rotors' wear."""
-        plant, broken = self._plant, self._crash.broken
+        plant, broken = self._plant, self._broken
         if not (self._schedule.active or broken):
-            plant.set_powered(powered)
-            plant.set_targets(tilt, thrust)
+            plant.set_powered(drive.powered)
+            plant.set_targets(drive.tilt, drive.thrust)
             return INTACT
-        drive = Actuation(np.array(tilt), np.array(thrust), np.array(powered), np.zeros(4, bool),
-                          np.ones(4))
+        drive = Drive(*map(np.array, (drive.tilt, drive.thrust, drive.powered, drive.jammed,
+                                      INTACT)))
         self._schedule.each('drive', drive)
         if broken:
             drive.thrust[:], drive.powered[:] = 0.0, False
@@ -393,13 +278,31 @@ class Simulator:
         plant.set_targets(clipped(drive.tilt, -limit, limit), drive.thrust)
         return drive.wear
 
-    def _with_sensor_faults(self, frame):
-        """Frame with the readings changed by sensor faults."""
-        return replace(frame, **{name: next(iter(self._schedule.through(
-            name, getattr(frame, name), self.time)), None) for name in READINGS})
+    def _watch_contact(self, before, contact):
+        """
+        Update touchdown and damage by the contact after a tick.
+
+        A robot that has flown breaks if its first contact is too fast, or a contact too inclined.
+        One that has not flown may be placed on its side. In the state ``before`` the tick the
+        floor has not slowed the robot yet.
+        """
+        limits = self._parameters
+        if not contact:
+            self._airborne += self.tick
+            self._flown = self._flown or self._airborne >= AIRBORNE_TIME
+            return
+        vertical = rotations.up(before.quaternion)[2]   # cosine of the inclination
+        breaks = vertical < np.cos(limits.crash_inclination)
+        if self._airborne > 0:
+            speed = float(np.linalg.norm(before.velocity))
+            breaks = breaks or speed > limits.crash_speed
+            if self._airborne >= AIRBORNE_TIME:
+                self._impact = Impact(before.stamp, speed,
+                                      float(np.arccos(np.clip(vertical, -1.0, 1.0))))
+        self._broken = self._broken or bool(self._flown and breaks)
+        self._airborne = 0.0
 
     def _truth(self):
         qpos, qvel = self._plant.state
         return Truth(self.time, qpos[:3], qvel[:3], qpos[XYZW], qvel[3:6], self._plant.tilt,
-                     qvel[6:], self._plant.thrust, self._plant.contact, self._crash.impact,
-                     self._crash.broken)
+                     qvel[6:], self._plant.thrust, self._plant.contact, self._impact, self._broken)

@@ -19,7 +19,7 @@ ALL = ['board port', 'board firmware', 'board receives host',
 
 @pytest.fixture
 def emulated():
-    with EmulatedMotorBoard(parameters=QUICK) as made:
+    with EmulatedMotorBoard(**QUICK) as made:
         yield made
 
 
@@ -64,7 +64,7 @@ def test_each_fault_is_found_and_named(emulated, break_it, changes, bad, words):
 def test_a_silent_or_foreign_board_ends_the_checks(emulated):
     found = board_with(emulated, {'motor board': 'fail'}, seconds=0.5, board_component=7)
     assert 'component 7' in found['motor board'].remedy
-    emulated.faults.mute = True
+    emulated.faults.drop_out = 1.0
     found = board(emulated.port, seconds=0.5)
     assert list(found) == ['board port', 'motor board']
     assert '0 bytes' in found['motor board'].found

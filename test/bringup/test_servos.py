@@ -42,7 +42,7 @@ def test_the_check_writes_no_register():
         packets, handle = [], emulated.handle
         emulated.handle = lambda packet, *rest: packets.append(packet) or handle(packet, *rest)
         servos(emulated.port)
-    assert packets and {packet.instruction for packet in packets} == {1, 2}    # ping and read
+    assert packets and {instruction for _, instruction, _ in packets} == {1, 2}    # ping and read
 
 
 def test_torque_that_was_on_before_stays_on_and_is_reported():
@@ -58,8 +58,8 @@ def turned(emulated):
 
 
 def hot(emulated):
-    emulated.servos[3]['Temperature Limit'] = 50    # also at 60
-    emulated.faults.overheated = {4}
+    emulated.servos[3]['Temperature Limit'] = 50
+    emulated.servos[3]['Present Temperature'] = 80
 
 
 def put(**faults):

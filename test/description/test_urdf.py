@@ -101,7 +101,7 @@ def test_the_file_equals_the_output_of_the_generator():
     spec = importlib.util.spec_from_file_location('generate_urdf', script)
     generator = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(generator)
-    written = generator.urdf(ROBOT, SimulatorParameters.load().plant)
+    written = generator.urdf(ROBOT, SimulatorParameters.load())
     number = re.compile(r'-?\d+\.?\d*(?:e-?\d+)?')
     assert number.sub('#', URDF.read_text()) == number.sub('#', written)
     np.testing.assert_allclose([float(x) for x in number.findall(URDF.read_text())],
@@ -123,7 +123,7 @@ def test_every_mesh_is_shipped_closed_and_faces_outwards():
 
 def test_feet_and_propellers_have_the_contact_geometry_of_the_plant():
     trimesh = pytest.importorskip('trimesh')
-    plant = SimulatorParameters.load().plant
+    plant = SimulatorParameters.load()
     placed = poses()
     lowest, widest = 0.0, 0.0
     for name, (rotation, position) in placed.items():

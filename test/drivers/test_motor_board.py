@@ -110,7 +110,7 @@ raise RuntimeError('a bug in the bridge')
 
 
 def test_a_process_disarms_after_an_exception():
-    with EmulatedMotorBoard(parameters=QUICK) as emulated:
+    with EmulatedMotorBoard(**QUICK) as emulated:
         arrivals, folder = [], Path(__file__).parent
         emulated.on_target = lambda now, stamp: arrivals.append(now)
         subprocess.run(

@@ -23,7 +23,7 @@ def stays_stopped(emulated):
 
 def arms_again(board, pilot):
     pilot.thrust = np.zeros(4)
-    time.sleep(QUICK.throttle_low_time)
+    time.sleep(QUICK['throttle_low_time'])
     return until(lambda: board.start(True).wait().accepted)
 
 
@@ -63,12 +63,11 @@ def test_voltage_sag_is_compensated_or_reported_as_saturation():
         emulated.set_battery(25.0, 30.0)
         time.sleep(0.3)
         before = emulated.commands
-        emulated.faults.voltage_sag = 3.0
+        emulated.set_battery(22.0, 30.0)
         assert until(lambda: np.allclose(emulated.thrust_targets, HOVER, rtol=2e-3))
         assert np.all(emulated.commands > before)
         pilot.thrust = np.full(4, 20.0)
         assert until(lambda: pilot.results[-1].saturated.all())
-        emulated.faults.voltage_sag = 0.0
         emulated.set_battery(3.0, 0.0)
         assert until(lambda: pilot.has_event('3.0 V not plausible'))
         assert keeps_flying(emulated, 0.2)
@@ -85,10 +84,10 @@ def test_a_long_disconnection_disarms_and_reconnecting_does_not_arm():
         assert arms_again(board, pilot)
 
 
-def test_a_board_that_hangs_in_flight_stops_and_needs_arming_again():
+def test_a_board_that_restarts_in_flight_stops_and_needs_arming_again():
     with flying() as (emulated, board, pilot):
-        emulated.hang()
-        assert until(lambda: not emulated.commands.any(), 0.15)
+        emulated.reboot()
+        assert not emulated.commands.any()
         assert until(lambda: pilot.has_event('restarted (watchdog reset)'))
         assert stays_stopped(emulated) and not board.state.status.armed
         assert board.link()['lost'] == 0

@@ -86,17 +86,17 @@ def test_a_lasting_overload_disables_the_servo_with_a_reason_until_the_service_r
 def test_expired_watchdogs_are_cleared_and_goals_are_followed_again():
     with running() as (bus, emulated):
         until(arrived(GOAL), bus, GOAL)
-        emulated.expire_watchdog(1)
-        assert emulated.stopped[1]
-        until(lambda *_: not emulated.stopped[1], bus, HOME)
+        emulated.servos[1].expire()
+        assert emulated.servos[1].expired
+        until(lambda *_: not emulated.servos[1].expired, bus, HOME)
         until(arrived(HOME), bus, HOME)
         assert any('stopped by its watchdog' in line for line in bus.take_events())
         time.sleep(0.15)        # a pause of the driver
-        assert emulated.stopped.all()
+        assert all(servo.expired for servo in emulated.servos)
         assert bus.write_goals(GOAL)
         bus.read()  # answered after the goals
         assert emulated.goals == pytest.approx(GOAL, abs=COUNT)
-        assert not emulated.stopped.any()
+        assert not any(servo.expired for servo in emulated.servos)
 
 
 def test_after_an_unplugged_cable_is_back_goals_are_followed_again():
@@ -111,7 +111,7 @@ def test_after_an_unplugged_cable_is_back_goals_are_followed_again():
             assert not bus.write_goals(GOAL) and not bus.link.is_open
             for index in range(4) if powered_off else ():
                 emulated.reboot(index)      # they lose settings and turns
-            emulated.replug()
+            emulated.plug()
             until(lambda *now: powered(*now) and arrived(GOAL)(*now), bus, GOAL)
         lines = bus.take_events()
         assert any('unplugged' in line for line in lines)
@@ -125,7 +125,7 @@ def test_pending_torque_off_is_executed_when_cable_or_servo_are_back():
     with running() as (bus, emulated):
         emulated.unplug()
         assert not bus.disable()
-        emulated.replug()
+        emulated.plug()
         until(lambda *_: not emulated.torque_enabled.any(), bus, GOAL)
         bus.enable()
         emulated.faults.silent = {3}

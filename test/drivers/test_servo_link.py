@@ -6,7 +6,13 @@ import pytest
 
 from beetle_omni_ros.drivers.servo_link import NoAnswer, ServoBusError, ServoLink
 from beetle_omni_ros.drivers.servo_registers import GOAL_POSITION, HARDWARE_ERROR, TORQUE_ENABLE
-from beetle_omni_ros.sim.emulated.servo_bus import packet, sealed, status
+from beetle_omni_ros.sim.emulated.servo_bus import packet, sealed, STATUS
+
+
+def status(identifier, error, data=b''):
+    """The answer of one servo."""
+    return packet(identifier, STATUS, bytes((error,)) + data)
+
 
 IDS = [1, 2, 3]
 DATA = {name: bytes(range(name, name + 10)) for name in IDS}

@@ -77,7 +77,7 @@ def test_each_controller_has_a_bag_that_gives_the_numbers_of_its_flight(poses, f
 
 def test_a_flight_ended_by_the_supervisor_is_reported_with_time_and_reason(poses, monkeypatch):
     small = SimulatorParameters.load()
-    small = replace(small, battery=replace(small.battery, capacity=0.04))
+    small = replace(small, battery_capacity=0.04)
     monkeypatch.setattr(SimulatorParameters, 'load', lambda: small)
     monkeypatch.setattr(loop, 'SWAP_CHARGE', 0.0)
     text = io.StringIO()
@@ -135,7 +135,7 @@ def test_an_exception_in_flight_falls_back_and_is_in_the_results(tmp_path):
 def test_an_empty_pack_is_swapped_at_the_next_target(monkeypatch):
     monkeypatch.setattr(loop, 'SWAP_CHARGE', 0.0)   # by the warning of the supervisor only
     small = SimulatorParameters.load()
-    small = replace(small, battery=replace(small.battery, capacity=CAPACITY))
+    small = replace(small, battery_capacity=CAPACITY)
     monkeypatch.setattr(SimulatorParameters, 'load', lambda: small)
     task = make_task('random2')
     log = command.fly('nmpc', task, robot=ROBOT, plant=ROBOT)
@@ -151,7 +151,7 @@ def test_faults_of_a_file_act_and_are_listed_in_the_results(tmp_path):
     path = tmp_path / 'faults.yaml'
     path.write_text('faults: [{what: rotor_stops, at: 1.0, rotor: 2}, {what: controller_silent}]')
     results = evaluate(task, ('hover',), faults=path, bag=tmp_path / 'bag')
-    listed = ['rotor_stops(rotor=2) at 1 s', 'controller_silent at 0 s']
+    listed = ['rotor_stops at=1 rotor=2', 'controller_silent at=0']
     assert results['meta']['faults'] == listed
     log = read_bag(tmp_path / 'bag')
     assert log.meta['faults'] == listed

@@ -7,7 +7,7 @@ from beetle_omni_ros.control.base import Command, PoseTarget, State
 from beetle_omni_ros.evaluation.loop import Processes, QUEUE
 from beetle_omni_ros.robot.readings import BatteryReading, ImuReading
 from beetle_omni_ros.sim.faults import Fault
-from beetle_omni_ros.sim.readings import Frame
+from beetle_omni_ros.sim.sensors import Frame
 
 TICK = 0.005
 STATE = State(1.0, np.ones(3), np.zeros(3), np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(4),

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from beetle_omni_ros.faults.flight import Watcher
-from beetle_omni_ros.sim.readings import Impact, Truth
+from beetle_omni_ros.faults.flight import PLAN, Watcher
+from beetle_omni_ros.sim.sensors import Impact, Truth
 
 TICK = 0.005
 
@@ -17,32 +17,34 @@ def truth(t, height=1.0, x=0.0, contact=False, impact=None, broken=False):
 
 
 @pytest.fixture
-def watch(listed):
+def watch():
     return Watcher(SimpleNamespace(
-        simulator=SimpleNamespace(truth=truth(0.0, 0.0), time=0.0),
-        supervisor=SimpleNamespace(events=[], faults={})), listed)
+        plan=PLAN, simulator=SimpleNamespace(truth=truth(0.0, 0.0), time=0.0),
+        supervisor=SimpleNamespace(events=[], faults={}, state='disarmed'),
+        loop=SimpleNamespace(refusals=[])))
 
 
 def soft(t=1.0, speed=0.3, inclination=0.05):
-    return Impact(t, speed, speed, inclination)
+    return Impact(t, speed, inclination)
 
 
-def judged(watch, asked=True, stopped=True, refused=False):
-    return watch.outcome(asked=asked, stopped=stopped, refused=refused)
+def judged(watch, asked=True, state='disarmed', refusals=()):
+    watch._flight.supervisor.state, watch._flight.loop.refusals = state, refusals
+    return watch.outcome(asked)
 
 
 def test_a_soft_landing_counts_as_flies_on_lands_or_refused(watch):
     watch.step(truth(1.0, 0.15, contact=True, impact=soft()), 0.0, TICK)
     assert judged(watch) == 'flies_on'
     assert judged(watch, asked=False) == 'lands'
-    assert judged(watch, refused=True) == 'refused'
-    assert judged(watch, stopped=False) == 'does not land'
+    assert judged(watch, refusals=['far']) == 'refused'
+    assert judged(watch, state='flying') == 'does not land'
 
 
-def test_a_hard_or_tilted_touchdown_is_not_a_landing(watch, listed):
-    watch.step(truth(1.0, impact=soft(inclination=1.1 * listed.limits.inclination)), 0.0, TICK)
+def test_a_hard_or_tilted_touchdown_is_not_a_landing(watch):
+    watch.step(truth(1.0, impact=soft(inclination=1.1 * PLAN.inclination)), 0.0, TICK)
     assert judged(watch) == 'tilted'
-    watch.step(truth(2.0, impact=soft(2.0, speed=1.1 * listed.limits.impact_speed)), 0.0, TICK)
+    watch.step(truth(2.0, impact=soft(2.0, speed=1.1 * PLAN.impact_speed)), 0.0, TICK)
     assert judged(watch) == 'hard'
 
 
@@ -54,11 +56,11 @@ def test_motors_must_stop_soon_after_a_crash(watch, late, outcome):
                    20.0 if t <= 0.1 + late else 0.0, TICK)
     assert judged(watch) == outcome
     assert np.isclose(watch.overrun, late, atol=2 * TICK)
-    assert judged(watch, stopped=False) == 'crash, motors on'
+    assert judged(watch, state='flying') == 'crash, motors on'
 
 
-def test_a_flyaway_is_a_position_far_outside(watch, listed):
-    fence = watch._fence[0] + listed.limits.fence_margin
+def test_a_flyaway_is_a_position_far_outside(watch):
+    fence = watch._fence[0] + PLAN.fence_margin
     watch.step(truth(1.0, x=fence - 0.1), 20.0, TICK)
     assert judged(watch) != 'flyaway'
     watch.step(truth(1.0, x=fence + 0.1), 20.0, TICK)

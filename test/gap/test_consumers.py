@@ -123,7 +123,8 @@ def estimator(robot):
 
 def buses(robot):
     """Delays of tilts and thrusts of one command."""
-    link = CommandLink(robot, WORLD.actuators, draw('nominal', WORLD, np.random.default_rng(0)))
+    link = CommandLink(robot, WORLD.command_timeout, draw(
+        'nominal', WORLD, np.random.default_rng(0)).command_delays(robot))
     link.push(Command(0.0, np.ones(4), np.full(4, 5.0)), 0.0)
     acting = []
     for k in range(20):

@@ -1,7 +1,6 @@
 """Test bench of the bridges: a process, an emulated device and an operator that commands."""
 
 from contextlib import contextmanager
-from dataclasses import replace
 import threading
 import time
 
@@ -14,7 +13,6 @@ from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.graph import Graph, reserved_domain
 from beetle_omni_ros.nodes.operator import Operator
-from beetle_omni_ros.sim.emulated.motor_board import EmulatedBoardParameters
 
 JOINT, ROTOR = 'joint_bridge_node', 'rotor_bridge_node'
 WITHIN = 40     # [s] timeout of expected events on a busy machine
@@ -22,8 +20,7 @@ WITHIN = 40     # [s] timeout of expected events on a busy machine
 PATIENT = {JOINT: {'timing': {'reply': 0.03, 'probe': 0.05,
                               'health': 0.04, 'reconnect': 0.02}},
            ROTOR: {'reconnect_period': 0.1, 'silence': 1.0}}
-QUICK = replace(EmulatedBoardParameters.load(), boot_time=0.05, throttle_low_time=0.2,
-                reception_rate=10.0)
+QUICK = {'boot_time': 0.05, 'throttle_low_time': 0.2, 'reception_rate': 10.0}
 COUNT = 2 * np.pi / 4096    # [rad]
 
 

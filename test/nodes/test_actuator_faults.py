@@ -44,8 +44,8 @@ class FaultOperator(Witness):
 
 # fault, value without fault; state of the bridge; whether it needs a reboot
 LANDING = [
-    ('servo_faults.overheated', [3], [], 'lost: gimbal3', True),
-    ('board_faults.mute', True, False, 'silent: no message', False),
+    ('servo_faults.overload', [3], [], 'lost: gimbal3', True),
+    ('board_faults.drop_out', 1.0, 0.0, 'silent: no message', False),
 ]
 
 

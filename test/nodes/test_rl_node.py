@@ -13,7 +13,7 @@ from policy_files import write
 
 
 def test_the_executable_flies_the_given_policy(make, tmp_path):
-    node = make(maker('rl_node'), f"policy:={write(tmp_path / 'policy.onnx', seed=5)}")
+    node = make(maker('rl_node'), f"policy:={write(tmp_path / 'policy.onnx', bias=[0.1] * 8)}")
     assert node.parameters.policy.endswith('policy.onnx')
     assert node._controller_status()[2]['policy'] == 'rl'
 

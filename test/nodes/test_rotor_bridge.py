@@ -13,7 +13,7 @@ pytest.importorskip('serial')
 
 from bridge_bench import QUICK, ROTOR, running_bridge, WITHIN
 
-from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
+from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard, NUMBERS
 
 pytestmark = pytest.mark.real_time
 HOVER = np.array([7.0, 7.5, 8.0, 8.5])
@@ -44,7 +44,7 @@ class Bench:
 @contextmanager
 def bench(folder, **parameters):
     """Start a bridge; without a parameter ``port``, on an emulated board."""
-    with EmulatedMotorBoard(parameters=QUICK) as board, running_bridge(
+    with EmulatedMotorBoard(**QUICK) as board, running_bridge(
             folder, ROTOR, **{'port': board.port, **parameters}) as (graph, operator):
         yield Bench(board, graph, operator)
 
@@ -123,7 +123,7 @@ def test_after_a_killed_bridge_no_rotor_turns_and_a_new_one_does_not_arm(tmp_pat
             turning, looked = looked, time.monotonic()
             time.sleep(0.001)
         # They turned at `turning` or later, also on a busy computer.
-        assert turning < arrivals[-1] + QUICK.target_timeout
+        assert turning < arrivals[-1] + NUMBERS['target_timeout']
         made.stops()
         operator.supervise('flying:nmpc')
         made.graph.start_process(ROTOR)

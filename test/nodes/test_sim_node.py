@@ -61,17 +61,17 @@ def test_the_simulator_publishes_simulated_time_only_without_serial_devices(sim)
 def test_faults_of_devices_change_in_flight_and_are_in_the_diagnostics(sim, tmp_path):
     servos, board = tmp_path / 'servos', tmp_path / 'board'
     servos.symlink_to('/nowhere')           # left by a process that was killed
-    node = sim(f'servo_port:={servos}', f'board_port:={board}', 'servo_faults.overheated:=[3]')
+    node = sim(f'servo_port:={servos}', f'board_port:={board}', 'servo_faults.overload:=[3]')
     published, subscribed = topics(node)
     assert not {'/joint_states', '/battery_state'} & published and '/command' not in subscribed
     bus = node._devices.bus
-    assert set(bus.faults.overheated) == {3}
-    assert put(node, servo_faults__overheated=[], servo_faults__silent=[2],
-               board_faults__voltage_sag=1.5).successful
+    assert set(bus.faults.overload) == {3}
+    assert put(node, servo_faults__overload=[], servo_faults__silent=[2],
+               board_faults__drop_in=0.5).successful
     level, text, values = node._devices_status()
-    assert level == base.WARN and text == 'faults: servo silent [2], board voltage_sag 1.5'
+    assert level == base.WARN and text == 'faults: servo silent [2], board drop_in 0.5'
     assert values['armed'] is False and values['torque'] == [False] * 4
-    assert put(node, servo_faults__silent=[], board_faults__voltage_sag=0.0).successful
+    assert put(node, servo_faults__silent=[], board_faults__drop_in=0.0).successful
     assert node._devices_status()[0] == base.OK
     refused = put(node, servo_faults__silent=[9])
     assert not refused.successful and 'servo_faults.silent: no servo has' in refused.reason
@@ -87,10 +87,8 @@ def test_faults_of_devices_change_in_flight_and_are_in_the_diagnostics(sim, tmp_
 def test_the_emulated_servos_are_those_of_the_bus_file(sim, tmp_path):
     file = tmp_path / 'bus.yaml'
     file.write_text('port: x\nids: [11, 12, 13, 14]\nsigns: [1, -1, 1, -1]\n'
-                    'zeros: [2000, 2100, 2048, 1900]\nbaud_rate: 3000000\n'
-                    'torque_per_current: 0.671\n')
+                    'zeros: [2000, 2100, 2048, 1900]\n')
     servos = sim(f'servo_bus_file:={file}')._devices.bus.servos
     assert [servo['ID'] for servo in servos] == [11, 12, 13, 14]
     assert [servo.sign for servo in servos] == [1, -1, 1, -1]
     assert [servo.zero for servo in servos] == [2000, 2100, 2048, 1900]
-    assert {servo['Baud Rate'] for servo in servos} == {5}      # 3 Mbit/s

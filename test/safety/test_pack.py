@@ -8,10 +8,11 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.thrust_map import ThrustMap
 from beetle_omni_ros.safety.pack import PackWatch
 from beetle_omni_ros.sim.parameters import SimulatorParameters
+from beetle_omni_ros.sim.sensors import VOLTAGE_NOISE
 from beetle_omni_ros.sim.simulator import Battery
 
 ROBOT = RobotParameters.load()
-PACK = SimulatorParameters.load().battery
+PACK = SimulatorParameters.load()
 TICK = 0.01
 LAG = ROBOT.rotors.time_constant
 
@@ -37,7 +38,7 @@ class Flight:
             self.watch.on_command(time, np.minimum(asked, possible))
             self.ticks += 1
             if self.ticks % 10 == 0:
-                self.seen = self.battery.voltage + PACK.voltage_noise * self.random.normal()
+                self.seen = self.battery.voltage + VOLTAGE_NOISE * self.random.normal()
                 self.watch.on_voltage(self.ticks * TICK, self.seen)
             if self.watch.limit is not None:
                 return self.ticks * TICK - time

@@ -28,26 +28,15 @@ def immovable():
 
 
 def plant(robot=ROBOT, position=HIGH, quaternion=LEVEL, variation=None):
-    made = Plant(robot, WORLD.plant, variation)
+    made = Plant(robot, WORLD, variation)
     made.reset(position, quaternion)
     return made
 
 
 def momenta(made):
-    """Linear momentum, angular momentum about the world's origin, centre of mass."""
+    """Linear momentum, angular momentum about the centre of mass, centre of mass."""
     model, data = made.model, made.data
     mujoco.mj_forward(model, data)
-    linear, angular, first = np.zeros(3), np.zeros(3), np.zeros(3)
-    twist = np.empty(6)
-    for body in range(1, model.nbody):
-        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, twist, 0)
-        spin = twist[:3]
-        centre = data.xipos[body]
-        velocity = twist[3:]            # of the body's centre of mass
-        axes = data.ximat[body].reshape(3, 3)
-        mass = model.body_mass[body]
-        linear += mass * velocity
-        first += mass * centre
-        angular += mass * np.cross(centre, velocity) \
-            + axes @ (model.body_inertia[body] * (axes.T @ spin))
-    return linear, angular, first / model.body_mass.sum()
+    mujoco.mj_subtreeVel(model, data)
+    return (model.body_mass.sum() * data.subtree_linvel[1], data.subtree_angmom[1].copy(),
+            data.subtree_com[1].copy())

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 from sim_robots import massless_modules, plant, ROBOT
 
 from beetle_omni_ros.robot.dynamics import body_acceleration
@@ -74,25 +73,6 @@ def test_modules_given_by_effect_act_as_described_ones():
     assert (missed < 0.2 * without).all()
 
 
-def test_plant_without_module_inertia_agrees_with_newton_euler():
-    """No effects; each rotor's thrust vector by scipy's rotations, frame by frame."""
-    robot = massless_modules()
-    made, rotors = plant(robot), robot.rotors
-    for p, q, v, w, tilt, tilt_rate, thrust in random_states(40, seed=2):
-        force, torque = np.zeros(3), np.zeros(3)
-        for i in range(4):
-            arm = Rotation.from_euler('z', rotors.arm_yaw[i])
-            up = (arm * Rotation.from_euler('x', tilt[i])).apply([0, 0, 1])
-            force += thrust[i] * up
-            torque += np.cross(rotors.positions[i], thrust[i] * up) \
-                - rotors.spin[i] * rotors.torque_to_thrust_ratio * thrust[i] * up
-        linear = Rotation.from_quat(q).apply(force) / robot.mass - [0, 0, robot.gravity]
-        angular = (torque - np.cross(w, robot.inertia * w)) / robot.inertia
-        found = made.acceleration(p, q, v, w, tilt, tilt_rate, thrust)
-        assert difference(found[:3], linear) < 1e-6
-        assert difference(found[3:6], angular) < 1e-6
-
-
 @pytest.mark.parametrize('effects', [
     {'wind': {'force': [3.0, -4.0, 2.0]}},
     {'wind': {'force': [3.0, -4.0, 2.0]}, 'body_drag': {'coefficient': 0.3},
@@ -108,12 +88,3 @@ def test_step_is_the_integral_of_the_acceleration(effects):
         change = (made.state[1] - velocity)[:6] / 0.005
         scale = np.abs(after - before)[:6] + 0.5
         assert np.all(np.abs(change - 0.5 * (before + after)[:6]) < 0.1 * scale)
-
-
-def test_terminal_speed_is_where_drag_carries_the_weight():
-    robot = replace(ROBOT, effects={'body_drag': {'coefficient': 2.0}})
-    made = plant(robot, position=[0, 0, 200])
-    for _ in range(1200):
-        made.step()
-    speed = np.sqrt(ROBOT.mass * ROBOT.gravity / 2.0)
-    assert made.state[1][2] == pytest.approx(-speed, rel=1e-5)

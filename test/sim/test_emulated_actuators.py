@@ -6,7 +6,7 @@ import pytest
 from sim_robots import HIGH, ROBOT, WORLD
 
 from beetle_omni_ros.control.base import Command
-from beetle_omni_ros.sim.emulated_actuators import EmulatedActuators
+from beetle_omni_ros.sim.emulated.actuators import EmulatedActuators
 from beetle_omni_ros.sim.simulator import Simulator
 
 HOVER = ROBOT.hover_thrust
@@ -16,11 +16,11 @@ class Bus:
     """Servos that take their goals without delay, and store their sensor values."""
 
     def __init__(self):
-        self.goals, self.powered, self.stopped = [0.0] * 4, [True] * 4, [False] * 4
+        self.goals, self.powered = [0.0] * 4, [True] * 4
         self.shown = []
 
     def drive(self):
-        return list(self.goals), list(self.powered), list(self.stopped)
+        return list(self.goals), list(self.powered)
 
     def set_state(self, position, velocity, effort):
         self.shown.append((position.copy(), velocity.copy(), effort.copy()))
@@ -35,8 +35,8 @@ class Board:
     def set_rotors(self, thrust):
         self.rotors = thrust
 
-    def set_battery(self, voltage, current, error=(0.0, 0.0)):
-        self.pack, self.error = (voltage, current), error
+    def set_battery(self, voltage, current):
+        self.pack = voltage, current
 
 
 def coupled(conditions='nominal', seed=0):
@@ -96,6 +96,3 @@ def test_devices_receive_angles_of_their_encoders():
     actuators, simulator = coupled()
     actuators.step()
     np.testing.assert_array_equal(actuators.bus.shown[-1][0], simulator.truth.tilt)
-
-
-# --- fault switches ---------------------------------------------------------------------------

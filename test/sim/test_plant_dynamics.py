@@ -8,6 +8,7 @@ import pytest
 from sim_robots import HIGH, LEVEL, momenta, plant, ROBOT, WORLD
 
 from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.sim.mjcf import PAYLOAD_DEPTH
 
 WEIGHTLESS = replace(ROBOT, gravity=0.0)
 
@@ -49,21 +50,9 @@ def test_tilting_modules_react_on_the_body_and_keep_momenta(target):
         turned = max(turned, np.abs(made.state[1][3:6]).max())
     linear, angular, centre = momenta(made)
     np.testing.assert_allclose(linear, 0, atol=1e-7)
-    np.testing.assert_allclose(angular - np.cross(centre, linear), 0, atol=1e-7)
+    np.testing.assert_allclose(angular, 0, atol=1e-7)
     np.testing.assert_allclose(centre, HIGH, atol=1e-6)
     assert turned > 1e-3
-
-
-def test_energy_equals_the_work_of_the_wrench():
-    made = plant(WEIGHTLESS)
-    force = np.array([2.0, -1.0, 3.0])
-    made.set_wrench(force, np.zeros(3))
-    for _ in range(100):
-        made.step()
-    mujoco.mj_energyVel(made.model, made.data)
-    work = force @ (made.state[0][:3] - HIGH)
-    # The modules hang a little off the axis and swing against their servos' damping.
-    assert made.data.energy[1] == pytest.approx(work, rel=2e-3)
 
 
 def test_wrench_acts_in_its_frames():
@@ -73,13 +62,13 @@ def test_wrench_acts_in_its_frames():
         made.step()
     linear, angular, centre = momenta(made)
     np.testing.assert_allclose(linear, [0.3, 0, 0], atol=1e-4)
-    np.testing.assert_allclose(angular - np.cross(centre, linear), [0, 0, 0.05], atol=1e-4)
+    np.testing.assert_allclose(angular, [0, 0, 0.05], atol=1e-4)
 
 
 def test_robot_rests_on_its_feet():
     made = plant(position=None)
     height = made.state[0][2]
-    assert WORLD.plant.foot_depth - 1e-3 < height < WORLD.plant.foot_depth
+    assert WORLD.foot_depth - 1e-3 < height < WORLD.foot_depth
     for _ in range(200):
         made.step()
     assert made.contact
@@ -94,7 +83,7 @@ def test_payload_adds_its_weight_below_the_centre():
     assert made.model.body_mass.sum() == pytest.approx(before + 0.75)
     mujoco.mj_forward(made.model, made.data)
     depth = HIGH[2] - made.data.subtree_com[1][2]
-    assert depth == pytest.approx(0.75 * WORLD.plant.payload_depth / (before + 0.75), rel=1e-6)
+    assert depth == pytest.approx(0.75 * PAYLOAD_DEPTH / (before + 0.75), rel=1e-6)
     lifted = made.acceleration(HIGH, LEVEL, np.zeros(3), np.zeros(3), np.zeros(4), np.zeros(4),
                                np.full(4, (before + 0.75) * ROBOT.gravity / 4))
     assert abs(lifted[2]) < 2e-3

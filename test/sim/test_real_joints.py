@@ -4,32 +4,27 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from sim_robots import plant, ROBOT, WORLD
 
-from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.servo import NUMPY, Servo, Step
-from beetle_omni_ros.sim.parameters import SimulatorParameters
-from beetle_omni_ros.sim.plant import Plant
 
-ROBOT = RobotParameters.load()
-KP = ROBOT.joints.kp
-PARAMETERS = SimulatorParameters.load().plant
+KP, TICK = ROBOT.joints.kp, WORLD.tick
 
 
 def flown(targets, thrust=0.0, **effects):
     """Encoder angles (K, 4), true tilts (K, 4) and the plant after commands (K, 4)."""
-    robot = replace(ROBOT, effects=effects)     # in free fall the modules load no joint
-    plant = Plant(robot, PARAMETERS)
-    plant.reset(np.array([0.0, 0.0, 500.0]))
+    # In free fall the modules load no joint.
+    made = plant(replace(ROBOT, effects=effects), [0.0, 0.0, 500.0])
     encoder, tilt = np.empty((2, *targets.shape))
     for k, target in enumerate(targets):
-        plant.set_targets(target, np.full(4, thrust))
-        plant.step()
-        encoder[k], tilt[k] = plant.encoder, plant.tilt
-    return encoder, tilt, plant
+        made.set_targets(target, np.full(4, thrust))
+        made.step()
+        encoder[k], tilt[k] = made.encoder, made.tilt
+    return encoder, tilt, made
 
 
 def ticks(duration):
-    return np.arange(0.0, duration, PARAMETERS.tick)
+    return np.arange(0.0, duration, TICK)
 
 
 def test_a_joint_below_its_stiction_rests():
@@ -50,7 +45,7 @@ def test_a_slow_reversal_shows_a_dead_band_of_friction_over_stiffness(friction):
     middle = [np.argmin(np.abs(t - at)) for at in (2.0, 6.0)]
     band = encoder[middle[1]] - encoder[middle[0]]
     # Lag of the ramp in both directions; encoders are read at the end of a tick.
-    lag = 2 * 0.05 * (ROBOT.joints.kd / KP - PARAMETERS.tick / 2)
+    lag = 2 * 0.05 * (ROBOT.joints.kd / KP - TICK / 2)
     assert np.allclose(band, 2 * friction / KP + lag, atol=2e-4)
 
 
@@ -63,7 +58,7 @@ def test_servos_with_friction_move_as_the_servo_model():
                           joint_friction={'coulomb': coulomb, 'stiction': coulomb})
     step = Step(NUMPY, Servo(ROBOT.joints.inertia, np.array(gains), np.array(damping),
                              ROBOT.joints.velocity_limit, coulomb=np.array(coulomb),
-                             stiction=np.array(coulomb)), PARAMETERS.tick)
+                             stiction=np.array(coulomb)), TICK)
     q, v, model = np.zeros(4), np.zeros(4), np.empty_like(encoder)
     for k, target in enumerate(targets):
         q, v = step(target, q, v)
@@ -77,18 +72,18 @@ def test_servos_with_friction_move_as_the_servo_model():
 def test_the_rotor_follows_behind_the_play(at_encoder):
     gap, t = 0.03, ticks(4.0)
     targets = np.tile(0.3 * np.sin(2 * np.pi * 0.5 * t)[:, None], (1, 4))
-    encoder, tilt, plant = flown(targets, thrust=6.0,
-                                 joint_backlash={'gap': gap, 'at_encoder': at_encoder})
+    encoder, tilt, made = flown(targets, thrust=6.0,
+                                joint_backlash={'gap': gap, 'at_encoder': at_encoder})
     free, _, _ = flown(targets, thrust=6.0)
     lag = (encoder if not at_encoder else free) - tilt
     assert np.abs(lag).max() == pytest.approx(gap / 2, abs=2e-3)
     assert at_encoder == float(np.array_equal(encoder, tilt))
     # The thrust acts along the true tilts.
-    along, wrong = (plant.thrust @ (np.cos(angle)[:, None] * [0, 0, 1.0] + np.sin(angle)[:, None]
+    along, wrong = (made.thrust @ (np.cos(angle)[:, None] * [0, 0, 1.0] + np.sin(angle)[:, None]
                                     * np.cross(ROBOT.tilt_axes, [0, 0, 1.0])) / ROBOT.mass
                     for angle in (tilt[-1], encoder[-1]))
     if not at_encoder and np.abs(along - wrong).max() > 1e-3:
-        felt = plant.specific_force
+        felt = made.specific_force
         assert np.linalg.norm(felt - along) < np.linalg.norm(felt - wrong)
 
 

@@ -7,10 +7,12 @@ from scipy.spatial.transform import Rotation
 from sim_robots import HIGH, ROBOT, WORLD
 
 from beetle_omni_ros.control.base import Command
+from beetle_omni_ros.sim import parameters as published
 from beetle_omni_ros.sim.parameters import draw
+from beetle_omni_ros.sim.sensors import RESOLUTION
 from beetle_omni_ros.sim.simulator import Simulator
 
-TICK = WORLD.plant.tick
+TICK = WORLD.tick
 
 
 def at_rest(conditions='nominal', seconds=20, seed=0):
@@ -61,9 +63,8 @@ def test_rates_and_ages_are_exact_in_ticks():
 
 def test_readings_equal_the_truth_at_their_stamps():
     """Falling and turning, noise off: old readings equal the old truth."""
-    quiet = replace(WORLD, imu=replace(WORLD.imu, specific_force_noise=0.0,
-                                       angular_velocity_noise=0.0),
-                    mocap=replace(WORLD.mocap, position_noise=0.0, orientation_noise=0.0))
+    quiet = replace(WORLD, specific_force_noise=0.0, angular_velocity_noise=0.0,
+                    position_noise=0.0, orientation_noise=0.0)
     simulator = Simulator(ROBOT, quiet)
     simulator.reset(HIGH, Rotation.from_euler('ZYX', [0.3, 0.2, 0.1]).as_quat())
     simulator.set_wrench([1, 2, 3], [0.1, 0.2, -0.1])
@@ -78,7 +79,7 @@ def test_readings_equal_the_truth_at_their_stamps():
                                        truths[frame.mocap.stamp].quaternion, atol=1e-12)
         then = min(truths, key=lambda t: abs(t - frame.joints.stamp))
         if frame.joints.stamp >= 0:
-            count = 2 * np.pi / WORLD.encoders.counts_per_turn
+            count = RESOLUTION
             error = frame.joints.position - truths[then].tilt
             assert np.abs(error).max() <= count / 2 + 1e-12
             turns = frame.joints.position / count
@@ -90,8 +91,7 @@ def test_readings_equal_the_truth_at_their_stamps():
 
 def test_imu_readings_sum_to_the_motion_even_through_jolts():
     """Strapdown integration of the readings follows the truth during fast tilt motion."""
-    quiet = replace(WORLD, imu=replace(WORLD.imu, specific_force_noise=0.0,
-                                       angular_velocity_noise=0.0))
+    quiet = replace(WORLD, specific_force_noise=0.0, angular_velocity_noise=0.0)
     simulator = Simulator(ROBOT, quiet)
     simulator.reset(HIGH)
     attitude = Rotation.from_quat(simulator.truth.quaternion)
@@ -110,7 +110,7 @@ def test_imu_readings_sum_to_the_motion_even_through_jolts():
 
 def test_published_biases_and_noise_come_from_the_table():
     simulator, frames = at_rest('published', seed=5)
-    drawn, p = simulator.conditions, WORLD.published
+    drawn = simulator.conditions
     position, rotation = pose_errors(frames, {f.time: f.truth for f in frames} | {
         0.0: frames[0].truth})
     agrees(position, np.hypot(0.001, 0.01 / np.sqrt(3)), drawn.position_bias)
@@ -119,22 +119,15 @@ def test_published_biases_and_noise_come_from_the_table():
     agrees(rate, np.hypot(0.005, 0.005 / np.sqrt(3)), drawn.imu_bias[3:])
     tilt = np.array([frame.joints.position for frame in frames])
     agrees(tilt, np.deg2rad(2) / np.sqrt(3), drawn.tilt_bias)
-    assert np.all(np.abs(tilt - drawn.tilt_bias) <= p.tilt_noise + 2 * np.pi / 4096)
+    assert np.all(np.abs(tilt - drawn.tilt_bias) <= published.TILT_NOISE + 2 * np.pi / 4096)
 
 
 def test_published_draws_fill_their_ranges():
-    p, tick = WORLD.published, WORLD.published.latency_unit
     drawn = [draw('published', WORLD, np.random.default_rng(seed)) for seed in range(400)]
-    for values, low, high in [
-            ([d.variation.mass_scale for d in drawn], 1 - p.mass_scale, 1 + p.mass_scale),
-            ([d.variation.inertia_scale for d in drawn], 0.95, 1.05),
-            ([d.variation.centre_of_mass for d in drawn], -0.01, 0.01),
-            ([d.position_bias for d in drawn], -0.01, 0.01),
-            ([d.tilt_bias for d in drawn], -np.deg2rad(3), np.deg2rad(3))]:
-        span = high - low
-        assert low <= np.min(values) < low + 0.05 * span
-        assert high - 0.05 * span < np.max(values) <= high + 1e-6
-    for name, expected in [('imu_latency', {3, 4, 5}), ('tilt_latency', {1, 2}),
-                           ('tilt_command_delay', {1, 2, 3}),
-                           ('thrust_command_delay', {1, 2, 3})]:
-        assert {round(getattr(d, name) / tick) for d in drawn} == expected
+    for values, middle, width in [
+            ([d.variation.mass_scale for d in drawn], 1, published.MASS_SCALE),
+            ([d.position_bias for d in drawn], 0, published.POSITION_BIAS),
+            ([d.tilt_bias for d in drawn], 0, published.TILT_BIAS)]:
+        away = np.abs(np.array(values) - middle)
+        assert 0.95 * width < away.max() <= width
+    assert {round(d.imu_latency / published.LATENCY_UNIT) for d in drawn} == {3, 4, 5}

@@ -79,7 +79,7 @@ def test_the_thrust_limit_acts_but_is_not_observed():
 @pytest.mark.parametrize('charge', [0.9, 0.35])
 def test_the_pack_sags_under_load_as_in_the_simulator(charge):
     pack = Battery(replace(ROBOT, rotors=replace(ROBOT.rotors, thrust_max=40.0)),
-                   SimulatorParameters.load().battery)
+                   SimulatorParameters.load())
     shipped = TrainParameters.load().random
 
     def limit(thrust):

@@ -125,7 +125,7 @@ def flown(x, u, duration):
         data.qpos[7:], data.act[:] = state[13:17], state[21:25]
         made.set_targets(command[:4], command[4:])
         made._update()
-        for _ in range(round(duration / WORLD.plant.tick)):
+        for _ in range(round(duration / WORLD.tick)):
             made.step()
         q, v = made.state
         after[k] = np.r_[q[:3] - height, v[:3], q[[4, 5, 6, 3]], v[3:6], q[7:], v[6:],

@@ -27,7 +27,7 @@ def check_own_controller(folder):
     assert 'flying:mine' in log.states and not log.warnings
     assert set(log.requests) == {'mine', *registry.standing_by()}
 
-    assert log.meta['faults'][1] == 'mocap_lost at 3 s for 0.3 s'
+    assert log.meta['faults'][1] == 'mocap_lost at=3 duration=0.3'
     begin = log.targets[0].stamp
     late = log.mocap_t[(log.mocap_t > begin) & (log.mocap_t < begin + 7)]
     gap = (late[1:] - late[:-1]).argmax()

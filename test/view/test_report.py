@@ -43,7 +43,7 @@ def test_flights_with_and_without_targets_share_one_page(tmp_path):
 
 def test_the_outcome_and_faults_are_on_the_page_and_in_the_table(tmp_path):
     meta = {'task': 'waypoints', 'seed': 0, 'plant': 'used.yaml', 'robot': 'params/robot.yaml',
-            'faults': ['rotor_stops(rotor=2) at 5 s']}
+            'faults': ['rotor_stops at=5 rotor=2']}
     with BagWriter(tmp_path / 'bag', meta) as writer:
         for k in range(80):
             t = 10 + 0.05 * k
@@ -65,7 +65,7 @@ def test_the_outcome_and_faults_are_on_the_page_and_in_the_table(tmp_path):
     text = page.read_text()
     for expected in ('fault: rotor2_lost at', '<td>landing</td><td>rotor2_lost</td>',
                      'fault: joint3_slipped at', 'nmpc.refused.stale stamp',
-                     'injected: rotor_stops(rotor=2) at 5 s', 'plant used.yaml'):
+                     'injected: rotor_stops at=5 rotor=2', 'plant used.yaml'):
         assert expected in text, expected
     assert 'landing: rotor2_lost at 1.5 s' in text and 'rotor2_lost at' in printed.getvalue()
     assert '<td>&lt;b&gt;</td>' in text and '<td><b>' not in text

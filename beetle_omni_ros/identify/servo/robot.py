@@ -31,7 +31,7 @@ OTHER_DELAYS = tuple(name for name in delaying('tilt', 'encoders') if name not i
 def own_delay() -> float:
     """Delay [s] from a command to its reading that the simulator has for every robot."""
     simulator = load_yaml(share_path('params/simulator.yaml'))
-    return simulator['actuators']['command_delay'] + simulator['encoders']['latency']
+    return simulator['command_delay'] + simulator['encoder_latency']
 
 
 def other_delays(robot: RobotParameters) -> float:

@@ -4,25 +4,19 @@ The emulated motor board: the firmware of docs/reference/firmware.md on a pseudo
 The framing is that of the driver. ``test/drivers/reference_packets.py`` checks it independently.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from dataclasses import dataclass
-import heapq
+from collections.abc import Callable, Iterator
 import math
 from pathlib import Path
-import random
-import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 
 from beetle_omni_ros.drivers.mavlink import common, EscInfo, EscStatus, MavlinkReceiver
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import parameter, ParameterFile
 from beetle_omni_ros.robot.thrust_map import duty_of_command, ThrustMap
-from beetle_omni_ros.sim.emulated import BoardFaults
-from beetle_omni_ros.sim.emulated.pseudo_terminal import PseudoTerminal
+from beetle_omni_ros.sim.emulated.device import BoardFaults, Device
+from beetle_omni_ros.sim.parameters import RPM_AT_1_NEWTON
 
 BOOT, DISARMED, ARMED, RUNNING = range(4)
 NONE, ASKED, HEARTBEAT_LOST, IDLE, WATCHDOG = range(5)      # reasons of the last disarming
@@ -33,44 +27,17 @@ CONTRACT_VERSION = 1
 BOARD, HOST = (1, 1), (1, 191)    # MAVLink system and component of both sides
 ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED = range(4)
 STOP = (0.0, 0.0, 0.0, 0.0)
-UNKNOWN_CELL, UNKNOWN_CURRENT, UNKNOWN_TEMPERATURE = 65535, -1, 32767
+UNKNOWN_CELL, UNKNOWN_TEMPERATURE = 65535, 32767
 GENERIC_FAILURE = 64            # ESC_FAILURE_GENERIC
 MIN_HEARTBEAT_PERIOD = 0.02     # [s]
-TICK = 0.01                     # [s] longest sleep of the thread
 CLOCK_START, CLOCK_DRIFT = 4.0, 20e-6   # [s], [s/s] of the board's clock, as of a crystal
-IDLE_TEMPERATURE = 35.0         # [C] of the ESCs
-
-
-@dataclass(frozen=True, kw_only=True)
-class EmulatedBoardParameters(ParameterFile, file='emulated_board.yaml'):
-    """Parameters of the firmware contract and of the emulated sensors."""
-
-    target_timeout: float = parameter(
-        0.1, doc='time without a new target after which the rotors stop', unit='s', low=0.01,
-        high=1)
-    heartbeat_timeout: float = parameter(
-        1.0, doc='time without a heartbeat after which it disarms', unit='s', low=0.1, high=10)
-    idle_timeout: float = parameter(
-        2.0, doc='time armed without a target after which it disarms', unit='s', low=0.1, high=60)
-    throttle_low_time: float = parameter(
-        1.0, doc='time without a nonzero target before arming', unit='s', low=0, high=10)
-    target_age_limit: float = parameter(
-        0.1, doc='largest age of a target', unit='s', low=0.01, high=10)
-    target_future_limit: float = parameter(
-        0.05, doc='largest lead of a stamp over the clock', unit='s', low=0, high=10)
-    watchdog_time: float = parameter(
-        0.1, doc='time from a hang to the reset', unit='s', low=0.001, high=1)
-    boot_time: float = parameter(
-        0.3, doc='time from a reset to the first heartbeat', unit='s', low=0, high=10)
-    arm_cell_voltage: float = parameter(
-        3.5, doc='smallest cell voltage for arming', unit='V', low=0, high=5)
-    heartbeat_rate: float = parameter(5.0, doc='rate of HEARTBEAT', unit='Hz', low=1, high=50)
-    battery_rate: float = parameter(50.0, doc='rate of BATTERY_STATUS', unit='Hz', low=1, high=200)
-    rotor_rate: float = parameter(100.0, doc='rate of ESC_STATUS', unit='Hz', low=1, high=500)
-    rotor_info_rate: float = parameter(2.0, doc='rate of ESC_INFO', unit='Hz', low=0.1, high=50)
-    reception_rate: float = parameter(1.0, doc='rate of SYS_STATUS', unit='Hz', low=0.1, high=50)
-    rpm_at_1_newton: float = parameter(
-        2700.0, doc='speed of a rotor at 1 N', unit='1/min', low=1, high=1e5)
+ESC_TEMPERATURE = 35.0          # [C]
+# Section 2 of the contract: times [s], voltage of a cell [V], rates of messages [Hz].
+NUMBERS = {
+    'target_timeout': 0.1, 'heartbeat_timeout': 1.0, 'idle_timeout': 2.0,
+    'throttle_low_time': 1.0, 'target_age_limit': 0.1, 'target_future_limit': 0.05,
+    'boot_time': 0.3, 'arm_cell_voltage': 3.5, 'heartbeat_rate': 5.0, 'rotor_info_rate': 2.0,
+    'rotor_rate': 100.0, 'battery_rate': 50.0, 'reception_rate': 1.0}
 
 
 class BoardFirmware:
@@ -78,62 +45,47 @@ class BoardFirmware:
     State machine of the board, powered at ``now`` [s] by a battery of ``cells``, without port.
 
     All times are arguments on a clock without steps. Each call first advances the state to its
-    time, so that the results do not depend on the frequency of calls.
-
-    Attributes:
-        voltage, current: of the battery [V, A], NaN without a measurement; set from outside, as
-            the next two.
-        rpm, rotor_current, temperature: of the four rotors [1/min, A, C].
-        failed: rotors (0 to 3) whose ESC has failed.
-        refused: reason -> number of refused targets since the start.
-        timeouts: number of target timeouts with turning rotors.
-
+    time, so that the results do not depend on the frequency of calls. ``changes`` are of NUMBERS.
     """
 
-    def __init__(self, parameters: EmulatedBoardParameters, cells: int, now: float):
-        self._parameters = parameters
+    def __init__(self, cells: int, now: float, **changes: float):
+        self.numbers = SimpleNamespace(**NUMBERS | changes)
         self._clock_zero = now - CLOCK_START
-        self._arm_voltage = cells * parameters.arm_cell_voltage
-        self.voltage = self.current = math.nan
-        self.rpm, self.rotor_current = [0.0] * 4, [0.0] * 4
-        self.temperature = [IDLE_TEMPERATURE] * 4
+        self._arm_voltage = cells * self.numbers.arm_cell_voltage
+        # Measurements, set from outside: battery [V, A], rotors [1/min], failed ESCs (0 to 3).
+        self.voltage = self.current = 0.0
+        self.rpm = [0.0] * 4
         self.failed: frozenset[int] = frozenset()
         self._start(now, NONE)
 
     def _start(self, now, reason):
-        self._hung_at = math.inf
-        self._booted_at = now + self._parameters.boot_time
+        self._booted_at = now + self.numbers.boot_time
         self._announced = False
         self._armed_at = -math.inf              # finite while armed
         self._stop_reason = reason
         self._heartbeat_at = self._nonzero_target_at = self._target_at = -math.inf
         self._target, self._target_stamp, self._saturated = STOP, -math.inf, False
-        self.refused: dict[str, int] = {}
-        self.timeouts = 0
-        self._next = dict.fromkeys(('heartbeat_rate', 'rotor_info_rate', 'rotor_rate',
-                                    'battery_rate', 'reception_rate'), self._booted_at)
+        self.refused: dict[str, int] = {}   # reason -> number of refused targets
+        self.timeouts = 0                   # of targets with turning rotors
+        # Rate -> time at which its message is due [s].
+        self.next = {name: self._booted_at for name in NUMBERS if name.endswith('_rate')}
         self._sent_mode, self._sent_at = None, -math.inf
         self._sent_failed: frozenset[int] | None = None
-        self._errors, self._packets = [0] * 4, 0
+        self._errors = [0] * 4
 
-    def reboot(self, now: float, reason: int = NONE) -> None:
-        """Reset the board: outputs off, initial state, clock at zero."""
+    def reboot(self, now: float) -> None:
+        """Reset by the watchdog: outputs off, initial state, clock at zero."""
         self._clock_zero = now
-        self._start(now, reason)
-
-    def hang(self, now: float) -> None:
-        """Stop the execution; the outputs are constant until the watchdog resets the board."""
-        self._advance(now)
-        self._hung_at = min(self._hung_at, now)
+        self._start(now, WATCHDOG)
 
     def clock(self, now: float) -> float:
         """Clock of the board [s since its start]."""
         return (now - self._clock_zero) * (1 + CLOCK_DRIFT)
 
     def runs(self, now: float) -> bool:
-        """Whether the firmware is executed, neither booting nor hung."""
+        """Whether it has booted."""
         self._advance(now)
-        return now >= self._booted_at and self._hung_at == math.inf
+        return now >= self._booted_at
 
     def state(self, now: float) -> int:
         """BOOT, DISARMED, ARMED (rotors stopped) or RUNNING (following targets)."""
@@ -142,19 +94,19 @@ class BoardFirmware:
             return BOOT
         if self._armed_at == -math.inf:
             return DISARMED
-        return RUNNING if self._fresh(min(now, self._hung_at)) else ARMED
+        return RUNNING if self._fresh(now) else ARMED
 
     def outputs(self, now: float) -> tuple[float, ...]:
-        """Normalised commands of the four PWM outputs, 0 to 1."""
+        """Present normalised PWM commands, 0 (stop) to 1."""
         return self._target if self.state(now) == RUNNING else STOP
 
     def conditions(self, now: float) -> int:
         """Bits of the conditions that prevent arming, and of timed-out and saturated targets."""
-        parameters, armed = self._parameters, self._armed_at > -math.inf
+        numbers, armed = self.numbers, self._armed_at > -math.inf
         return BOOTING * (now < self._booted_at) \
-            | NO_HEARTBEAT * (now - self._heartbeat_at >= parameters.heartbeat_timeout) \
+            | NO_HEARTBEAT * (now - self._heartbeat_at >= numbers.heartbeat_timeout) \
             | THROTTLE * (not armed and
-                          now - self._nonzero_target_at < parameters.throttle_low_time) \
+                          now - self._nonzero_target_at < numbers.throttle_low_time) \
             | BATTERY_LOW * (not self.voltage >= self._arm_voltage) \
             | ESC_FAILURE * bool(self.failed) \
             | TIMED_OUT * (armed and self._target_at > -math.inf and not self._fresh(now)) \
@@ -175,10 +127,6 @@ class BoardFirmware:
             return [self._command(message, now)]
         return []
 
-    def next_due(self) -> float:
-        """Time of the next periodic message [s]."""
-        return min(self._next.values())
-
     def due(self, now: float, received: dict[str, int]) -> list:
         """Periodic messages due at ``now``; ``received`` has the counts of the receiver."""
         if not self.runs(now):
@@ -193,13 +141,20 @@ class BoardFirmware:
             self._sent_mode, self._sent_at = beat.custom_mode, now
             messages.append(beat)
         stamp = round(1e6 * self.clock(now))
+        failed = [k in self.failed for k in range(4)]
+        works = [not bad for bad in failed]
         if self._is_due('rotor_info_rate', now) or self.failed != self._sent_failed:
             self._sent_failed = self.failed
-            messages.append(self._esc_info(stamp))
+            self._errors = [count + bad for count, bad in zip(self._errors, failed)]
+            messages.append(EscInfo(
+                0, stamp, 0, 4, 0, sum(on << k for k, on in enumerate(works)),
+                [GENERIC_FAILURE * bad for bad in failed], self._errors,
+                [UNKNOWN_TEMPERATURE if bad else round(100 * ESC_TEMPERATURE) for bad in failed]))
         if self._is_due('rotor_rate', now):
-            messages.append(self._esc_status(stamp))
-        total, current = _integer(1000 * self.voltage, 0, UNKNOWN_CELL - 1, UNKNOWN_CELL), \
-            _integer(100 * self.current, -32768, 32767, UNKNOWN_CURRENT)
+            messages.append(EscStatus(
+                0, stamp, [round(rpm) * on for rpm, on in zip(self.rpm, works)],
+                [self.voltage * on for on in works], [self.current / 4 * on for on in works]))
+        total, current = max(0, round(1000 * self.voltage)), round(100 * self.current)
         if self._is_due('battery_rate', now):
             messages.append(common.MAVLink_battery_status_message(
                 0, 0, 1, UNKNOWN_TEMPERATURE, [total, *[UNKNOWN_CELL] * 9], current, -1, -1, -1))
@@ -213,10 +168,10 @@ class BoardFirmware:
 
     def _is_due(self, rate, now):
         """Whether a message with this rate is due: without drift, and once after a pause."""
-        if now < self._next[rate]:
+        if now < self.next[rate]:
             return False
-        period = 1 / getattr(self._parameters, rate)
-        self._next[rate] += period * (1 + math.floor((now - self._next[rate]) / period))
+        period = 1 / getattr(self.numbers, rate)
+        self.next[rate] += period * (1 + math.floor((now - self.next[rate]) / period))
         return True
 
     def _heartbeat(self, state, now):
@@ -225,36 +180,17 @@ class BoardFirmware:
         status = 1 if state == BOOT else 5 if self.failed else 4 if armed else 3
         return common.MAVLink_heartbeat_message(2, 0, 1 | 128 * armed, mode, status, 3)
 
-    def _esc_status(self, stamp):
-        self._packets += 1
-        works = [k not in self.failed for k in range(4)]
-        volts = 0.0 if math.isnan(self.voltage) else self.voltage
-        return EscStatus(0, stamp, [round(rpm) * on for rpm, on in zip(self.rpm, works)],
-                         [volts * on for on in works],
-                         [current * on for current, on in zip(self.rotor_current, works)])
-
-    def _esc_info(self, stamp):
-        failed = [k in self.failed for k in range(4)]
-        self._errors = [count + bad for count, bad in zip(self._errors, failed)]
-        return EscInfo(
-            0, stamp, self._packets % 65536, 4, 0, sum(1 << k for k in range(4) if not failed[k]),
-            [GENERIC_FAILURE * bad for bad in failed], self._errors,
-            [UNKNOWN_TEMPERATURE if bad else round(100 * value)
-             for value, bad in zip(self.temperature, failed)])
-
     def _fresh(self, now):
-        return now - self._target_at < self._parameters.target_timeout
+        return now - self._target_at < self.numbers.target_timeout
 
     def _advance(self, now):
         """Advance the state to ``now``."""
-        parameters = self._parameters
-        if now >= self._hung_at + parameters.watchdog_time:
-            self.reboot(self._hung_at + parameters.watchdog_time, WATCHDOG)
-        if self._hung_at < math.inf or self._armed_at == -math.inf:
+        numbers = self.numbers
+        if self._armed_at == -math.inf:
             return
-        if now - self._heartbeat_at >= parameters.heartbeat_timeout:
+        if now - self._heartbeat_at >= numbers.heartbeat_timeout:
             self._disarm(HEARTBEAT_LOST)
-        elif now - max(self._target_at, self._armed_at) >= parameters.idle_timeout:
+        elif now - max(self._target_at, self._armed_at) >= numbers.idle_timeout:
             self._disarm(IDLE)
         elif self._target is not STOP and not self._fresh(now):
             self._target = STOP
@@ -293,9 +229,9 @@ class BoardFirmware:
             return 'not finite'
         if any(controls[4:]):
             return 'more than four rotors'
-        if age > self._parameters.target_age_limit:
+        if age > self.numbers.target_age_limit:
             return 'stale stamp'
-        if age < -self._parameters.target_future_limit:
+        if age < -self.numbers.target_future_limit:
             return 'stamp in the future'
         return 'older than the last' if stamp < self._target_stamp else ''
 
@@ -319,117 +255,35 @@ class BoardFirmware:
                                                   message.get_srcComponent())
 
 
-def _integer(value, low, high, unknown):
-    return unknown if math.isnan(value) else max(low, min(high, round(value)))
-
-
-class Line:
-    """One direction of a cable, which loses, corrupts and delays frames by a seed."""
-
-    def __init__(self, seed: int):
-        self._random = random.Random(seed)
-        self._waiting: list = []
-        self._count = 0
-
-    def put(self, data: bytes, now: float, corrupt: float, drop: float, delay: float) -> None:
-        """Send a frame at ``now`` [s] with these faults."""
-        if drop and self._random.random() < drop:
-            return
-        if corrupt and self._random.random() < corrupt:
-            corrupted = bytearray(data)
-            corrupted[self._random.randrange(len(data))] ^= 1 << self._random.randrange(8)
-            data = bytes(corrupted)
-        self._count += 1
-        heapq.heappush(self._waiting, (now + delay, self._count, data))
-
-    def take(self, now: float) -> bytes:
-        """Receive everything that has arrived by ``now`` [s]."""
-        pieces = []
-        while self.next() <= now:
-            pieces.append(heapq.heappop(self._waiting)[2])
-        return b''.join(pieces)
-
-    def next(self) -> float:
-        """Arrival of the next frame [s], inf without one."""
-        return self._waiting[0][0] if self._waiting else math.inf
-
-    def clear(self) -> None:
-        """Lose all frames that have not arrived."""
-        self._waiting.clear()
-
-
-def frames(data: bytes) -> list[bytes]:
+def frames(data: bytes) -> Iterator[bytes]:
     """Split a sequence of valid MAVLink 2 packets; an incomplete rest is one more piece."""
-    pieces = []
     while data:
         size = 12 + data[1] if len(data) > 1 and data[0] == 0xFD else len(data)
-        pieces.append(data[:size])
+        yield data[:size]
         data = data[size:]
-    return pieces
 
 
-class EmulatedMotorBoard:
+class EmulatedMotorBoard(Device):
     """
-    A motor board that a driver can open by :attr:`port`.
+    A motor board whose PWM the rotor map of the true ``robot`` converts to thrust.
 
-    A thread serves the port in real time. A plant reads :attr:`commands` or
-    :attr:`thrust_targets` and sets the sensors, from any thread. Before :meth:`set_battery` the
-    battery is full, and before :meth:`set_rotors` the rotors follow their targets without lag.
-
-    Args:
-        robot: the true robot, whose rotor map converts PWM to thrust.
-        parameters: parameters of the board; default: params/emulated_board.yaml.
-        port: path of the created port; by default a temporary one.
-
-    Attributes:
-        faults: present faults; their attributes may be set at any time.
-        on_target: called in the board's thread after each target with its arrival
-            [s, monotonic] and its stamp [us], for measurements.
-
-    Raises:
-        OSError: the port cannot be created.
-
+    A plant reads :attr:`thrust_targets` and sets the sensors, from any thread. Before
+    :meth:`set_battery` the battery is full, and before :meth:`set_rotors` the rotors follow their
+    targets without lag. ``changes`` are of NUMBERS. ``on_target`` is called in the board's thread
+    after each target with its arrival [s, monotonic] and its stamp [us], for measurements.
     """
 
-    def __init__(self, robot: RobotParameters | None = None,
-                 parameters: EmulatedBoardParameters | None = None, seed: int = 0,
-                 port: str | Path | None = None):
+    def __init__(self, robot: RobotParameters | None = None, *, seed: int = 0,
+                 port: str | Path | None = None, **changes: float):
         robot = robot or RobotParameters.load()
-        self._parameters = parameters or EmulatedBoardParameters.load()
         self._map = ThrustMap(robot.rotors)
         self.faults = BoardFaults()
         self.on_target: Callable[[float, int], None] | None = None
-        self._lock = threading.RLock()
-        self._firmware = BoardFirmware(self._parameters, robot.battery.cells, time.monotonic())
+        self._firmware = BoardFirmware(robot.battery.cells, time.monotonic(), **changes)
         self._voltage, self._current = robot.battery.full_voltage, 0.0
-        self._error = 0.0, 0.0
         self._thrust: np.ndarray | None = None
-        self._incoming, self._outgoing = Line(seed), Line(seed + 1)
         self._clear_stream()
-        self._executes = True
-        self._terminal = PseudoTerminal(port, 'motor_board')
-        self._stop = False
-        self._thread = threading.Thread(target=self._run, name='emulated_motor_board', daemon=True)
-        self._thread.start()
-
-    @property
-    def port(self) -> str:
-        """Path of the serial port, which does not change when it is unplugged."""
-        return self._terminal.port
-
-    def close(self) -> None:
-        """Stop the thread and remove the port."""
-        if not self._stop:
-            self._stop = True
-            self._terminal.interrupt()
-            self._thread.join(2.0)
-            self._terminal.close()
-
-    def __enter__(self) -> EmulatedMotorBoard:
-        return self
-
-    def __exit__(self, *_) -> None:
-        self.close()
+        super().__init__('motor_board', port, seed)
 
     @property
     def armed(self) -> bool:
@@ -443,18 +297,16 @@ class EmulatedMotorBoard:
         with self._lock:
             # Handle received bytes, because the thread may not have been scheduled.
             now = time.monotonic()
-            self._step(now)
+            self._serve(now)
             return np.array(self._firmware.outputs(now))
 
     @property
     def thrust_targets(self) -> np.ndarray:
         """(4,) targets of the rotors [N] for the PWM commands at the true voltage."""
-        with self._lock:
-            return self._thrusts(self.commands)
+        return self._thrusts(self.commands)
 
     def _thrusts(self, commands):
-        thrust = self._map.thrust(duty_of_command(commands),
-                                  self._voltage - self.faults.voltage_sag)
+        thrust = self._map.thrust(duty_of_command(commands), self._voltage)
         for rotor in self.faults.failed_escs:
             thrust[int(rotor) - 1] = 0.0
         return thrust
@@ -464,93 +316,57 @@ class EmulatedMotorBoard:
         """Reason -> number of refused targets since the start of the board."""
         return dict(self._firmware.refused)
 
-    def set_battery(self, voltage: float, current: float,
-                    error: tuple[float, float] = (0.0, 0.0)) -> None:
-        """Set true voltage [V], drawn current [A] and errors of both measurements [V, A]."""
-        self._voltage, self._current, self._error = float(voltage), float(current), error
+    def set_battery(self, voltage: float, current: float) -> None:
+        """Set voltage [V] and drawn current [A]."""
+        self._voltage, self._current = float(voltage), float(current)
 
-    def set_rotors(self, thrust: np.ndarray, temperature: np.ndarray | None = None) -> None:
-        """Set present thrusts (4,) [N] and ESC temperatures (4,) [C] of the rotors."""
+    def set_rotors(self, thrust: np.ndarray) -> None:
+        """Set present thrusts (4,) [N] of the rotors."""
         self._thrust = np.array(thrust, dtype=float)
-        if temperature is not None:
-            self._firmware.temperature = [float(value) for value in temperature]
 
     def reboot(self) -> None:
-        """Reset the board, as a brown-out does."""
+        """Reset the board, as its watchdog does."""
         with self._lock:
             self._firmware.reboot(time.monotonic())
             self._clear_stream()
 
-    def hang(self) -> None:
-        """Hang the firmware until its watchdog resets it."""
-        with self._lock:
-            self._firmware.hang(time.monotonic())
-
-    def unplug(self) -> None:
-        """Unplug the cable."""
-        with self._lock:
-            self._terminal.unplug()
-            self._incoming.clear()
-            self._outgoing.clear()
-
-    def plug(self) -> None:
-        """Plug the cable in; the port has its old path."""
-        with self._lock:
-            self._terminal.plug()
-
     def _clear_stream(self):
         self._receiver, self._packer = MavlinkReceiver(*HOST), common.MAVLink(None, *BOARD)
 
-    def _run(self):
-        while not self._stop:
-            now = time.monotonic()
-            telemetry = self._firmware.next_due()
-            self._terminal.wait(min(telemetry if telemetry > now else now + TICK,
-                                    self._incoming.next(), self._outgoing.next(),
-                                    now + TICK) - now)
-            with self._lock:
-                self._step(time.monotonic())
+    def _due(self):
+        telemetry = min(self._firmware.next.values())
+        return min(super()._due(), telemetry if telemetry > time.monotonic() else math.inf)
 
-    def _step(self, now):
+    def _serve(self, now):
         """Receive, execute and send."""
-        faults, executed = self.faults, self._executes
-        self._executes = executes = self._firmware.runs(now)
-        if executed and not executes:
-            self._clear_stream()
-        received = self._terminal.read()
+        faults, received = self.faults, self._read()
         # Read the clock after the bytes, as a board does, because this thread may have waited.
         now = time.monotonic()
         for frame in frames(received):
-            self._incoming.put(frame, now, faults.corrupt_in, faults.drop_in, faults.delay_in)
+            self._incoming.put(frame, now, faults.drop_in, faults.corrupt_in, faults.delay_in)
         data = self._incoming.take(now)
-        if executes:
+        if self._firmware.runs(now):
             self._measure(now)
+            # Before any answer: the first frame after a reset is a heartbeat.
+            self._send(self._firmware.due(now, self._receiver.counts), now)
             for message in self._receiver.feed(data):
                 self._send(self._firmware.receive(message, now), now)
                 if self.on_target and message.get_type() == 'SET_ACTUATOR_CONTROL_TARGET':
                     self.on_target(now, message.time_usec)
-            self._send(self._firmware.due(now, self._receiver.counts), now)
-        if out := self._outgoing.take(now):
-            self._terminal.write(out)
+        self._flush(now)
 
     def _send(self, messages, now):
         faults = self.faults
         for message in messages:
             frame = message.pack(self._packer)
             self._packer.seq = (self._packer.seq + 1) % 256
-            self._outgoing.put(frame, now, faults.corrupt_out, 1.0 if faults.mute
-                               else faults.drop_out, faults.delay_out)
+            self._outgoing.put(frame, now, faults.drop_out, faults.corrupt_out, faults.delay_out)
 
     def _measure(self, now):
         """Set the measurements of the firmware."""
         firmware = self._firmware
-        firmware.voltage = self._voltage - self.faults.voltage_sag + self._error[0]
-        firmware.current = self._current + self._error[1]
+        firmware.voltage, firmware.current = self._voltage, self._current
         firmware.failed = frozenset(int(rotor) - 1 for rotor in self.faults.failed_escs)
         thrust = self._thrusts(np.array(firmware.outputs(now))) if self._thrust is None \
             else self._thrust
-        thrust = np.maximum(thrust, 0.0)
-        firmware.rpm = (self._parameters.rpm_at_1_newton * np.sqrt(thrust)).tolist()
-        # The battery current is divided among the rotors by aerodynamic power.
-        powers = thrust ** 1.5
-        firmware.rotor_current = (self._current * powers / (powers.sum() or 1.0)).tolist()
+        firmware.rpm = (RPM_AT_1_NEWTON * np.sqrt(np.maximum(thrust, 0.0))).tolist()

@@ -11,19 +11,14 @@ is that of the rest of the packet. In instruction and parameters an ``FD`` is st
 """
 
 from collections.abc import Container, Iterator, Sequence
-from enum import IntEnum
-import heapq
 import itertools
 from math import floor, inf, pi
-from random import Random
-from threading import Lock, Thread
 import time
 from typing import NamedTuple
 
 import numpy as np
 
-from beetle_omni_ros.sim.emulated import ServoFaults
-from beetle_omni_ros.sim.emulated.pseudo_terminal import PseudoTerminal
+from beetle_omni_ros.sim.emulated.device import Device, PERIOD, ServoFaults
 
 HEADER = b'\xff\xff\xfd\x00'
 BROADCAST = 0xFE
@@ -33,35 +28,20 @@ PING, READ, WRITE, REBOOT, STATUS, SYNC_READ, SYNC_WRITE = (
     0x01, 0x02, 0x03, 0x08, 0x55, 0x82, 0x83)
 
 EEPROM_END = 64     # registers below it keep their value without power
-STARTUP_FIRMWARE = 46   # first version with a startup configuration
-FIRMWARE = 52
 COUNTS_PER_TURN = 4096
 POSITION_UNIT = 2 * pi / COUNTS_PER_TURN    # [rad]
 ZERO = 2048         # position reading in the middle of the turn
 VELOCITY_UNIT = 0.229 * 2 * pi / 60         # [rad/s] 0.229 rev/min
-VOLTAGE_UNIT = 0.1  # [V]
+VOLTAGE_UNIT, VOLTAGE_LIMITS = 0.1, (5.5, 14.0)    # [V]
 WATCHDOG_UNIT, WATCHDOG_EXPIRED = 0.02, 255     # [s]
 # [N m] for one count (about 1 mA) of current: the maker's model file xc330_t181_fw52.model
 TORQUE_UNIT = 0.000670947
-BAUD_RATES = (9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
 # Hardware Error Status (70) and Shutdown (63)
 VOLTAGE_ERROR, OVERHEATING, OVERLOAD = 0x01, 0x04, 0x20
+# Errors in the lower seven bits of the error byte in a status packet; ALERT is the eighth bit.
+NONE, RESULT_FAIL, INSTRUCTION, DATA_RANGE, ACCESS, ALERT = 0, 1, 2, 4, 7, 0x80
 
-CHECK_PERIOD = 0.01 # [s] between checks of watchdog, temperature and voltage
 PAUSE = 0.05        # [s] silence after which an incomplete packet is dropped
-
-
-class Error(IntEnum):
-    """Lower seven bits of the error byte in a status packet; ALERT is the eighth."""
-
-    NONE = 0
-    RESULT_FAIL = 1
-    INSTRUCTION = 2
-    DATA_RANGE = 4
-    DATA_LENGTH = 5
-    DATA_LIMIT = 6
-    ACCESS = 7
-    ALERT = 0x80
 
 
 class Register(NamedTuple):
@@ -77,17 +57,14 @@ class Register(NamedTuple):
 GAIN = range(16384)
 TABLE = {
     'Model Number': Register(0, 2, 1210),
-    'Firmware Version': Register(6, 1, FIRMWARE),
+    'Firmware Version': Register(6, 1, 52),
     'ID': Register(7, 1, 1, range(253)),
-    'Baud Rate': Register(8, 1, 1, range(7)),
     'Return Delay Time': Register(9, 1, 250, range(255)),
     'Drive Mode': Register(10, 1, 0, (0, 1, 4, 5, 8, 9, 12, 13)),
     'Operating Mode': Register(11, 1, 3, (0, 1, 3, 4, 5, 16)),
     'Secondary(Shadow) ID': Register(12, 1, 255, (*range(253), 255)),
     'Homing Offset': Register(20, 4, 0, range(-1_044_479, 1_044_480), True),
     'Temperature Limit': Register(31, 1, 70, range(101)),
-    'Max Voltage Limit': Register(32, 2, 140, range(55, 141)),
-    'Min Voltage Limit': Register(34, 2, 55, range(55, 141)),
     'Current Limit': Register(38, 2, 910, range(911)),
     'Startup Configuration': Register(60, 1, 0, range(4)),
     'Shutdown': Register(63, 1, 52, range(0x3E)),
@@ -103,7 +80,6 @@ TABLE = {
     'Feedforward 2nd Gain': Register(88, 2, 0, GAIN),
     'Feedforward 1st Gain': Register(90, 2, 0, GAIN),
     'Bus Watchdog': Register(98, 1, 0, range(128)),
-    'Goal Current': Register(102, 2, 910, range(-910, 911), True),
     'Profile Acceleration': Register(108, 4, 0, range(32768)),
     'Profile Velocity': Register(112, 4, 0, range(32768)),
     'Goal Position': Register(116, 4, 0, range(-1_048_575, 1_048_576), True),
@@ -117,22 +93,17 @@ TABLE = {
 NAMES = {register.address: name for name, register in TABLE.items()}
 DEFINED = frozenset(address for register in TABLE.values()
                     for address in range(register.address, register.address + register.size))
-# Registers that a change of the operating mode resets.
-RESET_BY_MODE = tuple(name for name in TABLE if 'Gain' in name or 'Profile' in name)
 
 
 # --- packets ----------------------------------------------------------------------------------
 
-def _crc_table():
-    """Remainders of the polynomial x^16 + x^15 + x^2 + 1 for each leading byte."""
-    for byte in range(256):
-        remainder = byte << 8
-        for _ in range(8):
-            remainder = (remainder << 1) ^ (0x8005 if remainder & 0x8000 else 0)
-        yield remainder & 0xFFFF
-
-
-CRC_TABLE = tuple(_crc_table())
+# Remainders of the polynomial x^16 + x^15 + x^2 + 1 for each leading byte.
+CRC_TABLE = []
+for byte in range(256):
+    remainder = byte << 8
+    for _ in range(8):
+        remainder = (remainder << 1) ^ (0x8005 if remainder & 0x8000 else 0)
+    CRC_TABLE.append(remainder & 0xFFFF)
 
 
 def sealed(data: bytes) -> bytes:
@@ -149,47 +120,23 @@ def packet(identifier: int, instruction: int, parameters: bytes = b'') -> bytes:
     return sealed(HEADER + bytes((identifier,)) + (len(body) + 2).to_bytes(2, 'little') + body)
 
 
-def status(identifier: int, error: int, data: bytes = b'') -> bytes:
-    """Build the answer of one servo."""
-    return packet(identifier, STATUS, bytes((error,)) + data)
-
-
-class Packet(NamedTuple):
-    """A received packet without stuffing."""
-
-    identifier: int
-    instruction: int
-    parameters: bytes
-
-
-class Receiver:
-    """Finds packets with a correct CRC in a stream of bytes."""
-
-    def __init__(self):
-        self._buffer = bytearray()
-
-    def forget(self):
-        """Drop an incomplete packet, as a servo does after a pause on the line."""
-        self._buffer.clear()
-
-    def feed(self, data: bytes) -> Iterator[Packet]:
-        """Parse further bytes; yield each packet that they complete."""
-        self._buffer += data
-        while (start := self._buffer.find(HEADER)) >= 0:
-            del self._buffer[:start]
-            if len(self._buffer) < HEAD_SIZE:
-                return
-            length = int.from_bytes(self._buffer[5:7], 'little')
-            end = HEAD_SIZE + length
-            if 3 <= length <= LENGTH_LIMIT and len(self._buffer) < end:
-                return
-            raw = bytes(self._buffer[:end])
-            if not 3 <= length <= LENGTH_LIMIT or sealed(raw[:-2]) != raw:
-                del self._buffer[:len(HEADER)]      # its rest may have the start of the next one
-                continue
-            del self._buffer[:end]
-            body = raw[HEAD_SIZE:-2].replace(b'\xff\xff\xfd\xfd', b'\xff\xff\xfd')
-            yield Packet(raw[4], body[0], body[1:])
+def packets(buffer: bytearray) -> Iterator[tuple[int, int, bytes]]:
+    """Take the packets with a correct CRC from a stream: ID, instruction, parameters."""
+    while (start := buffer.find(HEADER)) >= 0:
+        del buffer[:start]
+        if len(buffer) < HEAD_SIZE:
+            return
+        length = int.from_bytes(buffer[5:7], 'little')
+        end = HEAD_SIZE + length
+        if 3 <= length <= LENGTH_LIMIT and len(buffer) < end:
+            return
+        raw = bytes(buffer[:end])
+        if not 3 <= length <= LENGTH_LIMIT or sealed(raw[:-2]) != raw:
+            del buffer[:len(HEADER)]        # its rest may have the start of the next one
+            continue
+        del buffer[:end]
+        body = raw[HEAD_SIZE:-2].replace(b'\xff\xff\xfd\xfd', b'\xff\xff\xfd')
+        yield raw[4], body[0], body[1:]
 
 
 # --- servos -----------------------------------------------------------------------------------
@@ -202,16 +149,15 @@ class EmulatedServo:
     owner sets ``angle``, ``velocity`` [rad/s] and ``effort`` [N m] of the shaft.
     """
 
-    def __init__(self, identifier: int, *, firmware: int = FIRMWARE, baud_rate: int = 1_000_000,
-                 sign: int = 1, zero: int = ZERO, reboot_time: float = 0.3):
+    def __init__(self, identifier: int, *, sign: int = 1, zero: int = ZERO,
+                 reboot_time: float = 0.3):
         self.sign, self.zero, self.reboot_time = sign, zero, reboot_time
         self.angle = self.velocity = self.effort = 0.0
         self.last_packet, self.boots_at = 0.0, -inf
         self._memory = bytearray(max(DEFINED) + 1)
         for name, register in TABLE.items():
             self[name] = register.initial
-        self['ID'], self['Firmware Version'] = identifier, firmware
-        self['Baud Rate'] = BAUD_RATES.index(baud_rate)
+        self['ID'] = identifier
         self._to_one_turn()
 
     def __getitem__(self, name: str) -> int:
@@ -242,50 +188,37 @@ class EmulatedServo:
         counts = self['Goal Position'] + COUNTS_PER_TURN * self._turns
         return self.sign * (counts - self.zero) * POSITION_UNIT
 
-    @property
-    def alert(self) -> int:
-        """Alert bit of its error bytes."""
-        return Error.ALERT if self['Hardware Error Status'] else 0
-
-    def read(self, address: int, length: int) -> tuple[Error, bytes]:
+    def read(self, address: int, length: int) -> tuple[int, bytes]:
         """Read bytes of the control table; error ACCESS for undefined addresses."""
         end = address + length
         if not length or not all(place in DEFINED for place in range(address, end)):
-            return Error.ACCESS, b''
+            return ACCESS, b''
         self['Present Current'] = round(self.sign * self.effort / TORQUE_UNIT)
         self['Present Velocity'] = round(self.sign * self.velocity / VELOCITY_UNIT)
         self['Present Position'] = self._present()
-        return Error.NONE, bytes(self._memory[address:end])
+        return NONE, bytes(self._memory[address:end])
 
-    def write(self, address: int, data: bytes) -> Error:
-        """Write one register."""
+    def write(self, address: int, data: bytes) -> int:
+        """Write one register; return the error."""
         name = NAMES.get(address)
-        if name is None or (name == 'Startup Configuration'
-                            and self['Firmware Version'] < STARTUP_FIRMWARE):
-            return Error.ACCESS
+        if name is None or (address < EEPROM_END and self.torque):
+            return ACCESS
         register = TABLE[name]
-        if not register.legal or (address < EEPROM_END and self.torque):
-            return Error.ACCESS
-        if len(data) != register.size:
-            return Error.DATA_LENGTH
+        if not register.legal or len(data) != register.size:
+            return ACCESS
         value = int.from_bytes(data, 'little', signed=register.signed)
         if value not in register.legal or (self.expired and (
-                name in ('Goal Position', 'Goal Current') or name == 'Bus Watchdog' and value)):
-            return Error.DATA_RANGE
+                name == 'Goal Position' or name == 'Bus Watchdog' and value)):
+            return DATA_RANGE
         # The manual defines the refusal, but not its error.
         if name == 'Torque Enable' and value and self['Hardware Error Status'] & self['Shutdown']:
-            return Error.RESULT_FAIL
-        if name == 'Goal Current' and abs(value) > self['Current Limit']:
-            return Error.DATA_LIMIT
-        self._apply(name, value)
-        return Error.NONE
-
-    def _apply(self, name, value):
+            return RESULT_FAIL
         if name == 'Operating Mode' and self[name] != value:
-            for other in RESET_BY_MODE:
-                self[other] = TABLE[other].initial
-            self['Goal Current'] = self['Current Limit']
+            for other in TABLE:
+                if 'Gain' in other or 'Profile' in other:
+                    self[other] = TABLE[other].initial
         self[name] = value      # a goal remains, so torque without a new one causes a jump
+        return NONE
 
     def reboot(self, now: float):
         """Restart with initial RAM, torque off, position within one turn; silent until booted."""
@@ -295,16 +228,15 @@ class EmulatedServo:
         self.boots_at = now + self.reboot_time
         self._to_one_turn()
 
-    def advance(self, now: float, temperature: int, voltage: float):
-        """Check watchdog, temperature [deg C] and supply voltage [V]."""
+    def advance(self, now: float, voltage: float):
+        """Check watchdog, temperature and supply voltage [V]."""
         limit, silence = self['Bus Watchdog'], now - self.last_packet
         if self.torque and 0 < limit < WATCHDOG_EXPIRED and silence > limit * WATCHDOG_UNIT:
             self.expire()
-        self['Present Temperature'] = temperature
-        if temperature > self['Temperature Limit']:
+        if self['Present Temperature'] > self['Temperature Limit']:
             self.trip(OVERHEATING)
-        self['Present Input Voltage'] = counts = round(voltage / VOLTAGE_UNIT)
-        if not self['Min Voltage Limit'] <= counts <= self['Max Voltage Limit']:
+        self['Present Input Voltage'] = round(voltage / VOLTAGE_UNIT)
+        if not VOLTAGE_LIMITS[0] <= voltage <= VOLTAGE_LIMITS[1]:
             self.trip(VOLTAGE_ERROR)
 
     def expire(self):
@@ -317,76 +249,43 @@ class EmulatedServo:
         if error & self['Shutdown']:
             self['Torque Enable'] = 0
 
-    def _counts(self):
-        return round(self.zero + self.sign * self.angle / POSITION_UNIT)
-
     def _present(self):
-        return self._counts() - COUNTS_PER_TURN * self._turns
+        counts = round(self.zero + self.sign * self.angle / POSITION_UNIT)
+        return counts - COUNTS_PER_TURN * self._turns
 
     def _to_one_turn(self):
-        self._turns = floor(self._counts() / COUNTS_PER_TURN)
+        self._turns = 0
+        self._turns = floor(self._present() / COUNTS_PER_TURN)
 
 
 # --- the line ---------------------------------------------------------------------------------
 
-class EmulatedServoBus:
+class EmulatedServoBus(Device):
     """
-    XC330 servos on one serial port, as a context manager.
+    XC330 servos on one serial port, with IDs, signs and zeros [counts] in the order of the joints.
 
-    A plant reads :meth:`drive` and calls :meth:`set_state`. ``refusals`` is the number of refused
-    instructions.
-
-    Args:
-        identifiers: IDs in the order of the joints.
-        port: path of the created port; by default a temporary one.
-        firmware: firmware version of the servos; below 46 without startup configuration.
-        baud_rate: baud rate of the servos [bit/s].
-        signs: +1 or -1 for each servo: counts rise or fall with the joint's angle.
-        zeros: counts at which the angle of each joint is zero.
-        speed: of servos with torque without a plant [rad/s]; by default they do not move.
-        reboot_time: time without answers after a reboot [s].
-        seed: seed of the faults.
-
+    A plant reads :meth:`drive` and calls :meth:`set_state`. Without a plant servos with torque
+    move at ``speed`` [rad/s]. After a reboot they are silent for ``reboot_time`` [s]. ``refusals``
+    is the number of refused instructions.
     """
 
     def __init__(self, identifiers: Sequence[int] = (1, 2, 3, 4), *, port: str | None = None,
-                 firmware: int = FIRMWARE, baud_rate: int = 1_000_000,
                  signs: Sequence[int] = (1,) * 4, zeros: Sequence[int] = (ZERO,) * 4,
                  speed: float = 0.0, reboot_time: float = 0.3, seed: int = 0):
         self.faults, self.refusals = ServoFaults(), 0
-        self.servos = [EmulatedServo(name, firmware=firmware, baud_rate=baud_rate, sign=sign,
-                                     zero=zero, reboot_time=reboot_time)
+        self.servos = [EmulatedServo(name, sign=sign, zero=zero, reboot_time=reboot_time)
                        for name, sign, zero in zip(identifiers, signs, zeros, strict=True)]
-        self._speed = speed
-        self._terminal = PseudoTerminal(port, 'servo_bus')
-        self._receiver, self._random = Receiver(), Random(seed)
-        self._late: list[tuple[float, int, bytes]] = []
-        self._order = itertools.count()
-        self._lock = Lock()
+        self._speed, self._buffer = speed, bytearray()
         self._last_data = self._last_check = self._last_move = time.monotonic()
-        self._running = True
-        self._thread = Thread(target=self._run, name='emulated servo bus', daemon=True)
-        self._thread.start()
+        super().__init__('servo_bus', port, seed)
 
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        self.close()
-
-    @property
-    def port(self) -> str:
-        """Path of the serial port."""
-        return self._terminal.port
-
-    def drive(self) -> tuple[list[float], list[bool], list[bool]]:
-        """Goals [rad], whether motors are powered, whether watchdogs stopped them, at one time."""
+    def drive(self) -> tuple[list[float], list[bool]]:
+        """Goals [rad], and whether motors are powered, at one time."""
         with self._lock:
             # Handle received bytes, because the thread may not have been scheduled.
             self._serve(time.monotonic())
             return ([servo.goal for servo in self.servos],
-                    [servo.torque for servo in self.servos],
-                    [servo.expired for servo in self.servos])
+                    [servo.torque for servo in self.servos])
 
     @property
     def goals(self) -> np.ndarray:
@@ -397,11 +296,6 @@ class EmulatedServoBus:
     def torque_enabled(self) -> np.ndarray:
         """(n,) bool: whether a motor is powered; without power the joint is free."""
         return np.array(self.drive()[1])
-
-    @property
-    def stopped(self) -> np.ndarray:
-        """(n,) bool: whether the bus watchdog has stopped a servo, which then refuses goals."""
-        return np.array(self.drive()[2])
 
     def set_state(self, position: np.ndarray, velocity: np.ndarray, effort: np.ndarray):
         """Set the joints' true angles [rad], rates [rad/s] and torques [N m], each (n,)."""
@@ -414,61 +308,34 @@ class EmulatedServoBus:
         with self._lock:
             self.servos[index].reboot(time.monotonic())
 
-    def expire_watchdog(self, index: int):
-        """Expire the watchdog of servo ``index``."""
-        with self._lock:
-            if self.servos[index].torque:
-                self.servos[index].expire()
-
     def unplug(self):
         """Unplug the adapter; the servos keep their power."""
         with self._lock:
-            self._terminal.unplug()
-            self._receiver.forget()
-            self._late.clear()
-
-    def replug(self):
-        """Plug the adapter in."""
-        with self._lock:
-            self._terminal.plug()
-
-    def close(self):
-        """Stop the thread and remove the port."""
-        if self._running:
-            self._running = False
-            self._terminal.interrupt()
-            self._thread.join(2.0)
-            self._terminal.close()
-
-    def _run(self):
-        while self._running:
-            due = self._late[0][0] - time.monotonic() if self._late else inf
-            self._terminal.wait(min(CHECK_PERIOD, due))
-            with self._lock:
-                self._serve(time.monotonic())
+            super().unplug()
+            self._buffer.clear()
 
     def _serve(self, now):
         """Handle received packets, check the servos, send due answers."""
-        if data := self._terminal.read():
+        if data := self._read():
             if now - self._last_data > PAUSE:
-                self._receiver.forget()
+                self._buffer.clear()
             self._last_data = now
-            for received in self._receiver.feed(data):
+            self._buffer += data
+            faults = self.faults
+            for received in packets(self._buffer):
                 self._move(now)
-                for answer in self.handle(received, self._terminal.baud_rate, now):
-                    self._send(answer, now)
+                for answer in self.handle(received, now):
+                    self._outgoing.put(answer, now, faults.dropped, faults.bad_crc, faults.delay,
+                                       faults.delayed)
         # After the data, so that waiting packets restart the watchdogs of a late thread.
-        if now - self._last_check >= CHECK_PERIOD:
+        if now - self._last_check >= PERIOD:
             self._last_check = now
             for servo in self.servos:
-                hot = servo['ID'] in self.faults.overheated
-                servo.advance(now, servo['Temperature Limit'] + 10 if hot else 35,
-                              self.faults.supply_voltage)
+                servo.advance(now, self.faults.supply_voltage)
                 if servo['ID'] in self.faults.overload and servo.torque:
                     servo.trip(OVERLOAD)
             self._move(now)
-        while self._late and self._late[0][0] <= now:
-            self._terminal.write(heapq.heappop(self._late)[2])
+        self._flush(now)
 
     def _move(self, now):
         step, self._last_move = self._speed * (now - self._last_move), now
@@ -476,24 +343,10 @@ class EmulatedServoBus:
             if servo.torque:
                 servo.angle += max(-step, min(step, servo.goal - servo.angle))
 
-    def _send(self, data, now):
-        faults, draw = self.faults, self._random.random
-        if draw() < faults.dropped:
-            return
-        if draw() < faults.bad_crc:
-            place = self._random.randrange(len(data))
-            data = data[:place] + bytes((data[place] ^ 1 << self._random.randrange(8),)) \
-                + data[place + 1:]
-        if draw() < faults.delayed:
-            heapq.heappush(self._late, (now + faults.delay, next(self._order), data))
-        else:
-            self._terminal.write(data)
-
-    def handle(self, received: Packet, baud_rate: int, now: float) -> list[bytes]:
+    def handle(self, received: tuple[int, int, bytes], now: float) -> list[bytes]:
         """Execute a packet in every servo that receives it; return the answers in order."""
         listening = {servo['ID']: servo for servo in self.servos
-                     if servo['ID'] not in self.faults.silent and now >= servo.boots_at
-                     and BAUD_RATES[servo['Baud Rate']] == baud_rate}
+                     if servo['ID'] not in self.faults.silent and now >= servo.boots_at}
         for servo in listening.values():
             servo.last_packet = now
         name, code, given = received
@@ -503,32 +356,32 @@ class EmulatedServoBus:
         if code == SYNC_WRITE:
             for k in range(4, len(given), length + 1):
                 if given[k] in listening:
-                    self._checked(listening[given[k]].write(address, given[k + 1:k + 1 + length]))
+                    error = listening[given[k]].write(address, given[k + 1:k + 1 + length])
+                    self.refusals += error != NONE
         answers = []
         if code == SYNC_READ:       # each waits for the previous one, so a silent one ends it
             for one in itertools.takewhile(listening.__contains__, given[4:]):
-                error, data = listening[one].read(address, length)
-                answers.append(status(one, self._checked(error) | listening[one].alert, data))
+                answers.append(self._answer(listening[one],
+                                            *listening[one].read(address, length)))
         return answers
 
     def _single(self, servo, code, given, now):
         """Execute an instruction in one servo; return its answer."""
-        name, data = servo['ID'], b''   # with a new ID it still answers with the old one
+        data, error = b'', NONE
         address = int.from_bytes(given[:2], 'little')
         if code == PING:
-            error, data = servo.read(0, 2)
-            data += bytes((servo['Firmware Version'],))
+            data = servo.read(0, 2)[1] + bytes((servo['Firmware Version'],))
         elif code == READ:
             error, data = servo.read(address, int.from_bytes(given[2:4], 'little'))
         elif code == WRITE:
             error = servo.write(address, given[2:])
         elif code == REBOOT:
-            error = Error.NONE
             servo.reboot(now)
         else:
-            error = Error.INSTRUCTION
-        return status(name, self._checked(error) | servo.alert, data)
+            error = INSTRUCTION
+        return self._answer(servo, error, data)
 
-    def _checked(self, error):
-        self.refusals += error is not Error.NONE
-        return error
+    def _answer(self, servo, error, data):
+        self.refusals += error != NONE
+        return packet(servo['ID'], STATUS, bytes((
+            error | ALERT * bool(servo['Hardware Error Status']),)) + data)

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.sim.emulated import BoardFaults, SERVO_EVENTS, ServoFaults, switched_on
-from beetle_omni_ros.sim.readings import Drive, Frame
+from beetle_omni_ros.sim.emulated.device import BoardFaults, ServoFaults, switched_on
+from beetle_omni_ros.sim.faults import Drive
+from beetle_omni_ros.sim.sensors import Frame
 from beetle_omni_ros.sim.simulator import ROUNDING, Simulator
 
 if TYPE_CHECKING:       # pymavlink is needed by an emulated board only
@@ -24,8 +25,7 @@ class EmulatedActuators:
 
     The devices run in real time, so :meth:`step` is called once in each tick of real time. Their
     outputs act after the command delay of the conditions. A command for the IMU sample of one
-    tick, received before the next tick, then acts at the same time as without devices. The bus
-    has four servos without motion model. :meth:`close` closes both devices.
+    tick, received before the next tick, then acts at the same time as without devices.
     """
 
     def __init__(self, simulator: Simulator, bus: EmulatedServoBus, board: EmulatedMotorBoard):
@@ -34,18 +34,11 @@ class EmulatedActuators:
         tilt, thrust = simulator.command_delays
         self._tilts = _line(tilt, simulator.tick, lambda: (np.zeros(4), [False] * 4))
         self._thrusts = _line(thrust, simulator.tick, lambda: np.zeros(4))
-        self._held: dict[int, float] = {}
         self._faults = ServoFaults(), BoardFaults()
         truth = simulator.truth
         bus.set_state(truth.tilt, truth.tilt_velocity, np.zeros(4))
         board.set_rotors(truth.thrust)
         board.set_battery(simulator.battery.voltage, simulator.battery.current)
-
-    def __enter__(self) -> EmulatedActuators:
-        return self
-
-    def __exit__(self, *_) -> None:
-        self.close()
 
     def close(self) -> None:
         """Stop both devices and remove their ports."""
@@ -54,68 +47,33 @@ class EmulatedActuators:
 
     def step(self) -> Frame:
         """Advance the simulator by one tick."""
-        goals, powered, stopped = self.bus.drive()
-        if any(stopped) or self._held:
-            self._hold(goals, stopped)
+        goals, powered = self.bus.drive()
         self._tilts.append((np.array(goals), powered))
         self._thrusts.append(self.board.thrust_targets)
         tilt, powered = self._tilts[0]
-        frame = self._simulator.step(Drive(tilt, powered, self._thrusts[0]))
-        joints, pack, battery = frame.joints, frame.battery, self._simulator.battery
+        frame = self._simulator.step(Drive(tilt, self._thrusts[0], powered))
+        joints, battery = frame.joints, self._simulator.battery
         # The current of a servo without torque is zero.
         self.bus.set_state(joints.position, joints.velocity, joints.effort * powered)
-        voltage, current = battery.voltage, battery.current
-        self.board.set_battery(voltage, current,
-                               (pack.voltage - voltage, -pack.current - current))
+        self.board.set_battery(battery.voltage, battery.current)
         self.board.set_rotors(frame.truth.thrust)
         return frame
-
-    def _hold(self, goals, stopped):
-        """
-        Hold the true angle of servos that their watchdog has stopped.
-
-        Their goal differs from it by the encoder error, and the delayed goals are old.
-        """
-        for joint, stop in enumerate(stopped):
-            if not stop:
-                self._held.pop(joint, None)
-                continue
-            if joint not in self._held:
-                held = self._held[joint] = float(self._simulator.truth.tilt[joint])
-                for tilt, _ in self._tilts:
-                    tilt[joint] = held
-            goals[joint] = self._held[joint]
 
     def set_faults(self, servo: ServoFaults, board: BoardFaults) -> None:
         """
         Switch faults on and off, and trigger the events that are set.
 
-        Raises:
-            ParameterError: unknown servo or rotor, without any change, or a port whose path is in
-                use when it is plugged in.
-
+        A ParameterError reports an unknown servo, without any change.
         """
-        places = {one['ID']: place for place, one in enumerate(self.bus.servos)}
-        for name in ('silent', 'overload', 'overheated', *SERVO_EVENTS):
+        ids = [one['ID'] for one in self.bus.servos]
+        for name in ('silent', 'overload', 'reboot'):
             for wanted in np.ravel(getattr(servo, name)):
-                if wanted not in places and not (name in SERVO_EVENTS and wanted == 0):
+                if wanted not in (*ids, *[0] * (name == 'reboot')):
                     raise ParameterError(f'servo_faults.{name}: no servo has the id {wanted:g}; '
-                                         f'ids are {list(places)}')
-        if np.any(board.failed_escs != np.round(board.failed_escs)):
-            raise ParameterError('board_faults.failed_escs: expected rotors 1 to 4, found '
-                                 f'{board.failed_escs}')
+                                         f'ids are {ids}')
         self._faults = self.bus.faults, self.board.faults = servo, board
-        try:
-            (self.bus.unplug if servo.unplugged else self.bus.replug)()
-            (self.board.unplug if board.unplugged else self.board.plug)()
-        except OSError as error:
-            raise ParameterError(str(error)) from None
         if servo.reboot:
-            self.bus.reboot(places[servo.reboot])
-        if servo.expire_watchdog:
-            self.bus.expire_watchdog(places[servo.expire_watchdog])
-        if board.hang:
-            self.board.hang()
+            self.bus.reboot(ids.index(servo.reboot))
         if board.reboot:
             self.board.reboot()
 
@@ -128,9 +86,8 @@ class EmulatedActuators:
     def status(self) -> dict[str, object]:
         """States and refusals of the devices, for diagnostics."""
         bus, board = self.bus, self.board
-        _, torque, stopped = bus.drive()
         return {'servo_port': bus.port, 'board_port': board.port, 'armed': board.armed,
-                'torque': torque, 'stopped': stopped, 'servo refused': bus.refusals,
+                'torque': bus.drive()[1], 'servo refused': bus.refusals,
                 **{f'board refused: {reason}': count for reason, count in board.refused.items()}}
 
 
