@@ -46,9 +46,6 @@ ARGUMENTS = {
     'composed': ('true', ['true', 'false'], 'all nodes in one process'),
     'viewer': ('false', ['true', 'false'], 'description, tf and markers for RViz and Foxglove'),
     'view': ('false', ['true', 'false'], 'the flight in 3D in the browser; prints the address'),
-    'allow_targets': ('false', ['true', 'false'],
-                      'with view: poses dragged there become targets, and controllers can be '
-                      'selected there'),
     'robot_file': ('', None, 'robot file that estimator and controller believe'),
     'plant_file': ('', None, 'robot file that is true in the simulation'),
     'conditions': ('nominal', ['nominal', 'published'], 'of the simulation'),
@@ -122,9 +119,7 @@ def viewing(given):
     """Viewer in a process of its own."""
     return ExecuteProcess(
         cmd=[sys.executable, '-m', f'{PACKAGE}.start', 'beetle_omni', 'view',
-             *(['--namespace', given['namespace']] if given['namespace'] else []),
-             *(['--robot', given['robot_file']] if given['robot_file'] else []),
-             *(['--allow-targets'] if given['allow_targets'] == 'true' else [])],
+             *(['--namespace', given['namespace']] if given['namespace'] else [])],
         output='screen')
 
 

@@ -78,14 +78,14 @@ def test_report_writes_one_page_that_needs_no_network(capsys, bag, tmp_path):
     text = page.read_text()
     # test/view loads it in a browser, too. Libraries name addresses, and load none.
     assert '<script src' not in text
-    for part in ('flight (1)', 'flight (2)', 'Steady errors', 'Joint and thrust use',
+    for part in ('>flight<', '>flight.mcap<',
                  'one MoCap pose was no unit quaternion', 'CPU time of a step',
                  'estimated position'):
         assert part in text
     judged = json.loads(result.read_text())
     assert judged['meta']['task'] == 'waypoints'
-    assert judged['flight (1)'] == judged['flight (2)']
-    assert sum(pose['reached'] for pose in judged['flight (1)']['poses']) == 3
+    assert judged['flight'] == judged['flight.mcap']
+    assert sum(pose['reached'] for pose in judged['flight']['poses']) == 3
     assert '3 of 15' in capsys.readouterr().out
 
 

@@ -82,9 +82,6 @@ def fly(controller: ControllerOption = DEFAULT,
         discovery: DiscoveryOption = None,
         view: Annotated[bool, typer.Option(
             '--view', help='Show the flight in the browser, as beetle_omni view does.')] = False,
-        allow_targets: Annotated[bool, typer.Option(
-            '--allow-targets', help='With --view: poses dragged in the page become targets, and '
-                                    'controllers can be selected there.')] = False,
         json_path: JsonOption = None):
     """
     Fly the whole ROS graph in real time against the simulated robot.
@@ -94,8 +91,6 @@ def fly(controller: ControllerOption = DEFAULT,
     """
     given, bag = bag, bag or Path('runs_out') / f'fly_{datetime.now():%Y%m%d_%H%M%S}'
     check_flight(conditions, compression, json_path, nmpc_file, policy, faults)
-    if allow_targets and not view:
-        raise ParameterError('--allow-targets: expected --view with it')
     from beetle_omni_ros.nodes.fly import run_fly
     if not given:
         typer.echo(f'bag: {bag}')
@@ -105,7 +100,7 @@ def fly(controller: ControllerOption = DEFAULT,
                    allow_other_robot=allow_other_robot, standby=standby,
                    composed=composed, faults=faults, json_path=json_path,
                    domain_id=domain_id, discovery=discovery,
-                   view=view, allow_targets=allow_targets)
+                   view=view)
     raise typer.Exit(code if isinstance(code, int) else 0)
 
 

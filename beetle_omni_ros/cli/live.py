@@ -78,9 +78,6 @@ def drive(source: Annotated[str, typer.Argument(
 def view(runs: Annotated[Optional[list[Path]], typer.Argument(
              metavar='RUN...', help='Recorded bags, shown together; without RUN: a running '
                                     'graph.')] = None,
-         allow_targets: Annotated[bool, typer.Option(
-             '--allow-targets', help='For a running graph: poses dragged in the page become '
-                                     'targets, and controllers can be selected there.')] = False,
          namespace: Annotated[str, typer.Option(
              '--namespace', metavar='NAME', help='Namespace of the topics of a running '
                                                  'graph.')] = '',
@@ -88,9 +85,6 @@ def view(runs: Annotated[Optional[list[Path]], typer.Argument(
              '--domain-id', min=0, max=101,
              help='ROS domain of a running graph. Default: ROS_DOMAIN_ID.')] = None,
          discovery: DiscoveryOption = None,
-         robot: Annotated[Optional[Path], typer.Option(
-             '--robot', metavar='FILE', help='For a running graph: robot file, for the '
-                                             'checks of targets.')] = None,
          urdf: Annotated[Optional[Path], typer.Option(
              '--urdf', metavar='FILE', help="URDF of the robot's shape. Default: the shipped "
                                             'description.')] = None,
@@ -98,24 +92,21 @@ def view(runs: Annotated[Optional[list[Path]], typer.Argument(
              '--host', metavar='ADDRESS', help='Address at which the page is served; 0.0.0.0: to '
                                                'the whole network.')] = '127.0.0.1',
          port: Annotated[int, typer.Option(
-             '--port', min=1, max=65535, help='Port of the page.')] = 8080,
-         dark: Annotated[bool, typer.Option('--dark', help='Begin with dark colours.')] = False):
+             '--port', min=1, max=65535, help='Port of the page.')] = 8080):
     """
     Show a running graph, or play recorded runs, in 3D in the browser.
 
     Prints the address of the page, which needs no network, and runs until Ctrl-C. Example:
     beetle_omni view my_run/rl my_run/nmpc
     """
-    shared = {'urdf': urdf, 'host': host, 'port': port, 'dark': dark}
+    shared = {'urdf': urdf, 'host': host, 'port': port}
     if runs:
-        for option, given in (('--allow-targets', allow_targets), ('--namespace', namespace),
-                              ('--domain-id', domain_id is not None),
-                              ('--discovery', discovery), ('--robot', robot)):
+        for option, given in (('--namespace', namespace), ('--discovery', discovery),
+                              ('--domain-id', domain_id is not None)):
             if given:
                 raise ParameterError(f'{option}: expected without RUN, which is a recording')
         from beetle_omni_ros.view.recorded import run_view
         run_view(runs, **shared)
         return
     from beetle_omni_ros.nodes.operator import run_live
-    run_live(namespace=namespace, domain_id=domain_id, discovery=discovery, robot=robot,
-             allow_targets=allow_targets, **shared)
+    run_live(namespace=namespace, domain_id=domain_id, discovery=discovery, **shared)

@@ -79,7 +79,7 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             allow_other_robot: bool = False, standby: bool = True, composed: bool = True,
             faults: Path | None = None, json_path: Path | None = None,
             domain_id: int | None = None, discovery: str | None = None,
-            view: bool = False, allow_targets: bool = False,
+            view: bool = False,
             console: Console | None = None) -> int:
     """
     Fly a task through the ROS graph and print the results of the bag.
@@ -121,7 +121,7 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             controller = registry.find(controller).name
             number = stack.enter_context(reserved_domain()) if domain_id is None else domain_id
             if view:
-                stack.enter_context(viewer_process(number, robot, allow_targets, console))
+                stack.enter_context(viewer_process(number, console))
             meta = {'task': task, 'conditions': conditions, 'seed': seed,
                     'robot': str(robot) if robot else 'params/robot.yaml',
                     'plant': str(plant) if plant else None, 'version': __version__,
@@ -209,13 +209,11 @@ def needed_load() -> float:
 
 
 @contextmanager
-def viewer_process(domain_id: int, robot: Path | None, allow_targets: bool, console: Console):
+def viewer_process(domain_id: int, console: Console):
     """Run `beetle_omni view` during a flight and print its lines on the console."""
     process = subprocess.Popen(
         [sys.executable, '-m', 'beetle_omni_ros.start', 'beetle_omni', 'view',
-         '--domain-id', str(domain_id),
-         *(['--robot', str(robot)] if robot else []),
-         *(['--allow-targets'] if allow_targets else [])],
+         '--domain-id', str(domain_id)],
         env=child_environment(domain_id), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
         text=True, start_new_session=True)
     threading.Thread(target=lambda: [_print(console, line.rstrip()) for line in process.stdout],

@@ -140,6 +140,11 @@ class FlightLog:
         return 'truth' if len(self.truth_t) else 'odom'
 
     @property
+    def begin(self) -> float:
+        """Time of the first target [s]; without one, that of :attr:`start`."""
+        return self.targets[0].stamp if self.targets else self.start
+
+    @property
     def start(self) -> float:
         """Earliest time in any series [s]; 0 for an empty log."""
         return min((times[0] for times in self._times()), default=0.0)

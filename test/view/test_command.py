@@ -27,7 +27,7 @@ def bag(tmp_path_factory):
 
 
 @pytest.mark.parametrize('arguments, message', [
-    (['BAG', 'none'], 'none: no such bag'), (['BAG', '--allow-targets'], '--allow-targets'),
+    (['BAG', 'none'], 'none: no such bag'), (['BAG', '--namespace', 'a'], '--namespace'),
     (['BAG', '--urdf', 'text.mcap'], 'not a usable URDF'),
     (['BAG', '--host', '300.1.1.1'], '--host 300.1.1.1')])
 def test_unusable_input_is_one_line_and_status_2(bag, tmp_path, monkeypatch, capfd, arguments,
