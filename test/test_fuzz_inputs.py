@@ -10,7 +10,7 @@ from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.robot.readings import BatteryReading, ImuReading, JointReading, PoseReading
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.bag import BagError, read_bag
+from beetle_omni_ros.runs.bag import read_bag
 from beetle_omni_ros.runs.bag_writer import BagWriter
 from beetle_omni_ros.view.report import make_page, make_runs, results_of
 
@@ -97,7 +97,7 @@ def check(path, read):
     """Read a file; True if it was refused, by one bounded line."""
     try:
         read(path)
-    except (ParameterError, BagError) as error:
+    except ParameterError as error:
         text = str(error)
         assert '\n' not in text and len(text) <= LONGEST_TEXT, path
         return True

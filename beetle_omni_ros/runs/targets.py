@@ -157,11 +157,11 @@ def read_poses(path: str | Path, reach: float = np.inf) -> np.ndarray:
         ParameterError: unusable file; names file, row (as in an editor), column and expectation.
 
     """
-    table = read_table(path, _columns, ','.join(COLUMNS), check=_unusable)
-    if not len(table):
+    columns, rows = read_table(path, _columns, ','.join(COLUMNS), check=_unusable)
+    if not len(rows):
         raise ParameterError(f'{path}: no pose below the header; expected at least one row')
-    poses = np.stack(list(table.columns.values()), axis=1)
-    check_steps(poses, reach, lambda k: f'{path}: row {table.rows[k]}')
+    poses = np.stack(list(columns.values()), axis=1)
+    check_steps(poses, reach, lambda k: f'{path}: row {rows[k]}')
     return poses
 
 
