@@ -23,7 +23,7 @@ from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.bag import read_bag
 from beetle_omni_ros.runs.bag_writer import BagWriter
-from beetle_omni_ros.runs.log import Recorder, Tee
+from beetle_omni_ros.runs.log import Recorder
 from beetle_omni_ros.safety.events import INFO
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.sim.fault_lists import FaultList, FlightPlan
@@ -100,7 +100,7 @@ def fly_trial(trial: Trial, listed: FaultList, bags: Path | None = None) -> dict
     folder = bags / trial.name if bags else None
     try:
         with collector_off(), ExitStack() as stack:
-            recorder = Tee()
+            recorder = Recorder()
             if folder:
                 recorder = stack.enter_context(BagWriter(folder, asdict(trial), epoch=int(time())))
             result.update(_FLOWN.get(trial.case, _fly_fault)(trial, listed, recorder))
@@ -249,7 +249,7 @@ class Flight:
         true = RobotParameters.load(plant) if plant else nominal
         self.loop = FlightLoop(
             nominal, replace(true, effects=true.effects | (effects or {})), aboard,
-            recorder or Tee(), conditions=conditions, seed=seed, faults=strike)
+            recorder or Recorder(), conditions=conditions, seed=seed, faults=strike)
         self.simulator, self.supervisor = self.loop.simulator, self.loop.supervisor
         self.random = drawn(seed, moves)
 

@@ -3,8 +3,10 @@ One flight as numpy arrays, its recording, and the motion and errors in it.
 
 Times are float seconds on the flight's clock: ROS time in the graph, from 0 in the in-process
 loop. A loop records into memory (:class:`LogRecorder`), onto disk
-(:class:`~beetle_omni_ros.runs.bag_writer.BagWriter`), or both with :class:`Tee`.
+(:class:`~beetle_omni_ros.runs.bag_writer.BagWriter`), or both (:class:`Recorder`).
 """
+
+from __future__ import annotations
 
 from array import array
 from dataclasses import dataclass, field, fields
@@ -205,7 +207,7 @@ class FlightLog:
 
 class Recorder:
     """
-    Interface of recorders: :meth:`write` for every topic, and shorter calls for some.
+    Interface of recorders; by itself it passes everything on to others.
 
     Attributes:
         keeps_covariances: whether the covariances of ``odom`` are recorded.
@@ -213,6 +215,10 @@ class Recorder:
     """
 
     keeps_covariances = False
+
+    def __init__(self, *others: Recorder):
+        self._others = others
+        self.keeps_covariances = any(other.keeps_covariances for other in others)
 
     def write(self, topic: str, value: Any, received: float | None = None) -> None:
         """
@@ -225,11 +231,13 @@ class Recorder:
             received: time of recording [s]; default: the value's stamp. Required for text.
 
         """
-        raise NotImplementedError
+        for other in self._others:
+            other.write(topic, value, received)
 
     def write_meta(self, meta: dict) -> None:
         """Add metadata of the flight: task, conditions, seed, robot, version."""
-        raise NotImplementedError
+        for other in self._others:
+            other.write_meta(meta)
 
     def write_target(self, target: Target, received=None) -> None:
         """Record a pose or trajectory target, valid from its stamp."""
@@ -331,7 +339,9 @@ class LogRecorder(Recorder):
             _unpack(log, series + '_', self._rows[series], channels)
         log.requests = {name: _unpack(Commands(), '', rows, SERIES['command'])
                         for name, rows in self._requests.items()}
-        log.targets = _in_order(log.targets)
+        # A latched topic repeats its target: of equal stamps, the last one is kept.
+        log.targets = list({(target.stamp, type(target)): target for target in sorted(
+            log.targets, key=lambda target: target.stamp)}.values())
         states = sorted(self._states, key=lambda entry: entry[0])
         log.state_t = np.array([t for t, _ in states], dtype=float)
         log.states = [state for _, state in states]
@@ -350,35 +360,6 @@ def _unpack(into, prefix, rows, channels):
         setattr(into, prefix + name, values.copy())
         column += max(1, w)
     return into
-
-
-def _in_order(targets):
-    """Sort by stamp; of several targets with the same stamp (latched topics), keep one."""
-    kept: list[Target] = []
-    for target in sorted(targets, key=lambda entry: entry.stamp):
-        if kept and target.stamp == kept[-1].stamp and type(target) is type(kept[-1]):
-            kept[-1] = target
-        else:
-            kept.append(target)
-    return kept
-
-
-class Tee(Recorder):
-    """Records with several recorders."""
-
-    def __init__(self, *recorders: Recorder):
-        self._recorders = recorders
-        self.keeps_covariances = any(recorder.keeps_covariances for recorder in recorders)
-
-    def write(self, topic: str, value: Any, received: float | None = None) -> None:
-        """Record one value."""
-        for recorder in self._recorders:
-            recorder.write(topic, value, received)
-
-    def write_meta(self, meta: dict) -> None:
-        """Add metadata of the flight."""
-        for recorder in self._recorders:
-            recorder.write_meta(meta)
 
 
 @dataclass(frozen=True)

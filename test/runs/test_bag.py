@@ -19,7 +19,7 @@ from beetle_omni_ros.messages.bag_types import new, to_bytes, TYPESTORE
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.bag import read_bag
 from beetle_omni_ros.runs.bag_writer import add_meta, BagWriter
-from beetle_omni_ros.runs.log import FlightLog, LogRecorder, Tee
+from beetle_omni_ros.runs.log import FlightLog, LogRecorder, Recorder
 from beetle_omni_ros.runs.tasks import make_task
 
 META = {'task': 'lemniscate', 'conditions': 'nominal', 'seed': 4, 'version': '0.1.0'}
@@ -31,8 +31,8 @@ def recorded(tmp_path_factory):
     folder = tmp_path_factory.mktemp('bags') / 'flight'
     memory = LogRecorder(META)
     with BagWriter(folder, META) as writer:
-        fly(Tee(memory, writer), make_task('lemniscate'), duration=4.0, start=50.0)
-        write_wrench(Tee(memory, writer), 53.0, [0, 0, 3.0], [0.5, 0, 0])
+        fly(Recorder(memory, writer), make_task('lemniscate'), duration=4.0, start=50.0)
+        write_wrench(Recorder(memory, writer), 53.0, [0, 0, 3.0], [0.5, 0, 0])
     return folder, memory.log()
 
 
