@@ -65,12 +65,12 @@ def main(args: list[str] | None = None) -> int:
     except (KeyboardInterrupt, typer.Abort):
         return _fail('interrupted', INTERRUPTED)
     except Exception as error:
-        # usage errors of typer's parser and bag errors; importing their types would slow --help
+        # usage errors of typer's parser; importing their type would slow --help
         if hasattr(error, 'format_message'):
-            text = _usage(error, args)  # empty after the help of `beetle_omni` alone
-            return _fail(text, UNUSABLE) if text else UNUSABLE
-        if type(error).__name__ == 'BagError':
-            return _fail(error, UNUSABLE)
+            text = error.format_message()   # empty after the help of `beetle_omni` alone
+            context = getattr(error, 'ctx', None)
+            command = context.command_path if context else 'beetle_omni'
+            return _fail(f'{text} See {command} --help.', UNUSABLE) if text else UNUSABLE
         raise
 
 
@@ -104,19 +104,3 @@ def _fail(error: Exception | str, status: int) -> int:
     """Print an error as one line on standard error; returns ``status``."""
     print(f"beetle_omni: error: {' '.join(str(error).split())}", file=sys.stderr)
     return status
-
-
-def _usage(error, args: list[str]) -> str:
-    """Text of a usage error of typer's parser: the given value, its option, the expected value."""
-    text, context = error.format_message(), getattr(error, 'ctx', None)
-    if not text:
-        return ''
-    names = getattr(getattr(error, 'param', None), 'opts', ())
-    if type(error).__name__ == 'BadParameter' and names:
-        given = [value for name, value in zip(args, args[1:]) if name in names] + [
-            arg.partition('=')[2] for arg in args if arg.partition('=')[0] in names and '=' in arg]
-        # remove pydantic's wording, of newer versions of typer
-        wanted = str(error.message).partition(', unable')[0].replace('Input should be', 'expected')
-        text = f"{names[0]} '{given[0]}': {wanted}." if given else text
-    command = context.command_path if context else 'beetle_omni'
-    return f'{text} See {command} --help.'

@@ -89,7 +89,6 @@ def make_page(runs: list[Run], results: dict) -> str:
     tables = ''.join(html(grid) for grid in shown if grid.title != 'Poses')
     poses = ''.join(html(grid) for grid in shown if grid.title == 'Poses')
     folded = f'<section><details><summary>Every pose</summary>{poses}</details></section>'
-    faults = ''.join(html(grid) for run in runs for grid in _faults(run))
     scene = recorded_scene({run.label: run.log for run in runs})
     content = f"""<div class="cards">{''.join(map(_card, runs))}</div>
 <section>{tables}</section>
@@ -98,32 +97,14 @@ def make_page(runs: list[Run], results: dict) -> str:
 {section('In time', 'Grey: L window, green: U window. Drag over a chart to zoom all, click twice '
          'to see all; click in the legend to hide a run.', charts.html(runs))}
 {folded if poses else ''}
-<section class="faults"><h2>Faults</h2>{faults}</section>"""
+<section class="faults"><h2>Faults</h2>{''.join(map(_faults, runs))}</section>"""
     meta = results['meta']
     subtitle = ', '.join(filter(None, [table.title(meta), f"beetle_omni_ros {meta['version']}"]))
     return frame('Flight report', subtitle, content)
 
 
-def _outcome(result):
-    """Outcome of a flight as text."""
-    tracking = result.get('trajectory') or {}
-    poses = [] if tracking else result['poses']
-    parts = ['crashed'] if result.get('crashed') else []
-    parts += [result['ended']] if result.get('ended') else []
-    if poses:
-        parts.append(f"{sum(pose['reached'] for pose in poses)} of {len(poses)} poses reached")
-    for found, position, angle, where in (
-            (result['median'], 'U_position_m', 'U_orientation_deg', 'median error at the target'),
-            (tracking, 'position_mean_m', 'orientation_mean_deg', 'mean error on the trajectory')):
-        if found.get(position) is not None and (poses or tracking):
-            parts.append(f'{where} {1e3 * found[position]:.1f} mm and {found[angle]:.2f}°')
-    return ', '.join(parts) or 'no target'
-
-
 def _card(run):
     log, meta = run.log, run.log.meta
-    outcome = '; '.join(f'{label}: {_outcome(result)}' if len(run.results) > 1
-                        else _outcome(result) for label, result in run.results.items())
     facts = [', '.join(log.controllers()), *(f'{key} {meta[key]}' for key in
              ('task', 'conditions', 'seed', 'robot', 'plant') if meta.get(key) is not None),
              f'{log.end - log.start:.0f} s', log.source]
@@ -136,30 +117,24 @@ def _card(run):
         *named[:MOST_ROWS], *log.warnings))
     text = escape(' · '.join(fact for fact in facts if fact))
     return (f'<div class="card" style="border-top-color: {run.colour}"><strong>'
-            f'{escape(run.label)}</strong><em>{escape(outcome)}</em><span>{text}</span>'
-            f'{lines}</div>')
+            f'{escape(run.label)}</strong><span>{text}</span>{lines}</div>')
 
 
 def _faults(run):
-    """Tables of the supervisor's states, warnings of the nodes, and rejected messages."""
-    states: list[list[str]] = []
-    for t, state in zip(run.log.state_t, run.log.states, strict=True):
-        kind, _, what = (shortened(part) for part in state.partition(':'))
-        if not states or states[-1][1:] != [kind, what]:
-            states.append([f'{t - run.log.begin:.2f}', kind, what])
+    """Tables of warnings of the nodes, and of rejected messages."""
     told: dict[tuple, list] = {}
     last: dict[str, dict] = {}
     for entry in run.log.diagnostics:
         last[entry.name] = entry.values
         if entry.level > 0:
             told.setdefault((entry.name, entry.level, entry.message), []).append(entry.t)
-    warnings = [[name, LEVELS.get(level, str(level)), message, f'{times[0] - run.log.begin:.1f}',
-                 str(len(times))] for (name, level, message), times in told.items()]
+    warnings = [[name, LEVELS.get(level, str(level)), message,
+                 f'{times[0] - run.log.begin:.1f}', str(len(times))]
+                for (name, level, message), times in told.items()]
     rejected = [[name, key, value] for name, values in last.items()
                 for key, value in values.items()
                 if ('reject' in key or 'refused' in key) and value not in ('0', '0.0', '', '{}')]
     made = [Grid(f'{run.label}: {title}', header, rows[:MOST_ROWS]) for title, header, rows in (
-        ('states of the supervisor', ['at [s]', 'state', 'controller or fault'], states),
         ('warnings and errors', ['node', 'level', 'text', 'first at [s]', 'reports'], warnings),
         ('rejected', ['node', 'reason', 'count'], rejected))]
-    return [grid for grid in made if grid.rows]
+    return ''.join(html(grid) for grid in made if grid.rows)
