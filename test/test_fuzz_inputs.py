@@ -89,7 +89,7 @@ def write_bag(folder):
 def read_flight(path):
     """Read a bag, compute metrics and draw the page, like ``beetle_omni report``."""
     with np.errstate(all='ignore'):
-        runs = make_runs([read_bag(path)], ['run'])
+        runs = make_runs({'run': read_bag(path)})
         return runs, results_of(runs)
 
 

@@ -23,7 +23,7 @@ from beetle_omni_ros.messages.topics import (
     TOPICS,
 )
 from beetle_omni_ros.robot.schema import ParameterError, quoted, read_yaml, YamlError
-from beetle_omni_ros.runs.log import FlightLog, LogRecorder, SERIES_OF
+from beetle_omni_ros.runs.log import FlightLog, LogRecorder, motion, SERIES_OF
 
 BagError = ParameterError   # a bag cannot be read or written; the text names the folder or file
 AT_ONCE = 4096      # messages that are read together
@@ -89,12 +89,6 @@ def runs_in(paths: Iterable[str | Path]) -> list[Path]:
             inside = sorted({file.parent for file in path.glob('*/*.mcap')})
         runs += inside or [path]
     return runs
-
-
-def no_pose(path: str | Path, warnings: list[str]) -> BagError:
-    """Error for a bag without a pose; ``warnings`` of its reading may give the reason."""
-    return BagError('; '.join([f'{path}: no pose of the robot; expected ground_truth/odom or '
-                               'odom', *warnings]))
 
 
 def _split_number(file):
@@ -194,6 +188,26 @@ def read_bag(path: str | Path) -> FlightLog:
     log = reading.recorder.log()
     log.warnings, log.source = warnings + reading.problems(), str(path)
     return log
+
+
+def read_flights(paths: Iterable[str | Path], most: int) -> dict[str, FlightLog]:
+    """
+    Read the flights of RUN arguments: name -> flight with poses.
+
+    Raises:
+        ParameterError: as of :func:`read_bag`, a bag without a pose, or more than ``most`` runs.
+
+    """
+    runs = runs_in(paths)
+    if len(runs) > most:
+        raise ParameterError(f'{len(runs)} runs; expected at most {most}')
+    logs = {}
+    for path, name in zip(runs, names_of(runs), strict=True):
+        log = logs[name] = read_bag(path)
+        if not len(motion(log).t):
+            raise ParameterError('; '.join([f'{path}: no pose of the robot; expected '
+                                            'ground_truth/odom or odom', *log.warnings]))
+    return logs
 
 
 class _Reading:

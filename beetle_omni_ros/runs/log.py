@@ -137,11 +137,6 @@ class FlightLog:
     source: str = ''
 
     @property
-    def body(self) -> str:
-        """Series that metrics use: 'truth' if it was recorded, else 'odom'."""
-        return 'truth' if len(self.truth_t) else 'odom'
-
-    @property
     def begin(self) -> float:
         """Time of the first target [s]; without one, that of :attr:`start`."""
         return self.targets[0].stamp if self.targets else self.start
@@ -393,9 +388,9 @@ class Motion:
         return len(times) > 0 and times[0] <= begin + gap and times[-1] >= end - gap
 
 
-def motion(log: FlightLog, series: str | None = None) -> Motion:
-    """Return the motion of a series, by default of the truth if recorded, else the estimate."""
-    name = series or log.body
+def motion(log: FlightLog) -> Motion:
+    """Return the true motion if it was recorded, else the estimated one."""
+    name = 'truth' if len(log.truth_t) else 'odom'
     return Motion(*(getattr(log, f'{name}_{channel}') for channel in
                     ('t', 'position', 'quaternion', 'velocity', 'angular_velocity')))
 

@@ -9,7 +9,7 @@ import numpy as np
 from beetle_omni_ros.pages.figures import COLOURS
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.robot.urdf import Model
-from beetle_omni_ros.runs.bag import names_of, no_pose, read_bag, runs_in
+from beetle_omni_ros.runs.bag import read_flights
 from beetle_omni_ros.runs.log import FlightLog, motion
 from beetle_omni_ros.view.scene import close, drawable, moments, Room, serve
 
@@ -61,19 +61,11 @@ def run_view(runs: list[Path], *, urdf: Path | None = None, host: str, port: int
     Serve a player of recorded runs until Ctrl-C; arguments are options of `beetle_omni view`.
 
     Raises:
-        BagError: unusable run.
-        ParameterError: other unusable input.
+        ParameterError: unusable input.
 
     """
-    runs, model = runs_in(runs), Model.load(urdf)
-    if len(runs) > len(COLOURS):
-        raise ParameterError(f'{len(runs)} runs; expected at most {len(COLOURS)}')
-    logs = {}
-    for path, name in zip(runs, names_of(runs), strict=True):
-        log = logs[name] = read_bag(path)
-        if not len(motion(log).t):
-            raise no_pose(path, log.warnings)
-    page = recorded_scene(logs, model).encode()
+    model = Model.load(urdf)
+    page = recorded_scene(read_flights(runs, len(COLOURS)), model).encode()
 
     class Answer(BaseHTTPRequestHandler):
         def do_GET(self):

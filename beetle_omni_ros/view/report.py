@@ -9,11 +9,11 @@ from rich.console import Console
 from beetle_omni_ros import __version__
 from beetle_omni_ros.pages.figures import COLOURS
 from beetle_omni_ros.pages.page import frame, Grid, html, section, Terminal
-from beetle_omni_ros.robot.schema import ParameterError, shortened
+from beetle_omni_ros.robot.schema import shortened
 from beetle_omni_ros.runs import table
-from beetle_omni_ros.runs.bag import names_of, no_pose, read_bag, runs_in
+from beetle_omni_ros.runs.bag import read_flights
 from beetle_omni_ros.runs.files import write_json, write_text
-from beetle_omni_ros.runs.log import FlightLog, motion
+from beetle_omni_ros.runs.log import FlightLog
 from beetle_omni_ros.runs.metrics import metrics_by_controller
 from beetle_omni_ros.view import charts
 from beetle_omni_ros.view.charts import MAX_RUNS, Run
@@ -34,23 +34,15 @@ def run_report(paths: list[Path], output: Path, *, json_path: Path | None = None
         The results: ``meta`` and one key for each run and controller.
 
     Raises:
-        BagError: a run cannot be read.
-        ParameterError: too many runs, or the page cannot be written.
+        ParameterError: a run cannot be read, too many runs, or the page cannot be written.
 
     """
     console = console or Terminal()
-    paths = runs_in(paths)
-    if len(paths) > MAX_RUNS:
-        raise ParameterError(f'{len(paths)} runs; a page shows at most {MAX_RUNS} side by side')
-    logs = []
-    for path in paths:
-        log = read_bag(path)
-        if not len(motion(log).t):
-            raise no_pose(path, log.warnings)
+    logs = read_flights(paths, MAX_RUNS)
+    for log in logs.values():
         for warning in log.warnings:
-            print(f'{path}: {warning}', file=sys.stderr)
-        logs.append(log)
-    runs = make_runs(logs, names_of(paths))
+            print(f'{log.source}: {warning}', file=sys.stderr)
+    runs = make_runs(logs)
     results = results_of(runs)
     table.print_results(results, console)
     page = make_page(runs, results)
@@ -60,15 +52,14 @@ def run_report(paths: list[Path], output: Path, *, json_path: Path | None = None
     return results
 
 
-def make_runs(logs: list[FlightLog], names: list[str]) -> list[Run]:
-    """Compute the metrics of flights with these labels; give each a colour."""
+def make_runs(logs: dict[str, FlightLog]) -> list[Run]:
+    """Compute the metrics of flights; give each a colour."""
     runs = []
-    for k, (log, name) in enumerate(zip(logs, names, strict=True)):
-        by_controller = metrics_by_controller(log)
-        several = len(by_controller) > 1
+    for k, (name, log) in enumerate(logs.items()):
+        found = metrics_by_controller(log)
         runs.append(Run(name, COLOURS[k % MAX_RUNS], log, {
-            f'{name}: {key}' if several else name: result
-            for key, result in by_controller.items()}))
+            f'{name}: {key}' if len(found) > 1 else name: result
+            for key, result in found.items()}))
     return runs
 
 
