@@ -52,7 +52,7 @@ CASES = {
         ('short.csv', 'row 2: expected 6 values, found 5'),
         ('far.csv', 'row 3: |x| = 100 m, expected at most'),
         ('low.csv', 'row 2: z = 0.05 m, expected at least'),
-        ('below.csv', 'row 2, column z_m: expected a height above the floor, found -1'),
+        ('below.csv', 'row 2: z = -1 m, expected at least'),
         ('empty.csv', 'empty.csv: empty; expected the header'),
         ('header.csv', 'no pose below the header; expected at least one row'),
         ('binary.csv', 'binary.csv: not a CSV text file')],
