@@ -9,8 +9,8 @@ loop. A loop records into memory (:class:`LogRecorder`), onto disk
 from __future__ import annotations
 
 from array import array
-from dataclasses import dataclass, field, fields
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -29,7 +29,7 @@ SERIES = {
     'command': {'received': 0, 'tilt': 4, 'thrust': 4},
     'wrench': {'force': 3, 'torque': 3},
 }
-"""Series -> channel -> width; 0 is a scalar channel. Each series has times ``<series>_t``."""
+"""Series -> channel -> width; 0 is a scalar. A log has times ``<series>_t`` and each channel."""
 
 SERIES_OF = {'ground_truth/odom': 'truth', 'odom': 'odom', 'imu/data_raw': 'imu',
              'mocap/pose': 'mocap', 'joint_states': 'joint', 'battery_state': 'battery',
@@ -95,36 +95,6 @@ class FlightLog:
 
     """
 
-    truth_t: np.ndarray = _empty(0)
-    truth_position: np.ndarray = _empty(3)
-    truth_quaternion: np.ndarray = _empty(4)
-    truth_velocity: np.ndarray = _empty(3)
-    truth_angular_velocity: np.ndarray = _empty(3)
-    odom_t: np.ndarray = _empty(0)
-    odom_position: np.ndarray = _empty(3)
-    odom_quaternion: np.ndarray = _empty(4)
-    odom_velocity: np.ndarray = _empty(3)
-    odom_angular_velocity: np.ndarray = _empty(3)
-    imu_t: np.ndarray = _empty(0)
-    imu_specific_force: np.ndarray = _empty(3)
-    imu_angular_velocity: np.ndarray = _empty(3)
-    mocap_t: np.ndarray = _empty(0)
-    mocap_position: np.ndarray = _empty(3)
-    mocap_quaternion: np.ndarray = _empty(4)
-    joint_t: np.ndarray = _empty(0)
-    joint_position: np.ndarray = _empty(4)
-    joint_velocity: np.ndarray = _empty(4)
-    joint_effort: np.ndarray = _empty(4)
-    battery_t: np.ndarray = _empty(0)
-    battery_voltage: np.ndarray = _empty(0)
-    battery_current: np.ndarray = _empty(0)
-    command_t: np.ndarray = _empty(0)
-    command_received: np.ndarray = _empty(0)
-    command_tilt: np.ndarray = _empty(4)
-    command_thrust: np.ndarray = _empty(4)
-    wrench_t: np.ndarray = _empty(0)
-    wrench_force: np.ndarray = _empty(3)
-    wrench_torque: np.ndarray = _empty(3)
     requests: dict[str, Commands] = field(default_factory=dict)
     targets: list[Target] = field(default_factory=list)
     state_t: np.ndarray = _empty(0)
@@ -135,6 +105,14 @@ class FlightLog:
     meta: dict = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     source: str = ''
+
+    if TYPE_CHECKING:
+        def __getattr__(self, name: str) -> np.ndarray:
+            """Return a channel of SERIES."""
+
+    def __post_init__(self):
+        for series, channels in SERIES.items():
+            _unpack(self, f'{series}_', (), channels)
 
     @property
     def begin(self) -> float:
@@ -152,8 +130,8 @@ class FlightLog:
         return max((times[-1] for times in self._times()), default=0.0)
 
     def _times(self):
-        return [times for entry in fields(self) if entry.name.endswith('_t')
-                and len(times := getattr(self, entry.name))]
+        return [times for series in (*SERIES, 'state')
+                if len(times := getattr(self, f'{series}_t'))]
 
     def controllers(self) -> list[str]:
         """Return the names of the controllers that flew, in this order."""
