@@ -28,9 +28,10 @@ from beetle_omni_ros.runs.log import FlightLog, LogRecorder, motion, SERIES_OF
 BagError = ParameterError   # a bag cannot be read or written; the text names the folder or file
 AT_ONCE = 4096      # messages that are read together
 META_KEY = 'beetle_omni'  # under custom_data of metadata.yaml
-# Text entries of the metadata that readers of a log rely on, and their longest length.
-META_TEXTS = ('task', 'conditions', 'robot', 'plant', 'controller', 'guidance', 'version')
+# Entries of the metadata that readers of a log rely on; a task may be the name of a file.
 LONGEST_TEXT = 250
+META_TYPES = {'seed': int, **dict.fromkeys(
+    ('task', 'conditions', 'robot', 'plant', 'controller', 'guidance', 'version'), str)}
 
 
 class Recorded(NamedTuple):
@@ -308,15 +309,9 @@ def _metadata(path, warnings):
     except (YamlError, KeyError, TypeError, AttributeError, ValueError, RecursionError):
         warnings.append('metadata.yaml is not readable')
         return {}
-    used = {key: value for key, value in meta.items() if _usable(key, value)}
+    used = {key: value for key, value in meta.items()
+            if key not in META_TYPES or value is None
+            or isinstance(value, META_TYPES[key]) and len(str(value)) <= LONGEST_TEXT}
     warnings.extend(f'metadata.yaml: {quoted(key)} is not usable, found {quoted(value)}'
                     for key, value in meta.items() if key not in used)
     return used
-
-
-def _usable(key, value):
-    """Whether a value has the type that readers of the log rely on."""
-    if value is None or key not in ('seed', *META_TEXTS):
-        return True
-    return isinstance(value, int) and 0 <= value < 1 << 63 if key == 'seed' else \
-        isinstance(value, str) and len(value) <= LONGEST_TEXT and value.isprintable()
