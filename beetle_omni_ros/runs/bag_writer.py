@@ -13,7 +13,7 @@ import struct
 from typing import Any
 
 from rosbags.interfaces import Connection
-from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
+from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
 from rosbags.rosbag2.storage_mcap import McapWriter, write_channel, write_string
 from rosbags.serde import SerdeError
@@ -160,7 +160,7 @@ class BagWriter(Recorder):
             epoch: UNIX time of time 0 [s], so that a flight that begins at 0 s gets a real date.
 
         Raises:
-            ParameterError: the folder exists or cannot be made.
+            ParameterError: as of :func:`check_new`.
 
         """
         self.path = Path(path)
@@ -169,16 +169,13 @@ class BagWriter(Recorder):
         self._connections: dict[str, Connection] = {}
         self._prefix = '/' + namespace.strip('/') + '/' if namespace.strip('/') else '/'
         check_new(self.path)
-        try:
-            self._writer: Writer | None = Writer(self.path, version=VERSION,
-                                                 storage_plugin=StoragePlugin.MCAP)
-            self._writer.STORAGE_PLUGINS = {StoragePlugin.MCAP: JazzyStorage}
-            if compression == 'zstd':
-                self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+        self._writer: Writer | None = Writer(self.path, version=VERSION,
+                                             storage_plugin=StoragePlugin.MCAP)
+        self._writer.STORAGE_PLUGINS = {StoragePlugin.MCAP: JazzyStorage}
+        if compression == 'zstd':
+            self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+        with self._disk():
             self._writer.open()
-        except (OSError, WriterError) as error:
-            reason = getattr(error, 'strerror', None) or error
-            raise ParameterError(f'{path}: cannot write a bag there ({reason})') from None
         for name in topics:
             self._declare(self._prefix + name, topic_of(name).type, topic_of(name).qos)
         self._frames = None
@@ -213,7 +210,7 @@ class BagWriter(Recorder):
     def write(self, topic: str, value: Any, received: float | None = None) -> None:
         """Write one value, see :class:`Recorder`."""
         name, entry = self._prefix + topic, topic_of(topic)
-        if name not in self._connections and self._writer is not None:
+        if name not in self._connections:
             self._declare(name, entry.type, entry.qos)
         if received is None:
             received = value[0].t if isinstance(value, list) else value.stamp
@@ -233,15 +230,13 @@ class BagWriter(Recorder):
             t: time of recording since ``epoch`` [s].
 
         Raises:
-            ParameterError: unknown type, or the file cannot be written.
+            ParameterError: the file cannot be written.
 
         """
-        if self._writer is None:
+        if self._writer is None:    # a node may still receive while it ends
             raise ParameterError(f'{self.path}: the bag is closed')
         connection = self._connections.get(topic)
         if connection is None:
-            if msgtype not in TYPESTORE.types:
-                raise ParameterError(f'{self.path}: topic {topic} has the unknown type {msgtype}')
             ours = ALL.get(topic.removeprefix(self._prefix))
             connection = self._declare(topic, msgtype, ours.qos if ours else EVENT)
         first, self._last_t = self._last_t is None, t
@@ -255,8 +250,6 @@ class BagWriter(Recorder):
 
     def flush(self) -> None:
         """Pass the written data to the operating system, so that it survives a SIGKILL."""
-        if self._writer is None:
-            return
         storage = self._writer.storage
         with self._disk():
             if storage.chunk.msgs:
@@ -306,10 +299,8 @@ def check_new(path: str | Path) -> None:
     if path.exists() or path.is_symlink():
         raise ParameterError(f'{path}: exists already; a bag needs a new folder')
     parent = next(folder for folder in path.absolute().parents if folder.exists())
-    if not parent.is_dir():
-        raise ParameterError(f'{path}: {parent} is not a folder')
-    if not os.access(parent, os.W_OK | os.X_OK):
-        raise ParameterError(f'{path}: no permission to write in {parent}')
+    if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
+        raise ParameterError(f'{path}: {parent} is not a folder that can be written')
 
 
 def add_meta(path: str | Path, meta: dict) -> None:
