@@ -119,6 +119,9 @@ CASES = {
         ('old', 'convert it with ros2 bag'), ('not.mcap', 'not.mcap: not an MCAP file'),
         ('imu_only', 'ground_truth/odom'), (' '.join(['imu_only'] * 7), 'at most'),
         ('imu_only --output no/page.html', 'page.html')],
+    'view': [
+        ('none', 'none: no such bag'), ('imu_only --namespace a', '--namespace: expected without'),
+        ('imu_only --urdf not.mcap', 'not a usable URDF')],
     'gap': [
         ('', "'RUN...'"), ('none', 'none: no such bag'), ('imu_only imu_only', 'imu_only'),
         ('imu_only --robot unknown.yaml', 'masss'), ('imu_only --gap unknown.yaml', 'masss'),

@@ -3,18 +3,16 @@
 from pathlib import Path
 
 import numpy as np
+from synthetic_flights import fly
 from test_packaging import parameter_classes
 
-from beetle_omni_ros.control.base import Command, PoseTarget
-from beetle_omni_ros.messages.values import Odom
-from beetle_omni_ros.robot.readings import BatteryReading, ImuReading, JointReading, PoseReading
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.bag import read_bag
 from beetle_omni_ros.runs.bag_writer import BagWriter
+from beetle_omni_ros.runs.tasks import make_task
 from beetle_omni_ros.view.report import make_page, make_runs, results_of
 
-LEVEL, ZERO = np.array([0, 0, 0, 1.0]), np.zeros(3)
 LONGEST_TEXT = 2000     # characters of a refusal
 LAUGHS = 'a: &a [x, x, x, x, x, x, x, x, x]\n' + ''.join(
     f'{two}: &{two} [{", ".join(["*" + one] * 9)}]\n' for one, two in zip('abcdefgh', 'bcdefghi'))
@@ -65,27 +63,6 @@ def mutate_yaml(rng, data):
     return '\n'.join([*lines, '']).encode()
 
 
-def write_bag(folder):
-    """One short bag with every kind of message that a report uses."""
-    with BagWriter(folder / 'bag', {'task': 'waypoints', 'seed': 1}) as writer:
-        writer.write_target(PoseTarget(position=np.array([0, 0, 1.0]), quaternion=LEVEL,
-                                       stamp=1.5))
-        for k in range(60):
-            t = 1 + 0.05 * k
-            for topic, value in (
-                    ('ground_truth/odom', Odom(t, ZERO, ZERO, LEVEL, ZERO)),
-                    ('odom', Odom(t, ZERO, ZERO, LEVEL, ZERO)),
-                    ('imu/data_raw', ImuReading(t, ZERO, ZERO)),
-                    ('mocap/pose', PoseReading(t, ZERO, LEVEL)),
-                    ('joint_states', JointReading(t, np.zeros(4), np.zeros(4))),
-                    ('battery_state', BatteryReading(t, 24.0, -10.0)),
-                    ('command', Command(t, np.zeros(4), np.ones(4)))):
-                writer.write(topic, value)
-            writer.write('supervisor/state', 'flying:nmpc', t)
-            writer.write_diagnostic(t, 'nmpc_node', {'rejected': '3'}, 1, 'late')
-    return next((folder / 'bag').glob('*.mcap')).read_bytes()
-
-
 def read_flight(path):
     """Read a bag, compute metrics and draw the page, like ``beetle_omni report``."""
     with np.errstate(all='ignore'):
@@ -124,7 +101,9 @@ def test_a_damaged_parameter_file_is_refused_in_one_line(tmp_path):
 
 
 def test_a_damaged_bag_is_read_up_to_the_damage(tmp_path):
-    bag = write_bag(tmp_path)
+    with BagWriter(tmp_path / 'bag', {'task': 'waypoints', 'seed': 1}) as writer:
+        fly(writer, make_task('waypoints'), duration=3.0)
+    bag = (tmp_path / 'bag' / 'bag.mcap').read_bytes()
     refusals(8, tmp_path, '.mcap', {'bag': bag}, mutate_bytes,
              lambda path, _: make_page(*read_flight(path)))
     metadata = tmp_path / 'bag' / 'metadata.yaml'
