@@ -63,8 +63,8 @@ BagsArgument = Annotated[list[Path], Argument(
 ControllerOption = Annotated[str, Option(
     metavar='NAME', help=f'The active controller: {KNOWN}.')]
 TaskOption = Annotated[str, Option(metavar='TASK', help=(
-    'CSV file of poses, or waypoints, randomN (random100), lemniscate, hover, force, torque or '
-    'payload.'))]
+    'CSV file of poses, or waypoints, randomN (random100), lemniscate, lemniscate_large, hover, '
+    'force, force_down, force_up, torque, torque_pulses, wind, pushes, payload or steps.'))]
 ConditionsOption = Annotated[str, Option(
     callback=one_of, metavar='|'.join(CONDITIONS), help=(
         "nominal: the simulator with the measured parameters; published: with the publication's "

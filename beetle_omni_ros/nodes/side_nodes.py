@@ -25,7 +25,7 @@ from beetle_omni_ros.robot.schema import NAMES, parameter, ParameterError
 from beetle_omni_ros.robot.urdf import description
 from beetle_omni_ros.runs.bag import BagError
 from beetle_omni_ros.runs.bag_writer import BagWriter, COMPRESSIONS
-from beetle_omni_ros.runs.tasks import make_task, TaskPlayer
+from beetle_omni_ros.runs.tasks import make_task, TaskPlayer, WITH_WRENCHES
 
 try:
     from tf2_msgs.msg import TFMessage
@@ -75,8 +75,8 @@ class ReferenceNode(FlightNode):
         self._payload = self.create_client(SetParameters, 'sim_node/set_parameters')
         self._set_state('waiting')
         self.follow('supervisor/state', self._on_supervisor)
-        disturbed = self._task.kind in ('force', 'torque')
-        if disturbed:       # the loss of control ends these tasks
+        disturbed = self._task.kind in WITH_WRENCHES
+        if disturbed:       # the loss of control ends tasks with rising levels
             self.listen('odom', partial(setattr, self, '_odom'), qos=SENSOR)
         self.health.report('task', lambda: (OK, self._state, {'task': self._task.name}))
         self.create_timer(IMPULSE_PERIOD if disturbed else PERIOD, self._on_timer,
@@ -113,7 +113,7 @@ class ReferenceNode(FlightNode):
             self._trajectory, self._window_end = moment.target, moment.target.times[0]
         if self._trajectory is not None and now > self._window_end - WINDOW_PERIOD:
             self._publish_window(now)
-        if moment.changed and self._task.kind in ('force', 'torque'):
+        if moment.changed and self._task.kind in WITH_WRENCHES:
             self._wrenches.publish(Wrench(now, moment.force_world, moment.torque_body))
         if moment.changed and self._task.kind == 'payload':
             self._payload.call_async(wire.parameter_request('payload', float(moment.payload)))

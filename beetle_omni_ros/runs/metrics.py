@@ -20,13 +20,16 @@ from beetle_omni_ros.runs.log import (
     inside,
     Motion,
     motion,
+    roll_pitch_yaw,
     target_ends,
 )
 from beetle_omni_ros.runs.tasks import (
     control_lost,
     GROUND_HEIGHT,
+    HOVER,
     make_task,
     POSE_DURATION,
+    STEPS,
     Task,
 )
 
@@ -34,6 +37,10 @@ U_WINDOW = (7.0, 7.5)  # [s] after the target
 L_WINDOW = (1.0, 7.0)  # [s]
 REACHED_POSITION = 0.10  # [m]
 REACHED_ORIENTATION = 10.0  # [deg]
+WIND_ONSET = 2.0  # [s] at the start of each wind speed, not evaluated
+RECOVERED = (0.02, 2.0)  # [m], [deg] errors after a push
+SETTLED = 0.05  # of a step
+AXES = ('x', 'y', 'z', 'roll', 'pitch', 'yaw')
 COMMAND_PERIOD = 0.010  # [s] for changes of the command
 END_MARGIN = 0.1  # [s] before the end of the task, above which a landing is early
 CRASH = 'emergency_stop:crash'    # supervisor/state after a crash
@@ -349,6 +356,12 @@ def _task_metrics(log: FlightLog, body: Motion, task: Task) -> dict:
     if task.kind == 'hover':
         return {'hover': _summary(body, log.targets[0], start + POSE_DURATION,
                                   start + task.duration)}
+    if task.kind == 'wind':
+        return {'wind': _winds(log, body, task, start)}
+    if task.kind == 'pushes':
+        return {'pushes': _pushes(log, body, task, start)}
+    if task.kind == 'steps':
+        return {'steps': _steps(log, body)}
     return {}
 
 
@@ -361,17 +374,18 @@ def _summary(body, target, begin, end):
             for what, reduce in SUMMARY}
 
 
+def _summary_if_flown(body, target, begin, end):
+    """Summary of a window that was flown to its end, else None."""
+    return _summary(body, target, begin, end if body.covers(begin, end) else -np.inf)
+
+
 def _tracking(log, body, task, start):
     """Tracking errors over all rounds and of each; None for an incomplete round."""
-    unknown = {f'{name}_{what}_{unit}': None
-               for name, unit in (('position', 'm'), ('orientation', 'deg'))
-               for what, _ in SUMMARY}
     windows = [t for t in log.targets if isinstance(t, TrajectoryTarget)]
     if not windows:
-        return {**unknown, 'rounds': []}
+        return {**_summary(body, log.targets[0], np.inf, np.inf), 'rounds': []}
     target = _joined(windows)
-    rounds = [_summary(body, target, start + begin, start + end)
-              if body.covers(start + begin, start + end) else dict(unknown)
+    rounds = [_summary_if_flown(body, target, start + begin, start + end)
               for begin, end in task.rounds]
     whole = _summary(body, target, start + task.rounds[0][0], start + task.rounds[-1][1])
     return {**whole, 'rounds': rounds}
@@ -417,6 +431,81 @@ def _lost(body, target, window):
     last = window.stop - 1
     return any(control_lost(target, position) for position in body.position[window]) or \
         control_lost(target, body.position[last], body.quaternion[last])
+
+
+def _winds(log, body, task, start):
+    """Errors at each wind speed; None where it was not flown to the end."""
+    return [{'speed_m_s': speed,
+             **_summary_if_flown(body, log.targets[0], begin + WIND_ONSET, end)}
+            for speed, begin, end in _level_windows(task, start)]
+
+
+def _pushes(log, body, task, start):
+    """Peak errors and recovery of each push, and mean speeds from the first push to the end."""
+    windows, pushes = _level_windows(task, start), []
+    for _, begin, end in windows:
+        push = dict.fromkeys(('peak_position_m', 'peak_orientation_deg', 'recovery_s'))
+        if body.covers(begin, end):
+            window = body.window(begin, end)
+            position, orientation = errors(body, log.targets[0], window)
+            outside = (position > RECOVERED[0]) | (orientation > RECOVERED[1])
+            push = {'peak_position_m': float(np.max(position)),
+                    'peak_orientation_deg': float(np.max(orientation)),
+                    'recovery_s': settling_time(body.t[window] - begin, outside)}
+        pushes.append(push)
+    whole = body.window(windows[0][1], windows[-1][2])
+    return {'speed_mean_m_s': _mean(np.linalg.norm(body.velocity[whole], axis=1)),
+            'angular_speed_mean_rad_s': _mean(
+                np.linalg.norm(body.angular_velocity[whole], axis=1)),
+            'pushes': pushes}
+
+
+def _steps(log, body):
+    """Response of each axis to its step away from the hover; None for one not flown to its end."""
+    responses = []
+    for k, (axis, step) in enumerate(zip(AXES, STEPS, strict=True)):
+        unit = 'm' if k < 3 else 'deg'
+        response = {**dict.fromkeys(('rise_s', 'settling_s', 'overshoot_percent')),
+                    f'end_error_{unit}': None}
+        target = log.targets[2 * k + 1] if len(log.targets) > 2 * k + 1 else None
+        if target and body.covers(target.stamp, target.stamp + POSE_DURATION):
+            window = body.window(target.stamp, target.stamp + POSE_DURATION)
+            values = body.position[window, k] if k < 3 else \
+                roll_pitch_yaw(body.quaternion[window])[:, k - 3]
+            response = step_response(body.t[window] - target.stamp, values, step)
+            end = response.pop('end') - HOVER[k] - step
+            response[f'end_error_{unit}'] = abs(end)
+        responses.append({'axis': axis, f'step_{unit}': float(step), **response})
+    return responses
+
+
+def step_response(times: np.ndarray, values: np.ndarray, step: float) -> dict:
+    """
+    Describe the response to a step, relative to its end, the mean of the last second.
+
+    Args:
+        times: (N,) since the step [s].
+        values: (N,).
+        step: commanded change of the value.
+
+    Returns:
+        ``rise_s`` from 10 to 90 %, ``settling_s`` to 5 %, ``overshoot_percent``, ``end``.
+
+    """
+    end = float(np.mean(values[times >= times[-1] - 1.0]))
+    done = 1 + (values - end) / step
+    low, high = (times[np.argmax(done >= share)] for share in (0.1, 0.9))
+    return {'rise_s': float(high - low),
+            'settling_s': settling_time(times, np.abs(done - 1) > SETTLED),
+            'overshoot_percent': float(100 * max(0.0, np.max(done) - 1)), 'end': end}
+
+
+def settling_time(times: np.ndarray, outside: np.ndarray) -> float | None:
+    """Time after which ``outside`` (N,) stays False; None if it is True at the end."""
+    late = np.flatnonzero(outside)
+    if not len(late):
+        return 0.0
+    return None if late[-1] == len(times) - 1 else float(times[late[-1] + 1])
 
 
 def _level_windows(task, start):

@@ -1,6 +1,7 @@
 """Result tables of flights."""
 
 from itertools import zip_longest
+from types import MappingProxyType
 
 from rich.console import Console
 
@@ -88,6 +89,22 @@ LEMNISCATE = {
                        'orientation_mean_deg': 8.06, 'orientation_std_deg': 2.45},
 }
 
+# Real robot, from the text: before a fan, and pushed by a stick.
+WIND = {
+    'NMPC, real robot': {'position_mean_m': 0.04, 'position_std_m': 0.028,
+                         'orientation_mean_deg': 4.27, 'orientation_std_deg': 1.32},
+    'RL, real robot': {'position_mean_m': 0.10, 'position_std_m': 0.005,
+                       'orientation_mean_deg': 3.55, 'orientation_std_deg': 0.63},
+}
+PUSHED = {
+    'NMPC, real robot': {'speed_mean_m_s': 0.033, 'angular_speed_mean_rad_s': 0.092},
+    'RL, real robot': {'speed_mean_m_s': 0.025, 'angular_speed_mean_rad_s': 0.081},
+}
+
+# Rise times of the same laboratory's NMPC: Li et al., Servo Integrated Nonlinear Model Predictive
+# Control for Overactuated Tiltable-Quadrotors (arXiv 2405.09871).
+RISE = {'x': 0.71, 'y': 0.70, 'z': 0.58, 'roll': 0.91, 'pitch': 0.89, 'yaw': 0.68}
+
 # Task -> published results of poses, and of tracking, in the form of our metrics.
 POSES = {'random100': RANDOM_POSES, 'waypoints': WAYPOINTS}
 TRACKING = {'lemniscate': LEMNISCATE}
@@ -110,14 +127,26 @@ def grids(results: dict, *, with_poses: bool | None = None) -> list[Grid]:
 
     made = [_summary(by_label, task)]
     if tracked := having('trajectory'):
-        made.append(_tracking(tracked, task))
+        rounds = [part for name, result in tracked.items() for part in (
+            *((name, str(k + 1), each) for k, each in enumerate(result['trajectory']['rounds'])),
+            (name, 'all', result['trajectory']))]
+        made.append(_spread('Trajectory tracking', 'round', rounds, TRACKING.get(task, {})))
     for kind, unit in (('force', 'N'), ('torque', 'N_m')):
         if disturbed := having(kind):
             made.append(_levels(disturbed, kind, unit))
     if loaded := having('payload'):
         made.append(_payloads(loaded))
     if hovered := having('hover'):
-        made.append(_hover(hovered))
+        made.append(_spread('Hover after 8 s', 'part', [
+            (name, 'all', result['hover']) for name, result in hovered.items()]))
+    if blown := having('wind'):
+        made.append(_spread('Hover before a fan', 'wind', [
+            (name, f"{part['speed_m_s']:g} m/s", part)
+            for name, result in blown.items() for part in result['wind']], WIND))
+    if pushed := having('pushes'):
+        made.append(_pushes(pushed))
+    if stepped := having('steps'):
+        made.append(_steps(stepped))
     for group in _same_poses(by_label):
         count = len(next(iter(group.values()))['poses'])
         if with_poses or (with_poses is None and 1 < count <= MANY_POSES):
@@ -174,18 +203,14 @@ def _reached(result):
     return f"{sum(pose['reached'] for pose in result['poses'])} of {len(result['poses'])}"
 
 
-def _tracking(by_label, task):
-    header = ['', 'round', 'position mean ± std (max) [m]', 'orientation mean ± std (max) [deg]']
-    rows = []
-    for name, result in by_label.items():
-        tracking = result['trajectory']
-        for k, part in enumerate(tracking['rounds']):
-            rows.append([name, str(k + 1), *_tracking_cells(part)])
-        rows.append([name, 'all', *_tracking_cells(tracking)])
+def _spread(title, column, parts, published=MappingProxyType({})):
+    """Table of both errors of each part (controller, name, errors) of flights."""
+    header = ['', column, 'position mean ± std (max) [m]', 'orientation mean ± std (max) [deg]']
+    rows = [[label, name, *_tracking_cells(part)] for label, name, part in parts]
     ours = len(rows)
     rows += [[f'published {name}', 'all', *_tracking_cells(part)]
-             for name, part in TRACKING.get(task, {}).items()]
-    return Grid('Trajectory tracking', header, rows, frozenset(range(ours, len(rows))))
+             for name, part in published.items()]
+    return Grid(title, header, rows, frozenset(range(ours, len(rows))))
 
 
 def _tracking_cells(part):
@@ -229,10 +254,34 @@ def _payloads(by_label):
     return Grid('Payload, steady errors', header, rows)
 
 
-def _hover(by_label):
-    header = ['', 'position mean ± std (max) [m]', 'orientation mean ± std (max) [deg]']
-    rows = [[name, *_tracking_cells(result['hover'])] for name, result in by_label.items()]
-    return Grid('Hover after 8 s', header, rows)
+def _pushes(by_label):
+    header = ['', 'push', 'peak position [m]', 'peak orientation [deg]', 'recovery [s]',
+              'mean speed [m/s]', 'mean rate [rad/s]']
+    rows = []
+    for name, result in by_label.items():
+        rows += [[name, str(k + 1), number(push['peak_position_m'], 3),
+                  number(push['peak_orientation_deg'], 2), number(push['recovery_s'], 2), '', '']
+                 for k, push in enumerate(result['pushes']['pushes'])]
+        rows.append([name, 'all', '', '', '', *_mean_speeds(result['pushes'])])
+    ours = len(rows)
+    rows += [[f'published {name}', 'all', '', '', '', *_mean_speeds(part)]
+             for name, part in PUSHED.items()]
+    return Grid('Stick pushes', header, rows, frozenset(range(ours, len(rows))))
+
+
+def _mean_speeds(part):
+    return (number(part['speed_mean_m_s'], 3), number(part['angular_speed_mean_rad_s'], 3))
+
+
+def _steps(by_label):
+    header = ['step', *(f'{name}: {what}' for name in by_label for what in (
+        'rise [s]', 'settling [s]', 'overshoot [%]')), 'published rise [s]']
+    rows = []
+    for steps in zip(*(result['steps'] for result in by_label.values()), strict=True):
+        axis = steps[0]['axis']
+        rows.append([axis, *(number(step[key], digits) for step in steps for key, digits in (
+            ('rise_s', 2), ('settling_s', 2), ('overshoot_percent', 1))), number(RISE[axis], 2)])
+    return Grid('Step responses', header, rows)
 
 
 def _poses(by_label):

@@ -2,7 +2,8 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from math import cos, pi, sin
+from functools import partial
+from math import cos, exp, pi, sin, sqrt
 from pathlib import Path
 import re
 
@@ -15,10 +16,6 @@ from beetle_omni_ros.runs.targets import read_poses
 
 POSE_DURATION = 8.0  # [s] of one pose
 HOVER_DURATION = 60.0  # [s]
-DISTURBANCE_PERIOD = 2.0  # [s] between disturbance levels
-TORQUE_IMPULSE = 0.05  # [s]
-FORCE_LEVELS = np.arange(10.0, 101.0, 10.0)  # [N] upwards
-TORQUE_LEVELS = np.arange(2.5, 30.1, 2.5)  # [N m]
 PAYLOADS = (0.0, 0.25, 0.5, 0.75, 1.0)  # [kg]
 LOST_POSITION = 1.5  # [m] position error above which control is lost
 LOST_ORIENTATION = np.radians(90)  # [rad] the same for the orientation, at the end of a level
@@ -34,25 +31,67 @@ WAYPOINTS = np.array([[0.0, 0.0, 0.8, 0.0, 0.0, 0.0],
                       [0.0, 0.0, 0.8, 0.0, 0.0, 90.0]])
 WAYPOINT_ROUNDS = 3
 
+# Task -> kind, direction (force in world, torque in base_link), levels [N] or [N m], duration of a
+# push and of the rest after it [s]. The first two are those of the published figure, which rise
+# without a return to rest. The others are the protocol of the authors, with a rest.
+AUTHORS_LEVELS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
+RISING = {
+    'force': ('force', (0, 0, 1, 0, 0, 0), tuple(np.arange(10.0, 101.0, 10.0)), 2.0, 0.0),
+    'torque': ('torque', (0, 0, 0, 1, 0, 0), tuple(np.arange(2.5, 30.1, 2.5)), 0.05, 1.95),
+    'force_down': ('force', (0, 0, -1, 0, 0, 0), AUTHORS_LEVELS, 2.0, 2.0),
+    'force_up': ('force', (0, 0, 1, 0, 0, 0), AUTHORS_LEVELS, 2.0, 2.0),
+    'torque_pulses': ('torque', (0, 0, 0, 1, 0, 0), AUTHORS_LEVELS, 0.05, 5.0),
+}
+
+# Task 'wind': a fan blows along x for 10 s at each speed. On the robot at rest in hover, wind u
+# has the force k u + c |u| u. k is the drag of the rotors in their plane (Faessler et al. 2018),
+# and along their axes (Leishman 2006, ch. 2), with the usual values of robot/effects.py. c is 0.5
+# x 1.2 kg/m^3 x 1.05 x 0.029 m^2: drag coefficient of a cube (Hoerner 1965), and the silhouette of
+# the meshes from the side. On the axis of a free round jet, the turbulence is 0.25 of the speed,
+# and its integral length 0.7 half-widths (Pope 2000, ch. 5); a half-width of 0.25 m covers the
+# robot. The spectrum is Dryden's longitudinal one, first-order filtered noise, for all three axes.
+WIND_SPEEDS = (2.0, 3.0, 4.0)  # [m/s]
+WIND_DURATION = 10.0  # [s] of one speed
+WIND_SAMPLE = 0.02  # [s] of constant force
+ROTOR_DRAG = np.array([0.4, 0.4, 1.6])  # [N s/m] k of all rotors, in x, y and z
+BODY_DRAG = 0.018  # [N s^2/m^2] c
+TURBULENCE = 0.25  # [-]
+EDDY = 0.7 * 0.25  # [m] integral length
+
+# Task 'pushes': a stick pushes from four sides, 0.1 m above base_link. The publication states no
+# size. This impulse makes mean speeds of its order.
+PUSH_FORCE = 10.0  # [N]
+PUSH_DURATION = 0.1  # [s]
+PUSH_HEIGHT = 0.1  # [m]
+PUSH_PERIOD = 5.0  # [s]
+PUSH_SIDES = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
+
+# Task 'steps': each axis steps alone from the hover and back. The steps are those of the set
+# points in the authors' code (`SetPointTraj`).
+STEPS = np.array([0.3, 0.2, 0.5, *np.degrees([0.5, 0.5, 0.3])])  # [m], [deg]
+
 # The 3D lemniscate of the publication: a figure of eight with varying height and attitude. With
 # the phase phi, one round of which is 2 pi, and theta = phi + pi / 2:
 #   x = A cos(theta),  y = A sin(2 theta) / 2,  z = H + C sin(2 theta + pi / 2)
 #   roll = -D sin(2 theta),  pitch = D cos(theta),  yaw = pi / 2 (1 - sin(theta))
-# Curve and numbers are those of the authors' code (`LemniscateTrajOmni` in
-# https://github.com/jsk-ros-pkg/jsk_aerial_robot). Yaw is within [0, pi] there; the publication
-# states [0, 2 pi]. In addition, the phase starts and ends at rest here: its rate follows a quintic
-# smoothstep over ramps before the first and after the last round, so all rounds have equal speed.
+# Curve and numbers, also both values of D, are those of the authors' code (`LemniscateTrajOmni` in
+# https://github.com/jsk-ros-pkg/jsk_aerial_robot and its forks). Yaw is within [0, pi] there; the
+# publication states [0, 2 pi]. In addition, the phase starts and ends at rest here: its rate
+# follows a quintic smoothstep over ramps before the first and after the last round, so all rounds
+# have equal speed.
 LENGTH = 1.0  # [m] A, half the extent in x, and the extent in y
 HEIGHT = 1.0  # [m] H, mean height
 RISE = 0.3  # [m] C, half the extent in z
-TILT = 0.5  # [rad] D, largest roll and pitch
+TILTS = {'lemniscate': 0.5, 'lemniscate_large': 2.5}  # [rad] D, largest roll and pitch
 PERIOD = 20.0  # [s] of one round
 ROUNDS = 5
 RAMP = 4.0  # [s] from rest to full speed
 DURATION = 2 * RAMP + ROUNDS * PERIOD  # [s]
 SAMPLE_PERIOD = 0.02  # [s] between the samples of the published trajectory
 
-NAMES = ('waypoints', 'random100', 'lemniscate', 'hover', 'force', 'torque', 'payload')
+NAMES = ('waypoints', 'random100', *TILTS, 'hover', *RISING, 'wind', 'pushes', 'payload',
+         'steps')
+WITH_WRENCHES = ('force', 'torque', 'wind', 'pushes')  # kinds of tasks
 
 
 @dataclass(frozen=True)
@@ -66,7 +105,8 @@ class Segment:
         force_world: (3,) external force in world [N].
         torque_body: (3,) external torque in base_link [N m].
         payload: mass attached below the body [kg].
-        level: disturbance level of this segment [N, N m or kg], 0 for none.
+        level: disturbance level of this segment [N, N m, m/s or kg] or number of a push, 0 for
+            none.
 
     """
 
@@ -85,7 +125,8 @@ class Task:
 
     Attributes:
         name: name or file given by the user.
-        kind: 'poses', 'trajectory', 'hover', 'force', 'torque' or 'payload'.
+        kind: 'poses', 'trajectory', 'hover', 'force', 'torque', 'wind', 'pushes', 'payload' or
+            'steps'; it decides the metrics.
         segments: segments in order.
         poses: (P, 6) pose targets in order: x, y, z [m], roll, pitch, yaw [deg].
         rounds: (start, end) of each round of a trajectory, since the task's start [s].
@@ -225,7 +266,7 @@ def make_task(name: str | Path, seed: int = 0, reach: float = np.inf) -> Task:
         return _pose_task(name, np.tile(WAYPOINTS, (WAYPOINT_ROUNDS, 1)))
     if match := re.fullmatch(r'random([1-9]\d{0,5})', name):
         return _pose_task(name, random_poses(int(match[1]), seed))
-    if name == 'lemniscate':
+    if name in TILTS:
         return _lemniscate_task(name)
     if name == 'hover':
         return Task(name, name, (Segment(HOVER_DURATION, _builder(HOVER)),), HOVER[None])
@@ -233,13 +274,19 @@ def make_task(name: str | Path, seed: int = 0, reach: float = np.inf) -> Task:
         return Task(name, name, tuple(
             Segment(POSE_DURATION, _builder(HOVER), payload=mass, level=mass)
             for mass in PAYLOADS), np.tile(HOVER, (len(PAYLOADS), 1)))
-    if name in ('force', 'torque'):
-        levels = [Segment(DISTURBANCE_PERIOD, force_world=np.array([0.0, 0.0, level]), level=level)
-                  for level in FORCE_LEVELS] if name == 'force' else [
-            segment for level in TORQUE_LEVELS for segment in (
-                Segment(TORQUE_IMPULSE, torque_body=np.array([level, 0.0, 0.0]), level=level),
-                Segment(DISTURBANCE_PERIOD - TORQUE_IMPULSE, level=level))]
-        return Task(name, name, (Segment(POSE_DURATION, _builder(DISTURBED)), *levels),
+    if name == 'steps':
+        poses = np.vstack([HOVER, *(pose for step in np.diag(STEPS)
+                                    for pose in (HOVER + step, HOVER))])
+        return _pose_task(name, poses, kind=name)
+    if name in ('wind', 'pushes'):
+        disturbed = _wind(np.random.default_rng(seed)) if name == 'wind' else _stick()
+        return Task(name, name, (Segment(POSE_DURATION, _builder(HOVER)), *disturbed), HOVER[None])
+    if name in RISING:
+        kind, direction, levels, push, rest = RISING[name]
+        segments = [segment for level in levels for segment in (
+            _push(push, level * np.array(direction), level), Segment(rest, level=level))
+            if segment.duration]
+        return Task(name, kind, (Segment(POSE_DURATION, _builder(DISTURBED)), *segments),
                     DISTURBED[None])
     if name.lower().endswith('.csv') or name and Path(name).exists():
         return _pose_task(name, read_poses(name, reach))
@@ -260,21 +307,50 @@ def pose_target(pose: np.ndarray, stamp: float = 0.0) -> PoseTarget:
                       rotations.from_rpy(*np.radians(pose[3:])), stamp)
 
 
+def _push(duration, wrench, level):
+    """Segment with a wrench (6,): force in world [N], torque in base_link [N m]."""
+    return Segment(duration, force_world=wrench[:3], torque_body=wrench[3:], level=level)
+
+
+def _wind(rng):
+    """Segments of a fan."""
+    for speed in WIND_SPEEDS:
+        count = round(WIND_DURATION / WIND_SAMPLE)
+        kept = exp(-WIND_SAMPLE * speed / EDDY)
+        gusts = TURBULENCE * speed * rng.standard_normal((count, 3))
+        for k in range(1, count):
+            gusts[k] = kept * gusts[k - 1] + sqrt(1 - kept ** 2) * gusts[k]
+        for gust in gusts:
+            wind = gust + [speed, 0, 0]
+            force = ROTOR_DRAG * wind + BODY_DRAG * np.linalg.norm(wind) * wind
+            yield _push(WIND_SAMPLE, np.concatenate([force, np.zeros(3)]), speed)
+
+
+def _stick():
+    """Segments of stick pushes."""
+    for k, side in enumerate(PUSH_SIDES):
+        force = PUSH_FORCE * side
+        torque = np.cross([0, 0, PUSH_HEIGHT], force)
+        yield _push(PUSH_DURATION, np.concatenate([force, torque]), k + 1)
+        yield Segment(PUSH_PERIOD - PUSH_DURATION, level=k + 1)
+
+
 def _builder(pose):
     return lambda start: pose_target(pose, start)
 
 
-def _pose_task(name, poses):
+def _pose_task(name, poses, kind='poses'):
     segments = tuple(Segment(POSE_DURATION, _builder(pose)) for pose in poses)
-    return Task(name, 'poses', segments, poses)
+    return Task(name, kind, segments, poses)
 
 
 def _lemniscate_task(name):
-    first = lemniscate(0.0)
+    tilt = TILTS[name]
+    first = lemniscate(0.0, tilt)
     pose = np.concatenate([first.position, np.degrees(rotations.to_rpy(first.quaternion))])
     begin = POSE_DURATION + RAMP
-    return Task(name, 'trajectory', (Segment(POSE_DURATION, _builder(pose)),
-                                     Segment(DURATION, lemniscate_target)), pose[None],
+    path = Segment(DURATION, partial(lemniscate_target, tilt=tilt))
+    return Task(name, 'trajectory', (Segment(POSE_DURATION, _builder(pose)), path), pose[None],
                 tuple((begin + k * PERIOD, begin + (k + 1) * PERIOD) for k in range(ROUNDS)))
 
 
@@ -302,17 +378,21 @@ def _ramp_phase(time, rate):
     return rate * RAMP * s ** 4 * (2.5 - 3 * s + s * s)
 
 
-def lemniscate(time: float) -> Reference:
-    """Return pose and velocity in world and body rates at ``time`` since the start [s]."""
+def lemniscate(time: float, tilt: float) -> Reference:
+    """
+    Return pose and velocity in world and body rates at ``time`` since the start [s].
+
+    ``tilt`` is the largest roll and pitch [rad].
+    """
     phi, rate = lemniscate_phase(time)
     once, twice = phi + pi / 2, 2 * phi + pi
     position = np.array([LENGTH * cos(once), LENGTH / 2 * sin(twice),
                          HEIGHT + RISE * sin(twice + pi / 2)])
     velocity = rate * np.array([-LENGTH * sin(once), LENGTH * cos(twice),
                                 2 * RISE * cos(twice + pi / 2)])
-    roll, pitch, yaw = -TILT * sin(twice), TILT * cos(once), pi / 2 * (1 - sin(once))
+    roll, pitch, yaw = -tilt * sin(twice), tilt * cos(once), pi / 2 * (1 - sin(once))
     roll_rate, pitch_rate, yaw_rate = rate * np.array([
-        -2 * TILT * cos(twice), -TILT * sin(once), -pi / 2 * cos(once)])
+        -2 * tilt * cos(twice), -tilt * sin(once), -pi / 2 * cos(once)])
     angular_velocity = np.array([  # body rates of R = Rz(yaw) Ry(pitch) Rx(roll)
         roll_rate - yaw_rate * sin(pitch),
         pitch_rate * cos(roll) + yaw_rate * cos(pitch) * sin(roll),
@@ -320,10 +400,10 @@ def lemniscate(time: float) -> Reference:
     return Reference(position, rotations.from_rpy(roll, pitch, yaw), velocity, angular_velocity)
 
 
-def lemniscate_target(start: float) -> TrajectoryTarget:
-    """Return the whole lemniscate, beginning at ``start`` [s]."""
+def lemniscate_target(start: float, tilt: float) -> TrajectoryTarget:
+    """Return the whole lemniscate of largest roll and pitch ``tilt``, from ``start`` [s]."""
     times = np.linspace(0.0, DURATION, round(DURATION / SAMPLE_PERIOD) + 1)
-    samples = [lemniscate(float(t)) for t in times]
+    samples = [lemniscate(float(t), tilt) for t in times]
     columns = (np.array([getattr(sample, name) for sample in samples])
                for name in ('position', 'quaternion', 'velocity', 'angular_velocity'))
     return TrajectoryTarget(start + times, *columns, stamp=start)

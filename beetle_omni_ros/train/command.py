@@ -28,7 +28,8 @@ from beetle_omni_ros.train.runner import is_rank_zero, Runner
 PARAMETER_FILE, POLICY_FILE = 'train.yaml', 'policy.onnx'
 # A run of less than a minute on a CPU that executes every part; the policy learns nothing.
 SMOKE = {'iterations': 3, 'log_every': 1, 'save_every': 2, 'ppo.robots': 32, 'ppo.steps': 8,
-         'ppo.epochs': 2, 'ppo.minibatches': 2, 'network.hidden': [32, 16, 16]}
+         'ppo.epochs': 2, 'ppo.minibatches': 2, 'network.hidden': [32, 16, 16],
+         'network.critic': [32, 16, 16]}
 ROBOTS, CPU_ROBOTS = 8192, 64            # robots of the final assessment
 COLUMNS = (('iteration', 'iteration', '{:.0f}'), ('seconds', 'time s', '{:.0f}'),
            ('samples_per_second', 'samples/s', '{:.2e}'), ('reward', 'reward', '{:+.4f}'),

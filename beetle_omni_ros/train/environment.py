@@ -28,7 +28,7 @@ from beetle_omni_ros.train.starts import (
     Starts,
 )
 
-NUMBERS = 167       # random numbers for each robot and step
+NUMBERS = 169       # random numbers for each robot and step
 REACHED_POSITION, REACHED_ATTITUDE = 0.10, 0.17453    # [m], [rad] limits of the task metrics
 
 
@@ -89,7 +89,7 @@ class TiltableQuadrotorEnv(VecEnv):
         self._finish = self._after_physics
         if compiled if compiled is not None else self.device.type == 'cuda':
             self._finish = torch.compile(self._after_physics, fullgraph=True, dynamic=False)
-        self.observation, self.critic = self._observe(self.state, batch.Draw(numbers[:, 130:]))
+        self.observation, self.critic = self._observe(self.state, batch.Draw(numbers[:, 131:]))
         self.reward = torch.zeros(self.num_envs, device=self.device)
         self.done, self.timeout = self.reward > 0, self.reward > 0
 

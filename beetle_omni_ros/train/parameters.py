@@ -48,6 +48,8 @@ class EpisodeParameters:
                                   low=1, high=200)
     hold_targets: float = parameter(0.1, doc='fraction of new targets near the present pose, '
                                              'to train holding', low=0, high=1)
+    level_targets: float = parameter(0.1, doc='fraction of the other targets with a level '
+                                              'attitude', low=0, high=1)
     trim_share: float = parameter(
         0.5, doc='fraction of robots that fly with the trimming, whose integral needs damping; '
         'the others need accuracy', low=0, high=1)
@@ -201,7 +203,8 @@ class RewardWeights:
 class NetworkParameters:
     """Networks of actor and critic."""
 
-    hidden: np.ndarray = parameter([512, 256, 128], doc='published')
+    hidden: np.ndarray = parameter([512, 256, 128], doc='layers of the actor; published')
+    critic: np.ndarray = parameter([512, 256, 128], doc='layers of the critic; published')
     output_scale: float = parameter(4.0, doc='action for each unit of the last layer', low=0.01,
                                     high=100)
     carry: float = parameter(0.7, doc='factor of the previous action in the output', low=0, high=1)
@@ -212,10 +215,11 @@ class NetworkParameters:
                                   low=0, high=10)
 
     def __post_init__(self):
-        sizes = self.hidden
-        if sizes.ndim != 1 or not sizes.size or (sizes < 1).any() or (sizes % 1).any():
-            raise ParameterError("key 'hidden': expected the sizes of the hidden layers, found "
-                                 f'{sizes.tolist()}')
+        for name in ('hidden', 'critic'):
+            sizes = getattr(self, name)
+            if sizes.ndim != 1 or not sizes.size or (sizes < 1).any() or (sizes % 1).any():
+                raise ParameterError(f"key '{name}': expected the sizes of the hidden layers, "
+                                     f'found {sizes.tolist()}')
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,7 +25,8 @@ SCHEDULE_EVERY = 10      # iterations between two changes of the schedule
 
 def rsl_rl_configuration(p: TrainParameters) -> dict:
     """Configuration of rsl-rl's runner for these parameters."""
-    hidden = [int(size) for size in p.network.hidden]
+    hidden, critic = ([int(size) for size in sizes]
+                      for sizes in (p.network.hidden, p.network.critic))
     stds = [float(p.network.tilt_std)] * 4 + [float(p.network.thrust_std)] * 4
     place = 'beetle_omni_ros.train'
     return {
@@ -36,7 +37,7 @@ def rsl_rl_configuration(p: TrainParameters) -> dict:
                   'carry': p.network.carry, 'last_gain': p.network.last_gain,
                   'distribution_cfg': {'class_name': f'{place}.network:BoundedGaussian',
                                        'stds': stds}},
-        'critic': {'class_name': f'{place}.network:CriticModel', 'hidden_dims': hidden,
+        'critic': {'class_name': f'{place}.network:CriticModel', 'hidden_dims': critic,
                    'activation': 'elu'},
         'algorithm': {'class_name': f'{place}.ppo:GraphPpo', 'num_learning_epochs': p.ppo.epochs,
                       'num_mini_batches': p.ppo.minibatches, 'clip_param': p.ppo.clip,

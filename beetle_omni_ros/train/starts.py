@@ -140,7 +140,11 @@ class Starts:
         angle = d.around(1.0, 3)
         place = torch.where(near, position + NEAR_POSITION * offset, 0.5 * self._region * offset)
         turned = batch.product(attitude, batch.from_rotation_vector(NEAR_ANGLE * angle))
-        target = torch.where(near, turned, d.attitude())
+        free = d.attitude()
+        # the heading of a free attitude, because robots hover level more often than at any other
+        level = torch.nn.functional.normalize(free * free.new_tensor([1.0, 0.0, 0.0, 1.0]), dim=-1)
+        free = torch.where(d.chance(e.level_targets), level, free)
+        target = torch.where(near, turned, free)
         return {'target_position': place, 'target_attitude': target,
                 'target_left': torch.floor(d.uniform(1, *self._target_time))[:, 0],
                 'floor': torch.minimum(place[:, 2:], position[:, 2:]),

@@ -87,7 +87,7 @@ def test_joints_with_half_a_turn_to_go_turn_with_the_body_in_spite_of_noise(axis
 
 
 def test_commands_lead_a_moving_reference_so_that_the_lag_arrives_on_time():
-    target = lemniscate_target(0.0)
+    target = lemniscate_target(0.0, 0.5)
     reference = planner().plan(target, 20.0, LEVEL, np.zeros(4), np.zeros(10))
     for values, lead, lag in ((TILT, TILT_LEAD, LAG),
                               (THRUST, THRUST_LEAD, ROBOT.rotors.time_constant)):

@@ -76,6 +76,18 @@ def test_trajectory_windows_join_without_a_gap_and_keep_to_the_path(reference):
     assert conversions.take_trajectory(node._trajectories[0]).times[0] == pytest.approx(2008.0)
 
 
+def test_a_stick_push_of_the_task_is_published_for_its_duration(reference):
+    node, clock = reference('pushes')
+    node._wrenches, impulse = Sent('disturbance'), np.zeros(3)
+    node._on_supervisor('flying:nmpc')
+    while clock.now < 2012.9:
+        node._on_timer()
+        force = node._wrenches[-1].wrench.force
+        impulse += 0.005 * np.array([force.x, force.y, force.z])
+        clock.now += 0.005
+    assert impulse == pytest.approx([1.0, 0, 0], abs=0.06)
+
+
 def test_the_estimator_publishes_only_valid_estimates(make):
     node = make(EkfNode)
     node._publisher = Sent('odom')

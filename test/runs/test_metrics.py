@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 from synthetic_flights import (
     fly,
@@ -19,7 +20,7 @@ from beetle_omni_ros.control.base import TrajectoryTarget
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.runs.files import write_json
 from beetle_omni_ros.runs.log import geodesic_angles, LogRecorder, roll_pitch_yaw
-from beetle_omni_ros.runs.metrics import metrics, metrics_by_controller
+from beetle_omni_ros.runs.metrics import metrics, metrics_by_controller, step_response
 from beetle_omni_ros.runs.tasks import make_task, pose_target
 
 LEVEL = np.array([0, 0, 0, 1.0])
@@ -205,6 +206,78 @@ def test_the_level_at_which_control_was_lost_is_reported():
     complete = metrics(flown(task), task)['force']
     assert complete['lost_at_N'] is None
     assert complete['withstood_N'] == 100
+
+
+def test_a_step_of_a_second_order_system_has_its_known_rise_settling_and_overshoot():
+    damping, frequency = 0.6, 5.0
+    fast = frequency * np.sqrt(1 - damping ** 2)
+
+    def response(t):
+        return 1 - np.exp(-damping * frequency * t) * (
+            np.cos(fast * t) + damping / np.sqrt(1 - damping ** 2) * np.sin(fast * t))
+
+    peak = np.pi / fast
+    rise = np.diff([brentq(lambda t, s=share: response(t) - s, 0, peak) for share in (0.1, 0.9)])
+    settling = brentq(lambda t: response(t) - 1.05, peak, 2 * peak)     # the last crossing
+    times = np.arange(0, 8.001, 0.001)
+    found = step_response(times, 3.0 - 0.4 * response(times), -0.4)
+    assert found['rise_s'] == pytest.approx(rise[0], abs=2e-3)
+    assert found['settling_s'] == pytest.approx(settling, abs=2e-3)
+    assert found['overshoot_percent'] == pytest.approx(
+        100 * np.exp(-np.pi * damping / np.sqrt(1 - damping ** 2)), abs=0.01)
+    assert found['end'] == pytest.approx(2.6)
+
+
+def test_each_axis_has_its_own_step_response():
+    task, recorder = make_task('steps'), LogRecorder()
+    lags = [0.2 + 0.1 * k for k in range(6)]
+    write_state(recorder, 0.0, 'flying:nmpc')
+    for k, target in enumerate(task.targets(1.0)):
+        recorder.write_target(target)
+        before, now = np.array(HOVER), task.poses[k]
+        for t in np.arange(0.005, 8.001, 0.005) if k < 10 else ():  # no step of pitch and yaw
+            pose = now + (before - now) * np.exp(-t / lags[min(k // 2, 5)]) * (k % 2)
+            write_truth(recorder, target.stamp + t, pose[:3],
+                        rotations.from_rpy(*np.radians(pose[3:])), np.zeros(3), np.zeros(3))
+    steps = metrics(recorder.log(), task)['steps']
+    assert [step['axis'] for step in steps] == ['x', 'y', 'z', 'roll', 'pitch', 'yaw']
+    assert [step['step_m'] for step in steps[:3]] == [0.3, 0.2, 0.5]
+    assert [step['step_deg'] for step in steps[3:]] == pytest.approx(np.degrees([0.5, 0.5, 0.3]))
+    for step, lag in zip(steps[:5], lags, strict=False):    # of a first-order lag
+        assert step['rise_s'] == pytest.approx(lag * np.log(9), abs=6e-3)
+        assert step['settling_s'] == pytest.approx(lag * np.log(20), abs=6e-3)
+        assert step['overshoot_percent'] < 0.1
+    assert steps[5]['rise_s'] is None
+
+
+def test_pushes_report_their_peaks_and_when_the_robot_has_recovered():
+    task, recorder = make_task('pushes'), LogRecorder()
+    target, = task.targets(0.0)
+    write_state(recorder, -1.0, 'flying:nmpc')
+    recorder.write_target(target)
+    for t in np.arange(0, 28.001, 0.005):
+        since = (t - 8.001) % 5 if t > 8.001 else 100.0
+        lag = 1.0 if t < 23.001 else 5.0        # the last push is not settled after 5 s
+        write_truth(recorder, t, target.position + [0.1 * np.exp(-since / lag), 0, 0],
+                    target.quaternion, np.array([0.03, 0, 0.04]), np.array([0, 0.2, 0]))
+    pushes = metrics(recorder.log(), task)['pushes']
+    assert pushes['speed_mean_m_s'] == pytest.approx(0.05)
+    assert pushes['angular_speed_mean_rad_s'] == pytest.approx(0.2)
+    assert [push['peak_position_m'] for push in pushes['pushes']] == pytest.approx(
+        [0.1] * 4, abs=1e-3)
+    assert [push['recovery_s'] for push in pushes['pushes'][:3]] == pytest.approx(
+        [np.log(5)] * 3, abs=6e-3)
+    assert pushes['pushes'][3]['recovery_s'] is None
+
+
+def test_each_wind_speed_that_was_flown_to_its_end_has_its_errors():
+    task = make_task('wind')
+    slow, middle, fast = metrics(flown(task, duration=29.0), task)['wind']
+    for part in (slow, middle):
+        assert part['position_mean_m'] == pytest.approx(0.02, abs=1e-6)
+        assert part['orientation_std_deg'] == pytest.approx(0.0, abs=1e-6)
+    assert [part['speed_m_s'] for part in (slow, middle, fast)] == [2, 3, 4]
+    assert fast['position_mean_m'] is None
 
 
 def test_metrics_of_an_empty_flight_are_empty_and_strict_json(tmp_path):

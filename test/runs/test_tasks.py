@@ -2,7 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from beetle_omni_ros.control.base import TrajectoryTarget
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.runs.tasks import (
     DURATION,
@@ -38,10 +40,11 @@ def test_random_poses_fill_the_stated_ranges_and_follow_the_seed():
     assert np.array_equal(make_task('random100', seed=1).poses, poses[:100])
 
 
-def test_lemniscate_derivatives_agree_with_finite_differences():
+@pytest.mark.parametrize('tilt', [0.5, 2.5])
+def test_lemniscate_derivatives_agree_with_finite_differences(tilt):
     step = 1e-5
     for t in np.linspace(0.01, DURATION - 0.01, 301):
-        before, now, after = (lemniscate(t + dt) for dt in (-step, 0, step))
+        before, now, after = (lemniscate(t + dt, tilt) for dt in (-step, 0, step))
         velocity = (after.position - before.position) / (2 * step)
         turn = rotations.log(rotations.multiply(rotations.conjugate(before.quaternion),
                                                 after.quaternion))
@@ -49,39 +52,80 @@ def test_lemniscate_derivatives_agree_with_finite_differences():
         assert now.angular_velocity == pytest.approx(turn / (2 * step), abs=1e-6)
 
 
-def test_each_round_of_the_lemniscate_is_the_curve_of_the_authors():
-    period = 20.0
-    for begin, end in make_task('lemniscate').rounds:
+@pytest.mark.parametrize(('name', 'tilt'), [('lemniscate', 0.5), ('lemniscate_large', 2.5)])
+def test_each_round_of_the_lemniscate_is_the_curve_of_the_authors(name, tilt):
+    period, task = 20.0, make_task(name)
+    path, = (target for target in task.targets(0.0) if isinstance(target, TrajectoryTarget))
+    for begin, end in task.rounds:
         assert end - begin == pytest.approx(period)
         for t in np.linspace(0, period, 101):
             w, shifted = 2 * np.pi / period, t + period / 4
-            given = lemniscate(begin - 8.0 + t)
-            assert given.position == pytest.approx(
+            given = path.sample(np.array([begin + t]))
+            assert given.position[0] == pytest.approx(
                 [np.cos(w * shifted), np.sin(2 * w * shifted) / 2,
-                 1.0 + 0.3 * np.sin(2 * w * shifted + np.pi / 2)], abs=1e-9)
-            assert rotations.to_rpy(given.quaternion) == pytest.approx(
-                [-0.5 * np.sin(2 * w * shifted), 0.5 * np.cos(w * shifted),
-                 np.pi / 2 * np.sin(w * shifted + np.pi) + np.pi / 2], abs=1e-9)
+                 1.0 + 0.3 * np.sin(2 * w * shifted + np.pi / 2)], abs=1e-4)
+            attitude = Rotation.from_euler('xyz', [
+                -tilt * np.sin(2 * w * shifted), tilt * np.cos(w * shifted),
+                np.pi / 2 * np.sin(w * shifted + np.pi) + np.pi / 2])
+            assert (attitude.inv() * Rotation.from_quat(given.quaternion[0])).magnitude() < 1e-4
 
 
-def _impulse(task, tick=0.005):
-    """Integral of force and torque over the flight, by level."""
-    player, t, total = TaskPlayer(task, 0.0), 0.0, {}
+def _played(task, tick=0.005):
+    """Times (N,) and wrenches (N, 6) of a task."""
+    player, t, rows = TaskPlayer(task, 0.0), 0.0, []
     while not (moment := player.update(t)).finished:
-        size = float(np.abs(moment.force_world).sum() + np.abs(moment.torque_body).sum())
-        if size:
-            total[size] = total.get(size, 0.0) + size * tick
+        rows.append(np.concatenate([[t], moment.force_world, moment.torque_body]))
         t += tick
-    return total
+    rows = np.array(rows)
+    return rows[:, 0], rows[:, 1:]
 
 
-@pytest.mark.parametrize(('name', 'levels', 'seconds'), [
-    ('force', np.arange(10.0, 101, 10), 2.0), ('torque', np.arange(2.5, 30.1, 2.5), 0.05)])
-def test_pushes_rise_in_equal_steps_and_last_their_time(name, levels, seconds):
-    impulses = _impulse(make_task(name))
-    assert list(impulses) == pytest.approx(levels)
-    for level, impulse in impulses.items():
-        assert impulse == pytest.approx(seconds * level, rel=0.01)
+AUTHORS = [1, 2, 5, 10, 20, 50, 100]
+
+
+@pytest.mark.parametrize(('name', 'axis', 'levels', 'seconds', 'period'), [
+    ('force', [0, 0, 1, 0, 0, 0], np.arange(10.0, 101, 10), 2.0, 2.0),
+    ('torque', [0, 0, 0, 1, 0, 0], np.arange(2.5, 30.1, 2.5), 0.05, 2.0),
+    ('force_down', [0, 0, -1, 0, 0, 0], AUTHORS, 2.0, 4.0),
+    ('force_up', [0, 0, 1, 0, 0, 0], AUTHORS, 2.0, 4.0),
+    ('torque_pulses', [0, 0, 0, 1, 0, 0], AUTHORS, 0.05, 5.05)])
+def test_each_level_has_the_impulse_of_its_protocol(name, axis, levels, seconds, period):
+    times, wrenches = _played(make_task(name))
+    assert not wrenches[times < 7.99].any()
+    for k, level in enumerate(levels):
+        during = (times > 7.999 + k * period) & (times < 7.999 + (k + 1) * period)
+        assert wrenches[during].sum(axis=0) * 0.005 == pytest.approx(
+            seconds * level * np.array(axis), rel=0.01)
+        assert np.abs(wrenches[during]).max() == level
+    assert times[-1] == pytest.approx(8 + len(levels) * period, abs=0.01)
+
+
+def test_the_wind_has_the_stated_mean_intensity_and_length_and_follows_the_seed():
+    shares, (times, first) = [], _played(make_task('wind', 0), 0.02)
+    for seed in range(12):
+        again = _played(make_task('wind', seed), 0.02)[1]
+        assert np.array_equal(first, again) == (seed == 0)
+        for k, speed in enumerate((2, 3, 4)):
+            force = again[(times > 7.999 + 10 * k) & (times < 17.999 + 10 * k)]
+            drag = 0.4 * speed + 0.018 * speed ** 2
+            # The vertical force is nearly linear in the gust.
+            lift = force[:, 2] / (1.6 + 0.018 * speed)
+            lag = 0.7 * 0.25 / speed
+            near, far = int(lag / 0.02), int(lag / 0.02) + 1
+            correlation = [np.corrcoef(lift[:-n], lift[n:])[0, 1] for n in (near, far)]
+            shares.append([force[:, 0].mean() / drag, lift.std() / (0.25 * speed),
+                           np.interp(lag, [0.02 * near, 0.02 * far], correlation)])
+            assert not force[:, 3:].any()
+    assert np.mean(shares, axis=0) == pytest.approx([1, 1, np.exp(-1)], abs=0.06)
+
+
+def test_stick_pushes_come_from_four_sides_above_the_centre():
+    times, wrenches = _played(make_task('pushes'))
+    impulses = np.array([wrenches[(times > 7.999 + 5 * k) & (times < 12.999 + 5 * k)].sum(axis=0)
+                         for k in range(4)]) * 0.005
+    assert np.linalg.norm(impulses[:, :3], axis=1) == pytest.approx(1.0)
+    assert impulses.sum(axis=0) == pytest.approx(0.0, abs=1e-9)
+    assert impulses[:, 3:] == pytest.approx(np.cross([0, 0, 0.1], impulses[:, :3]))
 
 
 @pytest.mark.parametrize(('recovers_at', 'lost'), [(9.5, None), (20.0, 2.5)])

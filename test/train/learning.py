@@ -15,7 +15,8 @@ from beetle_omni_ros.train.parameters import read_parameters
 torch.set_num_threads(1)    # more threads would be slower on such small batches
 ROBOT = RobotParameters.load()
 SMALL = {'ppo.robots': 16, 'ppo.steps': 6, 'ppo.epochs': 2, 'ppo.minibatches': 2,
-         'network.hidden': [16, 16], 'iterations': 4, 'log_every': 1, 'save_every': 2}
+         'network.hidden': [16, 16], 'network.critic': [16, 16],
+         'iterations': 4, 'log_every': 1, 'save_every': 2}
 # Neither noise nor bias nor disturbance, robots as in the file, latencies of one period.
 QUIET = {f'random.{name}': 0.0 for name in (
     'mass_scale', 'inertia_scale', 'centre_of_mass', 'position_bias', 'position_noise',
