@@ -10,12 +10,12 @@ from typing import Annotated
 from typer import Argument, echo, Option, Typer
 
 from beetle_omni_ros.cli.options import (
-    BagsArgument,
     CompressionOption,
     CONDITIONS,
     ConditionsOption,
     ControllerOption,
     DiscoveryOption,
+    DomainOption,
     FAILED,
     FaultsOption,
     JobsOption,
@@ -79,8 +79,7 @@ def fly(controller: ControllerOption = DEFAULT,
             'One process for all nodes and one for the bridges, or one process for each '
             'node.'))] = True,
         faults: FaultsOption = None,
-        domain_id: Annotated[int | None, Option(min=0, max=101, help=(
-            'ROS domain. Default: a free one.'))] = None,
+        domain_id: DomainOption = None,
         discovery: DiscoveryOption = None,
         view: Annotated[bool, Option('--view', help=(
             'Show the flight in the browser, as beetle_omni view does.'))] = False,
@@ -222,7 +221,8 @@ def faults(faults: Annotated[Path | None, Option(metavar='FILE', help=(
 
 
 @app.command()
-def report(paths: BagsArgument,
+def report(paths: Annotated[list[Path], Argument(metavar='RUN...', help=(
+               'Recorded bags: rosbag2 folders, or one of their files.'))],
            output: Annotated[Path, Option(
                '--output', '-o', callback=writable, metavar='FILE', help='The page to write.')]
            = Path('report.html'),
@@ -241,8 +241,7 @@ def report(paths: BagsArgument,
 def view(runs: Annotated[list[Path] | None, Argument(metavar='RUN...', help=(
              'Recorded bags, shown together; without RUN: a running graph.'))] = None,
          namespace: NamespaceOption = '',
-         domain_id: Annotated[int | None, Option(min=0, max=101, help=(
-             'ROS domain of a running graph. Default: ROS_DOMAIN_ID.'))] = None,
+         domain_id: DomainOption = None,
          discovery: DiscoveryOption = None,
          urdf: Annotated[Path | None, Option(metavar='FILE', help=(
              "URDF of the robot's shape. Default: the shipped description."))] = None,
@@ -276,9 +275,7 @@ def gap(runs: Annotated[list[Path], Argument(metavar='RUN...', help=(
             'and command).'))],
         holdout: Annotated[list[Path], Option(metavar='RUN...', help=(
             'Flights for validation only. Default: the last run of three or more.'))] = (),
-        robot: Annotated[Path | None, Option(metavar='FILE', help=(
-            'Robot file with which the flights are compared. Default: the shipped '
-            'params/robot.yaml.'))] = None,
+        robot: TheRobotOption = None,
         apply: Annotated[Path | None, Option(metavar='FILE', help=(
             'Write a robot file with the named effects.'))] = None,
         page: PageOption = None,
@@ -321,9 +318,7 @@ def train(output: Annotated[Path | None, Option(metavar='DIR', help=(
               'Test all parts with tiny sizes.'))] = False,
           stop_after: Annotated[float | None, Option(min=0, metavar='SECONDS', help=(
               'End the training after this time.'))] = None,
-          robot: Annotated[Path | None, Option(metavar='FILE', help=(
-              'Robot file for the training, with its effects. Default: the shipped '
-              'params/robot.yaml.'))] = None,
+          robot: TheRobotOption = None,
           json_path: JsonOption = None):
     """
     Train a policy and export it to ONNX; needs the extra 'train' and a GPU.
@@ -379,8 +374,7 @@ def drive(source: Annotated[str, Argument(metavar='keyboard|joystick|terminal', 
           poses: Annotated[Path | None, Option(metavar='FILE', help=(
               'More named poses (YAML).'))] = None,
           robot: RobotOption = None,
-          domain_id: Annotated[int | None, Option(min=0, max=232, help=(
-              'ROS domain. Default: ROS_DOMAIN_ID, or 0.'))] = None,
+          domain_id: DomainOption = None,
           discovery: DiscoveryOption = None):
     """
     Drive a running graph by hand: the target moves at limited speed, within all supervisor checks.

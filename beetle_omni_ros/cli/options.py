@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated
 
-from typer import Argument, CallbackParam, Option
+from typer import CallbackParam, Option
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.robot.schema import ParameterError
@@ -58,8 +58,6 @@ def whole(param: CallbackParam, text: str | None) -> list[int] | None:
     return None if found is None else list(map(int, found))
 
 
-BagsArgument = Annotated[list[Path], Argument(
-    metavar='RUN...', help='Recorded bags: rosbag2 folders, or one of their files.')]
 ControllerOption = Annotated[str, Option(
     metavar='NAME', help=f'The active controller: {KNOWN}.')]
 TaskOption = Annotated[str, Option(metavar='TASK', help=(
@@ -89,6 +87,8 @@ OtherRobotOption = Annotated[bool, Option('--allow-other-robot', help=(
 DiscoveryOption = Annotated[str | None, Option(
     metavar='LOCALHOST|SUBNET|OFF|SYSTEM_DEFAULT', help=(
         'Range in which nodes are visible. Default: programs on this computer only.'))]
+DomainOption = Annotated[int | None, Option(
+    min=0, max=101, help='ROS domain. Default: ROS_DOMAIN_ID; of fly, a free one.')]
 NamespaceOption = Annotated[str, Option(
     metavar='NAME', help="Namespace of the robot's topics in a running graph.")]
 CompressionOption = Annotated[str, Option(
