@@ -15,18 +15,8 @@ pytestmark = pytest.mark.real_time
 TURNED = np.array([0.0, 0.0, np.sin(0.3), np.cos(0.3)])
 
 
-@pytest.fixture
-def bench(make_bench):
-    return make_bench(user='supervisor_node')
-
-
-@pytest.fixture
-def listener(bench, ros_domain):
-    with closing(LiveGraph(domain=ros_domain)) as made:
-        yield made
-
-
-def test_messages_become_a_moment(bench, listener):
+def test_messages_become_a_moment(make_bench, ros_domain):
+    bench = make_bench(user='supervisor_node')
     odom, truth, command, target = (wire.Publisher(bench.user, topic) for topic in (
         'odom', 'ground_truth/odom', 'command', 'target_pose'))
     target.publish(PoseTarget(np.array([0, 0, 2.0]), TURNED, 6.0))
@@ -37,9 +27,10 @@ def test_messages_become_a_moment(bench, listener):
             publisher.publish(Odom(7.0, np.array([0.5, 0, height]), np.zeros(3), TURNED,
                                    np.zeros(3), np.zeros((6, 6)), np.zeros((6, 6))))
         command.publish(Command(7.0, np.full(4, 0.2), np.array([1.0, 2, 3, 4])))
-        listener.take(newest)
+        graph.take(newest)
         return len(newest.values) == 4
-    assert bench.wait(complete)
+    with closing(LiveGraph(domain=ros_domain)) as graph:
+        assert bench.wait(complete)
     moment = newest.moment()
     np.testing.assert_allclose(moment.position, [0.5, 0, 1.0])
     np.testing.assert_allclose(moment.target[0], [0, 0, 2])
