@@ -64,24 +64,11 @@ class JazzyStorage(McapWriter):
 
 
 class FrameWriter:
-    """
-    Converts `odom` and `joint_states` to transforms, 50 times a second.
-
-    Args:
-        write: called with topic, ROS type, CDR and time [s].
-        description: URDF.
-        prefix: prefix of the robot's topics, '/' or e.g. '/robot1/'.
-
-    Raises:
-        ParameterError: unusable URDF.
-
-    """
+    """Converts `odom` and `joint_states` to transforms, 50 times a second; writes the URDF too."""
 
     def __init__(self, write: Callable[[str, str, bytes, float], None], description: str,
                  prefix: str):
         self._write, self._text, self._prefix = write, description, prefix
-        self.topics = {'/tf': (TRANSFORMS, EVENT), '/tf_static': (TRANSFORMS, LATCHED),
-                       f'{prefix}robot_description': (TEXT, LATCHED)}
         tree = joints(description)
         self._fixed = [joint for joint in tree if joint.axis is None]
         self._moving = {joint.name: joint for joint in tree if joint.axis is not None}
@@ -116,7 +103,7 @@ class FrameWriter:
                  for joint in self._fixed]), t)
             text = new(TEXT)
             text.data = self._text
-            self._write(list(self.topics)[-1], TEXT, to_bytes(text, TEXT), t)
+            self._write(f'{self._prefix}robot_description', TEXT, to_bytes(text, TEXT), t)
         self._due = t + PERIOD if self._due is None else max(self._due + PERIOD, t)
         self._write('/tf', TRANSFORMS, _transforms(frames), t)
 
@@ -181,8 +168,9 @@ class BagWriter(Recorder):
         self._frames = None
         if description:
             self._frames = FrameWriter(self.write_raw, description, self._prefix)
-            for name, (msgtype, qos) in self._frames.topics.items():
-                self._declare(name, msgtype, qos)
+            self._declare('/tf', TRANSFORMS, EVENT)
+            self._declare('/tf_static', TRANSFORMS, LATCHED)
+            self._declare(f'{self._prefix}robot_description', TEXT, LATCHED)
         self._last_t = None      # [s] of the newest message
         if meta:
             self.write_meta(meta)
