@@ -45,6 +45,12 @@ def information(bag):
     return yaml.safe_load((bag / 'metadata.yaml').read_text())['rosbag2_bagfile_information']
 
 
+def topics(bag):
+    """Name -> metadata of a topic."""
+    return {entry['topic_metadata']['name']: entry['topic_metadata']
+            for entry in information(bag)['topics_with_message_count']}
+
+
 def test_metadata_has_the_fields_of_version_9_and_names_jazzy(plain):
     found = information(plain)
     assert set(found) == {
@@ -54,15 +60,14 @@ def test_metadata_has_the_fields_of_version_9_and_names_jazzy(plain):
     assert (found['version'], found['storage_identifier'], found['ros_distro']) \
         == (9, 'mcap', 'jazzy')
     assert found['starting_time']['nanoseconds_since_epoch'] >= 1_699_999_999 * 10**9
-    topics = {entry['topic_metadata']['name']: entry['topic_metadata']
-              for entry in found['topics_with_message_count']}
-    state = topics['/supervisor/state']
+    state = topics(plain)['/supervisor/state']
     assert set(state) == {'name', 'type', 'serialization_format', 'offered_qos_profiles',
                           'type_description_hash'}
     qos, = state['offered_qos_profiles']
     assert (qos['history'], qos['depth'], qos['reliability'], qos['durability']) \
         == ('keep_last', 1, 'reliable', 'transient_local')
-    assert topics['/imu/data_raw']['offered_qos_profiles'][0]['reliability'] == 'best_effort'
+    qos, = topics(plain)['/imu/data_raw']['offered_qos_profiles']
+    assert qos['reliability'] == 'best_effort'
 
 
 def test_the_file_contains_the_same_metadata_and_hashes(plain):
@@ -71,11 +76,8 @@ def test_the_file_contains_the_same_metadata_and_hashes(plain):
         assert reader.get_header().profile == 'ros2'
         channels = {c.topic: c.metadata for c in reader.get_summary().channels.values()}
         record, = (r for r in reader.iter_metadata() if r.name == 'rosbag2')
-    inside = yaml.safe_load(record.metadata['serialized_metadata'])
-    outside = information(plain)
-    assert inside == outside
-    for entry in outside['topics_with_message_count']:
-        topic = entry['topic_metadata']
+    assert yaml.safe_load(record.metadata['serialized_metadata']) == information(plain)
+    for topic in topics(plain).values():
         own = channels[topic['name']]
         assert own['topic_type_hash'] == topic['type_description_hash']
         assert yaml.safe_load(own['offered_qos_profiles']) == topic['offered_qos_profiles']
@@ -84,8 +86,7 @@ def test_the_file_contains_the_same_metadata_and_hashes(plain):
 @pytest.mark.skipif(not (INTERFACES / 'std_msgs/msg/String.json').is_file(),
                     reason='no message packages in this environment')
 def test_type_hashes_are_those_of_the_installed_message_packages(plain):
-    for entry in information(plain)['topics_with_message_count']:
-        topic = entry['topic_metadata']
+    for topic in topics(plain).values():
         described = json.loads((INTERFACES / f"{topic['type']}.json").read_text())
         hashes = {one['type_name']: one['hash_string'] for one in described['type_hashes']}
         assert topic['type_description_hash'] == hashes[topic['type']], topic['type']
@@ -99,9 +100,6 @@ def test_compressed_bags_have_equal_content_and_half_the_size(plain, packed):
     # rosbag2 names the compression of whole files and of messages here, not that of chunks.
     assert information(packed)['compression_format'] == ''
     assert information(packed)['compression_mode'] == ''
-    with AnyReader([packed]) as reader:
-        found = [reader.deserialize(data, c.msgtype) for c, _, data in reader.messages()]
-    assert len(found) == information(packed)['message_count']
     mine, theirs = read_bag(plain), read_bag(packed)
     assert mine.odom_position.tobytes() == theirs.odom_position.tobytes()
     assert mine.imu_t.tobytes() == theirs.imu_t.tobytes()
