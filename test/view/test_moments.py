@@ -1,15 +1,18 @@
 """What a picture shows agrees with the recording, and with the newest messages."""
 
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
-from synthetic_flights import fly
+from synthetic_flights import fly, write_truth
 
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import JOINT_NAMES
 from beetle_omni_ros.robot.urdf import Model
 from beetle_omni_ros.runs.log import LogRecorder
 from beetle_omni_ros.runs.tasks import make_task
+from beetle_omni_ros.view.live import draw
 from beetle_omni_ros.view.recorded import recorded_scene
 from beetle_omni_ros.view.scene import close, moments, NEWTON_PER_METRE, Room, serve
 
@@ -57,3 +60,20 @@ def test_a_recorded_scene_refers_to_nothing_outside(log):
     scene = recorded_scene({'a</script>': log})
     assert '__VISER_EMBED_DATA__="' in scene and 'a</script>' not in scene
     assert len(scene) < 2e6
+
+
+def test_a_running_graph_is_drawn_until_ctrl_c():
+    server, taken = serve('127.0.0.1', 8320), []
+
+    def take(newest):
+        if taken:
+            raise KeyboardInterrupt
+        taken.append(write_truth(newest, 7.0, np.array([0.5, 0, 1]), np.array([0.0, 0, 0, 1]),
+                                 np.zeros(3), np.zeros(3)))
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            draw(server, SimpleNamespace(take=take), Model.load())
+        robot = server.scene._handle_from_node_name['/robot0']
+        assert robot.visible and robot.position[0] == pytest.approx(0.5)
+    finally:
+        close(server)
