@@ -102,7 +102,7 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
         the results as in INTERFACES: ``meta`` and a key for each controller.
 
     Raises:
-        ParameterError, BagError: unusable input, one line.
+        ParameterError: unusable input, one line.
 
     """
     console = console or table.Terminal()

@@ -32,7 +32,7 @@ from beetle_omni_ros.nodes.operator import Operator
 from beetle_omni_ros.robot.parameters import find_robot, RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError, RunError
 from beetle_omni_ros.runs import table
-from beetle_omni_ros.runs.bag import BagError, read_bag
+from beetle_omni_ros.runs.bag import read_bag
 from beetle_omni_ros.runs.bag_writer import add_meta, check_new
 from beetle_omni_ros.runs.files import check_writable, write_json
 from beetle_omni_ros.runs.metrics import failed, metrics
@@ -139,7 +139,7 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             if not bag.exists():
                 return status or runner.FAILED
             return max(status, _report(bag, controller, flown_task, meta, json_path, console))
-    except (ParameterError, BagError, OSError) as error:
+    except (ParameterError, OSError) as error:
         _complain(error)
         return runner.UNUSABLE
     except KeyboardInterrupt:

@@ -25,7 +25,7 @@ from beetle_omni_ros.messages.topics import (
 from beetle_omni_ros.robot.schema import ParameterError, quoted, read_yaml, YamlError
 from beetle_omni_ros.runs.log import FlightLog, LogRecorder, motion, SERIES_OF
 
-BagError = ParameterError   # a bag cannot be read or written; the text names the folder or file
+BagError = ParameterError   # its name in identify and nodes
 AT_ONCE = 4096      # messages that are read together
 META_KEY = 'beetle_omni'  # under custom_data of metadata.yaml
 # Entries of the metadata that readers of a log rely on; a task may be the name of a file.
@@ -60,24 +60,24 @@ def bag_files(path: str | Path) -> list[Path]:
         path: rosbag2 folder, its metadata.yaml or one of its ``.mcap`` files.
 
     Raises:
-        BagError: no such path, or no MCAP file there.
+        ParameterError: no such path, or no MCAP file there.
 
     """
     path = Path(path)
     if not path.exists():
-        raise BagError(f'{path}: no such bag')
+        raise ParameterError(f'{path}: no such bag')
     if path.name == 'metadata.yaml':
         path = path.absolute().parent
     if path.is_file():
         if path.suffix != '.mcap':
-            raise BagError(f'{path}: expected a rosbag2 folder or a .mcap file')
+            raise ParameterError(f'{path}: expected a rosbag2 folder or a .mcap file')
         return [path]
     files = sorted(path.glob('*.mcap'), key=_split_number)
     if not files:
         other = sorted(p.name for pattern in ('*.db3', '*.mcap.*', '*.bag')
                        for p in path.glob(pattern))
         hint = f' (found {other[0]}; convert it with ros2 bag convert)' if other else ''
-        raise BagError(f'{path}: no .mcap file in this folder{hint}')
+        raise ParameterError(f'{path}: no .mcap file in this folder{hint}')
     return files
 
 
@@ -117,7 +117,7 @@ def read_messages(path: str | Path, warnings: list[str] | None = None) -> Iterat
         warnings: list to which a line is added for each truncated or damaged file.
 
     Raises:
-        BagError: no such bag, unreadable, or not MCAP.
+        ParameterError: no such bag, unreadable, or not MCAP.
 
     """
     found, broken = 0, ''
@@ -126,7 +126,7 @@ def read_messages(path: str | Path, warnings: list[str] | None = None) -> Iterat
         try:
             stream = file.open('rb')
         except OSError as error:
-            raise BagError(f'{file}: {error.strerror}') from None
+            raise ParameterError(f'{file}: {error.strerror}') from None
         with stream:
             messages = NonSeekingReader(stream, validate_crcs=True).iter_messages(
                 log_time_order=False)
@@ -137,7 +137,7 @@ def read_messages(path: str | Path, warnings: list[str] | None = None) -> Iterat
                                    from_nanoseconds(message.log_time))
             except Exception as error:  # broken bytes raise anything in the library
                 if isinstance(error, InvalidMagic) and not count:
-                    raise BagError(f'{file}: not an MCAP file') from None
+                    raise ParameterError(f'{file}: not an MCAP file') from None
                 kind = f'damaged ({type(error).__name__}: {error})' if stream.read(1) \
                     else 'cut off'
                 broken = f'{file.name}: {kind} after {count} readable messages'
@@ -145,7 +145,7 @@ def read_messages(path: str | Path, warnings: list[str] | None = None) -> Iterat
                     warnings.append(broken)
         found += count
     if broken and not found:
-        raise BagError(f"{path}: {broken}; 'mcap recover' of the mcap tool may save more")
+        raise ParameterError(f"{path}: {broken}; 'mcap recover' of the mcap tool may save more")
 
 
 def read_together(path: str | Path, warnings: list[str] | None = None
@@ -177,7 +177,7 @@ def read_bag(path: str | Path) -> FlightLog:
         The flight; its ``warnings`` list missing and unusable data.
 
     Raises:
-        BagError: no such bag, unreadable, not MCAP, or several robots in it.
+        ParameterError: no such bag, unreadable, not MCAP, or several robots in it.
 
     """
     reading, warnings = _Reading(str(path)), []
@@ -271,7 +271,7 @@ class _Reading:
             return name
         if name == 'diagnostics':
             return None
-        raise BagError(f"{self._path}: holds several robots ('{self._namespace}' and "
+        raise ParameterError(f"{self._path}: holds several robots ('{self._namespace}' and "
                        f"'{namespace}'); expected one")
 
     def problems(self) -> list[str]:

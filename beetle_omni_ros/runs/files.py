@@ -11,7 +11,7 @@ import numpy as np
 
 from beetle_omni_ros.robot.schema import ParameterError, quoted
 
-LogError = ParameterError   # a measured log is unusable
+LogError = ParameterError   # its name in identify
 
 
 def read_table(path: str | Path, wanted: Callable[[list[str]], list[str]], expected: str, *,
