@@ -1,6 +1,7 @@
 """Recorded runs in 3D: one HTML text with viser's player, which needs no network."""
 
 from collections.abc import Mapping
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
@@ -72,7 +73,8 @@ def run_view(runs: list[Path], *, urdf: Path | None = None, host: str, port: int
             self.send_response(200)
             self.send_header('Content-Type', 'text/html; charset=utf-8')
             self.end_headers()
-            self.wfile.write(page)
+            with suppress(ConnectionError):     # a browser may leave before the end
+                self.wfile.write(page)
 
         def log_message(self, *given):
             """Print nothing."""
