@@ -53,7 +53,7 @@ def simulate(controller: str | Callable = 'nmpc', task: Any = 'waypoints', *,
         The flight; ``log.meta['crashed']`` is true if the robot touched the ground.
 
     Raises:
-        ParameterError, BagError, RunError: with a message of one line.
+        ParameterError, RunError: with a message of one line.
 
     """
     from beetle_omni_ros.evaluation.command import fly
@@ -109,7 +109,7 @@ def read_run(path: str | Path) -> FlightLog:
         The flight; its ``warnings`` list missing topics and damage.
 
     Raises:
-        BagError: the bag cannot be read; the message has one line.
+        ParameterError: the bag cannot be read; the message has one line.
 
     """
     from beetle_omni_ros.runs.bag import read_bag

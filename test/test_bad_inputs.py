@@ -52,7 +52,7 @@ CASES = {
         ('short.csv', 'row 2: expected 6 values, found 5'),
         ('far.csv', 'row 3: |x| = 100 m, expected at most'),
         ('low.csv', 'row 2: z = 0.05 m, expected at least'),
-        ('below.csv', 'row 2, column z_m: expected a height above the floor, found -1'),
+        ('below.csv', 'row 2: z = -1 m, expected at least'),
         ('empty.csv', 'empty.csv: empty; expected the header'),
         ('header.csv', 'no pose below the header; expected at least one row'),
         ('binary.csv', 'binary.csv: not a CSV text file')],
@@ -62,7 +62,7 @@ CASES = {
         ('unknown.yaml', "'masss': unknown key; did you mean 'mass'"),
         ('effect.yaml', 'rotor_drg'), ('extends.yaml', 'nobody.yaml')],
     f'{EVALUATE} --seed': [
-        ('1.5', "--seed '1.5': expected"), ('99999999999', "--seed '99999999999': expected")],
+        ('1.5', "'--seed': Input should be"), ('99999999999', "'--seed': Input should be")],
     f'{EVALUATE} --faults': [
         ('none.yaml', 'none.yaml: no such file'),
         ('no_list.yaml', "key 'faults': expected a list"),
@@ -95,20 +95,20 @@ CASES = {
         ('--faults device.yaml --actuators emulated', 'expected --actuators direct'),
         ('--actuators steam', "actuators 'steam': expected emulated or direct"),
         ('--clock sun', "clock 'sun': expected system or simulated"),
-        ('--domain-id 102', "--domain-id '102': expected"),
+        ('--domain-id 102', "'--domain-id': Input"),
         ('--clock simulated --actuators emulated', 'serial devices keep real')],
     COMPARE: [
         ("--controllers ''", "--controllers '': expected"), ('--tasks hovr', 'hovr'),
         ('--controllers npmc', 'npmc'), ('--tasks hover,hover', "--tasks 'hover,hover'"),
         ('--seeds 0,x', "'x'"), ('--seeds -1', "'-1'"), ('--conditions windy', 'windy'),
-        ('--jobs 0', "--jobs '0': expected"), ('--backend threads', 'threads'),
+        ('--jobs 0', "'--jobs' / '-j': Input should be"), ('--backend threads', 'threads'),
         ('--policy none.onnx', 'none.onnx: no such file'), ('--output notes.txt', 'notes'),
         ('--json no/result.json', 'there is no folder')],
     FAULTS: [
         ('--faults no_list.yaml', "'faults'"),
         ('--only rotor_9_stops', "fault 'rotor_9_stops' is unknown; near: rotor_4_stops"),
         ('--from bed', "--from 'bed': expected hover, moving, upside_down"),
-        ('--seeds 0', "--seeds '0': expected"), ('--healthy nan', "--healthy 'nan'"),
+        ('--seeds 0', "'--seeds': Input should be"), ('--healthy nan', "'--healthy'"),
         ('--controller npmc', 'npmc'), ('--output notes.txt', 'notes.txt'),
         ('--json folder', 'it is a folder'), ('--bags', '--bags: expected --output')],
     'report': [
@@ -118,6 +118,9 @@ CASES = {
         ('old', 'convert it with ros2 bag'), ('not.mcap', 'not.mcap: not an MCAP file'),
         ('imu_only', 'ground_truth/odom'), (' '.join(['imu_only'] * 7), 'at most'),
         ('imu_only --output no/page.html', 'page.html')],
+    'view': [
+        ('none', 'none: no such bag'), ('imu_only --namespace a', '--namespace: expected without'),
+        ('imu_only --urdf not.mcap', 'not a usable URDF')],
     'gap': [
         ('', "'RUN...'"), ('none', 'none: no such bag'), ('imu_only imu_only', 'imu_only'),
         ('imu_only --robot unknown.yaml', 'masss'), ('imu_only --gap unknown.yaml', 'masss'),
@@ -132,7 +135,7 @@ CASES = {
         ('', 'times.csv'), ('--robot none.yaml', 'none.yaml'),
         ('--params no/robot.yaml', 'there is no folder'), ('--report folder', 'it is a folder')],
     'check': [
-        ('--seconds 0', "--seconds '0': expected"), ('--skip legs', "--skip 'legs': expected"),
+        ('--seconds 0', "'--seconds': Input"), ('--skip legs', "--skip 'legs': expected"),
         ('--servo-bus baud.yaml', 'baud_rate'), ('--motor-board port.yaml', "'prt': unknown"),
         ('--robot unknown.yaml', 'masss'), ('--json no/x.json', 'there is no folder')],
     'controllers': [('nmpc', 'nmpc'), ('--json folder', 'it is a folder')],

@@ -32,8 +32,8 @@ ALLOWED = {
     'nodes': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs', 'drivers', 'drive',
               'messages', 'view', 'bringup.findings'),
     'train': ('robot', 'control.guidance', 'control.policy_file', 'runs.files'),
-    'cli': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs', 'evaluation', 'comparison',
-            'faults', 'nodes', 'train', 'identify', 'bringup', 'view'),
+    'cli': ('robot', 'pages', 'control', 'estimation', 'sim', 'safety', 'runs', 'evaluation',
+            'comparison', 'faults', 'nodes', 'train', 'identify', 'bringup', 'view'),
 }
 
 # Library -> the only subpackage that imports it.

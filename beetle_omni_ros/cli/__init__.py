@@ -14,15 +14,8 @@ import typer
 from typer.main import get_command
 
 from beetle_omni_ros import __version__
-from beetle_omni_ros.cli import commands, live
-from beetle_omni_ros.cli.options import (
-    fail,
-    FAILED,
-    INTERRUPTED,
-    refuse_empty,
-    UNUSABLE,
-    usage_text,
-)
+from beetle_omni_ros.cli.commands import app
+from beetle_omni_ros.cli.options import FAILED, INTERRUPTED, UNUSABLE
 from beetle_omni_ros.robot.resources import PACKAGE
 from beetle_omni_ros.robot.schema import ParameterError, RunError
 
@@ -30,19 +23,8 @@ from beetle_omni_ros.robot.schema import ParameterError, RunError
 ROS_MODULES, ROS_ENDINGS = ('rclpy', 'ament_index_python'), ('_msgs', '_srvs', '_interfaces')
 HARDWARE_MODULES = ('dynamixel_sdk', 'pymavlink', 'serial')
 TRAIN_MODULES = ('onnx', 'onnxscript', 'rsl_rl', 'tensorboard', 'tensordict', 'torch')
-HELP = {'help_option_names': ['-h', '--help']}
-
-app = typer.Typer(no_args_is_help=True, context_settings=HELP,
-                  help='Fly, evaluate and report on the tiltable quadrotor.')
-for command in (commands.fly, commands.evaluate, commands.compare, commands.faults,
-                commands.report, live.view, commands.gap, commands.train,
-                live.check, live.drive, commands.controllers):
-    app.command()(command)
-identify = typer.Typer(no_args_is_help=True, context_settings=HELP,
-                       help='Fit the actuator models from measured data.')
-for command in (commands.joint, commands.rotor, commands.robot):
-    identify.command()(command)
-app.add_typer(identify, name='identify')
+SEVERAL = ('--holdout', '--validate')   # options with several values
+MAY_BE_EMPTY = ('--namespace',)
 
 
 def _version(wanted: bool):
@@ -60,11 +42,9 @@ def _common(version: Annotated[bool, typer.Option(
 def main(args: list[str] | None = None) -> int:
     """Run the command and return its exit status."""
     args = list(sys.argv[1:] if args is None else args)
-    if args[:1] == ['gap']:
-        args = ['gap', *commands.spread(args[1:])]
     try:
-        refuse_empty(args)
-        status = get_command(app).main(args=args, prog_name='beetle_omni', standalone_mode=False)
+        status = get_command(app).main(args=spread(args), prog_name='beetle_omni',
+                                       standalone_mode=False)
         return status if isinstance(status, int) else 0
     except ModuleNotFoundError as error:
         top = (error.name or '').partition('.')[0]
@@ -77,23 +57,50 @@ def main(args: list[str] | None = None) -> int:
             cure = "pip install 'beetle_omni_ros[hardware]'"
         elif top in TRAIN_MODULES:
             cure = "run make setup-train in a checkout, or pip install 'beetle_omni_ros[train]'"
-        return fail(f"the module '{top}' is not installed; {cure}", UNUSABLE)
+        return _fail(f"the module '{top}' is not installed; {cure}", UNUSABLE)
     except ParameterError as error:
-        return fail(error, UNUSABLE)
+        return _fail(error, UNUSABLE)
     except RunError as error:
-        return fail(error, FAILED)
+        return _fail(error, FAILED)
     except (KeyboardInterrupt, typer.Abort):
-        return fail('interrupted', INTERRUPTED)
+        return _fail('interrupted', INTERRUPTED)
     except Exception as error:
-        # usage errors of typer's parser and bag errors; importing their types would slow --help
+        # usage errors of typer's parser; importing their type would slow --help
         if hasattr(error, 'format_message'):
-            text = usage_text(error, args)  # empty after the help of `beetle_omni` alone
-            return fail(text, UNUSABLE) if text else UNUSABLE
-        if type(error).__name__ == 'BagError':
-            return fail(error, UNUSABLE)
+            text = error.format_message()   # empty after the help of `beetle_omni` alone
+            context = getattr(error, 'ctx', None)
+            command = context.command_path if context else 'beetle_omni'
+            return _fail(f'{text} See {command} --help.', UNUSABLE) if text else UNUSABLE
         raise
 
 
 def run() -> None:
     """Entry point of the console script."""
     sys.exit(main())
+
+
+def spread(arguments: list[str]) -> list[str]:
+    """
+    Repeat an option for each of its values: `--holdout RUN RUN`.
+
+    Raises:
+        ParameterError: '' as a value, which as a path would mean the working folder.
+
+    """
+    spread, option = [], ''
+    for before, argument in zip(['', *arguments], arguments):
+        if argument.startswith('-'):
+            option = argument
+        elif option in SEVERAL and before != option:
+            spread.append(option)
+        if argument == '' and before not in MAY_BE_EMPTY:
+            where = before if before.startswith('-') else 'argument'
+            raise ParameterError(f"{where} '': expected a value")
+        spread.append(argument)
+    return spread
+
+
+def _fail(error: Exception | str, status: int) -> int:
+    """Print an error as one line on standard error; returns ``status``."""
+    print(f"beetle_omni: error: {' '.join(str(error).split())}", file=sys.stderr)
+    return status

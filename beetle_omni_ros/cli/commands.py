@@ -1,85 +1,83 @@
-"""Subcommands for flights, their recordings, models from data, and the list of controllers."""
+"""Subcommands. Each passes its options, under their names, to the function that does the work."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
-import typer
+from typer import Argument, echo, Option, Typer
 
 from beetle_omni_ros.cli.options import (
-    check_files,
-    check_flight,
     CompressionOption,
     CONDITIONS,
     ConditionsOption,
     ControllerOption,
+    DomainOption,
     FAILED,
     FaultsOption,
     JobsOption,
     JsonOption,
     KNOWN,
-    names,
+    NamespaceOption,
     NmpcOption,
-    numbers,
     OtherRobotOption,
+    OutputOption,
+    PageOption,
+    ParamsOption,
     PlantOption,
     PolicyOption,
-    PublishedOption,
+    RateOption,
     RobotOption,
     SeedOption,
+    several,
     TaskOption,
+    TheRobotOption,
+    whole,
+    writable,
 )
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.registry import ControllerOptions, DEFAULT, owner
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.files import check_writable, write_json
+from beetle_omni_ros.runs.files import write_json
 
-PageOption = Annotated[Optional[Path], typer.Option(
-    '--report', metavar='FILE', help='Write a self-contained HTML page with plots.')]
-ParamsOption = Annotated[Optional[Path], typer.Option(
-    '--params', metavar='FILE', help='Write a robot file with the result.')]
-RateOption = Annotated[Optional[float], typer.Option(
-    '--rate', min=1, metavar='HZ', help='Rows a second of time series without a column of times.')]
-HOLDOUT = '--holdout'
+HELP = {'help_option_names': ['-h', '--help']}
+
+app = Typer(no_args_is_help=True, context_settings=HELP,
+            help='Fly, evaluate and report on the tiltable quadrotor.')
+identify = Typer(no_args_is_help=True, context_settings=HELP,
+                 help='Fit the actuator models from measured data.')
 
 
+@app.command()
 def fly(controller: ControllerOption = DEFAULT,
         task: TaskOption = 'waypoints',
-        bag: Annotated[Optional[Path], typer.Option(
-            '--bag', metavar='DIR', help='New folder for the recorded bag. Default: '
-                                         'runs_out/fly_DATE.')] = None,
+        bag: Annotated[Path | None, Option(metavar='DIR', help=(
+            'New folder for the recorded bag. Default: runs_out/fly_DATE.'))] = None,
         compression: CompressionOption = 'none',
         conditions: ConditionsOption = 'nominal',
         seed: SeedOption = 0,
-        actuators: Annotated[Optional[str], typer.Option(
-            '--actuators', metavar='emulated|direct',
-            help='emulated (default): commands go through joint_bridge_node, rotor_bridge_node, '
-                 'serial ports and emulated devices; direct: they go straight to the simulated '
-                 'plant.')] = None,
-        clock: Annotated[str, typer.Option(
-            '--clock', metavar='system|simulated',
-            help='system: real time; simulated: simulated time on /clock, which waits for late '
-                 'nodes, with direct actuators, for a computer that is too slow for real '
-                 'time.')] = 'system',
+        actuators: Annotated[str | None, Option(metavar='emulated|direct', help=(
+            'emulated (default): commands go through joint_bridge_node, rotor_bridge_node, serial '
+            'ports and emulated devices; direct: they go straight to the simulated '
+            'plant.'))] = None,
+        clock: Annotated[str, Option(metavar='system|simulated', help=(
+            'system: real time; simulated: simulated time on /clock, which waits for late nodes, '
+            'with direct actuators, for a computer that is too slow for real '
+            'time.'))] = 'system',
         robot: RobotOption = None,
         plant: PlantOption = None,
-        nmpc_file: NmpcOption = None,
+        nmpc: NmpcOption = None,
         policy: PolicyOption = None,
         allow_other_robot: OtherRobotOption = False,
-        standby: Annotated[bool, typer.Option(
-            '--standby/--alone', help='Run the other controllers on standby, to be selected in '
-                                      'flight, or only the active controller.')] = True,
+        standby: Annotated[bool, Option('--standby/--alone', help=(
+            'Run the other controllers on standby, to be selected in flight, or only the active '
+            'controller.'))] = True,
         faults: FaultsOption = None,
-        domain_id: Annotated[Optional[int], typer.Option(
-            '--domain-id', min=0, max=101, help='ROS domain. Default: a free one.')] = None,
-        view: Annotated[bool, typer.Option(
-            '--view', help='Show the flight in the browser, as beetle_omni view does.')] = False,
-        allow_targets: Annotated[bool, typer.Option(
-            '--allow-targets', help='With --view: poses dragged in the page become targets, and '
-                                    'controllers can be selected there.')] = False,
+        domain_id: DomainOption = None,
+        view: Annotated[bool, Option('--view', help=(
+            'Show the flight in the browser, as beetle_omni view does.'))] = False,
         json_path: JsonOption = None):
     """
     Fly the whole ROS graph in real time against the simulated robot.
@@ -87,41 +85,31 @@ def fly(controller: ControllerOption = DEFAULT,
     Takes off, flies the task, lands, records a bag and prints the result table.
     Example: beetle_omni fly --controller nmpc --task waypoints --bag my_flight
     """
-    given, bag = bag, bag or Path('runs_out') / f'fly_{datetime.now():%Y%m%d_%H%M%S}'
-    check_flight(conditions, compression, json_path, nmpc_file, policy, faults)
-    if allow_targets and not view:
-        raise ParameterError('--allow-targets: expected --view with it')
+    given = dict(locals())
     from beetle_omni_ros.nodes.fly import run_fly
-    if not given:
-        typer.echo(f'bag: {bag}')
-    code = run_fly(controller=controller, task=task, bag=bag, compression=compression,
-                   seed=seed, conditions=conditions, actuators=actuators, clock=clock,
-                   robot=robot, plant=plant, nmpc=nmpc_file, policy=policy,
-                   allow_other_robot=allow_other_robot, standby=standby,
-                   faults=faults, json_path=json_path,
-                   domain_id=domain_id, view=view, allow_targets=allow_targets)
-    raise typer.Exit(code if isinstance(code, int) else 0)
+    if bag is None:
+        bag = Path('runs_out') / f'fly_{datetime.now():%Y%m%d_%H%M%S}'
+        echo(f'bag: {bag}')
+    return run_fly(**{**given, 'bag': bag})
 
 
-def evaluate(controllers: Annotated[str, typer.Option(
-                 '--controllers', metavar='NAME,...',
-                 help=f'Controllers to fly one after the other: {KNOWN}.')]
-             = DEFAULT,
+@app.command()
+def evaluate(controllers: Annotated[str, Option(callback=several, metavar='NAME,...', help=(
+                 f'Controllers to fly one after the other: {KNOWN}.'))] = DEFAULT,
              task: TaskOption = 'random100',
              conditions: ConditionsOption = 'nominal',
              seed: SeedOption = 0,
              robot: RobotOption = None,
              plant: PlantOption = None,
-             nmpc_file: NmpcOption = None,
+             nmpc: NmpcOption = None,
              policy: PolicyOption = None,
              allow_other_robot: OtherRobotOption = False,
-             without: Annotated[str, typer.Option(
-                 '--without', metavar='LAYER,...',
-                 help='Layers of the guidance that are off: unwinding, routing, '
-                      'trimming, or all.')] = '',
-             bag: Annotated[Optional[Path], typer.Option(
-                 '--bag', metavar='DIR', help='New folder for the bag; with several controllers '
-                                              'it contains one bag for each.')] = None,
+             without: Annotated[str, Option(metavar='LAYER,...', help=(
+                 'Layers of the guidance that are off: unwinding, routing, trimming, or '
+                 'all.'))] = '',
+             bag: Annotated[Path | None, Option(metavar='DIR', help=(
+                 'New folder for the bag; with several controllers it contains one bag for '
+                 'each.'))] = None,
              compression: CompressionOption = 'none',
              faults: FaultsOption = None,
              json_path: JsonOption = None):
@@ -131,63 +119,51 @@ def evaluate(controllers: Annotated[str, typer.Option(
     Plant, sensors, estimator, controllers and actuators are those of the ROS graph.
     Example: beetle_omni evaluate --controllers nmpc --task random100 --json result.json
     """
-    chosen = names('--controllers', controllers)
-    guided = [name for name in chosen if registry.find(name).guidance != 'none']
+    guided = [name for name in controllers if registry.find(name).guidance != 'none']
     if without and not guided:
         raise ParameterError(f'--without {without}: no controller with guidance among '
-                             f"{', '.join(chosen)}")
+                             f"{', '.join(controllers)}")
     options = {name: ControllerOptions(allow_other_robot=allow_other_robot,
                                        without=without if name in guided else '')
-               for name in chosen}
-    for option, file, key in (('--nmpc', nmpc_file, 'parameters'), ('--policy', policy, 'policy')):
+               for name in controllers}
+    for option, file, key in (('--nmpc', nmpc, 'parameters'), ('--policy', policy, 'policy')):
         name = owner(option)
-        if file and name not in chosen:
+        if file and name not in controllers:
             raise ParameterError(f"{option} {file}: for the controller '{name}', which is not "
-                                 f"among {', '.join(chosen)}")
+                                 f"among {', '.join(controllers)}")
         if file:
             options[name] = replace(options[name], **{key: file})
-    check_flight(conditions, compression, json_path, nmpc_file, policy, faults)
     from beetle_omni_ros.evaluation.command import run_evaluate
     from beetle_omni_ros.runs.metrics import failed
-    results = run_evaluate(controllers=chosen, task=task, conditions=conditions, robot=robot,
+    results = run_evaluate(controllers=controllers, task=task, conditions=conditions, robot=robot,
                            plant=plant, seed=seed, bag=bag, compression=compression,
                            json_path=json_path, faults=faults, options=options)
-    if any(map(failed, results.values())):
-        raise typer.Exit(FAILED)
+    return FAILED if any(map(failed, results.values())) else 0
 
 
-def compare(controllers: Annotated[Optional[str], typer.Option(
-                '--controllers', metavar='NAME,...',
-                help=f"Controllers: {KNOWN}. Default: {', '.join(registry.compared())}; a "
-                     'missing policy is left out.')] = None,
-            tasks: Annotated[Optional[str], typer.Option(
-                '--tasks', metavar='TASK,...', help='Names or pose files. Default: those '
-                                                     'of the publication.')] = None,
-            conditions: Annotated[str, typer.Option(
-                '--conditions', metavar='NAME,...',
-                help='nominal, published, or both.')] = ','.join(CONDITIONS),
-            seeds: Annotated[Optional[str], typer.Option(
-                '--seeds', metavar='N,...',
-                help='Default: 0 to 9; 0 to 5 above 50 s, 0 to 2 above 300 s.')] = None,
+@app.command()
+def compare(controllers: Annotated[str | None, Option(callback=several, metavar='NAME,...', help=(
+                f"Controllers: {KNOWN}. Default: {', '.join(registry.compared())}; a missing "
+                'policy is left out.'))] = None,
+            tasks: Annotated[str | None, Option(callback=several, metavar='TASK,...', help=(
+                'Names or pose files. Default: those of the publication.'))] = None,
+            conditions: Annotated[str, Option(callback=several, metavar='NAME,...', help=(
+                'nominal, published, or both.'))] = ','.join(CONDITIONS),
+            seeds: Annotated[str | None, Option(callback=whole, metavar='N,...', help=(
+                'Default: 0 to 9; 0 to 5 above 50 s, 0 to 2 above 300 s.'))] = None,
             policy: PolicyOption = None,
             plant: PlantOption = None,
             jobs: JobsOption = None,
-            backend: Annotated[str, typer.Option(
-                '--backend', metavar='processes|ray', help='Run the flights on this computer, or '
-                                                           'on Ray.')]
-            = 'processes',
-            address: Annotated[Optional[str], typer.Option(
-                '--ray-address', metavar='ADDRESS', envvar='RAY_ADDRESS',
-                help='Address of a running cluster. Default: Ray on this computer.')] = None,
-            output: Annotated[Path, typer.Option(
-                '--output', '-o', metavar='DIR', help='Folder for page, pictures and JSON.')]
-            = Path('comparison'),
-            cache: Annotated[Optional[Path], typer.Option(
-                '--cache', metavar='DIR', help='Cache of finished flights. Default: .flights in '
-                                               'the output.')] = None,
-            readme: Annotated[Optional[Path], typer.Option(
-                '--readme', metavar='FILE', help='Markdown file whose table of results is '
-                                                 'renewed.')] = None,
+            backend: Annotated[str, Option(metavar='processes|ray', help=(
+                'Run the flights on this computer, or on Ray.'))] = 'processes',
+            address: Annotated[str | None, Option(
+                '--ray-address', metavar='ADDRESS', envvar='RAY_ADDRESS', help=(
+                    'Address of a running cluster. Default: Ray on this computer.'))] = None,
+            output: OutputOption = Path('comparison'),
+            cache: Annotated[Path | None, Option(metavar='DIR', help=(
+                'Cache of finished flights. Default: .flights in the output.'))] = None,
+            readme: Annotated[Path | None, Option(metavar='FILE', help=(
+                'Markdown file whose table of results is renewed.'))] = None,
             json_path: JsonOption = None):
     """
     Fly every experiment with several controllers and write one page about it.
@@ -195,50 +171,38 @@ def compare(controllers: Annotated[Optional[str], typer.Option(
     An interrupted or repeated comparison flies only the missing flights. Example: beetle_omni
     compare --controllers rl,nmpc --tasks waypoints --seeds 0,1,2
     """
-    arguments = {'controllers': names('--controllers', controllers),
-                 'tasks': names('--tasks', tasks),
-                 'conditions': names('--conditions', conditions),
-                 'seeds': numbers('--seeds', seeds)}
-    check_files(policy)
-    check_writable(json_path)
+    given = dict(locals())
     from beetle_omni_ros.comparison.command import run_compare
-    run_compare(**arguments, output=output, jobs=jobs, backend=backend, address=address,
-                cache=cache, policy=policy, plant=plant, readme=readme, json_path=json_path)
+    run_compare(**given)
 
 
-def faults(faults: Annotated[Optional[Path], typer.Option(
-               '--faults', metavar='FILE', help='List of faults. Default: the shipped '
-                                                'params/faults.yaml.')] = None,
-           only: Annotated[Optional[str], typer.Option(
-               '--only', metavar='NAME,...', help='Faults of the list. Default: all.')] = None,
-           starts: Annotated[Optional[str], typer.Option(
-               '--from', metavar='NAME,...', help='Flight before the fault: hover, moving, '
-                                                  'upside_down, or random (a random time of '
-                                                  'random100). Default: the first three.')] = None,
-           seeds: Annotated[int, typer.Option(
-               '--seeds', metavar='N', min=1, help='Flights of each fault from each start.')] = 1,
-           seed: Annotated[int, typer.Option(
-               '--seed', metavar='N', min=0, max=2**31 - 1,
-               help='Seed of the first flight; it grows by one with each further flight.')] = 0,
+@app.command()
+def faults(faults: Annotated[Path | None, Option(metavar='FILE', help=(
+               'List of faults. Default: the shipped params/faults.yaml.'))] = None,
+           only: Annotated[str | None, Option(callback=several, metavar='NAME,...', help=(
+               'Faults of the list. Default: all.'))] = None,
+           starts: Annotated[str | None, Option(
+               '--from', callback=several, metavar='NAME,...', help=(
+                   'Flight before the fault: hover, moving, upside_down, or random (a random time '
+                   'of random100). Default: the first three.'))] = None,
+           seeds: Annotated[int, Option(metavar='N', min=1, help=(
+               'Flights of each fault from each start.'))] = 1,
+           seed: Annotated[int, Option(metavar='N', min=0, max=2**31 - 1, help=(
+               'Seed of the first flight; it grows by one with each further flight.'))] = 0,
            conditions: ConditionsOption = 'nominal',
            controller: ControllerOption = DEFAULT,
            plant: PlantOption = None,
-           landings: Annotated[int, typer.Option(
-               '--landings', metavar='N', min=0, help='Fly N landings from random attitudes '
-                                                      'instead of the list.')] = 0,
-           without_mocap: Annotated[bool, typer.Option(
-               '--without-mocap', help='With --landings: motion capture is lost at the '
-                                       'beginning.')] = False,
-           healthy: Annotated[float, typer.Option(
-               '--healthy', metavar='HOURS', min=0.0, max=1000.0,
-               help='Fly for this time without a fault under each of nominal, published and '
-                    'effects, and count false alarms, instead of the list.')] = 0.0,
+           landings: Annotated[int, Option(metavar='N', min=0, help=(
+               'Fly N landings from random attitudes instead of the list.'))] = 0,
+           without_mocap: Annotated[bool, Option('--without-mocap', help=(
+               'With --landings: motion capture is lost at the beginning.'))] = False,
+           healthy: Annotated[float, Option(metavar='HOURS', min=0.0, max=1000.0, help=(
+               'Fly for this time without a fault under each of nominal, published and effects, '
+               'and count false alarms, instead of the list.'))] = 0.0,
            jobs: JobsOption = None,
-           bags: Annotated[bool, typer.Option(
-               '--bags', help='Record each flight in --output.')] = False,
-           output: Annotated[Optional[Path], typer.Option(
-               '--output', '-o', metavar='DIR', help='Folder for page, Markdown and JSON.')]
-           = None,
+           bags: Annotated[bool, Option('--bags', help=(
+               'Record each flight in --output.'))] = False,
+           output: OutputOption = None,
            json_path: JsonOption = None):
     """
     Inject a list of faults into flights, on all cores, and compare outcomes with expectations.
@@ -246,20 +210,18 @@ def faults(faults: Annotated[Optional[Path], typer.Option(
     Each fault occurs in hover, on the move and upside down; each flight ends with a landing.
     Example: beetle_omni faults --only rotor_1_stops,mocap_lost --seeds 3 --output runs_out/faults
     """
-    check_flight(conditions, 'none', json_path, faults)
+    given = dict(locals())
     if without_mocap and not landings:
         raise ParameterError('--without-mocap: expected --landings N with it')
     from beetle_omni_ros.faults.command import run_faults
-    run_faults(faults=faults, only=names('--only', only), starts=names('--from', starts),
-               seeds=seeds, seed=seed, conditions=conditions, controller=controller, jobs=jobs,
-               output=output, json_path=json_path, bags=bags, landings=landings,
-               without_mocap=without_mocap, healthy=healthy, plant=plant)
+    run_faults(**given)
 
 
-def report(runs: Annotated[list[Path], typer.Argument(
-               metavar='RUN...', help='Recorded bags: rosbag2 folders, or one of their files.')],
-           output: Annotated[Path, typer.Option(
-               '--output', '-o', metavar='FILE', help='The page to write.')]
+@app.command()
+def report(paths: Annotated[list[Path], Argument(metavar='RUN...', help=(
+               'Recorded bags: rosbag2 folders, or one of their files.'))],
+           output: Annotated[Path, Option(
+               '--output', '-o', callback=writable, metavar='FILE', help='The page to write.')]
            = Path('report.html'),
            json_path: JsonOption = None):
     """
@@ -267,12 +229,158 @@ def report(runs: Annotated[list[Path], typer.Argument(
 
     Example: beetle_omni report flight_a flight_b --output report.html
     """
-    check_writable(output, 'report')
-    check_writable(json_path)
+    given = dict(locals())
     from beetle_omni_ros.view.report import run_report
-    run_report(runs, output, json_path=json_path)
+    run_report(**given)
 
 
+@app.command()
+def view(runs: Annotated[list[Path] | None, Argument(metavar='RUN...', help=(
+             'Recorded bags, shown together; without RUN: a running graph.'))] = None,
+         namespace: NamespaceOption = '',
+         domain_id: DomainOption = None,
+         urdf: Annotated[Path | None, Option(metavar='FILE', help=(
+             "URDF of the robot's shape. Default: the shipped description."))] = None,
+         host: Annotated[str, Option(metavar='ADDRESS', help=(
+             'Address at which the page is served; 0.0.0.0: to the whole network.'))]
+         = '127.0.0.1',
+         port: Annotated[int, Option(min=1, max=65535, help='Port of the page.')] = 8080):
+    """
+    Show a running graph, or play recorded runs, in 3D in the browser.
+
+    Prints the address of the page, which needs no network, and runs until Ctrl-C. Example:
+    beetle_omni view my_run/rl my_run/nmpc
+    """
+    page = {'urdf': urdf, 'host': host, 'port': port}
+    graph = {'namespace': namespace, 'domain_id': domain_id}
+    if not runs:
+        from beetle_omni_ros.nodes.operator import run_live
+        run_live(**graph, **page)
+        return
+    for name, value in graph.items():
+        if value not in ('', None):
+            raise ParameterError(f"--{name.replace('_', '-')}: expected without RUN, which is a "
+                                 'recording')
+    from beetle_omni_ros.view.recorded import run_view
+    run_view(runs, **page)
+
+
+@app.command()
+def gap(runs: Annotated[list[Path], Argument(metavar='RUN...', help=(
+            'Recorded flights (bags), or logs of the joints (CSV, or bags with only joint_states '
+            'and command).'))],
+        holdout: Annotated[list[Path], Option(metavar='RUN...', help=(
+            'Flights for validation only. Default: the last run of three or more.'))] = (),
+        robot: TheRobotOption = None,
+        apply: Annotated[Path | None, Option(metavar='FILE', help=(
+            'Write a robot file with the named effects.'))] = None,
+        page: PageOption = None,
+        parameters: Annotated[Path | None, Option('--gap', metavar='FILE', help=(
+            'File with changes to params/gap.yaml.'))] = None,
+        fix: Annotated[bool, Option('--fix', help=(
+            'Correct damaged recordings if the correction is certain; the bags stay '
+            'unchanged.'))] = False,
+        tolerances: Annotated[bool, Option('--tolerances', help=(
+            "With --apply: also write this robot's own mass, inertia, gains, lags and rotor "
+            'positions, as fitted within tolerance.'))] = False,
+        json_path: JsonOption = None):
+    """
+    Compare flights with the robot model, identify the missing effect and add it to the model.
+
+    Example: beetle_omni gap flight1 flight2 --holdout flight3 --apply robot_new.yaml
+    """
+    given = dict(locals())
+    from beetle_omni_ros.identify.gap.command import run_gap
+    return run_gap(**given)
+
+
+@app.command()
+def train(output: Annotated[Path | None, Option(metavar='DIR', help=(
+              'Folder for checkpoints, TensorBoard log and policy.onnx. Default: that of '
+              '--resume.'))] = None,
+          config: Annotated[Path | None, Option(metavar='FILE', help=(
+              'Training parameters. Default: the shipped params/train.yaml.'))] = None,
+          changes: Annotated[list[str], Option('--set', metavar='KEY=VALUE', help=(
+              'Replace a parameter, e.g. iterations=5000 or ppo.robots=8192; may be '
+              'repeated.'))] = (),
+          seed: Annotated[int | None, Option(min=0, max=2**31 - 1, help=(
+              'Seed of all random numbers.'))] = None,
+          memory: Annotated[bool | None, Option('--memory', help=(
+              'Add the estimated disturbance to the inputs of the policy.'))] = None,
+          device: Annotated[str, Option(help='auto, cpu, cuda[:N].')] = 'auto',
+          resume: Annotated[Path | None, Option(metavar='DIR', help=(
+              'Continue from the last checkpoint of a run, or from a model_N.pt.'))] = None,
+          smoke: Annotated[bool, Option('--smoke', help=(
+              'Test all parts with tiny sizes.'))] = False,
+          stop_after: Annotated[float | None, Option(min=0, metavar='SECONDS', help=(
+              'End the training after this time.'))] = None,
+          robot: TheRobotOption = None,
+          json_path: JsonOption = None):
+    """
+    Train a policy and export it to ONNX; needs the extra 'train' and a GPU.
+
+    Several GPUs: torchrun --nproc-per-node N -m beetle_omni_ros.cli train --output DIR
+    """
+    from beetle_omni_ros.train.command import parse_changes, run_train
+    run_train(output=output, config=config, robot=robot, device=device, resume=resume,
+              changes=parse_changes(changes, seed=seed, memory=memory),
+              smoke=smoke, stop_after=stop_after, json_path=json_path)
+
+
+@app.command()
+def check(servo_port: Annotated[str | None, Option(metavar='PORT', help=(
+              'Serial port of the servos. Default: the port in --servo-bus.'))] = None,
+          board_port: Annotated[str | None, Option(metavar='PORT', help=(
+              'Serial port of the motor board. Default: the port in --motor-board.'))] = None,
+          servo_bus: Annotated[Path | None, Option(metavar='FILE', help=(
+              'Settings of the servo bus. Default: the shipped params/servo_bus.yaml.'))] = None,
+          motor_board: Annotated[Path | None, Option(metavar='FILE', help=(
+              'Settings of the motor board. Default: the shipped '
+              'params/motor_board.yaml.'))] = None,
+          robot: TheRobotOption = None,
+          seconds: Annotated[float, Option(min=1, max=600, help=(
+              'Time to receive from the motor board, and from ROS.'))] = 3.0,
+          skip: Annotated[list[str], Option(metavar='servos|board|ros', help=(
+              'Skip a part; may be repeated.'))] = (),
+          namespace: NamespaceOption = '',
+          json_path: JsonOption = None):
+    """
+    Check the real robot before a flight: ports, servos, motor board, MoCap, IMU, clocks.
+
+    It moves nothing and changes no setting. Exit status 0: nothing failed; 1: something failed.
+    Example: beetle_omni check --servo-port /dev/ttyUSB0 --skip board
+    """
+    def listen(duration):
+        from beetle_omni_ros.nodes.operator import listen as listen_to_ros
+        return listen_to_ros(duration, namespace)
+
+    from beetle_omni_ros.bringup.command import run_check
+    return run_check(listen=listen, servo_port=servo_port, board_port=board_port,
+                     servo_bus=servo_bus, motor_board=motor_board, robot=robot, seconds=seconds,
+                     skip=tuple(skip), json_path=json_path)
+
+
+@app.command()
+def drive(source: Annotated[str, Argument(metavar='keyboard|joystick|terminal', help=(
+              'Input: keys of this terminal, the topic joy, or typed commands.'))] = 'keyboard',
+          parameters: Annotated[Path | None, Option('--params', metavar='FILE', help=(
+              'Limits, axes, buttons and named poses. Default: the shipped '
+              'params/drive.yaml.'))] = None,
+          poses: Annotated[Path | None, Option(metavar='FILE', help=(
+              'More named poses (YAML).'))] = None,
+          robot: RobotOption = None,
+          domain_id: DomainOption = None):
+    """
+    Drive a running graph by hand: the target moves at limited speed, within all supervisor checks.
+
+    Example: beetle_omni drive keyboard
+    """
+    given = dict(locals())
+    from beetle_omni_ros.nodes.driver import run_drive
+    return run_drive(**given)
+
+
+@app.command()
 def controllers(json_path: JsonOption = None):
     """
     List the registered controllers.
@@ -280,23 +388,15 @@ def controllers(json_path: JsonOption = None):
     Others fly as FILE.py:Class or package.module:Class, see docs/how-to/own_controller.md.
     Example: beetle_omni controllers --json controllers.json
     """
-    from rich.table import Table
-
-    from beetle_omni_ros.runs.table import Terminal
-    check_writable(json_path)
+    from beetle_omni_ros.pages.page import Grid, print_grids, Terminal
     found = {name: _known(name) for name in registry.names()}
-    table = Table(box=None, header_style='dim', padding=(0, 2, 0, 0))
-    for column in ('name', 'description', 'rate [Hz]', 'parameters', 'policy', 'actuators lost',
-                   'guidance'):
-        table.add_column(column)
-    for name, known in found.items():
-        if 'error' in known:
-            table.add_row(name, known['error'])
-            continue
-        table.add_row(name, known['description'], f"{known['rate_hz']:g}",
-                      known['parameters_file'] or '–', known['policy_file'] or '–',
-                      'flies' if known['flies_degraded'] else '–', known['guidance'])
-    Terminal().print(table)
+    header = ['name', 'description', 'rate [Hz]', 'parameters', 'policy', 'actuators lost',
+              'guidance']
+    rows = [[name, known['error'], *[''] * 5] if 'error' in known else
+            [name, known['description'], f"{known['rate_hz']:g}", known['parameters_file'] or '–',
+             known['policy_file'] or '–', 'flies' if known['flies_degraded'] else '–',
+             known['guidance']] for name, known in found.items()]
+    print_grids([Grid('', header, rows)], Terminal())
     write_json(json_path, found)
 
 
@@ -311,90 +411,35 @@ def _known(name):
                 'parameters_file', 'policy_file', 'flies_degraded', 'guidance', 'stands_by')}}
 
 
-def gap(runs: Annotated[list[Path], typer.Argument(
-            metavar='RUN...', help='Recorded flights (bags), or logs of the joints (CSV, or bags '
-                                     'with only joint_states and command).')],
-        holdout: Annotated[Optional[list[Path]], typer.Option(
-            HOLDOUT, metavar='RUN...', help='Flights for validation only. Default: the last run '
-                                            'of three or more.')] = None,
-        robot: Annotated[Optional[Path], typer.Option(
-            '--robot', metavar='FILE', help='Robot file with which the flights are compared. '
-                                            'Default: the shipped params/robot.yaml.')] = None,
-        apply: Annotated[Optional[Path], typer.Option(
-            '--apply', metavar='FILE', help='Write a robot file with the named effects.')] = None,
-        page: PageOption = None,
-        parameters: Annotated[Optional[Path], typer.Option(
-            '--gap', metavar='FILE', help='File with changes to params/gap.yaml.')] = None,
-        fix: Annotated[bool, typer.Option(
-            '--fix', help='Correct damaged recordings if the correction is certain; the bags stay '
-                          'unchanged.')] = False,
-        tolerances: Annotated[bool, typer.Option(
-            '--tolerances', help="With --apply: also write this robot's own mass, inertia, gains, "
-                                 'lags and rotor positions, as fitted within tolerance.')] = False,
-        json_path: JsonOption = None):
-    """
-    Compare flights with the robot model, identify the missing effect and add it to the model.
-
-    Example: beetle_omni gap flight1 flight2 --holdout flight3 --apply robot_new.yaml
-    """
-    from beetle_omni_ros.identify.gap.command import run_gap
-    raise typer.Exit(run_gap(runs, holdout or [], robot, apply, json_path, page,
-                             parameters=parameters, fix=fix, tolerances=tolerances))
-
-
-def spread(arguments: list[str]) -> list[str]:
-    """
-    Interpret `gap RUN... --holdout RUN RUN` as two held-out flights.
-
-    If no run precedes `--holdout`, only the first run after it is held out.
-    """
-    spread, runs, holding = [], 0, False
-    for k, argument in enumerate(arguments):
-        if argument == HOLDOUT:
-            holding = True
-        elif argument.startswith('-'):
-            holding = False
-        elif arguments[k - 1].startswith('-') and k and arguments[k - 1] != HOLDOUT:
-            pass            # the value of another option
-        elif holding and arguments[k - 1] != HOLDOUT and runs:
-            spread.append(HOLDOUT)
-        elif not holding:
-            runs += 1
-        spread.append(argument)
-    return spread
-
-
-def joint(logs: Annotated[list[Path], typer.Argument(
-              metavar='LOG...', help='Response logs (CSV) or recorded run (bag), see '
-                                  'docs/how-to/identification.md.')],
-          validate: Annotated[Optional[list[Path]], typer.Option(
-              '--validate', metavar='LOG.csv...', help='Further logs for validation.')] = None,
-          robot: PublishedOption = None, report: PageOption = None, params: ParamsOption = None,
+@identify.command()
+def joint(paths: Annotated[list[Path], Argument(metavar='LOG...', help=(
+              'Response logs (CSV) or recorded run (bag), see docs/how-to/identification.md.'))],
+          validate: Annotated[list[Path], Option(metavar='LOG.csv...', help=(
+              'Further logs for validation.'))] = (),
+          robot: TheRobotOption = None, report: PageOption = None, params: ParamsOption = None,
           json_path: JsonOption = None):
     """
     Fit one servo model to the first 60 % of response logs; the rest is for validation.
 
-    Several logs of the same servos are fitted together. With --validate, one log is fitted.
+    Several logs of the same servos are fitted together.
 
     Example: beetle_omni identify joint slow.csv --validate fast.csv --report servos.html
     """
-    from beetle_omni_ros.runs.bag import runs_in
-    logs = runs_in(logs)
-    more = logs[1:] if validate else []     # `--validate a.csv b.csv` puts b.csv here
+    given = dict(locals())
     from beetle_omni_ros.identify.command import run_identify_joint
-    run_identify_joint(logs[:len(logs) - len(more)], validate=[*(validate or []), *more],
-                       robot=robot, report=report, params=params, json_path=json_path)
+    from beetle_omni_ros.runs.bag import runs_in
+    run_identify_joint(**{**given, 'paths': runs_in(paths)})
 
 
-def rotor(logs: Annotated[list[Path], typer.Argument(
-              metavar='LOG.csv...', help='Logs of a force-torque stand, see '
-                                         'docs/how-to/identification.md.')],
-          columns: Annotated[Optional[list[str]], typer.Option(
-              '--column', metavar='QUANTITY=[-]COLUMN[*FACTOR]',
-              help='Column of a quantity with sign and factor to SI units, e.g. thrust=-fz or '
-                   'thrust=load_g*0.00981; may be repeated.')] = None,
+@identify.command()
+def rotor(paths: Annotated[list[Path], Argument(metavar='LOG.csv...', help=(
+              'Logs of a force-torque stand, see docs/how-to/identification.md.'))],
+          columns: Annotated[list[str], Option('--column', metavar='QUANTITY=[-]COLUMN[*FACTOR]',
+                                               help=(
+              'Column of a quantity with sign and factor to SI units, e.g. thrust=-fz or '
+              'thrust=load_g*0.00981; may be repeated.'))] = (),
           rate: RateOption = None,
-          robot: PublishedOption = None, report: PageOption = None, params: ParamsOption = None,
+          robot: TheRobotOption = None, report: PageOption = None, params: ParamsOption = None,
           json_path: JsonOption = None):
     """
     Fit thrust, torque and lag of a rotor to logs of a force-torque stand.
@@ -403,64 +448,28 @@ def rotor(logs: Annotated[list[Path], typer.Argument(
 
     Example: beetle_omni identify rotor bench.csv --params my_robot.yaml --report rotor.html
     """
+    given = dict(locals())
     from beetle_omni_ros.identify.command import run_identify_rotor
-    results = run_identify_rotor(logs, columns=columns or (), rate=rate, robot=robot,
-                                 report=report, params=params, json_path=json_path)
-    raise typer.Exit(3 if results['verdict'] == 'bad_data' else 0)
+    return 3 if run_identify_rotor(**given)['verdict'] == 'bad_data' else 0
 
 
-def robot(logs: Annotated[list[Path], typer.Argument(
-              metavar='LOG...', help='Response logs of the joints (CSV or bag) and logs of a '
-                                     'force-torque stand, recognised by their header.')],
-          params: Annotated[Path, typer.Option(
-              '--params', metavar='FILE', help='The robot file to write.')],
-          rate: RateOption = None, robot: PublishedOption = None,
-          picture: Annotated[Optional[Path], typer.Option(
-              '--picture', metavar='FILE', help='Draw the logs with both robots (.png or .svg).')]
-          = None, json_path: JsonOption = None):
+@identify.command()
+def robot(paths: Annotated[list[Path], Argument(metavar='LOG...', help=(
+              'Response logs of the joints (CSV or bag) and logs of a force-torque stand, '
+              'recognised by their header.'))],
+          params: Annotated[Path, Option(metavar='FILE', help='The robot file to write.')],
+          rate: RateOption = None, robot: TheRobotOption = None,
+          picture: Annotated[Path | None, Option(metavar='FILE', help=(
+              'Draw the logs with both robots (.png or .svg).'))] = None,
+          json_path: JsonOption = None):
     """
     Write a robot file with intervals and origins from all logs of servos and rotors.
 
     Example: beetle_omni identify robot slow.csv fast.csv bench.csv --params my_robot.yaml
     """
+    given = dict(locals())
     from beetle_omni_ros.identify.command import run_identify_robot
-    run_identify_robot(logs, params, rate=rate, robot=robot, picture=picture,
-                       json_path=json_path)
+    run_identify_robot(**given)
 
 
-def train(output: Annotated[Path, typer.Option(
-              '--output', metavar='DIR', help='Folder for checkpoints, TensorBoard log and '
-                                              'policy.onnx. Default: that of --resume.')] = None,
-          config: Annotated[Optional[Path], typer.Option(
-              '--config', metavar='FILE', help='Training parameters. Default: the shipped '
-                                               'params/train.yaml.')] = None,
-          changes: Annotated[Optional[list[str]], typer.Option(
-              '--set', metavar='KEY=VALUE', help='Replace a parameter, e.g. iterations=5000 or '
-                                                 'ppo.robots=8192; may be repeated.')] = None,
-          seed: Annotated[Optional[int], typer.Option(
-              '--seed', min=0, max=2**31 - 1, help='Seed of all random numbers.')] = None,
-          memory: Annotated[Optional[bool], typer.Option(
-              '--memory', help='Add the estimated disturbance to the inputs of the '
-                               'policy.')] = None,
-          device: Annotated[str, typer.Option('--device', help='auto, cpu, cuda[:N].')] = 'auto',
-          resume: Annotated[Optional[Path], typer.Option(
-              '--resume', metavar='DIR', help='Continue from the last checkpoint of a run, or '
-                                              'from a model_N.pt.')] = None,
-          smoke: Annotated[bool, typer.Option(
-              '--smoke', help='Test all parts with tiny sizes.')] = False,
-          stop_after: Annotated[Optional[float], typer.Option(
-              '--stop-after', min=0, metavar='SECONDS',
-              help='End the training after this time.')] = None,
-          robot: Annotated[Optional[Path], typer.Option(
-              '--robot', metavar='FILE', help='Robot file for the training, with its effects. '
-                                              'Default: the shipped params/robot.yaml.')] = None,
-          json_path: JsonOption = None):
-    """
-    Train a policy and export it to ONNX; needs the extra 'train' and a GPU.
-
-    Several GPUs: torchrun --nproc-per-node N -m beetle_omni_ros.cli train --output DIR
-    """
-    from beetle_omni_ros.train.command import parse_changes, run_train
-    run_train(output=output, config=config, robot=robot, device=device, resume=resume,
-              changes=parse_changes(changes or [], seed=seed, memory=memory),
-              smoke=smoke, stop_after=stop_after, json_path=json_path)
+app.add_typer(identify, name='identify')

@@ -21,7 +21,7 @@ from beetle_omni_ros.robot.urdf import description
 from beetle_omni_ros.runs import table
 from beetle_omni_ros.runs.bag_writer import BagWriter
 from beetle_omni_ros.runs.files import write_json
-from beetle_omni_ros.runs.log import FlightLog, LogRecorder, Recorder, Tee
+from beetle_omni_ros.runs.log import FlightLog, LogRecorder, Recorder
 from beetle_omni_ros.runs.metrics import metrics
 from beetle_omni_ros.runs.targets import check_steps
 from beetle_omni_ros.runs.tasks import make_task, Task
@@ -61,7 +61,7 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
     with ExitStack() as stack:
         recorder: Recorder = memory
         if bag is not None:
-            recorder = Tee(memory, stack.enter_context(BagWriter(
+            recorder = Recorder(memory, stack.enter_context(BagWriter(
                 bag, meta=meta, topics=tuple(topics_with([entry.name])), compression=compression,
                 description=description(), epoch=int(time()))))
         loop = FlightLoop(robot, plant, aboard, recorder, conditions=conditions, seed=seed,
@@ -102,7 +102,7 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
         the results as in INTERFACES: ``meta`` and a key for each controller.
 
     Raises:
-        ParameterError, BagError: unusable input, one line.
+        ParameterError: unusable input, one line.
 
     """
     console = console or table.Terminal()

@@ -22,7 +22,7 @@ from beetle_omni_ros.evaluation.loop import collector_off, FlightLoop
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.bag_writer import BagWriter
-from beetle_omni_ros.runs.log import Recorder, Tee
+from beetle_omni_ros.runs.log import Recorder
 from beetle_omni_ros.safety.events import INFO
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.sim.fault_lists import Case
@@ -127,7 +127,7 @@ def fly_trial(trial: Trial, case: Case, bags: Path | None = None, plan: Plan = P
     try:
         with collector_off(), ExitStack() as stack:
             recorder = stack.enter_context(BagWriter(
-                bags / trial.name, asdict(trial), epoch=int(time()))) if bags else Tee()
+                bags / trial.name, asdict(trial), epoch=int(time()))) if bags else Recorder()
             result.update(_fly_healthy(trial, recorder, plan) if case == HEALTHY
                           else _fly_fault(trial, case, recorder, plan))
     except Exception as error:          # the campaign continues and reports the error

@@ -24,7 +24,7 @@ from beetle_omni_ros.nodes.operator import Operator
 from beetle_omni_ros.robot.parameters import find_robot, RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError, RunError
 from beetle_omni_ros.runs import table
-from beetle_omni_ros.runs.bag import BagError, read_bag
+from beetle_omni_ros.runs.bag import read_bag
 from beetle_omni_ros.runs.bag_writer import add_meta, check_new
 from beetle_omni_ros.runs.files import check_writable, write_json
 from beetle_omni_ros.runs.metrics import failed, metrics
@@ -58,7 +58,7 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             nmpc: Path | None = None, policy: Path | None = None,
             allow_other_robot: bool = False, standby: bool = True,
             faults: Path | None = None, json_path: Path | None = None,
-            domain_id: int | None = None, view: bool = False, allow_targets: bool = False,
+            domain_id: int | None = None, view: bool = False,
             console: Console | None = None) -> int:
     """
     Fly a task through the ROS graph and print the results of the bag.
@@ -96,7 +96,7 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             controller = registry.find(controller).name
             number = stack.enter_context(reserved_domain()) if domain_id is None else domain_id
             if view:
-                stack.enter_context(viewer_process(number, robot, allow_targets, console))
+                stack.enter_context(viewer_process(number, console))
             meta = {'task': task, 'conditions': conditions, 'seed': seed,
                     'robot': str(robot) if robot else 'params/robot.yaml',
                     'plant': str(plant) if plant else None, 'version': __version__,
@@ -114,7 +114,7 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             if not bag.exists():
                 return status or runner.FAILED
             return max(status, _report(bag, controller, flown_task, meta, json_path, console))
-    except (ParameterError, BagError, OSError) as error:
+    except (ParameterError, OSError) as error:
         _complain(error)
         return runner.UNUSABLE
     except KeyboardInterrupt:
@@ -145,11 +145,10 @@ def _absolute(path):
 
 
 @contextmanager
-def viewer_process(domain_id: int, robot: Path | None, allow_targets: bool, console: Console):
+def viewer_process(domain_id: int, console: Console):
     """Run `beetle_omni view` during a flight, and print its address."""
     command = [sys.executable, '-m', 'beetle_omni_ros.start', 'beetle_omni', 'view', '--domain-id',
-               str(domain_id), *(['--robot', str(robot)] if robot else []),
-               *(['--allow-targets'] if allow_targets else [])]
+               str(domain_id)]
     with subprocess.Popen(command, env=child_environment(domain_id), stdin=subprocess.DEVNULL,
                           stdout=subprocess.PIPE, text=True, start_new_session=True) as process:
         try:

@@ -13,16 +13,13 @@ from rcl_interfaces.srv import SetParameters
 import rclpy
 from rclpy.exceptions import NameValidationException
 from rclpy.signals import SignalHandlerOptions
-from rich.console import Console
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from beetle_omni_ros.bringup import findings
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.messages.conversions import seconds as seconds_of
 from beetle_omni_ros.messages.topics import (
-    controller_of,
     LOG,
     Qos,
     SENSOR,
@@ -32,7 +29,6 @@ from beetle_omni_ros.messages.topics import (
 from beetle_omni_ros.messages.values import Diagnostic, MessageError
 from beetle_omni_ros.nodes import runner, wire
 from beetle_omni_ros.nodes.graph import BRIDGES, confine, READY
-from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 
 # Simulated time may be slow, or stop if the simulator dies: waiting ends after this much steady
@@ -241,22 +237,14 @@ def _observe(node, topic, stream, data):
 # --- beetle_omni view ---------------------------------------------------------------------------
 
 class LiveGraph(Client):
-    """
-    ROS side of the page; implements :class:`~beetle_omni_ros.view.live.Graph`.
+    """ROS side of the page, which publishes nothing."""
 
-    Targets and selections of a controller are sent only if ``writable``.
-    """
-
-    def __init__(self, namespace: str = '', domain: int | None = None, writable: bool = False):
+    def __init__(self, namespace: str = '', domain: int | None = None):
         super().__init__('view', domain, namespace)
-        node = self._node
         self._write: Callable[[str, Any], None] = lambda topic, value: None
         for topic in (*SHOWN, *EVENTS, *TARGETS):
-            wire.subscribe(node, topic, partial(self._take, topic),
+            wire.subscribe(self._node, topic, partial(self._take, topic),
                            NEWEST if topic in SHOWN else None)
-        self._targets = wire.Publisher(node, 'target_pose') if writable else None
-        self._setting = node.create_client(SetParameters, f'{SUPERVISOR}/set_parameters') \
-            if writable else None
 
     def _take(self, topic, value):
         self._write(topic, value)
@@ -266,48 +254,22 @@ class LiveGraph(Client):
         self._write = newest.write
         self.spin_steadily(SPIN)
 
-    def controllers(self) -> list[str]:
-        """Return the names of the controllers whose command topic exists."""
-        prefix = self._node.get_namespace().rstrip('/') + '/'
-        names = (controller_of(name.removeprefix(prefix))
-                 for name, _ in self._node.get_topic_names_and_types() if name.startswith(prefix))
-        return sorted(filter(None, names))
 
-    def publish_target(self, target: PoseTarget) -> None:
-        """Publish a target, latched, on target_pose."""
-        if self._targets is not None:
-            self._targets.publish(target)
-
-    def select(self, controller: str, answer) -> None:
-        """Set the supervisor's parameter ``controller``."""
-        if self._setting is None or not self._setting.service_is_ready():
-            answer(f'{SUPERVISOR} is not there')
-            return
-
-        def done(future):
-            result = future.result().results[0]
-            answer('' if result.successful else result.reason or 'no reason given')
-        request = wire.parameter_request('controller', controller)
-        self._setting.call_async(request).add_done_callback(done)
-
-
-def run_live(*, namespace: str = '', domain_id: int | None = None, robot: Path | None = None,
-             urdf: Path | None = None, host: str, port: int,
-             dark: bool = False, allow_targets: bool = False,
-             console: Console | None = None) -> None:
+def run_live(*, namespace: str = '', domain_id: int | None = None,
+             urdf: Path | None = None, host: str, port: int) -> None:
     """Show a running graph until Ctrl-C; arguments are the options of `beetle_omni view`."""
     from beetle_omni_ros.robot.urdf import Model
-    from beetle_omni_ros.view.live import Live
+    from beetle_omni_ros.view.live import draw
     from beetle_omni_ros.view.recorded import announce
     from beetle_omni_ros.view.scene import close, serve
     runner.end_with_parent()
-    model, parameters = Model.load(urdf), RobotParameters.load(robot)
+    model = Model.load(urdf)
     with ExitStack() as stack:
-        graph = LiveGraph(namespace, domain_id, allow_targets)
+        graph = LiveGraph(namespace, domain_id)
         stack.callback(graph.close)
         os.nice(NICENESS)
-        server = serve(host, port, dark)
+        server = serve(host, port)
         stack.callback(close, server)
-        announce(host, server.get_port(), console or Console())
+        announce(host, server.get_port())
         with suppress(KeyboardInterrupt):       # the regular end
-            Live(server, graph, model, parameters, allow_targets).run()
+            draw(server, graph, model)

@@ -83,40 +83,20 @@ def print_grids(shown: list[Grid], console: Console) -> None:
 
 
 def _rich(grid, available):
-    widths = _widths(list(zip(grid.header, *grid.rows, strict=True)), available)
-    total = _total(widths)
-    table = Table(title=Text(grid.title), title_justify='left', title_style='', box=None,
-                  min_width=min(len(grid.title), LONGEST_TITLE), header_style='dim',
-                  padding=(0, SPACE, 0, 0), width=total if total > available else None)
-    for k, (name, width) in enumerate(zip(grid.header, widths, strict=True)):
-        table.add_column(Text(name), justify='left' if k == 0 else 'right', width=width,
-                         style='dim' if k in grid.faint_columns else None)
+    """Table whose lines break between words only, and whose first column never breaks."""
+    columns = list(zip(grid.header, *grid.rows, strict=True))
+    least = [max((len(word) for cell in column for word in (cell.split() if k else [cell])),
+                 default=0) for k, column in enumerate(columns)]
+    table = Table(title=Text(grid.title) if grid.title else None, title_justify='left',
+                  title_style='', box=None, min_width=min(len(grid.title), LONGEST_TITLE),
+                  header_style='dim', padding=(0, SPACE, 0, 0))
+    for k, name in enumerate(grid.header):
+        table.add_column(Text(name), justify='right' if k else 'left', min_width=least[k],
+                         no_wrap=not k, style='dim' if k in grid.faint_columns else None)
     for k, row in enumerate(grid.rows):
         table.add_row(*(Text(cell) for cell in row),
                       style='dim' if k in grid.faint else None)
     return table
-
-
-def _widths(columns, available):
-    """
-    Widths with which lines break between words only.
-
-    Headers are broken before cells. The sum exceeds ``available`` if words alone need more. The
-    first column is never broken.
-    """
-    words = [[max(map(len, cell.split() or [''])) for cell in column] for column in columns]
-    widths = [max(map(len, column)) for column in columns]
-    for least in ([max(head[0], *map(len, column[1:]), 0)
-                   for head, column in zip(words, columns, strict=True)], list(map(max, words))):
-        least[0] = widths[0]
-        while _total(widths) > available and widths != least:
-            k = max(range(len(widths)), key=lambda k: (widths[k] > least[k], widths[k]))
-            widths[k] -= 1
-    return widths
-
-
-def _total(widths):
-    return sum(widths) + SPACE * len(widths)
 
 
 def markdown(grid: Grid, numeric: bool = False) -> str:

@@ -1,21 +1,15 @@
-"""
-Reading of rosbag2 folders (metadata.yaml and MCAP) without ROS, also of truncated files.
-
-Flights are read into a log, or incrementally into a recorder.
-"""
+"""Reading of rosbag2 folders (metadata.yaml and MCAP) without ROS, also of truncated files."""
 
 from collections import Counter
-from collections.abc import Container, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from itertools import islice
 import json
 from pathlib import Path
 from typing import NamedTuple
 
-from mcap.opcode import Opcode
-from mcap.records import Channel, Message, Schema
-from mcap.stream_reader import MAGIC_SIZE, StreamReader
-from mcap.writer import MCAP0_MAGIC
+from mcap.exceptions import InvalidMagic
+from mcap.reader import NonSeekingReader
 import numpy as np
 
 from beetle_omni_ros.control.base import TrajectoryTarget
@@ -28,57 +22,34 @@ from beetle_omni_ros.messages.topics import (
     topic_of,
     TOPICS,
 )
-from beetle_omni_ros.robot.schema import quoted, read_yaml, YamlError
-from beetle_omni_ros.runs.log import FlightLog, LogRecorder, Recorder, SERIES_OF
+from beetle_omni_ros.robot.schema import ParameterError, quoted, read_yaml, YamlError
+from beetle_omni_ros.runs.log import FlightLog, LogRecorder, motion, SERIES_OF
 
+BagError = ParameterError   # its name in identify and nodes
 AT_ONCE = 4096      # messages that are read together
 META_KEY = 'beetle_omni'  # under custom_data of metadata.yaml
-
-# Text entries of the metadata that readers of a log rely on, and their longest length.
-META_TEXTS = ('task', 'conditions', 'robot', 'plant', 'controller', 'guidance', 'version')
+# Entries of the metadata that readers of a log rely on; a task may be the name of a file.
 LONGEST_TEXT = 250
+META_TYPES = {'seed': int, **dict.fromkeys(
+    ('task', 'conditions', 'robot', 'plant', 'controller', 'guidance', 'version'), str)}
 
 
-class BagError(ValueError):
-    """A bag cannot be written or read; the text names the folder or file."""
+class Recorded(NamedTuple):
+    """
+    One message of a bag, or several of one topic in the order of the file.
 
+    Attributes:
+        topic: full name.
+        type: ROS type.
+        data: CDR, or list of it.
+        received: time of recording [s], or (N,) times.
 
-class RawMessage(NamedTuple):
-    """One message: full topic, ROS type, CDR, time of recording [s]."""
-
-    topic: str
-    type: str
-    data: bytes
-    received: float
-
-
-class Messages(NamedTuple):
-    """Messages of one topic in the order of the file: CDR, (N,) times of recording [s]."""
+    """
 
     topic: str
     type: str
-    data: list[bytes]
-    received: np.ndarray
-
-
-class _WholeReads:
-    """A stream whose reads are complete or raise EOFError, to detect the end of a cut file."""
-
-    def __init__(self, stream):
-        self._stream = stream
-
-    def read(self, size):
-        data = self._stream.read(size)
-        if len(data) < size:
-            raise EOFError
-        return data
-
-
-class _Records(StreamReader):
-    """Records of a file, without the content of message indices, which is not needed."""
-
-    def _read_record(self, opcode, length):
-        return None if opcode == Opcode.MESSAGE_INDEX else super()._read_record(opcode, length)
+    data: bytes | list[bytes]
+    received: float | np.ndarray
 
 
 def bag_files(path: str | Path) -> list[Path]:
@@ -89,24 +60,24 @@ def bag_files(path: str | Path) -> list[Path]:
         path: rosbag2 folder, its metadata.yaml or one of its ``.mcap`` files.
 
     Raises:
-        BagError: no such path, or no MCAP file there.
+        ParameterError: no such path, or no MCAP file there.
 
     """
     path = Path(path)
     if not path.exists():
-        raise BagError(f'{path}: no such bag')
+        raise ParameterError(f'{path}: no such bag')
     if path.name == 'metadata.yaml':
         path = path.absolute().parent
     if path.is_file():
         if path.suffix != '.mcap':
-            raise BagError(f'{path}: expected a rosbag2 folder or a .mcap file')
+            raise ParameterError(f'{path}: expected a rosbag2 folder or a .mcap file')
         return [path]
     files = sorted(path.glob('*.mcap'), key=_split_number)
     if not files:
         other = sorted(p.name for pattern in ('*.db3', '*.mcap.*', '*.bag')
                        for p in path.glob(pattern))
         hint = f' (found {other[0]}; convert it with ros2 bag convert)' if other else ''
-        raise BagError(f'{path}: no .mcap file in this folder{hint}')
+        raise ParameterError(f'{path}: no .mcap file in this folder{hint}')
     return files
 
 
@@ -119,12 +90,6 @@ def runs_in(paths: Iterable[str | Path]) -> list[Path]:
             inside = sorted({file.parent for file in path.glob('*/*.mcap')})
         runs += inside or [path]
     return runs
-
-
-def no_pose(path: str | Path, warnings: list[str]) -> BagError:
-    """Error for a bag without a pose; ``warnings`` of its reading may give the reason."""
-    return BagError('; '.join([f'{path}: no pose of the robot; expected ground_truth/odom or '
-                               'odom', *warnings]))
 
 
 def _split_number(file):
@@ -143,7 +108,7 @@ def names_of(runs: list[Path]) -> list[str]:
     return [f'{name} ({k + 1})' for k, name in enumerate(names)] if runs else []
 
 
-def read_messages(path: str | Path, warnings: list[str] | None = None) -> Iterator[RawMessage]:
+def read_messages(path: str | Path, warnings: list[str] | None = None) -> Iterator[Recorded]:
     """
     Yield the messages of a bag in the order of recording, up to a truncation.
 
@@ -152,44 +117,39 @@ def read_messages(path: str | Path, warnings: list[str] | None = None) -> Iterat
         warnings: list to which a line is added for each truncated or damaged file.
 
     Raises:
-        BagError: no such bag, unreadable, or not MCAP.
+        ParameterError: no such bag, unreadable, or not MCAP.
 
     """
     found, broken = 0, ''
     for file in bag_files(path):
-        count, schemas, known = 0, {0: ''}, {}
+        count = 0
         try:
-            with file.open('rb') as stream:
-                # A shorter file may be an MCAP file that was cut off.
-                if not MCAP0_MAGIC.startswith(stream.read(MAGIC_SIZE)):
-                    raise BagError(f'{file}: not an MCAP file')
-                stream.seek(0)
-                for record in _Records(_WholeReads(stream), validate_crcs=True).records:
-                    if isinstance(record, Message):
-                        count += 1
-                        yield RawMessage(*known[record.channel_id], record.data,
-                                         from_nanoseconds(record.log_time))
-                    elif isinstance(record, Schema):
-                        schemas[record.id] = record.name
-                    elif isinstance(record, Channel):
-                        known[record.id] = record.topic, schemas[record.schema_id]
+            stream = file.open('rb')
         except OSError as error:
-            raise BagError(f'{file}: {error.strerror}') from None
-        except BagError:
-            raise
-        except Exception as error:  # broken bytes raise anything in the library
-            kind = 'cut off' if isinstance(error, EOFError) else \
-                f'damaged ({type(error).__name__}: {error})'
-            broken = f'{file.name}: {kind} after {count} readable messages'
-            if warnings is not None:
-                warnings.append(broken)
+            raise ParameterError(f'{file}: {error.strerror}') from None
+        with stream:
+            messages = NonSeekingReader(stream, validate_crcs=True).iter_messages(
+                log_time_order=False)
+            try:
+                for schema, channel, message in messages:
+                    count += 1
+                    yield Recorded(channel.topic, schema.name if schema else '', message.data,
+                                   from_nanoseconds(message.log_time))
+            except Exception as error:  # broken bytes raise anything in the library
+                if isinstance(error, InvalidMagic) and not count:
+                    raise ParameterError(f'{file}: not an MCAP file') from None
+                kind = f'damaged ({type(error).__name__}: {error})' if stream.read(1) \
+                    else 'cut off'
+                broken = f'{file.name}: {kind} after {count} readable messages'
+                if warnings is not None:
+                    warnings.append(broken)
         found += count
     if broken and not found:
-        raise BagError(f"{path}: {broken}; 'mcap recover' of the mcap tool may save more")
+        raise ParameterError(f"{path}: {broken}; 'mcap recover' of the mcap tool may save more")
 
 
 def read_together(path: str | Path, warnings: list[str] | None = None
-                  ) -> Iterator[list[Messages]]:
+                  ) -> Iterator[list[Recorded]]:
     """
     Yield the messages of a bag by topic, a few seconds at a time.
 
@@ -203,89 +163,79 @@ def read_together(path: str | Path, warnings: list[str] | None = None
             all_data, times = groups.setdefault((topic, kind), ([], []))
             all_data.append(data)
             times.append(received)
-        yield [Messages(*name, data, np.array(times)) for name, (data, times) in groups.items()]
+        yield [Recorded(*name, data, np.array(times)) for name, (data, times) in groups.items()]
 
 
-def read_bag(path: str | Path, *, namespace: str | None = None) -> FlightLog:
+def read_bag(path: str | Path) -> FlightLog:
     """
     Read a flight.
 
     Args:
         path: rosbag2 folder, or one of its files.
-        namespace: namespace of the robot, if the bag contains several.
 
     Returns:
         The flight; its ``warnings`` list missing and unusable data.
 
     Raises:
-        BagError: no such bag, unreadable, not MCAP, or several robots in it.
+        ParameterError: no such bag, unreadable, not MCAP, or several robots in it.
 
     """
-    recorder, warnings = LogRecorder(), []
-    for _ in replay(path, recorder, warnings, namespace=namespace):
-        pass
-    log = recorder.log()
-    log.warnings, log.source = warnings, str(path)
-    return log
-
-
-def replay(path: str | Path, recorder: Recorder, warnings: list[str], *,
-           namespace: str | None = None, leave_out: Container[str] | None = None
-           ) -> Iterator[np.ndarray]:
-    """
-    Pass the messages of a bag to a recorder, a few seconds at a time, as :func:`read_bag` does.
-
-    Args:
-        path: rosbag2 folder, or one of its files.
-        recorder: recorder that accepts values whose fields are arrays; texts come one by one.
-        warnings: list to which missing and unusable data are added at the end.
-        namespace: namespace of the robot, if the bag contains several.
-        leave_out: topics without namespace to skip, beside commands of controllers; None: none.
-
-    Yields:
-        (N,) times of recording of the messages so far passed on [s].
-
-    """
-    reading = _Reading(str(path), namespace, recorder, leave_out)
-    for together in read_together(path, reading.warnings):
+    reading, warnings = _Reading(str(path)), []
+    for together in read_together(path, warnings):
         # Ambiguous names last: the other topics may determine the namespace.
         for messages in sorted(together, key=lambda one: is_ambiguous(one.topic)):
             reading.take(messages)
-        yield np.concatenate([messages.received for messages in together])
-    recorder.write_meta(_metadata(path, reading.warnings))
-    warnings += reading.finish()
+    reading.recorder.write_meta(_metadata(path, warnings))
+    log = reading.recorder.log()
+    log.warnings, log.source = warnings + reading.problems(), str(path)
+    return log
+
+
+def read_flights(paths: Iterable[str | Path], most: int) -> dict[str, FlightLog]:
+    """
+    Read the flights of RUN arguments: name -> flight with poses.
+
+    Raises:
+        ParameterError: as of :func:`read_bag`, a bag without a pose, or more than ``most`` runs.
+
+    """
+    runs = runs_in(paths)
+    if len(runs) > most:
+        raise ParameterError(f'{len(runs)} runs; expected at most {most}')
+    logs = {}
+    for path, name in zip(runs, names_of(runs), strict=True):
+        log = logs[name] = read_bag(path)
+        if not len(motion(log).t):
+            raise ParameterError('; '.join([f'{path}: no pose of the robot; expected '
+                                            'ground_truth/odom or odom', *log.warnings]))
+    return logs
 
 
 class _Reading:
-    """Sorts messages by topic and namespace, and counts unusable ones."""
+    """Sorts messages by topic into a log, and counts unusable ones."""
 
-    def __init__(self, path, namespace, recorder, leave_out):
-        self.warnings: list[str] = []
-        self._recorder, self._left_out = recorder, leave_out
-        self._path = path
-        self._namespace = namespace and f"/{namespace.strip('/')}".rstrip('/')
-        self._chosen = namespace is not None
-        self._split = {}
+    def __init__(self, path):
+        self.recorder = LogRecorder()
+        self._path, self._namespace = path, None
+        self._names = {}        # full topic -> name
         self._counts: Counter = Counter()
         self._bad: Counter = Counter()
         self._reason: dict[str, str] = {}
 
-    def take(self, messages: Messages) -> None:
+    def take(self, messages: Recorded) -> None:
         """Read messages of one topic; those of a series together."""
         name = self._name(messages.topic)
         if name is None:
             return
-        topic, count = topic_of(name), len(messages.data)
-        if self._left_out is not None and (name in self._left_out or controller_of(name)):
-            self._counts[name] += count
-        elif messages.type != topic.type:
-            self._refuse(name, f'type is {messages.type}, not {topic.type}', count)
+        topic = topic_of(name)
+        if messages.type != topic.type:
+            self._refuse(name, f'type is {messages.type}, not {topic.type}', len(messages.data))
         elif name in SERIES_OF or controller_of(name):
             rows, value, refused = read_all(topic, messages.data)
             if len(rows):
                 received = messages.received[rows]
                 stamp = np.where(value.stamp == 0, received, value.stamp)
-                self._recorder.write(name, replace(value, stamp=stamp), received)
+                self.recorder.write(name, replace(value, stamp=stamp), received)
             self._counts[name] += len(rows)
             for reason, number in refused.items():
                 self._refuse(name, reason, number)
@@ -293,49 +243,46 @@ class _Reading:
             for data, received in zip(messages.data, messages.received.tolist(), strict=True):
                 try:
                     value = topic.read(from_bytes(data, topic.type))
-                    self._recorder.write(name, _stamped(value, received), received)
+                    self.recorder.write(name, _stamped(value, received), received)
                     self._counts[name] += 1
                 except Exception as error:  # must not prevent reading the others
                     self._refuse(name, str(error) or type(error).__name__)
-
-    def _name(self, topic):
-        """Name without namespace; None for a topic that is unknown or still ambiguous."""
-        if topic not in self._split:
-            if self._namespace is None and is_ambiguous(topic):
-                return None     # until another topic determines the robot's namespace
-            self._split[topic] = self._recognise(topic)
-        return self._split[topic]
 
     def _refuse(self, name, reason, count=1):
         self._bad[name] += count
         self._reason.setdefault(name, reason)
 
+    def _name(self, topic):
+        """Name without namespace; None for a topic that is unknown or still ambiguous."""
+        if topic not in self._names:
+            if self._namespace is None and is_ambiguous(topic):
+                return None     # until another topic determines the robot's namespace
+            self._names[topic] = self._recognise(topic)
+        return self._names[topic]
+
     def _recognise(self, topic):
-        split = split_topic(topic, () if self._namespace is None else (self._namespace,))
-        if split is None:
-            return None
-        namespace, name = split
-        if name == 'diagnostics' and namespace == '':
+        known = () if self._namespace is None else (self._namespace,)
+        namespace, name = split_topic(topic, known) or (None, None)
+        if name is None or name == 'diagnostics' and namespace in ('', self._namespace):
             return name
         if self._namespace is None:
             self._namespace = namespace
-        if namespace != self._namespace:
-            if self._chosen or name == 'diagnostics':
-                return None
-            raise BagError(f"{self._path}: holds several robots ('{self._namespace}' and "
-                           f"'{namespace}'); choose one namespace")
-        return name
+        if namespace == self._namespace:
+            return name
+        if name == 'diagnostics':
+            return None
+        raise ParameterError(f"{self._path}: holds several robots ('{self._namespace}' and "
+                       f"'{namespace}'); expected one")
 
-    def finish(self):
+    def problems(self) -> list[str]:
+        """Return a line about missing topics, and one for each topic with unusable messages."""
         missing = [name for name, topic in TOPICS.items()
                    if topic.required and not self._counts[name]]
         if 'target_pose' in missing and self._counts['target_trajectory']:
             missing.remove('target_pose')
-        if missing:
-            self.warnings.append(f"no message on {', '.join(missing)}")
-        for name, count in self._bad.items():
-            self.warnings.append(f'{name}: {count} messages not used ({self._reason[name]})')
-        return self.warnings
+        lines = [f"no message on {', '.join(missing)}"] if missing else []
+        return lines + [f'{name}: {count} messages not used ({self._reason[name]})'
+                        for name, count in self._bad.items()]
 
 
 def _stamped(value, received):
@@ -362,15 +309,9 @@ def _metadata(path, warnings):
     except (YamlError, KeyError, TypeError, AttributeError, ValueError, RecursionError):
         warnings.append('metadata.yaml is not readable')
         return {}
-    used = {key: value for key, value in meta.items() if _usable(key, value)}
+    used = {key: value for key, value in meta.items()
+            if key not in META_TYPES or value is None
+            or isinstance(value, META_TYPES[key]) and len(str(value)) <= LONGEST_TEXT}
     warnings.extend(f'metadata.yaml: {quoted(key)} is not usable, found {quoted(value)}'
                     for key, value in meta.items() if key not in used)
     return used
-
-
-def _usable(key, value):
-    """Whether a value has the type that readers of the log rely on."""
-    if value is None or key not in ('seed', *META_TEXTS):
-        return True
-    return isinstance(value, int) and 0 <= value < 1 << 63 if key == 'seed' else \
-        isinstance(value, str) and len(value) <= LONGEST_TEXT and value.isprintable()

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from io import BytesIO
 import json
 from math import isfinite
 import os
 from pathlib import Path
 import struct
-from typing import Any, ClassVar
+from typing import Any
 
 from rosbags.interfaces import Connection
-from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
+from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
 from rosbags.rosbag2.storage_mcap import McapWriter, write_channel, write_string
 from rosbags.serde import SerdeError
@@ -22,9 +22,10 @@ import yaml
 from beetle_omni_ros.messages.bag_types import from_bytes, new, offered, to_bytes, TYPESTORE
 from beetle_omni_ros.messages.conversions import BODY, nanoseconds, WORLD
 from beetle_omni_ros.messages.topics import ALL, EVENT, LATCHED, Qos, topic_of, TOPICS
-from beetle_omni_ros.robot.schema import read_yaml
+from beetle_omni_ros.robot.schema import ParameterError, read_yaml, YamlError
 from beetle_omni_ros.robot.urdf import joints
-from beetle_omni_ros.runs.bag import BagError, META_KEY
+from beetle_omni_ros.runs.bag import META_KEY
+from beetle_omni_ros.runs.files import write_text
 from beetle_omni_ros.runs.log import Recorder, RUN_STATUS
 
 VERSION = 9     # of metadata.yaml
@@ -42,7 +43,7 @@ def _from_jazzy(metadata):
 
 
 class JazzyStorage(McapWriter):
-    """MCAP with the hash of each type."""
+    """rosbags' MCAP with the hash of each type."""
 
     def add_connection(self, connection: Connection, offered_qos_profiles: str) -> None:
         """Declare a topic."""
@@ -62,37 +63,12 @@ class JazzyStorage(McapWriter):
         super().close(version, _from_jazzy(metadata))
 
 
-class JazzyWriter(Writer):
-    """rosbags' writer with :class:`JazzyStorage`."""
-
-    STORAGE_PLUGINS: ClassVar = {StoragePlugin.MCAP: JazzyStorage}
-
-    def close(self) -> None:
-        """Finish the bag."""
-        super().close()
-        self.metapath.write_text(_from_jazzy(self.metapath.read_text('utf8')), 'utf8')
-
-
 class FrameWriter:
-    """
-    Converts `odom` and `joint_states` to transforms, 50 times a second.
-
-    Args:
-        write: called with topic, ROS type, CDR and time [s].
-        description: URDF.
-        prefix: prefix of the robot's topics, '/' or e.g. '/robot1/'.
-
-    Raises:
-        ParameterError: unusable URDF.
-
-    """
+    """Converts `odom` and `joint_states` to transforms, 50 times a second; writes the URDF too."""
 
     def __init__(self, write: Callable[[str, str, bytes, float], None], description: str,
-                 prefix: str = '/'):
-        self._write, self._text = write, description
-        self._odom, self._joints = f'{prefix}odom', f'{prefix}joint_states'
-        self.topics = {'/tf': (TRANSFORMS, EVENT), '/tf_static': (TRANSFORMS, LATCHED),
-                       f'{prefix}robot_description': (TEXT, LATCHED)}
+                 prefix: str):
+        self._write, self._text, self._prefix = write, description, prefix
         tree = joints(description)
         self._fixed = [joint for joint in tree if joint.axis is None]
         self._moving = {joint.name: joint for joint in tree if joint.axis is not None}
@@ -101,40 +77,35 @@ class FrameWriter:
 
     def take(self, topic: str, data: bytes | memoryview, t: float) -> None:
         """Process a message recorded at ``t`` [s], and write transforms if they are due."""
-        try:
-            if topic == self._joints:
-                self._latest = data
-            elif topic == self._odom and self._latest is not None \
-                    and (self._due is None or t >= self._due):
+        if topic == f'{self._prefix}joint_states':
+            self._latest = data
+        elif topic == f'{self._prefix}odom' and self._latest is not None \
+                and (self._due is None or t >= self._due):
+            # An unreadable message is recorded as it is, without transforms.
+            with suppress(LookupError, TypeError, ValueError, SerdeError, struct.error):
                 self._follow(data, t)
-        except (LookupError, TypeError, ValueError, SerdeError, struct.error):
-            pass        # an unreadable message is recorded as it is, without transforms
 
     def _follow(self, data, t):
         joints = from_bytes(self._latest, 'sensor_msgs/msg/JointState')
         stamp, angles = joints.header.stamp, dict(zip(joints.name, joints.position))
         odom = from_bytes(data, 'nav_msgs/msg/Odometry')
-        if not angles.keys() >= self._moving.keys():
-            return
-        if self._due is None:
-            self._begin(odom.header.stamp, t)
-        self._due = t + PERIOD if self._due is None else max(self._due + PERIOD, t)
         at, turn = odom.pose.pose.position, odom.pose.pose.orientation
         frames = [(WORLD, BODY, odom.header.stamp, (at.x, at.y, at.z),
                    (turn.x, turn.y, turn.z, turn.w)),
                   *((joint.parent, joint.child, stamp, joint.position, joint.turned(angles[name]))
                     for name, joint in self._moving.items())]
-        if all(isfinite(x) for *_, position, quaternion in frames for x in (
-                *position, *quaternion)):
-            self._write('/tf', TRANSFORMS, _transforms(frames), t)
-
-    def _begin(self, stamp, t):
-        self._write('/tf_static', TRANSFORMS, _transforms(
-            [(joint.parent, joint.child, stamp, joint.position, joint.quaternion)
-             for joint in self._fixed]), t)
-        text = new(TEXT)
-        text.data = self._text
-        self._write(list(self.topics)[-1], TEXT, to_bytes(text, TEXT), t)
+        if not all(isfinite(x) for *_, position, quaternion in frames
+                   for x in (*position, *quaternion)):
+            return
+        if self._due is None:
+            self._write('/tf_static', TRANSFORMS, _transforms(
+                [(joint.parent, joint.child, odom.header.stamp, joint.position, joint.quaternion)
+                 for joint in self._fixed]), t)
+            text = new(TEXT)
+            text.data = self._text
+            self._write(f'{self._prefix}robot_description', TEXT, to_bytes(text, TEXT), t)
+        self._due = t + PERIOD if self._due is None else max(self._due + PERIOD, t)
+        self._write('/tf', TRANSFORMS, _transforms(frames), t)
 
 
 def _transforms(frames):
@@ -176,7 +147,7 @@ class BagWriter(Recorder):
             epoch: UNIX time of time 0 [s], so that a flight that begins at 0 s gets a real date.
 
         Raises:
-            BagError: the folder exists or cannot be made.
+            ParameterError: as of :func:`check_new`.
 
         """
         self.path = Path(path)
@@ -185,22 +156,21 @@ class BagWriter(Recorder):
         self._connections: dict[str, Connection] = {}
         self._prefix = '/' + namespace.strip('/') + '/' if namespace.strip('/') else '/'
         check_new(self.path)
-        try:
-            self._writer: JazzyWriter | None = JazzyWriter(
-                self.path, version=VERSION, storage_plugin=StoragePlugin.MCAP)
-            if compression == 'zstd':
-                self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+        self._writer: Writer | None = Writer(self.path, version=VERSION,
+                                             storage_plugin=StoragePlugin.MCAP)
+        self._writer.STORAGE_PLUGINS = {StoragePlugin.MCAP: JazzyStorage}
+        if compression == 'zstd':
+            self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+        with self._disk():
             self._writer.open()
-        except (OSError, WriterError) as error:
-            reason = getattr(error, 'strerror', None) or error
-            raise BagError(f'{path}: cannot write a bag there ({reason})') from None
         for name in topics:
             self._declare(self._prefix + name, topic_of(name).type, topic_of(name).qos)
         self._frames = None
         if description:
             self._frames = FrameWriter(self.write_raw, description, self._prefix)
-            for name, (msgtype, qos) in self._frames.topics.items():
-                self._declare(name, msgtype, qos)
+            self._declare('/tf', TRANSFORMS, EVENT)
+            self._declare('/tf_static', TRANSFORMS, LATCHED)
+            self._declare(f'{self._prefix}robot_description', TEXT, LATCHED)
         self._last_t = None      # [s] of the newest message
         if meta:
             self.write_meta(meta)
@@ -228,7 +198,7 @@ class BagWriter(Recorder):
     def write(self, topic: str, value: Any, received: float | None = None) -> None:
         """Write one value, see :class:`Recorder`."""
         name, entry = self._prefix + topic, topic_of(topic)
-        if name not in self._connections and self._writer is not None:
+        if name not in self._connections:
             self._declare(name, entry.type, entry.qos)
         if received is None:
             received = value[0].t if isinstance(value, list) else value.stamp
@@ -248,15 +218,13 @@ class BagWriter(Recorder):
             t: time of recording since ``epoch`` [s].
 
         Raises:
-            BagError: unknown type, or the file cannot be written.
+            ParameterError: the file cannot be written.
 
         """
-        if self._writer is None:
-            raise BagError(f'{self.path}: the bag is closed')
+        if self._writer is None:    # a node may still receive while it ends
+            raise ParameterError(f'{self.path}: the bag is closed')
         connection = self._connections.get(topic)
         if connection is None:
-            if msgtype not in TYPESTORE.types:
-                raise BagError(f'{self.path}: topic {topic} has the unknown type {msgtype}')
             ours = ALL.get(topic.removeprefix(self._prefix))
             connection = self._declare(topic, msgtype, ours.qos if ours else EVENT)
         first, self._last_t = self._last_t is None, t
@@ -270,8 +238,6 @@ class BagWriter(Recorder):
 
     def flush(self) -> None:
         """Pass the written data to the operating system, so that it survives a SIGKILL."""
-        if self._writer is None:
-            return
         storage = self._writer.storage
         with self._disk():
             if storage.chunk.msgs:
@@ -290,13 +256,14 @@ class BagWriter(Recorder):
             writer.storage.chunk.message_start_time = 0
         with self._disk():
             writer.close()
+            writer.metapath.write_text(_from_jazzy(writer.metapath.read_text('utf8')), 'utf8')
 
     @contextmanager
     def _disk(self):
         try:
             yield
         except OSError as error:
-            raise BagError(f'{self.path}: {error.strerror}') from error
+            raise ParameterError(f'{self.path}: {error.strerror}') from error
 
     def write_meta(self, meta: dict) -> None:
         """Add metadata; also written as a message, for a bag without metadata.yaml."""
@@ -313,38 +280,31 @@ def check_new(path: str | Path) -> None:
     Check before a flight that its bag can be written.
 
     Raises:
-        BagError: the folder exists, or its nearest existing parent is no writable folder.
+        ParameterError: the folder exists, or its nearest existing parent is no writable folder.
 
     """
     path = Path(path)
     if path.exists() or path.is_symlink():
-        raise BagError(f'{path}: exists already; a bag needs a new folder')
+        raise ParameterError(f'{path}: exists already; a bag needs a new folder')
     parent = next(folder for folder in path.absolute().parents if folder.exists())
-    if not parent.is_dir():
-        raise BagError(f'{path}: {parent} is not a folder')
-    if not os.access(parent, os.W_OK | os.X_OK):
-        raise BagError(f'{path}: no permission to write in {parent}')
+    if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
+        raise ParameterError(f'{path}: {parent} is not a folder that can be written')
 
 
 def add_meta(path: str | Path, meta: dict) -> None:
     """
-    Add metadata of the flight to a finished bag: task, conditions, seed, robot.
+    Add metadata of the flight to a finished bag of a :class:`BagWriter`.
 
     Raises:
-        BagError: the folder has no usable metadata.yaml.
+        ParameterError: the folder has no metadata.yaml, or it cannot be written.
 
     """
     file = Path(path) / 'metadata.yaml'
     try:
         content = read_yaml(file)
-        information = content['rosbag2_bagfile_information']
-        custom = information['custom_data'] or {}
-        known = json.loads(custom.get(META_KEY, '{}'))
-        information['custom_data'] = {**custom, META_KEY: json.dumps({**known, **meta})}
-        temporary = file.with_suffix('.yaml.tmp')
-        temporary.write_text(yaml.safe_dump(content))
-        temporary.replace(file)
-    except OSError as error:
-        raise BagError(f'{file}: {error.strerror}') from None
-    except (AttributeError, KeyError, RecursionError, TypeError, ValueError):
-        raise BagError(f'{file}: not the metadata of a rosbag2 folder') from None
+    except YamlError as error:
+        raise ParameterError(f'{file}: {error}') from None
+    information = content['rosbag2_bagfile_information']
+    known = json.loads((information['custom_data'] or {}).get(META_KEY, '{}'))
+    information['custom_data'] = {META_KEY: json.dumps({**known, **meta})}
+    write_text(file, yaml.safe_dump(content), 'metadata')

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 import csv
-from dataclasses import dataclass
 import json
 from math import isfinite
 import os
@@ -12,72 +11,52 @@ import numpy as np
 
 from beetle_omni_ros.robot.schema import ParameterError, quoted
 
-
-class LogError(ParameterError):
-    """A measured log is unusable; the text states file, row or column, and expectation."""
-
-
-@dataclass(frozen=True)
-class Table:
-    """
-    Columns of numbers.
-
-    Attributes:
-        path: path of the file.
-        columns: name -> (N,) values of the read columns.
-        rows: (N,) line number of each row in the file.
-
-    """
-
-    path: Path
-    columns: dict[str, np.ndarray]
-    rows: np.ndarray
-
-    def __len__(self):
-        return len(self.rows)
+LogError = ParameterError   # its name in identify
 
 
 def read_table(path: str | Path, wanted: Callable[[list[str]], list[str]], expected: str, *,
-               check: Callable[[list[float]], str] = lambda values: '') -> Table:
+               check: Callable[[list[float]], str] = lambda values: ''
+               ) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """
     Read columns of a CSV file; blank lines, comments (#) and further columns are ignored.
 
     Args:
         path: path of the file.
-        wanted: header -> names of the columns to read; may raise LogError without the path.
+        wanted: header -> names of the columns to read; may raise ParameterError without the path.
         expected: example of a header, for messages.
         check: values of a row -> text about an unusable row after its number, or ''.
 
+    Returns:
+        Name -> (N,) values of the read columns, and (N,) line number of each row in the file.
+
     Raises:
-        LogError: no such file, no header, a missing or repeated column, or a field without a
-        number.
+        ParameterError: no such file, no header, a missing or repeated column, or a field without
+        a number; names file, row or column, and expectation.
 
     """
-    path = Path(path)
     try:
         with open(path, newline='', encoding='utf-8-sig') as file:
             reader = csv.reader(file)
             lines = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
     except FileNotFoundError:
-        raise LogError(f'{path}: no such file') from None
+        raise ParameterError(f'{path}: no such file') from None
     except (OSError, UnicodeDecodeError, csv.Error) as cause:
         reason = f"not a CSV text file ({getattr(cause, 'strerror', None) or cause})"
-        raise LogError(f'{path}: {reason}') from None
+        raise ParameterError(f'{path}: {reason}') from None
     lines = [(number, row) for number, row in lines
              if any(row) and not row[0].startswith('#')]
     if not lines:
-        raise LogError(f'{path}: empty; expected the header {expected}')
+        raise ParameterError(f'{path}: empty; expected the header {expected}')
     number, header = lines.pop(0)
-    if all(map(_is_number, header)):
-        raise LogError(f'{path}: row {number}: the header is missing; expected {expected}')
     try:
+        if all(map(_is_number, header)):
+            raise ParameterError('the header is missing')
         names = wanted(header)
-    except LogError as cause:
-        raise LogError(f'{path}: row {number}: {cause}; expected {expected}') from None
-    for name in names:
-        if header.count(name) > 1:
-            raise LogError(f"{path}: row {number}: column '{name}' occurs twice; "
-                        f'expected {expected}')
+        for name in names:
+            if header.count(name) > 1:
+                raise ParameterError(f"column '{name}' occurs twice")
+    except ParameterError as cause:
+        raise ParameterError(f'{path}: row {number}: {cause}; expected {expected}') from None
     index, values = [header.index(name) for name in names], []
     for line, row in lines:
         reason = _unusable(row, header, index)
@@ -85,10 +64,10 @@ def read_table(path: str | Path, wanted: Callable[[list[str]], list[str]], expec
             values.append([float(row[k]) for k in index])
             reason = check(values[-1])
         if reason:
-            raise LogError(f'{path}: row {line}{reason}')
+            raise ParameterError(f'{path}: row {line}{reason}')
     table = np.array(values).reshape(len(lines), len(names))
-    return Table(path, {name: table[:, k] for k, name in enumerate(names)},
-                 np.array([line for line, _ in lines], dtype=int))
+    return ({name: table[:, k] for k, name in enumerate(names)},
+            np.array([line for line, _ in lines], dtype=int))
 
 
 def _unusable(row, header, index):
@@ -107,12 +86,12 @@ def _is_number(text):
     return True
 
 
-def missing(name: str, header: list[str]) -> LogError:
+def missing(name: str, header: list[str]) -> ParameterError:
     """Error about a missing column; it mentions a column of the same name with another unit."""
     stem = name.rpartition('_')[0]
     other = [cell for cell in header if stem and cell.rpartition('_')[0] == stem]
     hint = f" ('{other[0]}' has another unit)" if other else ''
-    return LogError(f"column '{name}' is missing{hint}")
+    return ParameterError(f"column '{name}' is missing{hint}")
 
 
 def check_writable(path: str | Path | None, what: str = 'result file') -> None:

@@ -3,12 +3,14 @@ One flight as numpy arrays, its recording, and the motion and errors in it.
 
 Times are float seconds on the flight's clock: ROS time in the graph, from 0 in the in-process
 loop. A loop records into memory (:class:`LogRecorder`), onto disk
-(:class:`~beetle_omni_ros.runs.bag_writer.BagWriter`), or both with :class:`Tee`.
+(:class:`~beetle_omni_ros.runs.bag_writer.BagWriter`), or both (:class:`Recorder`).
 """
 
+from __future__ import annotations
+
 from array import array
-from dataclasses import dataclass, field, fields
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -27,7 +29,7 @@ SERIES = {
     'command': {'received': 0, 'tilt': 4, 'thrust': 4},
     'wrench': {'force': 3, 'torque': 3},
 }
-"""Series -> channel -> width; 0 is a scalar channel. Each series has times ``<series>_t``."""
+"""Series -> channel -> width; 0 is a scalar. A log has times ``<series>_t`` and each channel."""
 
 SERIES_OF = {'ground_truth/odom': 'truth', 'odom': 'odom', 'imu/data_raw': 'imu',
              'mocap/pose': 'mocap', 'joint_states': 'joint', 'battery_state': 'battery',
@@ -93,36 +95,6 @@ class FlightLog:
 
     """
 
-    truth_t: np.ndarray = _empty(0)
-    truth_position: np.ndarray = _empty(3)
-    truth_quaternion: np.ndarray = _empty(4)
-    truth_velocity: np.ndarray = _empty(3)
-    truth_angular_velocity: np.ndarray = _empty(3)
-    odom_t: np.ndarray = _empty(0)
-    odom_position: np.ndarray = _empty(3)
-    odom_quaternion: np.ndarray = _empty(4)
-    odom_velocity: np.ndarray = _empty(3)
-    odom_angular_velocity: np.ndarray = _empty(3)
-    imu_t: np.ndarray = _empty(0)
-    imu_specific_force: np.ndarray = _empty(3)
-    imu_angular_velocity: np.ndarray = _empty(3)
-    mocap_t: np.ndarray = _empty(0)
-    mocap_position: np.ndarray = _empty(3)
-    mocap_quaternion: np.ndarray = _empty(4)
-    joint_t: np.ndarray = _empty(0)
-    joint_position: np.ndarray = _empty(4)
-    joint_velocity: np.ndarray = _empty(4)
-    joint_effort: np.ndarray = _empty(4)
-    battery_t: np.ndarray = _empty(0)
-    battery_voltage: np.ndarray = _empty(0)
-    battery_current: np.ndarray = _empty(0)
-    command_t: np.ndarray = _empty(0)
-    command_received: np.ndarray = _empty(0)
-    command_tilt: np.ndarray = _empty(4)
-    command_thrust: np.ndarray = _empty(4)
-    wrench_t: np.ndarray = _empty(0)
-    wrench_force: np.ndarray = _empty(3)
-    wrench_torque: np.ndarray = _empty(3)
     requests: dict[str, Commands] = field(default_factory=dict)
     targets: list[Target] = field(default_factory=list)
     state_t: np.ndarray = _empty(0)
@@ -134,10 +106,18 @@ class FlightLog:
     warnings: list[str] = field(default_factory=list)
     source: str = ''
 
+    if TYPE_CHECKING:
+        def __getattr__(self, name: str) -> np.ndarray:
+            """Return a channel of SERIES."""
+
+    def __post_init__(self):
+        for series, channels in SERIES.items():
+            _unpack(self, f'{series}_', (), channels)
+
     @property
-    def body(self) -> str:
-        """Series that metrics use: 'truth' if it was recorded, else 'odom'."""
-        return 'truth' if len(self.truth_t) else 'odom'
+    def begin(self) -> float:
+        """Time of the first target [s]; without one, that of :attr:`start`."""
+        return self.targets[0].stamp if self.targets else self.start
 
     @property
     def start(self) -> float:
@@ -150,8 +130,8 @@ class FlightLog:
         return max((times[-1] for times in self._times()), default=0.0)
 
     def _times(self):
-        return [times for entry in fields(self) if entry.name.endswith('_t')
-                and len(times := getattr(self, entry.name))]
+        return [times for series in (*SERIES, 'state')
+                if len(times := getattr(self, f'{series}_t'))]
 
     def controllers(self) -> list[str]:
         """Return the names of the controllers that flew, in this order."""
@@ -200,7 +180,7 @@ class FlightLog:
 
 class Recorder:
     """
-    Interface of recorders: :meth:`write` for every topic, and shorter calls for some.
+    Interface of recorders; by itself it passes everything on to others.
 
     Attributes:
         keeps_covariances: whether the covariances of ``odom`` are recorded.
@@ -208,6 +188,10 @@ class Recorder:
     """
 
     keeps_covariances = False
+
+    def __init__(self, *others: Recorder):
+        self._others = others
+        self.keeps_covariances = any(other.keeps_covariances for other in others)
 
     def write(self, topic: str, value: Any, received: float | None = None) -> None:
         """
@@ -220,11 +204,13 @@ class Recorder:
             received: time of recording [s]; default: the value's stamp. Required for text.
 
         """
-        raise NotImplementedError
+        for other in self._others:
+            other.write(topic, value, received)
 
     def write_meta(self, meta: dict) -> None:
         """Add metadata of the flight: task, conditions, seed, robot, version."""
-        raise NotImplementedError
+        for other in self._others:
+            other.write_meta(meta)
 
     def write_target(self, target: Target, received=None) -> None:
         """Record a pose or trajectory target, valid from its stamp."""
@@ -326,7 +312,9 @@ class LogRecorder(Recorder):
             _unpack(log, series + '_', self._rows[series], channels)
         log.requests = {name: _unpack(Commands(), '', rows, SERIES['command'])
                         for name, rows in self._requests.items()}
-        log.targets = _in_order(log.targets)
+        # A latched topic repeats its target: of equal stamps, the last one is kept.
+        log.targets = list({(target.stamp, type(target)): target for target in sorted(
+            log.targets, key=lambda target: target.stamp)}.values())
         states = sorted(self._states, key=lambda entry: entry[0])
         log.state_t = np.array([t for t, _ in states], dtype=float)
         log.states = [state for _, state in states]
@@ -345,35 +333,6 @@ def _unpack(into, prefix, rows, channels):
         setattr(into, prefix + name, values.copy())
         column += max(1, w)
     return into
-
-
-def _in_order(targets):
-    """Sort by stamp; of several targets with the same stamp (latched topics), keep one."""
-    kept: list[Target] = []
-    for target in sorted(targets, key=lambda entry: entry.stamp):
-        if kept and target.stamp == kept[-1].stamp and type(target) is type(kept[-1]):
-            kept[-1] = target
-        else:
-            kept.append(target)
-    return kept
-
-
-class Tee(Recorder):
-    """Records with several recorders."""
-
-    def __init__(self, *recorders: Recorder):
-        self._recorders = recorders
-        self.keeps_covariances = any(recorder.keeps_covariances for recorder in recorders)
-
-    def write(self, topic: str, value: Any, received: float | None = None) -> None:
-        """Record one value."""
-        for recorder in self._recorders:
-            recorder.write(topic, value, received)
-
-    def write_meta(self, meta: dict) -> None:
-        """Add metadata of the flight."""
-        for recorder in self._recorders:
-            recorder.write_meta(meta)
 
 
 @dataclass(frozen=True)
@@ -407,9 +366,9 @@ class Motion:
         return len(times) > 0 and times[0] <= begin + gap and times[-1] >= end - gap
 
 
-def motion(log: FlightLog, series: str | None = None) -> Motion:
-    """Return the motion of a series, by default of the truth if recorded, else the estimate."""
-    name = series or log.body
+def motion(log: FlightLog) -> Motion:
+    """Return the true motion if it was recorded, else the estimated one."""
+    name = 'truth' if len(log.truth_t) else 'odom'
     return Motion(*(getattr(log, f'{name}_{channel}') for channel in
                     ('t', 'position', 'quaternion', 'velocity', 'angular_velocity')))
 

@@ -1,7 +1,6 @@
 """Result tables of flights."""
 
-from itertools import zip_longest
-from types import MappingProxyType
+from collections.abc import Callable
 
 from rich.console import Console
 
@@ -105,9 +104,7 @@ PUSHED = {
 # Control for Overactuated Tiltable-Quadrotors (arXiv 2405.09871).
 RISE = {'x': 0.71, 'y': 0.70, 'z': 0.58, 'roll': 0.91, 'pitch': 0.89, 'yaw': 0.68}
 
-# Task -> published results of poses, and of tracking, in the form of our metrics.
-POSES = {'random100': RANDOM_POSES, 'waypoints': WAYPOINTS}
-TRACKING = {'lemniscate': LEMNISCATE}
+POSES = {'random100': RANDOM_POSES, 'waypoints': WAYPOINTS}     # of a task
 
 
 def grids(results: dict, *, with_poses: bool | None = None) -> list[Grid]:
@@ -121,37 +118,76 @@ def grids(results: dict, *, with_poses: bool | None = None) -> list[Grid]:
     """
     task = str(results.get('meta', {}).get('task', ''))
     by_label = {name: result for name, result in results.items() if name != 'meta'}
-
-    def having(key):
-        return {name: result for name, result in by_label.items() if key in result}
-
     made = [_summary(by_label, task)]
-    if tracked := having('trajectory'):
-        rounds = [part for name, result in tracked.items() for part in (
-            *((name, str(k + 1), each) for k, each in enumerate(result['trajectory']['rounds'])),
-            (name, 'all', result['trajectory']))]
-        made.append(_spread('Trajectory tracking', 'round', rounds, TRACKING.get(task, {})))
-    for kind, unit in (('force', 'N'), ('torque', 'N_m')):
-        if disturbed := having(kind):
-            made.append(_levels(disturbed, kind, unit))
-    if loaded := having('payload'):
-        made.append(_payloads(loaded))
-    if hovered := having('hover'):
-        made.append(_spread('Hover after 8 s', 'part', [
-            (name, 'all', result['hover']) for name, result in hovered.items()]))
-    if blown := having('wind'):
-        made.append(_spread('Hover before a fan', 'wind', [
-            (name, f"{part['speed_m_s']:g} m/s", part)
-            for name, result in blown.items() for part in result['wind']], WIND))
-    if pushed := having('pushes'):
-        made.append(_pushes(pushed))
-    if stepped := having('steps'):
-        made.append(_steps(stepped))
+    for key, (title, heading, parts, columns) in KINDS.items():
+        found = [(label, *part) for label, result in by_label.items() if key in result
+                 for part in parts(result[key])]
+        if found:
+            others = {'trajectory': LEMNISCATE if task == 'lemniscate' else {}, 'wind': WIND,
+                      'pushes': PUSHED}.get(key, {})
+            printed = [(f'published {name}', 'all', part) for name, part in others.items()]
+            if key == 'steps':
+                printed = [('published NMPC', axis, {'rise_s': rise})
+                           for axis, rise in RISE.items()]
+            rows = [[label, name, *(cell(part) for cell in columns.values())]
+                    for label, name, part in found + printed]
+            made.append(Grid(title, ['', heading, *columns], rows,
+                             frozenset(range(len(found), len(rows)))))
     for group in _same_poses(by_label):
         count = len(next(iter(group.values()))['poses'])
         if with_poses or (with_poses is None and 1 < count <= MANY_POSES):
             made.append(_poses(group))
     return made
+
+
+def _value(key, digits):
+    """Cell of a number."""
+    return lambda part: number(part.get(key), digits)
+
+
+def _spread(name, unit, digits):
+    """Cell of mean, standard deviation and largest value of an error."""
+    def cell(part):
+        mean, std, worst = (number(part.get(f'{name}_{what}_{unit}'), digits)
+                            for what in ('mean', 'std', 'max'))
+        return f'{mean} ± {std} ({worst})' if worst != ABSENT else f'{mean} ± {std}'
+    return cell
+
+
+def _levels(unit):
+    return lambda found: [(f"{level[f'level_{unit}']:g}" + (' lost' if level['lost'] else ''),
+                           level) for level in found.get('levels', [])]
+
+
+def _numbered(parts):
+    return [(str(k + 1), part) for k, part in enumerate(parts)]
+
+
+SPREADS = {'position mean ± std (max) [m]': _spread('position', 'm', 3),
+           'orientation mean ± std (max) [deg]': _spread('orientation', 'deg', 2)}
+PEAKS = {'peak position [m]': _value('peak_position_m', 3),
+         'peak orientation [deg]': _value('peak_orientation_deg', 2)}
+# Key of a result -> title of its table, heading and names of its parts, and cells of a part.
+KINDS: dict[str, tuple[str, str, Callable, dict[str, Callable]]] = {
+    'trajectory': ('Trajectory tracking', 'round', lambda found: [
+        *_numbered(found['rounds']), ('all', found)], SPREADS),
+    'force': ('Disturbance: force', 'force [N]', _levels('N'), PEAKS),
+    'torque': ('Disturbance: torque', 'torque [N m]', _levels('N_m'), PEAKS),
+    'payload': ('Payload, steady errors', 'payload [kg]', lambda found: [
+        (f"{part['payload_kg']:g}", part) for part in found], {
+            'height error [m]': _value('height_error_m', 4),
+            'orientation [deg]': _value('orientation_deg', 2)}),
+    'hover': ('Hover after 8 s', 'part', lambda found: [('all', found)], SPREADS),
+    'wind': ('Hover before a fan', 'wind', lambda found: [
+        (f"{part['speed_m_s']:g} m/s", part) for part in found], SPREADS),
+    'pushes': ('Stick pushes', 'push', lambda found: [
+        *_numbered(found['pushes']), ('all', found)], {
+            **PEAKS, 'recovery [s]': _value('recovery_s', 2),
+            'mean speed [m/s]': _value('speed_mean_m_s', 3),
+            'mean rate [rad/s]': _value('angular_speed_mean_rad_s', 3)}),
+    'steps': ('Step responses', 'step', lambda found: [(step['axis'], step) for step in found], {
+        'rise [s]': _value('rise_s', 2), 'settling [s]': _value('settling_s', 2),
+        'overshoot [%]': _value('overshoot_percent', 1)})}
 
 
 def _same_poses(by_label):
@@ -201,87 +237,6 @@ def _reached(result):
     if 'poses' not in result:
         return ABSENT
     return f"{sum(pose['reached'] for pose in result['poses'])} of {len(result['poses'])}"
-
-
-def _spread(title, column, parts, published=MappingProxyType({})):
-    """Table of both errors of each part (controller, name, errors) of flights."""
-    header = ['', column, 'position mean ± std (max) [m]', 'orientation mean ± std (max) [deg]']
-    rows = [[label, name, *_tracking_cells(part)] for label, name, part in parts]
-    ours = len(rows)
-    rows += [[f'published {name}', 'all', *_tracking_cells(part)]
-             for name, part in published.items()]
-    return Grid(title, header, rows, frozenset(range(ours, len(rows))))
-
-
-def _tracking_cells(part):
-    cells = []
-    for name, unit, digits in (('position', 'm', 3), ('orientation', 'deg', 2)):
-        mean, std, worst = (number(part.get(f'{name}_{what}_{unit}'), digits)
-                            for what in ('mean', 'std', 'max'))
-        cells.append(f'{mean} ± {std} ({worst})' if worst != ABSENT else f'{mean} ± {std}')
-    return cells
-
-
-def _levels(by_label, kind, unit):
-    text = unit.replace('_', ' ')
-    header = [f'{kind} [{text}]'] + [f'{name}: {what}' for name in by_label
-                                     for what in ('peak position [m]', 'peak orientation [deg]')]
-    levels = [{entry[f'level_{unit}']: entry for entry in result[kind].get('levels', [])}
-              for result in by_label.values()]
-    rows = []
-    for step in sorted(set().union(*levels)):
-        row = [f'{step:g}']
-        for entries in levels:
-            entry = entries.get(step)
-            row += [number(entry['peak_position_m'], 3) + (' lost' if entry['lost'] else ''),
-                    number(entry['peak_orientation_deg'], 1)] if entry else [ABSENT, ABSENT]
-        rows.append(row)
-    lost = [result[kind].get(f'lost_at_{unit}') for result in by_label.values()]
-    rows.append(['lost at'] + [cell for level in lost for cell in
-                               ('never' if level is None else f'{level:g} {text}', '')])
-    return Grid(f'Disturbance: {kind}', header, rows)
-
-
-def _payloads(by_label):
-    header = ['payload [kg]'] + [f'{name}: {what}' for name in by_label
-                                 for what in ('height error [m]', 'orientation [deg]')]
-    rows = []
-    for entries in zip_longest(*(result['payload'] for result in by_label.values())):
-        mass = next(entry['payload_kg'] for entry in entries if entry)
-        rows.append([f'{mass:g}'] + [cell for entry in entries for cell in (
-            [number(entry['height_error_m'], 4), number(entry['orientation_deg'], 2)]
-            if entry else [ABSENT, ABSENT])])
-    return Grid('Payload, steady errors', header, rows)
-
-
-def _pushes(by_label):
-    header = ['', 'push', 'peak position [m]', 'peak orientation [deg]', 'recovery [s]',
-              'mean speed [m/s]', 'mean rate [rad/s]']
-    rows = []
-    for name, result in by_label.items():
-        rows += [[name, str(k + 1), number(push['peak_position_m'], 3),
-                  number(push['peak_orientation_deg'], 2), number(push['recovery_s'], 2), '', '']
-                 for k, push in enumerate(result['pushes']['pushes'])]
-        rows.append([name, 'all', '', '', '', *_mean_speeds(result['pushes'])])
-    ours = len(rows)
-    rows += [[f'published {name}', 'all', '', '', '', *_mean_speeds(part)]
-             for name, part in PUSHED.items()]
-    return Grid('Stick pushes', header, rows, frozenset(range(ours, len(rows))))
-
-
-def _mean_speeds(part):
-    return (number(part['speed_mean_m_s'], 3), number(part['angular_speed_mean_rad_s'], 3))
-
-
-def _steps(by_label):
-    header = ['step', *(f'{name}: {what}' for name in by_label for what in (
-        'rise [s]', 'settling [s]', 'overshoot [%]')), 'published rise [s]']
-    rows = []
-    for steps in zip(*(result['steps'] for result in by_label.values()), strict=True):
-        axis = steps[0]['axis']
-        rows.append([axis, *(number(step[key], digits) for step in steps for key, digits in (
-            ('rise_s', 2), ('settling_s', 2), ('overshoot_percent', 1))), number(RISE[axis], 2)])
-    return Grid('Step responses', header, rows)
 
 
 def _poses(by_label):

@@ -42,10 +42,10 @@ class TargetLimits(ParameterFile, file='targets.yaml'):
 
 
 class TargetChecks:
-    """Checks targets of one robot, by default with the limits of params/targets.yaml."""
+    """Checks targets of one robot."""
 
-    def __init__(self, robot: RobotParameters, limits: TargetLimits | None = None):
-        self._p = p = limits or TargetLimits.load()
+    def __init__(self, robot: RobotParameters):
+        self._p = p = TargetLimits.load()
         feet = [(x * p.feet_spread, y * p.feet_spread, -p.feet) for x in (1, -1) for y in (1, -1)]
         # The joints' axes pass through the rotors' centres, which gives the main body's height.
         ball = robot.rotors.positions.mean(axis=0) + [
@@ -65,14 +65,12 @@ class TargetChecks:
             '' for a valid target, else error and expectation in one line.
 
         """
-        reason = self._stamp(target.stamp, now)
-        if reason:
+        if reason := self._stamp(target.stamp, now):
             return reason
         if isinstance(target, PoseTarget):
             return self.why_not_pose(target.position, target.quaternion)
         for k, pose in enumerate(zip(target.positions, target.quaternions)):
-            reason = self.why_not_pose(*pose)
-            if reason:
+            if reason := self.why_not_pose(*pose):
                 return f'point {k + 1}: {reason}'
         return self._motion(target.velocities, 'velocity', self._p.speed, 'm/s') or self._motion(
             target.angular_velocities, 'angular velocity', self._p.rate, 'rad/s') or \
@@ -93,24 +91,20 @@ class TargetChecks:
                                   ('z', z, self._p.height)):
             if value > most:
                 return f'{name} = {value:.4g} m, expected at most {most:g} m: the fence'
-        needed = self.lowest_height(quaternion)
+        down = self._points @ rotations.matrix(rotations.normalized(quaternion))[2] - self._radii
+        needed = self._p.clearance - float(down.min())
         if z < needed - 1e-9:
             return f'z = {z:.4g} m, expected at least {needed:.2f} m at this attitude: the floor'
         return ''
 
-    def lowest_height(self, quaternion: np.ndarray) -> float:
-        """Return the lowest allowed height of base_link at an attitude (4,) [m]."""
-        down = self._points @ rotations.matrix(rotations.normalized(quaternion))[2] - self._radii
-        return self._p.clearance - float(down.min())
-
     @staticmethod
     def _motion(values, name, most, unit):
-        good = np.all(np.abs(values) <= most, axis=1)       # nan is not
-        if good.all():
+        fast = np.argwhere(~(np.abs(values) <= most))       # nan too
+        if not len(fast):
             return ''
-        k = int(np.argmin(good))
-        worst = values[k][np.argmax(~(np.abs(values[k]) <= most))]
-        return f'point {k + 1}: {name} {worst:.4g} {unit}, expected within +-{most:g} {unit}'
+        k, axis = fast[0]
+        return f'point {k + 1}: {name} {values[k, axis]:.4g} {unit}, expected within ' \
+               f'+-{most:g} {unit}'
 
     def _steps(self, target):
         """Check the mean speeds between points."""
@@ -157,11 +151,11 @@ def read_poses(path: str | Path, reach: float = np.inf) -> np.ndarray:
         ParameterError: unusable file; names file, row (as in an editor), column and expectation.
 
     """
-    table = read_table(path, _columns, ','.join(COLUMNS), check=_unusable)
-    if not len(table):
+    columns, rows = read_table(path, _columns, ','.join(COLUMNS), check=_unusable)
+    if not len(rows):
         raise ParameterError(f'{path}: no pose below the header; expected at least one row')
-    poses = np.stack(list(table.columns.values()), axis=1)
-    check_steps(poses, reach, lambda k: f'{path}: row {table.rows[k]}')
+    poses = np.stack(list(columns.values()), axis=1)
+    check_steps(poses, reach, lambda k: f'{path}: row {rows[k]}')
     return poses
 
 
@@ -185,12 +179,10 @@ def _columns(header):
     for name in COLUMNS:
         if name not in header:
             raise missing(name, header)
-    return list(COLUMNS)    # a column that occurs twice is refused by read_table
+    return list(COLUMNS)
 
 
 def _unusable(pose):
-    if pose[2] <= 0:
-        return f', column z_m: expected a height above the floor, found {pose[2]:g}'
     reason = _checks().why_not_pose(pose[:3], rotations.from_rpy(*np.radians(pose[3:])))
     return f': {reason}' if reason else ''
 

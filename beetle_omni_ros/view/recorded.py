@@ -1,19 +1,18 @@
 """Recorded runs in 3D: one HTML text with viser's player, which needs no network."""
 
 from collections.abc import Mapping
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
 
 from beetle_omni_ros.pages.figures import COLOURS
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.robot.urdf import Model
-from beetle_omni_ros.runs.bag import names_of, no_pose, read_bag, runs_in
+from beetle_omni_ros.runs.bag import read_flights
 from beetle_omni_ros.runs.log import FlightLog, motion
-from beetle_omni_ros.view.moments import drawable, moments
-from beetle_omni_ros.view.scene import close, Room, serve
+from beetle_omni_ros.view.scene import close, drawable, moments, Room, serve
 
 RATE, MOST = 20.0, 4000     # [Hz] of the pictures; of all robots
 TEXT_EVERY = 4              # pictures
@@ -22,24 +21,17 @@ BEFORE = 3.0                # [s] shown before the first target
 LOCAL = '127.0.0.1'
 
 
-def start_of(log: FlightLog) -> float:
-    """Return the time of the first target, else the begin of the flight [s]."""
-    return log.targets[0].stamp if log.targets else log.start
-
-
-def recorded_scene(logs: Mapping[str, FlightLog], model: Model | None = None,
-                   dark: bool = False) -> str:
+def recorded_scene(logs: Mapping[str, FlightLog], model: Model | None = None) -> str:
     """
     Return the HTML of a player of flights, aligned by their first targets.
 
     Args:
         logs: name -> flight with poses; the first is drawn solid.
         model: links and shapes of the robots; default: the shipped ones.
-        dark: whether the background is dark.
 
     """
-    begin = max(-BEFORE, min(motion(log).t[0] - start_of(log) for log in logs.values()))
-    end = max(motion(log).t[-1] - start_of(log) for log in logs.values())
+    begin = max(-BEFORE, min(motion(log).t[0] - log.begin for log in logs.values()))
+    end = max(motion(log).t[-1] - log.begin for log in logs.values())
     step = max(1 / RATE, (end - begin) * len(logs) / MOST)
     times = np.arange(begin, end, step)
     server = serve(LOCAL, 8080)
@@ -52,7 +44,7 @@ def recorded_scene(logs: Mapping[str, FlightLog], model: Model | None = None,
         room.look_at(every.min(axis=0), every.max(axis=0))
         recording = server.get_scene_serializer()
         texts = [''] * len(logs)
-        columns = [moments(log, start_of(log) + times) for log in logs.values()]
+        columns = [moments(log, log.begin + times) for log in logs.values()]
         with server.atomic():       # nothing is sent in between
             for k, row in enumerate(zip(*columns, strict=True)):
                 if k % TEXT_EVERY == 0:
@@ -60,37 +52,29 @@ def recorded_scene(logs: Mapping[str, FlightLog], model: Model | None = None,
                              for name, moment in zip(logs, row)]
                 room.show(row, texts)
                 recording.insert_sleep(float(step))
-        return recording.as_html(dark_mode=dark)
+        return recording.as_html()
     finally:
         close(server)
 
 
-def run_view(runs: list[Path], *, urdf: Path | None = None, host: str, port: int,
-             dark: bool = False, console: Console | None = None) -> None:
+def run_view(runs: list[Path], *, urdf: Path | None = None, host: str, port: int) -> None:
     """
     Serve a player of recorded runs until Ctrl-C; arguments are options of `beetle_omni view`.
 
     Raises:
-        BagError: unusable run.
-        ParameterError: other unusable input.
+        ParameterError: unusable input.
 
     """
-    console, runs, model = console or Console(), runs_in(runs), Model.load(urdf)
-    if len(runs) > len(COLOURS):
-        raise ParameterError(f'{len(runs)} runs; expected at most {len(COLOURS)}')
-    logs = {}
-    for path, name in zip(runs, names_of(runs), strict=True):
-        log = logs[name] = read_bag(path)
-        if not len(motion(log).t):
-            raise no_pose(path, log.warnings)
-    page = recorded_scene(logs, model, dark).encode()
+    model = Model.load(urdf)
+    page = recorded_scene(read_flights(runs, len(COLOURS)), model).encode()
 
     class Answer(BaseHTTPRequestHandler):
         def do_GET(self):
             self.send_response(200)
             self.send_header('Content-Type', 'text/html; charset=utf-8')
             self.end_headers()
-            self.wfile.write(page)
+            with suppress(ConnectionError):     # a browser may leave before the end
+                self.wfile.write(page)
 
         def log_message(self, *given):
             """Print nothing."""
@@ -100,15 +84,14 @@ def run_view(runs: list[Path], *, urdf: Path | None = None, host: str, port: int
     except OSError as error:
         raise ParameterError(f'--host {host} --port {port}: cannot be served there '
                              f'({error})') from None
-    announce(host, server.server_port, console)
+    announce(host, server.server_port)
     try:
         server.serve_forever()
     except KeyboardInterrupt:       # the regular end
         server.server_close()
 
 
-def announce(host: str, port: int, console: Console) -> None:
+def announce(host: str, port: int) -> None:
     """Print the address of the page."""
     shown = 'localhost' if host in (LOCAL, '0.0.0.0') else host
-    console.print(f'http://{shown}:{port}  (Ctrl-C ends it)', markup=False, highlight=False,
-                  soft_wrap=True)
+    print(f'http://{shown}:{port}  (Ctrl-C ends it)', flush=True)

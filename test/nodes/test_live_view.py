@@ -1,10 +1,9 @@
-"""The viewer's data of a graph, and its selections of a controller."""
+"""The viewer's data of a graph."""
 
 from contextlib import closing
 
 import numpy as np
 import pytest
-from rcl_interfaces.msg import SetParametersResult
 
 from beetle_omni_ros.control.base import Command, PoseTarget
 from beetle_omni_ros.messages.values import Odom
@@ -16,18 +15,8 @@ pytestmark = pytest.mark.real_time
 TURNED = np.array([0.0, 0.0, np.sin(0.3), np.cos(0.3)])
 
 
-@pytest.fixture
-def bench(make_bench):
-    return make_bench(user='supervisor_node')
-
-
-@pytest.fixture
-def listener(bench, ros_domain):
-    with closing(LiveGraph(domain=ros_domain, writable=True)) as made:
-        yield made
-
-
-def test_messages_become_a_moment(bench, listener):
+def test_messages_become_a_moment(make_bench, ros_domain):
+    bench = make_bench(user='supervisor_node')
     odom, truth, command, target = (wire.Publisher(bench.user, topic) for topic in (
         'odom', 'ground_truth/odom', 'command', 'target_pose'))
     target.publish(PoseTarget(np.array([0, 0, 2.0]), TURNED, 6.0))
@@ -38,27 +27,13 @@ def test_messages_become_a_moment(bench, listener):
             publisher.publish(Odom(7.0, np.array([0.5, 0, height]), np.zeros(3), TURNED,
                                    np.zeros(3), np.zeros((6, 6)), np.zeros((6, 6))))
         command.publish(Command(7.0, np.full(4, 0.2), np.array([1.0, 2, 3, 4])))
-        listener.take(newest)
+        graph.take(newest)
         return len(newest.values) == 4
-    assert bench.wait(complete)
+    with closing(LiveGraph(domain=ros_domain)) as graph:
+        assert bench.wait(complete)
     moment = newest.moment()
     np.testing.assert_allclose(moment.position, [0.5, 0, 1.0])
     np.testing.assert_allclose(moment.target[0], [0, 0, 2])
     np.testing.assert_allclose(moment.thrust, [1, 2, 3, 4])
-    assert newest.clock == pytest.approx(7.0)
-    assert 'estimate 10 mm off' in newest.text(moment)
-
-
-def test_the_supervisor_accepts_or_refuses_a_controller(bench, listener):
-    answers = []
-    bench.user.declare_parameter('controller', 'nmpc')
-    bench.user.add_on_set_parameters_callback(lambda given: SetParametersResult(
-        successful=given[0].value == 'rl', reason='rl alone'))
-    wire.Publisher(bench.user, 'rl/command')
-    assert bench.wait(lambda: listener.controllers() == ['rl'])
-    assert bench.wait(lambda: listener._setting.service_is_ready())
-    listener.select('rl', answers.append)
-    assert bench.wait(lambda: listener.spin_steadily(0.01) or answers == [''])
-    assert bench.user.get_parameter('controller').value == 'rl'
-    listener.select('hover', answers.append)
-    assert bench.wait(lambda: listener.spin_steadily(0.01) or answers == ['', 'rl alone'])
+    text = newest.text(moment)
+    assert '**7.0 s**' in text and 'estimate 10 mm off' in text

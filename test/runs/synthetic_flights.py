@@ -16,7 +16,7 @@ def fly(recorder, task, *, start=1.0, controller='nmpc', offset=0.02, angle=3.0,
     Record a flight that follows every target with a decaying and a steady error.
 
     Args:
-        recorder: LogRecorder, BagWriter or Tee.
+        recorder: LogRecorder, BagWriter or Recorder.
         task: task to fly.
         start: time of the first target [s].
         controller: name of the active controller.

@@ -23,8 +23,6 @@ from beetle_omni_ros.runs.bag_writer import BagWriter
 from beetle_omni_ros.runs.tasks import make_task
 
 INTERFACES = Path(sys.prefix) / 'share'     # of the message packages, where ROS is of PyPI
-# RIHS01 of std_msgs/msg/String in Jazzy, as every one of its installations has it.
-STRING = 'RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18'
 
 
 def record(folder, compression='none'):
@@ -35,16 +33,22 @@ def record(folder, compression='none'):
 
 @pytest.fixture(scope='module')
 def plain(tmp_path_factory):
-    return record(tmp_path_factory.mktemp('plain') / 'flight')
+    return record(tmp_path_factory.mktemp('bags') / 'plain')
 
 
 @pytest.fixture(scope='module')
-def packed(tmp_path_factory):
-    return record(tmp_path_factory.mktemp('packed') / 'flight', 'zstd')
+def packed(plain):
+    return record(plain.with_name('packed'), 'zstd')
 
 
 def information(bag):
     return yaml.safe_load((bag / 'metadata.yaml').read_text())['rosbag2_bagfile_information']
+
+
+def topics(bag):
+    """Name -> metadata of a topic."""
+    return {entry['topic_metadata']['name']: entry['topic_metadata']
+            for entry in information(bag)['topics_with_message_count']}
 
 
 def test_metadata_has_the_fields_of_version_9_and_names_jazzy(plain):
@@ -55,23 +59,15 @@ def test_metadata_has_the_fields_of_version_9_and_names_jazzy(plain):
         'relative_file_paths', 'files', 'custom_data', 'ros_distro'}
     assert (found['version'], found['storage_identifier'], found['ros_distro']) \
         == (9, 'mcap', 'jazzy')
-    assert set(found['files'][0]) == {'path', 'starting_time', 'duration', 'message_count'}
-    assert found['files'][0]['path'] == found['relative_file_paths'][0]
-    assert (plain / found['relative_file_paths'][0]).is_file()
     assert found['starting_time']['nanoseconds_since_epoch'] >= 1_699_999_999 * 10**9
-    topics = {entry['topic_metadata']['name']: entry['topic_metadata']
-              for entry in found['topics_with_message_count']}
-    state = topics['/supervisor/state']
+    state = topics(plain)['/supervisor/state']
     assert set(state) == {'name', 'type', 'serialization_format', 'offered_qos_profiles',
                           'type_description_hash'}
-    forever = {'sec': 9223372036, 'nsec': 854775807}
-    assert state['offered_qos_profiles'] == [{
-        'history': 'keep_last', 'depth': 1, 'reliability': 'reliable',
-        'durability': 'transient_local', 'deadline': forever, 'lifespan': forever,
-        'liveliness': 'automatic', 'liveliness_lease_duration': forever,
-        'avoid_ros_namespace_conventions': False}]
-    assert state['type_description_hash'] == STRING
-    assert topics['/imu/data_raw']['offered_qos_profiles'][0]['reliability'] == 'best_effort'
+    qos, = state['offered_qos_profiles']
+    assert (qos['history'], qos['depth'], qos['reliability'], qos['durability']) \
+        == ('keep_last', 1, 'reliable', 'transient_local')
+    qos, = topics(plain)['/imu/data_raw']['offered_qos_profiles']
+    assert qos['reliability'] == 'best_effort'
 
 
 def test_the_file_contains_the_same_metadata_and_hashes(plain):
@@ -80,11 +76,8 @@ def test_the_file_contains_the_same_metadata_and_hashes(plain):
         assert reader.get_header().profile == 'ros2'
         channels = {c.topic: c.metadata for c in reader.get_summary().channels.values()}
         record, = (r for r in reader.iter_metadata() if r.name == 'rosbag2')
-    inside = yaml.safe_load(record.metadata['serialized_metadata'])
-    outside = information(plain)
-    assert inside == outside
-    for entry in outside['topics_with_message_count']:
-        topic = entry['topic_metadata']
+    assert yaml.safe_load(record.metadata['serialized_metadata']) == information(plain)
+    for topic in topics(plain).values():
         own = channels[topic['name']]
         assert own['topic_type_hash'] == topic['type_description_hash']
         assert yaml.safe_load(own['offered_qos_profiles']) == topic['offered_qos_profiles']
@@ -93,8 +86,7 @@ def test_the_file_contains_the_same_metadata_and_hashes(plain):
 @pytest.mark.skipif(not (INTERFACES / 'std_msgs/msg/String.json').is_file(),
                     reason='no message packages in this environment')
 def test_type_hashes_are_those_of_the_installed_message_packages(plain):
-    for entry in information(plain)['topics_with_message_count']:
-        topic = entry['topic_metadata']
+    for topic in topics(plain).values():
         described = json.loads((INTERFACES / f"{topic['type']}.json").read_text())
         hashes = {one['type_name']: one['hash_string'] for one in described['type_hashes']}
         assert topic['type_description_hash'] == hashes[topic['type']], topic['type']
@@ -108,9 +100,6 @@ def test_compressed_bags_have_equal_content_and_half_the_size(plain, packed):
     # rosbag2 names the compression of whole files and of messages here, not that of chunks.
     assert information(packed)['compression_format'] == ''
     assert information(packed)['compression_mode'] == ''
-    with AnyReader([packed]) as reader:
-        found = [reader.deserialize(data, c.msgtype) for c, _, data in reader.messages()]
-    assert len(found) == information(packed)['message_count']
     mine, theirs = read_bag(plain), read_bag(packed)
     assert mine.odom_position.tobytes() == theirs.odom_position.tobytes()
     assert mine.imu_t.tobytes() == theirs.imu_t.tobytes()

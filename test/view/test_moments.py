@@ -1,6 +1,6 @@
 """What a picture shows agrees with the recording, and with the newest messages."""
 
-import asyncio
+
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,14 +8,13 @@ import pytest
 from synthetic_flights import fly, write_truth
 
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters
+from beetle_omni_ros.robot.parameters import JOINT_NAMES
 from beetle_omni_ros.robot.urdf import Model
 from beetle_omni_ros.runs.log import LogRecorder
 from beetle_omni_ros.runs.tasks import make_task
-from beetle_omni_ros.view.live import Live
-from beetle_omni_ros.view.moments import moments
+from beetle_omni_ros.view.live import draw
 from beetle_omni_ros.view.recorded import recorded_scene
-from beetle_omni_ros.view.scene import close, NEWTON_PER_METRE, Room, serve
+from beetle_omni_ros.view.scene import close, moments, NEWTON_PER_METRE, Room, serve
 
 
 @pytest.fixture(scope='module')
@@ -63,20 +62,18 @@ def test_a_recorded_scene_refers_to_nothing_outside(log):
     assert len(scene) < 2e6
 
 
-def test_a_dragged_target_is_sent_when_it_is_released_unless_it_is_refused():
-    sent, server = [], serve('127.0.0.1', 8320)
-    graph = SimpleNamespace(take=lambda newest: write_truth(
-        newest, 7.0, np.array([0.0, 0, 1]), np.array([0.0, 0, 0, 1]), np.zeros(3), np.zeros(3)),
-        controllers=lambda: ['nmpc'], publish_target=sent.append)
+def test_a_running_graph_is_drawn_until_ctrl_c():
+    server, taken = serve('127.0.0.1', 8320), []
+
+    def take(newest):
+        if taken:
+            raise KeyboardInterrupt
+        taken.append(write_truth(newest, 7.0, np.array([0.5, 0, 1]), np.array([0.0, 0, 0, 1]),
+                                 np.zeros(3), np.zeros(3)))
     try:
-        live = Live(server, graph, Model.load(), RobotParameters.load(), True)
-        live.step()
-        for phase, height in (('update', 2.0), ('end', -5.0), ('end', 1.5)):
-            live._gizmo.position = 0.5, 0.0, height
-            asyncio.run(live._on_gizmo(SimpleNamespace(phase=phase, target=live._gizmo)))
+        with pytest.raises(KeyboardInterrupt):
+            draw(server, SimpleNamespace(take=take), Model.load())
+        robot = server.scene._handle_from_node_name['/robot0']
+        assert robot.visible and robot.position[0] == pytest.approx(0.5)
     finally:
         close(server)
-    target, = sent
-    np.testing.assert_allclose(target.position, [0.5, 0.0, 1.5])
-    np.testing.assert_allclose(target.quaternion, [0, 0, 0, 1], atol=1e-9)
-    assert target.stamp == 7.0

@@ -63,10 +63,8 @@ def test_the_outcome_and_faults_are_on_the_page_and_in_the_table(tmp_path):
     run_report([tmp_path / 'bag'], page, console=Console(file=printed, width=200))
     assert printed.getvalue().startswith('task waypoints, seed 0, plant used.yaml')
     text = page.read_text()
-    for expected in ('fault: rotor2_lost at', '<td>landing</td><td>rotor2_lost</td>',
+    for expected in ('fault: rotor2_lost at', '"landing:rotor2_lost"', 'fault: &lt;b&gt; at',
                      'fault: joint3_slipped at', 'nmpc.refused.stale stamp',
                      'injected: rotor_stops at=5 rotor=2', 'plant used.yaml'):
         assert expected in text, expected
     assert 'landing: rotor2_lost at 1.5 s' in text and 'rotor2_lost at' in printed.getvalue()
-    assert '<td>&lt;b&gt;</td>' in text and '<td><b>' not in text
-    assert text.count('<td>rotor2_lost</td>') == 1

@@ -82,32 +82,32 @@ def read_rotor_log(path: str | Path, columns: Mapping[str, tuple[str, float]] | 
 
     """
     source: dict[str, tuple[str, float]] = {}
-    table = read_table(path, lambda header: _wanted(header, columns or {}, source), EXPECTED)
+    table, rows = read_table(path, lambda header: _wanted(header, columns or {}, source), EXPECTED)
     p = shipped().rotor
-    if len(table) < p.least_rows:
-        raise LogError(f'{path}: {len(table)} rows are too few; expected at least {p.least_rows}')
-    data = {name: table.columns[column] * (factor or 1)
+    if len(rows) < p.least_rows:
+        raise LogError(f'{path}: {len(rows)} rows are too few; expected at least {p.least_rows}')
+    data = {name: table[column] * (factor or 1)
             for name, (column, factor) in source.items()}
     for name, low, high in (('thrust', -p.largest_force / 10, p.largest_force),
                             ('torque', -p.largest_torque, p.largest_torque), ('duty', *p.duty)):
         bad = np.flatnonzero((data.get(name, low) < low) | (data.get(name, low) > high))
         if bad.size:
-            raise LogError(f'{path}: row {table.rows[bad[0]]}, column {source[name][0]}: found '
-                           f'{table.columns[source[name][0]][bad[0]]:g}; expected {UNITS[name]}')
+            raise LogError(f'{path}: row {rows[bad[0]]}, column {source[name][0]}: found '
+                           f'{table[source[name][0]][bad[0]]:g}; expected {UNITS[name]}')
     command = 'duty' if 'duty' in data else 'target'
     if command == 'duty':
         data['duty'] = data['duty'] / 50 - 1
     if min(np.ptp(data[name]) for name in (command, 'thrust', 'torque')) == 0:
         raise LogError(f'{path}: command, force or torque never changes; expected a sweep')
     if 'time' in data and np.diff(data['time']).min() <= 0:
-        row = table.rows[np.argmax(np.diff(data['time']) <= 0) + 1]
+        row = rows[np.argmax(np.diff(data['time']) <= 0) + 1]
         raise LogError(f'{path}: row {row}: the time does not increase')
     notes: list[str] = []
     _telemetry(path, data, notes)
     if 'time' not in data and _transient(path, data[command], data['thrust'], rate):
-        data['time'] = np.arange(len(table)) / (rate or 1)
+        data['time'] = np.arange(len(rows)) / (rate or 1)
     series = 'time' in data
-    fresh = settled = np.ones(len(table), dtype=bool)
+    fresh = settled = np.ones(len(rows), dtype=bool)
     if series:
         force = np.column_stack([data['thrust'], data['torque']])
         fresh = np.append(True, (np.diff(force, axis=0) != 0).any(axis=1))
@@ -116,7 +116,7 @@ def read_rotor_log(path: str | Path, columns: Mapping[str, tuple[str, float]] | 
                          'the force of the row before: masked')
         settled = fresh & _settled(data['time'], data[command])
     data['torque'] = _checked(path, data, command, source['torque'][1], series)
-    return RotorLog(table.path.name, command, data, series, fresh, settled, notes)
+    return RotorLog(Path(path).name, command, data, series, fresh, settled, notes)
 
 
 def _wanted(header, columns, source):

@@ -194,16 +194,16 @@ def read_joint_log(path: str | Path) -> JointLog:
         for k, position, wanted in zip(JOINTS, measured, command, strict=True):
             _check_angles(path, k, position, wanted)
         return JointLog(Path(path).name, t, JOINTS, measured, command)
-    table = read_table(path, _wanted, HEADER)
-    t = table.columns['t_s']
-    _check_times(table.path, t, table.rows)
-    joints = tuple(k for k in JOINTS if f'q{k}_rad' in table.columns)
-    measured = np.stack([table.columns[f'q{k}_rad'] for k in joints])
-    command = np.stack([table.columns[own if (own := f'command{k}_rad') in table.columns
+    columns, rows = read_table(path, _wanted, HEADER)
+    t = columns['t_s']
+    _check_times(path, t, rows)
+    joints = tuple(k for k in JOINTS if f'q{k}_rad' in columns)
+    measured = np.stack([columns[f'q{k}_rad'] for k in joints])
+    command = np.stack([columns[own if (own := f'command{k}_rad') in columns
                                       else 'command_rad'] for k in joints])
     for k, position, wanted in zip(joints, measured, command, strict=True):
-        _check_angles(table.path, k, position, wanted)
-    return JointLog(table.path.name, t, joints, measured, command)
+        _check_angles(path, k, position, wanted)
+    return JointLog(Path(path).name, t, joints, measured, command)
 
 
 def _wanted(header):
