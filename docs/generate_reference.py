@@ -36,8 +36,6 @@ FILES = {
                             'The NMPC with the settings of the publication.'),
     'rl.yaml': ('control.policy:PolicyParameters', 'The policy and its guidance.'),
     'hover.yaml': ('control.hover:HoverParameters', 'The hover controller.'),
-    'degraded.yaml': ('robot.degraded:HoldingParameters',
-                      'Attitudes that can be held with a failed actuator.'),
     'ekf.yaml': ('estimation.parameters:EkfParameters', 'The estimator.'),
     'supervisor.yaml': ('safety.parameters:SupervisorParameters',
                         'Checks of commands, takeoff, landing, detection of faults.'),

@@ -27,7 +27,7 @@ import numpy as np
 from beetle_omni_ros.control.base import Command, State
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY, clipped, nearest_turn
-from beetle_omni_ros.robot.degraded import allocator, DegradedAllocator, LocalWeights
+from beetle_omni_ros.robot.degraded import allocator, DegradedAllocator
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import group, parameter, ParameterFile
 
@@ -63,7 +63,6 @@ class HoverParameters(ParameterFile, file='hover.yaml'):
 
     position: AxisGains = group(AxisGains, 'position and velocity in world')
     attitude: AxisGains = group(AxisGains, 'attitude and rate in base_link')
-    degraded: LocalWeights = group(LocalWeights, 'allocation with what is left of the actuators')
 
 
 class HoverController:
@@ -191,7 +190,7 @@ class HoverController:
         ahead = rotations.exp(_shortened(turn, self.parameters.attitude.error_limit))
         aim = degraded.hover(rotations.multiply(state.quaternion, ahead), present)
         force = (degraded.weight + force) @ rotations.matrix(state.quaternion)
-        return degraded.allocate_near(force, torque, present, aim, self.parameters.degraded)
+        return degraded.allocate_near(force, torque, present, aim)
 
     def _wrench(self, state, target):
         """Force without the support of the weight (world) and torque (base_link)."""
