@@ -81,16 +81,15 @@ class DegradedAllocator(Allocator):
         self._thrust_max = health.limited(self._thrust_max)
         self.matrix[:, np.repeat(~np.array(health.rotors), 2)] = 0.0
         self.scale = 1 / np.r_[np.full(3, self.mass), robot.inertia]
-        self.stuck = [i for i, angle in enumerate(health.stuck)
-                      if angle is not None and health.rotors[i]]
         self.held = {i: thrust for i, thrust in enumerate(health.held)
                      if thrust is not None and health.rotors[i]}
-        self.columns = self.matrix.copy()
-        for i in self.stuck:
-            angle = health.stuck[i]
-            self.columns[:, 2 * i] = self.matrix[:, 2 * i] * np.cos(angle) \
-                + self.matrix[:, 2 * i + 1] * np.sin(angle)
-            self.columns[:, 2 * i + 1] = 0.0
+        self.stuck, self.columns = [], self.matrix.copy()
+        for i, angle in enumerate(health.stuck):
+            if angle is not None and health.rotors[i]:
+                self.stuck.append(i)
+                self.columns[:, 2 * i] = self.matrix[:, 2 * i] * np.cos(angle) \
+                    + self.matrix[:, 2 * i + 1] * np.sin(angle)
+                self.columns[:, 2 * i + 1] = 0.0
         self._inverses: dict[tuple, np.ndarray] = {}    # used rotors -> pseudo-inverse
 
     def _inverse(self, used):
