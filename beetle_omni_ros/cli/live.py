@@ -91,9 +91,6 @@ def view(runs: Annotated[Optional[list[Path]], typer.Argument(
          robot: Annotated[Optional[Path], typer.Option(
              '--robot', metavar='FILE', help='For a running graph: robot file, for the '
                                              'checks of targets.')] = None,
-         urdf: Annotated[Optional[Path], typer.Option(
-             '--urdf', metavar='FILE', help="URDF of the robot's shape. Default: the shipped "
-                                            'description.')] = None,
          host: Annotated[str, typer.Option(
              '--host', metavar='ADDRESS', help='Address at which the page is served; 0.0.0.0: to '
                                                'the whole network.')] = '127.0.0.1',
@@ -106,7 +103,7 @@ def view(runs: Annotated[Optional[list[Path]], typer.Argument(
     Prints the address of the page, which needs no network, and runs until Ctrl-C. Example:
     beetle_omni view my_run/rl my_run/nmpc
     """
-    shared = {'urdf': urdf, 'host': host, 'port': port, 'dark': dark}
+    shared = {'host': host, 'port': port, 'dark': dark}
     if runs:
         for option, given in (('--allow-targets', allow_targets), ('--namespace', namespace),
                               ('--domain-id', domain_id is not None),

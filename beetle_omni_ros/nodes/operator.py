@@ -362,9 +362,8 @@ class LiveGraph:
 
 
 def run_live(*, namespace: str = '', domain_id: int | None = None, discovery: str | None = None,
-             robot: Path | None = None, urdf: Path | None = None, host: str, port: int,
-             dark: bool = False, allow_targets: bool = False,
-             console: Console | None = None) -> None:
+             robot: Path | None = None, host: str, port: int, dark: bool = False,
+             allow_targets: bool = False, console: Console | None = None) -> None:
     """
     Show a running graph until Ctrl-C; arguments are the options of `beetle_omni view`.
 
@@ -372,12 +371,11 @@ def run_live(*, namespace: str = '', domain_id: int | None = None, discovery: st
         ParameterError: unusable input.
 
     """
-    from beetle_omni_ros.robot.urdf import Model
     from beetle_omni_ros.view.live import Live
     from beetle_omni_ros.view.recorded import announce
     from beetle_omni_ros.view.scene import close, serve
     runner.end_with_parent()
-    model, parameters = Model.load(urdf), RobotParameters.load(robot)
+    parameters = RobotParameters.load(robot)
     with ExitStack() as stack:
         graph = LiveGraph(namespace, domain_id, discovery, allow_targets)
         stack.callback(graph.close)
@@ -386,4 +384,4 @@ def run_live(*, namespace: str = '', domain_id: int | None = None, discovery: st
         stack.callback(close, server)
         announce(host, server.get_port(), console or Console())
         with suppress(KeyboardInterrupt):       # the regular end
-            Live(server, graph, model, parameters, allow_targets).run()
+            Live(server, graph, parameters, allow_targets).run()

@@ -22,7 +22,6 @@ from beetle_omni_ros.nodes.parameters import file_parameter
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import NAMES, parameter, ParameterError
-from beetle_omni_ros.robot.urdf import description
 from beetle_omni_ros.runs.bag import BagError
 from beetle_omni_ros.runs.bag_writer import BagWriter, COMPRESSIONS
 from beetle_omni_ros.runs.tasks import make_task, TaskPlayer
@@ -148,7 +147,6 @@ class RecorderNodeParameters:
     controllers: NAMES = parameter(
         tuple(registry.standing_by()), read_only=True,
         doc='registered controllers whose commands are recorded')
-    urdf_file: str = file_parameter('robot description for the recorded frames')
     compression: str = parameter('none', choices=COMPRESSIONS, read_only=True,
                                  doc='compression of the chunks in the MCAP file')
 
@@ -166,7 +164,7 @@ class RecorderNode(FlightNode):
             self._bag = BagWriter(self.parameters.bag, namespace=self.get_namespace(),
                                   topics=tuple(topics),
                                   compression=self.parameters.compression,
-                                  description=description(self.parameters.urdf_file))
+                                  frames=True)
         except BagError as error:
             raise ParameterError(f"key 'bag': {error}") from None
         self._written = self._lost = self._writes = 0

@@ -23,7 +23,7 @@ from beetle_omni_ros.messages.bag_types import from_bytes, new, offered, to_byte
 from beetle_omni_ros.messages.conversions import BODY, nanoseconds, WORLD
 from beetle_omni_ros.messages.topics import ALL, EVENT, LATCHED, Qos, topic_of, TOPICS
 from beetle_omni_ros.robot.schema import read_yaml
-from beetle_omni_ros.robot.urdf import joints
+from beetle_omni_ros.robot.urdf import description, joints
 from beetle_omni_ros.runs.bag import BagError, META_KEY
 from beetle_omni_ros.runs.log import Recorder, RUN_STATUS
 
@@ -79,21 +79,16 @@ class FrameWriter:
 
     Args:
         write: called with topic, ROS type, CDR and time [s].
-        description: URDF.
         prefix: prefix of the robot's topics, '/' or e.g. '/robot1/'.
-
-    Raises:
-        ParameterError: unusable URDF.
 
     """
 
-    def __init__(self, write: Callable[[str, str, bytes, float], None], description: str,
-                 prefix: str = '/'):
-        self._write, self._text = write, description
+    def __init__(self, write: Callable[[str, str, bytes, float], None], prefix: str):
+        self._write, self._text = write, description()
         self._odom, self._joints = f'{prefix}odom', f'{prefix}joint_states'
         self.topics = {'/tf': (TRANSFORMS, EVENT), '/tf_static': (TRANSFORMS, LATCHED),
                        f'{prefix}robot_description': (TEXT, LATCHED)}
-        tree = joints(description)
+        tree = joints()
         self._fixed = [joint for joint in tree if joint.axis is None]
         self._moving = {joint.name: joint for joint in tree if joint.axis is not None}
         self._latest = None     # message of joint_states
@@ -162,7 +157,7 @@ class BagWriter(Recorder):
 
     def __init__(self, path: str | Path, meta: dict | None = None, *, namespace: str = '',
                  topics: Sequence[str] = tuple(TOPICS), compression: str = 'none',
-                 description: str = '', epoch: int = 0):
+                 frames: bool = False, epoch: int = 0):
         """
         Create the folder and the bag in it.
 
@@ -172,7 +167,7 @@ class BagWriter(Recorder):
             namespace: namespace of the topics, '' or e.g. '/robot1'.
             topics: names to declare, see :func:`~beetle_omni_ros.messages.topics.topic_of`.
             compression: compression of the chunks in the file, 'none' or 'zstd'.
-            description: URDF of the robot, to record its frames; '' for none.
+            frames: whether the description and the frames of the robot are recorded.
             epoch: UNIX time of time 0 [s], so that a flight that begins at 0 s gets a real date.
 
         Raises:
@@ -197,8 +192,8 @@ class BagWriter(Recorder):
         for name in topics:
             self._declare(self._prefix + name, topic_of(name).type, topic_of(name).qos)
         self._frames = None
-        if description:
-            self._frames = FrameWriter(self.write_raw, description, self._prefix)
+        if frames:
+            self._frames = FrameWriter(self.write_raw, self._prefix)
             for name, (msgtype, qos) in self._frames.topics.items():
                 self._declare(name, msgtype, qos)
         self._last_t = None      # [s] of the newest message

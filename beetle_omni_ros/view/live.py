@@ -10,7 +10,6 @@ import viser
 from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.urdf import Model
 from beetle_omni_ros.runs.log import FAULT_KEY, Recorder
 from beetle_omni_ros.runs.targets import TargetChecks
 from beetle_omni_ros.view.moments import Moment, target_at
@@ -108,17 +107,16 @@ class Live:
     Args:
         server: server of the page.
         graph: graph to display.
-        model: links and shapes of the robot.
         robot: robot parameters for the checks of targets.
         allow_targets: whether the page has controls for targets and the controller.
 
     """
 
-    def __init__(self, server: viser.ViserServer, graph: Graph, model: Model,
-                 robot: RobotParameters, allow_targets: bool):
+    def __init__(self, server: viser.ViserServer, graph: Graph, robot: RobotParameters,
+                 allow_targets: bool):
         self._server, self._graph, self._newest = server, graph, Newest()
         self._checks, self._stop = TargetChecks(robot), threading.Event()
-        self._room, self._dragging, self._gizmo = Room(server, model), False, None
+        self._room, self._dragging, self._gizmo = Room(server), False, None
         self._room.look_at(LOW, HIGH)
         self._text = server.gui.add_markdown(WAITING)
         if allow_targets:

@@ -9,7 +9,6 @@ from rich.console import Console
 
 from beetle_omni_ros.pages.figures import COLOURS
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.robot.urdf import Model
 from beetle_omni_ros.runs.bag import names_of, no_pose, read_bag, runs_in
 from beetle_omni_ros.runs.log import FlightLog, motion
 from beetle_omni_ros.view.moments import drawable, moments
@@ -27,14 +26,12 @@ def start_of(log: FlightLog) -> float:
     return log.targets[0].stamp if log.targets else log.start
 
 
-def recorded_scene(logs: Mapping[str, FlightLog], model: Model | None = None,
-                   dark: bool = False) -> str:
+def recorded_scene(logs: Mapping[str, FlightLog], dark: bool = False) -> str:
     """
     Return the HTML of a player of flights, aligned by their first targets.
 
     Args:
         logs: name -> flight with poses; the first is drawn solid.
-        model: links and shapes of the robots; default: the shipped ones.
         dark: whether the background is dark.
 
     """
@@ -44,7 +41,7 @@ def recorded_scene(logs: Mapping[str, FlightLog], model: Model | None = None,
     times = np.arange(begin, end, step)
     server = serve(LOCAL, 8080)
     try:
-        room = Room(server, model or Model.load(), len(logs))
+        room = Room(server, len(logs))
         paths = [drawable(motion(log).position) for log in logs.values()]
         for number, path in enumerate(paths):
             room.draw_path(number, path[::max(1, len(path) // PATH_POINTS)])
@@ -65,8 +62,8 @@ def recorded_scene(logs: Mapping[str, FlightLog], model: Model | None = None,
         close(server)
 
 
-def run_view(runs: list[Path], *, urdf: Path | None = None, host: str, port: int,
-             dark: bool = False, console: Console | None = None) -> None:
+def run_view(runs: list[Path], *, host: str, port: int, dark: bool = False,
+             console: Console | None = None) -> None:
     """
     Serve a player of recorded runs until Ctrl-C; arguments are options of `beetle_omni view`.
 
@@ -75,7 +72,7 @@ def run_view(runs: list[Path], *, urdf: Path | None = None, host: str, port: int
         ParameterError: other unusable input.
 
     """
-    console, runs, model = console or Console(), runs_in(runs), Model.load(urdf)
+    console, runs = console or Console(), runs_in(runs)
     if len(runs) > len(COLOURS):
         raise ParameterError(f'{len(runs)} runs; expected at most {len(COLOURS)}')
     logs = {}
@@ -83,7 +80,7 @@ def run_view(runs: list[Path], *, urdf: Path | None = None, host: str, port: int
         log = logs[name] = read_bag(path)
         if not len(motion(log).t):
             raise no_pose(path, log.warnings)
-    page = recorded_scene(logs, model, dark).encode()
+    page = recorded_scene(logs, dark).encode()
 
     class Answer(BaseHTTPRequestHandler):
         def do_GET(self):

@@ -9,7 +9,6 @@ from synthetic_flights import fly, write_truth
 
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters
-from beetle_omni_ros.robot.urdf import Model
 from beetle_omni_ros.runs.log import LogRecorder
 from beetle_omni_ros.runs.tasks import make_task
 from beetle_omni_ros.view.live import Live
@@ -40,7 +39,7 @@ def test_moments_agree_with_the_log(log):
 def test_the_drawn_robot_tilts_and_its_arrows_are_as_long_as_the_thrusts(log):
     server = serve('127.0.0.1', 8300)
     try:
-        room = Room(server, Model.load(), 2)
+        room = Room(server, 2)
         moment, = moments(log, np.array([55.0]))
         moment.tilt, moment.thrust = np.array([0.3, -1.2, 2.5, 0.0]), np.array([8.0, 4.0, 0.0, 1])
         room.show([moment, None], ['here', ''])
@@ -69,7 +68,7 @@ def test_a_dragged_target_is_sent_when_it_is_released_unless_it_is_refused():
         newest, 7.0, np.array([0.0, 0, 1]), np.array([0.0, 0, 0, 1]), np.zeros(3), np.zeros(3)),
         controllers=lambda: ['nmpc'], publish_target=sent.append)
     try:
-        live = Live(server, graph, Model.load(), RobotParameters.load(), True)
+        live = Live(server, graph, RobotParameters.load(), True)
         live.step()
         for phase, height in (('update', 2.0), ('end', -5.0), ('end', 1.5)):
             live._gizmo.position = 0.5, 0.0, height
