@@ -216,10 +216,6 @@ def pressed(before: Sequence[int], now: Sequence[int], p: DriveParameters) -> li
             and not (number < len(before) and before[number])]
 
 
-class WordError(ValueError):
-    """A typed line is not a command; the message has the expected input."""
-
-
 class Shift(NamedTuple):
     """Shift of the goal: (3,) in world [m], (3,) roll, pitch, yaw [rad]."""
 
@@ -248,7 +244,7 @@ def parse(line: str, poses: Mapping[str, Sequence[float]]) -> Shift | Go | Order
     ``poses``: name -> x, y, z [m], roll, pitch, yaw [deg].
 
     Raises:
-        WordError: not a command.
+        ParameterError: not a command.
 
     """
     word, *rest = line.partition('#')[0].split() or ['']
@@ -263,24 +259,24 @@ def parse(line: str, poses: Mapping[str, Sequence[float]]) -> Shift | Go | Order
     if word in TURNS:
         degrees, = _numbers(word, rest, 'DEGREES', (1,))
         if abs(degrees) > MAX_TURN:
-            raise WordError(f"'{line.strip()}': expected at most {MAX_TURN:g} degrees")
+            raise ParameterError(f"'{line.strip()}': expected at most {MAX_TURN:g} degrees")
         shift.turn[TURNS[word]] = radians(degrees)
         return shift
     if word == 'goto':
         return _pose(_numbers(word, rest, 'X Y Z [ROLL PITCH YAW]', (3, 6)))
     if word == 'controller':
         if len(rest) != 1:
-            raise WordError("'controller': expected one NAME after it")
+            raise ParameterError("'controller': expected one NAME after it")
         return Order(word, rest[0])
     if word == 'wait':
         seconds = _numbers(word, rest, 'SECONDS', (0, 1))
         if any(one < 0 for one in seconds):
-            raise WordError(f"'{line.strip()}': expected SECONDS from 0")
+            raise ParameterError(f"'{line.strip()}': expected SECONDS from 0")
         return Order(word, str(seconds[0]) if seconds else '')
     if word not in ORDERS and word not in poses:
-        raise WordError(f"'{word}': expected {HELP}, or a pose of {', '.join(poses)}")
+        raise ParameterError(f"'{word}': expected {HELP}, or a pose of {', '.join(poses)}")
     if rest:
-        raise WordError(f"'{line.strip()}': expected nothing after '{word}'")
+        raise ParameterError(f"'{line.strip()}': expected nothing after '{word}'")
     return Order(word) if word in ORDERS else _pose(poses[word])
 
 
@@ -296,5 +292,5 @@ def _numbers(word, texts, wanted, counts):
     except ValueError:
         values = [float('nan')]
     if len(values) not in counts or not all(map(isfinite, values)):
-        raise WordError(f"'{' '.join([word, *texts])}': expected {word} {wanted}")
+        raise ParameterError(f"'{' '.join([word, *texts])}': expected {word} {wanted}")
     return values

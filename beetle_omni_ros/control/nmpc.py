@@ -14,7 +14,7 @@ from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot import native
 from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY, clipped
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.schema import ParameterError, RunError
 
 FIRST_ITERATIONS = 5     # from a cold start, before the first command
 NARROW = 1e-3            # [rad or N] between bounds of a failed actuator; the QP needs an interior
@@ -61,7 +61,7 @@ class NmpcController:
         try:
             self._rti = Rti(problem, intervals, SLACKS if p.limits.soft else None, TOLERANCE,
                             p.solver.max_iterations, p.limits.tilt_rate_intervals - 1)
-        except native.CompilerError as error:
+        except RunError as error:
             raise ParameterError(f'the NMPC needs a C compiler: {error}') from None
         self._estimator = DisturbanceEstimator(robot, p.disturbance, p.model.command_delay,
                                                FunctionCall(native.compiled(advance)))

@@ -23,7 +23,6 @@ from beetle_omni_ros.drive import (
     read_named_poses,
     Shift,
     Steering,
-    WordError,
 )
 from beetle_omni_ros.messages.topics import SENSOR
 from beetle_omni_ros.messages.values import Odom
@@ -285,7 +284,7 @@ class _Terminal:
             line, _, self._text = self._text.partition('\n')
             try:
                 action = drive.parse(line, self._poses)
-            except WordError as error:
+            except ParameterError as error:
                 self._say(str(error))
                 continue
             name = action.name if isinstance(action, Order) else ''

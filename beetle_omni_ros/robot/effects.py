@@ -15,20 +15,18 @@ its kind:
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
-from beetle_omni_ros.robot.schema import ParameterError, quoted, shortened
+from beetle_omni_ros.robot.schema import numbers, ParameterError, quoted, shortened, unknown
 
 NAN = float('nan')
 UP = ca.DM([0, 0, 1])
 REFERENCE_HEIGHT = 0.25     # [m] of the rotor, for which the gain of the ground effect is given
 EXPONENTIAL_HEIGHT = 0.25   # [m] over which the exponential form falls to 1/e
 LEAST_HEIGHT = 0.08         # [m] below which the forms are not valid
-LAYERS = ('body', 'rotor', 'joint', 'timing', 'sensor')
 # Terms that the simulated plant and the gap finder have -> why NMPC and training leave out an
 # effect of them.
 MEASURED = {'voltage_ratio': 'it has no voltage and assumes a full pack',
@@ -705,9 +703,7 @@ def validated(effects: dict | None) -> dict[str, dict]:
     for name, given in (effects or {}).items():
         name = shortened(str(name))
         if name not in CATALOGUE:
-            near = get_close_matches(name, CATALOGUE, n=1)
-            hint = f"; did you mean '{near[0]}'?" if near else f"; known: {', '.join(CATALOGUE)}"
-            raise ParameterError(f'effects.{name}: unknown effect{hint}')
+            raise unknown(f'effects.{name}', 'effect', name, CATALOGUE)
         entry = CATALOGUE[name]
         needed = {key for key, spec in entry.parameters.items() if spec.default is None}
         if not isinstance(given, dict) or not needed <= set(given) <= set(entry.parameters):
@@ -720,20 +716,12 @@ def validated(effects: dict | None) -> dict[str, dict]:
 
 
 def _value(at, spec, value):
-    try:
-        array = np.array(value, dtype=float)
-    except (OverflowError, TypeError, ValueError):
-        raise ParameterError(f'{at}: expected numbers [{spec.unit}], '
-                             f'found {quoted(value)}') from None
-    shape = np.shape(spec.neutral)
+    array, shape = numbers(value, at, vars(spec)), np.shape(spec.neutral)
     if spec.of_each and array.shape == (4,):
         shape = array.shape
     if array.shape != shape:
         each = ' or (4,)' if spec.of_each else ''
         raise ParameterError(f'{at}: expected shape {shape}{each}, found {array.shape}')
-    if not np.all((array >= spec.low) & (array <= spec.high)):
-        raise ParameterError(f'{at}: {quoted(value)} is outside '
-                             f'{spec.low:g} to {spec.high:g} {spec.unit}')
     return tuple(map(float, array)) if shape else float(array)
 
 

@@ -28,7 +28,7 @@ from beetle_omni_ros.messages.topics import (
     topic_of,
     TOPICS,
 )
-from beetle_omni_ros.robot.schema import quoted, read_yaml, YamlError
+from beetle_omni_ros.robot.schema import quoted, read_yaml
 from beetle_omni_ros.runs.log import FlightLog, LogRecorder, Recorder, SERIES_OF
 
 AT_ONCE = 4096      # messages that are read together
@@ -359,7 +359,7 @@ def _metadata(path, warnings):
     try:
         custom = read_yaml(file)['rosbag2_bagfile_information']['custom_data']
         meta = dict(json.loads((custom or {}).get(META_KEY, '{}')))
-    except (YamlError, KeyError, TypeError, AttributeError, ValueError, RecursionError):
+    except (KeyError, TypeError, AttributeError, ValueError, RecursionError):
         warnings.append('metadata.yaml is not readable')
         return {}
     used = {key: value for key, value in meta.items() if _usable(key, value)}

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros import drive
-from beetle_omni_ros.drive import DriveParameters, Go, Order, parse, Shift, WordError
+from beetle_omni_ros.drive import DriveParameters, Go, Order, parse, Shift
 from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.schema import ParameterError
 
 
 @pytest.fixture(scope='module')
@@ -66,7 +67,7 @@ def test_commands_that_go_to_poses_and_that_request_actions(p):
     ('goto 1 2', 'X Y Z'), ('jump 3', "'jump': expected"), ('jump', 'or a pose of home'),
     ('controller', 'NAME'), ('wait -1', 'SECONDS'), ('land now', 'nothing after')])
 def test_an_unknown_command_is_refused_with_the_expected_ones(p, line, fragment):
-    with pytest.raises(WordError) as raised:
+    with pytest.raises(ParameterError) as raised:
         parse(line, p.poses)
     assert fragment in str(raised.value) and 'expected' in str(raised.value)
     assert '\n' not in str(raised.value)
