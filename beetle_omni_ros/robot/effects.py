@@ -672,20 +672,6 @@ def delaying(*what: str) -> tuple[str, ...]:
     return tuple(name for name, entry in CATALOGUE.items() if set(what) & set(entry.delays))
 
 
-def command_delays(effects: dict[str, dict]) -> tuple[float, float]:
-    """Delays of tilt and of thrust commands [s] from validated effects."""
-    tilt, thrust = (sum(effects.get(name, {}).get('delay', 0.0) for name in delaying(what))
-                    for what in ('tilt', 'thrust'))
-    return tilt, thrust
-
-
-def sensor_errors(effects: dict[str, dict]) -> SensorErrors:
-    """Sensor errors from validated effects."""
-    return SensorErrors(**{spec.sensor: values[parameter] for name, values in effects.items()
-                           for parameter, spec in CATALOGUE[name].parameters.items()
-                           if spec.sensor})
-
-
 def validated(effects: dict | None) -> dict[str, dict]:
     """
     Validate a robot file's ``effects`` mapping against the catalogue.

@@ -320,12 +320,16 @@ class RobotParameters:
     @property
     def command_delays(self) -> tuple[float, float]:
         """Delays of tilt and of thrust commands [s] by the effects."""
-        return catalogue.command_delays(self.effects)
+        tilt, thrust = (sum(self.effect(f'{name}.delay', 0.0) for name in catalogue.delaying(what))
+                        for what in ('tilt', 'thrust'))
+        return tilt, thrust
 
     @property
     def sensors(self) -> catalogue.SensorErrors:
         """Sensor errors by the effects."""
-        return catalogue.sensor_errors(self.effects)
+        return catalogue.SensorErrors(**{
+            spec.sensor: values[parameter] for name, values in self.effects.items()
+            for parameter, spec in catalogue.CATALOGUE[name].parameters.items() if spec.sensor})
 
     @property
     def hover_thrust(self) -> float:
