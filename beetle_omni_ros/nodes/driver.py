@@ -16,14 +16,7 @@ from sensor_msgs.msg import Joy
 from beetle_omni_ros import drive
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import PoseTarget
-from beetle_omni_ros.drive import (
-    DriveParameters,
-    Go,
-    Order,
-    read_named_poses,
-    Shift,
-    Steering,
-)
+from beetle_omni_ros.drive import Action, DriveParameters, read_named_poses, Steering
 from beetle_omni_ros.messages.topics import SENSOR
 from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes import wire
@@ -99,27 +92,28 @@ class Driver(Operator):
             self._targets.publish(PoseTarget(self.steering.position, self.steering.quaternion))
         return refused
 
-    def execute(self, action: Shift | Go | Order) -> str:
+    def execute(self, action: Action) -> str:
         """Execute an action; return the text for the user."""
-        name, value = action if isinstance(action, Order) else ('', '')
+        name, values = action
         if name in ('arm', 'land', 'emergency_stop'):
             accepted, answer = self.call(name)
             return f"{name}: {answer or ('done' if accepted else 'refused')}"
         if name == 'controller':
             names, now = list(registry.standing_by()), self.state.partition(':')[2]
             other = names[(names.index(now) + 1) % len(names)] if now in names else names[0]
-            accepted, answer = self.set('supervisor_node', 'controller', value or other)
-            return f'controller {value or other}' + ('' if accepted else f': {answer}')
+            wanted = values[0] if values else other
+            accepted, answer = self.set('supervisor_node', 'controller', wanted)
+            return f'controller {wanted}' + ('' if accepted else f': {answer}')
         if name == 'where':
             return self.where()
         if self.steering is None:
             return f"nothing flies (supervisor in '{self.state or 'unknown'}'); arm first"
         position, quaternion = self.steering.goal
-        if isinstance(action, Shift):
-            return self.steering.shift(action.way, action.turn)
-        if isinstance(action, Go):
-            return self.steering.go(action.position, quaternion if action.quaternion is None
-                                    else action.quaternion)
+        if name == 'shift':
+            return self.steering.shift(*values)
+        if name == 'goto':
+            place, attitude = values
+            return self.steering.go(place, quaternion if attitude is None else attitude)
         if name == 'hold':
             self.steering.hold()
             return ''
@@ -230,10 +224,10 @@ class _Keyboard:
                 self.done = True
                 break
             if shift:
-                found.append(Shift(*shift))
+                found.append(Action('shift', shift))
             elif word:
                 found.append(drive.parse(word, self._poses) if word in self._poses
-                             else Order(word))
+                             else Action(word))
         return found
 
 
@@ -256,7 +250,7 @@ class _Joystick:
                  for name in drive.pressed(before, self._buttons, p)]
         way, turn = drive.shift_of_sticks(driver.axes, seconds, p)
         if driver.steering is not None and (way.any() or turn.any()):
-            found.append(Shift(way, turn))
+            found.append(Action('shift', (way, turn)))
         return found
 
 
@@ -287,19 +281,19 @@ class _Terminal:
             except ParameterError as error:
                 self._say(str(error))
                 continue
-            name = action.name if isinstance(action, Order) else ''
+            name = action.name if action else ''
             if name == 'quit':
                 self.done = True
             elif name == 'help':
                 self._say(f"{self.help}: {', '.join(self._poses)}")
             elif name == 'wait':
                 self._waits = partial(self._is_waiting, self._driver.time(),
-                                      float(action.value) if action.value else None)
+                                      *action.values)
             elif action is not None:
                 found.append(action)
         return found
 
-    def _is_waiting(self, begin, seconds):
+    def _is_waiting(self, begin, seconds=None):
         passed = self._driver.time() - begin
         if seconds is None:
             return passed <= SETTLE_TIME or not self._driver.at_goal

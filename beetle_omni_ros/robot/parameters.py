@@ -207,18 +207,14 @@ class RobotParameters:
     def _checked_interval(self, key, pair):
         try:
             value = np.array(self._value(key), dtype=float)
-        except (AttributeError, KeyError, TypeError, ValueError):
-            raise ParameterError(f"key 'intervals': {quoted(key)}: expected the dotted key of a "
-                                 'number of this file') from None
-        try:
             low, high = (np.broadcast_to(np.array(bound, dtype=float), value.shape)
                          for bound in pair)
             fits = bool(np.all((low <= value) & (value <= high)))
-        except (TypeError, ValueError):
+        except (AttributeError, KeyError, TypeError, ValueError):
             fits = False
         if not fits:
-            raise ParameterError(f"key 'intervals.{key}': expected [lowest, highest] around "
-                                 f'{value.tolist()}, found {quoted(pair)}')
+            raise ParameterError(f"key 'intervals': {quoted(key)}: expected [lowest, highest] "
+                                 f'around a number of this file, found {quoted(pair)}')
         return low, high
 
     def _value(self, key):

@@ -145,7 +145,7 @@ def test_sticks_and_buttons_are_actions_until_the_joystick_is_silent():
     assert joystick.actions(0.1) == []
     pilot.axes[int(p.axes[0])], pilot.buttons[p.buttons['arm']] = float(p.signs[0]), 1
     order, shift = joystick.actions(0.1)
-    assert order.name == 'arm' and shift.way == pytest.approx([0.1 * p.speed, 0, 0])
+    assert order.name == 'arm' and shift.values[0] == pytest.approx([0.1 * p.speed, 0, 0])
     assert len(joystick.actions(0.1)) == 1      # the button is still pressed
     pilot.time = lambda: 5.0 + 2 * p.joystick_timeout
     assert joystick.actions(0.1) == []
