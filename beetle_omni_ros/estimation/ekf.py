@@ -290,7 +290,8 @@ class ErrorStateEkf:
         Such poses continue smoothly from the last good one, and their residuals have the same
         direction. The residuals of poses that are only noisy do not.
         """
-        before, self._residual = self._residual, self._model.whitened_residual
+        before, self._residual = self._residual, np.ravel(
+            self._model.filter.y) / np.sqrt(np.diag(self._model.filter.R))
         lengths = float(np.linalg.norm(before) * np.linalg.norm(self._residual))
         aligned = float(before @ self._residual) > ALIGNED * lengths
         smooth = self._continues_smoothly(track, stamp, position, quaternion)
@@ -326,12 +327,6 @@ class ErrorStateEkf:
     def _update_candidate(self, valid: Track | None, stamp, position, quaternion) -> bool:
         """
         Update the candidate with a pose that the track cannot use, and accept it if confirmed.
-
-        Args:
-            valid: the track, or None while it is not valid.
-            stamp: time of the pose [s].
-            position: (3,) of the marker body in world [m].
-            quaternion: (4,) marker body to world.
 
         Returns:
             False if the pose contradicts the candidate, which then restarts from this pose.

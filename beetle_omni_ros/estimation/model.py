@@ -282,11 +282,6 @@ class ErrorStateModel:
             return None
         return self._inject(prior, kalman.x, kalman.P)
 
-    @property
-    def whitened_residual(self) -> np.ndarray:
-        """(6,) residual of the last :meth:`correct` in standard deviations of the MoCap."""
-        return np.ravel(self.filter.y) / np.sqrt(np.diag(self.filter.R))
-
     def _linearise_time(self, prior) -> None:
         """
         Set the columns of the time offset: a moving pose is displaced by motion times offset.

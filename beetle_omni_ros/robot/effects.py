@@ -233,12 +233,12 @@ def vector(values):
         else values
 
 
-def _mass(terms, mass):
-    terms.mass = mass
-
-
-def _inertia(terms, inertia):
-    terms.inertia = vector(inertia)
+def _sets(term):
+    """Equation of an effect whose one parameter replaces a term."""
+    def act(terms, **values):
+        value, = values.values()
+        setattr(terms, term, vector(value))
+    return act
 
 
 def _centre_of_mass(terms, offset):
@@ -267,10 +267,6 @@ def _module_reaction(terms, module_inertia, mass_moment):
 
 def _thrust_coefficient(terms, scale):
     terms.thrust = vector(scale) * terms.thrust
-
-
-def _torque_coefficient(terms, torque_to_thrust_ratio):
-    terms.torque_ratio = torque_to_thrust_ratio
 
 
 def _wind(terms, force):
@@ -403,14 +399,14 @@ CATALOGUE: dict[str, Effect] = {
                                          tolerance='mass')},
         "m v' = F, Newton; INTERFACES: total mass", 'any flight',
         ('thrust_coefficient', 'voltage_sag', 'wind'),
-        'weigh the robot, or fly fast turns: thrust scales torques too, mass does not', _mass,
-        allocated=True, plant='model'),
+        'weigh the robot, or fly fast turns: thrust scales torques too, mass does not',
+        _sets('mass'), allocated=True, plant='model'),
     'inertia': Effect(
         'body', {'inertia': EffectParameter('kg m^2', (NAN,) * 3, 1e-5, 50, 0.2, 0.05,
                                             number='inertia', tolerance='inertia')},
         "I w' = tau - w x I w, Euler", 'fast turns about every axis',
         ('rotor_lag', 'propeller_gyroscopic_torque', 'thrust_coefficient'),
-        'flips by 90 and 180 deg about each axis', _inertia, plant='model'),
+        'flips by 90 and 180 deg about each axis', _sets('inertia'), plant='model'),
     'centre_of_mass': Effect(
         'body', {'offset': EffectParameter('m', (0.0,) * 3, -0.2, 0.2, 0.005, 0.0015)},
         'forces turn the body about its centre of mass, which is displaced from base_link',
@@ -446,7 +442,7 @@ CATALOGUE: dict[str, Effect] = {
             tolerance='torque_ratio')},
         'tau_i = -spin_i ratio f_i about the thrust axis', 'yaw steps, differential thrust',
         ('joint_offset', 'rotor_acceleration_torque'), 'yaw steps at zero tilt',
-        _torque_coefficient, allocated=True, plant='model'),
+        _sets('torque_ratio'), allocated=True, plant='model'),
     'ground_effect': Effect(
         'body', {'gain_at_0.25m': EffectParameter('1', 0.0, 0.0, 1.0, 0.08, 0.01),
                  'exponential_share': EffectParameter('1', 0.0, 0.0, 1.0, default=0.0, form=True)},

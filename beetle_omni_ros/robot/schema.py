@@ -221,16 +221,7 @@ def bind(cls: type, mapping: dict, where: str = '', prefix: str = ''):
 
 
 def check(entry, hint: Any, value: Any, at: str) -> Any:
-    """
-    Validate one value against its declaration and convert it to its declared type.
-
-    Args:
-        entry: dataclass field made by :func:`parameter`.
-        hint: annotated type of the field.
-        value: value of the file or the user.
-        at: file and key, for messages.
-
-    """
+    """Validate a value of a field; ``at`` is file and key, for messages."""
     if hint is np.ndarray:
         return _array(entry, value, at)
     if hint in (int, float):
