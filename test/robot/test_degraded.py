@@ -79,7 +79,6 @@ def test_a_stuck_rotor_that_would_need_negative_thrust_is_off():
 @pytest.mark.parametrize('health', [lost(0), stuck(1, 0.8)])
 def test_beyond_the_limits_the_error_is_smaller_than_by_clipping(health):
     ours = allocator(ROBOT, health)
-    scale = 1 / np.r_[np.full(3, ROBOT.mass), ROBOT.inertia]
     nearer, clipped = [], []
     for force, torque, present in draws(200, 3):
         force, torque = 2 * force, 2 * torque
@@ -90,9 +89,9 @@ def test_beyond_the_limits_the_error_is_smaller_than_by_clipping(health):
         pairs = ours.components(wrench[None])[0].reshape(4, 2)
         lengths = np.maximum(np.linalg.norm(pairs, axis=1), 1e-9)
         pairs *= np.minimum(1.0, ROBOT.rotors.thrust_max / lengths)[:, None]
-        clipped.append(np.linalg.norm(scale * (ours.columns @ pairs.ravel() - wrench)))
-        nearer.append(np.linalg.norm(scale * (np.concatenate(
-            ours.wrench(got.tilt, got.thrust)) - wrench)))
+        clipped.append(ours.error(pairs.ravel(), wrench))
+        made = np.concatenate(ours.wrench(got.tilt, got.thrust))
+        nearer.append(np.linalg.norm(ours.scale * (made - wrench)))
     assert len(nearer) > 20
     assert np.median(nearer) < 0.7 * np.median(clipped)
 
