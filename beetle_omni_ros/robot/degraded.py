@@ -192,8 +192,8 @@ class DegradedAllocator(Allocator):
             cos, sin = np.cos(z[:ROTORS]), np.sin(z[:ROTORS])
             along = matrix[:, 0::2] * cos + matrix[:, 1::2] * sin
             across = (matrix[:, 1::2] * cos - matrix[:, 0::2] * sin) * z[ROTORS:]
-            step = _bounded_step(np.hstack([across, along]), wrench - made, pull, goal - z,
-                                 low - z, high - z)
+            step = bounded_step(np.hstack([across, along]), wrench - made, pull**2, goal - z,
+                                low - z, high - z)
             for share in (1.0, 0.5, 0.25):
                 tried = z + share * step
                 new = self._made(matrix, tried)
@@ -230,15 +230,20 @@ class DegradedAllocator(Allocator):
         return components, self.error(components, wrench) < RESIDUAL
 
 
-def _bounded_step(jacobian, error, pull, towards, low, high):
-    """Damped least-squares step (8,) within bounds, by an active set."""
-    step = np.zeros(len(pull))
-    free = high > low
+def bounded_step(jacobian: np.ndarray, error: np.ndarray, weight: np.ndarray,
+                 towards: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """
+    Damped least-squares step (n,) within bounds, by an active set.
+
+    It minimises |jacobian step - error|^2 + sum(weight (step - towards)^2), from ``low`` to
+    ``high``.
+    """
+    step, free = clipped(np.zeros(len(weight)), low, high), high > low
     for _ in range(ROTORS):
-        columns, weight = jacobian[:, free], pull[free] ** 2
+        columns = jacobian[:, free]
         rest = error - jacobian[:, ~free] @ step[~free]
-        step[free] = np.linalg.solve(columns.T @ columns + np.diag(weight),
-                                     columns.T @ rest + weight * towards[free])
+        step[free] = np.linalg.solve(columns.T @ columns + np.diag(weight[free]),
+                                     columns.T @ rest + weight[free] * towards[free])
         outside = (step < low) | (step > high)
         step = clipped(step, low, high)
         if not (outside & free).any():
