@@ -14,14 +14,13 @@ from functools import lru_cache
 from pathlib import Path
 import reprlib
 from types import NoneType
-from typing import Any, ClassVar, get_args, get_type_hints, TypeVar
+from typing import Any, ClassVar, get_args, get_type_hints, Self
 
 import numpy as np
 import yaml
 
 from beetle_omni_ros.robot.resources import share_path
 
-File = TypeVar('File', bound='ParameterFile')
 NAMES = tuple[str, ...]     # type of a parameter that is a list of names
 # Type of a field that is no number -> types of its value in a file, and their name.
 KINDS: dict[Any, tuple[Any, str]] = {
@@ -159,7 +158,7 @@ class ParameterFile:
             cls._file = file
 
     @classmethod
-    def load(cls: type[File], path: str | Path | None = None) -> File:
+    def load(cls, path: str | Path | None = None) -> Self:
         """
         Read a file, by default the shipped one.
 
