@@ -216,78 +216,66 @@ def pressed(before: Sequence[int], now: Sequence[int], p: DriveParameters) -> li
             and not (number < len(before) and before[number])]
 
 
-class WordError(ValueError):
-    """A typed line is not a command; the message has the expected input."""
+class Action(NamedTuple):
+    """
+    A command of the operator.
 
-
-class Shift(NamedTuple):
-    """Shift of the goal: (3,) in world [m], (3,) roll, pitch, yaw [rad]."""
-
-    way: np.ndarray
-    turn: np.ndarray
-
-
-class Go(NamedTuple):
-    """A goal: (3,) in world [m], (4,) body to world, xyzw, or None to keep the attitude."""
-
-    position: np.ndarray
-    quaternion: np.ndarray | None
-
-
-class Order(NamedTuple):
-    """Another command: its name and its argument."""
+    Values: of 'shift' (3,) in world [m] and (3,) roll, pitch, yaw [rad]; of 'goto' (3,) in world
+    [m] and (4,) body to world, xyzw, or None to keep the attitude; of 'controller' a name; of
+    'wait' perhaps seconds.
+    """
 
     name: str
-    value: str = ''
+    values: tuple = ()
 
 
-def parse(line: str, poses: Mapping[str, Sequence[float]]) -> Shift | Go | Order | None:
+def parse(line: str, poses: Mapping[str, Sequence[float]]) -> Action | None:
     """
     Parse one line; None for an empty line or a comment after #.
 
     ``poses``: name -> x, y, z [m], roll, pitch, yaw [deg].
 
     Raises:
-        WordError: not a command.
+        ParameterError: not a command.
 
     """
     word, *rest = line.partition('#')[0].split() or ['']
     word = word.lower()
     if not word:
         return None
-    shift = Shift(np.zeros(3), np.zeros(3))
+    way, turn = np.zeros(3), np.zeros(3)
     if word in WAYS:
         axis, direction = WAYS[word]
-        shift.way[axis] = direction * _numbers(word, rest, 'METRES', (1,))[0]
-        return shift
+        way[axis] = direction * _numbers(word, rest, 'METRES', (1,))[0]
+        return Action('shift', (way, turn))
     if word in TURNS:
         degrees, = _numbers(word, rest, 'DEGREES', (1,))
         if abs(degrees) > MAX_TURN:
-            raise WordError(f"'{line.strip()}': expected at most {MAX_TURN:g} degrees")
-        shift.turn[TURNS[word]] = radians(degrees)
-        return shift
+            raise ParameterError(f"'{line.strip()}': expected at most {MAX_TURN:g} degrees")
+        turn[TURNS[word]] = radians(degrees)
+        return Action('shift', (way, turn))
     if word == 'goto':
         return _pose(_numbers(word, rest, 'X Y Z [ROLL PITCH YAW]', (3, 6)))
     if word == 'controller':
         if len(rest) != 1:
-            raise WordError("'controller': expected one NAME after it")
-        return Order(word, rest[0])
+            raise ParameterError("'controller': expected one NAME after it")
+        return Action(word, (rest[0],))
     if word == 'wait':
         seconds = _numbers(word, rest, 'SECONDS', (0, 1))
         if any(one < 0 for one in seconds):
-            raise WordError(f"'{line.strip()}': expected SECONDS from 0")
-        return Order(word, str(seconds[0]) if seconds else '')
+            raise ParameterError(f"'{line.strip()}': expected SECONDS from 0")
+        return Action(word, tuple(seconds))
     if word not in ORDERS and word not in poses:
-        raise WordError(f"'{word}': expected {HELP}, or a pose of {', '.join(poses)}")
+        raise ParameterError(f"'{word}': expected {HELP}, or a pose of {', '.join(poses)}")
     if rest:
-        raise WordError(f"'{line.strip()}': expected nothing after '{word}'")
-    return Order(word) if word in ORDERS else _pose(poses[word])
+        raise ParameterError(f"'{line.strip()}': expected nothing after '{word}'")
+    return Action(word) if word in ORDERS else _pose(poses[word])
 
 
 def _pose(values):
     position = np.array(values[:3], dtype=float)
-    return Go(position, rotations.from_rpy(*map(radians, values[3:])) if len(values) == 6
-              else None)
+    return Action('goto', (position, rotations.from_rpy(*map(radians, values[3:]))
+                           if len(values) == 6 else None))
 
 
 def _numbers(word, texts, wanted, counts):
@@ -296,5 +284,5 @@ def _numbers(word, texts, wanted, counts):
     except ValueError:
         values = [float('nan')]
     if len(values) not in counts or not all(map(isfinite, values)):
-        raise WordError(f"'{' '.join([word, *texts])}': expected {word} {wanted}")
+        raise ParameterError(f"'{' '.join([word, *texts])}': expected {word} {wanted}")
     return values

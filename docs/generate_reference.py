@@ -39,8 +39,6 @@ FILES = {
     'rl_memory.yaml': ('control.policy:PolicyParameters',
                        'The policy with the estimated disturbance as input.'),
     'hover.yaml': ('control.hover:HoverParameters', 'The hover controller.'),
-    'degraded.yaml': ('robot.degraded:HoldingParameters',
-                      'Attitudes that can be held with a failed actuator.'),
     'ekf.yaml': ('estimation.parameters:EkfParameters', 'The estimator.'),
     'supervisor.yaml': ('safety.parameters:SupervisorParameters',
                         'Checks of commands, takeoff, landing, detection of faults.'),
@@ -61,16 +59,9 @@ FILES = {
 
 ROBOT_FILE = """`mass`, `inertia` and `rotors.positions` are authoritative. With `multibody`, the
 simulated main body is what modules and end-effector leave of them. `multibody.main_body`,
-`multibody.module.joint_offset` and `multibody.centre_of_gravity_height` follow from these numbers.
-They are optional checks. A file that contradicts itself by more than 0.5 mm is refused, or if
-`multibody.main_body.inertia` is larger than the rest or lacks more than 10 % of the total inertia.
-
-A file that extends another moves what depends on its numbers:
-
-- If mass, rotor positions or parts change and the file has no `inertia`, the inertia follows. The
-  main body keeps its radii of gyration. Without `multibody`, changed positions need the `inertia`
-  beside them.
-- The checks of the extended file apply only if the file repeats them.
+`multibody.module.joint_offset` and `multibody.centre_of_gravity_height` are published values of
+this rest, which no program uses. A file that extends another keeps each number that it does not
+state: beside a changed `mass` or `rotors.positions`, state the `inertia`.
 
 """
 

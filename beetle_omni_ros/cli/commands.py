@@ -239,8 +239,6 @@ def view(runs: Annotated[list[Path] | None, Argument(metavar='RUN...', help=(
              'Recorded bags, shown together; without RUN: a running graph.'))] = None,
          namespace: NamespaceOption = '',
          domain_id: DomainOption = None,
-         urdf: Annotated[Path | None, Option(metavar='FILE', help=(
-             "URDF of the robot's shape. Default: the shipped description."))] = None,
          host: Annotated[str, Option(metavar='ADDRESS', help=(
              'Address at which the page is served; 0.0.0.0: to the whole network.'))]
          = '127.0.0.1',
@@ -251,7 +249,7 @@ def view(runs: Annotated[list[Path] | None, Argument(metavar='RUN...', help=(
     Prints the address of the page, which needs no network, and runs until Ctrl-C. Example:
     beetle_omni view my_run/rl my_run/nmpc
     """
-    page = {'urdf': urdf, 'host': host, 'port': port}
+    page = {'host': host, 'port': port}
     graph = {'namespace': namespace, 'domain_id': domain_id}
     if not runs:
         from beetle_omni_ros.nodes.operator import run_live

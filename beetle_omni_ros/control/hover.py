@@ -26,7 +26,7 @@ import numpy as np
 from beetle_omni_ros.control.base import Command, State
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY, clipped, nearest_turn
-from beetle_omni_ros.robot.degraded import allocator, DegradedAllocator, LocalWeights
+from beetle_omni_ros.robot.degraded import allocator, bounded_step, DegradedAllocator
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import parameter, ParameterFile
 
@@ -175,7 +175,7 @@ class HoverController:
         ahead = rotations.exp(_shortened(turn, ATTITUDE_LIMITS[0]))
         aim = degraded.hover(rotations.multiply(state.quaternion, ahead), present)
         force = (degraded.weight + force) @ rotations.matrix(state.quaternion)
-        return degraded.allocate_near(force, torque, present, aim, LocalWeights())
+        return degraded.allocate_near(force, torque, present, aim)
 
     def _wrench(self, state, target):
         """Force without the support of the weight (world) and torque (base_link)."""
@@ -234,23 +234,11 @@ class HoverController:
         wrench = matrix[:, 0::2] @ (goal.thrust * np.cos(goal.tilt)) \
             + matrix[:, 1::2] @ (goal.thrust * np.sin(goal.tilt))
         helpful = goal.thrust * np.maximum(0.0, np.cos(goal.tilt - tilt))
-        thrust, free = helpful.copy(), np.ones(4, dtype=bool)
+        low, high = np.full(4, rotors.thrust_min), np.full(4, self._thrust_max)
         for i, held in enumerate(self._health.held):
             if held is not None:
-                thrust[i], free[i] = held, False
-        for _ in range(4):
-            columns = now[:, free]
-            rest = wrench - now[:, ~free] @ thrust[~free]
-            thrust[free] = np.linalg.solve(columns.T @ columns + DAMPING * np.eye(free.sum()),
-                                           columns.T @ rest + DAMPING * helpful[free])
-            outside = (thrust < rotors.thrust_min) | (thrust > self._thrust_max)
-            thrust = clipped(thrust, rotors.thrust_min, self._thrust_max)
-            if not np.any(outside & free):
-                break
-            free &= ~outside
-            if not free.any():
-                break
-        return thrust
+                low[i] = high[i] = held
+        return bounded_step(now, wrench, np.full(4, DAMPING), helpful, low, high)
 
 
 def _pd(kp, kd, limits, error, rate_error):

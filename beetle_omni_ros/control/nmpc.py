@@ -12,7 +12,7 @@ from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot import native
 from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY, clipped
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import group, parameter, ParameterError, ParameterFile
+from beetle_omni_ros.robot.schema import group, parameter, ParameterError, ParameterFile, RunError
 
 FIRST_ITERATIONS = 5     # from a cold start, before the first command
 NARROW = 1e-3            # [rad or N] between bounds of a failed actuator; the QP needs an interior
@@ -159,7 +159,7 @@ class NmpcController:
             self._rti = Rti(robot, servo_lag, p.model.rotor_lag, p.horizon,
                             SLACKS if p.limits.soft else None, TOLERANCE, MAX_ITERATIONS,
                             p.limits.tilt_rate_intervals - 1)
-        except native.CompilerError as error:
+        except RunError as error:
             raise ParameterError(f'the NMPC needs a C compiler: {error}') from None
         self._estimator = DisturbanceEstimator(robot, p.disturbance, p.model.command_delay,
                                                native.compiled(advance))

@@ -153,7 +153,7 @@ class Rti:
         reaches: number of intervals after the first in which the lead of tilt targets is bounded.
 
     Raises:
-        CompilerError: there is no usable compiler.
+        RunError: there is no usable compiler.
         ParameterError: more than MAX_STAGES intervals.
 
     """

@@ -13,7 +13,7 @@ from math import sqrt
 
 import numpy as np
 
-from beetle_omni_ros.estimation.inputs import GAP, InputGuard, NoiseMonitor
+from beetle_omni_ros.estimation.inputs import DELAY_LIMIT, GAP, InputGuard, NoiseMonitor
 from beetle_omni_ros.estimation.model import ErrorStateModel, MEASUREMENTS
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.estimation.state import ATTITUDE, Estimate, Node, POSITION, SAME_INSTANT
@@ -23,6 +23,8 @@ from beetle_omni_ros.robot.rotations import geodesic_angle
 
 __all__ = ['EkfParameters', 'ErrorStateEkf', 'Estimate', 'ImuReading', 'PoseReading']
 
+DEAD_RECKONING, LOST = 0.1, 20.0    # [s] without an accepted pose until these states
+LOST_POSITION_STD = 5.0     # [m] of the position, each axis, above which the state is lost
 ALIGNED = 0.8   # least cosine between residuals of one cause; 3 % of random pairs in 6-D reach it
 SURE = 5.0      # standard deviations of the attitude that noise does not reach
 START_POSES = 20    # in a row that must agree with the IMU before the first fix, and when lost
@@ -51,21 +53,18 @@ class Track:
     that the result is the same as without the delay.
     """
 
-    def __init__(self, model: ErrorStateModel, first: Node, history: float,
-                 time_deviation: float = 0.0):
+    def __init__(self, model: ErrorStateModel, first: Node, time_deviation: float):
         """
         Start with one state.
 
         Args:
             model: prediction and correction.
             first: state with its covariance.
-            history: largest age of a pose [s].
             time_deviation: standard deviation of the first state's time offset [s].
 
         """
         self._time_deviation = time_deviation
         self._model = model
-        self._history = history
         self.nodes = [first]
         self.last_fix = first.stamp
         self._waits_since: float | None = None     # first reading after a pose was used
@@ -86,15 +85,15 @@ class Track:
         """Append the state at the next reading."""
         nodes = self.nodes
         nodes.append(self._model.predict(nodes[-1], stamp, force, rate, after_impact))
-        while nodes[1].stamp < stamp - self._history:
+        while nodes[1].stamp < stamp - DELAY_LIMIT:
             del nodes[0]
             self._model.covariance(nodes[0])    # otherwise it would keep its predecessors
 
-    def expect_poses(self, period: float) -> None:
-        """Prepare the newest state for dead reckoning if no pose was used for ``period`` [s]."""
+    def expect_poses(self) -> None:
+        """Prepare the newest state for dead reckoning if no pose was used for some time."""
         if self._waits_since is None:
             self._waits_since = self.newest.stamp
-        if self.newest.stamp - self._waits_since > period:
+        if self.newest.stamp - self._waits_since > DEAD_RECKONING:
             self._waits_since = np.inf      # once after each pose
             self.nodes[-1], turn = self._model.without_marker_error(self.newest)
             self._aligned = self.newest.stamp, turn
@@ -190,13 +189,12 @@ class ErrorStateEkf:
         """'uninitialised', 'tracking', 'dead_reckoning' or 'lost' at the newest IMU sample."""
         if self._track is None:
             return 'uninitialised'
-        limits = self._parameters.status
         newest = self._track.newest
         age = newest.stamp - self._track.last_fix
-        if age <= limits.dead_reckoning_after:
+        if age <= DEAD_RECKONING:
             return 'tracking'
         variance = max(np.diag(self._model.covariance(newest))[POSITION])
-        if age > limits.lost_after or not variance <= limits.lost_position_std ** 2:
+        if age > LOST or not variance <= LOST_POSITION_STD ** 2:
             return 'lost'
         return 'dead_reckoning'
 
@@ -216,17 +214,18 @@ class ErrorStateEkf:
 
         """
         checked = self._guard.reading(sample)
+        if checked is None and self._guard.clock_jumped:
+            rejected = self.rejected
+            self.reset()
+            self.rejected.update(rejected)
+            checked = self._guard.reading(sample)
         if checked is None:
             return False
         stamp = checked[0]
         reading = (stamp, *self._model.aligned(*checked[1:3]), self._guard.after_impact)
         self._estimate = None
-        if self._guard.clock_jumped:
-            self._restart(reading)
-            return True
         self._readings.append(reading)
-        oldest = stamp - self._parameters.mocap.delay_limit
-        while self._readings[0][0] < oldest:
+        while self._readings[0][0] < stamp - DELAY_LIMIT:
             self._readings.popleft()
         for track in (self._track, self._candidate):
             if track is not None:
@@ -234,7 +233,7 @@ class ErrorStateEkf:
         while self._early and self._early[0][0] <= stamp + SAME_INSTANT:
             self._apply(*self._early.popleft())
         if self._track is not None:
-            self._track.expect_poses(self._parameters.status.dead_reckoning_after)
+            self._track.expect_poses()
         return True
 
     def pose(self, sample: PoseReading) -> bool:
@@ -291,7 +290,8 @@ class ErrorStateEkf:
         Such poses continue smoothly from the last good one, and their residuals have the same
         direction. The residuals of poses that are only noisy do not.
         """
-        before, self._residual = self._residual, self._model.whitened_residual
+        before, self._residual = self._residual, np.ravel(
+            self._model.filter.y) / np.sqrt(np.diag(self._model.filter.R))
         lengths = float(np.linalg.norm(before) * np.linalg.norm(self._residual))
         aligned = float(before @ self._residual) > ALIGNED * lengths
         smooth = self._continues_smoothly(track, stamp, position, quaternion)
@@ -328,12 +328,6 @@ class ErrorStateEkf:
         """
         Update the candidate with a pose that the track cannot use, and accept it if confirmed.
 
-        Args:
-            valid: the track, or None while it is not valid.
-            stamp: time of the pose [s].
-            position: (3,) of the marker body in world [m].
-            quaternion: (4,) marker body to world.
-
         Returns:
             False if the pose contradicts the candidate, which then restarts from this pose.
 
@@ -366,20 +360,9 @@ class ErrorStateEkf:
         before = self._readings[len(self._readings) - len(later) - 1]
         force, rate = interpolate(stamp, before, later[0]) if later else (before[1], before[2])
         first = self._model.start(stamp, force, rate, position, quaternion, known)
-        time_deviation = (self._parameters.initial.time_offset_std if known is None else
+        time_deviation = (self._parameters.imu.delay_std if known is None else
                           self._model.time_deviation(known))
-        track = Track(self._model, first, self._parameters.mocap.delay_limit, time_deviation)
+        track = Track(self._model, first, time_deviation)
         for reading in later:
             track.predict(*reading)
         return track
-
-    def _restart(self, reading) -> None:
-        """Continue after a jump of the clock by an unknown time."""
-        self._readings.clear()
-        self._readings.append(reading)
-        self._early.clear()
-        self._candidate = None
-        if self._track is not None:
-            first = self._model.after_clock_jump(self._track.newest, *reading[:3])
-            self._track = Track(self._model, first, self._parameters.mocap.delay_limit)
-            self._track.last_fix = -np.inf

@@ -19,7 +19,9 @@ FROZEN_READINGS, FROZEN_POSES = 10, 5
 IMPACT = 30.0
 # [rad/s] a larger change of the rate in one reading is a fault; full thrust turns the body by 0.5
 SPIKE = 3.0
+FORCE_LIMIT, RATE_LIMIT = 160.0, 40.0   # [m/s^2], [rad/s] larger readings are refused
 PLACES = 100.0      # [m] largest coordinate of a pose
+DELAY_LIMIT = 0.2   # [s] largest age of a pose against the newest IMU sample
 UNIT = 0.01         # largest deviation of a quaternion's norm from 1
 
 POSES = 4           # a third difference needs four
@@ -38,15 +40,15 @@ class InputGuard:
 
     Attributes:
         rejected: reason -> count.
-        clock_jumped: whether the reading just accepted starts a new time line.
+        clock_jumped: whether enough refused stamps of the IMU continue each other.
         after_impact: whether readings just before it were beyond the sensor's range.
 
     """
 
     def __init__(self, parameters: EkfParameters):
-        self._imu, self._mocap = parameters.imu, parameters.mocap
+        self._offset = parameters.mocap.time_offset
         self.rejected: Counter = Counter()
-        self.clock_jumped = self.after_impact = self._out_of_range = False
+        self.after_impact = self._out_of_range = False
         self._last_reading: float | None = None
         self._last_pose = -inf
         self._pose_values: tuple[float, ...] | None = None
@@ -70,20 +72,18 @@ class InputGuard:
         values = (*force.tolist(), *rate.tolist())
         if not all(map(isfinite, (stamp, *values))):
             return self._refuse('not_finite')
-        if (_squared_norm(*values[:3]) > self._imu.specific_force_limit ** 2
-                or _squared_norm(*values[3:]) > self._imu.angular_velocity_limit ** 2):
+        if (_squared_norm(*values[:3]) > FORCE_LIMIT ** 2
+                or _squared_norm(*values[3:]) > RATE_LIMIT ** 2):
             self._out_of_range = True
             return self._refuse('out_of_range')
-        self.clock_jumped = False
         if self._last_reading is not None:
             step = stamp - self._last_reading
             if not 0 < step <= GAP:
-                if not self._starts_time_line(stamp):
-                    return self._refuse('duplicate' if step == 0 else
-                                        'backwards' if step < 0 else 'forward_gap')
-                self.clock_jumped = True
-                self._last_pose = -inf
-                self._spikes.reset()
+                if self._refused and not 0 < stamp - self._refused[-1] <= GAP:
+                    self._refused.clear()
+                self._refused.append(stamp)
+                return self._refuse('duplicate' if step == 0 else
+                                    'backwards' if step < 0 else 'forward_gap')
         same = values == self._reading_values
         self._moved |= self._reading_values is not None and not same
         self._reading_values = values
@@ -98,13 +98,10 @@ class InputGuard:
         self.after_impact, self._out_of_range = self._out_of_range or self._spikes.lasted, False
         return stamp, force, rate
 
-    def _starts_time_line(self, stamp) -> bool:
-        """Whether enough consecutive refused stamps are consistent, after a jump of the clock."""
-        refused = self._refused
-        if refused and not 0 < stamp - refused[-1] <= GAP:
-            refused.clear()
-        refused.append(stamp)
-        return len(refused) >= RESYNC
+    @property
+    def clock_jumped(self) -> bool:
+        """See the class."""
+        return len(self._refused) >= RESYNC
 
     def pose(self, sample, oldest: float) -> Checked | None:
         """
@@ -118,7 +115,7 @@ class InputGuard:
             (stamp on the IMU's clock, position, unit quaternion), or None if it is refused.
 
         """
-        stamp = float(sample.stamp) + self._mocap.time_offset
+        stamp = float(sample.stamp) + self._offset
         position = np.array(sample.position, dtype=float)
         quaternion = np.array(sample.quaternion, dtype=float)
         values = (*position.tolist(), *quaternion.tolist())
@@ -133,7 +130,7 @@ class InputGuard:
             return self._refuse('no_imu')
         if stamp <= self._last_pose:
             return self._refuse('duplicate' if stamp == self._last_pose else 'backwards')
-        if stamp < oldest or stamp < self._last_reading - self._mocap.delay_limit:
+        if stamp < oldest or stamp < self._last_reading - DELAY_LIMIT:
             return self._refuse('too_old')
         if stamp > self._last_reading + GAP:
             return self._refuse('future')

@@ -15,7 +15,7 @@ from filterpy.kalman import KalmanFilter
 import numpy as np
 from scipy.special import gammaincinv
 
-from beetle_omni_ros.estimation.inputs import IMPACT, PLACES
+from beetle_omni_ros.estimation.inputs import FORCE_LIMIT, IMPACT, RATE_LIMIT
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.estimation.state import (
     ACCELEROMETER_BIAS,
@@ -36,6 +36,10 @@ from beetle_omni_ros.robot import rotations
 MEASUREMENTS = 6  # position in world, rotation vector in base_link
 GATE = 0.99999          # share of good poses that passes the chi-square gate
 FIRST_SPEED = 5.0       # [m/s] standard deviation of the velocity before the second pose
+ACCELEROMETER_BIAS_STD, GYROSCOPE_BIAS_STD = 0.2, 0.05  # [m/s^2], [rad/s] at the start
+# For dead reckoning: standard deviations of the accelerometer's true bias [m/s^2] and of the
+# markers' attitude error [rad], each axis.
+TRUE_BIAS_STD, MARKER_STD = 0.03, 0.006
 # The offset between the clocks: largest [s], random walk [s/sqrt(s)], and the speed [m/s] and rate
 # [rad/s] below which it is not estimated, because both are then mostly noise.
 LARGEST_OFFSET, OFFSET_WALK, LEAST_SPEED, LEAST_RATE = 0.05, 1e-5, 0.1, 0.2
@@ -84,18 +88,13 @@ class ErrorStateModel:
         self._period = 1 / imu.rate
         # a missing reading was at the limit of the sensor's range or beyond, in any direction
         self._shock = np.zeros(STATES)
-        self._shock[VELOCITY] = imu.specific_force_limit ** 2
-        self._shock[ATTITUDE] = imu.angular_velocity_limit ** 2
+        self._shock[VELOCITY] = FORCE_LIMIT ** 2
+        self._shock[ATTITUDE] = RATE_LIMIT ** 2
         self._doubt = np.diag([*np.repeat(np.square(DOUBT), 3), *np.zeros(4)])
 
-        # mounting of the IMU, None where it is that of base_link
-        turned = np.any(imu.rotation)
-        self._axes = rotations.matrix(rotations.exp(imu.rotation)) if turned else None
-        self._arm = imu.position.copy() if np.any(imu.position) else None
-        self._biased = bool(np.any(imu.accelerometer_bias) or np.any(imu.gyroscope_bias))
+        self._axes = rotations.matrix(rotations.exp(imu.rotation))
         # vector from the navigated point (the IMU) to the marker body, in base_link axes
         self._lever = mocap.position - imu.position
-        self._has_lever = bool(np.any(self._lever))
         self.marker_to_base = rotations.conjugate(rotations.exp(mocap.rotation))
         self.filter.H[0:3, POSITION] = np.eye(3)
         self.filter.H[3:6, ATTITUDE] = np.eye(3)
@@ -122,7 +121,6 @@ class ErrorStateModel:
             biases: node whose biases and time offset are kept with their covariance, or None.
 
         """
-        first = self.parameters.initial
         attitude = rotations.normalized(rotations.multiply(quaternion, self.marker_to_base))
         rotation = rotations.matrix(attitude)
         arm = rotation @ rotations.skew(self._lever)
@@ -134,9 +132,9 @@ class ErrorStateModel:
         covariance[ATTITUDE, ATTITUDE] = noise[3:, 3:]
         covariance[VELOCITY, VELOCITY] = FIRST_SPEED ** 2 * np.eye(3)
         if biases is None:
-            known = np.zeros(3), np.zeros(3), first.time_offset
-            covariance[9:, 9:] = np.diag([first.accelerometer_bias_std ** 2] * 3
-                                         + [first.gyroscope_bias_std ** 2] * 3 + [0.0])
+            known = np.zeros(3), np.zeros(3), self.parameters.imu.delay
+            covariance[9:, 9:] = np.diag([ACCELEROMETER_BIAS_STD ** 2] * 3
+                                         + [GYROSCOPE_BIAS_STD ** 2] * 3 + [0.0])
         else:
             known = biases.accelerometer_bias, biases.gyroscope_bias, biases.time_offset
             covariance[9:15, 9:15] = self.covariance(biases)[9:15, 9:15]
@@ -205,9 +203,8 @@ class ErrorStateModel:
             error.
 
         """
-        priors, up = self.parameters.dead_reckoning, node.rotation[2]
-        markers = (self.gravity * priors.marker_attitude_std) ** 2
-        both = priors.accelerometer_bias_std ** 2 + markers
+        up, markers = node.rotation[2], (self.gravity * MARKER_STD) ** 2
+        both = TRUE_BIAS_STD ** 2 + markers
         share = markers / both
         turn = share / self.gravity * rotations.cross(up, node.accelerometer_bias)
         if turn.dot(turn) > (3 * share / self.gravity) ** 2 * both:
@@ -217,20 +214,8 @@ class ErrorStateModel:
         change[ATTITUDE] = np.eye(3)
         change[ACCELEROMETER_BIAS] = -self.gravity * rotations.skew(up)
         corrected.covariance = corrected.covariance \
-            + (1 - share) * priors.marker_attitude_std ** 2 * change @ change.T
+            + (1 - share) * MARKER_STD ** 2 * change @ change.T
         return corrected, turn
-
-    def after_clock_jump(self, node: Node, stamp: float, force: np.ndarray,
-                         rate: np.ndarray) -> Node:
-        """Move a state across an unknown time; only the biases remain known."""
-        covariance = self.covariance(node).copy()
-        covariance[0:9, :] = covariance[:, 0:9] = 0.0
-        covariance[POSITION, POSITION] = PLACES ** 2 * np.eye(3)
-        covariance[VELOCITY, VELOCITY] = FIRST_SPEED ** 2 * np.eye(3)
-        covariance[ATTITUDE, ATTITUDE] = np.pi ** 2 * np.eye(3)
-        return Node(stamp, force, rate, node.position, np.zeros(3), node.quaternion, node.rotation,
-                    node.accelerometer_bias, node.gyroscope_bias, node.time_offset,
-                    covariance=covariance)
 
     def predict(self, node: Node, stamp: float, force: np.ndarray, rate: np.ndarray,
                 after_impact: bool = False) -> Node:
@@ -286,9 +271,8 @@ class ErrorStateModel:
         x, y, z, w = prior.quaternion.tolist()
         measured = rotations.product(*quaternion.tolist(), *self.marker_to_base.tolist())
         residual[3:] = rotations.log(rotations.product(-x, -y, -z, w, *measured))
-        if self._has_lever:
-            residual[:3] -= prior.rotation @ self._lever
-            kalman.H[0:3, ATTITUDE] = -prior.rotation @ rotations.skew(self._lever)
+        residual[:3] -= prior.rotation @ self._lever
+        kalman.H[0:3, ATTITUDE] = -prior.rotation @ rotations.skew(self._lever)
         self._linearise_time(prior)
         kalman.P = self.covariance(prior)
         kalman.x = self._no_error
@@ -297,11 +281,6 @@ class ErrorStateModel:
         if not kalman.y.dot(kalman.SI).dot(kalman.y) <= self.gate:
             return None
         return self._inject(prior, kalman.x, kalman.P)
-
-    @property
-    def whitened_residual(self) -> np.ndarray:
-        """(6,) residual of the last :meth:`correct` in standard deviations of the MoCap."""
-        return np.ravel(self.filter.y) / np.sqrt(np.diag(self.filter.R))
 
     def _linearise_time(self, prior) -> None:
         """
@@ -312,9 +291,7 @@ class ErrorStateModel:
         """
         jacobian = self.filter.H
         rate = prior.rate - prior.gyroscope_bias
-        velocity = prior.velocity
-        if self._has_lever:
-            velocity = velocity + prior.rotation @ rotations.cross(rate, self._lever)
+        velocity = prior.velocity + prior.rotation @ rotations.cross(rate, self._lever)
         jacobian[0:3, TIME_OFFSET] = velocity if velocity.dot(velocity) > LEAST_SPEED ** 2 else 0.0
         jacobian[3:6, TIME_OFFSET] = rate if rate.dot(rate) > LEAST_RATE ** 2 else 0.0
 
@@ -340,10 +317,9 @@ class ErrorStateModel:
 
     def aligned(self, force: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Specific force and rate (3,) minus their known biases, in base_link axes."""
-        if self._biased:
-            imu = self.parameters.imu
-            force, rate = force - imu.accelerometer_bias, rate - imu.gyroscope_bias
-        return (force, rate) if self._axes is None else (self._axes @ force, self._axes @ rate)
+        imu = self.parameters.imu
+        return (self._axes.dot(force - imu.accelerometer_bias),
+                self._axes.dot(rate - imu.gyroscope_bias))
 
     def estimate(self, node: Node, readings: Sequence = ()) -> Estimate:
         """
@@ -360,18 +336,15 @@ class ErrorStateModel:
             self._extrapolated(node, age, self.trend(readings)) if late else
             (node.position, node.velocity, node.quaternion, node.rate))
         rate = measured_rate - node.gyroscope_bias
-        if self._arm is not None:
-            rotation = rotations.matrix(quaternion)
-            position = position - rotation @ self._arm
-            velocity = velocity - rotation @ rotations.cross(rate, self._arm)
+        rotation, arm = rotations.matrix(quaternion), self.parameters.imu.position
 
         def covariance():
             # that at the stamp of the reading, which is up to 50 ms older than the estimate
-            found = self.covariance(node)[:ERROR_STATES, :ERROR_STATES]
-            return found if self._arm is None else \
-                self._covariance_at_base(rotations.matrix(quaternion), rate, found, self._arm)
+            return self._covariance_at_base(
+                rotation, rate, self.covariance(node)[:ERROR_STATES, :ERROR_STATES], arm)
 
-        return Estimate(node.stamp, position, velocity, quaternion, rate,
+        return Estimate(node.stamp, position - rotation.dot(arm),
+                        velocity - rotation.dot(rotations.cross(rate, arm)), quaternion, rate,
                         node.accelerometer_bias, node.gyroscope_bias, covariance)
 
     def trend(self, readings) -> np.ndarray:

@@ -4,14 +4,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import group, parameter, ParameterFile
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImuParameters:
-    """Noise, mounting and plausible range of the IMU."""
+    """Noise and mounting of the IMU."""
 
     rate: float = parameter(
         200.0, doc='nominal sample rate', unit='Hz', low=20, high=4000)
@@ -36,15 +35,16 @@ class ImuParameters:
     gyroscope_bias: np.ndarray = parameter(
         [0.0, 0.0, 0.0], doc='known part of the bias, in the axes of the IMU', unit='rad/s',
         shape=(3,), low=-1, high=1)
-    specific_force_limit: float = parameter(
-        160.0, doc='larger readings are refused', unit='m/s^2', low=10, high=2000)
-    angular_velocity_limit: float = parameter(
-        40.0, doc='larger readings are refused', unit='rad/s', low=1, high=200)
+    delay: float = parameter(
+        0.0, doc='age of a reading at its stamp, at the start of its estimation', unit='s',
+        low=-0.2, high=0.2)
+    delay_std: float = parameter(
+        0.01, doc='standard deviation of this age; 0: exact', unit='s', low=0, high=0.1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class MocapParameters:
-    """Noise, mounting, delay and gating of the MoCap."""
+    """Noise, mounting and clock of the MoCap."""
 
     position_noise: float = parameter(
         0.001, doc='standard deviation of a position, each axis', unit='m', low=1e-6, high=1)
@@ -61,52 +61,6 @@ class MocapParameters:
     time_offset: float = parameter(
         0.0, doc='added to the stamps to convert them to the clock of the IMU', unit='s', low=-1,
         high=1)
-    delay_limit: float = parameter(
-        0.2, doc='largest age of a pose against the newest IMU sample', unit='s',
-        low=0.005, high=2)
-
-
-@dataclass(frozen=True, kw_only=True)
-class InitialParameters:
-    """Uncertainty of the first state."""
-
-    accelerometer_bias_std: float = parameter(
-        0.2, doc='standard deviation of the accelerometer bias', unit='m/s^2', low=1e-6, high=10)
-    gyroscope_bias_std: float = parameter(
-        0.05, doc='standard deviation of the gyroscope bias', unit='rad/s', low=1e-6, high=1)
-    time_offset: float = parameter(
-        0.0, doc='stamps of the IMU minus stamps of the MoCap at one instant', unit='s',
-        low=-0.2, high=0.2)
-    time_offset_std: float = parameter(
-        0.01, doc='standard deviation of the offset between the clocks; 0: no offset',
-        unit='s', low=0, high=0.1)
-
-
-@dataclass(frozen=True, kw_only=True)
-class StatusParameters:
-    """Limits of the status."""
-
-    dead_reckoning_after: float = parameter(
-        0.1, doc='time without an accepted pose until dead_reckoning', unit='s', low=0.01,
-        high=10)
-    lost_after: float = parameter(
-        20.0, doc='time without an accepted pose until lost', unit='s', low=0.02, high=600)
-    lost_position_std: float = parameter(
-        5.0, doc='standard deviation of the position, each axis, above which the state is lost',
-        unit='m', low=0.001, high=100)
-
-
-@dataclass(frozen=True, kw_only=True)
-class DeadReckoningParameters:
-    """Separation of accelerometer bias and attitude error of the markers, for dead reckoning."""
-
-    accelerometer_bias_std: float = parameter(
-        0.03, doc='standard deviation of the true bias, each axis', unit='m/s^2', low=1e-6,
-        high=10)
-    marker_attitude_std: float = parameter(
-        0.006, doc="standard deviation of the markers' attitude error, each axis; 0: none",
-        unit='rad', low=0, high=0.3)
-
 
 @dataclass(frozen=True, kw_only=True)
 class EkfParameters(ParameterFile, file='ekf.yaml'):
@@ -114,16 +68,6 @@ class EkfParameters(ParameterFile, file='ekf.yaml'):
 
     imu: ImuParameters = group(ImuParameters)
     mocap: MocapParameters = group(MocapParameters)
-    initial: InitialParameters = group(InitialParameters)
-    status: StatusParameters = group(StatusParameters)
-    dead_reckoning: DeadReckoningParameters = group(DeadReckoningParameters)
-
-    def __post_init__(self):
-        """Check the times against each other."""
-        if self.status.lost_after <= self.status.dead_reckoning_after:
-            raise schema.ParameterError(
-                f'status.lost_after ({self.status.lost_after:g} s) must be above '
-                f'status.dead_reckoning_after ({self.status.dead_reckoning_after:g} s)')
 
     def of_robot(self, robot: RobotParameters):
         """
@@ -143,7 +87,7 @@ class EkfParameters(ParameterFile, file='ekf.yaml'):
                 imu, rotation=mounted(imu.rotation, e.imu_rotation),
                 position=mounted(imu.position, e.imu_position),
                 accelerometer_bias=imu.accelerometer_bias + np.array(e.accelerometer_bias),
-                gyroscope_bias=imu.gyroscope_bias + np.array(e.gyroscope_bias)),
+                gyroscope_bias=imu.gyroscope_bias + np.array(e.gyroscope_bias),
+                delay=imu.delay + e.imu_delay),
             mocap=replace(mocap, rotation=mounted(mocap.rotation, e.mocap_rotation),
-                          time_offset=mocap.time_offset - e.mocap_delay),
-            initial=replace(self.initial, time_offset=self.initial.time_offset + e.imu_delay))
+                          time_offset=mocap.time_offset - e.mocap_delay))

@@ -41,36 +41,22 @@ class Node:
     The covariance of a predicted node is computed on demand, see
     :meth:`.model.ErrorStateModel.covariance`. A replay replaces most predicted nodes before that.
 
-    Attributes:
-        stamp: [s].
-        force: (3,) measured specific force, base_link axes [m/s^2].
-        rate: (3,) measured angular rate, base_link axes [rad/s].
-        position: (3,) of the IMU in world [m].
-        velocity: (3,) of the IMU in world [m/s].
-        quaternion: (4,) base_link to world.
-        rotation: (3, 3) matrix of ``quaternion``.
-        accelerometer_bias: (3,) base_link axes [m/s^2].
-        gyroscope_bias: (3,) base_link axes [rad/s].
-        time_offset: stamps of the IMU minus stamps of the MoCap at one instant [s].
-        after_impact: whether readings just before were beyond the sensor's range.
-        covariance: (16, 16) of the error states and the time offset; NaN while pending.
-        before: node from which a pending covariance is predicted; None if it is known.
-
     """
 
-    stamp: float
-    force: np.ndarray
-    rate: np.ndarray
-    position: np.ndarray
-    velocity: np.ndarray
-    quaternion: np.ndarray
-    rotation: np.ndarray
-    accelerometer_bias: np.ndarray
-    gyroscope_bias: np.ndarray
-    time_offset: float
-    after_impact: bool = False
+    stamp: float                    # [s]
+    force: np.ndarray               # (3,) measured specific force, base_link axes [m/s^2]
+    rate: np.ndarray                # (3,) measured angular rate, base_link axes [rad/s]
+    position: np.ndarray            # (3,) of the IMU in world [m]
+    velocity: np.ndarray            # (3,) of the IMU in world [m/s]
+    quaternion: np.ndarray          # (4,) base_link to world
+    rotation: np.ndarray            # (3, 3) matrix of it
+    accelerometer_bias: np.ndarray  # (3,) base_link axes [m/s^2]
+    gyroscope_bias: np.ndarray      # (3,) base_link axes [rad/s]
+    time_offset: float              # stamps of the IMU minus those of the MoCap [s]
+    after_impact: bool = False      # readings just before were beyond the sensor's range
+    # (16, 16) of the error states and the time offset; NaN while pending
     covariance: np.ndarray = field(default_factory=lambda: UNKNOWN)
-    before: Node | None = None
+    before: Node | None = None      # from which a pending covariance is predicted
 
     def pending(self) -> list[tuple[Node, Node]]:
         """Steps (before, after) from the last node with a known covariance to this node."""
@@ -158,34 +144,20 @@ def transition(before: Node, after: Node, out: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Estimate:
-    """
-    State of base_link at the newest IMU sample.
+    """State of base_link at the newest IMU sample."""
 
-    Attributes:
-        stamp: time of that sample [s].
-        position: (3,) in world [m].
-        velocity: (3,) in world [m/s].
-        quaternion: (4,) body to world (x, y, z, w), unit.
-        angular_velocity: (3,) in base_link, bias removed [rad/s].
-        accelerometer_bias: (3,) in base_link axes [m/s^2].
-        gyroscope_bias: (3,) in base_link axes [rad/s].
-        covariance: (15, 15) of the error, in the order of this module's slices; computed on first
-            access.
-
-    """
-
-    stamp: float
-    position: np.ndarray
-    velocity: np.ndarray
-    quaternion: np.ndarray
-    angular_velocity: np.ndarray
-    accelerometer_bias: np.ndarray
-    gyroscope_bias: np.ndarray
+    stamp: float                    # of that sample [s]
+    position: np.ndarray            # (3,) in world [m]
+    velocity: np.ndarray            # (3,) in world [m/s]
+    quaternion: np.ndarray          # (4,) body to world (x, y, z, w), unit
+    angular_velocity: np.ndarray    # (3,) in base_link, bias removed [rad/s]
+    accelerometer_bias: np.ndarray  # (3,) in base_link axes [m/s^2]
+    gyroscope_bias: np.ndarray      # (3,) in base_link axes [rad/s]
     compute_covariance: Callable[[], np.ndarray] = field(repr=False)
 
     @cached_property
     def covariance(self) -> np.ndarray:
-        """See the class."""
+        """Covariance (15, 15) of the error, in the order of this module's slices."""
         return self.compute_covariance()
 
 

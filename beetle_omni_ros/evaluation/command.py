@@ -17,7 +17,6 @@ from beetle_omni_ros.control.registry import ControllerOptions
 from beetle_omni_ros.evaluation.loop import FlightLoop
 from beetle_omni_ros.messages.topics import topics_with
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.urdf import description
 from beetle_omni_ros.runs import table
 from beetle_omni_ros.runs.bag_writer import BagWriter
 from beetle_omni_ros.runs.files import write_json
@@ -63,7 +62,7 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
         if bag is not None:
             recorder = Recorder(memory, stack.enter_context(BagWriter(
                 bag, meta=meta, topics=tuple(topics_with([entry.name])), compression=compression,
-                description=description(), epoch=int(time()))))
+                frames=True, epoch=int(time()))))
         loop = FlightLoop(robot, plant, aboard, recorder, conditions=conditions, seed=seed,
                           faults=faults)
         stayed, truth = loop.fly(task, progress), loop.simulator.truth

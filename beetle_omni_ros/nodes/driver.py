@@ -16,15 +16,7 @@ from sensor_msgs.msg import Joy
 from beetle_omni_ros import drive
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import PoseTarget
-from beetle_omni_ros.drive import (
-    DriveParameters,
-    Go,
-    Order,
-    read_named_poses,
-    Shift,
-    Steering,
-    WordError,
-)
+from beetle_omni_ros.drive import Action, DriveParameters, read_named_poses, Steering
 from beetle_omni_ros.messages.topics import SENSOR
 from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes import wire
@@ -105,27 +97,30 @@ class Driver(Operator):
             self._targets.publish(PoseTarget(self.steering.position, self.steering.quaternion))
         return refused
 
-    def execute(self, action: Shift | Go | Order) -> str:
+    def execute(self, action: Action) -> str:
         """Execute an action; return the text for the user."""
-        name, value = action if isinstance(action, Order) else ('', '')
+        name, values = action
         if name in ('arm', 'land', 'emergency_stop'):
             accepted, answer = self.call(name)
             return f"{name}: {answer or ('done' if accepted else 'refused')}"
         if name == 'controller':
             names, now = list(registry.standing_by()), self.state.partition(':')[2]
             other = names[(names.index(now) + 1) % len(names)] if now in names else names[0]
-            accepted, answer = self.set('supervisor_node', 'controller', value or other)
-            return f'controller {value or other}' + ('' if accepted else f': {answer}')
+            wanted = values[0] if values else other
+            wanted = values[0] if values else other
+            wanted = values[0] if values else other
+            accepted, answer = self.set('supervisor_node', 'controller', wanted)
+            return f'controller {wanted}' + ('' if accepted else f': {answer}')
         if name == 'where':
             return self.where()
         if self.steering is None:
             return f"nothing flies (supervisor in '{self.state or 'unknown'}'); arm first"
         position, quaternion = self.steering.goal
-        if isinstance(action, Shift):
-            return self.steering.shift(action.way, action.turn)
-        if isinstance(action, Go):
-            return self.steering.go(action.position, quaternion if action.quaternion is None
-                                    else action.quaternion)
+        if name == 'shift':
+            return self.steering.shift(*values)
+        if name == 'goto':
+            place, attitude = values
+            return self.steering.go(place, quaternion if attitude is None else attitude)
         if name == 'hold':
             self.steering.hold()
             return ''
@@ -220,9 +215,9 @@ def keyboard(driver, p, poses, say):
                     yield found
                     return
                 if shift:
-                    found.append(Shift(*shift))
+                    found.append(Action('shift', shift))
                 elif word:
-                    found.append(drive.parse(word, poses) if word in poses else Order(word))
+                    found.append(drive.parse(word, poses) if word in poses else Action(word))
             yield found
     finally:
         termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
@@ -240,7 +235,7 @@ def joystick(driver, p, poses, say):
             buttons = tuple(driver.buttons)
             way, turn = drive.shift_of_sticks(driver.axes, now - before, p)
             if driver.steering is not None and (way.any() or turn.any()):
-                found.append(Shift(way, turn))
+                found.append(Action('shift', (way, turn)))
         before = now
         yield found
 
@@ -261,17 +256,17 @@ def terminal(driver, p, poses, say):
             line, _, text = text.partition('\n')
             try:
                 action = drive.parse(line, poses)
-            except WordError as error:
+            except ParameterError as error:
                 say(str(error))
                 continue
-            name = action.name if isinstance(action, Order) else ''
+            name = action.name if action else ''
             if name == 'quit':
                 yield found
                 return
             if name == 'help':
                 say(f"{options}: {', '.join(poses)}")
             elif name == 'wait':
-                wait = driver.time(), float(action.value) if action.value else None
+                wait = driver.time(), action.values[0] if action.values else None
             elif action is not None:
                 found.append(action)
         yield found

@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
 import os
-from pathlib import Path
 import time
 from typing import Any
 
@@ -256,14 +255,12 @@ class LiveGraph(Client):
 
 
 def run_live(*, namespace: str = '', domain_id: int | None = None,
-             urdf: Path | None = None, host: str, port: int) -> None:
+             host: str, port: int) -> None:
     """Show a running graph until Ctrl-C; arguments are the options of `beetle_omni view`."""
-    from beetle_omni_ros.robot.urdf import Model
     from beetle_omni_ros.view.live import draw
     from beetle_omni_ros.view.recorded import announce
     from beetle_omni_ros.view.scene import close, serve
     runner.end_with_parent()
-    model = Model.load(urdf)
     with ExitStack() as stack:
         graph = LiveGraph(namespace, domain_id)
         stack.callback(graph.close)
@@ -272,4 +269,4 @@ def run_live(*, namespace: str = '', domain_id: int | None = None,
         stack.callback(close, server)
         announce(host, server.get_port())
         with suppress(KeyboardInterrupt):       # the regular end
-            draw(server, graph, model)
+            draw(server, graph)

@@ -23,9 +23,7 @@ from beetle_omni_ros.messages.topics import (
 from beetle_omni_ros.messages.values import Wrench
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.node import ERROR, FlightNode, OK, WARN
-from beetle_omni_ros.nodes.parameters import file_parameter
 from beetle_omni_ros.robot.schema import parameter, ParameterError
-from beetle_omni_ros.robot.urdf import description
 from beetle_omni_ros.runs.bag import BagError
 from beetle_omni_ros.runs.bag_writer import BagWriter, COMPRESSIONS
 from beetle_omni_ros.runs.tasks import make_task, TaskPlayer, WITH_WRENCHES
@@ -137,7 +135,6 @@ class RecorderNode(FlightNode):
             bag=parameter(doc='folder to create for the bag', read_only=True),
             controllers=parameter(tuple(registry.standing_by()), read_only=True,
                                   doc='registered controllers whose commands are recorded'),
-            urdf_file=file_parameter('robot description for the recorded frames'),
             compression=parameter('none', choices=COMPRESSIONS, read_only=True,
                                   doc='compression of the chunks in the MCAP file'))
         topics = topics_with(self.parameters.controllers)
@@ -146,7 +143,7 @@ class RecorderNode(FlightNode):
             self._bag = BagWriter(self.parameters.bag, namespace=self.get_namespace(),
                                   topics=tuple(topics),
                                   compression=self.parameters.compression,
-                                  description=description(self.parameters.urdf_file))
+                                  frames=True)
         except BagError as error:
             raise ParameterError(f"key 'bag': {error}") from None
         self._written = self._lost = self._writes = 0

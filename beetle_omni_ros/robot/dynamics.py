@@ -153,18 +153,6 @@ def gyroscopic_load(robot: RobotParameters, angular_velocity, tilt, thrust, join
         ca.DM(robot.tilt_axes[joint]), ca.cross(angular_velocity, n))
 
 
-def servo_acceleration(robot: RobotParameters, tilt, tilt_rate, target, thrust=0.0, joint=0,
-                       gyroscopic=0.0):
-    """
-    Acceleration of a tilt servo [rad/s^2], within its torque and rate limits.
-
-    The equation is that of :mod:`beetle_omni_ros.robot.servo` with the robot file's effects.
-    Arguments as of :func:`tilt_servo`.
-    """
-    servo, terms = tilt_servo(robot, joint, target, thrust, gyroscopic)
-    return servo.acceleration(CASADI, terms.target, tilt, tilt_rate, terms.load)
-
-
 def tilt_servo(robot: RobotParameters, joint: int, target, thrust=0.0,
                gyroscopic=0.0) -> tuple[Servo, ServoTerms]:
     """
@@ -195,10 +183,13 @@ def full_model(robot: RobotParameters) -> ca.Function:
     target = ca.fmin(ca.fmax(u[TILT_COMMAND], -limit), limit) + d[TILT_OFFSET]
     thrust_target = ca.fmin(ca.fmax(u[THRUST_COMMAND], robot.rotors.thrust_min),
                             robot.rotors.thrust_max)
-    tilt_acceleration = ca.vertcat(*[
-        servo_acceleration(robot, x[TILT][i], x[TILT_RATE][i], target[i], x[THRUST][i], i,
-                           gyroscopic_load(robot, x[RATE], x[TILT][i], x[THRUST][i], i))
-        for i in range(4)])
+    accelerations = []
+    for i in range(4):
+        servo, terms = tilt_servo(robot, i, target[i], x[THRUST][i], gyroscopic_load(
+            robot, x[RATE], x[TILT][i], x[THRUST][i], i))
+        accelerations.append(servo.acceleration(
+            CASADI, terms.target, x[TILT][i], x[TILT_RATE][i], terms.load))
+    tilt_acceleration = ca.vertcat(*accelerations)
     thrust_rate = (thrust_target - x[THRUST]) / robot.rotors.time_constant
     acceleration, angular_acceleration = rigid_body(
         robot, x[VELOCITY], x[QUATERNION], x[RATE], x[TILT], x[THRUST], d[FORCE], d[TORQUE],

@@ -15,20 +15,18 @@ its kind:
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
-from beetle_omni_ros.robot.schema import ParameterError, quoted, shortened
+from beetle_omni_ros.robot.schema import numbers, ParameterError, quoted, shortened, unknown
 
 NAN = float('nan')
 UP = ca.DM([0, 0, 1])
 REFERENCE_HEIGHT = 0.25     # [m] of the rotor, for which the gain of the ground effect is given
 EXPONENTIAL_HEIGHT = 0.25   # [m] over which the exponential form falls to 1/e
 LEAST_HEIGHT = 0.08         # [m] below which the forms are not valid
-LAYERS = ('body', 'rotor', 'joint', 'timing', 'sensor')
 # Terms that the simulated plant and the gap finder have -> why NMPC and training leave out an
 # effect of them.
 MEASURED = {'voltage_ratio': 'it has no voltage and assumes a full pack',
@@ -235,12 +233,12 @@ def vector(values):
         else values
 
 
-def _mass(terms, mass):
-    terms.mass = mass
-
-
-def _inertia(terms, inertia):
-    terms.inertia = vector(inertia)
+def _sets(term):
+    """Equation of an effect whose one parameter replaces a term."""
+    def act(terms, **values):
+        value, = values.values()
+        setattr(terms, term, vector(value))
+    return act
 
 
 def _centre_of_mass(terms, offset):
@@ -269,10 +267,6 @@ def _module_reaction(terms, module_inertia, mass_moment):
 
 def _thrust_coefficient(terms, scale):
     terms.thrust = vector(scale) * terms.thrust
-
-
-def _torque_coefficient(terms, torque_to_thrust_ratio):
-    terms.torque_ratio = torque_to_thrust_ratio
 
 
 def _wind(terms, force):
@@ -405,14 +399,14 @@ CATALOGUE: dict[str, Effect] = {
                                          tolerance='mass')},
         "m v' = F, Newton; INTERFACES: total mass", 'any flight',
         ('thrust_coefficient', 'voltage_sag', 'wind'),
-        'weigh the robot, or fly fast turns: thrust scales torques too, mass does not', _mass,
-        allocated=True, plant='model'),
+        'weigh the robot, or fly fast turns: thrust scales torques too, mass does not',
+        _sets('mass'), allocated=True, plant='model'),
     'inertia': Effect(
         'body', {'inertia': EffectParameter('kg m^2', (NAN,) * 3, 1e-5, 50, 0.2, 0.05,
                                             number='inertia', tolerance='inertia')},
         "I w' = tau - w x I w, Euler", 'fast turns about every axis',
         ('rotor_lag', 'propeller_gyroscopic_torque', 'thrust_coefficient'),
-        'flips by 90 and 180 deg about each axis', _inertia, plant='model'),
+        'flips by 90 and 180 deg about each axis', _sets('inertia'), plant='model'),
     'centre_of_mass': Effect(
         'body', {'offset': EffectParameter('m', (0.0,) * 3, -0.2, 0.2, 0.005, 0.0015)},
         'forces turn the body about its centre of mass, which is displaced from base_link',
@@ -448,7 +442,7 @@ CATALOGUE: dict[str, Effect] = {
             tolerance='torque_ratio')},
         'tau_i = -spin_i ratio f_i about the thrust axis', 'yaw steps, differential thrust',
         ('joint_offset', 'rotor_acceleration_torque'), 'yaw steps at zero tilt',
-        _torque_coefficient, allocated=True, plant='model'),
+        _sets('torque_ratio'), allocated=True, plant='model'),
     'ground_effect': Effect(
         'body', {'gain_at_0.25m': EffectParameter('1', 0.0, 0.0, 1.0, 0.08, 0.01),
                  'exponential_share': EffectParameter('1', 0.0, 0.0, 1.0, default=0.0, form=True)},
@@ -674,20 +668,6 @@ def delaying(*what: str) -> tuple[str, ...]:
     return tuple(name for name, entry in CATALOGUE.items() if set(what) & set(entry.delays))
 
 
-def command_delays(effects: dict[str, dict]) -> tuple[float, float]:
-    """Delays of tilt and of thrust commands [s] from validated effects."""
-    tilt, thrust = (sum(effects.get(name, {}).get('delay', 0.0) for name in delaying(what))
-                    for what in ('tilt', 'thrust'))
-    return tilt, thrust
-
-
-def sensor_errors(effects: dict[str, dict]) -> SensorErrors:
-    """Sensor errors from validated effects."""
-    return SensorErrors(**{spec.sensor: values[parameter] for name, values in effects.items()
-                           for parameter, spec in CATALOGUE[name].parameters.items()
-                           if spec.sensor})
-
-
 def validated(effects: dict | None) -> dict[str, dict]:
     """
     Validate a robot file's ``effects`` mapping against the catalogue.
@@ -705,9 +685,7 @@ def validated(effects: dict | None) -> dict[str, dict]:
     for name, given in (effects or {}).items():
         name = shortened(str(name))
         if name not in CATALOGUE:
-            near = get_close_matches(name, CATALOGUE, n=1)
-            hint = f"; did you mean '{near[0]}'?" if near else f"; known: {', '.join(CATALOGUE)}"
-            raise ParameterError(f'effects.{name}: unknown effect{hint}')
+            raise unknown(f'effects.{name}', 'effect', name, CATALOGUE)
         entry = CATALOGUE[name]
         needed = {key for key, spec in entry.parameters.items() if spec.default is None}
         if not isinstance(given, dict) or not needed <= set(given) <= set(entry.parameters):
@@ -720,20 +698,12 @@ def validated(effects: dict | None) -> dict[str, dict]:
 
 
 def _value(at, spec, value):
-    try:
-        array = np.array(value, dtype=float)
-    except (OverflowError, TypeError, ValueError):
-        raise ParameterError(f'{at}: expected numbers [{spec.unit}], '
-                             f'found {quoted(value)}') from None
-    shape = np.shape(spec.neutral)
+    array, shape = numbers(value, at, vars(spec)), np.shape(spec.neutral)
     if spec.of_each and array.shape == (4,):
         shape = array.shape
     if array.shape != shape:
         each = ' or (4,)' if spec.of_each else ''
         raise ParameterError(f'{at}: expected shape {shape}{each}, found {array.shape}')
-    if not np.all((array >= spec.low) & (array <= spec.high)):
-        raise ParameterError(f'{at}: {quoted(value)} is outside '
-                             f'{spec.low:g} to {spec.high:g} {spec.unit}')
     return tuple(map(float, array)) if shape else float(array)
 
 

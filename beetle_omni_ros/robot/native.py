@@ -11,13 +11,11 @@ import tempfile
 
 import casadi as ca
 
+from beetle_omni_ros.robot.schema import RunError
+
 log = logging.getLogger(__name__)
 FLAGS = ('-O2', '-fPIC', '-shared', '-std=gnu99', '-w')
 EXACT = ('-ffp-contract=off', '-lm')     # rounds each operation, as CasADi's interpreter does
-
-
-class CompilerError(RuntimeError):
-    """No usable C compiler, or a failed compilation; the text gives the first error."""
 
 
 def cache_folder() -> Path:
@@ -51,12 +49,12 @@ def built(name: str, source: str, options: Sequence[str] = ()) -> Path:
         path of the library.
 
     Raises:
-        CompilerError: no compiler, no write access to the cache, or compilation failed.
+        RunError: no compiler, no write access to the cache, or compilation failed.
 
     """
     compiler = os.environ.get('CC') or shutil.which('gcc') or shutil.which('cc')
     if not compiler or not shutil.which(compiler.split()[0]):
-        raise CompilerError('no C compiler found (looked for $CC, gcc, cc)')
+        raise RunError('no C compiler found (looked for $CC, gcc, cc)')
     key = '\n'.join((source, compiler, ' '.join((*FLAGS, *options)), ca.__version__))
     library = cache_folder() / f'{name}_{hashlib.sha256(key.encode()).hexdigest()[:20]}.so'
     if not library.is_file():
@@ -73,7 +71,7 @@ def compiled(function: ca.Function) -> ca.Function:
     try:
         return ca.external(function.name(),
                            str(built(function.name(), generated([function]), EXACT)))
-    except (CompilerError, RuntimeError) as error:     # RuntimeError: casadi cannot load it
+    except RuntimeError as error:     # also of CasADi, which cannot load it
         log.info('%s stays interpreted: %s', function.name(), str(error).splitlines()[0])
         return function
 
@@ -90,7 +88,7 @@ def _compile(compiler, source, options, library):
                                   capture_output=True, text=True, timeout=300)
             if done.returncode:
                 lines = done.stderr.strip().splitlines() or ['no message']
-                raise CompilerError(f'{compiler[0]} failed: {lines[0]}')
+                raise RunError(f'{compiler[0]} failed: {lines[0]}')
             os.replace(output, library)  # atomic, because other processes may build the same
     except (OSError, subprocess.TimeoutExpired) as error:
-        raise CompilerError(f'cannot build in {library.parent}: {error}') from None
+        raise RunError(f'cannot build in {library.parent}: {error}') from None

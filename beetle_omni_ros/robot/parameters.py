@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 import hashlib
 import json
@@ -19,8 +18,6 @@ from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import parameter, ParameterError, quoted
 
 LONGEST_NAME = 255      # characters of a file's name
-CLOSE = 5e-4        # [m] within which a described part agrees with the totals; 2.4e-4 as shipped
-MISSING = 0.1       # [1] of the inertia that a described main body may lack; 0.07 as shipped
 JOINT_NAMES = ('gimbal1', 'gimbal2', 'gimbal3', 'gimbal4')
 ROTOR_NAMES = ('rotor1', 'rotor2', 'rotor3', 'rotor4')
 TILT_LAG = 'tilt_lag'   # interval of a property; the logs determine it better than its parts
@@ -117,23 +114,13 @@ class BatteryParameters:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MainBodyParameters:
-    """The rest of the robot, described to check the totals."""
-
-    centre_of_mass: np.ndarray = parameter(doc='centre of mass in its own frame', unit='m',
-                                           shape=(3,))
-    inertia: np.ndarray = parameter(doc='diagonal about its centre of mass', unit='kg m^2',
-                                    shape=(3,), low=0)
-
-
-@dataclass(frozen=True, kw_only=True)
 class ModuleParameters:
     """One tilting rotor module."""
 
     mass: float = parameter(doc='mass', unit='kg', low=0, high=20)
     joint_offset: float | None = parameter(
-        None, doc='|x| = |y| of the joint origin in the main body frame; only compared with '
-        'rotors.positions', unit='m', low=0, high=5)
+        None, doc='|x| = |y| of the joint origin in the main body frame; not used, it follows '
+        'from rotors.positions', unit='m', low=0, high=5)
     joint_height: float = parameter(doc='z of the joint origin', unit='m', low=-5, high=5)
     centre_of_mass: np.ndarray = parameter(
         doc='outward, sideways, up from the joint axis', unit='m', shape=(3,))
@@ -154,18 +141,19 @@ class EndEffectorParameters:
 @dataclass(frozen=True, kw_only=True)
 class MultibodyParameters:
     """
-    Parts of the rigid body; the rest is the main body.
+    Parts of the rigid body; the rest of the totals is the main body.
 
-    What follows from the totals (main body, joint origins, centre of gravity) is optional. A robot
-    file that contradicts itself is refused.
+    The published values of this rest are kept for the hash of the robot, by which policy files
+    name the robot that they were trained for.
     """
 
-    main_body: MainBodyParameters | None = parameter(None, doc='main body')
+    main_body: dict = parameter({}, doc='centre_of_mass and inertia of the main body; not used, '
+                                'they follow from the totals')
     module: ModuleParameters = parameter(doc='tilting module')
     end_effector: EndEffectorParameters = parameter(doc='end-effector')
     centre_of_gravity_height: float | None = parameter(
-        None, doc='height above the main body origin; only compared with rotors.positions',
-        unit='m', low=-5, high=5)
+        None, doc='height above the main body origin; not used, it follows from '
+        'rotors.positions', unit='m', low=-5, high=5)
 
     @classmethod
     def from_totals(cls, module_inertia: float = 0.0,
@@ -221,18 +209,14 @@ class RobotParameters:
     def _checked_interval(self, key, pair):
         try:
             value = np.array(self._value(key), dtype=float)
-        except (AttributeError, KeyError, TypeError, ValueError):
-            raise ParameterError(f"key 'intervals': {quoted(key)}: expected the dotted key of a "
-                                 'number of this file') from None
-        try:
             low, high = (np.broadcast_to(np.array(bound, dtype=float), value.shape)
                          for bound in pair)
             fits = bool(np.all((low <= value) & (value <= high)))
-        except (TypeError, ValueError):
+        except (AttributeError, KeyError, TypeError, ValueError):
             fits = False
         if not fits:
-            raise ParameterError(f"key 'intervals.{key}': expected [lowest, highest] around "
-                                 f'{value.tolist()}, found {quoted(pair)}')
+            raise ParameterError(f"key 'intervals': {quoted(key)}: expected [lowest, highest] "
+                                 f'around a number of this file, found {quoted(pair)}')
         return low, high
 
     def _value(self, key):
@@ -296,8 +280,7 @@ class RobotParameters:
         Read a robot file, see :func:`find_robot`; without a path, the shipped one.
 
         A file may begin with ``extends: FILE``, a file in the same folder or of the shipped
-        params. It then contains the differences only; what they move without being named, moves
-        with them.
+        params. It then contains the differences only.
 
         Raises:
             ParameterError: names file, key and expected value.
@@ -310,13 +293,15 @@ class RobotParameters:
             raise ParameterError(f'{path}: no such file; expected a robot file, or one of the '
                                  f"shipped {', '.join(shipped)}")
         robot = schema.bind(cls, _merged(path, ()), str(path))
-        with _named(path):
-            check_parts(robot)
+        try:
+            mass_properties(replace(robot, effects={}))     # refuses an impossible main body
             # not in __post_init__, because copies without some effects keep the others' intervals
             replaced = catalogue.settings(robot.effects)
             return replace(robot, intervals={
                 key: robot._checked_interval(key, pair) for key, pair in robot.intervals.items()
                 if key not in replaced})
+        except ParameterError as error:
+            raise ParameterError(f'{path}: {error}') from None
 
     def effect(self, key: str, neutral):
         """Value of an effect's parameter, 'effect.parameter'; ``neutral`` without the effect."""
@@ -355,7 +340,9 @@ class RobotParameters:
     @property
     def command_delays(self) -> tuple[float, float]:
         """Delays of tilt and of thrust commands [s] by the effects."""
-        return catalogue.command_delays(self.effects)
+        tilt, thrust = (sum(self.effect(f'{name}.delay', 0.0) for name in catalogue.delaying(what))
+                        for what in ('tilt', 'thrust'))
+        return tilt, thrust
 
     @property
     def tilt_lag(self) -> np.ndarray:
@@ -365,7 +352,9 @@ class RobotParameters:
     @property
     def sensors(self) -> catalogue.SensorErrors:
         """Sensor errors by the effects."""
-        return catalogue.sensor_errors(self.effects)
+        return catalogue.SensorErrors(**{
+            spec.sensor: values[parameter] for name, values in self.effects.items()
+            for parameter, spec in catalogue.CATALOGUE[name].parameters.items() if spec.sensor})
 
     @property
     def hover_thrust(self) -> float:
@@ -424,33 +413,13 @@ def _merged(path: Path, seen: tuple[Path, ...]) -> dict:
                              'shipped params')
     if base.resolve() in (*seen, path.resolve()):
         raise ParameterError(f"{path}: key 'extends': {name} extends itself")
-    return _extended(base, _merged(base, (*seen, path.resolve())), path, content)
-
-
-def _extended(base: Path, below: dict, path: Path, content: dict) -> dict:
-    """
-    Merge a file with the file that it extends, whose content is ``below``.
-
-    Changed masses and positions change the inertia, if the file does not state it, and the checks
-    of the extended file do not apply to them.
-    """
-    rotors = content.get('rotors')
+    below = _merged(base, (*seen, path.resolve()))
     if 'intervals' in below:    # those of values that the file replaces do not hold for it
         moved = {'effects', 'joints'} & set(content)
-        below = below | {'intervals': {key: pair for key, pair in below['intervals'].items()
-                                       if not _states(content, key.split('.'))
-                                       and not (key == TILT_LAG and moved)}}
-    merged, own = _overlaid(below, content), content.get('multibody', {})
-    moves = {'mass', 'multibody'} & set(content) or (
-        isinstance(rotors, dict) and 'positions' in rotors)
-    if (moves or 'inertia' in content) and isinstance(own, dict) and merged.get('multibody'):
-        merged['multibody'] = _unchecked(merged['multibody'], own)
-    if moves and 'inertia' not in content:
-        pair = [schema.bind(RobotParameters, {**each, 'effects': {}}, str(file))
-                for each, file in ((merged, path), (below, base))]
-        with _named(path):
-            merged['inertia'] = moved_inertia(*pair)
-    return merged
+        below['intervals'] = {key: pair for key, pair in below['intervals'].items()
+                              if not _states(content, key.split('.'))
+                              and not (key == TILT_LAG and moved)}
+    return _overlaid(below, content)
 
 
 def _states(content: Any, names: list[str]) -> bool:
@@ -460,29 +429,10 @@ def _states(content: Any, names: list[str]) -> bool:
         not rest or first == 'effects' or _states(content[first], rest))
 
 
-def _unchecked(multibody: dict, own: dict) -> dict:
-    """Parts without the keys that are only checks, except those of the file itself."""
-    kept = {key: value for key, value in multibody.items()
-            if key in own or key not in ('main_body', 'centre_of_gravity_height')}
-    module, stated = kept.get('module'), own.get('module')
-    if isinstance(module, dict) and not (isinstance(stated, dict) and 'joint_offset' in stated):
-        kept['module'] = {key: value for key, value in module.items() if key != 'joint_offset'}
-    return kept
-
-
 def _between(interval, share):
     """Value at a share of an interval, of a positive one by ratio."""
     low, high = map(np.array, interval)
     return low * (high / low)**share if np.all(low > 0) else low + (high - low) * share
-
-
-@contextmanager
-def _named(path: Path) -> Iterator[None]:
-    """Put the file into the message of an error."""
-    try:
-        yield
-    except ParameterError as error:
-        raise ParameterError(f'{path}: {error}') from None
 
 
 def _overlaid(base: dict, content: dict) -> dict:
@@ -559,104 +509,36 @@ def mass_properties(robot: RobotParameters, variation: Variation | None = None) 
 
     """
     variation = variation or Variation()
-    made = _described(robot)
-    known = [*made.modules, made.end_effector]
-    mass = robot.true_mass * variation.mass_scale
-    total_inertia = np.array(robot.effect('inertia.inertia', robot.inertia))
-    centre = variation.centre_of_mass + robot.effect('centre_of_mass.offset', (0.0,) * 3)
-    point_mass = _remaining(mass, centre, known)
-    inertia = np.diag(total_inertia * variation.inertia_scale) - inertia_about(
-        centre, [point_mass, *known])
-    moments = np.linalg.eigvalsh(inertia)
-    if moments[0] <= 0 or moments[0] + moments[1] < moments[2]:
-        raise ParameterError(f'inertia: {_text(total_inertia)} kg m^2 leaves the main body the '
-                             f'principal moments {_text(moments)} kg m^2, which are impossible')
-    return replace(made, main_body=replace(point_mass, inertia=inertia))
-
-
-def _described(robot):
-    """All parts, without the main body."""
-    parts, nothing = robot.parts, RigidPart(0.0, np.zeros(3), np.zeros((3, 3)))
-    outward = robot.tilt_axes
+    parts, outward = robot.parts, robot.tilt_axes
     up = np.tile([0.0, 0.0, 1.0], (4, 1))
-    module_rotations = np.stack([outward, np.cross(up, outward), up], axis=2)
+    rotations = np.stack([outward, np.cross(up, outward), up], axis=2)
     joint_origins = robot.rotors.positions - parts.module.rotor_offset * outward
     main_origin = joint_origins.mean(axis=0) - [0.0, 0.0, parts.module.joint_height]
-
     modules = tuple(
         RigidPart(parts.module.mass, origin + rotation @ parts.module.centre_of_mass,
                   rotation @ np.diag(parts.module.inertia) @ rotation.T)
-        for origin, rotation in zip(joint_origins, module_rotations))
-    end_effector = RigidPart(parts.end_effector.mass,
-                             main_origin + [0.0, 0.0, parts.end_effector.height], np.zeros((3, 3)))
-    return MassProperties(nothing, modules, end_effector, main_origin, joint_origins,
-                          module_rotations)
+        for origin, rotation in zip(joint_origins, rotations))
+    ball = RigidPart(parts.end_effector.mass, main_origin + [0.0, 0.0, parts.end_effector.height],
+                     np.zeros((3, 3)))
 
-
-def _remaining(mass, centre, known):
-    """Point mass that completes the ``known`` parts to a total mass with its centre."""
+    mass = robot.true_mass * variation.mass_scale
+    total_inertia = np.array(robot.effect('inertia.inertia', robot.inertia))
+    centre = variation.centre_of_mass + robot.effect('centre_of_mass.offset', (0.0,) * 3)
+    known = [*modules, ball]
     rest = mass - sum(part.mass for part in known)
     if rest <= 0:
         raise ParameterError(f'multibody: modules and end-effector weigh {mass - rest:g} kg, '
                              f'the whole robot {mass:g} kg; expected a main body with mass')
     moment = mass * centre - np.sum([part.mass * part.centre for part in known], axis=0)
-    return RigidPart(rest, moment / rest, np.zeros((3, 3)))
-
-
-def moved_inertia(robot: RobotParameters, base: RobotParameters) -> np.ndarray:
-    """
-    Inertia (3,) of a robot that differs from ``base`` in mass, rotor positions or parts.
-
-    The main body keeps its radii of gyration. A robot without described parts keeps those of the
-    whole robot.
-
-    Raises:
-        ParameterError: the arms of a robot without described parts have changed.
-
-    """
-    if robot.multibody is None or base.multibody is None:
-        if not np.array_equal(robot.rotors.positions, base.rotors.positions):
-            raise ParameterError('inertia: without multibody it does not follow from the changed '
-                                 'rotors.positions; expected the key beside them')
-        return base.inertia * robot.mass / base.mass
-    before, made, origin = mass_properties(base).main_body, _described(robot), np.zeros(3)
-    known = [*made.modules, made.end_effector]
-    main = _remaining(robot.mass, origin, known)
-    main = replace(main, inertia=before.inertia * main.mass / before.mass)
-    return np.diag(inertia_about(origin, [main, *known]))
-
-
-def check_parts(robot: RobotParameters) -> None:
-    """
-    Compare the described parts with the totals, of which the main body is the rest.
-
-    Raises:
-        ParameterError: names the key that contradicts the totals, its value and the expected one.
-
-    """
-    made, parts = mass_properties(replace(robot, effects={})), robot.multibody
-    if parts is None:
-        return
-    joints, main = made.joint_origins - made.main_origin, parts.main_body
-    checks = [('module.joint_offset', parts.module.joint_offset, np.abs(joints[:, :2])),
-              ('centre_of_gravity_height', parts.centre_of_gravity_height, -made.main_origin[2]),
-              ('main_body.centre_of_mass', main.centre_of_mass if main else None,
-               made.main_body.centre - made.main_origin)]
-    for key, found, expected in checks:
-        if found is not None and np.abs(found - expected).max() > CLOSE:
-            right = expected if np.ndim(found) else np.mean(expected)
-            raise ParameterError(
-                f'multibody.{key}: {_text(found)} m contradicts mass {robot.mass:g} kg, '
-                f'rotors.positions and the other parts; expected {_text(right)} m within '
-                f'{CLOSE:g} m, or no such key')
-    if main:
-        rest = np.diag(made.main_body.inertia)
-        missing = (rest - main.inertia) / robot.inertia
-        if not 0 <= missing.min() <= missing.max() <= MISSING:
-            raise ParameterError(
-                f'inertia: {_text(robot.inertia)} kg m^2 leaves the main body {_text(rest)}, but '
-                f'multibody.main_body.inertia is {_text(main.inertia)}; expected it to lack at '
-                f'most {MISSING:.0%} of the total, or no such key')
+    main_body = RigidPart(rest, moment / rest, np.zeros((3, 3)))
+    inertia = np.diag(total_inertia * variation.inertia_scale) - inertia_about(
+        centre, [main_body, *known])
+    moments = np.linalg.eigvalsh(inertia)
+    if moments[0] <= 0 or moments[0] + moments[1] < moments[2]:
+        raise ParameterError(f'inertia: {_text(total_inertia)} kg m^2 leaves the main body the '
+                             f'principal moments {_text(moments)} kg m^2, which are impossible')
+    return MassProperties(replace(main_body, inertia=inertia), modules, ball, main_origin,
+                          joint_origins, rotations)
 
 
 def _text(numbers):

@@ -87,13 +87,8 @@ class SpikeFilter:
 
     def __init__(self, force_change: float, rate_change: float):
         self._limits = force_change**2, rate_change**2
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget the readings so far."""
         self._last: tuple[np.ndarray, np.ndarray] | None = None
-        self._held: np.ndarray | None = None
-        self._count, self.lasted = 0, False
+        self._held, self._count, self.lasted = np.zeros(6), 0, False
 
     def passes(self, force: np.ndarray, rate: np.ndarray) -> bool:
         """Whether a reading (3,) [m/s^2], (3,) [rad/s] is used; False holds it back."""
@@ -101,18 +96,13 @@ class SpikeFilter:
         if self._last is not None:
             push, turn = force - self._last[0], rate - self._last[1]
             if push.dot(push) > self._limits[0] or turn.dot(turn) > self._limits[1]:
-                held, jump = self._held, self._scaled(push, turn)
-                self._held, self._count = jump, self._count + 1
-                if held is None or not (self._agree(held, jump) or self._count > LONGEST_HELD):
+                held, self._count = self._held, self._count + 1
+                self._held = jump = np.concatenate([push / sqrt(self._limits[0]),
+                                                    turn / sqrt(self._limits[1])])
+                dot = held.dot(jump)
+                agree = dot > 0 and dot**2 >= AGREE * held.dot(held) * jump.dot(jump)
+                if not agree and self._count <= LONGEST_HELD:
                     return False
                 self.lasted = True
-        self._held, self._count, self._last = None, 0, (force, rate)
+        self._held, self._count, self._last = np.zeros(6), 0, (force, rate)
         return True
-
-    def _scaled(self, push, turn):
-        return np.concatenate([push / sqrt(self._limits[0]), turn / sqrt(self._limits[1])])
-
-    @staticmethod
-    def _agree(a, b):
-        dot = a.dot(b)
-        return dot > 0 and dot**2 >= AGREE * a.dot(a) * b.dot(b)

@@ -6,6 +6,7 @@ same file serves a node's ``--params-file`` and tools without ROS. Every error i
 names file, key and expected value.
 """
 
+from collections.abc import Iterable, Mapping
 from copy import deepcopy
 from dataclasses import field, fields, is_dataclass, MISSING
 from difflib import get_close_matches
@@ -13,14 +14,13 @@ from functools import lru_cache
 from pathlib import Path
 import reprlib
 from types import NoneType
-from typing import Any, ClassVar, get_args, get_type_hints, TypeVar
+from typing import Any, ClassVar, get_args, get_type_hints, Self
 
 import numpy as np
 import yaml
 
 from beetle_omni_ros.robot.resources import share_path
 
-File = TypeVar('File', bound='ParameterFile')
 NAMES = tuple[str, ...]     # type of a parameter that is a list of names
 # Type of a field that is no number -> types of its value in a file, and their name.
 KINDS: dict[Any, tuple[Any, str]] = {
@@ -41,10 +41,6 @@ class RunError(RuntimeError):
 
 class ParameterError(ValueError):
     """A parameter file or value cannot be used; the text names file, key and expected value."""
-
-
-class YamlError(ParameterError):
-    """A file that cannot be read as YAML; the text is one line without the file's name."""
 
 
 def quoted(value: Any) -> str:
@@ -94,44 +90,38 @@ def read_yaml(path: str | Path) -> Any:
     Read the one document of a YAML file.
 
     Raises:
-        YamlError: missing, unreadable or too large file, or broken YAML.
+        ParameterError: missing, unreadable or too large file, or broken YAML.
 
     """
+    at = shortened(str(path), FILE_NAME)
     try:
         with open(path, 'rb') as file:
             data = file.read(MAX_BYTES + 1)
     except (OSError, ValueError) as error:
-        raise YamlError(f'cannot be read ({getattr(error, "strerror", error)})') from None
+        raise ParameterError(f'{at}: cannot be read ({getattr(error, "strerror", error)})') \
+            from None
     if len(data) > MAX_BYTES:
-        raise YamlError(f'larger than {MAX_BYTES} bytes')
-    return parse_yaml(data)
+        raise ParameterError(f'{at}: larger than {MAX_BYTES} bytes')
+    return parse_yaml(data, f'{at}: ')
 
 
-def parse_yaml(data: bytes | str) -> Any:
-    """
-    Read the one document of a YAML text.
-
-    Raises:
-        YamlError: broken YAML.
-
-    """
-    return deepcopy(_parsed(data))
+_parsed = lru_cache(maxsize=32)(yaml.safe_load)     # a flight reads files several times, in 40 ms
 
 
-@lru_cache(maxsize=32)      # one flight reads the same files several times, each in 40 ms
-def _parsed(data):
+def parse_yaml(data: bytes | str, at: str = '') -> Any:
+    """Read the one document of a YAML text; raises ParameterError that starts with ``at``."""
     try:
-        return yaml.safe_load(data)
+        return deepcopy(_parsed(data))
     except yaml.YAMLError as error:
         mark = getattr(error, 'problem_mark', None)
         where = f' at line {mark.line + 1}, column {mark.column + 1}' if mark else ''
         problem = getattr(error, 'problem', None) or str(error)
-        raise YamlError(f'not valid YAML{where} ({shortened(problem)})') from None
+        raise ParameterError(f'{at}not valid YAML{where} ({shortened(problem)})') from None
     except RecursionError:
-        raise YamlError('not valid YAML (too deep)') from None
+        raise ParameterError(f'{at}not valid YAML (too deep)') from None
     except (AttributeError, LookupError, TypeError, ValueError) as error:
         # PyYAML's own errors about values such as `0b_` or a date with month 13
-        raise YamlError(f'not valid YAML ({shortened(str(error))})') from None
+        raise ParameterError(f'{at}not valid YAML ({shortened(str(error))})') from None
 
 
 def load_yaml(path: str | Path) -> dict:
@@ -142,10 +132,7 @@ def load_yaml(path: str | Path) -> dict:
         ParameterError: missing or unreadable file, broken YAML, or no mapping.
 
     """
-    try:
-        data = read_yaml(path)
-    except YamlError as error:
-        raise ParameterError(f'{shortened(str(path), FILE_NAME)}: {error}') from None
+    data = read_yaml(path)
     for value in data.values() if isinstance(data, dict) else ():
         if isinstance(value, dict) and set(value) == {'ros__parameters'}:
             data = value['ros__parameters']
@@ -171,7 +158,7 @@ class ParameterFile:
             cls._file = file
 
     @classmethod
-    def load(cls: type[File], path: str | Path | None = None) -> File:
+    def load(cls, path: str | Path | None = None) -> Self:
         """
         Read a file, by default the shipped one.
 
@@ -208,15 +195,13 @@ def bind(cls: type, mapping: dict, where: str = '', prefix: str = ''):
     known = {f.name: f for f in fields(cls) if f.init}
     for key in mapping:
         if key not in known:
-            near = get_close_matches(str(key)[:KEY], known, n=1)
-            hint = f"; did you mean '{near[0]}'?" if near else f"; known: {', '.join(known)}"
-            raise ParameterError(f'{_at(where, _join(prefix, key))}: unknown key{hint}')
+            raise unknown(_at(where, _join(prefix, key)), 'key', key, known)
     values: dict[str, Any] = {}
     for name, entry in known.items():
         key, hint = _join(prefix, name), hints[name]
         if name not in mapping:
             if entry.default is MISSING and entry.default_factory is MISSING:
-                raise ParameterError(f'{_at(where, key)}: missing{_unit(entry, " [{}]")}')
+                raise ParameterError(f'{_at(where, key)}: missing{_unit(entry.metadata)}')
             continue
         value = mapping[name]
         if NoneType in get_args(hint):      # Class | None
@@ -235,16 +220,7 @@ def bind(cls: type, mapping: dict, where: str = '', prefix: str = ''):
 
 
 def check(entry, hint: Any, value: Any, at: str) -> Any:
-    """
-    Validate one value against its declaration and convert it to its declared type.
-
-    Args:
-        entry: dataclass field made by :func:`parameter`.
-        hint: annotated type of the field.
-        value: value of the file or the user.
-        at: file and key, for messages.
-
-    """
+    """Validate a value of a field; ``at`` is file and key, for messages."""
     if hint is np.ndarray:
         return _array(entry, value, at)
     if hint in (int, float):
@@ -259,52 +235,62 @@ def check(entry, hint: Any, value: Any, at: str) -> Any:
     return hint(value or ()) if hint in (tuple, dict, NAMES) else value
 
 
+def unknown(at: str, what: str, name: Any, known: Iterable[str]) -> ParameterError:
+    """Error of a name that is not one of the known ones."""
+    near = get_close_matches(str(name)[:KEY], known, n=1)
+    hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(known)}"
+    return ParameterError(f'{at}: unknown {what}; {hint}')
+
+
 def _number(entry, hint, value, at):
     """Finite int or float within its range."""
-    try:
-        if isinstance(value, bool) or not isinstance(value, (int, float, np.number)):
-            raise TypeError
-        _check_range(entry, float(value), at)
-        if value != hint(value):
-            raise TypeError
-    except (OverflowError, TypeError):
+    found = numbers(value, at, entry.metadata) if isinstance(
+        value, (int, float, np.number)) and not isinstance(value, bool) else None
+    if found is None or value != hint(value):
         kind = 'an integer' if hint is int else 'a number'
-        raise ParameterError(f'{at}: expected {kind}{_unit(entry, " [{}]")}, '
-                             f'found {quoted(value)}') from None
+        raise ParameterError(f'{at}: expected {kind}{_unit(entry.metadata)}, '
+                             f'found {quoted(value)}')
     return hint(value)
 
 
 def _array(entry, value, at):
     """(n,) or the declared shape, of finite numbers within their range."""
-    try:
-        array = np.array(value, dtype=float)
-    except (OverflowError, TypeError, ValueError):
-        raise ParameterError(f'{at}: expected numbers, found {quoted(value)}') from None
-    shape = entry.metadata['shape']
+    array, shape = numbers(value, at, entry.metadata), entry.metadata['shape']
     if shape is not None and array.shape == (np.prod(shape),):
         array = array.reshape(shape)    # ROS has flat arrays only
     if shape is not None and array.shape != tuple(shape):
         raise ParameterError(f'{at}: expected shape {tuple(shape)}, found {array.shape}')
     if shape is None and array.ndim != 1:
         raise ParameterError(f'{at}: expected a list of numbers, found {quoted(value)}')
-    for element in array.ravel():
-        _check_range(entry, float(element), at)
     return array
 
 
-def _check_range(entry, value, at):
-    low, high = (entry.metadata[name] for name in ('low', 'high'))
-    low, high = -np.inf if low is None else low, np.inf if high is None else high
-    if not np.isfinite(value):
-        raise ParameterError(f'{at}: {value} is not finite')
-    if not low <= value <= high:
-        raise ParameterError(f'{at}: {value:g} is outside {low:g} to {high:g}'
-                             f'{_unit(entry, " {}")}')
+def numbers(value: Any, at: str, spec: Mapping[str, Any]) -> np.ndarray:
+    """
+    Convert to finite numbers from ``spec['low']`` to ``spec['high']`` [``spec['unit']``].
+
+    Raises:
+        ParameterError: the text starts with ``at``.
+
+    """
+    try:
+        array = np.array(value, dtype=float)
+    except (OverflowError, TypeError, ValueError):
+        raise ParameterError(f'{at}: expected numbers{_unit(spec)}, '
+                             f'found {quoted(value)}') from None
+    low, high = (limit if spec[name] is None else spec[name]
+                 for name, limit in (('low', -np.inf), ('high', np.inf)))
+    for number in array.ravel():
+        if not np.isfinite(number):
+            raise ParameterError(f'{at}: {number} is not finite')
+        if not low <= number <= high:
+            raise ParameterError(
+                f"{at}: {number:g} is outside {low:g} to {high:g} {spec['unit']}".rstrip())
+    return array
 
 
-def _unit(entry, form):
-    unit = entry.metadata.get('unit')
-    return form.format(unit) if unit else ''
+def _unit(spec):
+    return f" [{spec['unit']}]" if spec['unit'] else ''
 
 
 def _join(prefix, key):

@@ -13,7 +13,6 @@ from beetle_omni_ros.robot.schema import ParameterError
 
 STOP_DUTY, FULL_DUTY = 50.0, 100.0  # [% of 2000 us] 1000 us and 2000 us
 CELLS = 2048                        # linear pieces of a cubic; error at most 1e-5 of 0.5 N
-SLOPE_MIN = 1e-3                    # [% of duty / whole thrust range] keeps flat parts invertible
 FRACTIONS = np.linspace(0, 1, CELLS + 1)
 
 
@@ -26,8 +25,6 @@ class ThrustMap:
     Attributes:
         voltages: (rows,) rising [V].
         thrust_limits: (rows,) largest measured thrust at each voltage [N].
-        repaired: voltages at which the cubic is not monotonic and was replaced by its running
-            maximum.
 
     """
 
@@ -36,7 +33,8 @@ class ThrustMap:
         Tabulate the cubics of a robot file.
 
         Raises:
-            ParameterError: no row, two rows at one voltage, or a duty outside stop to full.
+            ParameterError: no row, two rows at one voltage, or a duty that does not rise from stop
+                to full.
 
         """
         rows = sorted(rotors.map, key=lambda row: row.voltage)
@@ -47,18 +45,14 @@ class ThrustMap:
             raise ParameterError(f'rotors.map: two rows at one voltage, {self.voltages} V')
         self.thrust_limits = np.array([row.thrust_max for row in rows])
         self._duty = np.empty((len(rows), CELLS + 1))
-        repaired = []
         for duty, row in zip(self._duty, rows):
             duty[:] = np.polynomial.polynomial.polyval(
                 np.linspace(0, row.thrust_max, CELLS + 1) / 10, row.coefficients)
-            if duty.min() < STOP_DUTY or duty.max() > FULL_DUTY:
+            if duty.min() < STOP_DUTY or duty.max() > FULL_DUTY or np.diff(duty).min() <= 0:
                 raise ParameterError(
                     f'rotors.map at {row.voltage:g} V: duty {duty.min():.1f} to {duty.max():.1f} '
-                    f'% over 0 to {row.thrust_max:g} N, expected {STOP_DUTY:g} to {FULL_DUTY:g} %')
-            if np.any(np.diff(duty) < SLOPE_MIN / CELLS):
-                repaired.append(row.voltage)
-                duty[:] = _rising(duty)
-        self.repaired = tuple(repaired)
+                    f'% over 0 to {row.thrust_max:g} N, expected a rise within {STOP_DUTY:g} to '
+                    f'{FULL_DUTY:g} %')
         self._blend_voltage, self._blend = np.nan, np.zeros(0)      # of the latest voltage
 
     def thrust_limit(self, voltage):
@@ -120,13 +114,3 @@ class ThrustMap:
 def duty_of_command(command) -> np.ndarray:
     """Duty [% of 2000 us] of a normalised ``command``, 0 to 1."""
     return STOP_DUTY + (FULL_DUTY - STOP_DUTY) * np.asarray(command)
-
-
-def _rising(duty):
-    """
-    Smallest upward change that makes samples increase; a falling end keeps the peak value.
-
-    The slope of flat parts is subtracted from the whole table, so that the peak is unchanged.
-    """
-    ramp = SLOPE_MIN * np.linspace(-1, 0, len(duty))
-    return np.maximum(np.maximum.accumulate(duty) + ramp, STOP_DUTY + SLOPE_MIN + ramp)

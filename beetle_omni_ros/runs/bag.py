@@ -22,7 +22,7 @@ from beetle_omni_ros.messages.topics import (
     topic_of,
     TOPICS,
 )
-from beetle_omni_ros.robot.schema import ParameterError, quoted, read_yaml, YamlError
+from beetle_omni_ros.robot.schema import ParameterError, quoted, read_yaml
 from beetle_omni_ros.runs.log import FlightLog, LogRecorder, motion, SERIES_OF
 
 BagError = ParameterError   # its name in identify and nodes
@@ -306,7 +306,7 @@ def _metadata(path, warnings):
     try:
         custom = read_yaml(file)['rosbag2_bagfile_information']['custom_data']
         meta = dict(json.loads((custom or {}).get(META_KEY, '{}')))
-    except (YamlError, KeyError, TypeError, AttributeError, ValueError, RecursionError):
+    except (KeyError, TypeError, AttributeError, ValueError, RecursionError):
         warnings.append('metadata.yaml is not readable')
         return {}
     used = {key: value for key, value in meta.items()

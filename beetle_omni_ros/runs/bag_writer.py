@@ -22,8 +22,8 @@ import yaml
 from beetle_omni_ros.messages.bag_types import from_bytes, new, offered, to_bytes, TYPESTORE
 from beetle_omni_ros.messages.conversions import BODY, nanoseconds, WORLD
 from beetle_omni_ros.messages.topics import ALL, EVENT, LATCHED, Qos, topic_of, TOPICS
-from beetle_omni_ros.robot.schema import ParameterError, read_yaml, YamlError
-from beetle_omni_ros.robot.urdf import joints
+from beetle_omni_ros.robot.schema import ParameterError, read_yaml
+from beetle_omni_ros.robot.urdf import description, joints
 from beetle_omni_ros.runs.bag import META_KEY
 from beetle_omni_ros.runs.files import write_text
 from beetle_omni_ros.runs.log import Recorder, RUN_STATUS
@@ -66,10 +66,9 @@ class JazzyStorage(McapWriter):
 class FrameWriter:
     """Converts `odom` and `joint_states` to transforms, 50 times a second; writes the URDF too."""
 
-    def __init__(self, write: Callable[[str, str, bytes, float], None], description: str,
-                 prefix: str):
-        self._write, self._text, self._prefix = write, description, prefix
-        tree = joints(description)
+    def __init__(self, write: Callable[[str, str, bytes, float], None], prefix: str):
+        self._write, self._text, self._prefix = write, description(), prefix
+        tree = joints()
         self._fixed = [joint for joint in tree if joint.axis is None]
         self._moving = {joint.name: joint for joint in tree if joint.axis is not None}
         self._latest = None     # message of joint_states
@@ -133,7 +132,7 @@ class BagWriter(Recorder):
 
     def __init__(self, path: str | Path, meta: dict | None = None, *, namespace: str = '',
                  topics: Sequence[str] = tuple(TOPICS), compression: str = 'none',
-                 description: str = '', epoch: int = 0):
+                 frames: bool = False, epoch: int = 0):
         """
         Create the folder and the bag in it.
 
@@ -143,7 +142,7 @@ class BagWriter(Recorder):
             namespace: namespace of the topics, '' or e.g. '/robot1'.
             topics: names to declare, see :func:`~beetle_omni_ros.messages.topics.topic_of`.
             compression: compression of the chunks in the file, 'none' or 'zstd'.
-            description: URDF of the robot, to record its frames; '' for none.
+            frames: whether the description and the frames of the robot are recorded.
             epoch: UNIX time of time 0 [s], so that a flight that begins at 0 s gets a real date.
 
         Raises:
@@ -166,8 +165,8 @@ class BagWriter(Recorder):
         for name in topics:
             self._declare(self._prefix + name, topic_of(name).type, topic_of(name).qos)
         self._frames = None
-        if description:
-            self._frames = FrameWriter(self.write_raw, description, self._prefix)
+        if frames:
+            self._frames = FrameWriter(self.write_raw, self._prefix)
             self._declare('/tf', TRANSFORMS, EVENT)
             self._declare('/tf_static', TRANSFORMS, LATCHED)
             self._declare(f'{self._prefix}robot_description', TEXT, LATCHED)
@@ -302,7 +301,7 @@ def add_meta(path: str | Path, meta: dict) -> None:
     file = Path(path) / 'metadata.yaml'
     try:
         content = read_yaml(file)
-    except YamlError as error:
+    except ParameterError as error:
         raise ParameterError(f'{file}: {error}') from None
     information = content['rosbag2_bagfile_information']
     known = json.loads((information['custom_data'] or {}).get(META_KEY, '{}'))

@@ -8,7 +8,7 @@ import numpy as np
 from beetle_omni_ros.control.base import Command, Fallback, Reference, State, TrajectoryTarget
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import ALL_HEALTHY, Allocator, ROTORS
-from beetle_omni_ros.robot.degraded import Holding
+from beetle_omni_ros.robot.degraded import FLYING_MARGIN, Holding
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.events import ERROR
 from beetle_omni_ros.safety.inputs import Inputs
@@ -49,6 +49,7 @@ LEAP_TIME = 0.85        # [s] upwards before a turn with a weak pack; between tw
 BRAKE = 3.0             # [-] in the turn after the leap the robot falls anyway
 AT_REST = 0.5           # [m/s]
 AT_ONCE = 1e-3          # [s]
+ESCAPE_TIME = 1.5       # [s] of the attitude of an escape, before the turn to level
 # Without MoCap the velocity error grows with time
 BLIND_RATE = 1.6        # [rad/s]
 BLIND_SPEED, BLIND_ACCELERATION = 1.0, 2.0      # [m/s], [m/s^2] until the flare
@@ -298,11 +299,10 @@ class Landing:
         way. The robot then leaps first (knots), to have speed and height for the fall in the turn.
         """
         holding = Holding(self._inputs.robot, self._health)
-        p = holding.parameters
         escape = holding.quickest(state.quaternion, state.angular_velocity, state.tilt,
-                                  p.flying_margin, rate)
+                                  FLYING_MARGIN, rate)
         level = rotations.from_rpy(0.0, 0.0, rotations.to_rpy(state.quaternion)[2])
-        goal = holding.nearest(level, p.flying_margin)
+        goal = holding.nearest(level, FLYING_MARGIN)
         turn = max(rotations.geodesic_angle(goal, escape) / rate, 1e-3)
         # The escape attitude is the reference at once: a sampled path to it costs height.
         times, attitudes, leap = [0.0], [escape], [(0.0, 0.0)]
@@ -313,7 +313,7 @@ class Landing:
                 leap += [(LEAP_TIME, LEAP_SHARE * margin * LEAP_TIME),
                          ((1 + 1 / BRAKE) * LEAP_TIME, 0.0)]
                 times, attitudes = [LEAP_TIME, AT_ONCE], [state.quaternion, escape]
-        return Way(np.cumsum([*times, p.escape_time, turn]),
+        return Way(np.cumsum([*times, ESCAPE_TIME, turn]),
                    np.array([*attitudes, escape, goal])), leap
 
     # A joint that turns over ------------------------------------------------------------------

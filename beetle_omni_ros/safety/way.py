@@ -25,7 +25,7 @@ import numpy as np
 from beetle_omni_ros.control.base import Reference
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import ActuatorHealth, Allocator, nearest_turn, ROTORS
-from beetle_omni_ros.robot.degraded import Holding, leaned, up
+from beetle_omni_ros.robot.degraded import FLYING_MARGIN, Holding, leaned, up
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -240,7 +240,7 @@ def find_turnover(quaternion: np.ndarray, tilt: np.ndarray, robot: RobotParamete
             & (holding.directions @ up(quaternion) >= np.cos(FARTHEST))
         margins = np.where(fit, holding.margins, 0.0)
         place = int(np.argmax(margins))
-        if margins[place] >= holding.parameters.flying_margin:
+        if margins[place] >= FLYING_MARGIN:
             return Turnover(joint, leaned(quaternion, holding.directions[place]),
                             float(goal[place]), resting)
     return None

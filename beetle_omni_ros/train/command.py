@@ -17,7 +17,6 @@ from beetle_omni_ros.robot.schema import (
     ParameterError,
     parse_yaml,
     quoted,
-    YamlError,
 )
 from beetle_omni_ros.runs.files import check_writable, write_json
 from beetle_omni_ros.train.assess import assess
@@ -198,7 +197,7 @@ def parse_changes(texts: list[str], **others) -> dict:
             raise ParameterError(f"--set '{text}': expected key=value")
         try:
             changes[key.strip()] = _number(parse_yaml(value))
-        except YamlError as error:
+        except ParameterError as error:
             raise ParameterError(f'--set {quoted(text)}: the value is {error}') from None
     return changes | {key: value for key, value in others.items() if value is not None}
 

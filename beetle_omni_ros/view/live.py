@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import viser
 
-from beetle_omni_ros.robot.urdf import Model
 from beetle_omni_ros.runs.log import FAULT_KEY, Recorder
 from beetle_omni_ros.view.scene import Moment, Room, target_at
 
@@ -73,9 +72,9 @@ class Newest(Recorder):
         return '\n\n'.join(lines)
 
 
-def draw(server: viser.ViserServer, graph, model: Model) -> None:
+def draw(server: viser.ViserServer, graph) -> None:
     """Draw a :class:`~beetle_omni_ros.nodes.operator.LiveGraph` as it runs, until Ctrl-C."""
-    newest, room = Newest(), Room(server, model)
+    newest, room = Newest(), Room(server)
     room.look_at(LOW, HIGH)
     shown = server.gui.add_markdown(WAITING)
     while True:

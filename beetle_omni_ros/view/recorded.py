@@ -9,7 +9,6 @@ import numpy as np
 
 from beetle_omni_ros.pages.figures import COLOURS
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.robot.urdf import Model
 from beetle_omni_ros.runs.bag import read_flights
 from beetle_omni_ros.runs.log import FlightLog, motion
 from beetle_omni_ros.view.scene import close, drawable, moments, Room, serve
@@ -21,13 +20,12 @@ BEFORE = 3.0                # [s] shown before the first target
 LOCAL = '127.0.0.1'
 
 
-def recorded_scene(logs: Mapping[str, FlightLog], model: Model | None = None) -> str:
+def recorded_scene(logs: Mapping[str, FlightLog]) -> str:
     """
     Return the HTML of a player of flights, aligned by their first targets.
 
     Args:
         logs: name -> flight with poses; the first is drawn solid.
-        model: links and shapes of the robots; default: the shipped ones.
 
     """
     begin = max(-BEFORE, min(motion(log).t[0] - log.begin for log in logs.values()))
@@ -36,7 +34,7 @@ def recorded_scene(logs: Mapping[str, FlightLog], model: Model | None = None) ->
     times = np.arange(begin, end, step)
     server = serve(LOCAL, 8080)
     try:
-        room = Room(server, model or Model.load(), len(logs))
+        room = Room(server, len(logs))
         paths = [drawable(motion(log).position) for log in logs.values()]
         for number, path in enumerate(paths):
             room.draw_path(number, path[::max(1, len(path) // PATH_POINTS)])
@@ -57,7 +55,7 @@ def recorded_scene(logs: Mapping[str, FlightLog], model: Model | None = None) ->
         close(server)
 
 
-def run_view(runs: list[Path], *, urdf: Path | None = None, host: str, port: int) -> None:
+def run_view(runs: list[Path], *, host: str, port: int) -> None:
     """
     Serve a player of recorded runs until Ctrl-C; arguments are options of `beetle_omni view`.
 
@@ -65,8 +63,7 @@ def run_view(runs: list[Path], *, urdf: Path | None = None, host: str, port: int
         ParameterError: unusable input.
 
     """
-    model = Model.load(urdf)
-    page = recorded_scene(read_flights(runs, len(COLOURS)), model).encode()
+    page = recorded_scene(read_flights(runs, len(COLOURS))).encode()
 
     class Answer(BaseHTTPRequestHandler):
         def do_GET(self):

@@ -13,7 +13,7 @@ from beetle_omni_ros.control.base import Target
 from beetle_omni_ros.pages.figures import COLOURS
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, ROTOR_NAMES
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.robot.urdf import Model
+from beetle_omni_ros.robot.urdf import links
 from beetle_omni_ros.runs.log import FlightLog, geodesic_angles, hold, motion
 
 NEWTON_PER_METRE = 40.0     # force that is drawn as one metre
@@ -135,17 +135,16 @@ class Robot:
 
     Args:
         scene: scene of the server.
-        model: links and shapes.
         number: 0 for the robot in the colours of the model, the others are transparent.
 
     """
 
-    def __init__(self, scene, model: Model, number: int):
+    def __init__(self, scene, number: int):
         tint = _colour(number) if number else None
         name = f'/robot{number}'
         self._root = scene.add_frame(name, show_axes=False, visible=False)
         self._joints, self._arrows, paths = {}, {}, {}
-        for link in model.links.values():
+        for link in links():
             above = name if link.joint is None else paths[link.joint.parent]
             path = paths[link.name] = f'{above}/{link.name}'
             node = scene.add_frame(path, show_axes=False, wxyz=wxyz(link.turned()), position=(
@@ -156,8 +155,8 @@ class Robot:
                 self._arrows[link.name] = scene.add_arrows(
                     f'{path}/thrust', np.zeros((1, 2, 3)), THRUST, shaft_radius=0.008,
                     head_radius=0.02, head_length=0.04)
-            for k, visual in enumerate(link.visuals):
-                _add(scene, f'{path}/{k}', visual, tint)
+            for k, (shape, colour) in enumerate(link.shapes):
+                _add(scene, f'{path}/{k}', shape, colour, tint)
         self._target = scene.add_frame(f'/target{number}', axes_length=TARGET_AXES,
                                        axes_radius=0.008, origin_radius=0.018, visible=False)
         self._force = scene.add_arrows(f'/force{number}', np.zeros((1, 2, 3)), FORCE,
@@ -197,7 +196,7 @@ def _arrow(begin, force):
 class Room:
     """Floor, light, camera and robots."""
 
-    def __init__(self, server: viser.ViserServer, model: Model, robots: int = 1):
+    def __init__(self, server: viser.ViserServer, robots: int = 1):
         scene = server.scene
         # Shadows and reflections would dominate the rendering time without a graphics card.
         scene.configure_default_lights(cast_shadow=False)
@@ -206,7 +205,7 @@ class Room:
         scene.add_grid('/floor', FLOOR, FLOOR, cell_size=1.0, section_size=FLOOR,
                        infinite_grid=False, shadow_opacity=0.0)
         self._server, self._scene = server, scene
-        self.robots = [Robot(scene, model, number) for number in range(robots)]
+        self.robots = [Robot(scene, number) for number in range(robots)]
 
     def show(self, moments: Sequence[Moment | None], texts: Sequence[str]) -> None:
         """Draw all robots at one moment."""
@@ -227,28 +226,14 @@ class Room:
             _colour(number), thickness=1.5, thickness_units='screen')
 
 
-def _add(scene, name, visual, tint):
-    """Add a shape of the model."""
-    *colour, opacity = visual.colour
-    look = {'position': visual.position, 'wxyz': wxyz(visual.quaternion),
-            'color': tint or tuple(round(255 * part) for part in colour),
+def _add(scene, name, shape, colour, tint):
+    """Add a shape of a link."""
+    import trimesh  # takes 0.6 s
+    *own, opacity = colour
+    look = {'color': tint or tuple(round(255 * part) for part in own),
             'opacity': GHOST_OPACITY * opacity if tint else opacity if opacity < 1 else None}
-    if visual.shape == 'box':
-        scene.add_box(name, dimensions=visual.size, **look)
-    elif visual.shape == 'cylinder':
-        scene.add_cylinder(name, *visual.size, radial_segments=SIDES, **look)
-    elif visual.shape == 'sphere':
-        scene.add_icosphere(name, visual.size[0], subdivisions=2, **look)
+    if isinstance(shape, tuple):
+        scene.add_cylinder(name, *shape, radial_segments=SIDES, **look)
     else:
-        mesh = _mesh(visual.file)
-        scene.add_mesh_simple(name, mesh.vertices, mesh.faces, scale=visual.size,
-                              flat_shading=True, **look)
-
-
-def _mesh(file):
-    """Read a mesh of the model; raises ParameterError if it is missing or broken."""
-    import trimesh  # takes 0.6 s, and not each model has meshes
-    try:
-        return trimesh.load_mesh(file)
-    except Exception as error:      # a missing or broken file raises anything in the library
-        raise ParameterError(f'{file}: not a usable mesh: {error}') from None
+        mesh = trimesh.load_mesh(shape)
+        scene.add_mesh_simple(name, mesh.vertices, mesh.faces, flat_shading=True, **look)

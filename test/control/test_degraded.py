@@ -9,7 +9,7 @@ from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.control.nmpc import NmpcController
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY
-from beetle_omni_ros.robot.degraded import Holding
+from beetle_omni_ros.robot.degraded import FLYING_MARGIN, Holding
 
 LOST = ActuatorHealth(rotors=(True, False, True, True))
 STUCK = ActuatorHealth(stuck=(None, None, 0.8, None))
@@ -19,8 +19,7 @@ PLACE = np.array([0.0, 0.0, 2.0])
 
 def held(health):
     """Attitude nearest to level with the margin for flying."""
-    holding = Holding(ROBOT, health)
-    return holding.nearest(LEVEL, holding.parameters.flying_margin)
+    return Holding(ROBOT, health).nearest(LEVEL, FLYING_MARGIN)
 
 
 @pytest.fixture(scope='module')

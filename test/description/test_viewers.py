@@ -12,7 +12,7 @@ from beetle_omni_ros.messages.bag_types import from_bytes, TYPESTORE
 from beetle_omni_ros.messages.topics import ALL
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, ROTOR_NAMES
 from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.urdf import description, SHIPPED
+from beetle_omni_ros.robot.urdf import description
 from beetle_omni_ros.runs.bag import read_messages
 from beetle_omni_ros.runs.bag_writer import BagWriter
 from beetle_omni_ros.runs.tasks import make_task
@@ -95,8 +95,7 @@ def test_rviz_shows_topics_of_the_graph_with_a_quality_of_service_that_matches()
 
 
 def test_a_bag_contains_the_frames_of_all_layouts(tmp_path):
-    urdf = description(share_path(SHIPPED))
-    with BagWriter(tmp_path / 'bag', description=urdf) as writer:
+    with BagWriter(tmp_path / 'bag', frames=True) as writer:
         fly(writer, make_task('waypoints'), duration=2.0)
     parents = {}
     for message in read_messages(tmp_path / 'bag'):
@@ -110,7 +109,7 @@ def test_a_bag_contains_the_frames_of_all_layouts(tmp_path):
             layout['3D!robot']['followTf'],
             *(layer['frameId'] for layer in layout['3D!robot']['layers'].values()
               if 'frameId' in layer)} <= frames
-    links = {link.get('name') for link in ElementTree.fromstring(urdf).findall('link')}
+    links = {link.get('name') for link in ElementTree.fromstring(description()).findall('link')}
     assert links <= frames
     for link in links:      # each has world as its root
         while link != 'world':

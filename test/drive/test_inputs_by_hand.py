@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros import drive
-from beetle_omni_ros.drive import DriveParameters, Go, Order, parse, Shift, WordError
+from beetle_omni_ros.drive import Action, DriveParameters, parse
 from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.schema import ParameterError
 
 
 @pytest.fixture(scope='module')
@@ -43,21 +44,21 @@ def test_full_deflection_gives_the_speed_and_the_dead_zone_gives_zero(p):
     ('right 0.5', [0, -0.5, 0], [0, 0, 0]), ('roll 180', [0, 0, 0], [np.pi, 0, 0]),
     ('yaw -90', [0, 0, 0], [0, 0, -np.pi / 2])])
 def test_commands_that_shift_the_target(p, line, way, turn):
-    shift = parse(line, p.poses)
-    assert isinstance(shift, Shift)
-    assert shift.way == pytest.approx(way) and shift.turn == pytest.approx(turn)
+    name, shift = parse(line, p.poses)
+    assert name == 'shift'
+    assert shift[0] == pytest.approx(way) and shift[1] == pytest.approx(turn)
 
 
 def test_commands_that_go_to_poses_and_that_request_actions(p):
-    over = parse('over', p.poses)
-    assert isinstance(over, Go) and rotations.matrix(over.quaternion)[2, 2] == pytest.approx(-1)
-    goto = parse('goto 1 0 1.5', p.poses)
-    assert goto.position == pytest.approx([1, 0, 1.5]) and goto.quaternion is None
-    turned = parse('goto 1 0 1.5 0 0 90', p.poses)
-    assert turned.quaternion == pytest.approx([0, 0, 0.5 ** 0.5, 0.5 ** 0.5])
-    assert parse('arm', p.poses) == Order('arm')
-    assert parse('controller rl', p.poses) == Order('controller', 'rl')
-    assert parse('wait 2', p.poses) == Order('wait', '2.0')
+    name, over = parse('over', p.poses)
+    assert name == 'goto' and rotations.matrix(over[1])[2, 2] == pytest.approx(-1)
+    position, quaternion = parse('goto 1 0 1.5', p.poses).values
+    assert position == pytest.approx([1, 0, 1.5]) and quaternion is None
+    _, turned = parse('goto 1 0 1.5 0 0 90', p.poses).values
+    assert turned == pytest.approx([0, 0, 0.5 ** 0.5, 0.5 ** 0.5])
+    assert parse('arm', p.poses) == Action('arm')
+    assert parse('controller rl', p.poses) == Action('controller', ('rl',))
+    assert parse('wait 2', p.poses) == Action('wait', (2.0,))
     assert parse('', p.poses) is None and parse('# nothing', p.poses) is None
 
 
@@ -66,7 +67,7 @@ def test_commands_that_go_to_poses_and_that_request_actions(p):
     ('goto 1 2', 'X Y Z'), ('jump 3', "'jump': expected"), ('jump', 'or a pose of home'),
     ('controller', 'NAME'), ('wait -1', 'SECONDS'), ('land now', 'nothing after')])
 def test_an_unknown_command_is_refused_with_the_expected_ones(p, line, fragment):
-    with pytest.raises(WordError) as raised:
+    with pytest.raises(ParameterError) as raised:
         parse(line, p.poses)
     assert fragment in str(raised.value) and 'expected' in str(raised.value)
     assert '\n' not in str(raised.value)

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.estimation.ekf import ImuReading, PoseReading
+from beetle_omni_ros.estimation.model import ACCELEROMETER_BIAS_STD, GYROSCOPE_BIAS_STD
 
 GRAVITY = 9.80665
 IMU_PERIOD, MOCAP_PERIOD, MOCAP_DELAY = 0.005, 0.01, 0.01
@@ -78,11 +79,11 @@ class Sensors:
     @classmethod
     def matching(cls, parameters, seed):
         """Sensors with the noise and mounting of the filter's parameters, and random biases."""
-        imu, mocap, first = parameters.imu, parameters.mocap, parameters.initial
+        imu, mocap = parameters.imu, parameters.mocap
         rng = np.random.default_rng([seed, 2])
         return cls(imu.accelerometer_noise, imu.gyroscope_noise,
-                   first.accelerometer_bias_std * rng.standard_normal(3),
-                   first.gyroscope_bias_std * rng.standard_normal(3),
+                   ACCELEROMETER_BIAS_STD * rng.standard_normal(3),
+                   GYROSCOPE_BIAS_STD * rng.standard_normal(3),
                    imu.accelerometer_bias_walk, imu.gyroscope_bias_walk,
                    mocap.position_noise, mocap.orientation_noise, imu.position, imu.rotation,
                    mocap.position, mocap.rotation)

@@ -18,13 +18,12 @@ MOUNTING = {'imu_position': (0.12, -0.05, 0.08), 'imu_rotation': (0.4, -1.2, 2.0
 def parameters_for(mounting):
     """The shipped parameters with the mounting of the sensors and equal clocks."""
     shipped = EkfParameters.load()
-    changes = {'imu': {}, 'mocap': {}}
+    changes = {'imu': {'delay_std': 0.0}, 'mocap': {}}
     for name, value in mounting.items():
         sensor, field = name.split('_')
         changes[sensor][field] = np.array(value)
     return replace(shipped, imu=replace(shipped.imu, **changes['imu']),
-                   mocap=replace(shipped.mocap, **changes['mocap']),
-                   initial=replace(shipped.initial, time_offset_std=0.0))
+                   mocap=replace(shipped.mocap, **changes['mocap']))
 
 
 @pytest.fixture(scope='module')

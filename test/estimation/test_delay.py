@@ -11,19 +11,19 @@ from beetle_omni_ros.estimation.ekf import EkfParameters, ErrorStateEkf, PoseRea
 
 
 @pytest.mark.parametrize(('delay', 'capture'), [(0.037, 0.0), (0.15, 0.0017)])
-def test_replay_equals_processing_in_order(delay, capture):
+def test_replay_equals_processing_in_order(monkeypatch, delay, capture):
     """For any latency of poses and any phase relative to the IMU samples."""
-    shipped = EkfParameters.load()      # in order, the last pose is older than the IMU by `delay`
-    patient = replace(shipped, status=replace(shipped.status, dead_reckoning_after=1.0))
+    # in order, the last pose is older than the IMU by `delay`
+    monkeypatch.setattr(ekf_module, 'DEAD_RECKONING', 1.0)
     flight = fly(1, 1.5)
     poses = flight.trajectory(np.array([s.stamp + capture for s in flight.poses]))
     flight.poses = [PoseReading(s.stamp + capture, p, q) for s, p, q in
                     zip(flight.poses, poses['position'], poses['rotation'].as_quat())
                     if s.stamp + capture + delay < 1.49]
     flight.delay = delay
-    late = run(ErrorStateEkf(patient, GRAVITY), flight).estimate
+    late = run(ErrorStateEkf(EkfParameters.load(), GRAVITY), flight).estimate
     flight.delay = 0.0
-    prompt = run(ErrorStateEkf(patient, GRAVITY), flight).estimate
+    prompt = run(ErrorStateEkf(EkfParameters.load(), GRAVITY), flight).estimate
     for name in ('position', 'velocity', 'quaternion'):
         np.testing.assert_allclose(getattr(late, name), getattr(prompt, name), atol=1e-9)
     np.testing.assert_allclose(late.covariance, prompt.covariance, rtol=1e-6, atol=1e-12)
@@ -41,7 +41,7 @@ def test_latency_in_imu_stamps_is_estimated_and_compensated(monkeypatch):
     assert np.linalg.norm(ekf.estimate.position - truth['position'][0]) < 0.004
     assert np.linalg.norm(error[:3]) > 0.5 * age * np.linalg.norm(truth['velocity'][0])
 
-    trusting = replace(parameters, initial=replace(parameters.initial, time_offset_std=0.0))
+    trusting = replace(parameters, imu=replace(parameters.imu, delay_std=0.0))
     monkeypatch.setattr(ekf_module, 'DOUBT_POSES', 1000)    # else it follows poses
     blind = run(ErrorStateEkf(trusting, GRAVITY), flight)
     assert (np.linalg.norm(blind.estimate.position - truth['position'][0])

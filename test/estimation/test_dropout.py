@@ -6,14 +6,14 @@ from ekf_flights import error_state, feed, fly, GRAVITY, ImuReading, run, Sensor
 import numpy as np
 import pytest
 
+from beetle_omni_ros.estimation import ekf as ekf_module
 from beetle_omni_ros.estimation.ekf import EkfParameters, ErrorStateEkf, JUMP_POSES
 from beetle_omni_ros.robot import rotations
 
 
-def new_ekf(**status):
-    """Filter with the shipped parameters, except the given ones of the status."""
-    shipped = EkfParameters.load()
-    return ErrorStateEkf(replace(shipped, status=replace(shipped.status, **status)), GRAVITY)
+def new_ekf():
+    """Filter with the shipped parameters."""
+    return ErrorStateEkf(EkfParameters.load(), GRAVITY)
 
 
 def history(ekf, flight, drop=lambda time: False):
@@ -40,14 +40,14 @@ def test_half_a_second_without_mocap_costs_less_than_5_cm_and_1_deg(seed):
     assert np.linalg.norm(error[:3]) < 0.05 and np.linalg.norm(error[6:9]) < np.deg2rad(1)
 
 
-def test_a_dropout_changes_status_and_covariance():
-    limits = EkfParameters.load().status
-    ekf, flight = new_ekf(lost_after=2.0), fly(1, 6.0)
+def test_a_dropout_changes_status_and_covariance(monkeypatch):
+    monkeypatch.setattr(ekf_module, 'LOST', 2.0)
+    ekf, flight = new_ekf(), fly(1, 6.0)
     rows = history(ekf, flight, drop=lambda time: 2.0 < time < 4.8)
     by_time = {round(time, 3): (status, variance) for time, status, variance in rows}
     assert by_time[0.1][0] == 'uninitialised'
     assert by_time[1.9][0] == 'tracking'
-    assert by_time[2.0 + limits.dead_reckoning_after + 0.02][0] == 'dead_reckoning'
+    assert by_time[2.0 + ekf_module.DEAD_RECKONING + 0.02][0] == 'dead_reckoning'
     assert by_time[2.0 + 2.0 + 0.02][0] == 'lost'
     assert by_time[5.9][0] == 'tracking'
     growing = [variance for time, _, variance in rows if 2.02 < time < 4.8]
@@ -83,7 +83,7 @@ def test_a_persistent_jump_is_accepted_only_after_a_delay():
     flight, shift = fly(5, 5.0), np.array([0.5, -0.3, 0.2])
     flight.poses = [replace(pose, position=pose.position + shift) if pose.stamp > 2.0 else pose
                     for pose in flight.poses]
-    ekf = new_ekf(lost_after=2.0)
+    ekf = new_ekf()
     rows = history(ekf, flight)
     back = 2.0 + 0.01 * (JUMP_POSES + 5)
     assert {s for time, s, _ in rows if 2.2 < time < back - 0.1} == {'dead_reckoning'}

@@ -1,11 +1,11 @@
 """Dead reckoning after poses whose markers are tilted, or with a biased accelerometer."""
 
-from dataclasses import replace
 
 from ekf_flights import GRAVITY
 import numpy as np
 import pytest
 
+from beetle_omni_ros.estimation import model
 from beetle_omni_ros.estimation.ekf import EkfParameters, ErrorStateEkf
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.readings import ImuReading, PoseReading
@@ -21,22 +21,22 @@ def half_turn(time):
 
 def rolled_over(marker_std, markers=(0.0, 0.0, 0.0), bias=(0.0, 0.0, 0.0), return_at=np.inf):
     """Filter after a hover, half a turn about x without poses, and a hover upside down."""
-    shipped = EkfParameters.load()
-    ekf = ErrorStateEkf(replace(shipped, dead_reckoning=replace(
-        shipped.dead_reckoning, marker_attitude_std=marker_std)), GRAVITY)
+    ekf = ErrorStateEkf(EkfParameters.load(), GRAVITY)
     random, tilted = np.random.default_rng(3), rotations.exp(np.array(markers))
-    for k in range(round(END / TICK)):
-        time = TICK * k
-        angle, rate = half_turn(time - HOVER)
-        quaternion, rate = rotations.exp(np.array([angle, 0.0, 0.0])), np.array([rate, 0.0, 0.0])
-        force = rotations.matrix(quaternion).T @ [0.0, 0.0, GRAVITY] + bias
-        ekf.imu(ImuReading(time, force + random.normal(0, 0.05, 3),
-                           rate + random.normal(0, 0.005, 3)))
-        if k % 2 == 0 and (time < HOVER or time >= return_at):
-            ekf.pose(PoseReading(
-                time, random.normal(0, 0.001, 3), rotations.multiply(
-                    rotations.multiply(quaternion, tilted),
-                    rotations.exp(random.normal(0, 0.0017, 3)))))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(model, 'MARKER_STD', marker_std)
+        for k in range(round(END / TICK)):
+            time = TICK * k
+            angle, rate = half_turn(time - HOVER)
+            quaternion, rate = rotations.exp(np.array([angle, 0, 0])), np.array([rate, 0, 0])
+            force = rotations.matrix(quaternion).T @ [0.0, 0.0, GRAVITY] + bias
+            ekf.imu(ImuReading(time, force + random.normal(0, 0.05, 3),
+                               rate + random.normal(0, 0.005, 3)))
+            if k % 2 == 0 and (time < HOVER or time >= return_at):
+                ekf.pose(PoseReading(
+                    time, random.normal(0, 0.001, 3), rotations.multiply(
+                        rotations.multiply(quaternion, tilted),
+                        rotations.exp(random.normal(0, 0.0017, 3)))))
     return ekf
 
 

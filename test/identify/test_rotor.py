@@ -127,7 +127,6 @@ def test_the_written_robot_file_gives_the_surface(tmp_path):
     low, high = robot.interval('rotors.torque_to_thrust_ratio')
     assert low < RATIO < high
     found = ThrustMap(robot.rotors)
-    assert not found.repaired
     for voltage in np.linspace(model.rows['voltage'].min(), model.rows['voltage'].max(), 7):
         thrust = np.linspace(2, found.thrust_limit(voltage), 20)
         duty = found.duty(thrust, voltage)

@@ -10,14 +10,13 @@ from beetle_omni_ros.robot.degraded import (
     DegradedAllocator,
     Holding,
     leaned,
-    LocalWeights,
+    TILT_REACH,
     up,
 )
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 ROBOT = RobotParameters.load()
 LIMIT = ROBOT.joints.position_limit
-WEIGHTS = LocalWeights()
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 LOST = ActuatorHealth(rotors=(False, True, True, True))
 STUCK = ActuatorHealth(stuck=(None, 1.5, None, None))
@@ -80,7 +79,6 @@ def test_a_stuck_rotor_that_would_need_negative_thrust_is_off():
 @pytest.mark.parametrize('health', [lost(0), stuck(1, 0.8)])
 def test_beyond_the_limits_the_error_is_smaller_than_by_clipping(health):
     ours = allocator(ROBOT, health)
-    scale = 1 / np.r_[np.full(3, ROBOT.mass), ROBOT.inertia]
     nearer, clipped = [], []
     for force, torque, present in draws(200, 3):
         force, torque = 2 * force, 2 * torque
@@ -88,15 +86,12 @@ def test_beyond_the_limits_the_error_is_smaller_than_by_clipping(health):
         if not got.saturated.any():
             continue
         wrench = np.concatenate([force, torque])
-        columns, inverse, _ = ours.choices[0]
-        pairs = (inverse @ wrench).reshape(4, 2)
-        if any(pairs[i, 0] < 0 for i in ours.stuck):
-            continue
+        pairs = ours.components(wrench[None])[0].reshape(4, 2)
         lengths = np.maximum(np.linalg.norm(pairs, axis=1), 1e-9)
         pairs *= np.minimum(1.0, ROBOT.rotors.thrust_max / lengths)[:, None]
-        clipped.append(np.linalg.norm(scale * (columns @ pairs.ravel() - wrench)))
-        nearer.append(np.linalg.norm(scale * (np.concatenate(
-            ours.wrench(got.tilt, got.thrust)) - wrench)))
+        clipped.append(ours.error(pairs.ravel(), wrench))
+        made = np.concatenate(ours.wrench(got.tilt, got.thrust))
+        nearer.append(np.linalg.norm(ours.scale * (made - wrench)))
     assert len(nearer) > 20
     assert np.median(nearer) < 0.7 * np.median(clipped)
 
@@ -107,9 +102,9 @@ def test_solutions_near_the_present_tilts_respect_range_and_health(health):
     for force, torque, present in draws(40, 4):
         present, _ = health.possible(present, np.zeros(4))
         aim = ours.allocate(force, torque, present)
-        got = ours.allocate_near(force, torque, present, aim, WEIGHTS)
+        got = ours.allocate_near(force, torque, present, aim)
         keeps_to(health, got.tilt, got.thrust)
-        assert np.all(np.abs(got.tilt - present) <= WEIGHTS.tilt_reach + 1e-9)
+        assert np.all(np.abs(got.tilt - present) <= TILT_REACH + 1e-9)
 
 
 def test_a_rotor_stuck_at_a_thrust_is_compensated_by_the_others():

@@ -19,17 +19,6 @@ def content():
     return yaml.safe_load(share_path('params/robot.yaml').read_text())
 
 
-def scaled(key, factor):
-    """Function that multiplies the numbers at a dotted key of a robot file."""
-    *parts, last = key.split('.')
-
-    def change(content):
-        for part in parts:
-            content = content[part]
-        content[last] = (np.array(content[last]) * factor).tolist()
-    return change
-
-
 def load(tmp_path, content):
     path = tmp_path / 'robot.yaml'
     path.write_text(yaml.safe_dump(content))
@@ -49,14 +38,14 @@ def test_the_hash_depends_on_physics_and_not_on_the_name(tmp_path, content):
     (lambda c: c['rotors'].update(thrust_min=30), 'rotors.thrust_min'),
     (lambda c: c['rotors'].update(spin=[1, 0, 1, 0]), 'must hold +1 or -1'),
     (lambda c: c['rotors']['map'][1].pop('voltage'), "key 'rotors.map[1].voltage': missing [V]"),
-    (scaled('rotors.positions', 1.2), 'multibody.module.joint_offset: 0.17938 m contradicts'),
-    (scaled('mass', 1.15), 'multibody.main_body.centre_of_mass: [0.     , 0.     , 0.01492] m '
-     'contradicts mass 3.49439 kg'),
+    (lambda c: c.update(mass=0.5), 'multibody: modules and end-effector weigh 0.76121 kg'),
     (lambda c: c.update(inertia=[0.03, 0.06, 0.09]), 'inertia: [0.03, 0.06, 0.09] kg m^2 leaves '
      'the main body the principal moments'),
     (lambda c: c.update(effects={'thrust_coeficient': {'scale': 1}}),
      "effects.thrust_coeficient: unknown effect; did you mean 'thrust_coefficient'?"),
     (lambda c: c.update(effects={'thrust_coefficient': {'scale': 93}}), 'is outside 0.2 to 2'),
+    (lambda c: c.update(extends=[1]), "key 'extends': expected the name of a file"),
+    (lambda c: c.update(effects=3), "key 'effects': expected a mapping, found 3"),
 ])
 def test_a_bad_robot_file_is_refused_with_the_key(tmp_path, content, change, message):
     change(content)
@@ -77,36 +66,6 @@ def test_a_file_that_extends_another_contains_differences_only(tmp_path):
     assert mine.effects == {'wind': {'force': (1.0, 0.0, 0.0)}}
     assert np.array_equal(mine.rotors.positions, shipped.rotors.positions)
     assert mine.joints == shipped.joints
-
-
-def extended(tmp_path, text):
-    (tmp_path / 'mine.yaml').write_text('extends: robot.yaml\n' + text)
-    return RobotParameters.load(tmp_path / 'mine.yaml')
-
-
-def test_positions_of_rotors_move_the_inertia(tmp_path):
-    shipped = RobotParameters.load()
-    positions = (shipped.rotors.positions * [1.2, 1.2, 1.0]).tolist()
-    longer = extended(tmp_path, f'rotors: {{positions: {positions}}}\n')
-    module = shipped.multibody.module
-    places = [robot.rotors.positions + (module.centre_of_mass[0] - module.rotor_offset)
-              * robot.tilt_axes for robot in (longer, shipped)]
-    squares = np.subtract(*[module.mass * np.sum(place[:, :2] ** 2, axis=0) for place in places])
-    assert longer.inertia - shipped.inertia == pytest.approx([*squares[::-1], squares.sum()],
-                                                             rel=1e-3)
-
-
-@pytest.mark.parametrize('text, message', [
-    ('multibody: null\nrotors: {positions: [[0.2, 0.2, 0], [-0.2, 0.2, 0], [-0.2, -0.2, 0], '
-     '[0.2, -0.2, 0]]}', 'inertia: without multibody it does not'),
-    ('multibody: {centre_of_gravity_height: 0.03}', 'height: 0.03 m contradicts mass'),
-    ('mass: 0.5', 'multibody: modules and end-effector weigh 0.76121 kg'),
-])
-def test_a_change_that_contradicts_the_extended_file_is_refused(tmp_path, text, message):
-    with pytest.raises(ParameterError) as error:
-        extended(tmp_path, text)
-    assert message in str(error.value)
-    assert 'mine.yaml: ' in str(error.value) and '\n' not in str(error.value)
 
 
 def test_the_name_of_a_shipped_file_is_a_robot_file_unless_a_local_file_has_it(

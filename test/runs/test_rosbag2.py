@@ -17,7 +17,6 @@ import yaml
 
 from beetle_omni_ros.messages import conversions
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.urdf import description
 from beetle_omni_ros.runs.bag import read_bag
 from beetle_omni_ros.runs.bag_writer import BagWriter
 from beetle_omni_ros.runs.tasks import make_task
@@ -117,7 +116,7 @@ def test_ros2_bag_info_and_play_accept_a_bag(packed):
 
 def test_the_frames_in_the_bag_agree_with_estimate_and_joints(tmp_path):
     robot = RobotParameters.load()
-    with BagWriter(tmp_path / 'bag', namespace='robot1', description=description()) as writer:
+    with BagWriter(tmp_path / 'bag', namespace='robot1', frames=True) as writer:
         fly(writer, make_task('hover'), duration=2.0, start=1.7e9)
     messages = {}
     with AnyReader([tmp_path / 'bag']) as reader:

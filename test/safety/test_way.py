@@ -7,7 +7,7 @@ import pytest
 
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import Allocator
-from beetle_omni_ros.robot.degraded import Holding
+from beetle_omni_ros.robot.degraded import FLYING_MARGIN, Holding
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.way import (
     climb,
@@ -116,7 +116,7 @@ def test_one_joint_turn_a_pair_permits_levelling_while_three_rotors_hold_the_pos
         assert plan(attitude, tilt, ALLOCATOR, RATE).lost > LOST_LIFT
         found = find_turnover(attitude, tilt, ROBOT, ALLOCATOR, RATE)
         holding = Holding(ROBOT, found.health)
-        assert holding.margin(found.quaternion) > holding.parameters.flying_margin
+        assert holding.margin(found.quaternion) > FLYING_MARGIN
         assert rotations.geodesic_angle(found.quaternion, attitude) < FARTHEST
         assert abs(found.tilt) <= ALLOCATOR.tilt_limit - ROOM
         assert np.sign(found.tilt) == -np.sign(tilt[found.joint])

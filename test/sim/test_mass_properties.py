@@ -45,7 +45,7 @@ def test_parts_agree_with_the_published_description():
     assert properties.main_body.mass == pytest.approx(2.27739, abs=1e-5)
     # The published rotor positions put the centre of gravity 0.2 mm beside the arms' middle.
     np.testing.assert_allclose(properties.main_body.centre - properties.main_origin,
-                               parts.main_body.centre_of_mass, atol=3e-4)
+                               parts.main_body['centre_of_mass'], atol=3e-4)
     assert -properties.main_origin[2] == pytest.approx(parts.centre_of_gravity_height, abs=1e-5)
     np.testing.assert_allclose(np.abs(properties.joint_origins - properties.main_origin)[:, :2],
                                parts.module.joint_offset, atol=1e-6)

@@ -9,7 +9,6 @@ from synthetic_flights import fly, write_truth
 
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import JOINT_NAMES
-from beetle_omni_ros.robot.urdf import Model
 from beetle_omni_ros.runs.log import LogRecorder
 from beetle_omni_ros.runs.tasks import make_task
 from beetle_omni_ros.view.live import draw
@@ -39,7 +38,7 @@ def test_moments_agree_with_the_log(log):
 def test_the_drawn_robot_tilts_and_its_arrows_are_as_long_as_the_thrusts(log):
     server = serve('127.0.0.1', 8300)
     try:
-        room = Room(server, Model.load(), 2)
+        room = Room(server, 2)
         moment, = moments(log, np.array([55.0]))
         moment.tilt, moment.thrust = np.array([0.3, -1.2, 2.5, 0.0]), np.array([8.0, 4.0, 0.0, 1])
         room.show([moment, None], ['here', ''])
@@ -72,7 +71,7 @@ def test_a_running_graph_is_drawn_until_ctrl_c():
                                  np.zeros(3), np.zeros(3)))
     try:
         with pytest.raises(KeyboardInterrupt):
-            draw(server, SimpleNamespace(take=take), Model.load())
+            draw(server, SimpleNamespace(take=take))
         robot = server.scene._handle_from_node_name['/robot0']
         assert robot.visible and robot.position[0] == pytest.approx(0.5)
     finally:

@@ -20,8 +20,9 @@ import numpy as np
 
 from beetle_omni_ros.identify.inference.hierarchy import Spread
 from beetle_omni_ros.identify.servo.log import JointLog
-from beetle_omni_ros.robot.native import built, CompilerError, EXACT, generated
+from beetle_omni_ros.robot.native import built, EXACT, generated
 from beetle_omni_ros.robot.parameters import JointParameters
+from beetle_omni_ros.robot.schema import RunError
 from beetle_omni_ros.robot.servo import CASADI, NUMPY, play, Servo, Step
 
 LONGEST_STEP = 0.0025   # [s]; relative error of the frequency (wn step)^2 / 24: 0.3 % at 100 rad/s
@@ -247,7 +248,7 @@ def _compiled() -> Callable | None:
         f'#define {name} {size}' for name, size in sizes.items()), LOOP])
     try:
         run = ctypes.CDLL(str(built('servo', source, EXACT))).servo_run
-    except (CompilerError, OSError) as error:
+    except (RunError, OSError) as error:
         logging.getLogger(__name__).info('servos move in numpy: %s', str(error).splitlines()[0])
         return None
     array = np.ctypeslib.ndpointer(float, flags='C_CONTIGUOUS')
