@@ -119,7 +119,8 @@ CASES = {
         ('imu_only', 'ground_truth/odom'), (' '.join(['imu_only'] * 7), 'at most'),
         ('imu_only --output no/page.html', 'page.html')],
     'view': [
-        ('none', 'none: no such bag'), ('imu_only --namespace a', '--namespace: expected without')],
+        ('none', 'none: no such bag'),
+        ('imu_only --namespace a', '--namespace: expected without')],
     'gap': [
         ('', "'RUN...'"), ('none', 'none: no such bag'), ('imu_only imu_only', 'imu_only'),
         ('imu_only --robot unknown.yaml', 'masss'), ('imu_only --gap unknown.yaml', 'masss'),
