@@ -302,9 +302,9 @@ class Watcher:
 
     def __init__(self, flight: Flight, listed: FaultList):
         """Start now."""
-        envelope = SupervisorParameters.load().envelope
+        own = SupervisorParameters.load()
         self._flight, self._limits, self._end_time = flight, listed.limits, listed.flight.end_time
-        self._fence = np.array([envelope.half_width, envelope.half_width, envelope.height])
+        self._fence = np.array([own.fence_half_width, own.fence_half_width, own.fence_height])
         self._place, self._start = flight.simulator.truth.position.copy(), flight.simulator.time
         self._past_events = len(flight.supervisor.events)
         self._past_faults = set(flight.supervisor.faults)

@@ -9,12 +9,13 @@ from beetle_omni_ros.control.base import Command, ROTORS
 from beetle_omni_ros.robot.allocation import clipped
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.events import Silence
-from beetle_omni_ros.safety.parameters import CommandLimits
 
 JUMP = 'implausible jump'
 FROZEN = 'the same numbers again'
 UNKNOWN = 'unknown controller'
 
+TIMEOUT = 0.05          # [s] without a valid command: 5 periods of 100 Hz
+RETURN_AFTER = 0.5      # [s] of valid commands before a controller gets control (again)
 STALE_AFTER = 0.05      # [s] a command computed from an older state is refused
 AHEAD = 0.02            # [s] a stamp farther in the future comes from another clock
 OVERSTEP = 0.25         # [-] of a range: 5 N, 1 rad. A wrong unit exceeds it by a factor of 3
@@ -35,7 +36,6 @@ class CommandStream:
     Commands of one controller: the last accepted one, and refusals with reasons.
 
     Args:
-        limits: thresholds.
         robot: thrust and tilt ranges.
 
     Attributes:
@@ -47,14 +47,13 @@ class CommandStream:
 
     """
 
-    def __init__(self, limits: CommandLimits, robot: RobotParameters):
-        self._return_after = limits.return_after
+    def __init__(self, robot: RobotParameters):
         self._tilt_limit = robot.joints.position_limit
         self._low, self._high = robot.rotors.thrust_min, robot.rotors.thrust_max
         self.accepted: Command | None = None
         self.clipped, self.refused = 0, Counter[str]()
         self._last_refusal = ''
-        self.silence = Silence(limits.timeout)
+        self.silence = Silence(TIMEOUT)
         self.good_for = 0.0
         self._offered: Command | None = None
         self._same = 0
@@ -62,7 +61,7 @@ class CommandStream:
     @property
     def good(self) -> bool:
         """Whether the controller may get control."""
-        return not self.silence.silent and self.good_for >= self._return_after - 1e-9
+        return not self.silence.silent and self.good_for >= RETURN_AFTER - 1e-9
 
     @property
     def complaint(self) -> str:
@@ -70,7 +69,7 @@ class CommandStream:
         if self.silence.silent:
             last = f'; last refused: {self._last_refusal}' if self._last_refusal else ''
             return self.silence.text + last
-        return f'good for only {self.good_for:.2f} s of {self._return_after:g} s'
+        return f'good for only {self.good_for:.2f} s of {RETURN_AFTER:g} s'
 
     def offer(self, command: Command, now: float) -> str:
         """

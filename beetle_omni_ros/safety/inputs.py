@@ -81,7 +81,7 @@ class Inputs:
         self.allocator = Allocator(robot)
         self.events, self.watch = EventLog(), FaultWatch(robot, self.allocator)
         self.faults = self.watch.faults
-        self.streams = {name: CommandStream(parameters.commands, robot) for name in controllers}
+        self.streams = {name: CommandStream(robot) for name in controllers}
         self.active = parameters.controller if parameters.controller in controllers \
             else controllers[0]
         self.backup = BackupEstimator(robot.gravity)
@@ -336,7 +336,7 @@ class Inputs:
             return f'turning at {rate:.2f} rad/s, at most {ARM_RATE:g} rad/s'
         if self.outside(0.0):
             return 'outside the fence'
-        least = self._parameters.battery.arm * self.robot.battery.cells
+        least = self._parameters.battery_arm * self.robot.battery.cells
         if self.voltage is not None and self.voltage < least:
             return f'battery at {self.voltage:.1f} V, at least {least:.1f} V'
         moved = [f'gimbal{k + 1}' for k, zero in enumerate(self.health.zeros) if zero]
@@ -345,9 +345,9 @@ class Inputs:
 
     def outside(self, margin: float) -> bool:
         """Whether the robot is more than ``margin`` [m] outside the fence."""
-        fence = self._parameters.envelope
+        limits = self._parameters
         x, y, z = map(abs, self.best.position.tolist())
-        return max(x, y) > fence.half_width + margin or z > fence.height + margin
+        return max(x, y) > limits.fence_half_width + margin or z > limits.fence_height + margin
 
     # Time -------------------------------------------------------------------------------------
 
@@ -366,10 +366,10 @@ class Inputs:
         for stream in self.streams.values():
             stream.tick(dt)
         self.backup.imu_alive = not self.imu.silent
-        cells, battery = self.robot.battery.cells, self._parameters.battery
+        limits, cells = self._parameters, self.robot.battery.cells
         cell = np.inf if self.voltage is None else self.voltage / cells
-        self._low_for = self._low_for + dt if cell < battery.warn else 0.0
-        self._empty_for = self._empty_for + dt if cell < battery.land else 0.0
+        self._low_for = self._low_for + dt if cell < limits.battery_warn else 0.0
+        self._empty_for = self._empty_for + dt if cell < limits.battery_land else 0.0
         self.battery_low, self.battery_empty = self._low_for >= LOW_TIME, \
             self._empty_for >= LOW_TIME
         if self.estimate is not None:

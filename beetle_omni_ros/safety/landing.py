@@ -12,7 +12,6 @@ from beetle_omni_ros.robot.degraded import Holding
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.events import ERROR
 from beetle_omni_ros.safety.inputs import Inputs
-from beetle_omni_ros.safety.parameters import TakeoffParameters
 from beetle_omni_ros.safety.way import (
     climb,
     find_turnover,
@@ -26,6 +25,7 @@ from beetle_omni_ros.safety.way import (
 
 ACCELERATION = 0.5      # [m/s^2] of climb and descent
 # Takeoff
+CLIMB_SPEED = 0.5       # [m/s]
 GROUND_RATE = 0.5       # [rad/s] at which an inclination of the ground is levelled
 AIRBORNE = 0.05         # [m] of rise; below it the reaction to a fault is motors off
 CLEARANCE = 0.3         # [m] smallest climb, for a start from a platform
@@ -58,6 +58,7 @@ OVERDUE = 0.3           # [m/s^2] a bias can prevent the descent: then sink fast
 OVERDUE_LIMIT = 6.0     # [s] after this the robot slides on the ground or is far away: motors off
 BLIND_LIMIT = 0.3       # [s] without any sensor the attitude is then unknown: motors off
 # The ground
+SPEED = 0.3             # [m/s] of the descent, harmless for the legs
 TARGET_LEAD = 0.5       # [m] depth of the target below the robot
 STILL_SPEED = 0.12      # [m/s] a slower robot may stand on the ground
 CARRIED = 0.2           # [-] share of the weight that the ground carries
@@ -128,12 +129,11 @@ class Takeoff:
 
     """
 
-    def __init__(self, parameters: TakeoffParameters, allocator: Allocator, hover: Fallback,
-                 state: State):
-        self._speed, self._hover, self._start = parameters.speed, hover, state
+    def __init__(self, height: float, allocator: Allocator, hover: Fallback, state: State):
+        self._hover, self._start = hover, state
         self._tilt = np.clip(state.tilt, -allocator.tilt_limit, allocator.tilt_limit)
         self._goal_tilt = allocator.hover(state.quaternion, self._tilt).tilt
-        self._rise = max(parameters.height - state.position[2], CLEARANCE)
+        self._rise = max(height - state.position[2], CLEARANCE)
         self.target = state.position + np.array([0.0, 0.0, self._rise])
         self._ramp: Ramp | None = None
         self._aligned_for = self._climbed_for = 0.0
@@ -160,7 +160,7 @@ class Takeoff:
             level = rotations.from_rpy(0.0, 0.0, rotations.to_rpy(state.quaternion)[2])
             self._ramp = Ramp(0.0, self._start.position,
                               Way.straight(state.quaternion, level, GROUND_RATE),
-                              climb(self._rise, self._speed, ACCELERATION))
+                              climb(self._rise, CLIMB_SPEED, ACCELERATION))
         elif self._aligned_for > ALIGN_PATIENCE:
             k = int(error.argmax())
             self.failure = f'gimbal{k + 1} is {error[k]:.2f} rad from its place after ' \
@@ -190,9 +190,9 @@ class Landing:
 
     """
 
-    def __init__(self, inputs: Inputs, hover: Fallback, gauge: SupportGauge, speed: float,
-                 now: float, in_force: Command | None):
-        self._inputs, self._hover, self._gauge, self._speed = inputs, hover, gauge, speed
+    def __init__(self, inputs: Inputs, hover: Fallback, gauge: SupportGauge, now: float,
+                 in_force: Command | None):
+        self._inputs, self._hover, self._gauge = inputs, hover, gauge
         self.grounded, self.given_up = False, ''
         self._standing_for = self._still_for = self._blind_for = 0.0
         self._support = 0.0     # share of the weight that the rotors do not carry, filtered
@@ -272,11 +272,11 @@ class Landing:
         if self._health.healthy:    # level for the flare: velocity errors grow with time
             wait = max(0.0, wait - fast / BLIND_SPEED)
         self._ramp = Ramp(state.stamp, state.position, way, self._descent(leap, wait, fast))
-        self._due = now + self._ramp.end + max(0.0, height + self._ramp.rise) / self._speed
+        self._due = now + self._ramp.end + max(0.0, height + self._ramp.rise) / SPEED
 
     def _descent(self, leap, wait, fast):
         """Knots: a leap, a wait, ``fast`` metres faster than the touchdown, then its speed."""
-        slow, a = self._speed, BLIND_ACCELERATION
+        slow, a = SPEED, BLIND_ACCELERATION
         begin = max(leap[-1][0], wait)
         top = min(BLIND_SPEED, (fast * a + 0.5 * slow**2) ** 0.5)
         if top <= slow:
@@ -393,7 +393,7 @@ class Landing:
         # The accelerometer jitters on the floor, by more than the weight with idle rotors.
         self._support += min(1.0, dt / FELT) * (
             self._gauge.support(specific_force_up) - self._support)
-        sinking = speed < -0.5 * self._speed
+        sinking = speed < -0.5 * SPEED
         stands = sinking and self._support > CARRIED and (still or specific_force_up is not None)
         self._standing_for = self._standing_for + dt if stands else 0.0
         self._still_for = self._still_for + dt if blind and sinking and still else 0.0

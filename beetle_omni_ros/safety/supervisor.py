@@ -28,6 +28,9 @@ IN_FLIGHT = (TAKEOFF, FLYING, FALLBACK, LANDING)
 AGE_LIMIT = 0.1         # [s] no older command is sent; the actuators have the same limit
 STOP_TIME = 0.3         # [s] zero thrust is sent for this time, then nothing
 RESUMING = 0.1          # [s] after a pause until every source has sent a message again
+FALLBACK_TIME = 30.0    # [s] of fallback until landing; enough to restart a controller
+MOCAP_PATIENCE = 1.5    # [s] of dead reckoning until landing; its velocity error is then 0.1 m/s
+                        # and grows
 RECOVERY_TIME = 1.0     # [s] in which a landing stops a tumble of 15 rad/s
 FENCE_MARGIN = 2.0      # [m] farther outside the fence a landing is a flyaway: motors off
 LANDING_LIMIT = 90.0    # [s] from the margin above the fence it takes 74 s, and levelling and
@@ -81,7 +84,7 @@ class Supervisor(Inputs):
         reason = self.why_not_arm() if self.state == DISARMED else f'{self.state}, not disarmed'
         if reason:
             return self._refuse(f'arm refused: {reason}')
-        self._takeoff = Takeoff(self._parameters.takeoff, self.allocator, self._hover,
+        self._takeoff = Takeoff(self._parameters.takeoff_height, self.allocator, self._hover,
                                 self.seen(None))
         self._in_force = None
         self.floor = float(self.known.position[2])
@@ -259,8 +262,7 @@ class Supervisor(Inputs):
 
     def _why_land(self, no_rotors, no_joints):
         """Name of the fault ('' for a detected one) and text of the most urgent reason."""
-        envelope = self._parameters.envelope
-        if self.state == FALLBACK and self._in_state > envelope.fallback_time:
+        if self.state == FALLBACK and self._in_state > FALLBACK_TIME:
             return 'controller_lost', f'{self.active}_node not good for {self._in_state:.0f} s: ' \
                                       'landing'
         if no_rotors:
@@ -273,7 +275,7 @@ class Supervisor(Inputs):
                                      'sensors'
         if 'mocap_jumped' in self.faults:
             return '', 'the position of MoCap jumped: landing'
-        if self.mocap.lost and self.mocap.elapsed > envelope.mocap_patience:
+        if self.mocap.lost and self.mocap.elapsed > MOCAP_PATIENCE:
             return 'mocap_lost', f'MoCap {self.mocap.text}: landing by dead reckoning'
         if no_joints:
             return 'joint_bridge_lost', f'{no_joints}: landing with the joints as they are'
@@ -379,8 +381,7 @@ class Supervisor(Inputs):
             self.watch.name(name, now)
         if not self.airborne:
             return self._enter(DISARMED, severity, f'{text}; still on the ground: motors off')
-        self._landing = Landing(self, self._hover, self._gauge, self._parameters.landing.speed,
-                                now, self._in_force)
+        self._landing = Landing(self, self._hover, self._gauge, now, self._in_force)
         return self._enter(LANDING, severity, text)
 
     def _enter(self, state, severity, text):

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from vehicle_rig import flown, PARAMETERS, TICK, VehicleRig
+from vehicle_rig import flown, TICK
 
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import ALL_HEALTHY
@@ -95,8 +95,8 @@ def test_limits_hold_while_landing(spoil):
 
 def test_landing_and_fallback_end_in_time(monkeypatch):
     monkeypatch.setattr('beetle_omni_ros.safety.supervisor.LANDING_LIMIT', 10.0)
-    rig = VehicleRig(replace(PARAMETERS, envelope=replace(PARAMETERS.envelope,
-                                                          fallback_time=3.0))).fly()
+    monkeypatch.setattr('beetle_omni_ros.safety.supervisor.FALLBACK_TIME', 3.0)
+    rig = flown()
     rig.alive -= {'nmpc', 'rl'}
     rig.run(2.9)
     assert rig.supervisor.state == 'fallback'

@@ -8,10 +8,9 @@ from vehicle_rig import flown, PARAMETERS, ROBOT, TICK, VehicleRig
 
 from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.safety.commands import RETURN_AFTER, TIMEOUT
 from beetle_omni_ros.safety.inputs import ESTIMATE_TIMEOUT, JOINT_TIMEOUT, LOST_TIME, LOW_TIME
 from beetle_omni_ros.safety.supervisor import STOP_TIME
-
-TIMEOUT = PARAMETERS.commands.timeout
 
 
 @pytest.mark.parametrize('spoil, text', [
@@ -47,7 +46,7 @@ def test_silent_controller_falls_back_to_hover_without_a_jump_and_gets_control_b
     assert np.abs(rig.command.tilt - before.tilt).max() < 0.2
     assert np.abs(rig.command.thrust - before.thrust).max() < 7
     rig.alive.add('nmpc')
-    rig.run(PARAMETERS.commands.return_after - 2 * TICK)
+    rig.run(RETURN_AFTER - 2 * TICK)
     assert rig.supervisor.state == 'fallback'
     rig.run(4 * TICK)
     assert rig.supervisor.state == 'flying' and rig.supervisor.source == 'nmpc'
@@ -138,15 +137,15 @@ def test_low_battery_warns_then_lands():
     rig = VehicleRig().fly()
     rig.supervisor.watch._pack = None   # the voltage falls without a load
     full = rig.voltage
-    rig.voltage = (PARAMETERS.battery.land - 0.05) * ROBOT.battery.cells
+    rig.voltage = (PARAMETERS.battery_land - 0.05) * ROBOT.battery.cells
     rig.run(LOW_TIME / 2)     # the sag of a manoeuvre
     rig.voltage = full
     rig.run(LOW_TIME)
     assert not any('battery' in t for t in rig.texts())
-    rig.voltage = (PARAMETERS.battery.warn - 0.05) * ROBOT.battery.cells
+    rig.voltage = (PARAMETERS.battery_warn - 0.05) * ROBOT.battery.cells
     rig.run(3.0)
     assert rig.supervisor.state == 'flying' and any('battery low' in t for t in rig.texts())
-    rig.voltage = (PARAMETERS.battery.land - 0.05) * ROBOT.battery.cells
+    rig.voltage = (PARAMETERS.battery_land - 0.05) * ROBOT.battery.cells
     rig.run(LOW_TIME - 0.1)
     assert rig.supervisor.state == 'flying'
     rig.run(0.2)
