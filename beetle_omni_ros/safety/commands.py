@@ -1,11 +1,9 @@
-"""Commands of the controllers: their checks, and the transition from one to another."""
+"""Checks of the commands of the controllers, and of the one that is sent."""
 
 from collections import Counter
 from math import isfinite
 
-import numpy as np
-
-from beetle_omni_ros.control.base import Command, ROTORS
+from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.robot.allocation import clipped
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.events import Silence
@@ -22,9 +20,6 @@ OVERSTEP = 0.25         # [-] of a range: 5 N, 1 rad. A wrong unit exceeds it by
 TILT_STEP = 2.0         # [rad] a single larger jump is a spike: the joint would need 0.2 s
 THRUST_STEP = 15.0      # [N] the same for thrust, three quarters of the range
 SAME = 10               # commands or estimates in a row that are equal to the last digit
-HANDOVER_TIME = 0.3     # [s] longest duration: half a turn of a joint
-TILT_RATE = 9.0         # [rad/s] as in hover.yaml: below the servos' 10
-THRUST_RATE = 300.0     # [N/s] as in hover.yaml: 3 N a period
 
 MEANINGS = {    # of reasons for refusals that do not explain themselves
     FROZEN: f' (more than {SAME} equal commands in a row count as a frozen controller; compute '
@@ -136,55 +131,13 @@ class CommandStream:
         return '', clean
 
 
-class Handover:
-    """
-    Limits the rate of the command after a change of the controller.
-
-    A controller on standby has similar commands, but in a large turn the commands may differ. The
-    limit ends when the new command is reached, or after HANDOVER_TIME.
-
-    Attributes:
-        left: remaining time, set to HANDOVER_TIME after a change of the controller [s].
-
-    """
-
-    left = 0.0
-
-    def limit(self, asked: Command, in_force: Command | None) -> Command:
-        """Return ``asked``, limited to the permitted change from ``in_force``."""
-        if self.left <= 0 or in_force is None:
-            return asked
-        step = asked.stamp - in_force.stamp
-        if step <= 0:       # a command for this state was already executed
-            return in_force
-        self.left -= step
-        change = np.concatenate([asked.tilt - in_force.tilt, asked.thrust - in_force.thrust])
-        reach = step * np.repeat([TILT_RATE, THRUST_RATE], ROTORS)
-        if (np.abs(change) <= reach).all():
-            self.left = 0.0
-            return asked
-        change = np.clip(change, -reach, reach)
-        return Command(asked.stamp, in_force.tilt + change[:ROTORS],
-                       in_force.thrust + change[ROTORS:])
-
-
-def within_limits(command: Command, robot: RobotParameters, stopped: bool = False) -> \
-        Command | None:
-    """
-    Final check of the output: finite and clipped to the limits, or None.
-
-    Args:
-        command: of any source.
-        robot: thrust and tilt ranges.
-        stopped: whether zero thrust is intended, below the smallest thrust in flight.
-
-    """
+def within_limits(command: Command, robot: RobotParameters) -> Command | None:
+    """Final check of the output: finite and clipped to the limits, or None."""
     if not all(map(isfinite, [*command.tilt.tolist(), *command.thrust.tolist()])):
         return None
     limit = robot.joints.position_limit
-    low, high = 0.0 if stopped else robot.rotors.thrust_min, robot.rotors.thrust_max
     return Command(command.stamp, clipped(command.tilt, -limit, limit),
-                   clipped(command.thrust, low, high))
+                   clipped(command.thrust, 0.0, robot.rotors.thrust_max))
 
 
 def _farthest(a, b):

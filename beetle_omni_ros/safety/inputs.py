@@ -16,7 +16,7 @@ from beetle_omni_ros.robot.readings import SpikeFilter
 from beetle_omni_ros.safety.backup import BackupEstimator
 from beetle_omni_ros.safety.commands import CommandStream, FROZEN, JUMP, MEANINGS, SAME, UNKNOWN
 from beetle_omni_ros.safety.detectors import FaultWatch
-from beetle_omni_ros.safety.events import EventLog, INFO, Silence, WARNING
+from beetle_omni_ros.safety.events import Event, INFO, Silence, WARNING
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.way import inclination
 
@@ -43,6 +43,7 @@ ARM_TILT, ARM_SPEED, ARM_RATE = 0.35, 0.3, 0.5  # [rad] 20 deg, on its side it c
 LOW_TIME = 2.0          # [s] of a low voltage, longer than the sag of one manoeuvre
 TUMBLING, FALLING = 15.0, 6.0   # [rad/s]; [m/s] after 1.8 m of free fall
 LOST_TIME = 0.3         # [s] of either
+QUIET_TIME = 1.0        # [s] in which the same message is logged once
 
 
 def plausible(*arrays: np.ndarray) -> bool:
@@ -79,7 +80,9 @@ class Inputs:
                  controllers: tuple[str, ...]):
         self._parameters, self.robot = parameters, robot
         self.allocator = Allocator(robot)
-        self.events, self.watch = EventLog(), FaultWatch(robot, self.allocator)
+        self.events: list[Event] = []
+        self._said: dict[str, float] = {}   # when the events with a key were last added [s]
+        self.watch = FaultWatch(robot, self.allocator)
         self.faults = self.watch.faults
         self.streams = {name: CommandStream(robot) for name in controllers}
         self.active = parameters.controller if parameters.controller in controllers \
@@ -115,10 +118,10 @@ class Inputs:
         if reason:
             self.refused[f'estimate: {reason}'] += 1
             self.last_refusal = reason
-            self._say(WARNING, f'ekf_node: estimate refused: {reason}', reason)
+            self.say(WARNING, f'ekf_node: estimate refused: {reason}', reason)
             return False
         if status not in (self.status, 'tracking'):
-            self._say(WARNING, f"ekf_node reports '{status}'")
+            self.say(WARNING, f"ekf_node reports '{status}'")
         self.estimate, self.status, self.last_refusal = true, status, ''
         self.ekf.reset()
         self.on_joints(state.tilt_stamp, state.tilt, state.tilt_velocity)
@@ -160,7 +163,7 @@ class Inputs:
         if reason:
             # A step to a new target causes one jump; repeated jumps end in the controller's
             # timeout.
-            self._say(INFO if reason == JUMP else WARNING,
+            self.say(INFO if reason == JUMP else WARNING,
                       f'{controller}_node: command refused: {reason}{MEANINGS.get(reason, "")}',
                       f'{controller}: {reason}')
         return not reason
@@ -260,7 +263,7 @@ class Inputs:
 
         """
         if name not in NODES:
-            self._say(WARNING, f"unknown bridge '{name}'", 'unknown bridge')
+            self.say(WARNING, f"unknown bridge '{name}'", 'unknown bridge')
             return False
         state = self.bridges[name] = ' '.join(text.split()) or 'empty state'
         self.unready[name] = '' if state == 'ready' else f'{NODES[name]} {state}'
@@ -357,7 +360,7 @@ class Inputs:
         if before is None:
             return 0.0
         if now < before:
-            self._say(WARNING, f'the clock went back by {before - now:.3f} s')
+            self.say(WARNING, f'the clock went back by {before - now:.3f} s')
             self._forget_stamps(now, before - now)
             return 0.0
         dt = min(now - before, TICK_LIMIT)
@@ -393,5 +396,10 @@ class Inputs:
     def _ahead(self, stamp: float) -> bool:
         return self._now is not None and stamp - self._now > ESTIMATE_TIMEOUT
 
-    def _say(self, severity: str, text: str, key: str | None = None) -> None:
-        self.events.say(self._now or 0.0, severity, text, key)
+    def say(self, severity: str, text: str, key: str = '') -> None:
+        """Add one event; with a ``key``, not again within the quiet time."""
+        now = self._now or 0.0
+        if key and abs(now - self._said.get(key, -np.inf)) < QUIET_TIME:
+            return
+        self._said[key] = now
+        self.events.append(Event(now, severity, text))

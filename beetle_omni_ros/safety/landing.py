@@ -220,8 +220,7 @@ class Landing:
         """The command for the present time."""
         inputs, backup = self._inputs, self._inputs.backup
         if not backup.running and inputs.ekf.silent:
-            inputs.events.say(now, ERROR, f'ekf_node {inputs.ekf.text}: descent goes on with raw '
-                                          'sensors')
+            inputs.say(ERROR, f'ekf_node {inputs.ekf.text}: descent goes on with raw sensors')
             backup.start(inputs.known)
             self.set_out(now, in_force)
         elif inputs.blind and not self._blind or now >= self._again_at:
@@ -231,8 +230,7 @@ class Landing:
                                 if inputs.mocap.lost else None)
         for source, name in ((inputs.mocap, 'MoCap'), (inputs.imu, 'IMU')):
             if source.silent:
-                inputs.events.say(now, ERROR, f'{name} is gone too: descent without it',
-                                  f'no {name}')
+                inputs.say(ERROR, f'{name} is gone too: descent without it', f'no {name}')
         no_mocap, no_imu = inputs.mocap.silent, inputs.imu.silent
         self._blind_for = self._blind_for + dt if no_mocap and no_imu else 0.0
         if self._blind_for > BLIND_LIMIT:

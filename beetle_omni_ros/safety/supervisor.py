@@ -12,9 +12,9 @@ import numpy as np
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import Command, Fallback, PoseTarget, Target
-from beetle_omni_ros.robot.allocation import ALL_HEALTHY, NO_ZEROS
+from beetle_omni_ros.robot.allocation import ALL_HEALTHY, NO_ZEROS, ROTORS
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.safety.commands import Handover, HANDOVER_TIME, within_limits
+from beetle_omni_ros.safety.commands import within_limits
 from beetle_omni_ros.safety.events import Answer, ERROR, INFO, WARNING
 from beetle_omni_ros.safety.inputs import ARM_TILT, Inputs
 from beetle_omni_ros.safety.landing import Landing, SupportGauge, Takeoff
@@ -27,6 +27,9 @@ FALLBACK, LANDING, STOPPED = 'fallback', 'landing', 'emergency_stop'
 IN_FLIGHT = (TAKEOFF, FLYING, FALLBACK, LANDING)
 AGE_LIMIT = 0.1         # [s] no older command is sent; the actuators have the same limit
 STOP_TIME = 0.3         # [s] zero thrust is sent for this time, then nothing
+HANDOVER_TIME = 0.3     # [s] longest duration: half a turn of a joint
+TILT_RATE = 9.0         # [rad/s] as in hover.yaml: below the servos' 10
+THRUST_RATE = 300.0     # [N/s] as in hover.yaml: 3 N a period
 RESUMING = 0.1          # [s] after a pause until every source has sent a message again
 FALLBACK_TIME = 30.0    # [s] of fallback until landing; enough to restart a controller
 MOCAP_PATIENCE = 1.5    # [s] of dead reckoning until landing; its velocity error is then 0.1 m/s
@@ -64,7 +67,7 @@ class Supervisor(Inputs):
         self._pilot = registry.pilot(controllers) if pilot is None else pilot
         self._hover = fallback
         self._gauge = SupportGauge(self.allocator, robot)
-        self._handover = Handover()
+        self._handover_left = 0.0   # after a change of the controller [s]
         self.state, self.source = DISARMED, 'none'
         self.target_override: Target | None = None
         # Objects of the present state, created when it is entered.
@@ -72,7 +75,6 @@ class Supervisor(Inputs):
         self._landing: Landing
         self._target: PoseTarget
         self._in_state = 0.0    # time since the last change of the state [s]
-        self._checked: Command | None = None    # the last command that was checked
         self._acted_on = ALL_HEALTHY    # health to which landing and hover are adapted
         self._before: float | None = None   # time of the update before [s]
         self._resumed = -np.inf     # time of the last pause [s]
@@ -127,12 +129,12 @@ class Supervisor(Inputs):
             return self._refuse(f'select refused: {controller}_node {stream.complaint}; '
                                 f'{self.active} stays selected')
         self.active = controller
-        self._handover.left = HANDOVER_TIME
-        self._say(INFO, f'{controller} selected')
+        self._handover_left = HANDOVER_TIME
+        self.say(INFO, f'{controller} selected')
         return Answer(True, f'{controller} selected')
 
     def _refuse(self, text):
-        self._say(WARNING, text)
+        self.say(WARNING, text)
         return Answer(False, text)
 
     # The cycle --------------------------------------------------------------------------------
@@ -157,7 +159,7 @@ class Supervisor(Inputs):
         if command is not None:
             if self.health.zeros != NO_ZEROS:       # in angles of the encoder that jumped
                 asked = within_limits(replace(command, tilt=self.health.read(command.tilt)),
-                                      self.robot, stopped=True)
+                                      self.robot)
             self.watch.on_command(asked)
         if self.state in IN_FLIGHT:
             self.airborne = self.state != TAKEOFF or self._takeoff.airborne
@@ -170,13 +172,11 @@ class Supervisor(Inputs):
         if command is None:
             return None
         if now - command.stamp > AGE_LIMIT:
-            self._say(ERROR, f'the command of {self.source} is '
+            self.say(ERROR, f'the command of {self.source} is '
                              f'{1000 * (now - command.stamp):.0f} ms old: nothing sent',
                       'old command')
             return None
-        if command is not self._checked:
-            self._checked = command
-            self._in_force = within_limits(command, self.robot, stopped=self.source == 'none')
+        self._in_force = within_limits(command, self.robot)
         if self._in_force is None:
             self.emergency_stop(now, f'{self.source} gave a command that is not finite')
         return self._in_force
@@ -189,7 +189,7 @@ class Supervisor(Inputs):
         if self.airborne and self.imu.lost and 'imu_frozen' not in self.faults:
             self.watch.name('imu_lost', now, f'the raw IMU is {self.imu.text}')
         while self.watch.news:
-            self._say(ERROR, self.watch.news.pop(0))
+            self.say(ERROR, self.watch.news.pop(0))
         if not self.airborne:
             return
         if before is not None and now - before > AGE_LIMIT:
@@ -206,7 +206,7 @@ class Supervisor(Inputs):
         self.watch.name('supervisor_paused', now)
         self.watch.restart(now)
         self._resumed = now
-        self._say(ERROR, f'supervisor_node was not scheduled for {1000 * paused:.0f} ms: the '
+        self.say(ERROR, f'supervisor_node was not scheduled for {1000 * paused:.0f} ms: the '
                          'actuators had stopped')
         if self.state == FLYING:
             self._fall_back(now, ERROR, 'fallback to hover after the pause')
@@ -242,7 +242,7 @@ class Supervisor(Inputs):
     def _react(self, now):
         """Faults that end or change a flight with any controller, the most urgent first."""
         if self.battery_low:
-            self._say(WARNING, f'battery low: {self.voltage:.1f} V', 'battery')
+            self.say(WARNING, f'battery low: {self.voltage:.1f} V', 'battery')
         no_rotors, no_joints = self.unready['rotor'], self.unready['joint']
         if no_rotors and not self.bridges['rotor'].startswith('silent:'):
             if not self.airborne:
@@ -342,7 +342,29 @@ class Supervisor(Inputs):
             return self._hold(now, dt)
         self.source = self.active
         self._hover.observe(self.seen(self._in_force))
-        return self._handover.limit(stream.accepted, self._in_force)
+        return self._hand_over(stream.accepted)
+
+    def _hand_over(self, asked):
+        """
+        Limit the change from the executed command after a change of the controller.
+
+        A controller on standby has similar commands, but in a large turn they may differ. The
+        limit ends when the new command is reached, or after HANDOVER_TIME.
+        """
+        before = self._in_force
+        if self._handover_left <= 0 or before is None:
+            return asked
+        step = asked.stamp - before.stamp
+        if step <= 0:       # a command for this state was already executed
+            return before
+        self._handover_left -= step
+        change = np.concatenate([asked.tilt - before.tilt, asked.thrust - before.thrust])
+        reach = step * np.repeat([TILT_RATE, THRUST_RATE], ROTORS)
+        if (np.abs(change) <= reach).all():
+            self._handover_left = 0.0
+            return asked
+        change = np.clip(change, -reach, reach)
+        return Command(asked.stamp, before.tilt + change[:ROTORS], before.thrust + change[ROTORS:])
 
     def _hold(self, now, dt):
         if self.streams[self.active].good and not self.lost and self._in_state >= RESUMING:
@@ -364,7 +386,7 @@ class Supervisor(Inputs):
         if self.target_override is not None and pilot is not None and pilot.good \
                 and pilot.accepted is not None and not self.backup.running:
             self.source = self._pilot
-            command = self._handover.limit(pilot.accepted, self._in_force)
+            command = self._hand_over(pilot.accepted)
         return command
 
     # Changes of state -------------------------------------------------------------------------
@@ -390,14 +412,14 @@ class Supervisor(Inputs):
             self.backup.stop()
             self.airborne = False
         if state == FLYING:
-            self._handover.left = HANDOVER_TIME
-        self._say(severity, text)
+            self._handover_left = HANDOVER_TIME
+        self.say(severity, text)
         return Answer(True, text)
 
     def _forget_stamps(self, now, by):
         super()._forget_stamps(now, by)
         self._hover.reset()
-        self._handover.left = 0.0
+        self._handover_left = 0.0
         if self.state == LANDING:
             self._landing.set_out(now, self._in_force)
 
