@@ -10,6 +10,7 @@ from beetle_omni_ros.safety.events import Silence
 
 JUMP = 'implausible jump'
 FROZEN = 'the same numbers again'
+NOT_FINITE = 'not finite'
 UNKNOWN = 'unknown controller'
 
 TIMEOUT = 0.05          # [s] without a valid command: 5 periods of 100 Hz
@@ -19,7 +20,7 @@ AHEAD = 0.02            # [s] a stamp farther in the future comes from another c
 OVERSTEP = 0.25         # [-] of a range: 5 N, 1 rad. A wrong unit exceeds it by a factor of 3
 TILT_STEP = 2.0         # [rad] a single larger jump is a spike: the joint would need 0.2 s
 THRUST_STEP = 15.0      # [N] the same for thrust, three quarters of the range
-SAME = 10               # commands or estimates in a row that are equal to the last digit
+SAME = 10               # commands in a row that are equal to the last digit
 
 MEANINGS = {    # of reasons for refusals that do not explain themselves
     FROZEN: f' (more than {SAME} equal commands in a row count as a frozen controller; compute '
@@ -54,14 +55,19 @@ class CommandStream:
         self._same = 0
 
     @property
+    def dead(self) -> bool:
+        """Whether it loses control: it is silent, or its last command is not finite."""
+        return self.silence.silent or self._last_refusal == NOT_FINITE
+
+    @property
     def good(self) -> bool:
         """Whether the controller may get control."""
-        return not self.silence.silent and self.good_for >= RETURN_AFTER - 1e-9
+        return not self.dead and self.good_for >= RETURN_AFTER - 1e-9
 
     @property
     def complaint(self) -> str:
         """Why the controller may not get control, for messages."""
-        if self.silence.silent:
+        if self.dead:
             last = f'; last refused: {self._last_refusal}' if self._last_refusal else ''
             return self.silence.text + last
         return f'good for only {self.good_for:.2f} s of {RETURN_AFTER:g} s'
@@ -101,7 +107,7 @@ class CommandStream:
         """Reason of a refusal and, without one, a copy within the limits."""
         stamp, tilt, thrust = command.stamp, command.tilt, command.thrust
         if not all(map(isfinite, [stamp, *tilt.tolist(), *thrust.tolist()])):
-            return 'not finite', None
+            return NOT_FINITE, None
         if now - stamp > STALE_AFTER:
             return 'stale stamp', None
         if stamp - now > AHEAD:

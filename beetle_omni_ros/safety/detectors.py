@@ -25,7 +25,6 @@ from beetle_omni_ros.safety.readings import JointWatch, MocapWatch
 from beetle_omni_ros.safety.speeds import LEAST_THRUST, SpeedWatch
 from beetle_omni_ros.safety.wrench import ContactWatch, NEAR_GROUND, WrenchWatch
 
-BUILD_UP = 0.5          # [s] five time constants of a rotor, without judgement after a pause
 NOTICEABLE = 0.3        # [N] change of a held thrust or of the pack's limit that is not reported
 MOVED = 0.02            # [rad] the same for the angle of a stuck joint
 
@@ -68,11 +67,11 @@ class FaultWatch:
         self.news: list[str] = []
         if self._pack is not None:
             self._pack.reset()
-        self.restart(-np.inf)
+        self.restart()
 
-    def restart(self, now: float) -> None:
+    def restart(self) -> None:
         """Restart the detectors after a pause or a step of the clock; detected faults stay."""
-        self._stamp, self._blind_until = -np.inf, now + BUILD_UP
+        self._stamp = -np.inf
         for watch in (self._wrench, self.contact, self._joints, self._speeds, self._mocap):
             watch.reset()
 
@@ -104,8 +103,6 @@ class FaultWatch:
         self.contact.update(min(max(dt, 0.0), 0.05), height, self._wrench)
         if height is not None and height < NEAR_GROUND:
             return      # the floor also exerts a force
-        if stamp < self._blind_until:
-            return self._wrench.forget()
         lost = self._wrench.lost
         if lost is None or not self.health.rotors[lost] or self.health.held[lost] is not None:
             return
@@ -118,8 +115,6 @@ class FaultWatch:
     def on_speeds(self, stamp: float, speed: np.ndarray) -> None:
         """Receive ESC speeds (4,) [rad/s], nan where unknown."""
         self._speeds.on_speeds(stamp, speed)
-        if stamp < self._blind_until:
-            return self._speeds.forget()
         lost, deaf, thrust = self._speeds.lost, self._speeds.deaf, self._speeds.thrust
         if lost is not None:
             self._lose_rotor(lost, stamp, 'its ESC')

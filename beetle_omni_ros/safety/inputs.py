@@ -14,7 +14,7 @@ from beetle_omni_ros.robot.allocation import ActuatorHealth, Allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import SpikeFilter
 from beetle_omni_ros.safety.backup import BackupEstimator
-from beetle_omni_ros.safety.commands import CommandStream, FROZEN, JUMP, MEANINGS, SAME, UNKNOWN
+from beetle_omni_ros.safety.commands import CommandStream, JUMP, MEANINGS, UNKNOWN
 from beetle_omni_ros.safety.detectors import FaultWatch
 from beetle_omni_ros.safety.events import Event, INFO, Silence, WARNING
 from beetle_omni_ros.safety.parameters import SupervisorParameters
@@ -101,7 +101,7 @@ class Inputs:
         self._low_for = self._empty_for = self._lost_for = 0.0
         # stamp, position and quaternion of the estimate before, accepted or not
         self._offered: tuple[float, list[float], list[float]] | None = None
-        self._same = self._same_samples = 0     # equal estimates and IMU samples in a row
+        self._same_samples = 0      # equal IMU samples in a row
         self._sample: list[float] = []
         self._spikes = SpikeFilter(FORCE_SPIKE, RATE_SPIKE)
         self._in_force: Command | None = None
@@ -145,9 +145,6 @@ class Inputs:
         before, self._offered = self._offered, (state.stamp, position, quaternion)
         if before is None:
             return ''
-        self._same = self._same + 1 if before[1:] == (position, quaternion) else 0
-        if self._same >= SAME and self.airborne:
-            return FROZEN
         if 0 < state.stamp - before[0] <= ESTIMATE_TIMEOUT and (
                 dist(before[1], position) > JUMP_POSITION
                 or rotations.geodesic_angle(before[2], quaternion) > JUMP_ATTITUDE):
@@ -314,9 +311,9 @@ class Inputs:
     @property
     def specific_force_up(self) -> float | None:
         """Latest specific force along world up by the estimator's attitude [m/s^2]."""
-        if not self.backup.samples or self.estimate is None or self.imu.silent:
+        if self.backup.sample is None or self.estimate is None or self.imu.silent:
             return None
-        return float(rotations.up(self.estimate.quaternion).dot(self.backup.samples[-1][1]))
+        return float(rotations.up(self.estimate.quaternion).dot(self.backup.sample[1]))
 
     def why_not_arm(self) -> str:
         """'' when the motors may start, else the missing condition."""
@@ -389,7 +386,7 @@ class Inputs:
             self.estimate = replace(self.estimate, stamp=min(self.estimate.stamp, now))
         self.tilt_stamp = min(self.tilt_stamp, now)
         self.backup.forget(by)
-        self.watch.restart(now)
+        self.watch.restart()
         for stream in self.streams.values():
             stream.forget()
 

@@ -163,8 +163,7 @@ class Supervisor(Inputs):
             self.watch.on_command(asked)
         if self.state in IN_FLIGHT:
             self.airborne = self.state != TAKEOFF or self._takeoff.airborne
-            self._gauge.update(command, self.best.quaternion, dt, self.specific_force_up,
-                               learn=self.state in (FLYING, FALLBACK))
+            self._gauge.update(command, self.best.quaternion, dt)
         return asked
 
     def _guarded(self, command, now):
@@ -204,10 +203,10 @@ class Supervisor(Inputs):
     def _resume(self, now, paused):
         """React to a pause of this process, in which the actuators have stopped."""
         self.watch.name('supervisor_paused', now)
-        self.watch.restart(now)
+        self.watch.restart()
         self._resumed = now
         self.say(ERROR, f'supervisor_node was not scheduled for {1000 * paused:.0f} ms: the '
-                         'actuators had stopped')
+                        'actuators had stopped')
         if self.state == FLYING:
             self._fall_back(now, ERROR, 'fallback to hover after the pause')
 
@@ -235,7 +234,7 @@ class Supervisor(Inputs):
         elif before.same_actuators(self.health):
             return
         else:
-            self._landing.set_out(now, self._in_force)
+            self._landing.set_out(self._in_force)
         if self.state == LANDING:
             self.target_override = self._landing.way
 
@@ -302,17 +301,11 @@ class Supervisor(Inputs):
     # One function for each state --------------------------------------------------------------
 
     def _stand(self, now, dt):
-        """
-        Motors off: zero thrust for a short time, then no command.
-
-        A rotor that ignores its thrust command is turned so that it presses on the floor.
-        """
+        """Motors off: zero thrust for a short time, then no command."""
         self.source = 'none'
         if self._in_state > STOP_TIME + 1e-9 or self._in_force is None:
             return None
-        tilt = np.array([own if held is None else np.copysign(np.pi, own) for own, held in zip(
-            self._in_force.tilt, self.health.held)])
-        return Command(now, tilt, np.zeros(4))
+        return Command(now, self._in_force.tilt, np.zeros(4))
 
     def _take_off(self, now, dt):
         self.source = 'hover'
@@ -331,7 +324,7 @@ class Supervisor(Inputs):
 
     def _fly(self, now, dt):
         stream = self.streams[self.active]
-        if stream.silence.silent or stream.accepted is None:
+        if stream.dead or stream.accepted is None:
             cause = ''
             if self.ekf.elapsed > 0.5 * self.ekf.limit:     # a controller answers estimates
                 cause = f' (ekf_node {self.ekf.text} too)'
@@ -421,7 +414,7 @@ class Supervisor(Inputs):
         self._hover.reset()
         self._handover_left = 0.0
         if self.state == LANDING:
-            self._landing.set_out(now, self._in_force)
+            self._landing.set_out(self._in_force)
 
     # Reports ----------------------------------------------------------------------------------
 

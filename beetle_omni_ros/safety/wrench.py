@@ -90,10 +90,6 @@ class WrenchWatch:
         self._steady, self._steady_vectors = np.zeros(6), np.zeros((2, 2 * ROTORS))
         self._waited = self.impact = 0.0
         self.unexplained = np.zeros(3)
-        self.forget()
-
-    def forget(self) -> None:
-        """Suspect no rotor."""
         self._lost_for, self._weak_for = np.zeros(ROTORS), np.zeros(ROTORS)
         self.lost: int | None = None
 
