@@ -11,7 +11,6 @@ from beetle_omni_ros.safety.events import Silence
 JUMP = 'implausible jump'
 FROZEN = 'the same numbers again'
 NOT_FINITE = 'not finite'
-UNKNOWN = 'unknown controller'
 
 TIMEOUT = 0.05          # [s] without a valid command: 5 periods of 100 Hz
 RETURN_AFTER = 0.5      # [s] of valid commands before a controller gets control (again)

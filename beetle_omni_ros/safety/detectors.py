@@ -89,8 +89,6 @@ class FaultWatch:
         thrust = clipped(command.thrust, 0.0, self._limit_now)
         self._joints.on_command(command.stamp, command.tilt)
         self._speeds.on_command(command.stamp, thrust)
-        if self._pack is not None:
-            self._pack.on_command(command.stamp, thrust)
 
     def on_imu(self, stamp: float, force: np.ndarray, rate: np.ndarray, tilt: np.ndarray | None,
                command: Command | None, height: float | None) -> None:
@@ -184,7 +182,7 @@ class FaultWatch:
         if self._map is None or self._pack is None:
             return
         self._limit_now = self._map.thrust_limit_below(voltage)
-        self._pack.on_voltage(stamp, voltage)
+        self._pack.on_voltage(stamp, voltage, self._wrench.thrust[1])
         limit, known = self._pack.limit, self.health.thrust_limit
         if limit is not None and (known is None or abs(limit - known) > NOTICEABLE):
             self.name('battery_weak', stamp, f'the pack sags to {voltage:.1f} V under load: it '

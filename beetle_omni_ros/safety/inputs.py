@@ -14,7 +14,7 @@ from beetle_omni_ros.robot.allocation import ActuatorHealth, Allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import SpikeFilter
 from beetle_omni_ros.safety.backup import BackupEstimator
-from beetle_omni_ros.safety.commands import CommandStream, JUMP, MEANINGS, UNKNOWN
+from beetle_omni_ros.safety.commands import CommandStream, JUMP, MEANINGS
 from beetle_omni_ros.safety.detectors import FaultWatch
 from beetle_omni_ros.safety.events import Event, INFO, Silence, WARNING
 from beetle_omni_ros.safety.parameters import SupervisorParameters
@@ -56,23 +56,18 @@ class Inputs:
     Checks and counts all messages, and keeps the latest data of each source.
 
     Attributes:
-        robot, allocator: the model.
-        floor: height of base_link on the ground before the flight [m].
         events: what happened, oldest first.
-        watch: the detectors.
         faults: of this flight: name -> time of detection [s].
-        streams: commands of each controller.
         active: name of the selected controller.
         estimate: the last valid one; status: of the estimator at that time.
-        ekf, joints, imu, mocap: silence of each source.
-        tilt, tilt_velocity, tilt_stamp: latest joint feedback.
-        voltage: of the pack [V], None before the first reading.
         bridges: bridge 'joint' or 'rotor' -> its reported state; a bridge that never reported has
             no influence, because without bridges the simulator gets the commands directly.
         unready: bridge -> '' while it is ready or never reported, else its node and state.
         battery_low, battery_empty, lost: pack below its voltages, robot tumbling or falling, for
             long enough.
         refused: 'estimate: stale stamp' and the like -> count.
+        floor: height of base_link on the ground before the flight [m].
+        airborne: whether the robot is in the air, by the state machine.
 
     """
 
@@ -99,15 +94,14 @@ class Inputs:
         self.unready = dict.fromkeys(NODES, '')
         self.battery_low = self.battery_empty = self.lost = False
         self._low_for = self._empty_for = self._lost_for = 0.0
-        # stamp, position and quaternion of the estimate before, accepted or not
-        self._offered: tuple[float, list[float], list[float]] | None = None
+        self._offered: State | None = None      # the estimate before, accepted or not
         self._same_samples = 0      # equal IMU samples in a row
         self._sample: list[float] = []
         self._spikes = SpikeFilter(FORCE_SPIKE, RATE_SPIKE)
         self._in_force: Command | None = None
         self.floor = 0.0
         self._now: float | None = None
-        self.airborne = False   # set by the state machine
+        self.airborne = False
 
     # Messages ---------------------------------------------------------------------------------
 
@@ -128,7 +122,7 @@ class Inputs:
         return True
 
     def _why_not(self, state, status):
-        now, position, quaternion = self._now, state.position.tolist(), state.quaternion.tolist()
+        now = self._now
         if not (isfinite(state.stamp) and plausible(
                 state.position, state.velocity, state.quaternion, state.angular_velocity)):
             return 'not finite'
@@ -142,21 +136,15 @@ class Inputs:
             return 'repeated or older stamp'
         if status not in TRACKING:
             return f"status '{status}'"
-        before, self._offered = self._offered, (state.stamp, position, quaternion)
-        if before is None:
-            return ''
-        if 0 < state.stamp - before[0] <= ESTIMATE_TIMEOUT and (
-                dist(before[1], position) > JUMP_POSITION
-                or rotations.geodesic_angle(before[2], quaternion) > JUMP_ATTITUDE):
-            return JUMP
-        return ''
+        before, self._offered = self._offered, state
+        jumped = before is not None and 0 < state.stamp - before.stamp <= ESTIMATE_TIMEOUT and (
+            dist(before.position, state.position) > JUMP_POSITION
+            or rotations.geodesic_angle(before.quaternion, state.quaternion) > JUMP_ATTITUDE)
+        return JUMP if jumped else ''
 
     def on_command(self, controller: str, command: Command, now: float) -> bool:
         """Check one command of one controller; False when it is refused (and counted)."""
-        stream = self.streams.get(controller)
-        if stream is None:
-            self.refused[UNKNOWN] += 1
-        reason = UNKNOWN if stream is None else stream.offer(command, now)
+        reason = self.streams[controller].offer(command, now)
         if reason:
             # A step to a new target causes one jump; repeated jumps end in the controller's
             # timeout.
@@ -246,7 +234,7 @@ class Inputs:
             self.watch.on_voltage(self._now, self.voltage)
         return True
 
-    def on_actuators(self, name: str, text: str, now: float) -> bool:
+    def on_actuators(self, name: str, text: str, now: float) -> None:
         """
         Receive the reported state of an actuator bridge; the next update acts on it.
 
@@ -255,16 +243,9 @@ class Inputs:
             text: 'ready', 'waiting: WHY', 'silent: WHY' or 'lost: WHY'.
             now: time [s].
 
-        Returns:
-            whether there is such a bridge.
-
         """
-        if name not in NODES:
-            self.say(WARNING, f"unknown bridge '{name}'", 'unknown bridge')
-            return False
-        state = self.bridges[name] = ' '.join(text.split()) or 'empty state'
-        self.unready[name] = '' if state == 'ready' else f'{NODES[name]} {state}'
-        return True
+        self.bridges[name] = text
+        self.unready[name] = '' if text == 'ready' else f'{NODES[name]} {text}'
 
     # What is known ----------------------------------------------------------------------------
 
@@ -289,18 +270,14 @@ class Inputs:
     @property
     def height(self) -> float | None:
         """Height of base_link above its height on the ground [m]; None if unknown."""
-        return None if self.estimate is None or self.blind else \
+        blind = self.mocap.silent if self.backup.running else self.mocap.lost
+        return None if self.estimate is None or blind else \
             float(self.best.position[2]) - self.floor
 
     @property
-    def blind(self) -> bool:
-        """Whether no MoCap pose corrects the estimate that is used."""
-        return self.mocap.silent if self.backup.running else self.mocap.lost
-
-    def seen(self, in_force: Command | None, state: State | None = None) -> State:
-        """A state for the hover controller; silent joints stand where they were asked to."""
-        state = self.known if state is None else state
-        tilt, velocity = self.tilt, self.tilt_velocity
+    def seen(self) -> State:
+        """The best state, for the hover controller; silent joints are where they were asked to."""
+        state, tilt, velocity, in_force = self.best, self.tilt, self.tilt_velocity, self._in_force
         # Joints of a bridge that lost them keep their last angles.
         if self.joints.silent and in_force is not None and not self.bridges.get(
                 'joint', '').startswith('lost:'):

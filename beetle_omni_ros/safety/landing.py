@@ -148,15 +148,14 @@ class Landing:
 
     """
 
-    def __init__(self, inputs: Inputs, hover: Fallback, gauge: SupportGauge, now: float,
-                 in_force: Command | None):
+    def __init__(self, inputs: Inputs, hover: Fallback, gauge: SupportGauge):
         self._inputs, self._hover, self._gauge = inputs, hover, gauge
         self.grounded, self.given_up = False, ''
         self._standing_for = self._still_for = self._blind_for = 0.0
         self._support = 0.0     # share of the weight that the rotors do not carry, filtered
         if 'estimator_wrong' in inputs.faults or inputs.ekf.silent:
             inputs.backup.start(inputs.known)
-        self.set_out(in_force)
+        self.set_out()
 
     @property
     def way(self) -> TrajectoryTarget:
@@ -169,15 +168,15 @@ class Landing:
                                 np.array([one.velocity for one in samples]),
                                 np.array([one.angular_velocity for one in samples]), ramp.stamp)
 
-    def step(self, now: float, dt: float, in_force: Command | None) -> Command:
+    def step(self, now: float, dt: float) -> Command:
         """The command for the present time."""
         inputs, backup = self._inputs, self._inputs.backup
         if not backup.running and inputs.ekf.silent:
             inputs.say(ERROR, f'ekf_node {inputs.ekf.text}: descent goes on with raw sensors')
             backup.start(inputs.known)
-            self.set_out(in_force)
+            self.set_out()
         if not backup.running:
-            return self._follow(inputs.seen(in_force), dt, inputs.specific_force_up
+            return self._follow(inputs.seen, dt, inputs.specific_force_up
                                 if inputs.mocap.lost else None)
         for source, name in ((inputs.mocap, 'MoCap'), (inputs.imu, 'IMU')):
             if source.silent:
@@ -187,16 +186,14 @@ class Landing:
         if self._blind_for > BLIND_LIMIT:
             self.given_up = 'no estimator, no MoCap, no IMU'
         if no_imu:
-            backup.predict(now, *self._gauge.motion(inputs.seen(in_force).tilt))
-        return self._follow(inputs.seen(in_force, inputs.best), dt,
-                            backup.specific_force_up if no_mocap else None)
+            backup.predict(now, *self._gauge.motion(inputs.seen.tilt))
+        return self._follow(inputs.seen, dt, backup.specific_force_up if no_mocap else None)
 
     # The plan ---------------------------------------------------------------------------------
 
-    def set_out(self, in_force: Command | None) -> None:
+    def set_out(self) -> None:
         """Plan the way down from the present pose, with the actuators that work."""
-        inputs = self._inputs
-        state = inputs.seen(in_force, inputs.best)
+        inputs, state = self._inputs, self._inputs.seen
         if inputs.health.healthy:
             way = plan(state.quaternion, state.tilt, inputs.allocator, LEVEL_RATE)
         else:

@@ -49,8 +49,6 @@ class Supervisor(Inputs):
         robot: the model of the robot.
         fallback: for takeoff, fallback and landing; a HoverController or similar.
         controllers: names of the controllers that may be active; None: those on standby.
-        pilot: the controller that lands with failed actuators, if it sends valid commands, else
-            the fallback; None: the registry's choice among ``controllers``.
 
     Attributes:
         state: 'disarmed', 'takeoff', 'flying', 'fallback', 'landing' or 'emergency_stop'.
@@ -60,11 +58,10 @@ class Supervisor(Inputs):
     """
 
     def __init__(self, parameters: SupervisorParameters, robot: RobotParameters,
-                 fallback: Fallback, controllers: Sequence[str] | None = None,
-                 pilot: str | None = None):
+                 fallback: Fallback, controllers: Sequence[str] | None = None):
         controllers = tuple(registry.standing_by() if controllers is None else controllers)
         super().__init__(parameters, robot, controllers)
-        self._pilot = registry.pilot(controllers) if pilot is None else pilot
+        self._pilot = registry.pilot(controllers)
         self._hover = fallback
         self._gauge = SupportGauge(self.allocator, robot)
         self._handover_left = 0.0   # after a change of the controller [s]
@@ -76,7 +73,7 @@ class Supervisor(Inputs):
         self._target: PoseTarget
         self._in_state = 0.0    # time since the last change of the state [s]
         self._acted_on = ALL_HEALTHY    # health to which landing and hover are adapted
-        self._before: float | None = None   # time of the update before [s]
+        self._before = np.inf       # time of the update before [s]
         self._resumed = -np.inf     # time of the last pause [s]
 
     # Requests ---------------------------------------------------------------------------------
@@ -86,9 +83,9 @@ class Supervisor(Inputs):
         reason = self.why_not_arm() if self.state == DISARMED else f'{self.state}, not disarmed'
         if reason:
             return self._refuse(f'arm refused: {reason}')
-        self._takeoff = Takeoff(self._parameters.takeoff_height, self.allocator, self._hover,
-                                self.seen(None))
         self._in_force = None
+        self._takeoff = Takeoff(self._parameters.takeoff_height, self.allocator, self._hover,
+                                self.seen)
         self.floor = float(self.known.position[2])
         self.watch.reset()
         self._acted_on = ALL_HEALTHY
@@ -184,44 +181,33 @@ class Supervisor(Inputs):
 
     def _look_for_faults(self, now):
         """Results of the detectors, in the air."""
-        before, self._before = self._before, now
+        paused, self._before = now - self._before, now
         if self.airborne and self.imu.lost and 'imu_frozen' not in self.faults:
             self.watch.name('imu_lost', now, f'the raw IMU is {self.imu.text}')
         while self.watch.news:
             self.say(ERROR, self.watch.news.pop(0))
         if not self.airborne:
             return
-        if before is not None and now - before > AGE_LIMIT:
-            self._resume(now, now - before)
-        elif now - self._resumed < RESUMING:
-            self._look_down(now)
-        if self.watch.contact.reason:
-            self._crash(now, self.watch.contact.reason)
+        contact, poses = self.watch.contact.reason, self.backup.poses
+        if paused > AGE_LIMIT:
+            self.watch.name('supervisor_paused', now)
+            self.watch.restart()
+            self._resumed = now
+            self.say(ERROR, f'supervisor_node was not scheduled for {1000 * paused:.0f} ms: the '
+                            'actuators had stopped')
+            if self.state == FLYING:
+                self._fall_back(now, ERROR, 'fallback to hover after the pause')
+        # Messages queued during the pause are older. The estimate may be wrong after a fall.
+        elif now - self._resumed < RESUMING and not self.mocap.silent \
+                and poses[-1][1][2] - self.floor < NEAR_GROUND:
+            contact = 'on the floor after the pause'
+        if contact and self.state == LANDING and inclination(self.best.quaternion) < ARM_TILT:
+            self._enter(DISARMED, INFO, f'on the ground, {contact}: motors off, disarmed')
+        elif contact:
+            self.watch.name('crash', now)
+            self.emergency_stop(now, f'crash: {contact}')
         elif self.health is not self._acted_on:
             self._degrade(now)
-
-    def _resume(self, now, paused):
-        """React to a pause of this process, in which the actuators have stopped."""
-        self.watch.name('supervisor_paused', now)
-        self.watch.restart()
-        self._resumed = now
-        self.say(ERROR, f'supervisor_node was not scheduled for {1000 * paused:.0f} ms: the '
-                        'actuators had stopped')
-        if self.state == FLYING:
-            self._fall_back(now, ERROR, 'fallback to hover after the pause')
-
-    def _look_down(self, now):
-        """Whether the robot lies on the floor; messages queued during the pause are older."""
-        poses = self.backup.poses       # the estimate may be wrong after a fall, MoCap is not
-        if not self.mocap.silent and poses[-1][1][2] - self.floor < NEAR_GROUND:
-            self._crash(now, 'on the floor after the pause')
-
-    def _crash(self, now, why):
-        """Motors off after a crash; a soft and upright landing is no crash."""
-        if self.state == LANDING and inclination(self.best.quaternion) < ARM_TILT:
-            return self._enter(DISARMED, INFO, f'on the ground, {why}: motors off, disarmed')
-        self.watch.name('crash', now)
-        return self.emergency_stop(now, f'crash: {why}')
 
     def _degrade(self, now):
         """Land with the working actuators, in the attitude nearest level with a margin."""
@@ -234,7 +220,7 @@ class Supervisor(Inputs):
         elif before.same_actuators(self.health):
             return
         else:
-            self._landing.set_out(self._in_force)
+            self._landing.set_out()
         if self.state == LANDING:
             self.target_override = self._landing.way
 
@@ -301,15 +287,21 @@ class Supervisor(Inputs):
     # One function for each state --------------------------------------------------------------
 
     def _stand(self, now, dt):
-        """Motors off: zero thrust for a short time, then no command."""
+        """
+        Motors off: zero thrust for a short time, then no command.
+
+        A rotor that ignores its thrust command is turned so that it presses on the floor.
+        """
         self.source = 'none'
         if self._in_state > STOP_TIME + 1e-9 or self._in_force is None:
             return None
-        return Command(now, self._in_force.tilt, np.zeros(4))
+        tilt = np.array([own if held is None else np.copysign(np.pi, own) for own, held in zip(
+            self._in_force.tilt, self.health.held)])
+        return Command(now, tilt, np.zeros(4))
 
     def _take_off(self, now, dt):
         self.source = 'hover'
-        command = self._takeoff.step(self.seen(self._in_force), dt)
+        command = self._takeoff.step(self.seen, dt)
         if self._takeoff.failure:
             self._enter(DISARMED, ERROR, f'takeoff failed: {self._takeoff.failure}')
             return self._stand(now, dt)
@@ -334,7 +326,7 @@ class Supervisor(Inputs):
                                         'to hover')
             return self._hold(now, dt)
         self.source = self.active
-        self._hover.observe(self.seen(self._in_force))
+        self._hover.observe(self.seen)
         return self._hand_over(stream.accepted)
 
     def _hand_over(self, asked):
@@ -364,11 +356,11 @@ class Supervisor(Inputs):
             self._enter(FLYING, INFO, f'{self.active}_node good again: it flies')
             return self._fly(now, dt)
         self.source = 'hover'
-        return self._hover.step(self.seen(self._in_force), self._target)
+        return self._hover.step(self.seen, self._target)
 
     def _descend(self, now, dt):
         self.source = 'hover'
-        command = self._landing.step(now, dt, self._in_force)
+        command = self._landing.step(now, dt)
         if self._landing.given_up:
             self.emergency_stop(now, self._landing.given_up)
             return self._stand(now, dt)
@@ -396,7 +388,7 @@ class Supervisor(Inputs):
             self.watch.name(name, now)
         if not self.airborne:
             return self._enter(DISARMED, severity, f'{text}; still on the ground: motors off')
-        self._landing = Landing(self, self._hover, self._gauge, now, self._in_force)
+        self._landing = Landing(self, self._hover, self._gauge)
         return self._enter(LANDING, severity, text)
 
     def _enter(self, state, severity, text):
@@ -414,7 +406,7 @@ class Supervisor(Inputs):
         self._hover.reset()
         self._handover_left = 0.0
         if self.state == LANDING:
-            self._landing.set_out(self._in_force)
+            self._landing.set_out()
 
     # Reports ----------------------------------------------------------------------------------
 

@@ -63,6 +63,7 @@ class WrenchWatch:
         lost: the rotor (0 to 3) that is missing, or None.
         impact: largest specific force of the last sample beyond the rotors' reach [m/s^2], or 0.
         supported: (4,) bool, rotors that are also slow by their ESC; set by the caller.
+        thrust: (2, 4) modelled thrusts with the shortest and with the longest lag [N].
         unexplained: (3,) filtered force that neither the rotors nor another thrust vector of one
             rotor explains, in base_link [m/s^2].
 
@@ -83,7 +84,7 @@ class WrenchWatch:
     def reset(self) -> None:
         """Reset, with stopped rotors."""
         # The first of two rows is that of the shortest lag.
-        self._thrust = np.zeros((2, ROTORS))
+        self.thrust = np.zeros((2, ROTORS))
         self._stamp: float | None = None
         self.supported = np.zeros(ROTORS, dtype=bool)
         self._measured, self._vectors = np.zeros(6), np.zeros((2, 2 * ROTORS))
@@ -108,7 +109,7 @@ class WrenchWatch:
         commanded = thrust if all(health.rotors) else np.where(health.rotors, thrust, 0.0)
         if dt > LONGEST or tilt is None:
             self.reset()
-            self._thrust = np.array([commanded] * 2)
+            self.thrust = np.array([commanded] * 2)
         else:
             self._compare(force, rate, tilt, commanded, dt)
         self._stamp, self._rate = stamp, rate
@@ -116,7 +117,7 @@ class WrenchWatch:
 
     def _compare(self, force, rate, tilt, commanded, dt):
         """Update the filters, and judge."""
-        self._thrust -= np.expm1(-dt / self._lags) * (commanded - self._thrust)
+        self.thrust -= np.expm1(-dt / self._lags) * (commanded - self.thrust)
         # Torque by the gyroscope over inertia; numpy is slower here.
         (x, y, z), (i, j, k), (a, b, c) = rate.tolist(), self._inertia, self._rate.tolist()
         measured = np.array([*force.tolist(),
@@ -124,8 +125,8 @@ class WrenchWatch:
                              (y - b) / dt + (z * (i * x) - x * (k * z)) / j,
                              (z - c) / dt + (x * (j * y) - y * (i * x)) / k])
         vectors = np.empty((2, ROTORS, 2))
-        vectors[:, :, 0] = np.cos(tilt) * self._thrust
-        vectors[:, :, 1] = np.sin(tilt) * self._thrust
+        vectors[:, :, 0] = np.cos(tilt) * self.thrust
+        vectors[:, :, 1] = np.sin(tilt) * self.thrust
         gain = 1 - exp(-dt / FILTER)
         self._measured += gain * (measured * self._weights - self._measured)
         self._vectors += gain * (vectors.reshape(2, -1) - self._vectors)
