@@ -34,7 +34,6 @@ class BackupEstimator:
         gravity: [m/s^2].
 
     Attributes:
-        running: whether :meth:`start` was called.
         specific_force_up: latest specific force along world up [m/s^2], None without IMU.
         imu_alive: set by the caller; without it rates come from MoCap.
         sample: latest IMU sample: stamp [s], specific force (3,), rate (3,) in base_link, or None.
@@ -48,7 +47,7 @@ class BackupEstimator:
         self._quaternion, self._rate = np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3)
         self.imu_alive = True
         self.poses: deque = deque(maxlen=KEPT_POSES)
-        self.running = False
+        self.running = False    # whether it is used; set to False by the caller
         self.specific_force_up: float | None = None
         self.forget()
 
@@ -60,17 +59,14 @@ class BackupEstimator:
         if self.running:
             self._stamp -= by
 
-    def stop(self) -> None:
-        """Reset the state; samples and poses stay."""
-        self.running, self.specific_force_up = False, None
-
     def add(self, stamp: float, specific_force: np.ndarray, rate: np.ndarray) -> bool:
         """Store one raw sample; False when it is not newer than the last."""
         if self.sample is not None and not stamp > self.sample[0]:
             return False
         self.sample = stamp, specific_force, rate
-        if self.running:
-            self._use(stamp, specific_force, rate)
+        if self.running and stamp > self._stamp:
+            self._rate = rate
+            self._advance(stamp, specific_force)
         return True
 
     def correct(self, stamp: float, position: np.ndarray, quaternion: np.ndarray) -> None:
@@ -96,12 +92,9 @@ class BackupEstimator:
 
     def start(self, state: State) -> None:
         """Continue from the last valid estimate."""
-        self.stop()
-        self.running = True
-        self._stamp = state.stamp
+        self.running, self._stamp, self._rate = True, state.stamp, state.angular_velocity
         self._position, self._velocity = state.position, state.velocity
-        self._quaternion, self._rate = rotations.normalized(state.quaternion), \
-            state.angular_velocity
+        self._quaternion = rotations.normalized(state.quaternion)
 
     @property
     def velocity_by_poses(self) -> np.ndarray | None:
@@ -113,10 +106,11 @@ class BackupEstimator:
 
     def predict(self, now: float, force: np.ndarray, turning: np.ndarray) -> None:
         """Advance to ``now`` without IMU, by specific force (3,) and turning (3,) of the model."""
-        self.specific_force_up, dt = None, now - self._stamp
+        dt = now - self._stamp
         if dt > 0:
             self._rate = self._rate + min(dt, LONGEST_STEP) * turning
-            self._advance(now, rotations.matrix(self._quaternion) @ force + self._gravity)
+            self._advance(now, force)
+        self.specific_force_up = None
 
     def state(self, now: float, other: State) -> State:
         """The estimate at ``now``, extrapolated by at most the longest step; joints of another."""
@@ -126,18 +120,11 @@ class BackupEstimator:
                        velocity=self._velocity, quaternion=rotations.normalized(attitude),
                        angular_velocity=self._rate)
 
-    def _use(self, stamp, force, rate):
-        if stamp <= self._stamp:
-            return
-        self._rate = rate
+    def _advance(self, stamp, force):
+        dt = min(stamp - self._stamp, LONGEST_STEP)
         in_world = rotations.matrix(self._quaternion).dot(force)
         self.specific_force_up = float(in_world[2])
-        self._advance(stamp, in_world + self._gravity)
-
-    def _advance(self, stamp, acceleration):
-        dt = min(stamp - self._stamp, LONGEST_STEP)
-        if dt <= 0:
-            return
+        acceleration = in_world + self._gravity
         self._position = self._position + dt * self._velocity + 0.5 * dt * dt * acceleration
         self._velocity = self._velocity + dt * acceleration
         self._quaternion = rotations.normalized(rotations.multiply(

@@ -21,10 +21,6 @@ TILT_STEP = 2.0         # [rad] a single larger jump is a spike: the joint would
 THRUST_STEP = 15.0      # [N] the same for thrust, three quarters of the range
 SAME = 10               # commands in a row that are equal to the last digit
 
-MEANINGS = {    # of reasons for refusals that do not explain themselves
-    FROZEN: f' (more than {SAME} equal commands in a row count as a frozen controller; compute '
-            'the command from the state, see docs/safety.md)'}
-
 
 class CommandStream:
     """

@@ -22,7 +22,7 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.thrust_map import ThrustMap
 from beetle_omni_ros.safety.pack import PackWatch
 from beetle_omni_ros.safety.readings import JointWatch, MocapWatch
-from beetle_omni_ros.safety.speeds import LEAST_THRUST, SpeedWatch
+from beetle_omni_ros.safety.speeds import SpeedWatch
 from beetle_omni_ros.safety.wrench import ContactWatch, NEAR_GROUND, WrenchWatch
 
 NOTICEABLE = 0.3        # [N] change of a held thrust or of the pack's limit that is not reported
@@ -104,11 +104,7 @@ class FaultWatch:
         lost = self._wrench.lost
         if lost is None or not self.health.rotors[lost] or self.health.held[lost] is not None:
             return
-        # A rotor that holds its thrust also gives less than commanded, while more is asked.
-        if self._speeds.suspected[lost] and self._speeds.thrust[lost] > LEAST_THRUST:
-            self._hold(lost, stamp)
-        else:
-            self._lose_rotor(lost, stamp, 'the wrench')
+        self._lose_rotor(lost, stamp, 'the wrench')
 
     def on_speeds(self, stamp: float, speed: np.ndarray) -> None:
         """Receive ESC speeds (4,) [rad/s], nan where unknown."""
@@ -116,18 +112,13 @@ class FaultWatch:
         lost, deaf, thrust = self._speeds.lost, self._speeds.deaf, self._speeds.thrust
         if lost is not None:
             self._lose_rotor(lost, stamp, 'its ESC')
-        if deaf is not None and self.health.rotors[deaf]:
-            self._hold(deaf, stamp)
+        if deaf is not None and self.health.rotors[deaf] and self.name(
+                f'rotor{deaf + 1}_deaf', stamp, f'rotor {deaf + 1} does not follow its commands, '
+                f'by its ESC; it gives {thrust[deaf]:.1f} N'):
+            self._set('held', deaf, min(float(thrust[deaf]), self._thrust_max))
         for rotor, held in enumerate(self.health.held):
             if held is not None and abs(thrust[rotor] - held) > NOTICEABLE:
                 self._set('held', rotor, min(max(float(thrust[rotor]), 0.0), self._thrust_max))
-
-    def _hold(self, rotor, stamp):
-        """The rotor keeps a thrust that does not depend on its command."""
-        thrust = float(self._speeds.thrust[rotor])
-        if self.name(f'rotor{rotor + 1}_deaf', stamp, f'rotor {rotor + 1} does not follow its '
-                     f'commands, by its ESC; it gives {thrust:.1f} N'):
-            self._set('held', rotor, min(max(thrust, 0.0), self._thrust_max))
 
     def _lose_rotor(self, rotor, stamp, by):
         if self.name(f'rotor{rotor + 1}_lost', stamp, f'rotor {rotor + 1} gives less thrust than '
@@ -166,12 +157,8 @@ class FaultWatch:
         watch.on_pose(stamp, position, quaternion, state)
         if watch.frozen:
             self.name('mocap_frozen', stamp, 'MoCap repeats the same pose')
-        elif watch.displaced:
-            self.name('mocap_jumped', stamp, 'the position of MoCap jumped, and the IMU does not '
-                      'show it')
         elif watch.contradicts and watch.jumped:
-            self.name('mocap_flipped', stamp, 'the attitude of MoCap jumped, and the gyroscope '
-                      'does not show it')
+            self.name('mocap_jumped', stamp, 'MoCap jumped, and the IMU does not show it')
         elif watch.contradicts:
             self.name('estimator_wrong', stamp, 'the estimate contradicts MoCap, which did not '
                       'jump')

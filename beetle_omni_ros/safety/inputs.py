@@ -14,7 +14,7 @@ from beetle_omni_ros.robot.allocation import ActuatorHealth, Allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import SpikeFilter
 from beetle_omni_ros.safety.backup import BackupEstimator
-from beetle_omni_ros.safety.commands import CommandStream, JUMP, MEANINGS
+from beetle_omni_ros.safety.commands import CommandStream, JUMP
 from beetle_omni_ros.safety.detectors import FaultWatch
 from beetle_omni_ros.safety.events import Event, INFO, Silence, WARNING
 from beetle_omni_ros.safety.parameters import SupervisorParameters
@@ -149,8 +149,7 @@ class Inputs:
             # A step to a new target causes one jump; repeated jumps end in the controller's
             # timeout.
             self.say(INFO if reason == JUMP else WARNING,
-                      f'{controller}_node: command refused: {reason}{MEANINGS.get(reason, "")}',
-                      f'{controller}: {reason}')
+                     f'{controller}_node: command refused: {reason}', f'{controller}: {reason}')
         return not reason
 
     def on_joints(self, stamp: float, position: np.ndarray,

@@ -259,7 +259,7 @@ class Supervisor(Inputs):
             return 'estimator_lost', f'ekf_node {self.ekf.text}{why}: controlled descent on raw ' \
                                      'sensors'
         if 'mocap_jumped' in self.faults:
-            return '', 'the position of MoCap jumped: landing'
+            return '', 'MoCap jumped: landing'
         if self.mocap.lost and self.mocap.elapsed > MOCAP_PATIENCE:
             return 'mocap_lost', f'MoCap {self.mocap.text}: landing by dead reckoning'
         if no_joints:
@@ -394,8 +394,7 @@ class Supervisor(Inputs):
     def _enter(self, state, severity, text):
         self.state, self._in_state, self.target_override = state, 0.0, None
         if state in (DISARMED, STOPPED):
-            self.backup.stop()
-            self.airborne = False
+            self.backup.running = self.airborne = False
         if state == FLYING:
             self._handover_left = HANDOVER_TIME
         self.say(severity, text)

@@ -69,7 +69,7 @@ def test_landing_and_fallback_end_in_time(monkeypatch):
     assert rig.supervisor.state == 'emergency_stop'
 
 
-@pytest.mark.parametrize('wrong, fault', [('mocap', 'mocap_flipped'),
+@pytest.mark.parametrize('wrong, fault', [('mocap', 'mocap_jumped'),
                                           ('estimate', 'estimator_wrong')])
 def test_a_turn_of_the_markers_or_of_the_estimate_is_named_and_leads_to_a_landing(wrong, fault):
     rig = flown()
