@@ -83,7 +83,6 @@ class Takeoff:
         failure: '' or the reason of an abort.
         done: whether the height is reached.
         airborne: whether it has left the ground.
-        target: (3,) position at its end [m].
 
     """
 
@@ -92,7 +91,7 @@ class Takeoff:
         self._tilt = np.clip(state.tilt, -allocator.tilt_limit, allocator.tilt_limit)
         self._goal_tilt = allocator.hover(state.quaternion, self._tilt).tilt
         self._rise = max(height - state.position[2], CLEARANCE)
-        self.target = state.position + np.array([0.0, 0.0, self._rise])
+        self._end = state.position + np.array([0.0, 0.0, self._rise])
         self._ramp: Ramp | None = None
         self._aligned_for = self._climbed_for = 0.0
         self.failure, self.done, self.airborne = '', False, False
@@ -128,7 +127,7 @@ class Takeoff:
     def _judge(self, state, over):
         if over < 0:
             return
-        if np.linalg.norm(state.position - self.target) < NEAR \
+        if np.linalg.norm(state.position - self._end) < NEAR \
                 and np.linalg.norm(state.velocity) < SLOW:
             self.done = True
         elif over > PATIENCE:

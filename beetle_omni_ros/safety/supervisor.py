@@ -36,8 +36,7 @@ MOCAP_PATIENCE = 1.5    # [s] of dead reckoning until landing; its velocity erro
                         # and grows
 RECOVERY_TIME = 1.0     # [s] in which a landing stops a tumble of 15 rad/s
 FENCE_MARGIN = 2.0      # [m] farther outside the fence a landing is a flyaway: motors off
-LANDING_LIMIT = 90.0    # [s] from the margin above the fence it takes 74 s, and levelling and
-                        # turning two joints over 14 s
+LANDING_LIMIT = 90.0    # [s] from the margin above the fence it takes 74 s, and levelling 4 s
 
 
 class Supervisor(Inputs):
@@ -311,19 +310,15 @@ class Supervisor(Inputs):
                 self._enter(FLYING, INFO, f'takeoff done: {self.active} flies')
             else:
                 self._fall_back(now, WARNING, f'takeoff done, but {self.active}_node '
-                                f'{stream.complaint}: hover waits for it', self._takeoff.target)
+                                f'{stream.complaint}: hover waits for it')
         return command
 
     def _fly(self, now, dt):
         stream = self.streams[self.active]
         if stream.dead or stream.accepted is None:
-            cause = ''
-            if self.ekf.elapsed > 0.5 * self.ekf.limit:     # a controller answers estimates
-                cause = f' (ekf_node {self.ekf.text} too)'
-            else:
-                self.watch.name('controller_silent', now)
-            self._fall_back(now, ERROR, f'{self.active}_node {stream.complaint}{cause}: fallback '
-                                        'to hover')
+            self.watch.name('controller_silent', now)
+            self._fall_back(now, ERROR,
+                            f'{self.active}_node {stream.complaint}: fallback to hover')
             return self._hold(now, dt)
         self.source = self.active
         self._hover.observe(self.seen)
@@ -376,11 +371,9 @@ class Supervisor(Inputs):
 
     # Changes of state -------------------------------------------------------------------------
 
-    def _fall_back(self, now, severity, text, position=None):
-        """Hover at the present pose, or at ``position``."""
-        state = self.known
-        self._target = PoseTarget(state.position if position is None else position,
-                                  state.quaternion, now)
+    def _fall_back(self, now, severity, text):
+        """Hover at the present pose."""
+        self._target = PoseTarget(self.known.position, self.known.quaternion, now)
         self._enter(FALLBACK, severity, text)
 
     def _land(self, now, severity, text, name=''):
