@@ -10,7 +10,7 @@ import numpy as np
 
 from beetle_omni_ros.control.base import Command, corrected, State
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.allocation import ActuatorHealth, Allocator
+from beetle_omni_ros.robot.allocation import ActuatorHealth, Allocator, ROTORS
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import SpikeFilter
 from beetle_omni_ros.safety.backup import BackupEstimator
@@ -67,6 +67,7 @@ class Inputs:
             long enough.
         refused: 'estimate: stale stamp' and the like -> count.
         floor: height of base_link on the ground before the flight [m].
+        thrusts: (4,) modelled with the rotors' lag [N].
         airborne: whether the robot is in the air, by the state machine.
 
     """
@@ -99,7 +100,7 @@ class Inputs:
         self._sample: list[float] = []
         self._spikes = SpikeFilter(FORCE_SPIKE, RATE_SPIKE)
         self._in_force: Command | None = None
-        self.floor = 0.0
+        self.floor, self.thrusts = 0.0, np.zeros(ROTORS)
         self._now: float | None = None
         self.airborne = False
 

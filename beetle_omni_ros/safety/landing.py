@@ -1,15 +1,13 @@
 """Takeoff and landing, stepped by the supervisor: the way up, and the one way down."""
 
 from dataclasses import replace
-from math import exp
 
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, Fallback, State, TrajectoryTarget
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.allocation import Allocator, ROTORS
+from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.degraded import Holding
-from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.events import ERROR
 from beetle_omni_ros.safety.inputs import Inputs
 from beetle_omni_ros.safety.way import climb, inclination, plan, Ramp, Way
@@ -40,39 +38,6 @@ FELT = 0.1              # [s] time constant of this share
 GROUND_TIME = 0.3       # [s] of both; the rotors need 0.1 s to settle
 STILL_TIME = 1.0        # [s] without sinking until the ground is detected without IMU
 AHEAD, BETWEEN = 20.0, 0.1      # [s] length and spacing of the published way
-
-
-class SupportGauge:
-    """Share of the weight that the rotors do not carry, from commands and accelerometer."""
-
-    def __init__(self, allocator: Allocator, robot: RobotParameters):
-        self._allocator, self._robot = allocator, robot
-        self._lift = 0.0    # modelled thrust along world up, in weights
-        self._thrusts = np.zeros(ROTORS)    # modelled thrust of each rotor [N]
-        # The last command and its force: a controller is slower than the supervisor.
-        self._command: Command | None = None
-        self._force = np.zeros(3)
-
-    def update(self, command: Command | None, quaternion: np.ndarray, dt: float) -> None:
-        """Update in one tick."""
-        share, gravity = 1.0 - exp(-dt / self._robot.rotors.time_constant), self._robot.gravity
-        self._thrusts += share * ((0.0 if command is None else command.thrust) - self._thrusts)
-        if command is not self._command:
-            self._command = command
-            self._force = np.zeros(3) if command is None else \
-                self._allocator.wrench(command.tilt, command.thrust)[0]
-        up = float(rotations.up(quaternion).dot(self._force)) / self._allocator.mass / gravity
-        self._lift += share * (up - self._lift)
-
-    def motion(self, tilt: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Specific force (3,) and angular acceleration (3,) by the rotors at true tilts (4,)."""
-        force, torque = self._allocator.wrench(tilt, self._thrusts)
-        return force / self._allocator.mass, torque / self._robot.inertia
-
-    def support(self, specific_force_up: float | None) -> float:
-        """Share of the weight that the rotors do not carry."""
-        felt = 1.0 if specific_force_up is None else specific_force_up / self._robot.gravity
-        return felt - self._lift
 
 
 class Takeoff:
@@ -115,8 +80,9 @@ class Takeoff:
         error = np.abs(state.tilt - self._goal_tilt)
         if error.max() < ALIGNED and np.array_equal(self._tilt, self._goal_tilt):
             level = rotations.from_rpy(0.0, 0.0, rotations.to_rpy(state.quaternion)[2])
+            turn = max(rotations.geodesic_angle(level, state.quaternion) / GROUND_RATE, 1e-9)
             self._ramp = Ramp(0.0, self._start.position,
-                              Way.straight(state.quaternion, level, GROUND_RATE),
+                              Way(np.array([0.0, turn]), np.array([state.quaternion, level])),
                               climb(self._rise, CLIMB_SPEED, ACCELERATION))
         elif self._aligned_for > ALIGN_PATIENCE:
             k = int(error.argmax())
@@ -147,8 +113,8 @@ class Landing:
 
     """
 
-    def __init__(self, inputs: Inputs, hover: Fallback, gauge: SupportGauge):
-        self._inputs, self._hover, self._gauge = inputs, hover, gauge
+    def __init__(self, inputs: Inputs, hover: Fallback):
+        self._inputs, self._hover = inputs, hover
         self.grounded, self.given_up = False, ''
         self._standing_for = self._still_for = self._blind_for = 0.0
         self._support = 0.0     # share of the weight that the rotors do not carry, filtered
@@ -185,7 +151,8 @@ class Landing:
         if self._blind_for > BLIND_LIMIT:
             self.given_up = 'no estimator, no MoCap, no IMU'
         if no_imu:
-            backup.predict(now, *self._gauge.motion(inputs.seen.tilt))
+            force, torque = inputs.allocator.wrench(inputs.seen.tilt, inputs.thrusts)
+            backup.predict(now, force / inputs.allocator.mass, torque / inputs.robot.inertia)
         return self._follow(inputs.seen, dt, backup.specific_force_up if no_mocap else None)
 
     # The plan ---------------------------------------------------------------------------------
@@ -239,9 +206,12 @@ class Landing:
         blind = backup.running and not backup.imu_alive
         by_poses = backup.velocity_by_poses if blind else None
         still = abs(state.velocity[2] if by_poses is None else by_poses[2]) < STILL_SPEED
+        model, gravity = self._inputs.allocator, self._inputs.robot.gravity
+        force, _ = model.wrench(state.tilt, self._inputs.thrusts)
+        lift = float(rotations.up(state.quaternion).dot(force)) / model.mass
+        felt = gravity if specific_force_up is None else specific_force_up
         # The accelerometer jitters on the floor, by more than the weight with idle rotors.
-        self._support += min(1.0, dt / FELT) * (
-            self._gauge.support(specific_force_up) - self._support)
+        self._support += min(1.0, dt / FELT) * ((felt - lift) / gravity - self._support)
         sinking = speed < -0.5 * SPEED
         stands = sinking and self._support > CARRIED and (still or specific_force_up is not None)
         self._standing_for = self._standing_for + dt if stands else 0.0

@@ -7,6 +7,7 @@ and the in-process evaluation run the same code with the same results. See docs/
 
 from collections.abc import Sequence
 from dataclasses import replace
+from math import exp
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.commands import within_limits
 from beetle_omni_ros.safety.events import Answer, ERROR, INFO, WARNING
 from beetle_omni_ros.safety.inputs import ARM_TILT, Inputs
-from beetle_omni_ros.safety.landing import Landing, SupportGauge, Takeoff
+from beetle_omni_ros.safety.landing import Landing, Takeoff
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.way import inclination
 from beetle_omni_ros.safety.wrench import NEAR_GROUND
@@ -62,7 +63,6 @@ class Supervisor(Inputs):
         super().__init__(parameters, robot, controllers)
         self._pilot = registry.pilot(controllers)
         self._hover = fallback
-        self._gauge = SupportGauge(self.allocator, robot)
         self._handover_left = 0.0   # after a change of the controller [s]
         self.state, self.source = DISARMED, 'none'
         self.target_override: Target | None = None
@@ -159,7 +159,8 @@ class Supervisor(Inputs):
             self.watch.on_command(asked)
         if self.state in IN_FLIGHT:
             self.airborne = self.state != TAKEOFF or self._takeoff.airborne
-            self._gauge.update(command, self.best.quaternion, dt)
+            share = 1 - exp(-dt / self.robot.rotors.time_constant)
+            self.thrusts += share * ((0.0 if command is None else command.thrust) - self.thrusts)
         return asked
 
     def _guarded(self, command, now):
@@ -381,7 +382,7 @@ class Supervisor(Inputs):
             self.watch.name(name, now)
         if not self.airborne:
             return self._enter(DISARMED, severity, f'{text}; still on the ground: motors off')
-        self._landing = Landing(self, self._hover, self._gauge)
+        self._landing = Landing(self, self._hover)
         return self._enter(LANDING, severity, text)
 
     def _enter(self, state, severity, text):

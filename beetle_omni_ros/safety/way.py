@@ -57,12 +57,6 @@ class Way:
                        for a, b in zip(quaternions[:-1], quaternions[1:])]
         self.duration = float(times[-1])    # until rest [s]
 
-    @classmethod
-    def straight(cls, start: np.ndarray, goal: np.ndarray, rate: float) -> Way:
-        """The shortest turn between two attitudes (4,) at ``rate`` [rad/s]."""
-        angle = rotations.geodesic_angle(goal, start)
-        return cls(np.array([0.0, max(angle / rate, 1e-9)]), np.array([start, goal]))
-
     def at(self, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
         """Attitude (4,) and body rate (3,) [rad/s], ``elapsed`` [s] after the start."""
         times = self._times

@@ -79,7 +79,7 @@ KNOTS = [climb(0.8, 0.4, 0.5), climb(0.1, 0.4, 0.5), [(0.0, 0.0), (0.5, 0.0), (0
 
 @pytest.mark.parametrize('knots', KNOTS)
 def test_velocities_of_a_ramp_are_the_derivatives_of_its_pose(knots):
-    way, h = Way.straight(ATTITUDES[2], UPSIDE_DOWN[1], 0.8), 1e-5
+    way, h = Way(np.array([0.0, 3.0]), np.array([ATTITUDES[2], UPSIDE_DOWN[1]])), 1e-5
     ramp = Ramp(10.0, np.array([1.0, 2.0, 3.0]), way, knots)
     for time in np.linspace(10.03, 16.03, 61):
         before, now, after = (ramp.at(t) for t in (time - h, time, time + h))
