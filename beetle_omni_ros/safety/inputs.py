@@ -221,7 +221,7 @@ class Inputs:
                 return False
         self.backup.correct(stamp, position, quaternion)
         if self.airborne and self.imu.silent:
-            self.watch.contact.on_pose(stamp, position, self.height)
+            self.watch.contact.on_pose(stamp, position, quaternion, self.height)
         self.mocap.reset()
         return True
 

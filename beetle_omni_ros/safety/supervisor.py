@@ -317,7 +317,8 @@ class Supervisor(Inputs):
     def _fly(self, now, dt):
         stream = self.streams[self.active]
         if stream.dead or stream.accepted is None:
-            self.watch.name('controller_silent', now)
+            if self.ekf.elapsed <= 0.5 * self.ekf.limit:    # a controller answers estimates
+                self.watch.name('controller_silent', now)
             self._fall_back(now, ERROR,
                             f'{self.active}_node {stream.complaint}: fallback to hover')
             return self._hold(now, dt)

@@ -8,6 +8,7 @@ import numpy as np
 from beetle_omni_ros.robot.allocation import ActuatorHealth, Allocator, ROTORS
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.servo import Responses
+from beetle_omni_ros.safety.way import inclination
 
 LONGEST = 0.05          # [s] between two IMU samples; a longer gap resets the filters
 TINY = 1e-12            # squared difference of two models that are equal
@@ -41,6 +42,7 @@ SUPPORT_TIME = 0.15     # [s]
 USUAL = 1.0             # [s] time constant of the learnt steady push in the air
 # Without IMU: change of the velocity that is an impact, three deviations of published MoCap noise
 BUMP = 1.2              # [m/s]
+TIPPED, LOW = 0.5, 0.12     # [rad], [m] above the standing height: it touches the floor
 SPAN, LONGEST_TRACK = 3, 0.12   # poses of either velocity; [s] of both
 
 
@@ -217,8 +219,11 @@ class ContactWatch:
         if self._for >= SUPPORT_TIME and not self.reason:
             self.reason = f'{push:.1f} of the weight are carried by something else'
 
-    def on_pose(self, stamp: float, position: np.ndarray, height: float | None) -> None:
-        """Detect an impact by MoCap alone, if there is no IMU; ``height`` as in :meth:`update`."""
+    def on_pose(self, stamp: float, position: np.ndarray, quaternion: np.ndarray,
+                height: float | None) -> None:
+        """Detect a crash by MoCap alone, if there is no IMU; ``height`` as in :meth:`update`."""
+        if height is not None and height < LOW and inclination(quaternion) > TIPPED:
+            self.reason = 'tipped over at the floor'
         self._track.append((stamp, position))
         (t, a), (u, b), (v, c) = self._track[0], self._track[len(self._track) // 2], \
             self._track[-1]
