@@ -154,7 +154,7 @@ class Inputs:
         return not reason
 
     def on_joints(self, stamp: float, position: np.ndarray,
-                  velocity: np.ndarray | None) -> bool:
+                  velocity: np.ndarray | None) -> None:
         """
         Receive raw joint feedback (4,), nan where unknown: there the last angle is kept.
 
@@ -162,7 +162,7 @@ class Inputs:
         """
         known = np.abs(position) < ABSURD
         if not stamp > self.tilt_stamp or self._ahead(stamp) or not known.any():
-            return False
+            return
         self.tilt = np.where(known, self.watch.health.true(position), self.tilt)
         self.tilt_velocity = np.zeros(4) if velocity is None else \
             np.where(known & np.isfinite(velocity), velocity, 0.0)
@@ -173,44 +173,39 @@ class Inputs:
             self.watch.on_joints(stamp, position, self.airborne)
             if self.watch.health.zeros != zeros:    # also of this reading
                 self.tilt = self.watch.health.true(position)
-        return True
 
     def on_imu(self, stamp: float, specific_force: np.ndarray,
-               angular_velocity: np.ndarray) -> bool:
+               angular_velocity: np.ndarray) -> None:
         """Receive a raw IMU sample (3,), (3,) in base_link."""
         if not plausible(specific_force, angular_velocity) or self._ahead(stamp):
-            return False
+            return
         values = specific_force.tolist() + angular_velocity.tolist()
         self._same_samples = self._same_samples + 1 if values == self._sample else 0
         self._sample = values
         if self._same_samples >= IMU_FROZEN and self.airborne:
             self.watch.name('imu_frozen', stamp, 'the IMU repeats the same sample')
-            return False
+            return
         if not self._spikes.passes(specific_force, angular_velocity) \
                 or not self.backup.add(stamp, specific_force, angular_velocity):
-            return False
+            return
         self.imu.reset()
         if self.airborne:
             known = stamp - self.tilt_stamp < TILT_AGE
             self.watch.on_imu(stamp, specific_force, angular_velocity,
                               self.tilt if known else None, self._in_force, self.height)
-        return True
 
-    def on_rotors(self, stamp: float, speed: np.ndarray) -> bool:
+    def on_rotors(self, stamp: float, speed: np.ndarray) -> None:
         """Receive the rotor speeds (4,) reported by the ESCs [rad/s], nan where unknown."""
-        if self._ahead(stamp):
-            return False
-        if self.airborne:
+        if self.airborne and not self._ahead(stamp):
             self.watch.on_speeds(stamp, speed)
-        return True
 
-    def on_mocap(self, stamp: float, position: np.ndarray, quaternion: np.ndarray) -> bool:
+    def on_mocap(self, stamp: float, position: np.ndarray, quaternion: np.ndarray) -> None:
         """Receive a raw MoCap pose (3,), (4,) of base_link."""
         poses = self.backup.poses
         if not plausible(position, quaternion) or self._ahead(stamp) \
                 or abs(quaternion.dot(quaternion) - 1) > UNIT_TOLERANCE \
                 or poses and not stamp > poses[-1][0]:
-            return False
+            return
         quaternion = rotations.normalized(quaternion)
         poses.append((stamp, position, quaternion))
         if self.airborne:
@@ -218,21 +213,17 @@ class Inputs:
             near = state is not None and abs(state.stamp - stamp) < POSE_AGE
             good = self.watch.on_mocap(stamp, position, quaternion, state if near else None)
             if not good and 'estimator_wrong' not in self.watch.faults:
-                return False
+                return
         self.backup.correct(stamp, position, quaternion)
         if self.airborne and self.imu.silent:
             self.watch.contact.on_pose(stamp, position, quaternion, self.height)
         self.mocap.reset()
-        return True
 
-    def on_battery(self, voltage: float) -> bool:
-        """Receive the pack voltage under load [V]; refused if not finite, negative or absurd."""
-        if not 0 <= voltage < VOLTAGE_END:
-            return False
-        self.voltage = float(voltage)
-        if self._now is not None:
+    def on_battery(self, voltage: float) -> None:
+        """Receive the pack voltage under load [V]; ignored if not finite, negative or absurd."""
+        if self._now is not None and 0 <= voltage < VOLTAGE_END:
+            self.voltage = float(voltage)
             self.watch.on_voltage(self._now, self.voltage)
-        return True
 
     def on_actuators(self, name: str, text: str, now: float) -> None:
         """

@@ -6,7 +6,7 @@ import pytest
 from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.thrust_map import ThrustMap
-from beetle_omni_ros.safety.pack import PackWatch
+from beetle_omni_ros.safety.detectors import PackWatch
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.simulator import Battery
 
