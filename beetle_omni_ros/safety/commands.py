@@ -19,7 +19,7 @@ AHEAD = 0.02            # [s] a stamp farther in the future comes from another c
 OVERSTEP = 0.25         # [-] of a range: 5 N, 1 rad. A wrong unit exceeds it by a factor of 3
 TILT_STEP = 2.0         # [rad] a single larger jump is a spike: the joint would need 0.2 s
 THRUST_STEP = 15.0      # [N] the same for thrust, three quarters of the range
-SAME = 10               # commands in a row that are equal to the last digit
+SAME = 10               # commands or estimates in a row that are equal to the last digit
 
 
 class CommandStream:

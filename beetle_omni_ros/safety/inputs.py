@@ -14,7 +14,7 @@ from beetle_omni_ros.robot.allocation import ActuatorHealth, Allocator, ROTORS
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import SpikeFilter
 from beetle_omni_ros.safety.backup import BackupEstimator
-from beetle_omni_ros.safety.commands import CommandStream, JUMP
+from beetle_omni_ros.safety.commands import CommandStream, FROZEN, JUMP, SAME
 from beetle_omni_ros.safety.detectors import FaultWatch
 from beetle_omni_ros.safety.events import Event, INFO, Silence, WARNING
 from beetle_omni_ros.safety.parameters import SupervisorParameters
@@ -96,7 +96,7 @@ class Inputs:
         self.battery_low = self.battery_empty = self.lost = False
         self._low_for = self._empty_for = self._lost_for = 0.0
         self._offered: State | None = None      # the estimate before, accepted or not
-        self._same_samples = 0      # equal IMU samples in a row
+        self._same = self._same_samples = 0     # equal estimates and IMU samples in a row
         self._sample: list[float] = []
         self._spikes = SpikeFilter(FORCE_SPIKE, RATE_SPIKE)
         self._in_force: Command | None = None
@@ -138,6 +138,10 @@ class Inputs:
         if status not in TRACKING:
             return f"status '{status}'"
         before, self._offered = self._offered, state
+        self._same = self._same + 1 if before is not None and np.array_equal(
+            before.position, state.position) else 0
+        if self._same >= SAME and self.airborne:
+            return FROZEN
         jumped = before is not None and 0 < state.stamp - before.stamp <= ESTIMATE_TIMEOUT and (
             dist(before.position, state.position) > JUMP_POSITION
             or rotations.geodesic_angle(before.quaternion, state.quaternion) > JUMP_ATTITUDE)

@@ -13,6 +13,7 @@ import numpy as np
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import Command, Fallback, PoseTarget, Target
+from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import ALL_HEALTHY, NO_ZEROS, ROTORS
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.commands import within_limits
@@ -31,6 +32,7 @@ STOP_TIME = 0.3         # [s] zero thrust is sent for this time, then nothing
 HANDOVER_TIME = 0.3     # [s] longest duration: half a turn of a joint
 TILT_RATE = 9.0         # [rad/s] as in hover.yaml: below the servos' 10
 THRUST_RATE = 300.0     # [N/s] as in hover.yaml: 3 N a period
+TURN_TIME = 0.2         # [s] of the present turn until it ends
 RESUMING = 0.1          # [s] after a pause until every source has sent a message again
 FALLBACK_TIME = 30.0    # [s] of fallback until landing; enough to restart a controller
 MOCAP_PATIENCE = 1.5    # [s] of dead reckoning until landing; its velocity error is then 0.1 m/s
@@ -374,8 +376,10 @@ class Supervisor(Inputs):
     # Changes of state -------------------------------------------------------------------------
 
     def _fall_back(self, now, severity, text):
-        """Hover at the present pose."""
-        self._target = PoseTarget(self.known.position, self.known.quaternion, now)
+        """Hover at the present position, in the attitude in which the present turn ends."""
+        turn = rotations.exp(TURN_TIME * self.known.angular_velocity)
+        self._target = PoseTarget(self.known.position, rotations.multiply(
+            self.known.quaternion, turn), now)
         self._enter(FALLBACK, severity, text)
 
     def _land(self, now, severity, text, name=''):
