@@ -83,6 +83,10 @@ class Reference:
     velocity: np.ndarray
     angular_velocity: np.ndarray
 
+    def at(self, time: float) -> Reference:
+        """Itself, at any time: a reference is also a target."""
+        return self
+
 
 @dataclass(frozen=True)
 class PoseTarget:

@@ -257,9 +257,9 @@ class Watcher:
 
     def __init__(self, flight: Flight):
         """Start now."""
-        envelope = SupervisorParameters.load().envelope
+        own = SupervisorParameters.load()
         self._flight, self._plan = flight, flight.plan
-        self._fence = np.array([envelope.half_width, envelope.half_width, envelope.height])
+        self._fence = np.array([own.fence_half_width, own.fence_half_width, own.fence_height])
         self._place, self._start = flight.simulator.truth.position.copy(), flight.simulator.time
         self._past_events = len(flight.supervisor.events)
         self._past_faults = set(flight.supervisor.faults)

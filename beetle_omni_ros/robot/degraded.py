@@ -340,10 +340,6 @@ class Holding:
             + self._unheld_angle(self.directions[firm]) / levelling_rate
         return leaned(quaternion, self.directions[firm[np.argmin(time)]])
 
-    def unheld_angle(self, quaternion: np.ndarray) -> float:
-        """Part of the turn from an attitude (4,) to level that cannot be held [rad]."""
-        return float(self._unheld_angle(up(quaternion)[None])[0])
-
     def _attainable(self, margin):
         """Limit a margin [m/s^2, rad/s^2] to 80 % of the largest one."""
         return min(margin, NEARLY * float(self.margins.max()))

@@ -4,9 +4,8 @@ The backup estimator, used when the EKF has failed.
 It starts from the last valid estimate and is deliberately simpler than the EKF, so that both do
 not fail for the same reason. It integrates gyroscope and accelerometer. MoCap poses correct
 position, velocity and attitude with fixed gains; each pose is compared with the state
-extrapolated back to its capture time. Without MoCap, position and velocity are dead reckoning, and
-the velocity slowly decays to the desired velocity, so that a descent stays slow. Without IMU the
-rotor model is used between MoCap poses.
+extrapolated back to its capture time. Without MoCap, position and velocity are dead reckoning.
+Without IMU the rotor model is used between MoCap poses.
 """
 
 from collections import deque
@@ -18,14 +17,12 @@ import numpy as np
 from beetle_omni_ros.control.base import State
 from beetle_omni_ros.robot import rotations
 
-KEPT_SAMPLES = 100      # IMU samples before the failure: 0.5 s at 200 Hz
 KEPT_POSES = 12         # MoCap poses from which the velocity is computed
 POSES_TIME = 0.1        # [s] older poses are not used for it
 LONGEST_STEP = 0.1      # [s] longest integrated gap in the samples
 POSITION_BANDWIDTH = 8.0    # [rad/s] MoCap of 1 mm and 100 Hz leaves 2 cm/s of velocity noise
 ATTITUDE_BANDWIDTH = 5.0    # [rad/s]
 WITHOUT_GYROSCOPE = 12.0    # [rad/s] bandwidth of attitude and rate without IMU
-LEAK_TIME = 3.0         # [s] 0.1 m/s^2 of unknown bias then costs at most 0.3 m/s
 LARGEST_ERROR = 0.2     # [m or rad] larger MoCap corrections are limited to this
 
 
@@ -37,10 +34,9 @@ class BackupEstimator:
         gravity: [m/s^2].
 
     Attributes:
-        running: whether :meth:`start` was called.
         specific_force_up: latest specific force along world up [m/s^2], None without IMU.
         imu_alive: set by the caller; without it rates come from MoCap.
-        samples: latest IMU samples: stamp [s], specific force (3,), rate (3,) in base_link.
+        sample: latest IMU sample: stamp [s], specific force (3,), rate (3,) in base_link, or None.
         poses: latest MoCap poses: stamp [s], position (3,), quaternion (4,).
 
     """
@@ -50,31 +46,27 @@ class BackupEstimator:
         self._stamp, self._position, self._velocity = -np.inf, np.zeros(3), np.zeros(3)
         self._quaternion, self._rate = np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3)
         self.imu_alive = True
-        self.samples: deque = deque(maxlen=KEPT_SAMPLES)
         self.poses: deque = deque(maxlen=KEPT_POSES)
-        self.running = False
+        self.running = False    # whether it is used; set to False by the caller
         self.specific_force_up: float | None = None
         self.forget()
 
     def forget(self, by: float = 0.0) -> None:
         """Accept new stamps after the clock was set back by ``by`` [s]."""
-        self.samples.clear()
+        self.sample: tuple[float, np.ndarray, np.ndarray] | None = None
         self.poses.clear()
         self._used_at = -np.inf
         if self.running:
             self._stamp -= by
 
-    def stop(self) -> None:
-        """Reset the state; samples and poses stay."""
-        self.running, self.specific_force_up = False, None
-
     def add(self, stamp: float, specific_force: np.ndarray, rate: np.ndarray) -> bool:
         """Store one raw sample; False when it is not newer than the last."""
-        if self.samples and not stamp > self.samples[-1][0]:
+        if self.sample is not None and not stamp > self.sample[0]:
             return False
-        self.samples.append((stamp, specific_force, rate))
-        if self.running:
-            self._use(stamp, specific_force, rate)
+        self.sample = stamp, specific_force, rate
+        if self.running and stamp > self._stamp:
+            self._rate = rate
+            self._advance(stamp, specific_force)
         return True
 
     def correct(self, stamp: float, position: np.ndarray, quaternion: np.ndarray) -> None:
@@ -99,25 +91,10 @@ class BackupEstimator:
             self._quaternion, rotations.exp(min(1.0, gain * dt) * turn)))
 
     def start(self, state: State) -> None:
-        """Continue from the last valid estimate, with the samples since then."""
-        self.stop()
-        self.running = True
-        self._stamp = state.stamp
+        """Continue from the last valid estimate."""
+        self.running, self._stamp, self._rate = True, state.stamp, state.angular_velocity
         self._position, self._velocity = state.position, state.velocity
-        self._quaternion, self._rate = rotations.normalized(state.quaternion), \
-            state.angular_velocity
-        for sample in self.samples:
-            self._use(*sample)
-
-    def start_from_poses(self, estimate: State) -> None:
-        """Continue from MoCap and IMU only, if the estimate is wrong."""
-        velocity = self.velocity_by_poses
-        if velocity is None:
-            return self.start(estimate)
-        stamp, position, quaternion = self.poses[-1]
-        rate = self.samples[-1][2] if self.samples else np.zeros(3)
-        self.start(replace(estimate, stamp=stamp, position=position, velocity=velocity,
-                           quaternion=quaternion, angular_velocity=rate))
+        self._quaternion = rotations.normalized(state.quaternion)
 
     @property
     def velocity_by_poses(self) -> np.ndarray | None:
@@ -127,25 +104,13 @@ class BackupEstimator:
             return None
         return (poses[-1][1] - poses[0][1]) / (poses[-1][0] - poses[0][0])
 
-    def predict(self, now: float, desired_velocity: np.ndarray | None = None,
-                motion: tuple[np.ndarray, np.ndarray] | None = None) -> None:
-        """
-        Advance to ``now`` without a sample.
-
-        While MoCap is lost, the velocity (3,) [m/s] decays to the desired one. While the IMU is
-        gone, specific force (3,) and angular acceleration (3,) of the model replace it.
-        """
+    def predict(self, now: float, force: np.ndarray, turning: np.ndarray) -> None:
+        """Advance to ``now`` without IMU, by specific force (3,) and turning (3,) of the model."""
         dt = now - self._stamp
-        if desired_velocity is not None and dt > 0:
-            self._velocity = self._velocity + min(1.0, dt / LEAK_TIME) \
-                * (desired_velocity - self._velocity)
-        if not self.imu_alive:
-            self.specific_force_up = None
-            if motion is None or dt <= 0:
-                return self._advance(now, np.zeros(3))
-            force, turning = motion
+        if dt > 0:
             self._rate = self._rate + min(dt, LONGEST_STEP) * turning
-            self._advance(now, rotations.matrix(self._quaternion) @ force + self._gravity)
+            self._advance(now, force)
+        self.specific_force_up = None
 
     def state(self, now: float, other: State) -> State:
         """The estimate at ``now``, extrapolated by at most the longest step; joints of another."""
@@ -155,18 +120,11 @@ class BackupEstimator:
                        velocity=self._velocity, quaternion=rotations.normalized(attitude),
                        angular_velocity=self._rate)
 
-    def _use(self, stamp, force, rate):
-        if stamp <= self._stamp:
-            return
-        self._rate = rate
+    def _advance(self, stamp, force):
+        dt = min(stamp - self._stamp, LONGEST_STEP)
         in_world = rotations.matrix(self._quaternion).dot(force)
         self.specific_force_up = float(in_world[2])
-        self._advance(stamp, in_world + self._gravity)
-
-    def _advance(self, stamp, acceleration):
-        dt = min(stamp - self._stamp, LONGEST_STEP)
-        if dt <= 0:
-            return
+        acceleration = in_world + self._gravity
         self._position = self._position + dt * self._velocity + 0.5 * dt * dt * acceleration
         self._velocity = self._velocity + dt * acceleration
         self._quaternion = rotations.normalized(rotations.multiply(

@@ -1,33 +1,25 @@
-"""Commands of the controllers: their checks, and the transition from one to another."""
+"""Checks of the commands of the controllers, and of the one that is sent."""
 
 from collections import Counter
 from math import isfinite
 
-import numpy as np
-
-from beetle_omni_ros.control.base import Command, ROTORS
+from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.robot.allocation import clipped
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.events import Silence
-from beetle_omni_ros.safety.parameters import CommandLimits
 
 JUMP = 'implausible jump'
 FROZEN = 'the same numbers again'
-UNKNOWN = 'unknown controller'
+NOT_FINITE = 'not finite'
 
+TIMEOUT = 0.05          # [s] without a valid command: 5 periods of 100 Hz
+RETURN_AFTER = 0.5      # [s] of valid commands before a controller gets control (again)
 STALE_AFTER = 0.05      # [s] a command computed from an older state is refused
 AHEAD = 0.02            # [s] a stamp farther in the future comes from another clock
 OVERSTEP = 0.25         # [-] of a range: 5 N, 1 rad. A wrong unit exceeds it by a factor of 3
 TILT_STEP = 2.0         # [rad] a single larger jump is a spike: the joint would need 0.2 s
 THRUST_STEP = 15.0      # [N] the same for thrust, three quarters of the range
 SAME = 10               # commands or estimates in a row that are equal to the last digit
-HANDOVER_TIME = 0.3     # [s] longest duration: half a turn of a joint
-TILT_RATE = 9.0         # [rad/s] as in hover.yaml: below the servos' 10
-THRUST_RATE = 300.0     # [N/s] as in hover.yaml: 3 N a period
-
-MEANINGS = {    # of reasons for refusals that do not explain themselves
-    FROZEN: f' (more than {SAME} equal commands in a row count as a frozen controller; compute '
-            'the command from the state, see docs/safety.md)'}
 
 
 class CommandStream:
@@ -35,7 +27,6 @@ class CommandStream:
     Commands of one controller: the last accepted one, and refusals with reasons.
 
     Args:
-        limits: thresholds.
         robot: thrust and tilt ranges.
 
     Attributes:
@@ -47,30 +38,34 @@ class CommandStream:
 
     """
 
-    def __init__(self, limits: CommandLimits, robot: RobotParameters):
-        self._return_after = limits.return_after
+    def __init__(self, robot: RobotParameters):
         self._tilt_limit = robot.joints.position_limit
         self._low, self._high = robot.rotors.thrust_min, robot.rotors.thrust_max
         self.accepted: Command | None = None
         self.clipped, self.refused = 0, Counter[str]()
         self._last_refusal = ''
-        self.silence = Silence(limits.timeout)
+        self.silence = Silence(TIMEOUT)
         self.good_for = 0.0
         self._offered: Command | None = None
         self._same = 0
 
     @property
+    def dead(self) -> bool:
+        """Whether it loses control: it is silent, or its last command is not finite."""
+        return self.silence.silent or self._last_refusal == NOT_FINITE
+
+    @property
     def good(self) -> bool:
         """Whether the controller may get control."""
-        return not self.silence.silent and self.good_for >= self._return_after - 1e-9
+        return not self.dead and self.good_for >= RETURN_AFTER - 1e-9
 
     @property
     def complaint(self) -> str:
         """Why the controller may not get control, for messages."""
-        if self.silence.silent:
+        if self.dead:
             last = f'; last refused: {self._last_refusal}' if self._last_refusal else ''
             return self.silence.text + last
-        return f'good for only {self.good_for:.2f} s of {self._return_after:g} s'
+        return f'good for only {self.good_for:.2f} s of {RETURN_AFTER:g} s'
 
     def offer(self, command: Command, now: float) -> str:
         """
@@ -107,7 +102,7 @@ class CommandStream:
         """Reason of a refusal and, without one, a copy within the limits."""
         stamp, tilt, thrust = command.stamp, command.tilt, command.thrust
         if not all(map(isfinite, [stamp, *tilt.tolist(), *thrust.tolist()])):
-            return 'not finite', None
+            return NOT_FINITE, None
         if now - stamp > STALE_AFTER:
             return 'stale stamp', None
         if stamp - now > AHEAD:
@@ -137,55 +132,13 @@ class CommandStream:
         return '', clean
 
 
-class Handover:
-    """
-    Limits the rate of the command after a change of the controller.
-
-    A controller on standby has similar commands, but in a large turn the commands may differ. The
-    limit ends when the new command is reached, or after HANDOVER_TIME.
-
-    Attributes:
-        left: remaining time, set to HANDOVER_TIME after a change of the controller [s].
-
-    """
-
-    left = 0.0
-
-    def limit(self, asked: Command, in_force: Command | None) -> Command:
-        """Return ``asked``, limited to the permitted change from ``in_force``."""
-        if self.left <= 0 or in_force is None:
-            return asked
-        step = asked.stamp - in_force.stamp
-        if step <= 0:       # a command for this state was already executed
-            return in_force
-        self.left -= step
-        change = np.concatenate([asked.tilt - in_force.tilt, asked.thrust - in_force.thrust])
-        reach = step * np.repeat([TILT_RATE, THRUST_RATE], ROTORS)
-        if (np.abs(change) <= reach).all():
-            self.left = 0.0
-            return asked
-        change = np.clip(change, -reach, reach)
-        return Command(asked.stamp, in_force.tilt + change[:ROTORS],
-                       in_force.thrust + change[ROTORS:])
-
-
-def within_limits(command: Command, robot: RobotParameters, stopped: bool = False) -> \
-        Command | None:
-    """
-    Final check of the output: finite and clipped to the limits, or None.
-
-    Args:
-        command: of any source.
-        robot: thrust and tilt ranges.
-        stopped: whether zero thrust is intended, below the smallest thrust in flight.
-
-    """
+def within_limits(command: Command, robot: RobotParameters) -> Command | None:
+    """Final check of the output: finite and clipped to the limits, or None."""
     if not all(map(isfinite, [*command.tilt.tolist(), *command.thrust.tolist()])):
         return None
     limit = robot.joints.position_limit
-    low, high = 0.0 if stopped else robot.rotors.thrust_min, robot.rotors.thrust_max
     return Command(command.stamp, clipped(command.tilt, -limit, limit),
-                   clipped(command.thrust, low, high))
+                   clipped(command.thrust, 0.0, robot.rotors.thrust_max))
 
 
 def _farthest(a, b):

@@ -18,16 +18,20 @@ from beetle_omni_ros.robot.allocation import (
     clipped,
     ROTORS,
 )
+from beetle_omni_ros.robot.degraded import sphere
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.thrust_map import ThrustMap
-from beetle_omni_ros.safety.pack import PackWatch
 from beetle_omni_ros.safety.readings import JointWatch, MocapWatch
-from beetle_omni_ros.safety.speeds import LEAST_THRUST, SpeedWatch
+from beetle_omni_ros.safety.speeds import SpeedWatch
 from beetle_omni_ros.safety.wrench import ContactWatch, NEAR_GROUND, WrenchWatch
 
-BUILD_UP = 0.5          # [s] five time constants of a rotor, without judgement after a pause
 NOTICEABLE = 0.3        # [N] change of a held thrust or of the pack's limit that is not reported
 MOVED = 0.02            # [rad] the same for the angle of a stuck joint
+# Of the pack
+DIRECTIONS = 200        # of up in the body, with a computed hover load, 14 deg apart
+STEPS = 500             # between no and full thrust, for the thrust of all rotors together
+LEAST = 1.0             # [V] a smaller reading is that of a disconnected sensor
+TIME = 0.2              # [s] three readings; full thrust in a manoeuvre is shorter
 
 
 class FaultWatch:
@@ -68,11 +72,11 @@ class FaultWatch:
         self.news: list[str] = []
         if self._pack is not None:
             self._pack.reset()
-        self.restart(-np.inf)
+        self.restart()
 
-    def restart(self, now: float) -> None:
+    def restart(self) -> None:
         """Restart the detectors after a pause or a step of the clock; detected faults stay."""
-        self._stamp, self._blind_until = -np.inf, now + BUILD_UP
+        self._stamp = -np.inf
         for watch in (self._wrench, self.contact, self._joints, self._speeds, self._mocap):
             watch.reset()
 
@@ -90,8 +94,6 @@ class FaultWatch:
         thrust = clipped(command.thrust, 0.0, self._limit_now)
         self._joints.on_command(command.stamp, command.tilt)
         self._speeds.on_command(command.stamp, thrust)
-        if self._pack is not None:
-            self._pack.on_command(command.stamp, thrust)
 
     def on_imu(self, stamp: float, force: np.ndarray, rate: np.ndarray, tilt: np.ndarray | None,
                command: Command | None, height: float | None) -> None:
@@ -104,37 +106,24 @@ class FaultWatch:
         self.contact.update(min(max(dt, 0.0), 0.05), height, self._wrench)
         if height is not None and height < NEAR_GROUND:
             return      # the floor also exerts a force
-        if stamp < self._blind_until:
-            return self._wrench.forget()
         lost = self._wrench.lost
         if lost is None or not self.health.rotors[lost] or self.health.held[lost] is not None:
             return
-        # A rotor that holds its thrust also gives less than commanded, while more is asked.
-        if self._speeds.suspected[lost] and self._speeds.thrust[lost] > LEAST_THRUST:
-            self._hold(lost, stamp)
-        else:
-            self._lose_rotor(lost, stamp, 'the wrench')
+        self._lose_rotor(lost, stamp, 'the wrench')
 
     def on_speeds(self, stamp: float, speed: np.ndarray) -> None:
         """Receive ESC speeds (4,) [rad/s], nan where unknown."""
         self._speeds.on_speeds(stamp, speed)
-        if stamp < self._blind_until:
-            return self._speeds.forget()
         lost, deaf, thrust = self._speeds.lost, self._speeds.deaf, self._speeds.thrust
         if lost is not None:
             self._lose_rotor(lost, stamp, 'its ESC')
-        if deaf is not None and self.health.rotors[deaf]:
-            self._hold(deaf, stamp)
+        if deaf is not None and self.health.rotors[deaf] and self.name(
+                f'rotor{deaf + 1}_deaf', stamp, f'rotor {deaf + 1} does not follow its commands, '
+                f'by its ESC; it gives {thrust[deaf]:.1f} N'):
+            self._set('held', deaf, min(float(thrust[deaf]), self._thrust_max))
         for rotor, held in enumerate(self.health.held):
             if held is not None and abs(thrust[rotor] - held) > NOTICEABLE:
                 self._set('held', rotor, min(max(float(thrust[rotor]), 0.0), self._thrust_max))
-
-    def _hold(self, rotor, stamp):
-        """The rotor keeps a thrust that does not depend on its command."""
-        thrust = float(self._speeds.thrust[rotor])
-        if self.name(f'rotor{rotor + 1}_deaf', stamp, f'rotor {rotor + 1} does not follow its '
-                     f'commands, by its ESC; it gives {thrust:.1f} N'):
-            self._set('held', rotor, min(max(thrust, 0.0), self._thrust_max))
 
     def _lose_rotor(self, rotor, stamp, by):
         if self.name(f'rotor{rotor + 1}_lost', stamp, f'rotor {rotor + 1} gives less thrust than '
@@ -173,12 +162,8 @@ class FaultWatch:
         watch.on_pose(stamp, position, quaternion, state)
         if watch.frozen:
             self.name('mocap_frozen', stamp, 'MoCap repeats the same pose')
-        elif watch.displaced:
-            self.name('mocap_jumped', stamp, 'the position of MoCap jumped, and the IMU does not '
-                      'show it')
         elif watch.contradicts and watch.jumped:
-            self.name('mocap_flipped', stamp, 'the attitude of MoCap jumped, and the gyroscope '
-                      'does not show it')
+            self.name('mocap_jumped', stamp, 'MoCap jumped, and the IMU does not show it')
         elif watch.contradicts:
             self.name('estimator_wrong', stamp, 'the estimate contradicts MoCap, which did not '
                       'jump')
@@ -189,7 +174,7 @@ class FaultWatch:
         if self._map is None or self._pack is None:
             return
         self._limit_now = self._map.thrust_limit_below(voltage)
-        self._pack.on_voltage(stamp, voltage)
+        self._pack.on_voltage(stamp, voltage, self._wrench.thrust[1])
         limit, known = self._pack.limit, self.health.thrust_limit
         if limit is not None and (known is None or abs(limit - known) > NOTICEABLE):
             self.name('battery_weak', stamp, f'the pack sags to {voltage:.1f} V under load: it '
@@ -201,3 +186,55 @@ class FaultWatch:
         old = getattr(self.health, field)
         self.health = replace(self.health, **{  # type: ignore[arg-type]
             field: (*old[:index], value, *old[index + 1:])})
+
+
+class PackWatch:
+    """
+    A pack is weak if its voltage allows less thrust than the most demanding attitude needs.
+
+    A rotor draws power with thrust to the power of 1.5, so the voltage under load is ``V = rest -
+    drop * load / V`` with the load being the sum of those powers. With the highest voltage of the
+    flight as ``rest``, a reading gives ``drop``, and this the thrust of all rotors together.
+
+    Args:
+        robot: nominal robot.
+        allocator: of the robot.
+        rotor_map: thrust limits by voltage.
+
+    Attributes:
+        limit: thrust that all rotors can give at the same time [N], None while the pack is strong
+            enough; it only falls.
+
+    """
+
+    def __init__(self, robot: RobotParameters, allocator: Allocator, rotor_map: ThrustMap):
+        self._map, self._thrust_max = rotor_map, robot.rotors.thrust_max
+        _, thrusts = allocator.upright(sphere(DIRECTIONS))
+        self._need = min(float(thrusts.max()), self._thrust_max)
+        self.reset()
+
+    def reset(self) -> None:
+        """Reset for a new flight, perhaps with another pack."""
+        self.limit: float | None = None
+        self._rest, self._read_at, self._weak_for = 0.0, -np.inf, 0.0
+
+    def on_voltage(self, stamp: float, voltage: float, thrust: np.ndarray) -> None:
+        """Receive a reading [V] under modelled thrusts (4,) [N]."""
+        since, self._read_at = min(stamp - self._read_at, 1.0), stamp
+        if since <= 0 or voltage < LEAST:
+            return
+        self._rest = max(self._rest, voltage)
+        allowed, load = float(self._map.thrust_limit_below(voltage)), float((thrust ** 1.5).sum())
+        self._weak_for = self._weak_for + since if allowed < self._need else 0.0
+        if self.limit is not None:
+            self.limit = min(self.limit, allowed)
+        elif self._weak_for > TIME and load > 0:
+            self.limit = min(allowed, self._together(voltage * (self._rest - voltage) / load))
+
+    def _together(self, drop):
+        """Thrust [N] that all rotors can give at the same time."""
+        thrusts = np.linspace(0.0, self._thrust_max, STEPS)
+        # V (rest - V) = drop * load; beyond the pack's largest power V is half of rest.
+        voltages = 0.5 * (self._rest + np.sqrt(np.maximum(
+            self._rest ** 2 - 4 * drop * ROTORS * thrusts ** 1.5, 0.0)))
+        return float(thrusts[self._map.thrust_limit_below(voltages) >= thrusts].max())

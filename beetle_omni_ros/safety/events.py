@@ -1,14 +1,12 @@
 """Outputs of the supervisor: events, answers to requests, and timeouts of sources."""
 
-from dataclasses import dataclass
 from math import inf
+from typing import NamedTuple
 
 INFO, WARNING, ERROR = 'info', 'warning', 'error'
-QUIET_TIME = 1.0    # [s] the same message is logged once in this time
 
 
-@dataclass(frozen=True)
-class Event:
+class Event(NamedTuple):
     """An event for the log: time [s], severity, and one line with node and outcome."""
 
     stamp: float
@@ -16,8 +14,7 @@ class Event:
     text: str
 
 
-@dataclass(frozen=True)
-class Answer:
+class Answer(NamedTuple):
     """The answer to a request: granted or not, with the reason."""
 
     ok: bool
@@ -26,22 +23,6 @@ class Answer:
     def __bool__(self):
         """Whether the request was granted."""
         return self.ok
-
-
-class EventLog(list):
-    """A list of events that does not repeat itself."""
-
-    def __init__(self):
-        super().__init__()
-        self._said: dict[str, float] = {}
-
-    def say(self, stamp: float, severity: str, text: str, key: str | None = None) -> None:
-        """Add one event; with a ``key``, not again within the quiet time."""
-        if key is not None:
-            if abs(stamp - self._said.get(key, -inf)) < QUIET_TIME:
-                return
-            self._said[key] = stamp
-        self.append(Event(stamp, severity, text))
 
 
 class Silence:

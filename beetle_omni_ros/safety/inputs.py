@@ -10,13 +10,13 @@ import numpy as np
 
 from beetle_omni_ros.control.base import Command, corrected, State
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.allocation import ActuatorHealth, Allocator
+from beetle_omni_ros.robot.allocation import ActuatorHealth, Allocator, ROTORS
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import SpikeFilter
 from beetle_omni_ros.safety.backup import BackupEstimator
-from beetle_omni_ros.safety.commands import CommandStream, FROZEN, JUMP, MEANINGS, SAME, UNKNOWN
+from beetle_omni_ros.safety.commands import CommandStream, FROZEN, JUMP, SAME
 from beetle_omni_ros.safety.detectors import FaultWatch
-from beetle_omni_ros.safety.events import EventLog, INFO, Silence, WARNING
+from beetle_omni_ros.safety.events import Event, INFO, Silence, WARNING
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.way import inclination
 
@@ -43,6 +43,7 @@ ARM_TILT, ARM_SPEED, ARM_RATE = 0.35, 0.3, 0.5  # [rad] 20 deg, on its side it c
 LOW_TIME = 2.0          # [s] of a low voltage, longer than the sag of one manoeuvre
 TUMBLING, FALLING = 15.0, 6.0   # [rad/s]; [m/s] after 1.8 m of free fall
 LOST_TIME = 0.3         # [s] of either
+QUIET_TIME = 1.0        # [s] in which the same message is logged once
 
 
 def plausible(*arrays: np.ndarray) -> bool:
@@ -55,23 +56,19 @@ class Inputs:
     Checks and counts all messages, and keeps the latest data of each source.
 
     Attributes:
-        robot, allocator: the model.
-        floor: height of base_link on the ground before the flight [m].
         events: what happened, oldest first.
-        watch: the detectors.
         faults: of this flight: name -> time of detection [s].
-        streams: commands of each controller.
         active: name of the selected controller.
         estimate: the last valid one; status: of the estimator at that time.
-        ekf, joints, imu, mocap: silence of each source.
-        tilt, tilt_velocity, tilt_stamp: latest joint feedback.
-        voltage: of the pack [V], None before the first reading.
         bridges: bridge 'joint' or 'rotor' -> its reported state; a bridge that never reported has
             no influence, because without bridges the simulator gets the commands directly.
         unready: bridge -> '' while it is ready or never reported, else its node and state.
         battery_low, battery_empty, lost: pack below its voltages, robot tumbling or falling, for
             long enough.
         refused: 'estimate: stale stamp' and the like -> count.
+        floor: height of base_link on the ground before the flight [m].
+        thrusts: (4,) modelled with the rotors' lag [N].
+        airborne: whether the robot is in the air, by the state machine.
 
     """
 
@@ -79,9 +76,11 @@ class Inputs:
                  controllers: tuple[str, ...]):
         self._parameters, self.robot = parameters, robot
         self.allocator = Allocator(robot)
-        self.events, self.watch = EventLog(), FaultWatch(robot, self.allocator)
+        self.events: list[Event] = []
+        self._said: dict[str, float] = {}   # when the events with a key were last added [s]
+        self.watch = FaultWatch(robot, self.allocator)
         self.faults = self.watch.faults
-        self.streams = {name: CommandStream(parameters.commands, robot) for name in controllers}
+        self.streams = {name: CommandStream(robot) for name in controllers}
         self.active = parameters.controller if parameters.controller in controllers \
             else controllers[0]
         self.backup = BackupEstimator(robot.gravity)
@@ -96,15 +95,14 @@ class Inputs:
         self.unready = dict.fromkeys(NODES, '')
         self.battery_low = self.battery_empty = self.lost = False
         self._low_for = self._empty_for = self._lost_for = 0.0
-        # stamp, position and quaternion of the estimate before, accepted or not
-        self._offered: tuple[float, list[float], list[float]] | None = None
+        self._offered: State | None = None      # the estimate before, accepted or not
         self._same = self._same_samples = 0     # equal estimates and IMU samples in a row
         self._sample: list[float] = []
         self._spikes = SpikeFilter(FORCE_SPIKE, RATE_SPIKE)
         self._in_force: Command | None = None
-        self.floor = 0.0
+        self.floor, self.thrusts = 0.0, np.zeros(ROTORS)
         self._now: float | None = None
-        self.airborne = False   # set by the state machine
+        self.airborne = False
 
     # Messages ---------------------------------------------------------------------------------
 
@@ -115,17 +113,17 @@ class Inputs:
         if reason:
             self.refused[f'estimate: {reason}'] += 1
             self.last_refusal = reason
-            self._say(WARNING, f'ekf_node: estimate refused: {reason}', reason)
+            self.say(WARNING, f'ekf_node: estimate refused: {reason}', reason)
             return False
         if status not in (self.status, 'tracking'):
-            self._say(WARNING, f"ekf_node reports '{status}'")
+            self.say(WARNING, f"ekf_node reports '{status}'")
         self.estimate, self.status, self.last_refusal = true, status, ''
         self.ekf.reset()
         self.on_joints(state.tilt_stamp, state.tilt, state.tilt_velocity)
         return True
 
     def _why_not(self, state, status):
-        now, position, quaternion = self._now, state.position.tolist(), state.quaternion.tolist()
+        now = self._now
         if not (isfinite(state.stamp) and plausible(
                 state.position, state.velocity, state.quaternion, state.angular_velocity)):
             return 'not finite'
@@ -139,34 +137,28 @@ class Inputs:
             return 'repeated or older stamp'
         if status not in TRACKING:
             return f"status '{status}'"
-        before, self._offered = self._offered, (state.stamp, position, quaternion)
-        if before is None:
-            return ''
-        self._same = self._same + 1 if before[1:] == (position, quaternion) else 0
+        before, self._offered = self._offered, state
+        self._same = self._same + 1 if before is not None and np.array_equal(
+            before.position, state.position) else 0
         if self._same >= SAME and self.airborne:
             return FROZEN
-        if 0 < state.stamp - before[0] <= ESTIMATE_TIMEOUT and (
-                dist(before[1], position) > JUMP_POSITION
-                or rotations.geodesic_angle(before[2], quaternion) > JUMP_ATTITUDE):
-            return JUMP
-        return ''
+        jumped = before is not None and 0 < state.stamp - before.stamp <= ESTIMATE_TIMEOUT and (
+            dist(before.position, state.position) > JUMP_POSITION
+            or rotations.geodesic_angle(before.quaternion, state.quaternion) > JUMP_ATTITUDE)
+        return JUMP if jumped else ''
 
     def on_command(self, controller: str, command: Command, now: float) -> bool:
         """Check one command of one controller; False when it is refused (and counted)."""
-        stream = self.streams.get(controller)
-        if stream is None:
-            self.refused[UNKNOWN] += 1
-        reason = UNKNOWN if stream is None else stream.offer(command, now)
+        reason = self.streams[controller].offer(command, now)
         if reason:
             # A step to a new target causes one jump; repeated jumps end in the controller's
             # timeout.
-            self._say(INFO if reason == JUMP else WARNING,
-                      f'{controller}_node: command refused: {reason}{MEANINGS.get(reason, "")}',
-                      f'{controller}: {reason}')
+            self.say(INFO if reason == JUMP else WARNING,
+                     f'{controller}_node: command refused: {reason}', f'{controller}: {reason}')
         return not reason
 
     def on_joints(self, stamp: float, position: np.ndarray,
-                  velocity: np.ndarray | None) -> bool:
+                  velocity: np.ndarray | None) -> None:
         """
         Receive raw joint feedback (4,), nan where unknown: there the last angle is kept.
 
@@ -174,7 +166,7 @@ class Inputs:
         """
         known = np.abs(position) < ABSURD
         if not stamp > self.tilt_stamp or self._ahead(stamp) or not known.any():
-            return False
+            return
         self.tilt = np.where(known, self.watch.health.true(position), self.tilt)
         self.tilt_velocity = np.zeros(4) if velocity is None else \
             np.where(known & np.isfinite(velocity), velocity, 0.0)
@@ -185,44 +177,39 @@ class Inputs:
             self.watch.on_joints(stamp, position, self.airborne)
             if self.watch.health.zeros != zeros:    # also of this reading
                 self.tilt = self.watch.health.true(position)
-        return True
 
     def on_imu(self, stamp: float, specific_force: np.ndarray,
-               angular_velocity: np.ndarray) -> bool:
+               angular_velocity: np.ndarray) -> None:
         """Receive a raw IMU sample (3,), (3,) in base_link."""
         if not plausible(specific_force, angular_velocity) or self._ahead(stamp):
-            return False
+            return
         values = specific_force.tolist() + angular_velocity.tolist()
         self._same_samples = self._same_samples + 1 if values == self._sample else 0
         self._sample = values
         if self._same_samples >= IMU_FROZEN and self.airborne:
             self.watch.name('imu_frozen', stamp, 'the IMU repeats the same sample')
-            return False
+            return
         if not self._spikes.passes(specific_force, angular_velocity) \
                 or not self.backup.add(stamp, specific_force, angular_velocity):
-            return False
+            return
         self.imu.reset()
         if self.airborne:
             known = stamp - self.tilt_stamp < TILT_AGE
             self.watch.on_imu(stamp, specific_force, angular_velocity,
                               self.tilt if known else None, self._in_force, self.height)
-        return True
 
-    def on_rotors(self, stamp: float, speed: np.ndarray) -> bool:
+    def on_rotors(self, stamp: float, speed: np.ndarray) -> None:
         """Receive the rotor speeds (4,) reported by the ESCs [rad/s], nan where unknown."""
-        if self._ahead(stamp):
-            return False
-        if self.airborne:
+        if self.airborne and not self._ahead(stamp):
             self.watch.on_speeds(stamp, speed)
-        return True
 
-    def on_mocap(self, stamp: float, position: np.ndarray, quaternion: np.ndarray) -> bool:
+    def on_mocap(self, stamp: float, position: np.ndarray, quaternion: np.ndarray) -> None:
         """Receive a raw MoCap pose (3,), (4,) of base_link."""
         poses = self.backup.poses
         if not plausible(position, quaternion) or self._ahead(stamp) \
                 or abs(quaternion.dot(quaternion) - 1) > UNIT_TOLERANCE \
                 or poses and not stamp > poses[-1][0]:
-            return False
+            return
         quaternion = rotations.normalized(quaternion)
         poses.append((stamp, position, quaternion))
         if self.airborne:
@@ -230,23 +217,19 @@ class Inputs:
             near = state is not None and abs(state.stamp - stamp) < POSE_AGE
             good = self.watch.on_mocap(stamp, position, quaternion, state if near else None)
             if not good and 'estimator_wrong' not in self.watch.faults:
-                return False
+                return
         self.backup.correct(stamp, position, quaternion)
         if self.airborne and self.imu.silent:
-            self.watch.contact.on_pose(stamp, position, self.height)
+            self.watch.contact.on_pose(stamp, position, quaternion, self.height)
         self.mocap.reset()
-        return True
 
-    def on_battery(self, voltage: float) -> bool:
-        """Receive the pack voltage under load [V]; refused if not finite, negative or absurd."""
-        if not 0 <= voltage < VOLTAGE_END:
-            return False
-        self.voltage = float(voltage)
-        if self._now is not None:
+    def on_battery(self, voltage: float) -> None:
+        """Receive the pack voltage under load [V]; ignored if not finite, negative or absurd."""
+        if self._now is not None and 0 <= voltage < VOLTAGE_END:
+            self.voltage = float(voltage)
             self.watch.on_voltage(self._now, self.voltage)
-        return True
 
-    def on_actuators(self, name: str, text: str, now: float) -> bool:
+    def on_actuators(self, name: str, text: str, now: float) -> None:
         """
         Receive the reported state of an actuator bridge; the next update acts on it.
 
@@ -255,16 +238,9 @@ class Inputs:
             text: 'ready', 'waiting: WHY', 'silent: WHY' or 'lost: WHY'.
             now: time [s].
 
-        Returns:
-            whether there is such a bridge.
-
         """
-        if name not in NODES:
-            self._say(WARNING, f"unknown bridge '{name}'", 'unknown bridge')
-            return False
-        state = self.bridges[name] = ' '.join(text.split()) or 'empty state'
-        self.unready[name] = '' if state == 'ready' else f'{NODES[name]} {state}'
-        return True
+        self.bridges[name] = text
+        self.unready[name] = '' if text == 'ready' else f'{NODES[name]} {text}'
 
     # What is known ----------------------------------------------------------------------------
 
@@ -289,18 +265,14 @@ class Inputs:
     @property
     def height(self) -> float | None:
         """Height of base_link above its height on the ground [m]; None if unknown."""
-        return None if self.estimate is None or self.blind else \
+        blind = self.mocap.silent if self.backup.running else self.mocap.lost
+        return None if self.estimate is None or blind else \
             float(self.best.position[2]) - self.floor
 
     @property
-    def blind(self) -> bool:
-        """Whether no MoCap pose corrects the estimate that is used."""
-        return self.mocap.silent if self.backup.running else self.mocap.lost
-
-    def seen(self, in_force: Command | None, state: State | None = None) -> State:
-        """A state for the hover controller; silent joints stand where they were asked to."""
-        state = self.known if state is None else state
-        tilt, velocity = self.tilt, self.tilt_velocity
+    def seen(self) -> State:
+        """The best state, for the hover controller; silent joints are where they were asked to."""
+        state, tilt, velocity, in_force = self.best, self.tilt, self.tilt_velocity, self._in_force
         # Joints of a bridge that lost them keep their last angles.
         if self.joints.silent and in_force is not None and not self.bridges.get(
                 'joint', '').startswith('lost:'):
@@ -311,9 +283,9 @@ class Inputs:
     @property
     def specific_force_up(self) -> float | None:
         """Latest specific force along world up by the estimator's attitude [m/s^2]."""
-        if not self.backup.samples or self.estimate is None or self.imu.silent:
+        if self.backup.sample is None or self.estimate is None or self.imu.silent:
             return None
-        return float(rotations.up(self.estimate.quaternion).dot(self.backup.samples[-1][1]))
+        return float(rotations.up(self.estimate.quaternion).dot(self.backup.sample[1]))
 
     def why_not_arm(self) -> str:
         """'' when the motors may start, else the missing condition."""
@@ -336,7 +308,7 @@ class Inputs:
             return f'turning at {rate:.2f} rad/s, at most {ARM_RATE:g} rad/s'
         if self.outside(0.0):
             return 'outside the fence'
-        least = self._parameters.battery.arm * self.robot.battery.cells
+        least = self._parameters.battery_arm * self.robot.battery.cells
         if self.voltage is not None and self.voltage < least:
             return f'battery at {self.voltage:.1f} V, at least {least:.1f} V'
         moved = [f'gimbal{k + 1}' for k, zero in enumerate(self.health.zeros) if zero]
@@ -345,9 +317,9 @@ class Inputs:
 
     def outside(self, margin: float) -> bool:
         """Whether the robot is more than ``margin`` [m] outside the fence."""
-        fence = self._parameters.envelope
+        limits = self._parameters
         x, y, z = map(abs, self.best.position.tolist())
-        return max(x, y) > fence.half_width + margin or z > fence.height + margin
+        return max(x, y) > limits.fence_half_width + margin or z > limits.fence_height + margin
 
     # Time -------------------------------------------------------------------------------------
 
@@ -357,7 +329,7 @@ class Inputs:
         if before is None:
             return 0.0
         if now < before:
-            self._say(WARNING, f'the clock went back by {before - now:.3f} s')
+            self.say(WARNING, f'the clock went back by {before - now:.3f} s')
             self._forget_stamps(now, before - now)
             return 0.0
         dt = min(now - before, TICK_LIMIT)
@@ -366,10 +338,10 @@ class Inputs:
         for stream in self.streams.values():
             stream.tick(dt)
         self.backup.imu_alive = not self.imu.silent
-        cells, battery = self.robot.battery.cells, self._parameters.battery
+        limits, cells = self._parameters, self.robot.battery.cells
         cell = np.inf if self.voltage is None else self.voltage / cells
-        self._low_for = self._low_for + dt if cell < battery.warn else 0.0
-        self._empty_for = self._empty_for + dt if cell < battery.land else 0.0
+        self._low_for = self._low_for + dt if cell < limits.battery_warn else 0.0
+        self._empty_for = self._empty_for + dt if cell < limits.battery_land else 0.0
         self.battery_low, self.battery_empty = self._low_for >= LOW_TIME, \
             self._empty_for >= LOW_TIME
         if self.estimate is not None:
@@ -386,12 +358,17 @@ class Inputs:
             self.estimate = replace(self.estimate, stamp=min(self.estimate.stamp, now))
         self.tilt_stamp = min(self.tilt_stamp, now)
         self.backup.forget(by)
-        self.watch.restart(now)
+        self.watch.restart()
         for stream in self.streams.values():
             stream.forget()
 
     def _ahead(self, stamp: float) -> bool:
         return self._now is not None and stamp - self._now > ESTIMATE_TIMEOUT
 
-    def _say(self, severity: str, text: str, key: str | None = None) -> None:
-        self.events.say(self._now or 0.0, severity, text, key)
+    def say(self, severity: str, text: str, key: str = '') -> None:
+        """Add one event; with a ``key``, not again within the quiet time."""
+        now = self._now or 0.0
+        if key and abs(now - self._said.get(key, -np.inf)) < QUIET_TIME:
+            return
+        self._said[key] = now
+        self.events.append(Event(now, severity, text))

@@ -25,7 +25,7 @@ FASTEST = 6.0           # [m/s] largest speed of a robot in a hall
 ATTITUDE = 0.35         # [rad] from the estimate, or jump against the gyroscope
 DISTANCE = 0.3          # [m] the same; larger than the error of dead reckoning after 1 s
 LASTING = 10            # poses, 0.1 s, of a contradiction
-DISPLACED = 30          # poses after a jump; longer than a temporary confusion of markers
+AFTER_JUMP = 30         # poses after a jump; longer than a temporary confusion of markers
 FROZEN = 5              # equal poses; noise of 1 mm never repeats exactly
 
 
@@ -95,9 +95,8 @@ class MocapWatch:
     Attributes:
         good: whether the last pose may be used.
         frozen: whether equal poses repeat.
-        jumped: whether the contradiction began with a jump of the attitude.
+        jumped: whether the contradiction began with a jump of MoCap.
         contradicts: whether pose and estimate have contradicted each other for long enough.
-        displaced: whether the position jumped and has contradicted the estimate for long enough.
 
     """
 
@@ -107,9 +106,8 @@ class MocapWatch:
     def reset(self) -> None:
         """Reset the detector."""
         self._before: tuple[float, np.ndarray, np.ndarray] | None = None
-        self._moved = self.good = self.frozen = False
-        self._same = self._off = self._far = 0
-        self.jumped = self.contradicts = self.displaced = False
+        self.good = self.frozen = self.jumped = self.contradicts = False
+        self._same = self._off = 0
 
     def on_pose(self, stamp: float, position: np.ndarray, quaternion: np.ndarray,
                 state: State | None) -> None:
@@ -132,20 +130,16 @@ class MocapWatch:
             self._same = self._same + 1 if not moved.any() and np.array_equal(
                 quaternion, before[2]) else 0
             if dt < LONGEST:
-                self.jumped |= turn > ATTITUDE + turning * dt
-                self._moved |= sqrt(moved.dot(moved)) > DISTANCE + FASTEST * dt
+                self.jumped |= turn > ATTITUDE + turning * dt \
+                    or sqrt(moved.dot(moved)) > DISTANCE + FASTEST * dt
         self.frozen = self._same >= FROZEN
-        off = far = False
+        off = False
         if state is not None:
             error = position - state.position
             speed = sqrt(state.velocity.dot(state.velocity))
             off = rotations.geodesic_angle(state.quaternion, quaternion) \
-                > ATTITUDE + turning * AGE
-            far = sqrt(error.dot(error)) > DISTANCE + speed * AGE
-        self._moved &= far
+                > ATTITUDE + turning * AGE or sqrt(error.dot(error)) > DISTANCE + speed * AGE
         self.jumped &= off
-        self._off = self._off + 1 if off or far else 0
-        self._far = self._far + 1 if far and self._moved else 0
-        self.displaced = self._far >= DISPLACED
-        self.contradicts = self._off >= LASTING and not self._moved
-        self.good = not off and not far and not self.frozen
+        self._off = self._off + 1 if off else 0
+        self.contradicts = self._off >= (AFTER_JUMP if self.jumped else LASTING)
+        self.good = not off and not self.frozen

@@ -1,7 +1,7 @@
 """Detection of rotors whose ESC speed differs from the commanded thrust."""
 
 from collections import deque
-from math import exp, expm1, inf
+from math import expm1, inf
 
 import numpy as np
 
@@ -19,12 +19,6 @@ SHARE = 0.5             # [-] missing share of the thrust of a lost rotor
 NOTICED = 0.25          # [-] missing share that confirms a loss by the wrench
 LEAST_THRUST = 1.5      # [N] smallest thrust for a decision: a fifth of the hover thrust
 TIME = 0.06             # [s] until a lost rotor is named: three ESC reports of 50 Hz
-WINDOW = 0.5            # [s] of the regression: five time constants of a rotor
-VARIATION = 1.0         # [N] smallest standard deviation of the commanded thrust: 1 % of speed
-                        # noise is 0.15 N, so the error of the slope is 0.1
-SLOPE = 0.4             # [-] smallest: with 25 ms of unmodelled delay it is 0.8, with another lag
-                        # of 0.2 s about 0.3
-DEAF_TIME = 0.3         # [s] a sudden loss of thrust gives similar values while in the window
 EXCESS = 3.0            # [N] over the command: a lag longer by a third leaves 1 N after a step
 
 
@@ -36,11 +30,8 @@ class SpeedWatch:
     Of the thrusts between both, the modelled one is the nearest to the measured one. The factor is
     the ratio of mean thrust and mean squared speed, which no lag changes.
 
-    A rotor that does not follow commands is detected by the slope of the measured over the
-    modelled thrust, a regression over the last half second. The slope is 1 for a healthy rotor,
-    less for a weak rotor, and 0 for a rotor that holds its thrust. It is used if the modelled
-    thrust has varied enough. A rotor that gives clearly more thrust than commanded is detected at
-    once, because neither lag nor weakness causes this.
+    A rotor that gives clearly more thrust than commanded does not follow its commands, because
+    neither lag nor weakness causes this.
 
     If the reports of the motor board pause, its commands were probably late, too. For SETTLED
     seconds the thrusts then differ from the model, and no rotor is suspected.
@@ -50,10 +41,9 @@ class SpeedWatch:
 
     Attributes:
         lost: the rotor (0 to 3) that turns too slowly, or None.
-        deaf: the rotor (0 to 3) whose speed does not follow its commands, or None.
+        deaf: the rotor (0 to 3) that gives more than commanded, or None.
         thrust: (4,) computed from the speeds [N], nan where unknown.
         slow: (4,) bool, rotors that turn noticeably too slowly at the last report.
-        suspected: (4,) bool, rotors whose last reports do not follow their commands.
 
     """
 
@@ -74,10 +64,8 @@ class SpeedWatch:
 
     def forget(self) -> None:
         """Suspect no rotor."""
-        self.slow = self.suspected = np.zeros(ROTORS, dtype=bool)
-        self._slow_for, self._deaf_for, self._more_for = np.zeros((3, ROTORS))
-        # Weight, x, y, x^2 and x y of modelled (x) and measured (y) thrust, with fading memory.
-        self._moments = np.zeros((5, ROTORS))
+        self.slow = np.zeros(ROTORS, dtype=bool)
+        self._slow_for, self._more_for = np.zeros((2, ROTORS))
         self.lost: int | None = None
         self.deaf: int | None = None
 
@@ -134,25 +122,15 @@ class SpeedWatch:
         judged = np.isfinite(square) & (x > LEAST_THRUST)
         known = judged & learnt
         too_slow = known & (y < (1 - SHARE) * x)
+        more = known & (y > (1 + SHARE) * x) & (y - x > EXCESS)
         self.thrust = np.where(known, y, np.nan)
         self.slow = known & (y < (1 - NOTICED) * x)
-        good = judged & ~too_slow & (square > 0)
+        good = judged & ~too_slow & ~more & (square > 0)
         gain = np.where(good, dt / np.minimum(np.maximum(self._learnt_for, dt), LEARNT), 0.0)
         self._mean_thrust += gain * (slowest - self._mean_thrust)
         self._mean_square += gain * (np.nan_to_num(square) - self._mean_square)
         self._learnt_for += np.where(good, dt, 0.0)
-        y = np.nan_to_num(y)
-        self._moments = np.where(known, self._moments * exp(-dt / WINDOW) + dt * np.array(
-            [np.ones(ROTORS), x, y, x * x, x * y]), 0.0)
-        weight = self._moments[0]
-        mean_x, mean_y, xx, xy = self._moments[1:] / np.maximum(weight, dt)
-        variance, covariance = xx - mean_x**2, xy - mean_x * mean_y
-        self.suspected = (weight > 0.5 * WINDOW) & (variance > VARIATION**2) \
-            & (covariance < SLOPE * variance)
-        more = known & (y > (1 + SHARE) * x) & (y - x > EXCESS)
-        self._slow_for, self._deaf_for, self._more_for = np.where(
-            [too_slow, self.suspected, more],
-            np.array([self._slow_for, self._deaf_for, self._more_for]) + dt, 0.0)
+        self._slow_for = np.where(too_slow, self._slow_for + dt, 0.0)
+        self._more_for = np.where(more, self._more_for + dt, 0.0)
         self.lost = int(self._slow_for.argmax()) if self._slow_for.max() >= TIME else None
-        deaf = (self._deaf_for >= DEAF_TIME) | (self._more_for >= TIME)
-        self.deaf = int(deaf.argmax()) if deaf.any() else None
+        self.deaf = int(self._more_for.argmax()) if self._more_for.max() >= TIME else None

@@ -7,17 +7,19 @@ and the in-process evaluation run the same code with the same results. See docs/
 
 from collections.abc import Sequence
 from dataclasses import replace
+from math import exp
 
 import numpy as np
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import Command, Fallback, PoseTarget, Target
-from beetle_omni_ros.robot.allocation import ALL_HEALTHY, NO_ZEROS
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.allocation import ALL_HEALTHY, NO_ZEROS, ROTORS
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.safety.commands import Handover, HANDOVER_TIME, within_limits
+from beetle_omni_ros.safety.commands import within_limits
 from beetle_omni_ros.safety.events import Answer, ERROR, INFO, WARNING
 from beetle_omni_ros.safety.inputs import ARM_TILT, Inputs
-from beetle_omni_ros.safety.landing import Landing, SupportGauge, Takeoff
+from beetle_omni_ros.safety.landing import Landing, Takeoff
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.way import inclination
 from beetle_omni_ros.safety.wrench import NEAR_GROUND
@@ -27,11 +29,17 @@ FALLBACK, LANDING, STOPPED = 'fallback', 'landing', 'emergency_stop'
 IN_FLIGHT = (TAKEOFF, FLYING, FALLBACK, LANDING)
 AGE_LIMIT = 0.1         # [s] no older command is sent; the actuators have the same limit
 STOP_TIME = 0.3         # [s] zero thrust is sent for this time, then nothing
+HANDOVER_TIME = 0.3     # [s] longest duration: half a turn of a joint
+TILT_RATE = 9.0         # [rad/s] as in hover.yaml: below the servos' 10
+THRUST_RATE = 300.0     # [N/s] as in hover.yaml: 3 N a period
+TURN_TIME = 0.2         # [s] of the present turn until it ends
 RESUMING = 0.1          # [s] after a pause until every source has sent a message again
+FALLBACK_TIME = 30.0    # [s] of fallback until landing; enough to restart a controller
+MOCAP_PATIENCE = 1.5    # [s] of dead reckoning until landing; its velocity error is then 0.1 m/s
+                        # and grows
 RECOVERY_TIME = 1.0     # [s] in which a landing stops a tumble of 15 rad/s
 FENCE_MARGIN = 2.0      # [m] farther outside the fence a landing is a flyaway: motors off
-LANDING_LIMIT = 90.0    # [s] from the margin above the fence it takes 74 s, and levelling and
-                        # turning two joints over 14 s
+LANDING_LIMIT = 90.0    # [s] from the margin above the fence it takes 74 s, and levelling 4 s
 
 
 class Supervisor(Inputs):
@@ -43,8 +51,6 @@ class Supervisor(Inputs):
         robot: the model of the robot.
         fallback: for takeoff, fallback and landing; a HoverController or similar.
         controllers: names of the controllers that may be active; None: those on standby.
-        pilot: the controller that lands with failed actuators, if it sends valid commands, else
-            the fallback; None: the registry's choice among ``controllers``.
 
     Attributes:
         state: 'disarmed', 'takeoff', 'flying', 'fallback', 'landing' or 'emergency_stop'.
@@ -54,14 +60,12 @@ class Supervisor(Inputs):
     """
 
     def __init__(self, parameters: SupervisorParameters, robot: RobotParameters,
-                 fallback: Fallback, controllers: Sequence[str] | None = None,
-                 pilot: str | None = None):
+                 fallback: Fallback, controllers: Sequence[str] | None = None):
         controllers = tuple(registry.standing_by() if controllers is None else controllers)
         super().__init__(parameters, robot, controllers)
-        self._pilot = registry.pilot(controllers) if pilot is None else pilot
+        self._pilot = registry.pilot(controllers)
         self._hover = fallback
-        self._gauge = SupportGauge(self.allocator, robot)
-        self._handover = Handover()
+        self._handover_left = 0.0   # after a change of the controller [s]
         self.state, self.source = DISARMED, 'none'
         self.target_override: Target | None = None
         # Objects of the present state, created when it is entered.
@@ -69,9 +73,8 @@ class Supervisor(Inputs):
         self._landing: Landing
         self._target: PoseTarget
         self._in_state = 0.0    # time since the last change of the state [s]
-        self._checked: Command | None = None    # the last command that was checked
         self._acted_on = ALL_HEALTHY    # health to which landing and hover are adapted
-        self._before: float | None = None   # time of the update before [s]
+        self._before = np.inf       # time of the update before [s]
         self._resumed = -np.inf     # time of the last pause [s]
 
     # Requests ---------------------------------------------------------------------------------
@@ -81,9 +84,9 @@ class Supervisor(Inputs):
         reason = self.why_not_arm() if self.state == DISARMED else f'{self.state}, not disarmed'
         if reason:
             return self._refuse(f'arm refused: {reason}')
-        self._takeoff = Takeoff(self._parameters.takeoff, self.allocator, self._hover,
-                                self.seen(None))
         self._in_force = None
+        self._takeoff = Takeoff(self._parameters.takeoff_height, self.allocator, self._hover,
+                                self.seen)
         self.floor = float(self.known.position[2])
         self.watch.reset()
         self._acted_on = ALL_HEALTHY
@@ -124,12 +127,12 @@ class Supervisor(Inputs):
             return self._refuse(f'select refused: {controller}_node {stream.complaint}; '
                                 f'{self.active} stays selected')
         self.active = controller
-        self._handover.left = HANDOVER_TIME
-        self._say(INFO, f'{controller} selected')
+        self._handover_left = HANDOVER_TIME
+        self.say(INFO, f'{controller} selected')
         return Answer(True, f'{controller} selected')
 
     def _refuse(self, text):
-        self._say(WARNING, text)
+        self.say(WARNING, text)
         return Answer(False, text)
 
     # The cycle --------------------------------------------------------------------------------
@@ -154,12 +157,12 @@ class Supervisor(Inputs):
         if command is not None:
             if self.health.zeros != NO_ZEROS:       # in angles of the encoder that jumped
                 asked = within_limits(replace(command, tilt=self.health.read(command.tilt)),
-                                      self.robot, stopped=True)
+                                      self.robot)
             self.watch.on_command(asked)
         if self.state in IN_FLIGHT:
             self.airborne = self.state != TAKEOFF or self._takeoff.airborne
-            self._gauge.update(command, self.best.quaternion, dt, self.specific_force_up,
-                               learn=self.state in (FLYING, FALLBACK))
+            share = 1 - exp(-dt / self.robot.rotors.time_constant)
+            self.thrusts += share * ((0.0 if command is None else command.thrust) - self.thrusts)
         return asked
 
     def _guarded(self, command, now):
@@ -167,13 +170,11 @@ class Supervisor(Inputs):
         if command is None:
             return None
         if now - command.stamp > AGE_LIMIT:
-            self._say(ERROR, f'the command of {self.source} is '
+            self.say(ERROR, f'the command of {self.source} is '
                              f'{1000 * (now - command.stamp):.0f} ms old: nothing sent',
                       'old command')
             return None
-        if command is not self._checked:
-            self._checked = command
-            self._in_force = within_limits(command, self.robot, stopped=self.source == 'none')
+        self._in_force = within_limits(command, self.robot)
         if self._in_force is None:
             self.emergency_stop(now, f'{self.source} gave a command that is not finite')
         return self._in_force
@@ -182,44 +183,33 @@ class Supervisor(Inputs):
 
     def _look_for_faults(self, now):
         """Results of the detectors, in the air."""
-        before, self._before = self._before, now
+        paused, self._before = now - self._before, now
         if self.airborne and self.imu.lost and 'imu_frozen' not in self.faults:
             self.watch.name('imu_lost', now, f'the raw IMU is {self.imu.text}')
         while self.watch.news:
-            self._say(ERROR, self.watch.news.pop(0))
+            self.say(ERROR, self.watch.news.pop(0))
         if not self.airborne:
             return
-        if before is not None and now - before > AGE_LIMIT:
-            self._resume(now, now - before)
-        elif now - self._resumed < RESUMING:
-            self._look_down(now)
-        if self.watch.contact.reason:
-            self._crash(now, self.watch.contact.reason)
+        contact, poses = self.watch.contact.reason, self.backup.poses
+        if paused > AGE_LIMIT:
+            self.watch.name('supervisor_paused', now)
+            self.watch.restart()
+            self._resumed = now
+            self.say(ERROR, f'supervisor_node was not scheduled for {1000 * paused:.0f} ms: the '
+                            'actuators had stopped')
+            if self.state == FLYING:
+                self._fall_back(now, ERROR, 'fallback to hover after the pause')
+        # Messages queued during the pause are older. The estimate may be wrong after a fall.
+        elif now - self._resumed < RESUMING and not self.mocap.silent \
+                and poses[-1][1][2] - self.floor < NEAR_GROUND:
+            contact = 'on the floor after the pause'
+        if contact and self.state == LANDING and inclination(self.best.quaternion) < ARM_TILT:
+            self._enter(DISARMED, INFO, f'on the ground, {contact}: motors off, disarmed')
+        elif contact:
+            self.watch.name('crash', now)
+            self.emergency_stop(now, f'crash: {contact}')
         elif self.health is not self._acted_on:
             self._degrade(now)
-
-    def _resume(self, now, paused):
-        """React to a pause of this process, in which the actuators have stopped."""
-        self.watch.name('supervisor_paused', now)
-        self.watch.restart(now)
-        self._resumed = now
-        self._say(ERROR, f'supervisor_node was not scheduled for {1000 * paused:.0f} ms: the '
-                         'actuators had stopped')
-        if self.state == FLYING:
-            self._fall_back(now, ERROR, 'fallback to hover after the pause')
-
-    def _look_down(self, now):
-        """Whether the robot lies on the floor; messages queued during the pause are older."""
-        poses = self.backup.poses       # the estimate may be wrong after a fall, MoCap is not
-        if not self.mocap.silent and poses[-1][1][2] - self.floor < NEAR_GROUND:
-            self._crash(now, 'on the floor after the pause')
-
-    def _crash(self, now, why):
-        """Motors off after a crash; a soft and upright landing is no crash."""
-        if self.state == LANDING and inclination(self.best.quaternion) < ARM_TILT:
-            return self._enter(DISARMED, INFO, f'on the ground, {why}: motors off, disarmed')
-        self.watch.name('crash', now)
-        return self.emergency_stop(now, f'crash: {why}')
 
     def _degrade(self, now):
         """Land with the working actuators, in the attitude nearest level with a margin."""
@@ -232,14 +222,14 @@ class Supervisor(Inputs):
         elif before.same_actuators(self.health):
             return
         else:
-            self._landing.set_out(now, self._in_force)
+            self._landing.set_out()
         if self.state == LANDING:
             self.target_override = self._landing.way
 
     def _react(self, now):
         """Faults that end or change a flight with any controller, the most urgent first."""
         if self.battery_low:
-            self._say(WARNING, f'battery low: {self.voltage:.1f} V', 'battery')
+            self.say(WARNING, f'battery low: {self.voltage:.1f} V', 'battery')
         no_rotors, no_joints = self.unready['rotor'], self.unready['joint']
         if no_rotors and not self.bridges['rotor'].startswith('silent:'):
             if not self.airborne:
@@ -259,8 +249,7 @@ class Supervisor(Inputs):
 
     def _why_land(self, no_rotors, no_joints):
         """Name of the fault ('' for a detected one) and text of the most urgent reason."""
-        envelope = self._parameters.envelope
-        if self.state == FALLBACK and self._in_state > envelope.fallback_time:
+        if self.state == FALLBACK and self._in_state > FALLBACK_TIME:
             return 'controller_lost', f'{self.active}_node not good for {self._in_state:.0f} s: ' \
                                       'landing'
         if no_rotors:
@@ -272,8 +261,8 @@ class Supervisor(Inputs):
             return 'estimator_lost', f'ekf_node {self.ekf.text}{why}: controlled descent on raw ' \
                                      'sensors'
         if 'mocap_jumped' in self.faults:
-            return '', 'the position of MoCap jumped: landing'
-        if self.mocap.lost and self.mocap.elapsed > envelope.mocap_patience:
+            return '', 'MoCap jumped: landing'
+        if self.mocap.lost and self.mocap.elapsed > MOCAP_PATIENCE:
             return 'mocap_lost', f'MoCap {self.mocap.text}: landing by dead reckoning'
         if no_joints:
             return 'joint_bridge_lost', f'{no_joints}: landing with the joints as they are'
@@ -314,7 +303,7 @@ class Supervisor(Inputs):
 
     def _take_off(self, now, dt):
         self.source = 'hover'
-        command = self._takeoff.step(self.seen(self._in_force), dt)
+        command = self._takeoff.step(self.seen, dt)
         if self._takeoff.failure:
             self._enter(DISARMED, ERROR, f'takeoff failed: {self._takeoff.failure}')
             return self._stand(now, dt)
@@ -324,34 +313,53 @@ class Supervisor(Inputs):
                 self._enter(FLYING, INFO, f'takeoff done: {self.active} flies')
             else:
                 self._fall_back(now, WARNING, f'takeoff done, but {self.active}_node '
-                                f'{stream.complaint}: hover waits for it', self._takeoff.target)
+                                f'{stream.complaint}: hover waits for it')
         return command
 
     def _fly(self, now, dt):
         stream = self.streams[self.active]
-        if stream.silence.silent or stream.accepted is None:
-            cause = ''
-            if self.ekf.elapsed > 0.5 * self.ekf.limit:     # a controller answers estimates
-                cause = f' (ekf_node {self.ekf.text} too)'
-            else:
+        if stream.dead or stream.accepted is None:
+            if self.ekf.elapsed <= 0.5 * self.ekf.limit:    # a controller answers estimates
                 self.watch.name('controller_silent', now)
-            self._fall_back(now, ERROR, f'{self.active}_node {stream.complaint}{cause}: fallback '
-                                        'to hover')
+            self._fall_back(now, ERROR,
+                            f'{self.active}_node {stream.complaint}: fallback to hover')
             return self._hold(now, dt)
         self.source = self.active
-        self._hover.observe(self.seen(self._in_force))
-        return self._handover.limit(stream.accepted, self._in_force)
+        self._hover.observe(self.seen)
+        return self._hand_over(stream.accepted)
+
+    def _hand_over(self, asked):
+        """
+        Limit the change from the executed command after a change of the controller.
+
+        A controller on standby has similar commands, but in a large turn they may differ. The
+        limit ends when the new command is reached, or after HANDOVER_TIME.
+        """
+        before = self._in_force
+        if self._handover_left <= 0 or before is None:
+            return asked
+        step = asked.stamp - before.stamp
+        if step <= 0:       # a command for this state was already executed
+            return before
+        self._handover_left -= step
+        change = np.concatenate([asked.tilt - before.tilt, asked.thrust - before.thrust])
+        reach = step * np.repeat([TILT_RATE, THRUST_RATE], ROTORS)
+        if (np.abs(change) <= reach).all():
+            self._handover_left = 0.0
+            return asked
+        change = np.clip(change, -reach, reach)
+        return Command(asked.stamp, before.tilt + change[:ROTORS], before.thrust + change[ROTORS:])
 
     def _hold(self, now, dt):
         if self.streams[self.active].good and not self.lost and self._in_state >= RESUMING:
             self._enter(FLYING, INFO, f'{self.active}_node good again: it flies')
             return self._fly(now, dt)
         self.source = 'hover'
-        return self._hover.step(self.seen(self._in_force), self._target)
+        return self._hover.step(self.seen, self._target)
 
     def _descend(self, now, dt):
         self.source = 'hover'
-        command = self._landing.step(now, dt, self._in_force)
+        command = self._landing.step(now, dt)
         if self._landing.given_up:
             self.emergency_stop(now, self._landing.given_up)
             return self._stand(now, dt)
@@ -362,16 +370,16 @@ class Supervisor(Inputs):
         if self.target_override is not None and pilot is not None and pilot.good \
                 and pilot.accepted is not None and not self.backup.running:
             self.source = self._pilot
-            command = self._handover.limit(pilot.accepted, self._in_force)
+            command = self._hand_over(pilot.accepted)
         return command
 
     # Changes of state -------------------------------------------------------------------------
 
-    def _fall_back(self, now, severity, text, position=None):
-        """Hover at the present pose, or at ``position``."""
-        state = self.known
-        self._target = PoseTarget(state.position if position is None else position,
-                                  state.quaternion, now)
+    def _fall_back(self, now, severity, text):
+        """Hover at the present position, in the attitude in which the present turn ends."""
+        turn = rotations.exp(TURN_TIME * self.known.angular_velocity)
+        self._target = PoseTarget(self.known.position, rotations.multiply(
+            self.known.quaternion, turn), now)
         self._enter(FALLBACK, severity, text)
 
     def _land(self, now, severity, text, name=''):
@@ -379,26 +387,24 @@ class Supervisor(Inputs):
             self.watch.name(name, now)
         if not self.airborne:
             return self._enter(DISARMED, severity, f'{text}; still on the ground: motors off')
-        self._landing = Landing(self, self._hover, self._gauge, self._parameters.landing.speed,
-                                now, self._in_force)
+        self._landing = Landing(self, self._hover)
         return self._enter(LANDING, severity, text)
 
     def _enter(self, state, severity, text):
         self.state, self._in_state, self.target_override = state, 0.0, None
         if state in (DISARMED, STOPPED):
-            self.backup.stop()
-            self.airborne = False
+            self.backup.running = self.airborne = False
         if state == FLYING:
-            self._handover.left = HANDOVER_TIME
-        self._say(severity, text)
+            self._handover_left = HANDOVER_TIME
+        self.say(severity, text)
         return Answer(True, text)
 
     def _forget_stamps(self, now, by):
         super()._forget_stamps(now, by)
         self._hover.reset()
-        self._handover.left = 0.0
+        self._handover_left = 0.0
         if self.state == LANDING:
-            self._landing.set_out(now, self._in_force)
+            self._landing.set_out()
 
     # Reports ----------------------------------------------------------------------------------
 

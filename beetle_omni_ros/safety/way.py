@@ -10,23 +10,18 @@ plane of the body, and paths through upward arms. A joint may begin within the m
 if the path leads it away at once.
 
 If both joints of a pair of opposite arms are wound in the same direction, one of them must turn
-back by a full turn on every path, during which its thrust points in wrong directions. The robot
-then flies to an attitude that the other three rotors hold with a margin, stops this rotor, turns
-its joint, and continues with four rotors. If both pairs are wound so, this happens twice.
+back by a full turn on every path, during which its thrust points in wrong directions.
 """
 
 from __future__ import annotations
 
 from math import sqrt
-from typing import NamedTuple
 
 import numpy as np
 
 from beetle_omni_ros.control.base import Reference
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.allocation import ActuatorHealth, Allocator, nearest_turn, ROTORS
-from beetle_omni_ros.robot.degraded import FLYING_MARGIN, Holding, leaned, up
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.allocation import Allocator, nearest_turn, ROTORS
 
 UP = np.array([0.0, 0.0, 1.0])
 TURN = 2 * np.pi
@@ -39,10 +34,6 @@ UNLOADED = 0.3          # [-] of its hover thrust is the loss if a rotor without
                         # because its small thrust controls the attitude
 MISSING_THRUST = 20.0   # [s] of one second without one hover thrust of lift, as time: turning a
                         # joint over under load costs more than any detour
-LOST_LIFT = 0.3         # [s] times the hover thrust of a rotor; above it a joint turns over with
-                        # its rotor off: a full turn under load costs 1.2 s, without load 0.4 s
-ROOM = 0.3              # [rad] of all tilts from their stops meanwhile: control moves them by 0.2
-FARTHEST = 1.3          # [rad] turn to that attitude: upside down 0.3 is enough, on its side 1.3
 
 
 def inclination(quaternion: np.ndarray) -> float:
@@ -57,21 +48,14 @@ class Way:
     Args:
         times: (P,) increasing [s]; at rest at the start until the first.
         quaternions: (P, 4) base_link to world, xyzw.
-        lost: lift lost by joints that turn over, in hover thrusts of one rotor times [s].
 
     """
 
-    def __init__(self, times: np.ndarray, quaternions: np.ndarray, lost: float = 0.0):
-        self._times, self._quaternions, self.lost = times, quaternions, lost
+    def __init__(self, times: np.ndarray, quaternions: np.ndarray):
+        self._times, self._quaternions = times, quaternions
         self._turns = [rotations.log(rotations.multiply(rotations.conjugate(a), b))
                        for a, b in zip(quaternions[:-1], quaternions[1:])]
         self.duration = float(times[-1])    # until rest [s]
-
-    @classmethod
-    def straight(cls, start: np.ndarray, goal: np.ndarray, rate: float) -> Way:
-        """The shortest turn between two attitudes (4,) at ``rate`` [rad/s]."""
-        angle = rotations.geodesic_angle(goal, start)
-        return cls(np.array([0.0, max(angle / rate, 1e-9)]), np.array([start, goal]))
 
     def at(self, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
         """Attitude (4,) and body rate (3,) [rad/s], ``elapsed`` [s] after the start."""
@@ -98,8 +82,7 @@ class Ramp:
             between them, and the last speed is kept.
 
     Attributes:
-        end, rise: time [s] and height [m] of the last knot after and above the start.
-        duration: until this and the end of the way [s].
+        duration: until the last knot and the end of the way [s].
 
     """
 
@@ -109,8 +92,7 @@ class Ramp:
         self._times, self._speeds = np.array(knots).T
         self._rises = np.concatenate([[0.0], np.cumsum(
             0.5 * (self._speeds[1:] + self._speeds[:-1]) * np.diff(self._times))])
-        self.end, self.rise = float(self._times[-1]), float(self._rises[-1])
-        self.duration = max(way.duration, self.end)
+        self.duration = max(way.duration, float(self._times[-1]))
 
     def at(self, time: float) -> Reference:
         """The reference at ``time``."""
@@ -131,8 +113,15 @@ def climb(height: float, speed: float, acceleration: float) -> list[tuple[float,
 
 def plan(quaternion: np.ndarray, tilt: np.ndarray, allocator: Allocator, rate: float) -> Way:
     """Plan the turn to level that the joints, at ``tilt`` (4,) [rad], can follow best."""
-    paths, times, lost = _compare(quaternion, tilt[None], allocator, rate)
-    k = int(np.argmin(times[0].sum(axis=1) + MISSING_THRUST * lost[0]))
+    paths = [_path(corners) for corners in _corners(rotations.up(quaternion), allocator.axes)]
+    longest = max(map(len, paths))
+    # One array: shorter paths stay level at their end.
+    ups = np.array([np.concatenate([path, np.tile(UP, (longest - len(path), 1))])
+                    for path in paths])
+    waits, lost = _follow(tilt, ups, allocator)
+    turns = np.arccos(np.clip((ups[:, 1:] * ups[:, :-1]).sum(axis=2), -1, 1))
+    times = np.maximum(np.concatenate([np.zeros((len(ups), 1)), turns], axis=1) / rate, waits)
+    k = int(np.argmin(times.sum(axis=1) + MISSING_THRUST * lost))
     path, attitudes = paths[k], [rotations.normalized(quaternion)]
     for a, b in zip(path[:-1], path[1:]):       # smallest turns from one up to the next
         axis = np.cross(b, a)
@@ -140,20 +129,7 @@ def plan(quaternion: np.ndarray, tilt: np.ndarray, allocator: Allocator, rate: f
         turn = axis / sine * np.arctan2(sine, a @ b) if sine > 1e-12 else np.zeros(3)
         attitudes.append(rotations.normalized(rotations.multiply(attitudes[-1],
                                                                  rotations.exp(turn))))
-    return Way(np.cumsum(times[0, k, :len(path)]), np.array(attitudes), float(lost[0, k]))
-
-
-def _compare(quaternion, tilts, allocator, rate):
-    """Paths of the up direction, their times (W, N, P) [s], and lost lift (W, N)."""
-    paths = [_path(corners) for corners in _corners(rotations.up(quaternion), allocator.axes)]
-    longest = max(map(len, paths))
-    # One array: shorter paths stay level at their end.
-    ups = np.array([np.concatenate([path, np.tile(UP, (longest - len(path), 1))])
-                    for path in paths])
-    waits, lost = _follow(tilts, ups, allocator)
-    turns = np.arccos(np.clip((ups[:, 1:] * ups[:, :-1]).sum(axis=2), -1, 1))
-    turns = np.concatenate([np.zeros((len(ups), 1)), turns], axis=1)
-    return paths, np.maximum(turns / rate, waits), lost
+    return Way(np.cumsum(times[k, :len(path)]), np.array(attitudes))
 
 
 def _corners(start, arms):
@@ -177,9 +153,9 @@ def _path(corners):
     return np.concatenate(points)
 
 
-def _follow(tilts, ups, allocator):
+def _follow(tilt, ups, allocator):
     """
-    Times (W, N, P) [s] that the joints need for each step of N paths, and lift lost (W, N) [s].
+    Times (N, P) [s] that the joints need for each step of N paths, and lift lost (N,) [s].
 
     A joint uses the nearest angle within its stops, as in the allocation. Lost lift is the thrust
     of a rotor times the time for which it points in a wrong direction, in hover thrusts.
@@ -188,8 +164,7 @@ def _follow(tilts, ups, allocator):
     angles, thrusts = (x.reshape(shape) for x in allocator.upright(ups.reshape(-1, 3)))
     limit, hover = allocator.tilt_limit - MARGIN, np.linalg.norm(allocator.weight) / ROTORS
     shares = np.maximum(thrusts / hover, UNLOADED)
-    present = np.tile(np.asarray(tilts, dtype=float)[:, None], (1, len(ups), 1))
-    waits, lost = np.zeros((len(tilts), *shape[:2])), np.zeros((len(tilts), len(ups)))
+    present, waits, lost = np.tile(tilt, (len(ups), 1)), np.zeros(shape[:2]), np.zeros(len(ups))
     for k in range(shape[1]):
         angle = angles[:, k]
         goal = nearest_turn(angle, present)
@@ -197,50 +172,7 @@ def _follow(tilts, ups, allocator):
             goal = np.where(np.abs(goal) > limit, angle, goal)
         moves = np.abs(goal - present)
         time = moves / JOINT_RATE
-        waits[..., k] = time.max(axis=2)
-        lost += (shares[:, k] * np.where(moves > TURNED_OVER, time, 0.0)).sum(axis=2)
+        waits[:, k] = time.max(axis=1)
+        lost += (shares[:, k] * np.where(moves > TURNED_OVER, time, 0.0)).sum(axis=1)
         present = goal
     return waits, lost
-
-
-class Turnover(NamedTuple):
-    """A planned turn of a joint with its rotor off."""
-
-    joint: int                  # index of the joint and its rotor
-    quaternion: np.ndarray      # (4,) attitude in which its rotor is off
-    tilt: float                 # angle at which the joint ends [rad]
-    health: ActuatorHealth      # of the actuators meanwhile
-
-
-def find_turnover(quaternion: np.ndarray, tilt: np.ndarray, robot: RobotParameters,
-                  allocator: Allocator, rate: float) -> Turnover | None:
-    """
-    Find the joint whose turnover saves most lift on the way to level, and where it can turn.
-
-    This is the firmest near attitude that three rotors hold and where the joint angles before and
-    after are legal. None if no turnover helps.
-    """
-    turned = tilt - np.copysign(TURN, tilt)
-    tilts = np.array([tilt, *np.where(np.eye(ROTORS, dtype=bool), turned, tilt)])
-    _, times, losses = _compare(quaternion, tilts, allocator, rate)
-    best = np.argmin(times.sum(axis=2) + MISSING_THRUST * losses, axis=1)
-    lost = losses[np.arange(len(best)), best]
-    for joint in map(int, np.argsort(lost[1:])):
-        if abs(turned[joint]) > allocator.tilt_limit or lost[joint + 1] > lost[0] - LOST_LIFT:
-            continue
-        others = np.arange(ROTORS) != joint
-        resting = ActuatorHealth(rotors=tuple(others.tolist()))
-        holding = Holding(robot, resting)
-        angles, _ = allocator.upright(holding.directions)
-        four, three = (nearest_turn(one, tilt) for one in (angles, holding.tilts))
-        goal = four[:, joint] - np.copysign(TURN, four[:, joint])
-        legal = np.column_stack([goal, four, three[:, others]])
-        fit = np.all(np.abs(legal) <= allocator.tilt_limit - ROOM, axis=1) \
-            & np.all(np.abs(three - four)[:, others] <= np.pi / 2, axis=1) \
-            & (holding.directions @ up(quaternion) >= np.cos(FARTHEST))
-        margins = np.where(fit, holding.margins, 0.0)
-        place = int(np.argmax(margins))
-        if margins[place] >= FLYING_MARGIN:
-            return Turnover(joint, leaned(quaternion, holding.directions[place]),
-                            float(goal[place]), resting)
-    return None

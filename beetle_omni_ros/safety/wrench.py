@@ -8,6 +8,7 @@ import numpy as np
 from beetle_omni_ros.robot.allocation import ActuatorHealth, Allocator, ROTORS
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.servo import Responses
+from beetle_omni_ros.safety.way import inclination
 
 LONGEST = 0.05          # [s] between two IMU samples; a longer gap resets the filters
 TINY = 1e-12            # squared difference of two models that are equal
@@ -41,6 +42,7 @@ SUPPORT_TIME = 0.15     # [s]
 USUAL = 1.0             # [s] time constant of the learnt steady push in the air
 # Without IMU: change of the velocity that is an impact, three deviations of published MoCap noise
 BUMP = 1.2              # [m/s]
+TIPPED, LOW = 0.5, 0.12     # [rad], [m] above the standing height: it touches the floor
 SPAN, LONGEST_TRACK = 3, 0.12   # poses of either velocity; [s] of both
 
 
@@ -63,6 +65,7 @@ class WrenchWatch:
         lost: the rotor (0 to 3) that is missing, or None.
         impact: largest specific force of the last sample beyond the rotors' reach [m/s^2], or 0.
         supported: (4,) bool, rotors that are also slow by their ESC; set by the caller.
+        thrust: (2, 4) modelled thrusts with the shortest and with the longest lag [N].
         unexplained: (3,) filtered force that neither the rotors nor another thrust vector of one
             rotor explains, in base_link [m/s^2].
 
@@ -83,17 +86,13 @@ class WrenchWatch:
     def reset(self) -> None:
         """Reset, with stopped rotors."""
         # The first of two rows is that of the shortest lag.
-        self._thrust = np.zeros((2, ROTORS))
+        self.thrust = np.zeros((2, ROTORS))
         self._stamp: float | None = None
         self.supported = np.zeros(ROTORS, dtype=bool)
         self._measured, self._vectors = np.zeros(6), np.zeros((2, 2 * ROTORS))
         self._steady, self._steady_vectors = np.zeros(6), np.zeros((2, 2 * ROTORS))
         self._waited = self.impact = 0.0
         self.unexplained = np.zeros(3)
-        self.forget()
-
-    def forget(self) -> None:
-        """Suspect no rotor."""
         self._lost_for, self._weak_for = np.zeros(ROTORS), np.zeros(ROTORS)
         self.lost: int | None = None
 
@@ -112,7 +111,7 @@ class WrenchWatch:
         commanded = thrust if all(health.rotors) else np.where(health.rotors, thrust, 0.0)
         if dt > LONGEST or tilt is None:
             self.reset()
-            self._thrust = np.array([commanded] * 2)
+            self.thrust = np.array([commanded] * 2)
         else:
             self._compare(force, rate, tilt, commanded, dt)
         self._stamp, self._rate = stamp, rate
@@ -120,7 +119,7 @@ class WrenchWatch:
 
     def _compare(self, force, rate, tilt, commanded, dt):
         """Update the filters, and judge."""
-        self._thrust -= np.expm1(-dt / self._lags) * (commanded - self._thrust)
+        self.thrust -= np.expm1(-dt / self._lags) * (commanded - self.thrust)
         # Torque by the gyroscope over inertia; numpy is slower here.
         (x, y, z), (i, j, k), (a, b, c) = rate.tolist(), self._inertia, self._rate.tolist()
         measured = np.array([*force.tolist(),
@@ -128,8 +127,8 @@ class WrenchWatch:
                              (y - b) / dt + (z * (i * x) - x * (k * z)) / j,
                              (z - c) / dt + (x * (j * y) - y * (i * x)) / k])
         vectors = np.empty((2, ROTORS, 2))
-        vectors[:, :, 0] = np.cos(tilt) * self._thrust
-        vectors[:, :, 1] = np.sin(tilt) * self._thrust
+        vectors[:, :, 0] = np.cos(tilt) * self.thrust
+        vectors[:, :, 1] = np.sin(tilt) * self.thrust
         gain = 1 - exp(-dt / FILTER)
         self._measured += gain * (measured * self._weights - self._measured)
         self._vectors += gain * (vectors.reshape(2, -1) - self._vectors)
@@ -220,8 +219,11 @@ class ContactWatch:
         if self._for >= SUPPORT_TIME and not self.reason:
             self.reason = f'{push:.1f} of the weight are carried by something else'
 
-    def on_pose(self, stamp: float, position: np.ndarray, height: float | None) -> None:
-        """Detect an impact by MoCap alone, if there is no IMU; ``height`` as in :meth:`update`."""
+    def on_pose(self, stamp: float, position: np.ndarray, quaternion: np.ndarray,
+                height: float | None) -> None:
+        """Detect a crash by MoCap alone, if there is no IMU; ``height`` as in :meth:`update`."""
+        if height is not None and height < LOW and inclination(quaternion) > TIPPED:
+            self.reason = 'tipped over at the floor'
         self._track.append((stamp, position))
         (t, a), (u, b), (v, c) = self._track[0], self._track[len(self._track) // 2], \
             self._track[-1]

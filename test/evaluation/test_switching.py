@@ -8,7 +8,7 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.log import LogRecorder
 from beetle_omni_ros.runs.metrics import metrics
 from beetle_omni_ros.runs.tasks import make_task
-from beetle_omni_ros.safety.commands import HANDOVER_TIME, THRUST_RATE, TILT_RATE
+from beetle_omni_ros.safety.supervisor import HANDOVER_TIME, THRUST_RATE, TILT_RATE
 
 ROBOT = RobotParameters.load()
 POSES, SWITCHES = 2, 20

@@ -128,7 +128,7 @@ def test_the_supervisor_selects_among_the_listed_controllers(make):
     assert put('controller', 'nmpc').successful and node._supervisor.active == 'nmpc'
     refused = put('controller', 'rl')
     assert not refused.successful and 'nmpc, pose_controller' in refused.reason
-    assert node._supervisor.active == 'nmpc' and not put('takeoff.height', 2.0).successful
+    assert node._supervisor.active == 'nmpc' and not put('takeoff_height', 2.0).successful
 
 
 def test_an_active_controller_outside_the_supervisors_list_is_refused(make):

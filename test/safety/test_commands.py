@@ -8,10 +8,8 @@ from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety import commands
 from beetle_omni_ros.safety.commands import CommandStream
-from beetle_omni_ros.safety.parameters import CommandLimits
 
 ROBOT = RobotParameters.load()
-LIMITS = CommandLimits()
 NOW = 50.0
 
 
@@ -26,7 +24,7 @@ def noisy(stamp, *numbers):
 
 
 def stream():
-    return CommandStream(LIMITS, ROBOT)
+    return CommandStream(ROBOT)
 
 
 @pytest.mark.parametrize('bad, reason', [
@@ -94,5 +92,5 @@ def test_good_means_half_a_second_without_gap_or_refusal():
     run(0.6)
     assert checked.good
     checked.tick(0.01)
-    checked.tick(LIMITS.timeout)
+    checked.tick(commands.TIMEOUT)
     assert not checked.good and 'silent for' in checked.complaint

@@ -240,12 +240,12 @@ def test_the_zero_of_an_encoder_that_jumps_moves_and_the_joint_is_not_stuck():
 
 
 @pytest.mark.parametrize('sticks', [True, False], ids=['holds its thrust', 'stops'])
-def test_a_rotor_that_turns_but_ignores_more_thrust_is_deaf_and_not_lost(sticks):
+def test_a_rotor_that_gives_more_thrust_than_asked_is_deaf_and_not_lost(sticks):
     watch, tilt, rotor = FaultWatch(ROBOT, ALLOCATOR), np.zeros(4), np.arange(4) == 2
     thrust, rate = np.full(4, 7.0), np.zeros(3)
     for n in range(800):
         t = TICK * n
-        asked = 7.0 + np.where(rotor, (8.0 + 2.0 * np.sin(6.0 * t)) * (t > 2.0), np.sin(6.0 * t))
+        asked = np.where(rotor & (t > 2.0), 2.0, 7.0 + np.sin(6.0 * t))
         follows = np.where(rotor & (t > 2.0), 7.0 if sticks else 0.0, asked)
         thrust = thrust - np.expm1(-TICK / LAG) * (follows - thrust)
         force, torque = ALLOCATOR.wrench(tilt, thrust)
@@ -262,12 +262,13 @@ def test_a_rotor_that_turns_but_ignores_more_thrust_is_deaf_and_not_lost(sticks)
     assert watch.health.held[2] == (pytest.approx(7.0, abs=1.5) if sticks else None)
 
 
-@pytest.mark.parametrize(('speed', 'height', 'crashed'), [
-    (2.0, 0.1, True), (0.4, 0.1, False), (2.0, 1.0, False)])
-def test_without_imu_a_fall_that_ends_at_once_near_the_floor_is_a_crash(speed, height, crashed):
+@pytest.mark.parametrize(('speed', 'height', 'roll', 'crashed'), [
+    (2.0, 0.1, 0.0, True), (0.4, 0.1, 0.2, False), (2.0, 1.0, 0.0, False), (0.4, 0.1, 1.0, True)])
+def test_without_imu_a_fall_or_a_tipped_robot_at_the_floor_is_a_crash(
+        speed, height, roll, crashed):
     """A landing ends at 0.3 m/s."""
     contact = ContactWatch(ROBOT.gravity)
     for n in range(20):
         z = height + speed * 0.01 * max(10 - n, 0)
-        contact.on_pose(0.01 * n, np.array([0.0, 0.0, z]), height)
+        contact.on_pose(0.01 * n, np.array([0.0, 0.0, z]), rotations.from_rpy(roll, 0, 0), height)
     assert bool(contact.reason) == crashed

@@ -1,26 +1,12 @@
 """The route to level: joints stay within their stops, from any winding."""
 
-import itertools
-
 import numpy as np
 import pytest
 
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import Allocator
-from beetle_omni_ros.robot.degraded import FLYING_MARGIN, Holding
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.safety.way import (
-    climb,
-    FARTHEST,
-    find_turnover,
-    inclination,
-    LOST_LIFT,
-    MARGIN,
-    plan,
-    Ramp,
-    ROOM,
-    Way,
-)
+from beetle_omni_ros.safety.way import climb, inclination, MARGIN, plan, Ramp, Way
 
 ROBOT = RobotParameters.load()
 ALLOCATOR = Allocator(ROBOT)
@@ -83,18 +69,17 @@ def test_two_opposite_joints_at_their_stops_turn_back_without_loss_of_lift():
         tilt = np.where(at_stop, other, tilt)
         way = plan(attitude, tilt, ALLOCATOR, RATE)
         tilts, jumps = followed(way, tilt)
-        assert way.lost < 0.1 and jumps.max() < 1.0
+        assert jumps.max() < 1.0
         np.testing.assert_allclose(tilts[-1], 0, atol=1e-3)
     assert tried > 10
 
 
-KNOTS = [climb(0.8, 0.4, 0.5), climb(0.1, 0.4, 0.5),
-         [(0.0, 0.0), (0.5, 0.0), (0.7, -1.0), (1.7, -1.0), (2.0, -0.3)]]
+KNOTS = [climb(0.8, 0.4, 0.5), climb(0.1, 0.4, 0.5), [(0.0, 0.0), (0.5, 0.0), (0.7, -1.0)]]
 
 
 @pytest.mark.parametrize('knots', KNOTS)
 def test_velocities_of_a_ramp_are_the_derivatives_of_its_pose(knots):
-    way, h = Way.straight(ATTITUDES[2], UPSIDE_DOWN[1], 0.8), 1e-5
+    way, h = Way(np.array([0.0, 3.0]), np.array([ATTITUDES[2], UPSIDE_DOWN[1]])), 1e-5
     ramp = Ramp(10.0, np.array([1.0, 2.0, 3.0]), way, knots)
     for time in np.linspace(10.03, 16.03, 61):
         before, now, after = (ramp.at(t) for t in (time - h, time, time + h))
@@ -104,22 +89,3 @@ def test_velocities_of_a_ramp_are_the_derivatives_of_its_pose(knots):
                                                 after.quaternion))
         if abs(time - 10 - way.duration) > 2 * h:
             np.testing.assert_allclose(turn / (2 * h), now.angular_velocity, atol=1e-4)
-
-
-WINDINGS = [np.pi * np.array(signs) for signs in itertools.product((1.0, -1.0), repeat=4)]
-
-
-@pytest.mark.parametrize('tilt', [tilt for tilt in WINDINGS if (tilt[:2] == tilt[2:]).any()])
-def test_one_joint_turn_a_pair_permits_levelling_while_three_rotors_hold_the_position(tilt):
-    attitude = UPSIDE_DOWN[1]
-    for _ in range(np.sum(tilt[:2] == tilt[2:])):
-        assert plan(attitude, tilt, ALLOCATOR, RATE).lost > LOST_LIFT
-        found = find_turnover(attitude, tilt, ROBOT, ALLOCATOR, RATE)
-        holding = Holding(ROBOT, found.health)
-        assert holding.margin(found.quaternion) > FLYING_MARGIN
-        assert rotations.geodesic_angle(found.quaternion, attitude) < FARTHEST
-        assert abs(found.tilt) <= ALLOCATOR.tilt_limit - ROOM
-        assert np.sign(found.tilt) == -np.sign(tilt[found.joint])
-        tilt = np.where(np.arange(4) == found.joint, tilt - np.copysign(2 * np.pi, tilt), tilt)
-    assert plan(attitude, tilt, ALLOCATOR, RATE).lost <= LOST_LIFT
-    assert find_turnover(LEVEL, np.zeros(4), ROBOT, ALLOCATOR, RATE) is None

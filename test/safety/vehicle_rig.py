@@ -29,8 +29,8 @@ def hover_command(stamp, quaternion=LEVEL):
 class VehicleRig:
     """Supervisor with all its message sources; those in ``alive`` publish."""
 
-    def __init__(self, parameters=PARAMETERS):
-        self.supervisor = Supervisor(parameters, ROBOT, HoverController(ROBOT))
+    def __init__(self):
+        self.supervisor = Supervisor(PARAMETERS, ROBOT, HoverController(ROBOT))
         self.now = 100.0
         self.alive = set(ALL)
         self.position, self.velocity = np.array([0.3, -0.2, 0.16]), np.zeros(3)
