@@ -8,10 +8,11 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.thrust_map import ThrustMap
 from beetle_omni_ros.safety.detectors import PackWatch
 from beetle_omni_ros.sim.parameters import SimulatorParameters
+from beetle_omni_ros.sim.sensors import VOLTAGE_NOISE
 from beetle_omni_ros.sim.simulator import Battery
 
 ROBOT = RobotParameters.load()
-PACK = SimulatorParameters.load().battery
+PACK = SimulatorParameters.load()
 TICK = 0.01
 LAG = ROBOT.rotors.time_constant
 
@@ -35,7 +36,7 @@ class Flight:
             self.battery.step(self.thrust, TICK * faster)
             self.ticks += 1
             if self.ticks % 10 == 0:
-                seen = self.battery.voltage + PACK.voltage_noise * self.random.normal()
+                seen = self.battery.voltage + VOLTAGE_NOISE * self.random.normal()
                 self.watch.on_voltage(self.ticks * TICK, seen, self.thrust)
             if self.watch.limit is not None:
                 return self.ticks * TICK - time
