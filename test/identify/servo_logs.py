@@ -29,7 +29,8 @@ def servo(t, command, **values):
 
 @cache
 def _moved(t, command, *, frequency=47.0, damping=0.63, delay=0.015, coulomb=0.0, stiction=0.0,
-          backlash=0.0, velocity_limit=np.inf, torque_limit=np.inf, offset=0.0, gain=0.0):
+          backlash=0.0, velocity_limit=np.inf, torque_limit=np.inf, offset=0.0, gain=0.0,
+          cosine=0.0):
     """Positions (N,) [rad] of a servo that holds each command from its logged time on."""
     t, command = np.frombuffer(t), np.frombuffer(command)
     # It has been moving before the log: a straight run-up of a second.
@@ -56,7 +57,8 @@ def _moved(t, command, *, frequency=47.0, damping=0.63, delay=0.015, coulomb=0.0
         v = min(max(v, -velocity_limit), velocity_limit)
         q += STEP * v
         shown = min(max(shown, q - backlash), q + backlash)
-    return (1 + gain) * np.interp(t[-count:], fine, positions)
+    at = np.interp(t[-count:], fine, positions)
+    return (1 + gain) * at + cosine * (np.cos(at) - 1)
 
 
 def noisy(positions, rng, sigma=0.0012, slow=0.001):

@@ -93,6 +93,27 @@ def test_zeros_that_moved_are_named_with_joint_and_sign(zeros):
         assert low < entry['value'] < high and high - low < 0.004
 
 
+def line_zero(log, joint):
+    """Offset of position = gain command(t - delay) + offset, at the best delay."""
+    late = [np.interp(log.t - delay, log.t, log.command[joint])[20:]
+            for delay in np.arange(0.02, 0.1, 0.001)]
+    fits = [np.polyfit(c, log.measured[joint, 20:], 1, full=True)[:2] for c in late]
+    return min(fits, key=lambda fit: fit[1][0])[0][1]
+
+
+def test_a_zero_beside_an_encoder_error_is_that_of_a_line_fit():
+    log = made(6, {'offset': -0.012, 'cosine': 0.1}, {})
+    result = judged(log)
+    assert {(n, effect['joint']) for effect in result['effects'] for n in effect['names']} == {
+        ('joint_offset', 1), ('joint_encoder_error', 1)}
+    zero, = (effect['parameters']['offset'] for effect in result['effects']
+             if effect['names'] == ['joint_offset'])
+    low, high = zero['interval']
+    assert low < -line_zero(log, 0) < high and high - low < 0.004
+    assert zero['written'] == pytest.approx(0.012, abs=0.002) and zero['written'] < low
+    assert judged(log, corrected(robot(), result))['verdict'] == 'no_gap'
+
+
 @pytest.mark.parametrize(('changed', 'both', 'name'), [
     ((), {'delay': DELAY + 0.012}, 'joint_command_latency'),
     ((), {'frequency': 0.84 * FREQUENCY, 'damping': 0.84 * DAMPING}, 'joint_bandwidth'),

@@ -31,6 +31,7 @@ def effects_with(robot: RobotParameters, named: list[dict]) -> dict[str, dict]:
             spec = entry.parameters[parameter]
             value = found['value']
             if member:
+                value = found.get('written', value)     # a zero is reported over a log's angles
                 all_four = list(values.get(parameter, spec.neutral))
                 all_four[member - 1] = value
                 value = all_four

@@ -23,7 +23,7 @@ from beetle_omni_ros.identify.servo.fit import (
 )
 from beetle_omni_ros.identify.servo.joint import ALWAYS, identify, joint_results
 from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
-from beetle_omni_ros.identify.servo.model import INDEX
+from beetle_omni_ros.identify.servo.model import INDEX, NAMES, with_encoder_errors
 from beetle_omni_ros.identify.servo.robot import catalogue_values, file_sets, own_delay
 from beetle_omni_ros.robot.effects import CATALOGUE, separating_experiment
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -192,7 +192,10 @@ def _effects(found, robot):
             number = s.units[unit][2]
             own = {key: {'value': entry['each'][str(number)], 'unit': entry['unit'],
                          'interval': entry['intervals'][str(number)],
-                         'file': entry['files'][str(number)]} for key, entry in parts.items()}
+                         'file': entry['files'][str(number)],
+                         'written': float(catalogue_values(found.values()[unit],
+                                                           robot)[name][key])}
+                   for key, entry in parts.items()}
             result.append(effect | {'joint': number, 'parameters': own})
     return result
 
@@ -222,12 +225,14 @@ def _parameters(found, trial, name, robot):
     for parameter in spec:
         each, ends, files = {}, {}, {}
         for unit, (*_, number) in enumerate(s.units):
-            estimates = [_derived(one, unit, lambda values: catalogue_values(
-                values, robot)[name][parameter]) for one in possible]
+            def reported(values, unit=unit, parameter=parameter):
+                value = catalogue_values(values, robot)[name][parameter]
+                return value - _constant(s, unit, values) if name == 'joint_offset' else value
+            estimates = [_derived(one, unit, reported) for one in possible]
             each[str(number)] = estimates[0][0]
             ends[str(number)] = [min(value - WIDTH * error for value, error in estimates),
                                  max(value + WIDTH * error for value, error in estimates)]
-            files[str(number)] = float(catalogue_values(file[number - 1], robot)[name][parameter])
+            files[str(number)] = float(reported(file[number - 1]))
         low, high = np.median(list(ends.values()), axis=0)
         joined[parameter] = {
             'value': float(np.median(list(each.values()))), 'unit': spec[parameter].unit,
@@ -235,6 +240,22 @@ def _parameters(found, trial, name, robot):
             'interval': [max(float(low), spec[parameter].low), float(high)],
             'each': each, 'intervals': ends, 'files': files}
     return joined
+
+
+def _constant(servos, unit, values):
+    """
+    Constant of a line through the encoder errors at the angles of a log [rad].
+
+    That of the cosine is 0 at angle 0 and has one sign elsewhere, so that a zero at angle 0 is not
+    the mean error of the reading over the log.
+    """
+    k, j, _ = servos.units[unit]
+    log, settled = servos.logs[k], servos.rows[k][0]
+    angles = log.measured[j, settled:][log.fresh[settled:]]
+    value = dict(zip(NAMES, values[:, None], strict=True))
+    positions = angles[None] + value['offset'][:, None]
+    errors = with_encoder_errors(positions, value) - positions
+    return np.polyfit(angles, errors[0], 1)[1]
 
 
 def _derived(trial, unit, function):
