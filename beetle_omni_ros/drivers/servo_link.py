@@ -19,10 +19,6 @@ class ServoBusError(RuntimeError):
     """The bus or a servo failed, or a servo answered with an error; one line with port and ID."""
 
 
-class NoAnswer(ServoBusError):
-    """A servo did not answer, or its answer was corrupt."""
-
-
 class ServoLink:
     """
     The bus at one baud rate.
@@ -138,7 +134,7 @@ class ServoLink:
                 break
             if not left:
                 text = self._handler.getTxRxResult(result).removeprefix('[TxRxResult] ')
-                raise NoAnswer(f'{self.path}, id {identifier}: {what}: {text}')
+                raise ServoBusError(f'{self.path}, id {identifier}: {what}: {text}')
         if number := error & ~ALERT:
             self.counts['refused'] += 1
             text = PACKET_ERRORS.get(number, f'error {number}')

@@ -36,7 +36,6 @@ FIRMWARE = Register('Firmware Version', 6, 1)
 RETURN_DELAY = Register('Return Delay Time', 9, 1)
 DRIVE_MODE = Register('Drive Mode', 10, 1)
 OPERATING_MODE = Register('Operating Mode', 11, 1)
-SHADOW_ID = Register('Secondary(Shadow) ID', 12, 1)
 HOMING_OFFSET = Register('Homing Offset', 20, 4, True)
 CURRENT_LIMIT = Register('Current Limit', 38, 2)
 STARTUP = Register('Startup Configuration', 60, 1)
@@ -72,8 +71,7 @@ VOLTAGE_UNIT = 0.1          # [V]
 WATCHDOG_UNIT = 0.02        # [s]
 WATCHDOG_EXPIRED = 255      # -1 in one byte
 
-BAUD_CODES = {9600: 0, 57600: 1, 115200: 2, 1_000_000: 3, 2_000_000: 4, 3_000_000: 5,
-              4_000_000: 6}
+BAUD_RATES = (9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
 EXTENDED_POSITION = 4       # operating mode
 
 # Bits of Hardware Error Status (70) and Shutdown (63).
@@ -110,26 +108,22 @@ def unambiguous_limit(travel: float) -> float:
     return TURN - travel if travel > pi else travel
 
 
-def settle(servos: Sequence, travel: float, confirmed: Sequence[float] | None) -> str:
+def settle(servos: Sequence, travel: float) -> str:
     """
     Determine the unknown turn counts of servos; return '' or a message about ambiguous ones.
 
     Their ``position`` [rad], ``turns`` and ``turns_known`` are updated. ``travel`` is that of the
-    joints to each side [rad], ``confirmed`` angles measured by the operator to half a turn [rad].
+    joints to each side [rad].
     """
     doubts = []
-    for k, servo in enumerate(servos):
+    for servo in servos:
         if servo.turns_known:
             continue
         options = candidates(servo.position, travel)
-        if len(options) == 1:
-            chosen = options[0]
-        elif options and confirmed is not None:
-            chosen = min(options, key=lambda angle: abs(angle - confirmed[k]))
-        else:
+        if len(options) != 1:
             places = ' or '.join(f'{angle:+.2f}' for angle in options or [servo.position])
             doubts.append(f'{servo.name} (id {servo.identifier}) stands at {places} rad')
             continue
-        servo.turns += nearest_turns(servo.position, chosen)
-        servo.position, servo.turns_known = chosen, True
+        servo.turns += nearest_turns(servo.position, options[0])
+        servo.position, servo.turns_known = options[0], True
     return '; '.join(doubts)

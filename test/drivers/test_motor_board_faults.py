@@ -67,7 +67,7 @@ def test_voltage_sag_is_compensated_or_reported_as_saturation():
         assert until(lambda: np.allclose(emulated.thrust_targets, HOVER, rtol=2e-3))
         assert np.all(emulated.commands > before)
         pilot.thrust = np.full(4, 20.0)
-        assert until(lambda: pilot.results[-1].saturated.all())
+        assert until(lambda: board.saturated.all())
         emulated.set_battery(3.0, 0.0)
         assert until(lambda: pilot.has_event('3.0 V not plausible'))
         assert keeps_flying(emulated, 0.2)
