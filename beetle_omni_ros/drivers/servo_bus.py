@@ -65,10 +65,8 @@ class Servo:
     misses: int = 0                     # consecutive missing answers
     silent: bool = False                # after several of them: it is only pinged
     next_probe: float = 0.0             # monotonic time of the next ping [s]
-    wanted: bool = False                # whether it should have torque
-    torque: bool | None = None          # whether it has
+    torque: bool | None = None          # whether it has torque
     error: int = 0                      # Hardware Error Status
-    watchdog_expired: bool = False
     voltage: float = float('nan')       # [V]
     temperature: float = float('nan')   # [deg C]
     recovery: Iterator[None] | None = None      # while it is recovered
@@ -84,13 +82,13 @@ class Servo:
         """Goal for a tilt [rad], in the servo's present frame."""
         return round(self.zero + self.sign * (tilt - TURN * self.turns) / registers.POSITION_UNIT)
 
-    def update(self, data: bytes, now: float) -> bool:
+    def update(self, data: bytes, now: float, enabled: bool) -> bool:
         """Update it from feedback at monotonic ``now`` [s]; return whether it has restarted."""
         current, velocity, counts = FEEDBACK_LAYOUT.unpack(data)
         self.current = self.sign * current * registers.CURRENT_UNIT
         self.velocity = self.sign * velocity * registers.VELOCITY_UNIT
         angle, before = self.angle(counts), self.turns
-        if self.wanted or now - self.updated < TRACKED:
+        if enabled or now - self.updated < TRACKED:
             # A servo cannot move by half a turn between two readings. After a pause without
             # torque, in which it can be turned by hand, the servo's own count is used.
             self.turns = nearest_turns(angle, self.position)
@@ -116,11 +114,7 @@ class Servo:
             return f'{self.where}: silent; check its cable and power'
         if errors and not self.torque:
             return f'{self.where}: shut down ({errors}); remove the cause, reboot it'
-        if errors:
-            return f'{self.where}: {errors}'
-        if self.watchdog_expired:
-            return f'{self.where}: stopped by its watchdog'
-        return f'{self.where}: torque is off' if self.wanted and self.torque is False else ''
+        return f'{self.where}: {errors}' if errors else ''
 
 
 def make_servos(parameters: ServoBusParameters) -> list[Servo]:
@@ -165,19 +159,17 @@ class ServoBus:
     results. Together they then take at most one reply time. They recover without further calls.
 
     ``clock`` gives the stamps of readings [s]. ``enabled`` is whether the servos should have
-    torque, ``clipped`` the number of goals limited to the travel, ``stamp`` the time of the last
-    request for feedback.
+    torque, ``stamp`` the time of the last request for feedback.
     """
 
     def __init__(self, parameters: ServoBusParameters, joints: JointParameters,
                  clock: Callable[[], float] = time.time):
         self.parameters, self.travel = parameters, joints.position_limit
         self.servos = make_servos(parameters)
-        self.enabled, self.clipped, self._clock, self.stamp = False, 0, clock, 0.0
+        self.enabled, self._clock, self.stamp = False, clock, 0.0
         self.link = ServoLink(parameters.port, parameters.baud_rate, parameters.reply_time)
         self._guard: Popen | None = None
         self._torque_off = registers.TORQUE_ENABLE, {one.identifier: 0 for one in self.servos}
-        self._recovering: deque[Servo] = deque()    # with a recovery, the next one first
         self._next_health = self._next_open = 0.0
         self._group = 0
         self._events: deque[str] = deque(maxlen=200)    # lines for the log
@@ -218,7 +210,7 @@ class ServoBus:
                 raise ServoBusError(f'{self.link.path}: ' + ' | '.join(problems))
             for servo in self.servos:
                 servo.silent, servo.kept_off, servo.misses, servo.recoveries = False, False, 0, 0
-                servo.torque, servo.error, servo.watchdog_expired = False, 0, False
+                servo.torque, servo.error = False, 0
             self._locate()
 
     def enable(self):
@@ -237,14 +229,14 @@ class ServoBus:
         if self.parameters.guard and self._guard is None:
             self._guard = servo_guard.start(self.link.path, self.link.baud_rate,
                                             self.link.packet_of_sync_write(*self._torque_off))
-        self._want_torque(True)
+        self.enabled = True
         try:
             with self._outside_the_loop():
                 for servo in self.servos:
                     for register, value in ((registers.WATCHDOG, 0), *self._power_on(
                             servo.counts(servo.position))):
                         self.link.write(servo.identifier, register, value)
-                    servo.torque, servo.watchdog_expired = True, False
+                    servo.torque = True
         except (ServoBusError, SerialPortError):
             self.disable()
             raise
@@ -252,7 +244,7 @@ class ServoBus:
     def disable(self) -> bool:
         """Switch the torque of all servos off; return whether every servo has confirmed it."""
         was_enabled = self.enabled
-        self._want_torque(False)
+        self.enabled = False
         self._drop_recoveries()
         if not self.link.is_open:
             return not was_enabled
@@ -275,10 +267,9 @@ class ServoBus:
             self._guard = None
         return confirmed
 
-    def reboot(self, identifier: int):
+    def reboot(self, index: int):
         """Start the restart of a servo; calls of :meth:`upkeep` finish it in about 0.5 s."""
-        (servo,) = (servo for servo in self.servos if servo.identifier == identifier)
-        self._recover(servo, forced=True)
+        self._recover(self.servos[index], forced=True)
 
     def write_goals(self, tilt: np.ndarray) -> bool:
         """
@@ -289,7 +280,6 @@ class ServoBus:
         if not self.enabled or not self.link.is_open:
             return False
         legal = np.clip(tilt, -self.travel, self.travel)
-        self.clipped += int(np.any(legal != tilt))
         try:
             self._feed_watchdog()
             return self.link.sync_write(registers.GOAL_POSITION, {
@@ -335,8 +325,8 @@ class ServoBus:
         try:
             if self.link.late:
                 self.link.late = False
-            elif self._recovering:
-                self._recover_step()
+            elif recovering := [servo for servo in self.servos if servo.recovery]:
+                self._recover_step(recovering[0])
             elif any(servo.silent and now >= servo.next_probe for servo in self.servos):
                 self._probe(now)
             elif now >= self._next_health:
@@ -397,11 +387,6 @@ class ServoBus:
                 self.link.sync_write(*self._torque_off)
         except SerialPortError:
             self.link.close()
-
-    def _want_torque(self, wanted):
-        self.enabled = wanted
-        for servo in self.servos:
-            servo.wanted = wanted
 
     def _apply_settings(self, servo):
         given, identifier = self.parameters, servo.identifier
@@ -480,7 +465,7 @@ class ServoBus:
             if data is None:
                 continue
             answered.add(servo)
-            if servo.update(data, now):
+            if servo.update(data, now, self.enabled):
                 servo.turns_known &= self.enabled
                 if servo.recovery is None:
                     self.log(f'{servo.where}: lost its turn count, taken as '
@@ -533,8 +518,7 @@ class ServoBus:
             elif register is registers.STATUS_LEVEL:
                 servo.error = data[2]  # Hardware Error Status is the third
             elif register is registers.WATCHDOG:
-                servo.watchdog_expired = data[0] == registers.WATCHDOG_EXPIRED
-                if servo.watchdog_expired and self.enabled:
+                if data[0] == registers.WATCHDOG_EXPIRED and self.enabled:
                     self.log(f'{servo.where}: was stopped by its watchdog, continues')
                     self._restart_watchdog([servo])
             else:
@@ -545,23 +529,17 @@ class ServoBus:
 
     def _recover(self, servo, forced=False):
         """Start the recovery of a servo; with ``forced``, restart it in any case."""
-        if servo.recovery is None:
-            self._recovering.append(servo)
-        elif not forced:
-            return
-        servo.torque = None     # unknown until it is read
-        servo.recovery = self._recovery(servo, forced)
+        if forced or servo.recovery is None:
+            servo.torque = None     # unknown until it is read
+            servo.recovery = self._recovery(servo, forced)
 
     def _drop_recoveries(self):
-        self._recovering.clear()
         for servo in self.servos:
             servo.recovery = None
 
-    def _recover_step(self):
-        servo = self._recovering.popleft()
+    def _recover_step(self, servo):
         try:
             next(servo.recovery)
-            self._recovering.append(servo)  # behind the others
             return
         except StopIteration:
             pass
@@ -615,7 +593,7 @@ class ServoBus:
         for register, value in self._power_on(counts):
             yield
             link.write(identifier, register, value, attempts=1)
-        servo.torque, servo.watchdog_expired = True, False
+        servo.torque = True
         self.log(f'{servo.where}: had restarted, is back at {servo.position:+.2f} rad')
 
     def _power_on(self, counts):

@@ -211,7 +211,7 @@ class JointBridgeNode(BridgeNode):
                  if servo.errors and not servo.torque] or range(4)
         with self._loop.exclusive() as bus:
             for k in which:
-                bus.reboot(int(self.parameters.ids[k]))
+                bus.reboot(k)
         response.success = True
         response.message = f"restarting {', '.join(JOINT_NAMES[k] for k in which)}"
         return response
@@ -253,8 +253,7 @@ class JointBridgeNode(BridgeNode):
         return level, 'no connection' if level == WARN else text, {
             'stage': self.stage, 'cycles': loop.cycles, 'missed_cycles': loop.missed,
             'connected': bus.link.is_open, 'goals_written': loop.written,
-            'goals_stale': loop.stale, 'goals_clipped': bus.clipped,
-            'incomplete': loop.incomplete, **bus.link.counts}
+            'goals_stale': loop.stale, 'incomplete': loop.incomplete, **bus.link.counts}
 
     def _servo_status(self, k):
         if self._bus is None:
@@ -264,8 +263,7 @@ class JointBridgeNode(BridgeNode):
         values = {'id': one.identifier, 'responding': not one.silent,
                   'torque': 'unknown' if one.torque is None else one.torque,
                   'voltage_v': one.voltage, 'temperature_c': one.temperature,
-                  'errors': ', '.join(one.errors) or 'none',
-                  'watchdog_expired': one.watchdog_expired, 'recovering': recovering}
+                  'errors': ', '.join(one.errors) or 'none', 'recovering': recovering}
         if one.message:
             bad = one.silent or (one.errors and not one.torque)
             return (ERROR if bad else WARN), one.message, values
