@@ -128,17 +128,16 @@ def check_servos(parameters: ServoBusParameters, joints: JointParameters,
 
 
 def _check_bus(findings, link, parameters, joints):
-    from beetle_omni_ros.drivers.servo_bus import examine, make_servos
+    from beetle_omni_ros.drivers.servo_bus import ATTEMPTS, examine, make_servos
     from beetle_omni_ros.drivers.servo_link import ServoBusError
     servos = make_servos(parameters)
-    with link.patient():
-        problems = [examine(link, servo) for servo in servos]
-        present = [servo for servo in servos if servo.model is not None]
-        for servo in present:
-            try:
-                servo.torque = bool(link.read(servo.identifier, registers.TORQUE_ENABLE))
-            except ServoBusError:
-                servo.torque = None
+    problems = [examine(link, servo) for servo in servos]
+    present = [servo for servo in servos if servo.model is not None]
+    for servo in present:
+        try:
+            servo.torque = bool(link.read(servo.identifier, registers.TORQUE_ENABLE, ATTEMPTS))
+        except ServoBusError:
+            servo.torque = None
     if not present:
         findings.add(BUS, f'no servo answers at {link.baud_rate} bit/s', fail="check the servos' "
                      'supply (their LEDs blink once at power-up), the data cable, and with '

@@ -81,7 +81,6 @@ class ClockOffset:
 class BoardStatus:
     """A heartbeat: state, reason of the last disarming, present conditions, contract version."""
 
-    stamp: float
     state: str
     stop_reason: str
     conditions: tuple[str, ...]
@@ -169,8 +168,7 @@ class BoardState:
         """Update the status after an acknowledged command, before the next heartbeat."""
         if self.status is not None and self.status.armed != arm:
             # The next heartbeat contains the conditions that prevent arming again.
-            self.status = replace(self.status, stamp=self._host_clock(),
-                                  state='armed' if arm else 'disarmed',
+            self.status = replace(self.status, state='armed' if arm else 'disarmed',
                                   conditions=self.status.conditions if arm else (THROTTLE,))
             self._event('info', self.status.state)
 
@@ -193,7 +191,7 @@ class BoardState:
         state, reason, conditions, contract = message.custom_mode.to_bytes(4, 'little')
         old = self.status
         self.status = new = BoardStatus(
-            self._host_clock(), STATES.get(state, f'state {state}'),
+            STATES.get(state, f'state {state}'),
             STOP_REASONS.get(reason, f'reason {reason}'), conditions_of(conditions), contract)
         if new.state == 'boot':
             self.clock.restart()

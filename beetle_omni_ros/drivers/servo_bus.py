@@ -2,7 +2,6 @@
 
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 import struct
 from subprocess import Popen
@@ -193,25 +192,24 @@ class ServoBus:
 
         ServoBusError names all servos that are missing or wrong, or refuse a setting.
         """
-        with self._outside_the_loop():
-            self.disable()
-            problems = []
-            for servo in self.servos:
-                problem, remedy = examine(self.link, servo)
-                if problem:
-                    problems.append(f'{servo.name} (id {servo.identifier}): {problem}; {remedy}')
-                    continue
-                try:
-                    servo.turns_known &= self._is_marked(servo)
-                    self._apply_settings(servo)
-                except ServoBusError as error:
-                    problems.append(f'{servo.name}: {error}')
-            if problems:
-                raise ServoBusError(f'{self.link.path}: ' + ' | '.join(problems))
-            for servo in self.servos:
-                servo.silent, servo.kept_off, servo.misses, servo.recoveries = False, False, 0, 0
-                servo.torque, servo.error = False, 0
-            self._locate()
+        self.disable()
+        problems = []
+        for servo in self.servos:
+            problem, remedy = examine(self.link, servo)
+            if problem:
+                problems.append(f'{servo.name} (id {servo.identifier}): {problem}; {remedy}')
+                continue
+            try:
+                servo.turns_known &= self._is_marked(servo)
+                self._apply_settings(servo)
+            except ServoBusError as error:
+                problems.append(f'{servo.name}: {error}')
+        if problems:
+            raise ServoBusError(f'{self.link.path}: ' + ' | '.join(problems))
+        for servo in self.servos:
+            servo.silent, servo.kept_off, servo.misses, servo.recoveries = False, False, 0, 0
+            servo.torque, servo.error = False, 0
+        self._locate()
 
     def enable(self):
         """
@@ -219,8 +217,7 @@ class ServoBus:
 
         ServoBusError: an angle is ambiguous, or a servo failed; then none has torque.
         """
-        with self._outside_the_loop():
-            self._locate()
+        self._locate()
         if doubts := registers.settle(self.servos, self.travel):
             limit = registers.unambiguous_limit(self.travel)
             raise ServoBusError(
@@ -231,12 +228,11 @@ class ServoBus:
                                             self.link.packet_of_sync_write(*self._torque_off))
         self.enabled = True
         try:
-            with self._outside_the_loop():
-                for servo in self.servos:
-                    for register, value in ((registers.WATCHDOG, 0), *self._power_on(
-                            servo.counts(servo.position))):
-                        self.link.write(servo.identifier, register, value)
-                    servo.torque = True
+            for servo in self.servos:
+                for register, value in ((registers.WATCHDOG, 0), *self._power_on(
+                        servo.counts(servo.position))):
+                    self.link.write(servo.identifier, register, value)
+                servo.torque = True
         except (ServoBusError, SerialPortError):
             self.disable()
             raise
@@ -250,15 +246,14 @@ class ServoBus:
             return not was_enabled
         confirmed = True
         try:
-            with self.link.patient():
-                self.link.sync_write(*self._torque_off)
-                for servo in self.servos:
-                    try:
-                        self.link.write(servo.identifier, registers.TORQUE_ENABLE, 0)
-                        servo.torque = False
-                    except ServoBusError as error:
-                        confirmed = False
-                        self.log(f'torque off is not confirmed: {error}')
+            self.link.sync_write(*self._torque_off)
+            for servo in self.servos:
+                try:
+                    self.link.write(servo.identifier, registers.TORQUE_ENABLE, 0)
+                    servo.torque = False
+                except ServoBusError as error:
+                    confirmed = False
+                    self.log(f'torque off is not confirmed: {error}')
         except SerialPortError as error:
             self._port_lost(error)
             return False
@@ -351,16 +346,6 @@ class ServoBus:
         if now - self._logged.get(line, -REPEAT_AFTER) >= REPEAT_AFTER:
             self._logged[line] = now
             self._events.append(line)
-
-    @contextmanager
-    def _outside_the_loop(self):
-        """Context that waits longer for answers."""
-        try:
-            with self.link.patient():
-                yield
-        except SerialPortError as error:
-            self._port_lost(error)
-            raise
 
     def _port_lost(self, error):
         """Close the failed port; :meth:`_reconnect` opens it again."""
