@@ -8,7 +8,7 @@ from types import SimpleNamespace
 from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, PacketHandler
 
 from beetle_omni_ros.drivers.serial_port import SerialPort, SerialPortError
-from beetle_omni_ros.drivers.servo_registers import ALERT, PACKET_ERRORS, Register
+from beetle_omni_ros.drivers.servo_registers import ALERT, Register
 
 RELAXED_REPLY_TIME = 0.02   # [s] time limit of an answer to a request with several attempts
 STATUS_SIZE = 11            # [B] of an answer without data
@@ -129,7 +129,7 @@ class ServoLink:
                 raise ServoBusError(f'{self.path}, id {identifier}: {what}: {text}')
         if number := error & ~ALERT:
             self.counts['refused'] += 1
-            text = PACKET_ERRORS.get(number, f'error {number}')
+            text = self._handler.getRxPacketError(number).removeprefix('[RxPacketError] ')
             raise ServoBusError(f'{self.path}, id {identifier}: {what}: refused, {text}')
         return data
 

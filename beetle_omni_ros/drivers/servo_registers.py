@@ -58,8 +58,6 @@ PRESENT_POSITION = Register('Present Position', 132, 4, True)
 INPUT_VOLTAGE = Register('Present Input Voltage', 144, 2)
 TEMPERATURE = Register('Present Temperature', 146, 1)
 
-ALL = tuple(value for value in list(globals().values()) if isinstance(value, Register))
-
 MODEL = 1210                # XC330-T181-T
 STARTUP_FIRMWARE = 46       # the startup configuration exists from here on
 
@@ -80,12 +78,7 @@ HARDWARE_ERRORS = {
     0x01: 'input voltage outside its limits', OVERHEATING: 'overheated', 0x08: 'encoder fault',
     0x10: 'electrical shock or too little power', 0x20: 'overload'}
 
-# Error number of a status packet; bit 7 is the alert that HARDWARE_ERROR explains.
-ALERT = 0x80
-PACKET_ERRORS = {
-    1: 'could not execute it', 2: 'unknown instruction', 3: 'received a bad CRC',
-    4: 'value out of range', 5: 'wrong data length', 6: 'value beyond a limit register',
-    7: 'no access (unknown or read-only register, or EEPROM while torque is on)'}
+ALERT = 0x80    # bit of a status packet's error number, which HARDWARE_ERROR explains
 
 
 # A servo counts turns only while it has power. After power-up or reboot its position is within

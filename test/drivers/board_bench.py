@@ -12,8 +12,8 @@ from beetle_omni_ros.drivers.motor_board import MotorBoard
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 
-QUICK = {'boot_time': 0.05, 'heartbeat_timeout': 0.5, 'idle_timeout': 1.0,
-         'throttle_low_time': 0.3, 'reception_rate': 10.0}
+QUICK = {'boot_time': 0.05, 'idle_timeout': 1.0, 'throttle_low_time': 0.3,
+         'reception_rate': 10.0}
 ROBOT = RobotParameters.load()
 HOVER = np.array([7.0, 7.5, 8.0, 8.5])
 

@@ -91,7 +91,8 @@ def test_impossible_parameters_are_refused(change, text):
         bind(ServoBusParameters, {**shipped, **change}, 'file')
 
 
-@pytest.mark.parametrize('register', registers.ALL, ids=str)
+@pytest.mark.parametrize('register', [
+    value for value in vars(registers).values() if isinstance(value, registers.Register)], ids=str)
 def test_registers_agree_with_the_table_of_the_emulated_servo(register):
     emulated = table.TABLE[register.name]
     assert (emulated.address, emulated.size, emulated.signed) == register[1:]
