@@ -26,7 +26,7 @@ HEARTBEAT_PERIOD = 0.2  # [s] by the contract, as the next three
 TIMESYNC_PERIOD, TIMESYNC_PERIOD_UNKNOWN = 0.2, 0.05    # [s]; the second until it is answered
 ACKNOWLEDGE_TIMEOUT = 0.1   # [s] until a command is repeated
 ATTEMPTS = 5            # of a command
-RECONNECT = 0.5         # [s] between attempts to open a lost port
+RECONNECT = 0.05        # [s] between attempts to open a lost port
 RESULTS = {1: 'refused', 2: 'denied', 3: 'unsupported', 4: 'failed'}
 
 DISARMED = 'disarmed'
@@ -116,9 +116,9 @@ class MotorBoard:
         self._port: SerialPort | None = None
         self._thread: threading.Thread | None = None
         self._stopping = False
-        self._sent = self._dropped = self._connections = 0
+        self._counts = dict.fromkeys(('sent', 'buffer_full', 'connections'), 0)
         self._command: ArmCommand | None = None
-        self._next_heartbeat = self._next_timesync = self._next_open = 0.0
+        self._next_heartbeat = self._next_timesync = 0.0
         self._last_stamp = (math.nan, 0)
 
     def open(self) -> None:
@@ -220,8 +220,7 @@ class MotorBoard:
     def link(self) -> dict[str, float]:
         """Counts of both directions of the link and synchronisation of the clocks, by name."""
         clock = self.state.clock
-        return {**self._receiver.counts, 'sent': self._sent, 'buffer_full': self._dropped,
-                'connections': self._connections,
+        return {**self._receiver.counts, **self._counts,
                 **{f'board {name}': count for name, count in self.state.reception.items()},
                 'clock_offset_s': clock.offset(),
                 'clock_uncertainty_ms': 1e3 * clock.uncertainty(time.monotonic())}
@@ -239,9 +238,7 @@ class MotorBoard:
             if taken:
                 # A dropped frame must not leave a gap, which the board would count as lost.
                 self._packer.seq = (self._packer.seq + 1) % 256
-                self._sent += 1
-            else:
-                self._dropped += 1
+            self._counts['sent' if taken else 'buffer_full'] += 1
             return taken
 
     def _connect(self):
@@ -249,7 +246,7 @@ class MotorBoard:
         self._receiver.restart()
         with self._write_lock:
             self._port = port
-        self._connections += 1
+        self._counts['connections'] += 1
 
     def _disconnect(self):
         with self._write_lock:
@@ -261,28 +258,18 @@ class MotorBoard:
         while not self._stopping:
             try:
                 if self._port is None:
-                    self._reconnect()
+                    time.sleep(RECONNECT)
+                    self._connect()
+                    with self._lock:
+                        self.state.connection('')
                 else:
                     self._serve(self._port)
             except SerialPortError as error:
-                self._disconnect()
-                with self._lock:
-                    self.state.connection(str(error))
+                if self._port is not None:      # lost, and not still missing
+                    self._disconnect()
+                    with self._lock:
+                        self.state.connection(str(error))
             self._tick(time.monotonic())
-
-    def _reconnect(self):
-        """Try to open the port if it is time."""
-        time.sleep(TICK)
-        now = time.monotonic()
-        if now < self._next_open:
-            return
-        self._next_open = now + RECONNECT
-        try:
-            self._connect()
-            with self._lock:
-                self.state.connection('')
-        except SerialPortError:
-            pass
 
     def _serve(self, port):
         """Wait at most one tick for bytes and handle them."""
