@@ -31,6 +31,7 @@ LOSS, LOSS_FAIL = (0, 0.01), (0, 0.1)       # [-] lost answers or packets; at 0.
 # [V] supply of a servo: the smallest of the XC330-T181-T by its manual, to 5 % above the largest;
 # half a volt below the recommended 11.1 V, it is weaker and slower.
 SUPPLY, SUPPLY_FAIL = (10.5, 12.6), (6.5, 12.6)
+CLOCK, CLOCK_FAIL = (0, 0.01), (0, 0.02)    # [s] error bound of the board's clock offset
 TEMPERATURE = (-inf, 55.0)  # [C] at rest a servo has nearly room temperature; it stops at 70
 # [V] cell at rest: about half empty; smallest for arming (supervisor.yaml). Above a full LiPo
 # cell, 4.2 V, the calibration or the number of cells is wrong.
@@ -115,7 +116,7 @@ def check_servos(parameters: ServoBusParameters, joints: JointParameters,
     except ModuleNotFoundError as error:
         findings.missing(BUS, error, 'hardware')
         return findings
-    link = ServoLink(parameters.port, parameters.baud_rate, parameters.timing.reply)
+    link = ServoLink(parameters.port, parameters.baud_rate, parameters.reply_time)
     if open_port(findings, link, 'servo', parameters.port, 'joint_bridge', graph):
         try:
             _check_bus(findings, link, parameters, joints)
@@ -127,24 +128,23 @@ def check_servos(parameters: ServoBusParameters, joints: JointParameters,
 
 
 def _check_bus(findings, link, parameters, joints):
-    from beetle_omni_ros.drivers.servo_bus import examine, make_servos
+    from beetle_omni_ros.drivers.servo_bus import ATTEMPTS, examine, make_servos
     from beetle_omni_ros.drivers.servo_link import ServoBusError
     servos = make_servos(parameters)
-    with link.patient():
-        problems = [examine(link, servo) for servo in servos]
-        present = [servo for servo in servos if servo.model is not None]
-        for servo in present:
-            try:
-                servo.torque = bool(link.read(servo.identifier, registers.TORQUE_ENABLE))
-            except ServoBusError:
-                servo.torque = None
+    problems = [examine(link, servo) for servo in servos]
+    present = [servo for servo in servos if servo.model is not None]
+    for servo in present:
+        try:
+            servo.torque = bool(link.read(servo.identifier, registers.TORQUE_ENABLE, ATTEMPTS))
+        except ServoBusError:
+            servo.torque = None
     if not present:
         findings.add(BUS, f'no servo answers at {link.baud_rate} bit/s', fail="check the servos' "
                      'supply (their LEDs blink once at power-up), the data cable, and with '
                      'DYNAMIXEL Wizard their baud rates')
         return
     _check_answers(findings, link, present)
-    for k, (servo, (problem, remedy)) in enumerate(zip(servos, problems, strict=True)):
+    for servo, (problem, remedy) in zip(servos, problems, strict=True):
         if servo.model is None:
             findings.add(servo.name, f'id {servo.identifier} {problem}',
                          fail='check its connector, and those before it in the chain; search '
@@ -160,15 +160,14 @@ def _check_bus(findings, link, parameters, joints):
                      fail=remedy if problem else '', id=servo.identifier, model=servo.model,
                      firmware=servo.firmware, baud_rate=link.baud_rate, **values)
         if values:
-            _check_servo(findings, servo, parameters, joints, k)
+            _check_servo(findings, servo, joints)
 
 
-def _check_servo(findings, servo, parameters, joints, k):
+def _check_servo(findings, servo, joints):
     """Add a finding for each problem of supply, temperature, torque and turn."""
     name, volts, angle = servo.name, servo.voltage, servo.position
     limit = registers.unambiguous_limit(joints.position_limit)
-    confirmed = [parameters.confirmed_tilts[k]] if parameters.confirm_tilts else None
-    doubts = registers.settle([servo], joints.position_limit, confirmed)    # the driver's rule
+    doubts = registers.settle([servo], joints.position_limit)       # the driver's rule
     rows = Findings()
     rows.grade(f'{name} supply', f'{volts:.1f} V, allowed are {SUPPLY_FAIL[0]:g} to '
                f'{SUPPLY_FAIL[1]:g} V, below {SUPPLY[0]:g} V it is slower and weaker than '
@@ -180,12 +179,9 @@ def _check_servo(findings, servo, parameters, joints, k):
     rows.add(f'{name} torque', 'its torque is on, although no driver has the port open',
              warn='a program left it on: switch it off with the joint bridge, or cut its supply'
              if servo.torque else '')
-    rows.add(f'{name} turn', f'ambiguous: {doubts}' if doubts else
-             f'taken as {servo.position:+.2f} rad because confirm_tilts is set',
-             fail=f'turn it by hand to within +-{limit:.2f} rad, cables untwisted; or set '
-             f'confirmed_tilts and confirm_tilts: {GUIDE}' if doubts else '',
-             warn='reset confirm_tilts once it is parked' if confirmed else '',
-             position_rad=angle if doubts else servo.position)
+    rows.add(f'{name} turn', f'ambiguous: {doubts}',
+             fail=f'turn it by hand to within +-{limit:.2f} rad, cables untwisted: {GUIDE}'
+             if doubts else '', position_rad=angle)
     findings += [row for row in rows if row.remedy]
 
 
@@ -237,16 +233,15 @@ def check_board(parameters: MotorBoardParameters, robot: RobotParameters, second
     if status is None:
         findings.add(BOARD, f"no heartbeat; {link['bytes']} bytes, {link['received']} good "
                      f"packets, {link['foreign']} of other senders", fail=(
-                         'another device sends MAVLink; expected system '
-                         f'{parameters.board_system}, component {parameters.board_component}: '
-                         'params/motor_board.yaml' if link['foreign'] else
+                         'another device sends MAVLink: docs/reference/firmware.md has the '
+                         'identity of the board' if link['foreign'] else
                          f'wrong baud rate (here {parameters.baud} bit/s), or another firmware or '
                          'device' if link['bytes'] else
                          "check the board's power, the cable, TX and RX swapped, another port"))
         return findings
     _check_status(findings, status)
     _check_power(findings, battery, rotors, robot.battery.cells)
-    _check_link(findings, link, receptions, parameters.clock_uncertainty_limit)
+    _check_link(findings, link, receptions)
     return findings
 
 
@@ -287,8 +282,7 @@ def _check_status(findings, status):
     blocking = [condition for condition in status.conditions if condition != NO_HOST_HEARTBEAT]
     receives = NO_HOST_HEARTBEAT not in status.conditions
     findings.add('board receives host', 'yes' if receives else NO_HOST_HEARTBEAT,
-                 fail='' if receives else "check the computer's TX wire, and host_system and "
-                 'host_component in params/motor_board.yaml')
+                 fail='' if receives else "check the computer's TX wire")
     findings.add('board ready to arm', ', '.join(blocking) or 'yes',
                  fail='charge the battery, check the ESCs, stop programs that command thrust'
                  if blocking else '')
@@ -323,14 +317,14 @@ def _check_power(findings, battery, rotors, cells):
             error_count=int(rotors.error_count[k]))
 
 
-def _check_link(findings, link, receptions, limit):
+def _check_link(findings, link, receptions):
     """Add findings about the clock and the packets in both directions."""
     offset, uncertainty = link['clock_offset_s'], link['clock_uncertainty_ms'] / 1e3
     findings.grade(
         'board clock', f'offset {offset:.3f} s +- {1e3 * uncertainty:.2f} ms'
         if np.isfinite(uncertainty) else 'offset unknown: no answer to TIMESYNC', uncertainty,
         "check the computer's TX wire, the latency timer of the adapter and the load of the "
-        'computer; the firmware must answer TIMESYNC', warn=(0, limit / 2), fail=(0, limit),
+        'computer; the firmware must answer TIMESYNC', warn=CLOCK, fail=CLOCK_FAIL,
         offset_s=offset, uncertainty_s=uncertainty)
     counts = [('link from the board', link['lost'], link['bad_crc'], link['received'])]
     if len(receptions) > 1:

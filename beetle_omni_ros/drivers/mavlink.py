@@ -35,6 +35,7 @@ _declare(291, 'ESC_STATUS', 10, '<Q4i4f4fB', {
     'time_usec': 1, 'rpm': 4, 'voltage': 4, 'current': 4, 'index': 1}, [
     'index', 'time_usec', 'rpm', 'voltage', 'current'])
 EscInfo, EscStatus = common.mavlink_map[290], common.mavlink_map[291]
+BOARD, HOST = (1, 1), (1, 191)    # system and component of both sides
 common.MAVLINK_IGNORE_CRC = 0   # the environment must not switch the checksum off
 
 

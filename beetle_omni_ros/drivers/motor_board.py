@@ -8,13 +8,12 @@ import math
 import select
 import threading
 import time
-from typing import NamedTuple
 
 import numpy as np
 
 from beetle_omni_ros.drivers import motor_board_state as messages
 from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters
-from beetle_omni_ros.drivers.mavlink import common, MavlinkReceiver, restarted
+from beetle_omni_ros.drivers.mavlink import BOARD, common, HOST, MavlinkReceiver, restarted
 from beetle_omni_ros.drivers.motor_board_state import BoardState, RotorStates
 from beetle_omni_ros.drivers.serial_port import SerialPort, SerialPortError
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -23,7 +22,11 @@ from beetle_omni_ros.robot.thrust_map import ThrustMap
 
 TICK = 0.01             # [s] longest sleep of the thread, a tenth of its shortest period
 CORRECTION = 50_000     # [us] a larger backward step of the board's clock is a restart
-CLOSING_COMMANDS = 3    # disarm commands sent at once on closing
+HEARTBEAT_PERIOD = 0.2  # [s] by the contract, as the next three
+TIMESYNC_PERIOD, TIMESYNC_PERIOD_UNKNOWN = 0.2, 0.05    # [s]; the second until it is answered
+ACKNOWLEDGE_TIMEOUT = 0.1   # [s] until a command is repeated
+ATTEMPTS = 5            # of a command
+RECONNECT = 0.05        # [s] between attempts to open a lost port
 RESULTS = {1: 'refused', 2: 'denied', 3: 'unsupported', 4: 'failed'}
 
 DISARMED = 'disarmed'
@@ -42,25 +45,23 @@ class ArmCommand:
     accepted it, None while it is pending, and ``reason`` the reason of a refusal.
     """
 
-    def __init__(self, arm: bool, parameters: MotorBoardParameters, send: Callable):
+    def __init__(self, arm: bool, send: Callable):
         self.arm, self.reason = arm, ''
         self.accepted: bool | None = None
-        self._parameters, self._send = parameters, send
-        self._next, self._attempts = -math.inf, 0
+        self._send, self._next, self._attempts = send, -math.inf, 0
         self._done = threading.Event()
 
     def tick(self, now: float) -> None:
         """Send it, or fail, if no acknowledgement arrived in time."""
         if self.accepted is not None or now < self._next:
             return
-        if self._attempts >= self._parameters.acknowledge_attempts:
+        if self._attempts >= ATTEMPTS:
             self.end(False, f'no acknowledgement to {self._attempts} attempts')
             return
-        self._next = now + self._parameters.acknowledge_timeout
+        self._next = now + ACKNOWLEDGE_TIMEOUT
         self._send(common.MAVLink_command_long_message(
-            self._parameters.board_system, self._parameters.board_component,
-            common.MAV_CMD_COMPONENT_ARM_DISARM, self._attempts,
-            float(self.arm), 0, 0, 0, 0, 0, 0))
+            *BOARD, common.MAV_CMD_COMPONENT_ARM_DISARM, self._attempts, float(self.arm),
+            0, 0, 0, 0, 0, 0))
         self._attempts += 1
 
     def acknowledge(self, message, state: BoardState) -> None:
@@ -83,19 +84,10 @@ class ArmCommand:
             self._done.set()
 
     def wait(self) -> ArmCommand:
-        """Return itself with the result, after half a second at most."""
-        p = self._parameters
-        if not self._done.wait(p.acknowledge_timeout * (p.acknowledge_attempts + 2)):
+        """Return itself with the result, after 0.7 s at most."""
+        if not self._done.wait(ACKNOWLEDGE_TIMEOUT * (ATTEMPTS + 2)):
             self.end(False, 'the thread of the link does not run')
         return self
-
-
-class Sent(NamedTuple):
-    """Result of sending one thrust target: the reason why it was not sent, or arrays (4,)."""
-
-    reason: str = ''
-    saturated: np.ndarray | None = None     # whether the battery limits the thrust to the one sent
-    command: np.ndarray | None = None       # normalised, 0 to 1
 
 
 class MotorBoard:
@@ -106,6 +98,8 @@ class MotorBoard:
     The board stops the rotors 100 ms after the last target, also if this process fails.
 
     ``clock`` is that of all stamps, those given to :meth:`send` and those returned [s].
+    ``duty`` (4,) are the normalised commands last sent, 0 to 1, ``saturated`` (4,) whether the
+    battery limits the thrusts to them.
     """
 
     def __init__(self, parameters: MotorBoardParameters, robot: RobotParameters,
@@ -115,16 +109,16 @@ class MotorBoard:
         self._clock = clock
         self._lock = threading.Lock()           # of state and command
         self._write_lock = threading.Lock()     # of port and packer
-        self.state = BoardState(parameters, robot.battery.cells, clock)
-        self._receiver = MavlinkReceiver(parameters.board_system, parameters.board_component,
-                                         restarted)
-        self._packer = common.MAVLink(None, parameters.host_system, parameters.host_component)
+        self.state = BoardState(robot.battery.cells, parameters.silence, clock)
+        self._receiver = MavlinkReceiver(*BOARD, restarted)
+        self._packer = common.MAVLink(None, *HOST)
+        self.duty, self.saturated = np.zeros(4), np.zeros(4, dtype=bool)
         self._port: SerialPort | None = None
         self._thread: threading.Thread | None = None
         self._stopping = False
-        self._sent = self._dropped = self._connections = 0
+        self._counts = dict.fromkeys(('sent', 'buffer_full', 'connections'), 0)
         self._command: ArmCommand | None = None
-        self._next_heartbeat = self._next_timesync = self._next_open = 0.0
+        self._next_heartbeat = self._next_timesync = 0.0
         self._last_stamp = (math.nan, 0)
 
     def open(self) -> None:
@@ -140,9 +134,7 @@ class MotorBoard:
         atexit.unregister(self.close)
         if self._thread is None:
             return
-        for _ in range(CLOSING_COMMANDS):
-            command = self.start(False)
-        command.wait()
+        self.start(False).wait()
         self._stopping = True
         self._thread.join(2.0)
         self._thread = None
@@ -176,7 +168,7 @@ class MotorBoard:
         """Start to arm or disarm without waiting; the returned command gets the result."""
         missing = self.ready if arm else ''
         with self._lock:
-            command = ArmCommand(arm, self.parameters, self._write)
+            command = ArmCommand(arm, self._write)
             if missing:
                 command.end(False, missing)
                 return command
@@ -186,26 +178,27 @@ class MotorBoard:
             command.tick(time.monotonic())
             return command
 
-    def send(self, thrust: np.ndarray, stamp: float) -> Sent:
+    def send(self, thrust: np.ndarray, stamp: float) -> str:
         """
-        Send thrust targets (4,) [N] without waiting. Only one thread may call this.
+        Send thrust targets (4,) [N] without waiting; return why they were not sent, or ''.
 
-        Zero and negative values stop the rotor. ``stamp`` is the time of the state estimate that
-        they answer [s].
+        Only one thread may call this. Zero and negative values stop the rotor. ``stamp`` is the
+        time of the state estimate that they answer [s].
         """
         age = self._clock() - stamp
         if abs(age) > self.parameters.stamp_age_limit:
-            return Sent('stale stamp' if age > 0 else 'stamp in the future')
+            return 'stale stamp' if age > 0 else 'stamp in the future'
         if not self.state.clock.known:
-            return Sent("offset of the board's clock unknown")
+            return "offset of the board's clock unknown"
         # Without a measurement use the highest voltage, which gives the smallest duty.
         voltage = self.state.voltage or self.thrust_map.voltages[-1]
-        command = self.thrust_map.command(thrust, voltage)
+        duty = self.thrust_map.command(thrust, voltage)
         if not self._write(common.MAVLink_set_actuator_control_target_message(
-                self._board_stamp(stamp, max(age, 0.0)), 0, self.parameters.board_system,
-                self.parameters.board_component, [*command.tolist(), 0.0, 0.0, 0.0, 0.0])):
-            return Sent('port is away' if self._port is None else 'buffer full')
-        return Sent('', self.thrust_map.saturated(thrust, voltage), command)
+                self._board_stamp(stamp, max(age, 0.0)), 0, *BOARD,
+                [*duty.tolist(), 0.0, 0.0, 0.0, 0.0])):
+            return 'port is away' if self._port is None else 'buffer full'
+        self.duty, self.saturated = duty, self.thrust_map.saturated(thrust, voltage)
+        return ''
 
     def _board_stamp(self, stamp, age):
         """Board's clock [us] at a stamp, equal for equal stamps and rising for rising ones."""
@@ -227,8 +220,7 @@ class MotorBoard:
     def link(self) -> dict[str, float]:
         """Counts of both directions of the link and synchronisation of the clocks, by name."""
         clock = self.state.clock
-        return {**self._receiver.counts, 'sent': self._sent, 'buffer_full': self._dropped,
-                'connections': self._connections,
+        return {**self._receiver.counts, **self._counts,
                 **{f'board {name}': count for name, count in self.state.reception.items()},
                 'clock_offset_s': clock.offset(),
                 'clock_uncertainty_ms': 1e3 * clock.uncertainty(time.monotonic())}
@@ -246,9 +238,7 @@ class MotorBoard:
             if taken:
                 # A dropped frame must not leave a gap, which the board would count as lost.
                 self._packer.seq = (self._packer.seq + 1) % 256
-                self._sent += 1
-            else:
-                self._dropped += 1
+            self._counts['sent' if taken else 'buffer_full'] += 1
             return taken
 
     def _connect(self):
@@ -256,7 +246,7 @@ class MotorBoard:
         self._receiver.restart()
         with self._write_lock:
             self._port = port
-        self._connections += 1
+        self._counts['connections'] += 1
 
     def _disconnect(self):
         with self._write_lock:
@@ -268,28 +258,18 @@ class MotorBoard:
         while not self._stopping:
             try:
                 if self._port is None:
-                    self._reconnect()
+                    time.sleep(RECONNECT)
+                    self._connect()
+                    with self._lock:
+                        self.state.connection('')
                 else:
                     self._serve(self._port)
             except SerialPortError as error:
-                self._disconnect()
-                with self._lock:
-                    self.state.connection(str(error))
+                if self._port is not None:      # lost, and not still missing
+                    self._disconnect()
+                    with self._lock:
+                        self.state.connection(str(error))
             self._tick(time.monotonic())
-
-    def _reconnect(self):
-        """Try to open the port if it is time."""
-        time.sleep(TICK)
-        now = time.monotonic()
-        if now < self._next_open:
-            return
-        self._next_open = now + self.parameters.reconnect_period
-        try:
-            self._connect()
-            with self._lock:
-                self.state.connection('')
-        except SerialPortError:
-            pass
 
     def _serve(self, port):
         """Wait at most one tick for bytes and handle them."""
@@ -318,13 +298,13 @@ class MotorBoard:
             if self._command:
                 self._command.tick(now)
         if now >= self._next_heartbeat:
-            self._next_heartbeat = now + 1 / self.parameters.heartbeat_rate
+            self._next_heartbeat = now + HEARTBEAT_PERIOD
             self._write(common.MAVLink_heartbeat_message(
                 common.MAV_TYPE_ONBOARD_CONTROLLER, common.MAV_AUTOPILOT_INVALID, 0, 0,
                 common.MAV_STATE_ACTIVE, 3))
         if now >= self._next_timesync:
-            factor = 1 if self.state.clock.known else 4
-            self._next_timesync = now + 1 / (factor * self.parameters.timesync_rate)
+            self._next_timesync = now + (TIMESYNC_PERIOD if self.state.clock.known
+                                         else TIMESYNC_PERIOD_UNKNOWN)
             self._write(self.state.timesync_request())
 
 

@@ -8,7 +8,6 @@ import time
 
 import numpy as np
 
-from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters
 from beetle_omni_ros.drivers.mavlink import common
 from beetle_omni_ros.robot.readings import BatteryReading
 
@@ -28,6 +27,9 @@ ESC_FAILURES = {1: 'over-current', 2: 'over-voltage', 4: 'overheated', 8: 'over-
 UNKNOWN_TEMPERATURE, UNKNOWN_CELL, UNKNOWN_CURRENT = 32767, 65535, -1
 EVENTS_KEPT = 200
 REQUESTS_KEPT = 50      # TIMESYNC requests; later answers are ignored
+CLOCK_DRIFT = 100e-6    # [s/s] bound of the clocks against each other
+VOLTAGE_TIME_CONSTANT = 0.05    # [s] of the voltage filter before the thrust map
+PLAUSIBLE_CELL = 2.5, 4.4       # [V] voltage of a LiPo cell
 
 
 class ClockOffset:
@@ -36,12 +38,11 @@ class ClockOffset:
 
     The remote clock is read between a request and its answer, so each exchange gives a lower and
     an upper bound of the offset. Bounds of earlier exchanges are widened by the largest possible
-    drift [s/s], and all bounds are intersected. The estimate is the centre of this interval, and
-    its error is at most half the width, for any delays.
+    drift, and all bounds are intersected. The estimate is the centre of this interval, and its
+    error is at most half the width, for any delays.
     """
 
-    def __init__(self, drift: float):
-        self._drift = drift
+    def __init__(self):
         self.restart()
 
     def restart(self) -> None:
@@ -56,10 +57,10 @@ class ClockOffset:
 
     def add(self, sent: float, remote: float, received: float) -> bool:
         """Use one exchange; return whether it contradicts the earlier ones, then forgotten."""
-        within = self._drift * (received - sent)
+        within = CLOCK_DRIFT * (received - sent)
         low, high = remote - received - within, remote - sent + within
         known_low, known_high, at = self._bounds
-        widening = self._drift * max(0.0, received - at)
+        widening = CLOCK_DRIFT * max(0.0, received - at)
         new_low, new_high = max(low, known_low - widening), min(high, known_high + widening)
         jumped = new_low > new_high
         self._bounds = (low, high, received) if jumped else (new_low, new_high, received)
@@ -73,14 +74,13 @@ class ClockOffset:
     def uncertainty(self, now: float) -> float:
         """Bound of the offset's error [s] at local time ``now``; inf while unknown."""
         low, high, at = self._bounds
-        return 0.5 * (high - low) + self._drift * max(0.0, now - at)
+        return 0.5 * (high - low) + CLOCK_DRIFT * max(0.0, now - at)
 
 
 @dataclass(frozen=True, slots=True)
 class BoardStatus:
     """A heartbeat: state, reason of the last disarming, present conditions, contract version."""
 
-    stamp: float
     state: str
     stop_reason: str
     conditions: tuple[str, ...]
@@ -109,14 +109,16 @@ class BoardState:
     """
     Newest state and measurements of the board, stamped by ``clock`` [s], and events.
 
+    ``silence`` is the time without a message after which the board is silent [s].
+
     ``status`` is the last heartbeat, ``voltage`` the filtered pack voltage [V] for the thrust map,
     ``reception`` the last counts of the board, and ``clock`` the offset of the board's clock
     against the monotonic clock.
     """
 
-    def __init__(self, parameters: MotorBoardParameters, cells: int, clock: Callable[[], float]):
-        self._parameters, self._host_clock, self._cells = parameters, clock, cells
-        self.clock = ClockOffset(parameters.clock_drift)
+    def __init__(self, cells: int, silence: float, clock: Callable[[], float]):
+        self._cells, self._silence, self._host_clock = cells, silence, clock
+        self.clock = ClockOffset()
         self.status: BoardStatus | None = None
         self.battery: BatteryReading | None = None
         self.rotors: RotorStates | None = None
@@ -145,22 +147,17 @@ class BoardState:
 
     def silent(self, now: float) -> bool:
         """Whether no message arrived for too long."""
-        return now - self._received_at > self._parameters.silence
+        return now - self._received_at > self._silence
 
     def tick(self, now: float, connected: bool) -> None:
-        """Update the events about silence and the clock's uncertainty."""
+        """Update the events about silence."""
         # After a reconnection the board has the same time for its first message.
         silent = math.isfinite(self._received_at) and \
-            now - max(self._received_at, self._opened) > self._parameters.silence
+            now - max(self._received_at, self._opened) > self._silence
         if connected and self._changed('silent', silent):
             self._event('error' if silent else 'info',
-                        f'no message for {self._parameters.silence:g} s' if silent
+                        f'no message for {self._silence:g} s' if silent
                         else 'messages again')
-        uncertainty = self.clock.uncertainty(now)
-        uncertain = self.clock.known and uncertainty > self._parameters.clock_uncertainty_limit
-        if self._changed('uncertain', uncertain):
-            self._event('warning' if uncertain else 'info',
-                        f'offset of its clock known to {1e3 * uncertainty:.1f} ms')
 
     def _changed(self, name, value):
         """Whether a condition differs from the last call."""
@@ -171,8 +168,7 @@ class BoardState:
         """Update the status after an acknowledged command, before the next heartbeat."""
         if self.status is not None and self.status.armed != arm:
             # The next heartbeat contains the conditions that prevent arming again.
-            self.status = replace(self.status, stamp=self._host_clock(),
-                                  state='armed' if arm else 'disarmed',
+            self.status = replace(self.status, state='armed' if arm else 'disarmed',
                                   conditions=self.status.conditions if arm else (THROTTLE,))
             self._event('info', self.status.state)
 
@@ -195,7 +191,7 @@ class BoardState:
         state, reason, conditions, contract = message.custom_mode.to_bytes(4, 'little')
         old = self.status
         self.status = new = BoardStatus(
-            self._host_clock(), STATES.get(state, f'state {state}'),
+            STATES.get(state, f'state {state}'),
             STOP_REASONS.get(reason, f'reason {reason}'), conditions_of(conditions), contract)
         if new.state == 'boot':
             self.clock.restart()
@@ -225,8 +221,7 @@ class BoardState:
     def _on_battery(self, message, now):
         cells = [cell for cell in message.voltages if cell != UNKNOWN_CELL]
         voltage = sum(cells) / 1000 if cells else math.nan
-        plausible = self._parameters.cell_voltage_low <= voltage / self._cells \
-            <= self._parameters.cell_voltage_high
+        plausible = PLAUSIBLE_CELL[0] <= voltage / self._cells <= PLAUSIBLE_CELL[1]
         if self._changed('implausible', not plausible):
             self._event('info' if plausible else 'warning',
                         'battery voltage plausible again' if plausible else
@@ -240,8 +235,7 @@ class BoardState:
         if self.voltage is None:
             self.voltage = voltage
         else:
-            constant = self._parameters.voltage_time_constant
-            weight = -math.expm1(-(now - self._battery_at) / constant) if constant else 1.0
+            weight = -math.expm1(-(now - self._battery_at) / VOLTAGE_TIME_CONSTANT)
             self.voltage += weight * (voltage - self.voltage)
         self._battery_at = now
 

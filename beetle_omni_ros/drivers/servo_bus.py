@@ -2,20 +2,21 @@
 
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 import struct
+from subprocess import Popen
 import time
 
 import numpy as np
 
+from beetle_omni_ros.drivers import servo_guard
 from beetle_omni_ros.drivers import servo_registers as registers
 from beetle_omni_ros.drivers.device_parameters import ServoBusParameters
 from beetle_omni_ros.drivers.serial_port import SerialPortError
-from beetle_omni_ros.drivers.servo_guard import Guard
-from beetle_omni_ros.drivers.servo_link import NoAnswer, ServoBusError, ServoLink
+from beetle_omni_ros.drivers.servo_link import ServoBusError, ServoLink
 from beetle_omni_ros.drivers.servo_registers import nearest_turns, TURN
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, JointParameters
+from beetle_omni_ros.robot.readings import JointReading
 
 # Current, velocity and position have consecutive addresses.
 FEEDBACK, FEEDBACK_LAYOUT = registers.PRESENT_CURRENT.address, struct.Struct('<hii')
@@ -27,26 +28,20 @@ HEALTH = ((registers.TORQUE_ENABLE, 2), (registers.STATUS_LEVEL, 3), (registers.
 # A value that only a configured servo has: a restart sets the register to its default, 1200. The
 # register has an effect only in velocity mode.
 MARK = (registers.VELOCITY_I, 1201)
-# Registers of the parameters of ServoGains, in their order.
-GAINS = (registers.POSITION_P, registers.POSITION_I, registers.POSITION_D,
-         registers.FEEDFORWARD_1, registers.FEEDFORWARD_2)
 ATTEMPTS = 3            # of reads outside the loop
 TRACKED = 0.2           # [s] half a turn takes longer at the servo's largest speed, 12 rad/s
+WATCHDOG = 0.1          # [s] silence of the bus after which the servos stop
+WATCHDOG_COUNTS = round(WATCHDOG / registers.WATCHDOG_UNIT)
 WATCHDOG_MARGIN = 0.8   # a pause above this share of the watchdog's time may have expired it
 REPEAT_AFTER = 1.0      # [s] until an equal line is logged again
 FIRST_PING = 0.2        # [s] after a reboot; a servo does not answer earlier
 PING_PERIOD = 0.02      # [s]
-
-
-@dataclass(frozen=True, slots=True)
-class ServoReadings:
-    """Feedback of the four servos (4,); the last one, or NaN, where it is not ``valid``."""
-
-    stamp: float            # time of the request on the bus's clock [s]
-    position: np.ndarray    # tilt [rad], unwrapped
-    velocity: np.ndarray    # [rad/s]
-    effort: np.ndarray      # torque estimated from the current [N m]
-    valid: np.ndarray       # whether a servo was read in this call
+BOOT = 2.0              # [s] from a reboot; a servo that is silent for longer has a fault
+SILENT_AFTER = 10       # consecutive missing answers after which a servo is only pinged
+PROBE = 0.1             # [s] between two pings of a silent servo
+HEALTH_PERIOD = 0.1     # [s] in which all health registers are read once
+RECONNECT = 0.2         # [s] between attempts to open a lost port
+RECOVERIES = 3          # restarts of a servo after overloads; then it stays off
 
 
 @dataclass(slots=True, eq=False)
@@ -69,10 +64,8 @@ class Servo:
     misses: int = 0                     # consecutive missing answers
     silent: bool = False                # after several of them: it is only pinged
     next_probe: float = 0.0             # monotonic time of the next ping [s]
-    wanted: bool = False                # whether it should have torque
-    torque: bool | None = None          # whether it has
+    torque: bool | None = None          # whether it has torque
     error: int = 0                      # Hardware Error Status
-    watchdog_expired: bool = False
     voltage: float = float('nan')       # [V]
     temperature: float = float('nan')   # [deg C]
     recovery: Iterator[None] | None = None      # while it is recovered
@@ -88,13 +81,13 @@ class Servo:
         """Goal for a tilt [rad], in the servo's present frame."""
         return round(self.zero + self.sign * (tilt - TURN * self.turns) / registers.POSITION_UNIT)
 
-    def update(self, data: bytes, now: float) -> bool:
+    def update(self, data: bytes, now: float, enabled: bool) -> bool:
         """Update it from feedback at monotonic ``now`` [s]; return whether it has restarted."""
         current, velocity, counts = FEEDBACK_LAYOUT.unpack(data)
         self.current = self.sign * current * registers.CURRENT_UNIT
         self.velocity = self.sign * velocity * registers.VELOCITY_UNIT
         angle, before = self.angle(counts), self.turns
-        if self.wanted or now - self.updated < TRACKED:
+        if enabled or now - self.updated < TRACKED:
             # A servo cannot move by half a turn between two readings. After a pause without
             # torque, in which it can be turned by hand, the servo's own count is used.
             self.turns = nearest_turns(angle, self.position)
@@ -120,11 +113,7 @@ class Servo:
             return f'{self.where}: silent; check its cable and power'
         if errors and not self.torque:
             return f'{self.where}: shut down ({errors}); remove the cause, reboot it'
-        if errors:
-            return f'{self.where}: {errors}'
-        if self.watchdog_expired:
-            return f'{self.where}: stopped by its watchdog'
-        return f'{self.where}: torque is off' if self.wanted and self.torque is False else ''
+        return f'{self.where}: {errors}' if errors else ''
 
 
 def make_servos(parameters: ServoBusParameters) -> list[Servo]:
@@ -140,15 +129,15 @@ def examine(link: ServoLink, servo: Servo) -> tuple[str, str]:
     servo.model = servo.firmware = None
     try:
         servo.model = link.ping(servo.identifier, ATTEMPTS)
-        voltage, temperature, servo.error, position, shadow, firmware = (
+        voltage, temperature, servo.error, position, firmware = (
             link.read(servo.identifier, register, ATTEMPTS) for register in (
                 registers.INPUT_VOLTAGE, registers.TEMPERATURE, registers.HARDWARE_ERROR,
-                registers.PRESENT_POSITION, registers.SHADOW_ID, registers.FIRMWARE))
+                registers.PRESENT_POSITION, registers.FIRMWARE))
     except ServoBusError as error:
         if servo.model is not None:
             return str(error), 'check its cable, and whether two servos have this id'
-        return ('does not answer', 'check power, cable, id and baud rate') \
-            if isinstance(error, NoAnswer) else (str(error), 'reboot it')
+        return ('does not answer', 'check power, cable, id and baud rate') if link.late \
+            else (str(error), 'reboot it')
     servo.firmware, servo.temperature = firmware, float(temperature)
     servo.voltage = voltage * registers.VOLTAGE_UNIT
     servo.position = servo.angle(position) + TURN * servo.turns
@@ -157,8 +146,6 @@ def examine(link: ServoLink, servo: Servo) -> tuple[str, str]:
                 'another servo has this id, or ids is wrong')
     if servo.error:
         return ', '.join(servo.errors), 'remove the cause, then reboot the servo'
-    if shadow <= 252:
-        return f'also has the secondary id {shadow}', 'set Secondary(Shadow) ID(12) to 255'
     return '', ''
 
 
@@ -170,20 +157,18 @@ class ServoBus:
     the cable is unplugged or servos are silent, they raise nothing and report it in their
     results. Together they then take at most one reply time. They recover without further calls.
 
-    ``clock`` gives the stamps of readings [s]. ``parameters`` may be replaced while torque is off.
-    ``enabled`` is whether the servos should have torque, ``clipped`` the number of goals limited
-    to the travel.
+    ``clock`` gives the stamps of readings [s]. ``enabled`` is whether the servos should have
+    torque, ``stamp`` the time of the last request for feedback.
     """
 
     def __init__(self, parameters: ServoBusParameters, joints: JointParameters,
                  clock: Callable[[], float] = time.time):
         self.parameters, self.travel = parameters, joints.position_limit
         self.servos = make_servos(parameters)
-        self.enabled, self.clipped, self._clock = False, 0, clock
-        self.link = ServoLink(parameters.port, parameters.baud_rate, parameters.timing.reply)
-        self._guard: Guard | None = None
+        self.enabled, self._clock, self.stamp = False, clock, 0.0
+        self.link = ServoLink(parameters.port, parameters.baud_rate, parameters.reply_time)
+        self._guard: Popen | None = None
         self._torque_off = registers.TORQUE_ENABLE, {one.identifier: 0 for one in self.servos}
-        self._recovering: deque[Servo] = deque()    # with a recovery, the next one first
         self._next_health = self._next_open = 0.0
         self._group = 0
         self._events: deque[str] = deque(maxlen=200)    # lines for the log
@@ -197,7 +182,7 @@ class ServoBus:
         """Switch the torque off and close the port; may be called at any time, repeatedly."""
         self.disable()
         if self._guard is not None:
-            self._guard.trigger()
+            self._guard.stdin.close()   # no servo has confirmed it: the guard switches it off
             self._guard = None
         self.link.close()
 
@@ -207,25 +192,24 @@ class ServoBus:
 
         ServoBusError names all servos that are missing or wrong, or refuse a setting.
         """
-        with self._outside_the_loop():
-            self.disable()
-            problems = []
-            for servo in self.servos:
-                problem, remedy = examine(self.link, servo)
-                if problem:
-                    problems.append(f'{servo.name} (id {servo.identifier}): {problem}; {remedy}')
-                    continue
-                try:
-                    servo.turns_known &= self._is_marked(servo)
-                    self._apply_settings(servo)
-                except ServoBusError as error:
-                    problems.append(f'{servo.name}: {error}')
-            if problems:
-                raise ServoBusError(f'{self.link.path}: ' + ' | '.join(problems))
-            for servo in self.servos:
-                servo.silent, servo.kept_off, servo.misses, servo.recoveries = False, False, 0, 0
-                servo.torque, servo.error, servo.watchdog_expired = False, 0, False
-            self._locate()
+        self.disable()
+        problems = []
+        for servo in self.servos:
+            problem, remedy = examine(self.link, servo)
+            if problem:
+                problems.append(f'{servo.name} (id {servo.identifier}): {problem}; {remedy}')
+                continue
+            try:
+                servo.turns_known &= self._is_marked(servo)
+                self._apply_settings(servo)
+            except ServoBusError as error:
+                problems.append(f'{servo.name}: {error}')
+        if problems:
+            raise ServoBusError(f'{self.link.path}: ' + ' | '.join(problems))
+        for servo in self.servos:
+            servo.silent, servo.kept_off, servo.misses, servo.recoveries = False, False, 0, 0
+            servo.torque, servo.error = False, 0
+        self._locate()
 
     def enable(self):
         """
@@ -233,27 +217,22 @@ class ServoBus:
 
         ServoBusError: an angle is ambiguous, or a servo failed; then none has torque.
         """
-        with self._outside_the_loop():
-            self._locate()
-        confirmed = self.parameters.confirmed_tilts if self.parameters.confirm_tilts else None
-        doubts = registers.settle(self.servos, self.travel, confirmed)
-        if doubts:
+        self._locate()
+        if doubts := registers.settle(self.servos, self.travel):
             limit = registers.unambiguous_limit(self.travel)
             raise ServoBusError(
                 f'{self.link.path}: no torque, the turn is lost: {doubts}; turn it by hand to '
-                f'within +-{limit:.2f} rad, or measure it and set confirmed_tilts and '
-                'confirm_tilts')
+                f'within +-{limit:.2f} rad, cables untwisted')
         if self.parameters.guard and self._guard is None:
-            self._guard = Guard(self.link.path, self.link.baud_rate,
-                                self.link.packet_of_sync_write(*self._torque_off))
-        self._want_torque(True)
+            self._guard = servo_guard.start(self.link.path, self.link.baud_rate,
+                                            self.link.packet_of_sync_write(*self._torque_off))
+        self.enabled = True
         try:
-            with self._outside_the_loop():
-                for servo in self.servos:
-                    for register, value in ((registers.WATCHDOG, 0), *self._power_on(
-                            servo.counts(servo.position))):
-                        self.link.write(servo.identifier, register, value)
-                    servo.torque, servo.watchdog_expired = True, False
+            for servo in self.servos:
+                for register, value in ((registers.WATCHDOG, 0), *self._power_on(
+                        servo.counts(servo.position))):
+                    self.link.write(servo.identifier, register, value)
+                servo.torque = True
         except (ServoBusError, SerialPortError):
             self.disable()
             raise
@@ -261,33 +240,31 @@ class ServoBus:
     def disable(self) -> bool:
         """Switch the torque of all servos off; return whether every servo has confirmed it."""
         was_enabled = self.enabled
-        self._want_torque(False)
+        self.enabled = False
         self._drop_recoveries()
         if not self.link.is_open:
             return not was_enabled
         confirmed = True
         try:
-            with self.link.patient():
-                self.link.sync_write(*self._torque_off)
-                for servo in self.servos:
-                    try:
-                        self.link.write(servo.identifier, registers.TORQUE_ENABLE, 0)
-                        servo.torque = False
-                    except ServoBusError as error:
-                        confirmed = False
-                        self.log(f'torque off is not confirmed: {error}')
+            self.link.sync_write(*self._torque_off)
+            for servo in self.servos:
+                try:
+                    self.link.write(servo.identifier, registers.TORQUE_ENABLE, 0)
+                    servo.torque = False
+                except ServoBusError as error:
+                    confirmed = False
+                    self.log(f'torque off is not confirmed: {error}')
         except SerialPortError as error:
             self._port_lost(error)
             return False
         if self._guard is not None and confirmed:
-            self._guard.dismiss()
+            servo_guard.dismiss(self._guard)
             self._guard = None
         return confirmed
 
-    def reboot(self, identifier: int):
+    def reboot(self, index: int):
         """Start the restart of a servo; calls of :meth:`upkeep` finish it in about 0.5 s."""
-        (servo,) = (servo for servo in self.servos if servo.identifier == identifier)
-        self._recover(servo, forced=True)
+        self._recover(self.servos[index], forced=True)
 
     def write_goals(self, tilt: np.ndarray) -> bool:
         """
@@ -298,7 +275,6 @@ class ServoBus:
         if not self.enabled or not self.link.is_open:
             return False
         legal = np.clip(tilt, -self.travel, self.travel)
-        self.clipped += int(np.any(legal != tilt))
         try:
             self._feed_watchdog()
             return self.link.sync_write(registers.GOAL_POSITION, {
@@ -308,9 +284,9 @@ class ServoBus:
             self._port_lost(error)
             return False
 
-    def read(self) -> ServoReadings:
-        """Read current, velocity and position of all servos except silent ones."""
-        stamp, answered = self._clock(), set()
+    def read(self) -> np.ndarray:
+        """Read current, velocity and position of all servos except silent ones; return whose."""
+        self.stamp, answered = self._clock(), set()
         if not self.link.is_open:
             self._reconnect()
         else:
@@ -320,11 +296,16 @@ class ServoBus:
                 answered = self._read_feedback(asked)
             except SerialPortError as error:
                 self._port_lost(error)
-        return ServoReadings(
-            stamp, np.array([servo.position for servo in self.servos]),
-            np.array([servo.velocity for servo in self.servos]),
-            self.parameters.torque_per_current * np.array([one.current for one in self.servos]),
-            np.array([servo in answered for servo in self.servos]))
+        return np.array([servo in answered for servo in self.servos])
+
+    def reading(self, which: np.ndarray) -> JointReading:
+        """Last feedback of the servos ``which`` (4,) bool, NaN if there is none; unwrapped."""
+        chosen = [servo for servo, is_chosen in zip(self.servos, which) if is_chosen]
+        return JointReading(
+            self.stamp, np.array([servo.position for servo in chosen]),
+            np.array([servo.velocity for servo in chosen]),
+            self.parameters.torque_per_current * np.array([servo.current for servo in chosen]),
+            [servo.name for servo in chosen])
 
     def upkeep(self):
         """
@@ -339,12 +320,12 @@ class ServoBus:
         try:
             if self.link.late:
                 self.link.late = False
-            elif self._recovering:
-                self._recover_step()
+            elif recovering := [servo for servo in self.servos if servo.recovery]:
+                self._recover_step(recovering[0])
             elif any(servo.silent and now >= servo.next_probe for servo in self.servos):
                 self._probe(now)
             elif now >= self._next_health:
-                self._next_health = now + self.parameters.timing.health / len(HEALTH)
+                self._next_health = now + HEALTH_PERIOD / len(HEALTH)
                 self._read_health()
         except SerialPortError as error:
             self._port_lost(error)
@@ -366,29 +347,19 @@ class ServoBus:
             self._logged[line] = now
             self._events.append(line)
 
-    @contextmanager
-    def _outside_the_loop(self):
-        """Context that waits longer for answers."""
-        try:
-            with self.link.patient():
-                yield
-        except SerialPortError as error:
-            self._port_lost(error)
-            raise
-
     def _port_lost(self, error):
         """Close the failed port; :meth:`_reconnect` opens it again."""
         if self.link.is_open:
-            self.log(f'{error}; trying again every {self.parameters.timing.reconnect:g} s')
+            self.log(f'{error}; trying again every {RECONNECT:g} s')
         self.link.close()
         self._drop_recoveries()
-        self._next_open = time.monotonic() + self.parameters.timing.reconnect
+        self._next_open = time.monotonic() + RECONNECT
 
     def _reconnect(self):
         """Open the port again if it is time, and restore the torque state of the servos."""
         if time.monotonic() < self._next_open:
             return
-        self._next_open = time.monotonic() + self.parameters.timing.reconnect
+        self._next_open = time.monotonic() + RECONNECT
         try:
             self.link.open()
             self.log(f'{self.link.path}: connected again')
@@ -402,15 +373,6 @@ class ServoBus:
         except SerialPortError:
             self.link.close()
 
-    def _want_torque(self, wanted):
-        self.enabled = wanted
-        for servo in self.servos:
-            servo.wanted = wanted
-
-    @property
-    def _watchdog_counts(self):
-        return round(self.parameters.timing.watchdog / registers.WATCHDOG_UNIT)     # 1 to 127
-
     def _apply_settings(self, servo):
         given, identifier = self.parameters, servo.identifier
         permanent = [       # in EEPROM; the mode is first, because it resets the gains
@@ -419,24 +381,24 @@ class ServoBus:
             (registers.CURRENT_LIMIT, round(given.current_limit / registers.CURRENT_UNIT))]
         if servo.firmware >= registers.STARTUP_FIRMWARE:
             permanent.append((registers.STARTUP, 0))    # nothing is restored after power-up
-        link, volatile = self.link, self._volatile_settings()
+        link = self.link
         link.write(identifier, registers.WATCHDOG, 0)
         link.write(identifier, registers.TORQUE_ENABLE, 0)
         for register, value in permanent:
             if link.read(identifier, register, ATTEMPTS) != value:
                 link.write(identifier, register, value)
-        for register, value in volatile:
+        for register, value in self._volatile_settings():
             link.write(identifier, register, value)
-        for register, value in permanent + volatile:
-            found = link.read(identifier, register, ATTEMPTS)
-            if found != value:
-                raise ServoBusError(f'{link.path}, id {identifier}: {register} is {found} after '
-                                    f'{value} was written')
 
     def _volatile_settings(self):
         """RAM settings, lost by a restart, except torque and watchdog."""
+        given = self.parameters
         return [MARK, (registers.STATUS_LEVEL, 2),
-                *zip(GAINS, astuple(self.parameters.gains), strict=True),
+                (registers.POSITION_P, given.position_p_gain),
+                (registers.POSITION_I, given.position_i_gain),
+                (registers.POSITION_D, given.position_d_gain),
+                (registers.FEEDFORWARD_1, given.feedforward_1st_gain),
+                (registers.FEEDFORWARD_2, given.feedforward_2nd_gain),
                 (registers.PROFILE_ACCELERATION, 0), (registers.PROFILE_VELOCITY, 0)]
 
     def _is_marked(self, servo):
@@ -456,11 +418,11 @@ class ServoBus:
     def _feed_watchdog(self):
         """Clear the watchdogs after a pause, because expired ones refuse goals without answer."""
         pause = time.monotonic() - self.link.last_sent
-        if pause > WATCHDOG_MARGIN * self.parameters.timing.watchdog:
+        if pause > WATCHDOG_MARGIN * WATCHDOG:
             self._restart_watchdog(self.servos)
 
     def _restart_watchdog(self, servos):
-        for counts in (0, self._watchdog_counts):
+        for counts in (0, WATCHDOG_COUNTS):
             self.link.sync_write(registers.WATCHDOG,
                                   {servo.identifier: counts for servo in servos})
 
@@ -488,7 +450,7 @@ class ServoBus:
             if data is None:
                 continue
             answered.add(servo)
-            if servo.update(data, now):
+            if servo.update(data, now, self.enabled):
                 servo.turns_known &= self.enabled
                 if servo.recovery is None:
                     self.log(f'{servo.where}: lost its turn count, taken as '
@@ -501,10 +463,9 @@ class ServoBus:
     def _count_miss(self, servo):
         """Count a missing answer; after several in a row the servo is silent and only pinged."""
         servo.misses += 1
-        timing = self.parameters.timing
-        if servo.misses >= timing.silent_after and not servo.silent:
+        if servo.misses >= SILENT_AFTER and not servo.silent:
             servo.silent, servo.torque = True, None
-            servo.next_probe = time.monotonic() + timing.probe
+            servo.next_probe = time.monotonic() + PROBE
             self.log(f'{servo.where}: silent; check its cable and power')
 
     def _probe(self, now):
@@ -512,13 +473,11 @@ class ServoBus:
                     key=lambda servo: servo.next_probe)
         try:
             self.link.ping(servo.identifier)
-        except NoAnswer:
-            self.link.late = False
-            servo.next_probe = now + (
-                PING_PERIOD if servo.restarting else self.parameters.timing.probe)
-            return
         except ServoBusError:
-            pass
+            if self.link.late:      # otherwise it answers, with an error
+                self.link.late = False
+                servo.next_probe = now + (PING_PERIOD if servo.restarting else PROBE)
+                return
         if not servo.restarting:
             self.log(f'{servo.where}: answers again')
             for other in self.servos:
@@ -544,8 +503,7 @@ class ServoBus:
             elif register is registers.STATUS_LEVEL:
                 servo.error = data[2]  # Hardware Error Status is the third
             elif register is registers.WATCHDOG:
-                servo.watchdog_expired = data[0] == registers.WATCHDOG_EXPIRED
-                if servo.watchdog_expired and self.enabled:
+                if data[0] == registers.WATCHDOG_EXPIRED and self.enabled:
                     self.log(f'{servo.where}: was stopped by its watchdog, continues')
                     self._restart_watchdog([servo])
             else:
@@ -556,29 +514,23 @@ class ServoBus:
 
     def _recover(self, servo, forced=False):
         """Start the recovery of a servo; with ``forced``, restart it in any case."""
-        if servo.recovery is None:
-            self._recovering.append(servo)
-        elif not forced:
-            return
-        servo.torque = None     # unknown until it is read
-        servo.recovery = self._recovery(servo, forced)
+        if forced or servo.recovery is None:
+            servo.torque = None     # unknown until it is read
+            servo.recovery = self._recovery(servo, forced)
 
     def _drop_recoveries(self):
-        self._recovering.clear()
         for servo in self.servos:
             servo.recovery = None
 
-    def _recover_step(self):
-        servo = self._recovering.popleft()
+    def _recover_step(self, servo):
         try:
             next(servo.recovery)
-            self._recovering.append(servo)  # behind the others
             return
         except StopIteration:
             pass
         except ServoBusError as error:
             self.log(f'{servo.name}: {error}')
-            if isinstance(error, NoAnswer):
+            if self.link.late:
                 self._count_miss(servo)
         servo.recovery = None
 
@@ -590,7 +542,7 @@ class ServoBus:
         torque if the bus is enabled. With ``forced``, and after a shutdown, it is restarted; the
         ping that it answers starts another recovery.
         """
-        link, identifier, given = self.link, servo.identifier, self.parameters
+        link, identifier = self.link, servo.identifier
         servo.error = link.read(identifier, registers.HARDWARE_ERROR)
         yield
         servo.torque = bool(link.read(identifier, registers.TORQUE_ENABLE))
@@ -598,9 +550,8 @@ class ServoBus:
         if servo.torque and not forced:
             return
         if forced or servo.error:
-            if not forced and not (self.enabled and given.reboot_after_overload
-                                   and not servo.error & registers.OVERHEATING
-                                   and servo.recoveries < given.recoveries):
+            if not forced and not (self.enabled and servo.recoveries < RECOVERIES
+                                   and not servo.error & registers.OVERHEATING):
                 self.log(f'{servo.where}: shut down ({", ".join(servo.errors)}); it stays off '
                          'until it is rebooted')
                 servo.kept_off = True
@@ -610,7 +561,7 @@ class ServoBus:
             link.reboot(identifier)
             now = time.monotonic()
             servo.silent = True     # so that reads of the others do not wait for it
-            servo.next_probe, servo.boot_ends = now + FIRST_PING, now + given.timing.reboot
+            servo.next_probe, servo.boot_ends = now + FIRST_PING, now + BOOT
             return
         for register, value in self._volatile_settings():
             link.write(identifier, register, value, attempts=1)
@@ -627,10 +578,10 @@ class ServoBus:
         for register, value in self._power_on(counts):
             yield
             link.write(identifier, register, value, attempts=1)
-        servo.torque, servo.watchdog_expired = True, False
+        servo.torque = True
         self.log(f'{servo.where}: had restarted, is back at {servo.position:+.2f} rad')
 
     def _power_on(self, counts):
         """Settings that switch the torque on with a goal, which holds the servo."""
-        return ((registers.GOAL_POSITION, counts), (registers.WATCHDOG, self._watchdog_counts),
+        return ((registers.GOAL_POSITION, counts), (registers.WATCHDOG, WATCHDOG_COUNTS),
                 (registers.TORQUE_ENABLE, 1))

@@ -1,7 +1,7 @@
 """
 Switches the servos' torque off if their driver was killed; their own watchdog only stops them.
 
-:class:`Guard` starts this module as a separate process, which sleeps and has no port open. Its
+:func:`start` runs this module as a separate process, which sleeps and has no port open. Its
 standard input is a pipe from the driver. A byte ends it without action. The end of the pipe
 without a byte means that the driver died with torque on.
 """
@@ -18,24 +18,22 @@ REPEATS = 3         # a broadcast has no acknowledgement
 PAUSE = 0.02        # [s] between repetitions
 
 
-class Guard:
-    """The guard process of one bus; ``packet`` switches the torque of all servos off."""
+def start(port: str, baud_rate: int, packet: bytes) -> subprocess.Popen:
+    """
+    Start the guard of one bus; ``packet`` switches the torque of all servos off.
 
-    def __init__(self, port: str, baud_rate: int, packet: bytes):
-        self.process = subprocess.Popen(
-            [sys.executable, __file__, port, str(baud_rate), packet.hex()],
-            stdin=subprocess.PIPE, start_new_session=True)
+    It does so when the ``stdin`` of the returned process is closed.
+    """
+    return subprocess.Popen([sys.executable, __file__, port, str(baud_rate), packet.hex()],
+                            stdin=subprocess.PIPE, start_new_session=True)
 
-    def trigger(self):
-        """Let it switch the torque off now, because the driver has no confirmation."""
-        self.process.stdin.close()
 
-    def dismiss(self):
-        """End it without action, because the torque of all servos is off."""
-        try:
-            self.process.communicate(b'.', 2.0)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
+def dismiss(guard: subprocess.Popen):
+    """End a guard without action, because the torque of all servos is off."""
+    try:
+        guard.communicate(b'.', 2.0)
+    except subprocess.TimeoutExpired:
+        guard.kill()
 
 
 def main():

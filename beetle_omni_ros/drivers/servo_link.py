@@ -1,6 +1,5 @@
 """Transactions with servos by dynamixel_sdk: each call exchanges packets and checks them."""
 
-from contextlib import contextmanager
 import math
 import select
 import time
@@ -9,18 +8,14 @@ from types import SimpleNamespace
 from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, PacketHandler
 
 from beetle_omni_ros.drivers.serial_port import SerialPort, SerialPortError
-from beetle_omni_ros.drivers.servo_registers import ALERT, PACKET_ERRORS, Register
+from beetle_omni_ros.drivers.servo_registers import ALERT, Register
 
-RELAXED_REPLY_TIME = 0.02   # [s] time limit of an answer outside the loop
+RELAXED_REPLY_TIME = 0.02   # [s] time limit of an answer to a request with several attempts
 STATUS_SIZE = 11            # [B] of an answer without data
 
 
 class ServoBusError(RuntimeError):
     """The bus or a servo failed, or a servo answered with an error; one line with port and ID."""
-
-
-class NoAnswer(ServoBusError):
-    """A servo did not answer, or its answer was corrupt."""
 
 
 class ServoLink:
@@ -32,7 +27,8 @@ class ServoLink:
     SerialPortError if the port is lost.
 
     Attributes:
-        reply_time: time limit of an answer, without its time on the wire [s].
+        reply_time: time limit of an answer, without its time on the wire [s]. It is longer for
+            requests with several attempts, which are made outside the loop.
         late: whether an answer of the last transaction was missing or corrupt.
         last_sent: monotonic time of the last packet [s], which restarts the servos' watchdogs.
         counts: transactions, connections and errors since the creation of the link.
@@ -47,7 +43,7 @@ class ServoLink:
             ('transactions', 'unanswered', 'corrupt', 'refused', 'connections'), 0)
         self._handler = PacketHandler(2.0)
         self._port: SerialPort | None = None
-        self._unsent, self._deadline = 0, 0.0
+        self._unsent, self._deadline, self._limit = 0, 0.0, reply_time
 
     @property
     def is_open(self) -> bool:
@@ -66,15 +62,6 @@ class ServoLink:
         if self._port is not None:
             self._port.close()
             self._port = None
-
-    @contextmanager
-    def patient(self):
-        """Context with a longer time limit for answers, for use outside the loop."""
-        self.reply_time, usual = max(self.reply_time, RELAXED_REPLY_TIME), self.reply_time
-        try:
-            yield
-        finally:
-            self.reply_time = usual
 
     # --- the port of the SDK ------------------------------------------------------------------
 
@@ -99,7 +86,7 @@ class ServoLink:
     def setPacketTimeout(self, packet_length):
         """Set the time limit: both packets' time on the wire and one reply time."""
         on_wire = 10 / self.baud_rate * (self._unsent + packet_length)
-        self._deadline = time.monotonic() + on_wire + self.reply_time
+        self._deadline = time.monotonic() + on_wire + self._limit
 
     def isPacketTimeout(self):
         """Whether the time limit has passed."""
@@ -129,6 +116,7 @@ class ServoLink:
 
     def _ask(self, identifier, what, attempts, exchange):
         """Data of an exchange, which returns (data, the SDK's result, error byte)."""
+        self._limit = max(self.reply_time, RELAXED_REPLY_TIME * (attempts > 1))
         for left in reversed(range(attempts)):
             data, result, error = exchange()
             self.counts['transactions'] += 1
@@ -138,10 +126,10 @@ class ServoLink:
                 break
             if not left:
                 text = self._handler.getTxRxResult(result).removeprefix('[TxRxResult] ')
-                raise NoAnswer(f'{self.path}, id {identifier}: {what}: {text}')
+                raise ServoBusError(f'{self.path}, id {identifier}: {what}: {text}')
         if number := error & ~ALERT:
             self.counts['refused'] += 1
-            text = PACKET_ERRORS.get(number, f'error {number}')
+            text = self._handler.getRxPacketError(number).removeprefix('[RxPacketError] ')
             raise ServoBusError(f'{self.path}, id {identifier}: {what}: refused, {text}')
         return data
 
@@ -193,7 +181,7 @@ class ServoLink:
         has one packet for all servos.
         """
         self.counts['transactions'] += 1
-        self.late = False
+        self.late, self._limit = False, self.reply_time
         if self._handler.syncReadTx(self, address, length, identifiers, len(identifiers),
                                     False) != COMM_SUCCESS:
             self.counts['unanswered'] += 1

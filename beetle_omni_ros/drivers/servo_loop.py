@@ -7,7 +7,8 @@ import time
 
 import numpy as np
 
-from beetle_omni_ros.drivers.servo_bus import ServoBus, ServoReadings
+from beetle_omni_ros.drivers.servo_bus import ServoBus
+from beetle_omni_ros.robot.readings import JointReading
 
 PERIOD = 0.005      # [s]
 STOP_TIMEOUT = 5.0  # [s] until the thread has ended; a cycle takes at most 0.02 s
@@ -22,8 +23,8 @@ class ServoLoop:
 
     Args:
         bus: configured bus; while the loop runs, other threads use it in :meth:`exclusive` only.
-        on_readings: called in the thread with the readings and (4,) bool: whether a reading is
-            valid and, with torque on, the servo obeys.
+        on_reading: called in the thread with the reading of the servos that have answered and,
+            with torque on, obey, unless there is none.
         on_written: called with their time of publication after the goals were written.
         clock: monotonic time [s].
 
@@ -35,12 +36,12 @@ class ServoLoop:
 
     """
 
-    def __init__(self, bus: ServoBus, on_readings: Callable[[ServoReadings, np.ndarray], None],
+    def __init__(self, bus: ServoBus, on_reading: Callable[[JointReading], None],
                  on_written: Callable[[float], None] = lambda published: None,
                  clock: Callable[[], float] = time.monotonic):
         self.cycles = self.missed = self.written = self.stale = self.incomplete = 0
         self.failure = ''
-        self._bus, self._on_readings, self._on_written = bus, on_readings, on_written
+        self._bus, self._on_reading, self._on_written = bus, on_reading, on_written
         self._clock, self._due = clock, clock()
         self._lock = Lock()
         self._goal: tuple[np.ndarray, float, float] | None = None
@@ -115,11 +116,11 @@ class ServoLoop:
         elif self._goal is not None and not self._wrote and self._clock() <= self._goal[2]:
             self.written += self._bus.write_goals(self._goal[0])  # a whole period brought none
         self._wrote = False
-        readings = self._bus.read()
-        self.incomplete += not readings.valid.all()
-        obeying = self._bus.obeying
-        self._on_readings(readings, readings.valid & obeying if self._bus.enabled
-                          else readings.valid)
+        answered, obeying = self._bus.read(), self._bus.obeying
+        self.incomplete += not answered.all()
+        good = answered & obeying if self._bus.enabled else answered
+        if good.any():
+            self._on_reading(self._bus.reading(good))
         self._write_fresh()
         self._bus.upkeep()
         self._last_obeying = np.where(obeying, self._clock(), self._last_obeying)

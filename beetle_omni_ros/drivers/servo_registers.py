@@ -36,7 +36,6 @@ FIRMWARE = Register('Firmware Version', 6, 1)
 RETURN_DELAY = Register('Return Delay Time', 9, 1)
 DRIVE_MODE = Register('Drive Mode', 10, 1)
 OPERATING_MODE = Register('Operating Mode', 11, 1)
-SHADOW_ID = Register('Secondary(Shadow) ID', 12, 1)
 HOMING_OFFSET = Register('Homing Offset', 20, 4, True)
 CURRENT_LIMIT = Register('Current Limit', 38, 2)
 STARTUP = Register('Startup Configuration', 60, 1)
@@ -59,8 +58,6 @@ PRESENT_POSITION = Register('Present Position', 132, 4, True)
 INPUT_VOLTAGE = Register('Present Input Voltage', 144, 2)
 TEMPERATURE = Register('Present Temperature', 146, 1)
 
-ALL = tuple(value for value in list(globals().values()) if isinstance(value, Register))
-
 MODEL = 1210                # XC330-T181-T
 STARTUP_FIRMWARE = 46       # the startup configuration exists from here on
 
@@ -72,8 +69,7 @@ VOLTAGE_UNIT = 0.1          # [V]
 WATCHDOG_UNIT = 0.02        # [s]
 WATCHDOG_EXPIRED = 255      # -1 in one byte
 
-BAUD_CODES = {9600: 0, 57600: 1, 115200: 2, 1_000_000: 3, 2_000_000: 4, 3_000_000: 5,
-              4_000_000: 6}
+BAUD_RATES = (9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
 EXTENDED_POSITION = 4       # operating mode
 
 # Bits of Hardware Error Status (70) and Shutdown (63).
@@ -82,12 +78,7 @@ HARDWARE_ERRORS = {
     0x01: 'input voltage outside its limits', OVERHEATING: 'overheated', 0x08: 'encoder fault',
     0x10: 'electrical shock or too little power', 0x20: 'overload'}
 
-# Error number of a status packet; bit 7 is the alert that HARDWARE_ERROR explains.
-ALERT = 0x80
-PACKET_ERRORS = {
-    1: 'could not execute it', 2: 'unknown instruction', 3: 'received a bad CRC',
-    4: 'value out of range', 5: 'wrong data length', 6: 'value beyond a limit register',
-    7: 'no access (unknown or read-only register, or EEPROM while torque is on)'}
+ALERT = 0x80    # bit of a status packet's error number, which HARDWARE_ERROR explains
 
 
 # A servo counts turns only while it has power. After power-up or reboot its position is within
@@ -110,26 +101,22 @@ def unambiguous_limit(travel: float) -> float:
     return TURN - travel if travel > pi else travel
 
 
-def settle(servos: Sequence, travel: float, confirmed: Sequence[float] | None) -> str:
+def settle(servos: Sequence, travel: float) -> str:
     """
     Determine the unknown turn counts of servos; return '' or a message about ambiguous ones.
 
     Their ``position`` [rad], ``turns`` and ``turns_known`` are updated. ``travel`` is that of the
-    joints to each side [rad], ``confirmed`` angles measured by the operator to half a turn [rad].
+    joints to each side [rad].
     """
     doubts = []
-    for k, servo in enumerate(servos):
+    for servo in servos:
         if servo.turns_known:
             continue
         options = candidates(servo.position, travel)
-        if len(options) == 1:
-            chosen = options[0]
-        elif options and confirmed is not None:
-            chosen = min(options, key=lambda angle: abs(angle - confirmed[k]))
-        else:
+        if len(options) != 1:
             places = ' or '.join(f'{angle:+.2f}' for angle in options or [servo.position])
             doubts.append(f'{servo.name} (id {servo.identifier}) stands at {places} rad')
             continue
-        servo.turns += nearest_turns(servo.position, chosen)
-        servo.position, servo.turns_known = chosen, True
+        servo.turns += nearest_turns(servo.position, options[0])
+        servo.position, servo.turns_known = options[0], True
     return '; '.join(doubts)

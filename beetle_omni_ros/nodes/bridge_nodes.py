@@ -11,7 +11,7 @@ from rclpy.lifecycle import LifecycleNodeMixin, TransitionCallbackReturn
 from std_srvs.srv import Trigger
 
 from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters, ServoBusParameters
-from beetle_omni_ros.drivers.motor_board import Arming, FLIES, LOST, MotorBoard
+from beetle_omni_ros.drivers.motor_board import Arming, FLIES, LOST, MotorBoard, RECONNECT
 from beetle_omni_ros.drivers.serial_port import SerialPortError
 from beetle_omni_ros.drivers.servo_bus import ServoBus
 from beetle_omni_ros.drivers.servo_link import ServoBusError
@@ -20,7 +20,7 @@ from beetle_omni_ros.nodes import parameters
 from beetle_omni_ros.nodes.graph import AUTOSTART
 from beetle_omni_ros.nodes.node import Distribution, ERROR, FlightNode, OK, WARN
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters
-from beetle_omni_ros.robot.readings import JointReading, RotorReading
+from beetle_omni_ros.robot.readings import RotorReading
 from beetle_omni_ros.robot.schema import parameter
 
 UNCONFIGURED, INACTIVE, ACTIVE = 'unconfigured', 'inactive', 'active'
@@ -143,8 +143,7 @@ class JointBridgeNode(BridgeNode):
 
     def __init__(self):
         super().__init__('joint_bridge_node', ServoBusParameters, 'params/servo_bus.yaml',
-                         'servo_bus_file', on_change=self._changed,
-                         changeable=('confirm_tilts', 'confirmed_tilts'), autostart='none')
+                         'servo_bus_file', autostart='none')
         self._travel = RobotParameters.load(self.parameters.robot_file or None).joints
         self._bus = self._loop = None
         self._lost_reason = ''
@@ -164,7 +163,7 @@ class JointBridgeNode(BridgeNode):
         self._bus.open()
         self._bus.configure()
         self._lost_reason = ''
-        self._loop = ServoLoop(self._bus, self._publish, self._on_written)
+        self._loop = ServoLoop(self._bus, self._joints.publish, self._on_written)
         self._loop.start()
 
     def activate(self):
@@ -203,12 +202,6 @@ class JointBridgeNode(BridgeNode):
         self.release()
         self._states.publish(self.state_text())
 
-    def _changed(self, new):
-        self.parameters = new
-        if self._loop is not None:
-            with self._loop.exclusive() as bus:
-                bus.parameters = new
-
     def _on_reboot(self, _, response):
         """Restart the servos that have switched themselves off, or all if none has."""
         if self._loop is None:
@@ -218,7 +211,7 @@ class JointBridgeNode(BridgeNode):
                  if servo.errors and not servo.torque] or range(4)
         with self._loop.exclusive() as bus:
             for k in which:
-                bus.reboot(int(self.parameters.ids[k]))
+                bus.reboot(k)
         response.success = True
         response.message = f"restarting {', '.join(JOINT_NAMES[k] for k in which)}"
         return response
@@ -230,12 +223,6 @@ class JointBridgeNode(BridgeNode):
 
     def _on_written(self, stamp):
         self.latency.add(self.now() - stamp)
-
-    def _publish(self, readings, good):
-        if good.any():
-            self._joints.publish(JointReading(
-                readings.stamp, readings.position[good], readings.velocity[good],
-                readings.effort[good], [n for n, is_good in zip(JOINT_NAMES, good) if is_good]))
 
     def _on_timer(self):
         if self._loop is not None:
@@ -266,8 +253,7 @@ class JointBridgeNode(BridgeNode):
         return level, 'no connection' if level == WARN else text, {
             'stage': self.stage, 'cycles': loop.cycles, 'missed_cycles': loop.missed,
             'connected': bus.link.is_open, 'goals_written': loop.written,
-            'goals_stale': loop.stale, 'goals_clipped': bus.clipped,
-            'incomplete': loop.incomplete, **bus.link.counts}
+            'goals_stale': loop.stale, 'incomplete': loop.incomplete, **bus.link.counts}
 
     def _servo_status(self, k):
         if self._bus is None:
@@ -277,8 +263,7 @@ class JointBridgeNode(BridgeNode):
         values = {'id': one.identifier, 'responding': not one.silent,
                   'torque': 'unknown' if one.torque is None else one.torque,
                   'voltage_v': one.voltage, 'temperature_c': one.temperature,
-                  'errors': ', '.join(one.errors) or 'none',
-                  'watchdog_expired': one.watchdog_expired, 'recovering': recovering}
+                  'errors': ', '.join(one.errors) or 'none', 'recovering': recovering}
         if one.message:
             bad = one.silent or (one.errors and not one.torque)
             return (ERROR if bad else WARN), one.message, values
@@ -312,7 +297,6 @@ class RotorBridgeNode(BridgeNode):
         self._updated = self._next_try = time.monotonic()
         self._cycle, self._sent_at = 0, 0.0
         self._unsent = Counter()
-        self._normalised = np.zeros(4)
         self._saturated, self._saturated_reported = np.zeros((2, 4), dtype=int)
         self._batteries = self.publisher('battery_state')
         self._rotors = self.publisher('rotor_states')
@@ -381,7 +365,7 @@ class RotorBridgeNode(BridgeNode):
         """Try to open the port; afterwards the driver itself reconnects."""
         if self._port_error is None or now < self._next_try:
             return
-        self._next_try = now + self.parameters.reconnect_period
+        self._next_try = now + RECONNECT
         try:
             self._board.open()
         except SerialPortError as error:
@@ -395,13 +379,12 @@ class RotorBridgeNode(BridgeNode):
         if self._arming.phase != FLIES or command is None \
                 or self.now() - command.stamp > self.parameters.stamp_age_limit:
             return False
-        sent = self._board.send(command.thrust, command.stamp)
+        reason = self._board.send(command.thrust, command.stamp)
         self._sent_at = time.monotonic()
-        if sent.reason:
-            self._unsent[sent.reason] += 1
+        if reason:
+            self._unsent[reason] += 1
             return False
-        self._normalised = sent.command
-        self._saturated += sent.saturated
+        self._saturated += self._board.saturated
         return True
 
     def _poll(self):
@@ -437,7 +420,7 @@ class RotorBridgeNode(BridgeNode):
 
     def _rotor_status(self, k):
         rotors, saturated = self._speeds, int(self._saturated[k])
-        values = {'saturated': saturated, 'command': float(self._normalised[k])
+        values = {'saturated': saturated, 'command': float(self._board.duty[k])
                   if self._arming.phase == FLIES else 0.0}
         saturates = saturated > self._saturated_reported[k]
         self._saturated_reported[k] = saturated

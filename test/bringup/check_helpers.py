@@ -42,7 +42,7 @@ def levels(found, *, without='ok'):
 
 
 def servos(port, graph=None, **changes):
-    parameters = replace(ServoBusParameters.load(), port=port, timing=PATIENT, **changes)
+    parameters = replace(ServoBusParameters.load(), port=port, reply_time=PATIENT, **changes)
     return by_item(check_servos(parameters, ROBOT.joints, graph))
 
 

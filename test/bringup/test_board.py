@@ -8,6 +8,7 @@ pytest.importorskip('dynamixel_sdk')
 
 from check_helpers import board, levels, QUICK, repeated
 
+from beetle_omni_ros.drivers import motor_board
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 
 pytestmark = pytest.mark.real_time
@@ -53,17 +54,18 @@ def put(**faults):
      'offline'),
     (put(corrupt_in=0.5, drop_out=0.05), {'seconds': 2.0},
      {'link to the board': 'fail', 'link from the board': 'warn'}, ''),
-    (put(), {'host_component': 190}, {'board receives host': 'fail', 'board clock': 'fail'},
-     'host_component')])
+    (put(drop_in=1.0), {}, {'board receives host': 'fail', 'board clock': 'fail'}, 'TX wire')])
 def test_each_fault_is_found_and_named(emulated, break_it, changes, bad, words):
     break_it(emulated)
     found = board_with(emulated, bad, **changes)[next(iter(bad))]
     assert words in found.found + found.remedy
 
 
-def test_a_silent_or_foreign_board_ends_the_checks(emulated):
-    found = board_with(emulated, {'motor board': 'fail'}, seconds=0.5, board_component=7)
-    assert 'component 7' in found['motor board'].remedy
+def test_a_silent_or_foreign_board_ends_the_checks(emulated, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(motor_board, 'BOARD', (1, 7))
+        found = board_with(emulated, {'motor board': 'fail'}, seconds=0.5)
+    assert 'another device' in found['motor board'].remedy
     emulated.faults.drop_out = 1.0
     found = board(emulated.port, seconds=0.5)
     assert list(found) == ['board port', 'motor board']

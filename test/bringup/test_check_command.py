@@ -25,7 +25,7 @@ PATIENT = """/**/joint_bridge_node:
     signs: [1, 1, 1, 1]
     zeros: [2048, 2048, 2048, 2048]
     torque_per_current: 0.671
-    timing: {reply: 0.05}
+    reply_time: 0.05
 """
 
 

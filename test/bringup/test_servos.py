@@ -76,8 +76,6 @@ FAULTS = {
     'hot': ({}, {}, hot, {'gimbal4': 'fail', 'gimbal4 temperature': 'warn'}, 'gimbal4', ()),
     'turn': ({}, {}, turned, {'gimbal2 turn': 'fail'}, 'gimbal2 turn',
              ('-3.48 or +2.80 rad', '2.32 rad')),
-    'confirmed': ({}, {'confirm_tilts': True, 'confirmed_tilts': [0, -3, 0, 0]}, turned,
-                  {f'{name} turn': 'warn' for name in NAMES}, 'gimbal2 turn', ('-3.48 rad',)),
     'line': ({}, {}, put(bad_crc=0.4), {'servo bus': 'fail'}, 'servo bus', ())}
 
 

@@ -12,20 +12,19 @@ from beetle_omni_ros.drivers.motor_board import MotorBoard
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 
-QUICK = {'boot_time': 0.05, 'heartbeat_timeout': 0.5, 'idle_timeout': 1.0,
-         'throttle_low_time': 0.3, 'reception_rate': 10.0}
+QUICK = {'boot_time': 0.05, 'idle_timeout': 1.0, 'throttle_low_time': 0.3,
+         'reception_rate': 10.0}
 ROBOT = RobotParameters.load()
 HOVER = np.array([7.0, 7.5, 8.0, 8.5])
 
 
-def driver(port, **changes):
-    return MotorBoard(replace(MotorBoardParameters.load(), port=port, reconnect_period=0.05,
-                              **changes), ROBOT)
+def driver(port):
+    return MotorBoard(replace(MotorBoardParameters.load(), port=port), ROBOT)
 
 
 @contextmanager
-def opened(port, **changes):
-    with closing(driver(port, **changes)) as board:
+def opened(port):
+    with closing(driver(port)) as board:
         board.open()
         yield board
 
@@ -69,17 +68,17 @@ class Pilot:
 
 
 @contextmanager
-def connected(**changes):
+def connected():
     with EmulatedMotorBoard(**QUICK) as emulated, \
-            opened(emulated.port, **changes) as board:
+            opened(emulated.port) as board:
         assert until(lambda: not board.ready), board.ready
         yield emulated, board
 
 
 @contextmanager
-def flying(**changes):
+def flying():
     """Emulated board, driver and pilot, rotors following."""
-    with connected(**changes) as (emulated, board):
+    with connected() as (emulated, board):
         result = board.start(True).wait()
         assert result.accepted, result.reason
         with Pilot(board) as pilot:

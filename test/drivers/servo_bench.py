@@ -3,6 +3,7 @@
 from contextlib import contextmanager
 from dataclasses import replace
 import time
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -14,17 +15,16 @@ from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
 JOINTS = RobotParameters.load().joints
 SHIPPED = ServoBusParameters.load()
 # Driver and servos share this process and a busy machine: wait longer than on a robot.
-PATIENT = replace(SHIPPED.timing, reply=0.03, probe=0.05, health=0.04,
-                  reconnect=0.02)
+PATIENT = 0.03  # [s]
 COUNT = 2 * np.pi / 4096  # [rad]
 
 
 @contextmanager
-def bench(guard=False, timing=PATIENT, servos=None, **parameters):
+def bench(guard=False, reply_time=PATIENT, servos=None, **parameters):
     """Open a bus of emulated servos with their own motion, not configured."""
     with EmulatedServoBus(**{'speed': 10.0, 'reboot_time': 0.05, **(servos or {})}) as emulated:
-        bus = ServoBus(replace(SHIPPED, port=emulated.port, guard=guard, timing=timing,
-                               **parameters), JOINTS)
+        bus = ServoBus(replace(SHIPPED, port=emulated.port, guard=guard,
+                               reply_time=reply_time, **parameters), JOINTS)
         bus.open()
         try:
             yield bus, emulated
@@ -41,9 +41,15 @@ def running(**options):
         yield bus, emulated
 
 
+def read(bus):
+    """Reading of all servos, with `valid`: whose feedback is new."""
+    valid = bus.read()
+    return SimpleNamespace(valid=valid, position=bus.reading(np.ones(4, bool)).position)
+
+
 def tick(bus, goal):
     bus.write_goals(goal)
-    readings = bus.read()
+    readings = read(bus)
     bus.upkeep()
     return readings, bus.servos
 

@@ -11,8 +11,8 @@ from beetle_omni_ros.drivers.motor_board import Arming, PATIENCE, STEP
 from beetle_omni_ros.drivers.motor_board_state import BoardStatus
 
 CYCLE = 0.005
-DISARMED = BoardStatus(0.0, 'disarmed', 'none', (), 1)
-ARMED = BoardStatus(0.0, 'armed', 'none', (), 1)
+DISARMED = BoardStatus('disarmed', 'none', (), 1)
+ARMED = BoardStatus('armed', 'none', (), 1)
 
 
 class BoardStub:
@@ -68,7 +68,7 @@ def test_arming_waits_for_board_and_supervisor_and_names_which(bench):
     board, arming = bench
     board.ready, board.state.status = 'port is away', None
     assert arming.text == 'waiting: port is away'
-    board.ready, board.state.status = '', BoardStatus(0.0, 'disarmed', 'none',
+    board.ready, board.state.status = '', BoardStatus('disarmed', 'none',
                                                 ('battery low', 'saturated'), 1)
     assert arming.text == 'waiting: battery low'
     board.state.status = DISARMED
@@ -117,9 +117,9 @@ def test_a_refusal_to_arm_is_reported_and_not_retried(bench):
 
 
 @pytest.mark.parametrize(('status', 'why'), [
-    (BoardStatus(0.0, 'boot', 'none', (), 1), 'restarted'),
-    (BoardStatus(0.0, 'disarmed', 'watchdog reset', (), 1), 'restarted (watchdog reset)'),
-    (BoardStatus(0.0, 'disarmed', 'no target for too long', (), 1),
+    (BoardStatus('boot', 'none', (), 1), 'restarted'),
+    (BoardStatus('disarmed', 'watchdog reset', (), 1), 'restarted (watchdog reset)'),
+    (BoardStatus('disarmed', 'no target for too long', (), 1),
      'disarmed (no target for too long)'),
     (None, 'restarted')])
 def test_a_board_that_stopped_in_flight_is_lost_until_the_supervisor_is_disarmed(

@@ -47,17 +47,6 @@ def test_a_poor_link_is_counted_and_tolerated(faults):
         assert until(counted)
 
 
-def test_delayed_targets_are_refused_and_the_rotors_stop():
-    with flying() as (emulated, board, pilot):
-        emulated.faults.delay_in = 0.2
-        assert until(lambda: not emulated.commands.any())
-        assert stays_stopped(emulated)
-        assert emulated.refused['stale stamp'] > 10
-        assert pilot.has_event('targets timed out')
-        assert until(lambda: not emulated.armed)
-        assert until(lambda: pilot.has_event('disarmed (no target for too long)'))
-
-
 def test_voltage_sag_is_compensated_or_reported_as_saturation():
     with flying() as (emulated, board, pilot):
         emulated.set_battery(25.0, 30.0)
@@ -67,7 +56,7 @@ def test_voltage_sag_is_compensated_or_reported_as_saturation():
         assert until(lambda: np.allclose(emulated.thrust_targets, HOVER, rtol=2e-3))
         assert np.all(emulated.commands > before)
         pilot.thrust = np.full(4, 20.0)
-        assert until(lambda: pilot.results[-1].saturated.all())
+        assert until(lambda: board.saturated.all())
         emulated.set_battery(3.0, 0.0)
         assert until(lambda: pilot.has_event('3.0 V not plausible'))
         assert keeps_flying(emulated, 0.2)
@@ -94,17 +83,3 @@ def test_a_board_that_restarts_in_flight_stops_and_needs_arming_again():
         assert arms_again(board, pilot)
         pilot.thrust = HOVER
         assert until(lambda: emulated.commands.all())
-
-
-def test_a_failed_esc_is_named_and_the_other_rotors_continue():
-    with flying() as (emulated, board, pilot):
-        emulated.faults.failed_escs = (3,)
-        assert until(lambda: pilot.has_event('ESC of rotor 3 offline'))
-        assert until(lambda: pilot.has_event('ESC failure'))
-        assert emulated.thrust_targets[2] == 0
-        assert np.all(emulated.thrust_targets[[0, 1, 3]] > 5)
-        rotors = None
-        while rotors is None:
-            rotors = board.poll()[1]
-        assert np.isnan(rotors.rpm[2]) and rotors.failures[2] == ('generic',)
-        assert np.all(rotors.rpm[[0, 1, 3]] > 1000)

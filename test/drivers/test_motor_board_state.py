@@ -7,21 +7,21 @@ from hypothesis import given, settings, strategies
 import pytest
 import reference_packets as reference
 
-from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 pytest.importorskip('pymavlink')
 
+from beetle_omni_ros.drivers import motor_board_state
 from beetle_omni_ros.drivers.mavlink import MavlinkReceiver, restarted
 from beetle_omni_ros.drivers.motor_board_state import BoardState, ClockOffset, conditions_of
 
-PARAMETERS, CELLS = MotorBoardParameters.load(), RobotParameters.load().battery.cells
+CELLS = RobotParameters.load().battery.cells
 DELAYS = strategies.floats(1e-5, 0.2)
 
 
 @pytest.fixture
 def board():
-    return BoardState(PARAMETERS, CELLS, time.time)
+    return BoardState(CELLS, 0.3, time.time)
 
 
 def tell(board, number, values, now=None):
@@ -34,7 +34,7 @@ def tell(board, number, values, now=None):
 @given(strategies.lists(reference.ANY_FRAME, max_size=8))
 def test_valid_frames_with_arbitrary_content_are_tolerated(frames):
     """The voltage for the thrust map remains plausible."""
-    board = BoardState(PARAMETERS, CELLS, time.time)
+    board = BoardState(CELLS, 0.3, time.time)
     for message in MavlinkReceiver(1, 1).feed(b''.join(frames)):
         board.message(message, time.monotonic())
         board.tick(time.monotonic(), True)
@@ -81,7 +81,7 @@ def test_the_voltage_filter_depends_on_time_and_not_on_message_count(board):
 
     measure(25.0, 10.0)
     assert board.voltage == 25.0
-    measure(24.0, 10.0 + PARAMETERS.voltage_time_constant)
+    measure(24.0, 10.0 + motor_board_state.VOLTAGE_TIME_CONSTANT)
     assert board.voltage == pytest.approx(25 - (1 - math.exp(-1)), abs=1e-6)
     measure(24.0, 20.0)
     assert board.voltage == pytest.approx(24.0)
@@ -93,7 +93,7 @@ def test_the_voltage_filter_depends_on_time_and_not_on_message_count(board):
        strategies.lists(strategies.tuples(DELAYS, DELAYS), min_size=1, max_size=50))
 def test_the_true_offset_is_within_the_bound(start, drift, delays):
     """With unequal delays of 10 us to 0.2 s, and drift within its bound."""
-    clock, now = ClockOffset(1e-4), 100.0
+    clock, now = ClockOffset(), 100.0
 
     def truth(time):
         return start + drift * (time - 100.0)
@@ -108,7 +108,7 @@ def test_the_true_offset_is_within_the_bound(start, drift, delays):
 
 
 def test_a_restarted_clock_is_detected_and_the_offset_replaced():
-    clock = ClockOffset(1e-4)
+    clock = ClockOffset()
     assert not clock.add(10.0, 500.001, 10.002)
     assert clock.add(11.0, 0.001, 11.002)
     assert clock.offset() == pytest.approx(-11, abs=1e-6)

@@ -1,17 +1,18 @@
 """Outcome of every fault of the bus in the running loop."""
 
-from dataclasses import replace
 import time
 
 import numpy as np
 import pytest
-from servo_bench import arrived, COUNT, PATIENT, running, tick, until
+from servo_bench import arrived, COUNT, read, running, tick, until
+
+from beetle_omni_ros.drivers.servo_bus import RECOVERIES, SILENT_AFTER
 
 pytestmark = pytest.mark.real_time
 
 GOAL = np.array([0.5, -1.0, 3.5, -3.5])
 HOME = np.zeros(4)
-BRISK = {'timing': replace(PATIENT, reply=0.01)}    # one fault costs one tick
+BRISK = {'reply_time': 0.01}    # one fault costs one tick
 
 
 def powered(readings, servos):
@@ -23,7 +24,7 @@ def powered(readings, servos):
 def test_a_bad_line_costs_readings_but_never_gives_a_wrong_one(fault):
     with running(servos={'speed': 0.0}, **BRISK) as (bus, emulated):
         emulated.set_state(GOAL / 2, HOME, HOME)
-        while not np.allclose(bus.read().position, GOAL / 2, atol=COUNT):
+        while not np.allclose(read(bus).position, GOAL / 2, atol=COUNT):
             pass
         setattr(emulated.faults, fault, 0.2)
         emulated.faults.delay = 0.012
@@ -55,7 +56,7 @@ def test_silent_servos_are_omitted_and_the_others_continue(silent):
         assert (readings.valid == others).all()
         # The missing servo is last in the request, so the others lose one reading only.
         assert missing <= len(silent)
-        assert unheard <= PATIENT.silent_after * len(silent)
+        assert unheard <= SILENT_AFTER * len(silent)
         for one, other in zip(servos, others, strict=True):
             assert ('silent; check its cable and power' in one.message) != other
         until(lambda readings, _: np.allclose(readings.position[others], GOAL[others],
@@ -67,19 +68,19 @@ def test_silent_servos_are_omitted_and_the_others_continue(silent):
 
 
 def test_a_lasting_overload_disables_the_servo_with_a_reason_until_the_service_restarts_it():
-    with running(recoveries=2) as (bus, emulated):
+    with running() as (bus, emulated):
         emulated.faults.overload = {2}
         _, servos = until(lambda _, servos: 'shut down (overload)' in servos[1].message
                           and servos[1].kept_off, bus, GOAL)
         assert 'reboot' in servos[1].message
-        assert bus.servos[1].recoveries == 2
+        assert bus.servos[1].recoveries == RECOVERIES
         assert not emulated.torque_enabled[1] and emulated.torque_enabled[[0, 2, 3]].all()
         until(lambda readings, _: readings.valid.all(), bus, GOAL)
         emulated.faults.overload = set()
         for _ in range(50):
             tick(bus, GOAL)
         assert not emulated.torque_enabled[1], 'nobody asked for it'
-        bus.reboot(2)
+        bus.reboot(1)
         until(lambda *now: powered(*now) and arrived(GOAL)(*now), bus, GOAL)
 
 

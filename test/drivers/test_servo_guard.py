@@ -20,7 +20,7 @@ from beetle_omni_ros.drivers.servo_bus import ServoBus
 from beetle_omni_ros.drivers.device_parameters import ServoBusParameters
 from beetle_omni_ros.robot.parameters import RobotParameters
 shipped = ServoBusParameters.load()
-bus = ServoBus(replace(shipped, port=sys.argv[1], timing=replace(shipped.timing, reply=0.05)),
+bus = ServoBus(replace(shipped, port=sys.argv[1], reply_time=0.05),
                RobotParameters.load().joints)
 bus.open(); bus.configure(); bus.enable()
 while True:

@@ -39,7 +39,10 @@ class FakeBus:
     def read(self):
         self.upkeep()
         self.during_read()
-        return SimpleNamespace(valid=self.valid)
+        return self.valid
+
+    def reading(self, which):
+        return which
 
     def close(self):
         self.closed = True
@@ -47,7 +50,7 @@ class FakeBus:
 
 def make(**options):
     bus, clock, seen = FakeBus(), SimpleNamespace(now=100.0), []
-    loop = ServoLoop(bus, lambda readings, good: seen.append(good), clock=lambda: clock.now,
+    loop = ServoLoop(bus, seen.append, clock=lambda: clock.now,
                      **options)
     return loop, bus, clock, seen
 
