@@ -29,15 +29,15 @@ def rsl_rl_configuration(p: TrainParameters) -> dict:
                       for sizes in (p.network.hidden, p.network.critic))
     stds = [float(p.network.tilt_std)] * 4 + [float(p.network.thrust_std)] * 4
     place = 'beetle_omni_ros.train'
+    gaussian = {'class_name': 'GaussianDistribution', 'std_type': 'log'}
     return {
         'num_steps_per_env': p.ppo.steps, 'save_interval': p.save_every, 'logger': 'tensorboard',
         'obs_groups': {'actor': ['actor'], 'critic': ['critic']}, 'check_for_nan': False,
-        'actor': {'class_name': f'{place}.network:ActorModel', 'hidden_dims': hidden,
+        'actor': {'class_name': f'{place}.network:FeatureModel', 'hidden_dims': hidden,
                   'activation': 'elu', 'output_scale': p.network.output_scale,
                   'carry': p.network.carry, 'last_gain': p.network.last_gain,
-                  'distribution_cfg': {'class_name': f'{place}.network:BoundedGaussian',
-                                       'stds': stds}},
-        'critic': {'class_name': f'{place}.network:CriticModel', 'hidden_dims': critic,
+                  'stds': stds, 'distribution_cfg': gaussian},
+        'critic': {'class_name': f'{place}.network:FeatureModel', 'hidden_dims': critic,
                    'activation': 'elu'},
         'algorithm': {'class_name': f'{place}.ppo:GraphPpo', 'num_learning_epochs': p.ppo.epochs,
                       'num_mini_batches': p.ppo.minibatches, 'clip_param': p.ppo.clip,
