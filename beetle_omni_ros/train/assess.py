@@ -30,7 +30,6 @@ NOMINAL = {'command_latency': [0.010, 0.010], 'velocity_latency': [0.0, 0.0],
 PUBLISHED = {'command_latency': [0.005, 0.015], 'velocity_latency': [0.015, 0.025],
              'tilt_latency': [0.005, 0.010], 'carried_share': 1.0, 'noise_power': 0.0,
              'actuator_spread': [0.0, 0.0]}
-SILENT = {'force_bias': 0.0, 'torque_bias': 0.0, 'force_noise': 0.0, 'torque_noise': 0.0}
 DISTURBANCES = ('force_share', 'strong_share', 'payload_share', 'push_share')
 
 
@@ -77,21 +76,18 @@ def assess(mean: Callable[[torch.Tensor], torch.Tensor], parameters: TrainParame
     env = TiltableQuadrotorEnv(replace(
         parameters, ppo=replace(parameters.ppo, robots=robots), episode=episode,
         start=start,
-        estimate=replace(parameters.estimate, **SILENT) if name != 'published'
-        else parameters.estimate,
         random=conditions(name, parameters.random)),
         robot, device, compiled=False)
     env.state['age'].zero_()
-    env.state['target_left'].fill_(round(SEGMENT / episode.period))
+    env.state['target_left'].fill_(round(SEGMENT / batch.PERIOD))
     return _fly(mean, env, segments)
 
 
 @torch.no_grad()
 def _fly(mean, env, segments):
-    period = env.cfg.episode.period
-    length = round(SEGMENT / period)
-    windows = {'U': tuple(round(t / period) for t in AT_TARGET),
-               'L': tuple(round(t / period) for t in ON_THE_WAY)}
+    length = round(SEGMENT / batch.PERIOD)
+    windows = {'U': tuple(round(t / batch.PERIOD) for t in AT_TARGET),
+               'L': tuple(round(t / batch.PERIOD) for t in ON_THE_WAY)}
     shape = (segments + 1, env.num_envs)
     sums = {key: torch.zeros(shape, device=env.device)
             for key in ('U_position', 'U_attitude', 'L_position', 'L_attitude')}

@@ -24,7 +24,7 @@ SCHEDULE_EVERY = 10      # iterations between two changes of the schedule
 
 
 def rsl_rl_configuration(p: TrainParameters) -> dict:
-    """Configuration of rsl-rl's runner for these parameters."""
+    """Configuration of rsl-rl's runner for these parameters; its numbers are published."""
     hidden, critic = ([int(size) for size in sizes]
                       for sizes in (p.network.hidden, p.network.critic))
     stds = [float(p.network.tilt_std)] * 4 + [float(p.network.thrust_std)] * 4
@@ -40,11 +40,10 @@ def rsl_rl_configuration(p: TrainParameters) -> dict:
         'critic': {'class_name': f'{place}.network:FeatureModel', 'hidden_dims': critic,
                    'activation': 'elu'},
         'algorithm': {'class_name': f'{place}.ppo:GraphPpo', 'num_learning_epochs': p.ppo.epochs,
-                      'num_mini_batches': p.ppo.minibatches, 'clip_param': p.ppo.clip,
-                      'gamma': p.ppo.discount, 'lam': p.ppo.trace,
-                      'value_loss_coef': p.ppo.value_weight,
+                      'num_mini_batches': p.ppo.minibatches, 'clip_param': 0.2,
+                      'gamma': p.ppo.discount, 'lam': 0.95, 'value_loss_coef': 1.0,
                       'entropy_coef': float(p.schedule.entropy[0]),
-                      'learning_rate': p.ppo.learning_rate, 'max_grad_norm': p.ppo.gradient_norm,
+                      'learning_rate': p.ppo.learning_rate, 'max_grad_norm': 1.0,
                       'use_clipped_value_loss': False, 'desired_kl': float(p.schedule.kl[0]),
                       'rnd_cfg': None, 'symmetry_cfg': None}}
 
@@ -103,7 +102,6 @@ class Runner(OnPolicyRunner):
         self.alg.scheduled.copy_(torch.tensor([
             at(name) for name in ('kl', 'entropy', 'tilt_std_limit', 'thrust_std_limit')]))
         env.severity.fill_(at('severity'))
-        env.depth_limit.fill_(at('depth_limit'))
         factors = {term: at(name) for name, terms in SCHEDULED.items() for term in terms}
         env.weights.copy_(env.base_weights * torch.tensor(
             [factors.get(name, 1.0) for name in rewards.TERMS], device=env.device))
