@@ -73,10 +73,6 @@ class StartParameters:
     other_branch: float = parameter(
         0.3, doc='fraction of the joints of a hover start on another turn', low=0, high=1)
 
-    def __post_init__(self):
-        if not any(getattr(self, name) for name in STRATA):
-            raise ParameterError('all shares are zero')
-
 
 @dataclass(frozen=True, kw_only=True)
 class RandomParameters:

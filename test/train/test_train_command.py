@@ -158,13 +158,6 @@ def test_unusable_input_is_refused_before_any_file_is_written(capsys, tmp_path, 
     assert [path.name for path in tmp_path.iterdir()] == ['file']
 
 
-def test_a_refused_effect_leaves_no_empty_folder(capsys, tmp_path):
-    (tmp_path / 'mine.yaml').write_text('extends: robot.yaml\neffects:\n'
-                                        '  command_latency: {delay: 0.015}\n')
-    refused(capsys, *TINY, '--robot', tmp_path / 'mine.yaml', '--output', tmp_path / 'run')
-    assert not (tmp_path / 'run').exists()
-
-
 def test_another_run_is_not_overwritten(capsys, run):
     before = sorted(run.iterdir())
     line = refused(capsys, *TINY, '--output', run)
