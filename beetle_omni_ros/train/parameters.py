@@ -14,6 +14,7 @@ from beetle_omni_ros.robot.schema import (
     parameter,
     ParameterError,
     ParameterFile,
+    unknown,
 )
 
 STRATA = ('wound_back', 'level', 'wound', 'mixed', 'hover', 'hold', 'moving')
@@ -257,11 +258,7 @@ class TrainParameters(ParameterFile, file='train.yaml'):
 
 def read_parameters(file: Path | None, changes: dict) -> TrainParameters:
     """Read a parameter file (None: the shipped one) and replace values by dotted names."""
-    parameters = TrainParameters.load(file)
-    flat = parameters.plain()
-    for key, value in changes.items():
-        if key not in flat:
-            raise ParameterError(f'--set {key}: unknown; keys are those of params/train.yaml, '
-                                 'e.g. ppo.robots')
-        flat[key] = value
-    return bind(TrainParameters, nest(flat), '--set' if changes else str(file or ''))
+    flat = TrainParameters.load(file).plain()
+    for key in changes.keys() - flat.keys():
+        raise unknown(f'--set {key}', 'key', key, flat)
+    return bind(TrainParameters, nest(flat | changes), '--set' if changes else str(file or ''))

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 import os
 from pathlib import Path
-import pickle
 import time
 
 import numpy as np
@@ -78,8 +77,7 @@ class Runner(OnPolicyRunner):
         self.parameters, self.folder = parameters, folder if is_rank_zero() else None
         self._robot_hash = robot.hash()
         torch.manual_seed(parameters.seed)
-        env = TiltableQuadrotorEnv(parameters, robot, device,
-                                   compiled=graphs if graphs is not None else None)
+        env = TiltableQuadrotorEnv(parameters, robot, device, compiled=graphs)
         super().__init__(env, rsl_rl_configuration(parameters),
                          str(self.folder) if self.folder else None, device)
         if self.is_distributed:
@@ -163,9 +161,8 @@ class Runner(OnPolicyRunner):
             group.update({key: ours[key] for key in ('capturable', 'fused', 'foreach')})
             self.alg.load(saved, None, True)
             self.current_learning_iteration, infos = int(saved['iter']), saved['infos'] or {}
-        except (OSError, RuntimeError, LookupError, ValueError, TypeError, EOFError,
-                pickle.UnpicklingError) as error:
-            text = ' '.join(str(error).split()) or type(error).__name__
+        except Exception as error:      # torch's errors for a bad file have no common base class
+            text = ' '.join(str(error).split())
             raise ParameterError(f'{path}: no checkpoint that fits this training '
                                  f'({text[:160]})') from None
         found = infos.get('robot_hash', self._robot_hash)

@@ -139,7 +139,7 @@ def test_a_missing_gpu_is_reported_in_one_line(tmp_path, capsys):
 
 @pytest.mark.parametrize(('arguments', 'named'), [
     ('', '--output: missing'), ('--output OUT --device tpu', "--device 'tpu': expected"),
-    ('--output OUT --set ppo.robtos=4', 'ppo.robtos: unknown'),
+    ('--output OUT --set ppo.robtos=4', "ppo.robtos: unknown key; did you mean 'ppo.robots'?"),
     ('--output OUT --set iterations', 'expected key=value'),
     ('--output OUT --set iterations=[1', 'not valid YAML'),
     ('--output OUT --set iterations=many', 'expected an integer'),
