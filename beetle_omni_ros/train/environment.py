@@ -12,7 +12,6 @@ from tensordict import TensorDict
 import torch
 
 from beetle_omni_ros.control import guidance
-from beetle_omni_ros.control.disturbance import DisturbanceParameters
 from beetle_omni_ros.control.policy_file import PolicyContract
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -30,7 +29,7 @@ from beetle_omni_ros.train.starts import (
 )
 
 SUBSTEPS = 4        # of the physics in a period
-ESTIMATE = DisturbanceParameters()     # of the controller of a policy with memory
+FORCE_BANDWIDTH, TORQUE_BANDWIDTH = 3.0, 4.0    # [rad/s] of the controller's estimate
 NUMBERS = 169       # random numbers for each robot and step
 REACHED_POSITION, REACHED_ATTITUDE = 0.10, 0.17453    # [m], [rad] limits of the task metrics
 
@@ -247,8 +246,8 @@ class TiltableQuadrotorEnv(VecEnv):
         force = s['wrench'][:, :3] + (mass - self._nominal_mass) * weight
         torque = s['wrench'][:, 3:] + torch.linalg.cross(centre, pull) \
             + s['body'][:, INERTIA] / batch.PERIOD * self._delay_error(s, x)
-        lag = torch.cat((torch.full_like(force, ESTIMATE.force_bandwidth * batch.PERIOD),
-                         torch.full_like(torque, ESTIMATE.torque_bandwidth * batch.PERIOD)), -1)
+        lag = torch.cat((torch.full_like(force, FORCE_BANDWIDTH * batch.PERIOD),
+                         torch.full_like(torque, TORQUE_BANDWIDTH * batch.PERIOD)), -1)
         return s['estimate'] + lag * (torch.cat((force, torque), -1) - s['estimate'])
 
     @staticmethod

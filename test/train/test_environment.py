@@ -8,11 +8,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 import torch
 
+from beetle_omni_ros.control.disturbance import DisturbanceParameters
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.simulator import Battery
 from beetle_omni_ros.train import rewards
-from beetle_omni_ros.train.environment import ESTIMATE
 from beetle_omni_ros.train.parameters import TrainParameters
 from beetle_omni_ros.train.physics import Physics
 
@@ -203,7 +203,7 @@ def test_the_estimate_approaches_the_disturbance():
     assert not env.done.any()
     force = env.state['wrench'][:, :3]
     assert force.abs().max() > 0.5
-    lag = 1 - (1 - ESTIMATE.force_bandwidth * PERIOD) ** 60
+    lag = 1 - (1 - DisturbanceParameters().force_bandwidth * PERIOD) ** 60
     torch.testing.assert_close(env.state['estimate'][:, :3], lag * force, atol=1e-3, rtol=1e-3)
 
 
