@@ -28,8 +28,9 @@ import torch
 
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.train.batch import PERIOD
 from beetle_omni_ros.train.command import choose_device
-from beetle_omni_ros.train.environment import TiltableQuadrotorEnv
+from beetle_omni_ros.train.environment import SUBSTEPS, TiltableQuadrotorEnv
 from beetle_omni_ros.train.parameters import TrainParameters
 from beetle_omni_ros.train.physics import Physics
 from beetle_omni_ros.train.runner import Runner
@@ -62,7 +63,7 @@ def with_robots(robots: int) -> TrainParameters:
 def agreement(device: str) -> float | None:
     """Largest relative difference of kernel and torch after a period; None without kernel."""
     p = with_robots(1000)
-    physics = Physics(ROBOT, p.episode.period, p.episode.substeps, device)
+    physics = Physics(ROBOT, PERIOD, SUBSTEPS, device)
     if not physics.has_kernel:
         return None
     torch.manual_seed(0)

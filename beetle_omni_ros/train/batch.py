@@ -105,33 +105,30 @@ class Draw:
         return torch.where(self.chance(0.5), uniform, axis_angle)
 
 
-class Signals:
+def sensed(random, s, draw):
     """
-    Estimated state as observed by the policy: delayed, biased and noisy.
+    Position, rotation, velocity, rate and tilts that the policy observes: delayed and noisy.
 
     The velocity is in base_link, as rate and tilt in the units of :mod:`robot.dynamics`. The
     rotations are matrices (N, 3, 3).
     """
-
-    def __init__(self, random, s, draw):
-        r, x, scale, bias = random, s['x'], s['noise'], s['bias']
-        self.position = x[:, model.POSITION] + bias[:, 0:3] \
-            + scale * draw.around(r.position_noise, 3)
-        error = bias[:, 3:6] + scale * draw.around(r.attitude_noise, 3)
-        self.rotation = matrix(product(
-            x[:, model.QUATERNION], from_rotation_vector(error)))
-        now = torch.cat((transpose_product(matrix(x[:, model.QUATERNION]),
-                                                 x[:, model.VELOCITY]), x[:, model.RATE]), -1)
-        ahead = s['extrapolated'] * s['delays'][:, 2:3]
-        motion = extrapolated(torch.cat((now[:, None], s['past_motion']), 1),
-                              s['delays'][:, 2:3], ahead)
-        self.velocity = motion[:, :3] + bias[:, 6:9] + scale * draw.around(r.velocity_noise, 3)
-        # A trend through two noisy readings has the weights 1 + a and -a.
-        gain = ((1 + ahead / PERIOD) ** 2 + (ahead / PERIOD) ** 2).sqrt()
-        self.rate = motion[:, 3:] + bias[:, 9:12] + scale * gain * draw.around(r.rate_noise, 3)
-        tilts = torch.cat((x[:, None, model.TILT], s['past_tilt']), 1)
-        self.tilt = delayed(tilts, s['delays'][:, 3:4]) + bias[:, 12:16] \
-            + scale * draw.around(r.tilt_noise, 4)
+    r, x, scale, bias = random, s['x'], s['noise'], s['bias']
+    position = x[:, model.POSITION] + bias[:, 0:3] + scale * draw.around(r.position_noise, 3)
+    error = bias[:, 3:6] + scale * draw.around(r.attitude_noise, 3)
+    rotation = matrix(product(x[:, model.QUATERNION], from_rotation_vector(error)))
+    now = torch.cat((transpose_product(matrix(x[:, model.QUATERNION]), x[:, model.VELOCITY]),
+                     x[:, model.RATE]), -1)
+    ahead = s['extrapolated'] * s['delays'][:, 2:3]
+    motion = extrapolated(torch.cat((now[:, None], s['past_motion']), 1),
+                          s['delays'][:, 2:3], ahead)
+    velocity = motion[:, :3] + bias[:, 6:9] + scale * draw.around(r.velocity_noise, 3)
+    # A trend through two noisy readings has the weights 1 + a and -a.
+    gain = ((1 + ahead / PERIOD) ** 2 + (ahead / PERIOD) ** 2).sqrt()
+    rate = motion[:, 3:] + bias[:, 9:12] + scale * gain * draw.around(r.rate_noise, 3)
+    tilts = torch.cat((x[:, None, model.TILT], s['past_tilt']), 1)
+    tilt = delayed(tilts, s['delays'][:, 3:4]) + bias[:, 12:16] \
+        + scale * draw.around(r.tilt_noise, 4)
+    return position, rotation, velocity, rate, tilt
 
 
 def delayed(history: torch.Tensor, delay: torch.Tensor) -> torch.Tensor:
@@ -165,25 +162,25 @@ def extrapolated(history: torch.Tensor, delay: torch.Tensor, ahead: torch.Tensor
     return value + ahead / PERIOD * (value - delayed(history, delay + PERIOD))
 
 
-def actor_observation(signals: Signals, s, previous_action, estimate=None, draw=None):
-    """(N, 33) observation; with ``estimate``, (N, 39) with the disturbance estimate."""
+def actor_observation(random, s, previous_action, memory, draw):
+    """(N, 33) observation; with ``memory``, (N, 39) with the disturbance estimate."""
+    position, rotation, velocity, rate, tilt = sensed(random, s, draw)
     trim = s['trim']
-    target = matrix(product(s['target_attitude'],
-                                        from_rotation_vector(trim[:, 3:])))
-    blocks = [signals.velocity, signals.rate,
-              transpose_product(signals.rotation,
-                                      s['target_position'] + trim[:, :3] - signals.position),
-              signals.rotation[:, :, 0], signals.rotation[:, :, 2], target[:, :, 0],
-              target[:, :, 2], signals.tilt, previous_action]
-    if estimate is not None:
+    target = matrix(product(s['target_attitude'], from_rotation_vector(trim[:, 3:])))
+    blocks = [velocity, rate,
+              transpose_product(rotation, s['target_position'] + trim[:, :3] - position),
+              rotation[:, :, 0], rotation[:, :, 2], target[:, :, 0], target[:, :, 2], tilt,
+              previous_action]
+    if memory:
         error = s['bias'][:, 16:22] + s['noise'] * torch.cat(
-            (draw.around(estimate.force_noise, 3), draw.around(estimate.torque_noise, 3)), -1)
-        blocks += [transpose_product(signals.rotation, s['estimate'][:, :3]) + error[:, :3],
+            (draw.around(random.estimated_force_noise, 3),
+             draw.around(random.estimated_torque_noise, 3)), -1)
+        blocks += [transpose_product(rotation, s['estimate'][:, :3]) + error[:, :3],
                    s['estimate'][:, 3:] + error[:, 3:]]
     return torch.cat(blocks, -1)
 
 
-def critic_observation(s, previous_action, torque_ratio, memory: bool = False):
+def critic_observation(s, previous_action, torque_ratio, memory):
     """(N, 47) true state with torques and thrusts of the rotors and trim; + 6 with memory."""
     x = s['x']
     rotation, target = matrix(x[:, model.QUATERNION]), matrix(s['target_attitude'])

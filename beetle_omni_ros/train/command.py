@@ -1,8 +1,7 @@
 """`beetle_omni train`: trains a policy from a parameter file and exports it to ONNX."""
 
-from contextlib import redirect_stdout, suppress
+from contextlib import redirect_stdout
 import io
-import itertools
 import os
 from pathlib import Path
 import re
@@ -12,12 +11,7 @@ import torch
 import yaml
 
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import (
-    nest,
-    ParameterError,
-    parse_yaml,
-    quoted,
-)
+from beetle_omni_ros.robot.schema import nest, ParameterError, parse_yaml, quoted
 from beetle_omni_ros.runs.files import check_writable, write_json
 from beetle_omni_ros.train.assess import assess
 from beetle_omni_ros.train.network import export_policy
@@ -36,13 +30,12 @@ COLUMNS = (('iteration', 'iteration', '{:.0f}'), ('seconds', 'time s', '{:.0f}')
            ('attitude_error_deg', 'error deg', '{:.1f}'), ('deaths', 'lost', '{:.0f}'),
            ('tilt_std', 'std tilt', '{:.2f}'), ('thrust_std', 'std thrust', '{:.2f}'),
            ('learning_rate', 'rate', '{:.0e}'))
-HEADER_EVERY = 20
 OF_TARGETS = ('success_rate', 'position_error_m', 'attitude_error_deg')  # averages over targets
 
 
 def choose_device(name: str) -> str:
     """Torch device for a name; 'auto' is a GPU if available."""
-    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    count = torch.cuda.device_count()
     if name == 'cpu' or (name == 'auto' and not count):
         return 'cpu'
     if name != 'auto' and not re.fullmatch(r'cuda(:\d+)?', name):
@@ -76,28 +69,29 @@ def run_train(*, output: Path | None, config: Path | None = None, robot: Path | 
     if output is None and resume is None:
         raise ParameterError('--output: missing; expected a folder for the training')
     where = choose_device(device)
-    checkpoint = _last_checkpoint(resume) if resume else None
-    output = output or checkpoint.parent
-    if checkpoint and config is None and (checkpoint.parent / PARAMETER_FILE).is_file():
-        config = checkpoint.parent / PARAMETER_FILE
-    changes = {**(SMOKE if smoke and not checkpoint else {}), **(changes or {})}
-    parameters = read_parameters(config, changes)
+    checkpoint = None
+    if resume:
+        last = max(_checkpoints(resume), default=(0, None))[1]
+        checkpoint = resume if resume.is_file() else last
+        if checkpoint is None:
+            raise ParameterError(f'--resume {resume}: no model_N.pt there; expected the folder of '
+                                 'a training')
+        output = output or checkpoint.parent
+        saved = checkpoint.parent / PARAMETER_FILE
+        config = config or (saved if saved.is_file() else None)
+    elif smoke:
+        changes = SMOKE | (changes or {})
+    parameters = read_parameters(config, changes or {})
     nominal = RobotParameters.load(robot)
-    new = is_rank_zero() and _make_folder(output, checkpoint)
     torch.set_float32_matmul_precision('high')
     if smoke:
         torch.set_num_threads(1)    # on a loaded machine several threads wait for each other
-    try:
-        with redirect_stdout(io.StringIO()):     # rsl-rl prints its models
-            runner = Runner(parameters, nominal, output, where)
-        if checkpoint:
-            runner.resume(checkpoint)
-    except BaseException:
-        if new:
-            with suppress(OSError):     # not empty
-                output.rmdir()
-        raise
+    with redirect_stdout(io.StringIO()):     # rsl-rl prints its models
+        runner = Runner(parameters, nominal, output, where)
+    if checkpoint:
+        runner.resume(checkpoint)
     if is_rank_zero():
+        _make_folder(output, checkpoint)
         (output / PARAMETER_FILE).write_text(
             yaml.safe_dump(nest(parameters.plain()), sort_keys=False))
     processes = f'{runner.gpu_world_size} x ' if runner.is_distributed else ''
@@ -143,13 +137,12 @@ def _finish(runner, robot, output, device, smoke, json_path, console):
 
 
 def _progress_table(console):
-    """Printer of rows of progress, with a header every ``HEADER_EVERY`` rows."""
-    widths, count = [max(len(title), 9) for _, title, _ in COLUMNS], itertools.count()
+    """Printer of rows of progress under a header."""
+    widths = [max(len(title), 9) for _, title, _ in COLUMNS]
+    console.print(' '.join(title.rjust(width) for (_, title, _), width in zip(COLUMNS, widths)),
+                  style='bold', soft_wrap=True)
 
     def show(row):
-        if next(count) % HEADER_EVERY == 0:
-            console.print(' '.join(title.rjust(width) for (_, title, _), width
-                                   in zip(COLUMNS, widths)), style='bold', soft_wrap=True)
         cells = ['–' if key in OF_TARGETS and not row['targets'] else pattern.format(row[key])
                  for key, _, pattern in COLUMNS]
         console.print(' '.join(map(str.rjust, cells, widths)), soft_wrap=True, highlight=False)
@@ -157,26 +150,13 @@ def _progress_table(console):
     return show
 
 
-def _last_checkpoint(folder):
-    """Latest checkpoint of a run."""
-    if folder.is_file():
-        return folder
-    found = _checkpoints(folder)
-    if not found:
-        raise ParameterError(f'--resume {folder}: no model_N.pt there; expected the folder of a '
-                             'training')
-    return found[-1]
-
-
 def _checkpoints(folder):
-    """Checkpoints in the order of their iterations."""
-    return sorted((path for path in folder.glob('model_*.pt') if path.stem[6:].isdigit()),
-                  key=lambda path: int(path.stem[6:]))
+    """Iterations and paths of the checkpoints in a folder."""
+    return [(int(path.stem[6:]), path) for path in folder.glob('model_*.pt')]
 
 
 def _make_folder(output, checkpoint):
-    """Create the folder of a run; return whether it is new."""
-    new = not output.exists()
+    """Create the folder of a run, unless it has another run's checkpoints."""
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -185,7 +165,6 @@ def _make_folder(output, checkpoint):
     if _checkpoints(output) and not resumed:
         raise ParameterError(f'--output {output}: holds the checkpoints of another run; '
                              f'--resume {output} continues it')
-    return new
 
 
 def parse_changes(texts: list[str], **others) -> dict:

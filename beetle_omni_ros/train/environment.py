@@ -28,6 +28,8 @@ from beetle_omni_ros.train.starts import (
     Starts,
 )
 
+SUBSTEPS = 4        # of the physics in a period
+FORCE_BANDWIDTH, TORQUE_BANDWIDTH = 3.0, 4.0    # [rad/s] of the controller's estimate
 NUMBERS = 169       # random numbers for each robot and step
 REACHED_POSITION, REACHED_ATTITUDE = 0.10, 0.17453    # [m], [rad] limits of the task metrics
 
@@ -45,9 +47,8 @@ class TiltableQuadrotorEnv(VecEnv):
     Attributes:
         state: name -> (N, ...) tensor, all quantities that persist between steps.
         weights: (R,) reward weights in the order of ``rewards.TERMS``, on the device. They may
-            change between steps, as may ``severity`` and ``depth_limit``.
+            change between steps, as may ``severity``.
         severity: () factor on forces, payloads and pushes.
-        depth_limit: () depth below both start and target that ends an episode [m].
 
     """
 
@@ -55,10 +56,9 @@ class TiltableQuadrotorEnv(VecEnv):
                  device: torch.device | str = 'cpu', compiled: bool | None = None):
         self.cfg, self.robot, self.device = parameters, robot, torch.device(device)
         self.num_envs, self.num_actions = parameters.ppo.robots, model.INPUT_SIZE
-        self.max_episode_length = round(parameters.episode.duration / parameters.episode.period)
+        self.max_episode_length = round(parameters.episode.duration / batch.PERIOD)
         self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.long, device=device)
-        self.physics = Physics(robot, parameters.episode.period, parameters.episode.substeps,
-                               device)
+        self.physics = Physics(robot, batch.PERIOD, SUBSTEPS, device)
         contract = PolicyContract.default(robot, parameters.memory)
         self.scale = self._tensor(contract.action_scale)
         self.offset = self._tensor(contract.action_offset)
@@ -68,7 +68,6 @@ class TiltableQuadrotorEnv(VecEnv):
         self._torque_ratio = self._tensor(-np.array(rotors.spin) * rotors.torque_to_thrust_ratio)
         self._starts = Starts(parameters, robot, self.num_envs, self.device)
         self.severity = self._starts.severity
-        self.depth_limit = torch.full((), np.inf, device=self.device)
         self._module_moment = module_reaction(robot)['mass_moment'] if robot.multibody else 0.0
         self._axes = self._tensor(robot.tilt_axes)
         self._sideways = self._tensor(np.cross(robot.tilt_axes, [0.0, 0.0, 1.0]))
@@ -83,7 +82,7 @@ class TiltableQuadrotorEnv(VecEnv):
         age = torch.rand(self.num_envs, device=self.device) * self.max_episode_length
         self.state['age'] = age.floor()
         self._replays = Replays(self.state, parameters.episode.replay_share,
-                                parameters.episode.target_time[1] / parameters.episode.period)
+                                parameters.episode.target_time[1] / batch.PERIOD)
         # sums since the last reading: targets finished, reached, errors, rewards, ends
         self.tally = torch.zeros(8 + len(rewards.TERMS), device=self.device)
         self._finish = self._after_physics
@@ -141,30 +140,29 @@ class TiltableQuadrotorEnv(VecEnv):
         x = self._push(s, x, draw)
         rotation, target = batch.matrix(x[:, model.QUATERNION]), batch.matrix(s['target_attitude'])
         inputs = self._reward_inputs(s, x, requested, rotation, target)
-        made = rewards.terms(inputs)
+        distance, angle = inputs['position_error'], inputs['attitude_error']
+        made = rewards.terms(**inputs)
         terms = torch.stack([made[name] for name in rewards.TERMS], -1)
         broken = ~torch.isfinite(x).all(-1)
         calm = s['disturbed'][:, 0] < 0.5
-        died = broken | (inputs.position_error > limits.position_limit) \
-            | (inputs.speed > limits.velocity_limit) | (inputs.rate > limits.rate_limit) \
-            | ((inputs.depth > self.depth_limit) & calm)
+        died = broken | (distance > limits.position_limit) \
+            | (inputs['speed'] > limits.velocity_limit) | (inputs['rate'] > limits.rate_limit)
         reward = torch.where(broken, 0.0, terms @ weights) \
             + died * (self.cfg.reward.termination * self.cfg.reward.scale)
         age = s['age'] + 1
         timeout = (age >= self.max_episode_length) & ~died
         done = died | timeout
         due = (s['target_left'] <= 1) & ~done
-        reached = (inputs.position_error < REACHED_POSITION) \
-            & (inputs.attitude_error < REACHED_ATTITUDE)
+        reached = (distance < REACHED_POSITION) & (angle < REACHED_ATTITUDE)
         finished = due & calm & (s['source'] < 0)
         tally = torch.cat([torch.stack([
-            finished.sum(), (finished & reached).sum(),
-            (finished * inputs.position_error).sum(), (finished * inputs.attitude_error).sum(),
-            reward.sum(), died.sum(), timeout.sum(), torch.ones_like(reward).sum()]),
+            finished.sum(), (finished & reached).sum(), (finished * distance).sum(),
+            (finished * angle).sum(), reward.sum(), died.sum(), timeout.sum(),
+            torch.ones_like(reward).sum()]),
             torch.where(broken[:, None], 0.0, terms).sum(0)])
-        new = self._continued(s, x, command, rotation, age, inputs.depth)
+        new = self._continued(s, x, command, rotation, age, inputs['depth'])
         missed = calm & ((died & ~broken) | due & (
-            (inputs.position_error > MISSED_POSITION) | (inputs.attitude_error > MISSED_ATTITUDE)
+            (distance > MISSED_POSITION) | (angle > MISSED_ATTITUDE)
             | (new['deepest'] > MISSED_DEPTH)))
         new = self._retarget(new, due, rotation, draw)
         self._replays.step(s, new, self._starts.draw(draw),
@@ -174,7 +172,7 @@ class TiltableQuadrotorEnv(VecEnv):
 
     def _push(self, s, x, draw):
         r = self.cfg.random
-        chance = s['pushed'] * (self.cfg.episode.period / r.push_period)
+        chance = s['pushed'] * (batch.PERIOD / r.push_period)
         push = draw.uniform(1) < chance
         # uniform, with the standard deviation of the parameters
         kick = torch.cat((draw.around(3 ** 0.5 * r.push_velocity, 3),
@@ -183,19 +181,19 @@ class TiltableQuadrotorEnv(VecEnv):
                           x[:, model.QUATERNION], x[:, model.RATE] + kick[:, 3:], x[:, 13:]), -1)
 
     def _reward_inputs(self, s, x, requested, rotation, target):
-        return rewards.RewardInputs(
-            position_error=(x[:, model.POSITION] - s['target_position']).norm(dim=-1),
-            attitude_error=batch.geodesic(rotation, target),
-            speed=x[:, model.VELOCITY].norm(dim=-1), rate=x[:, model.RATE].norm(dim=-1),
-            tilt=x[:, model.TILT], tilt_rate=x[:, model.TILT_RATE],
-            previous_tilt_rate=s['x'][:, model.TILT_RATE], thrust=x[:, model.THRUST],
-            tilt_command=requested[:, :4], thrust_command=requested[:, 4:],
-            previous_tilt_command=s['previous'][:, :4],
-            previous_thrust_command=s['previous'][:, 4:],
-            z_axis=rotation[:, :, 2], target_z_axis=target[:, :, 2],
-            depth=(s['floor'][:, 0] - x[:, 2]).clamp(min=0),
-            tilt_limit=self.robot.joints.position_limit,
-            thrust_limit=self.robot.rotors.thrust_max)
+        return {
+            'position_error': (x[:, model.POSITION] - s['target_position']).norm(dim=-1),
+            'attitude_error': batch.geodesic(rotation, target),
+            'speed': x[:, model.VELOCITY].norm(dim=-1), 'rate': x[:, model.RATE].norm(dim=-1),
+            'tilt': x[:, model.TILT], 'tilt_rate': x[:, model.TILT_RATE],
+            'previous_tilt_rate': s['x'][:, model.TILT_RATE], 'thrust': x[:, model.THRUST],
+            'tilt_command': requested[:, :4], 'thrust_command': requested[:, 4:],
+            'previous_tilt_command': s['previous'][:, :4],
+            'previous_thrust_command': s['previous'][:, 4:],
+            'z_axis': rotation[:, :, 2], 'target_z_axis': target[:, :, 2],
+            'depth': (s['floor'][:, 0] - x[:, 2]).clamp(min=0),
+            'tilt_limit': self.robot.joints.position_limit,
+            'thrust_limit': self.robot.rotors.thrust_max}
 
     def _continued(self, s, x, command, rotation, age, depth):
         """State after a step without resets and new targets."""
@@ -214,7 +212,7 @@ class TiltableQuadrotorEnv(VecEnv):
 
     def _trim(self, s, x):
         """(N, 6) shift of the target, as :class:`control.guidance.Trimming`."""
-        rate = guidance.TRIM_RATE * self.cfg.episode.period
+        rate = guidance.TRIM_RATE * batch.PERIOD
         way = s['target_position'] - x[:, model.POSITION] - s['bias'][:, 0:3]
         seen = batch.product(x[:, model.QUATERNION],
                              batch.from_rotation_vector(s['bias'][:, 3:6]))
@@ -237,7 +235,6 @@ class TiltableQuadrotorEnv(VecEnv):
         delayed rate gives an error: the difference of the delayed, extrapolated change of rate
         and the present change.
         """
-        e, period = self.cfg.estimate, self.cfg.episode.period
         mass, weight = s['body'][:, MASS], torch.zeros_like(s['wrench'][:, :3])
         weight[:, 2] = -self.robot.gravity
         tilt = x[:, model.TILT]
@@ -248,9 +245,9 @@ class TiltableQuadrotorEnv(VecEnv):
         pull = batch.transpose_product(rotation, weight * mass)
         force = s['wrench'][:, :3] + (mass - self._nominal_mass) * weight
         torque = s['wrench'][:, 3:] + torch.linalg.cross(centre, pull) \
-            + s['body'][:, INERTIA] / period * self._delay_error(s, x)
-        lag = torch.cat((torch.full_like(force, e.force_bandwidth * period),
-                         torch.full_like(torque, e.torque_bandwidth * period)), -1)
+            + s['body'][:, INERTIA] / batch.PERIOD * self._delay_error(s, x)
+        lag = torch.cat((torch.full_like(force, FORCE_BANDWIDTH * batch.PERIOD),
+                         torch.full_like(torque, TORQUE_BANDWIDTH * batch.PERIOD)), -1)
         return s['estimate'] + lag * (torch.cat((force, torque), -1) - s['estimate'])
 
     @staticmethod
@@ -277,12 +274,10 @@ class TiltableQuadrotorEnv(VecEnv):
         return changed
 
     def _observe(self, s, draw):
-        signals = batch.Signals(self.cfg.random, s, draw)
         previous_action = (s['previous'] - self.offset) / self.scale
-        observation = batch.actor_observation(signals, s, previous_action,
-                                        self.cfg.estimate if self.cfg.memory else None, draw)
-        return observation, batch.critic_observation(s, previous_action, self._torque_ratio,
-                                               self.cfg.memory)
+        memory = self.cfg.memory
+        return batch.actor_observation(self.cfg.random, s, previous_action, memory, draw), \
+            batch.critic_observation(s, previous_action, self._torque_ratio, memory)
 
     def read_tally(self) -> dict[str, float]:
         """Averages since the last call, which then restart; waits for the device."""

@@ -19,7 +19,6 @@ import numpy as np
 import onnx
 from rsl_rl.models import MLPModel
 from rsl_rl.modules import MLP
-from rsl_rl.modules.distribution import GaussianDistribution
 import torch
 
 from beetle_omni_ros import __version__
@@ -42,40 +41,13 @@ NEAR = 0.1           # [m or rad] below which the normalised error is linear
 RATE, FORCE, TORQUE, THRUST, TILT_ACTION, THRUST_ACTION = 0.5, 0.1, 2.0, 0.1, 0.25, 0.1
 # Blocks of the observation; the critic has eight rotor columns between tilt and action.
 VELOCITY, ANGULAR_VELOCITY, TARGET = slice(0, 3), slice(3, 6), slice(6, 9)
-ATTITUDES, TILT = slice(9, 21), slice(21, 25)     # of body and target; joints
+TILT = slice(21, 25)
 ACTION, ACTOR_SIZE = slice(25, 33), 33
 ROTORS, CRITIC_ACTION, TRIM, CRITIC_SIZE = slice(25, 33), slice(33, 41), slice(41, 47), 47
 
 
-def features(observation: torch.Tensor) -> torch.Tensor:
-    """(N, 50) features of (N, 33) observations, or (N, 56) of (N, 39)."""
-    shared = _shared(observation, observation[..., ACTION])
-    return torch.cat([*shared, *_disturbance(observation[..., ACTOR_SIZE:])], -1)
-
-
-def critic_features(state: torch.Tensor) -> torch.Tensor:
-    """(N, 64) features of the (N, 47) privileged state, or (N, 70) of (N, 53)."""
-    shared = _shared(state, state[..., CRITIC_ACTION])
-    rotors = state[..., ROTORS]
-    return torch.cat([*shared, rotors[..., :4], THRUST * rotors[..., 4:],
-                      state[..., TRIM] / NEAR, *_disturbance(state[..., CRITIC_SIZE:])], -1)
-
-
-def _shared(o, action):
-    target, tilt = o[..., TARGET], o[..., TILT]
-    x, z = o[..., 9:12], o[..., 12:15]
-    x_goal, z_goal = o[..., 15:18], o[..., 18:21]
-    y, y_goal = torch.linalg.cross(z, x), torch.linalg.cross(z_goal, x_goal)
-    axes, goals = (x, y, z), (x_goal, y_goal, z_goal)
-    relative = [(a * g).sum(-1) for a in axes for g in goals]    # R^T R*, row by row
-    turn = 0.5 * torch.stack((relative[7] - relative[5], relative[2] - relative[6],
-                              relative[3] - relative[1]), -1)
-    return [o[..., VELOCITY], RATE * o[..., ANGULAR_VELOCITY], target, _fine(target),
-            torch.stack(relative, -1), _fine(turn),
-            torch.stack([a[..., 2] for a in axes], -1),
-            torch.stack([g[..., 2] for g in goals], -1),
-            tilt, torch.sin(tilt), torch.cos(tilt),
-            TILT_ACTION * action[..., :4], THRUST_ACTION * action[..., 4:]]
+def _dot(a, b):
+    return (a * b).sum(-1)
 
 
 def _fine(error):
@@ -83,24 +55,67 @@ def _fine(error):
     return error / torch.sqrt((error * error).sum(-1, keepdim=True) + NEAR ** 2)
 
 
+# What is not linear in the features. The export replaces these functions.
+NOT_LINEAR = (torch.linalg.cross, _dot, _fine, torch.sin, torch.cos)
+
+
+def features(observation: torch.Tensor, not_linear=NOT_LINEAR) -> torch.Tensor:
+    """(N, 50) features of (N, 33) observations, or (N, 56) of (N, 39)."""
+    shared = _shared(observation, observation[..., ACTION], *not_linear)
+    return torch.cat([*shared, *_disturbance(observation[..., ACTOR_SIZE:])], -1)
+
+
+def critic_features(state: torch.Tensor) -> torch.Tensor:
+    """(N, 64) features of the (N, 47) privileged state, or (N, 70) of (N, 53)."""
+    shared = _shared(state, state[..., CRITIC_ACTION], *NOT_LINEAR)
+    rotors = state[..., ROTORS]
+    return torch.cat([*shared, rotors[..., :4], THRUST * rotors[..., 4:],
+                      state[..., TRIM] / NEAR, *_disturbance(state[..., CRITIC_SIZE:])], -1)
+
+
+def _shared(o, action, cross, dot, fine, sin, cos):
+    target, tilt = o[..., TARGET], o[..., TILT]
+    x, z = o[..., 9:12], o[..., 12:15]
+    x_goal, z_goal = o[..., 15:18], o[..., 18:21]
+    y, y_goal = cross(z, x), cross(z_goal, x_goal)
+    axes, goals = (x, y, z), (x_goal, y_goal, z_goal)
+    relative = [dot(a, g) for a in axes for g in goals]    # R^T R*, row by row
+    turn = 0.5 * torch.stack((relative[7] - relative[5], relative[2] - relative[6],
+                              relative[3] - relative[1]), -1)
+    return [o[..., VELOCITY], RATE * o[..., ANGULAR_VELOCITY], target, fine(target),
+            torch.stack(relative, -1), fine(turn),
+            torch.stack([a[..., 2] for a in axes], -1),
+            torch.stack([g[..., 2] for g in goals], -1),
+            tilt, sin(tilt), cos(tilt),
+            TILT_ACTION * action[..., :4], THRUST_ACTION * action[..., 4:]]
+
+
 def _disturbance(block):
     return [FORCE * block[..., :3], TORQUE * block[..., 3:]] if block.shape[-1] else []
 
 
-class ActorModel(MLPModel):
-    """Actor with the mean action output_scale * mlp(features) + carry * previous action."""
+class FeatureModel(MLPModel):
+    """
+    Actor or critic of rsl-rl, on features of its observation.
 
-    def __init__(self, obs, obs_groups, obs_set, output_dim, *, output_scale: float, carry: float,
-                 last_gain: float, **keywords):
+    The mean action is output_scale * mlp(features) + carry * previous action; the value of the
+    critic is mlp(features). ``stds`` are initial standard deviations of the actions.
+    """
+
+    def __init__(self, obs, obs_groups, obs_set, output_dim, *, output_scale=1.0, carry=0.0,
+                 last_gain=None, stds=None, **keywords):
+        self.features = features if obs_set == 'actor' else critic_features
         super().__init__(obs, obs_groups, obs_set, output_dim, **keywords)
         self.output_scale, self.carry = output_scale, carry
-        with torch.no_grad():
-            self.mlp[-1].weight.mul_(last_gain)
-            self.mlp[-1].bias.zero_()
+        if stds:
+            with torch.no_grad():
+                self.mlp[-1].weight.mul_(last_gain)
+                self.mlp[-1].bias.zero_()
+                self.distribution.log_std_param.copy_(torch.log(torch.tensor(stds)))
 
     def mean(self, observation: torch.Tensor) -> torch.Tensor:
-        """(N, 8) mean actions of (N, 33 or 39) observations."""
-        out = self.output_scale * self.mlp(features(observation))
+        """(N, 8) mean actions of (N, 33 or 39) observations; (N, 1) values of states."""
+        out = self.output_scale * self.mlp(self.features(observation))
         return out + self.carry * observation[..., ACTION] if self.carry else out
 
     def forward(self, obs, masks=None, hidden_state=None, stochastic_output=False):
@@ -112,84 +127,48 @@ class ActorModel(MLPModel):
         return mean
 
     def _get_latent_dim(self):
-        return features(torch.zeros(1, self.obs_dim)).shape[-1]
-
-
-class CriticModel(MLPModel):
-    """Critic: value of the privileged state."""
-
-    def value(self, state: torch.Tensor) -> torch.Tensor:
-        """(N, 1) values of (N, 47 or 53) states."""
-        return self.mlp(critic_features(state))
-
-    def forward(self, obs, masks=None, hidden_state=None, stochastic_output=False):
-        """As rsl-rl's model, on features."""
-        return self.value(torch.cat([obs[group] for group in self.obs_groups], -1))
-
-    def _get_latent_dim(self):
-        return critic_features(torch.zeros(1, self.obs_dim)).shape[-1]
-
-
-class BoundedGaussian(GaussianDistribution):
-    """Gaussian with a standard deviation for each action and an upper bound from the schedule."""
-
-    def __init__(self, output_dim: int, stds: list[float]):
-        super().__init__(output_dim, std_type='log')
-        with torch.no_grad():
-            self.log_std_param.copy_(torch.log(torch.tensor(stds)))
-
-    def bound(self, limits: torch.Tensor) -> None:
-        """Limit the standard deviations to (8,) ``limits``."""
-        with torch.no_grad():
-            self.log_std_param.copy_(torch.minimum(self.log_std_param, torch.log(limits)))
+        return self.features(torch.zeros(1, self.obs_dim)).shape[-1]
 
 
 class ExportedPolicy(torch.nn.Module):
     """
     Network of the ONNX file, from the raw observation to the mean action in few operations.
 
-    The function is that of :meth:`ActorModel.mean`, written for a single observation on one CPU
-    core, where the number of operations determines the time. All linear operations between two
-    products, with their scales and the previous action, are therefore one constant matrix.
+    The function is that of :meth:`FeatureModel.mean`, written for a single observation on one CPU
+    core, where the number of operations determines the time. Axes and products of axes are
+    appended to the observation by two stages of products. All features are then one linear
+    function of these numbers, except that errors are normalised and angles become sines.
     """
 
-    def __init__(self, actor: ActorModel):
+    def __init__(self, actor: FeatureModel):
         super().__init__()
-        size = actor.obs_dim
         self.mlp: MLP = copy.deepcopy(actor.mlp).cpu()
-        known = size + len(CROSSED[0])
-        # matrices of linear functions of rows
-        left, right = _factors(torch.eye(known))
-        self.register_buffer('left', left)
-        self.register_buffer('right', right)
-        self.register_buffer('linear', _linear(torch.eye(known + left.shape[1])).T)
-        self.splits = [self.linear.shape[0] - 14, 6, 8]
-        self.register_buffer('offset', torch.zeros(self.linear.shape[0]))
-        self.offset[-4:] = 0.5 * torch.pi       # cosines are sines
-        self.register_buffer('norms', torch.block_diag(torch.ones(3, 3), torch.ones(3, 3)))
-        self.register_buffer('near', torch.full((6,), NEAR ** 2))
+        stages, linear = _folded(actor.obs_dim)
+        self.stages = [[factor.clone() for factor in stage] for stage in stages]
+        self.linear = linear.T.contiguous()
+        count = len(self.linear)
+        self.offset = torch.zeros(count)
+        self.offset[COSINES] = 0.5 * torch.pi       # cosines are sines
+        self.norms, self.near = torch.zeros(count, count), torch.ones(count)
+        for block in FINE:
+            self.norms[block, block], self.near[block] = 1.0, NEAR ** 2
+        self.angle = torch.zeros(count, dtype=torch.bool)
+        self.angle[SINES] = self.angle[COSINES] = True
         last = self.mlp[-1]
-        self.register_buffer('carry', torch.zeros(last.out_features, size))
+        self.carry = torch.zeros(last.out_features, actor.obs_dim)
         self.carry[:, ACTION] = actor.carry * torch.eye(last.out_features)
-        sizes = dict(BLOCKS[:len(BLOCKS) if size > ACTOR_SIZE else -2])
-        first = dict(zip(sizes, torch.arange(sum(sizes.values())).split(list(sizes.values()))))
-        order = torch.cat([first[name] for name in sizes if name not in NOT_LINEAR]
-                          + [first[name] for name in NOT_LINEAR])
         with torch.no_grad():
-            self.mlp[0].weight.copy_(self.mlp[0].weight[:, order])
             last.weight.mul_(actor.output_scale)
             last.bias.mul_(actor.output_scale)
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
         """(1, 8) action of a (1, 33 or 39) observation."""
-        first, second = (torch.index_select(observation, -1, torch.tensor(places))
-                         for places in CROSSED)
-        known = torch.cat((observation, first * second), -1)
-        known = torch.cat((known, (known @ self.left) * (known @ self.right)), -1)
-        features, errors, angles = torch.nn.functional.linear(
-            known, self.linear, self.offset).split(self.splits, -1)
-        norms = torch.sqrt(torch.nn.functional.linear(errors * errors, self.norms, self.near))
-        features = torch.cat((features, errors / norms, torch.sin(angles)), -1)
+        known = observation
+        for left, right in self.stages:
+            known = torch.cat((known, (known @ left) * (known @ right)), -1)
+        features = torch.nn.functional.linear(known, self.linear, self.offset)
+        norms = torch.sqrt(torch.nn.functional.linear(features * features, self.norms, self.near))
+        features = torch.where(self.angle, torch.sin(features), features / norms)
         *hidden, last = self.mlp
         for layer in hidden:
             features = layer(features)
@@ -197,46 +176,39 @@ class ExportedPolicy(torch.nn.Module):
                                           torch.cat((last.weight, self.carry), -1), last.bias)
 
 
-# Blocks of :func:`features` with their sizes, and the blocks at the end of the exported graph.
-BLOCKS = (('velocity', 3), ('rate', 3), ('target', 3), ('target_fine', 3), ('relative', 9),
-          ('turn_fine', 3), ('up', 3), ('target_up', 3), ('tilt', 4), ('sine', 4), ('cosine', 4),
-          ('tilt_action', 4), ('thrust_action', 4), ('force', 3), ('torque', 3))
-NOT_LINEAR = ('target_fine', 'turn_fine', 'sine', 'cosine')
-# Indices of the observation whose products are y = z x x of body and target. The first six
-# products have a positive sign.
-CROSSED = ((13, 14, 12, 19, 20, 18, 14, 12, 13, 20, 18, 19),
-           (11, 9, 10, 17, 15, 16, 10, 11, 9, 16, 17, 15))
+# Places of the normalised errors and of the sines and cosines of the tilts in the features.
+FINE, SINES, COSINES = (slice(9, 12), slice(21, 24)), slice(34, 38), slice(38, 42)
+CROSS_PRODUCTS, DOT_PRODUCTS = 12, 27      # of two cross products and nine scalar products
 
 
-def _axes(known):
-    """Axes of body and target from the observation and the subsequent products."""
-    x, z, x_goal, z_goal = known[:, ATTITUDES].split(3, -1)
-    y, y_goal = (known[:, -12:-6] - known[:, -6:]).split(3, -1)
-    return (x, y, z), (x_goal, y_goal, z_goal)
+def _folded(size):
+    """
+    Left and right matrices of both stages of products, and the matrix of the features.
+
+    Features of the rows of a unit matrix are a matrix, if all that is not linear is replaced by a
+    linear function of the results of the stages.
+    """
+    known = torch.eye(size + CROSS_PRODUCTS + DOT_PRODUCTS)
+    products = iter(known[:, size:].split(3, -1))
+    crossed, dotted = [], []
+
+    def cross(a, b):
+        crossed.extend(((a[:, (1, 2, 0)], b[:, (2, 0, 1)]), (a[:, (2, 0, 1)], b[:, (1, 2, 0)])))
+        return next(products) - next(products)
+
+    def dot(a, b):
+        dotted.append((a, b))
+        return next(products).sum(-1)
+
+    def same(value):
+        return value
+
+    linear = features(known[:, :size], (cross, dot, same, same, same))
+    return [[torch.cat(factors, -1)[:rows] for factors in zip(*stage)]
+            for stage, rows in ((crossed, size), (dotted, size + CROSS_PRODUCTS))], linear
 
 
-def _factors(known):
-    """Left and right factors of the products of the body's axes with the target's axes."""
-    body, goals = _axes(known)
-    return (torch.cat([axis for axis in body for _ in goals], -1),
-            torch.cat([goal for _ in body for goal in goals], -1))
-
-
-def _linear(known):
-    """Features that are linear in observation and products, errors (6) and angles (8)."""
-    o, products = known[:, :-27], known[:, -27:]
-    body, goals = _axes(o)
-    relative = products.reshape(-1, 9, 3).sum(-1)
-    turn = 0.5 * (relative[:, (7, 2, 3)] - relative[:, (5, 6, 1)])
-    target, tilt, action = o[:, TARGET], o[:, TILT], o[:, ACTION]
-    return torch.cat((
-        o[:, VELOCITY], RATE * o[:, ANGULAR_VELOCITY], target, relative,
-        *(axis[:, 2:] for axis in (*body, *goals)), tilt,
-        TILT_ACTION * action[:, :4], THRUST_ACTION * action[:, 4:],
-        *_disturbance(o[:, ACTOR_SIZE:-12]), target, turn, tilt, tilt), -1)
-
-
-def export_policy(actor: ActorModel, path: Path, robot: RobotParameters,
+def export_policy(actor: FeatureModel, path: Path, robot: RobotParameters,
                   parameters: TrainParameters, training: dict | None = None,
                   metrics: dict | None = None) -> float:
     """

@@ -14,6 +14,7 @@ from beetle_omni_ros.robot.schema import (
     parameter,
     ParameterError,
     ParameterFile,
+    unknown,
 )
 
 STRATA = ('wound_back', 'level', 'wound', 'mixed', 'hover', 'hold', 'moving')
@@ -31,9 +32,6 @@ def _check_ranges(parameters, *names):
 class EpisodeParameters:
     """Time, targets and the end of an episode."""
 
-    period: float = parameter(0.01, doc='time between two actions, as in the policy file',
-                              unit='s', low=0.01, high=0.01)
-    substeps: int = parameter(4, doc='integration steps in a period', low=1, high=100)
     duration: float = parameter(16.0, doc='longest episode', unit='s', low=1, high=1000)
     target_time: np.ndarray = parameter(
         [3.0, 8.0], doc='range of the duration of a target', unit='s', shape=(2,),
@@ -75,14 +73,6 @@ class StartParameters:
     moving: float = parameter(1.0, doc='hover with initial velocities', low=0, high=100)
     other_branch: float = parameter(
         0.3, doc='fraction of the joints of a hover start on another turn', low=0, high=1)
-    velocity: float = parameter(1.5, doc='largest velocity of moving starts, each axis',
-                                unit='m/s', low=0, high=10)
-    rate: float = parameter(3.0, doc='largest angular rate of moving starts, each axis',
-                            unit='rad/s', low=0, high=20)
-
-    def __post_init__(self):
-        if not any(getattr(self, name) for name in STRATA):
-            raise ParameterError('all shares are zero')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,6 +92,13 @@ class RandomParameters:
     rate_noise: float = parameter(0.005, doc='each axis', unit='rad/s', low=0, high=1)
     tilt_bias: float = parameter(0.0524, doc='each joint', unit='rad', low=0, high=0.5)
     tilt_noise: float = parameter(0.0349, doc='each joint', unit='rad', low=0, high=0.5)
+    estimated_force_bias: float = parameter(
+        0.6, doc='of the disturbance estimate of a policy with memory, each axis', unit='N',
+        low=0, high=10)
+    estimated_force_noise: float = parameter(0.1, doc='each axis', unit='N', low=0, high=10)
+    estimated_torque_bias: float = parameter(
+        0.15, doc='each axis, mostly from biased encoders', unit='N m', low=0, high=1)
+    estimated_torque_noise: float = parameter(0.05, doc='each axis', unit='N m', low=0, high=1)
     noise_power: float = parameter(
         0.7, doc='scale of noise and biases of a robot is u^power, u uniform in [0, 1]; 0: full '
                  'scale for every robot', low=0, high=10)
@@ -153,22 +150,6 @@ class RandomParameters:
 
 
 @dataclass(frozen=True, kw_only=True)
-class EstimateParameters:
-    """Disturbance estimate of a policy with memory, as the controller computes it."""
-
-    force_bandwidth: float = parameter(3.0, doc='bandwidth of the force', unit='rad/s', low=0.1,
-                                       high=50)
-    torque_bandwidth: float = parameter(4.0, doc='bandwidth of the torque', unit='rad/s', low=0.1,
-                                        high=50)
-    force_bias: float = parameter(0.6, doc='half-width, scaled as the other biases', unit='N',
-                                  low=0, high=10)
-    torque_bias: float = parameter(0.15, doc='half-width, mostly from biased encoders', unit='N m',
-                                   low=0, high=1)
-    force_noise: float = parameter(0.1, doc='half-width', unit='N', low=0, high=10)
-    torque_noise: float = parameter(0.05, doc='half-width', unit='N m', low=0, high=1)
-
-
-@dataclass(frozen=True, kw_only=True)
 class RewardWeights:
     """Weights of the terms in :mod:`train.rewards`, with the terms' names."""
 
@@ -214,13 +195,6 @@ class NetworkParameters:
     thrust_std: float = parameter(1.7, doc='initial standard deviation of the thrust actions',
                                   low=0, high=10)
 
-    def __post_init__(self):
-        for name in ('hidden', 'critic'):
-            sizes = getattr(self, name)
-            if sizes.ndim != 1 or not sizes.size or (sizes < 1).any() or (sizes % 1).any():
-                raise ParameterError(f"key '{name}': expected the sizes of the hidden layers, "
-                                     f'found {sizes.tolist()}')
-
 
 @dataclass(frozen=True, kw_only=True)
 class PpoParameters:
@@ -230,20 +204,10 @@ class PpoParameters:
     steps: int = parameter(48, doc='steps in an iteration; published', low=1, high=10000)
     epochs: int = parameter(5, doc='published', low=1, high=100)
     minibatches: int = parameter(4, doc='minibatches in an epoch', low=1, high=1000)
-    clip: float = parameter(0.2, doc='published', low=0, high=1)
     discount: float = parameter(0.99, doc='published', low=0, high=1)
-    trace: float = parameter(0.95, doc='GAE factor; published', low=0, high=1)
-    gradient_norm: float = parameter(1.0, doc='published', low=0, high=1000)
-    value_weight: float = parameter(1.0, doc='weight of the value loss', low=0, high=100)
     learning_rate: float = parameter(1e-3, doc='initial learning rate', low=0, high=1)
     learning_rate_limits: np.ndarray = parameter([3e-5, 1e-2], doc='limits of the adaptation',
                                                  shape=(2,))
-
-    def __post_init__(self):
-        _check_ranges(self, 'learning_rate_limits')
-        if self.minibatches > self.robots * self.steps:
-            raise ParameterError(f"key 'minibatches': {self.minibatches} are more than the "
-                                 f'{self.robots * self.steps} samples of an iteration')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -264,9 +228,6 @@ class ScheduleParameters:
                                    'hover_*_rate', shape=(2,))
     severity: np.ndarray = parameter([0.0, 1.0], doc='factor on forces, payloads and pushes',
                                      shape=(2,))
-    depth_limit: np.ndarray = parameter([9.0, 9.0], doc='depth below both start and target that '
-                                        'ends the episode of an undisturbed robot', unit='m',
-                                        shape=(2,))
     near: np.ndarray = parameter([0.5, 1.0], doc='factor on the weights of near_*', shape=(2,))
     sinking: np.ndarray = parameter([0.3, 1.0], doc='factor on the weight of sinking', shape=(2,))
 
@@ -284,7 +245,6 @@ class TrainParameters(ParameterFile, file='train.yaml'):
     episode: EpisodeParameters = group(EpisodeParameters, 'episodes and targets')
     start: StartParameters = group(StartParameters, 'initial states')
     random: RandomParameters = group(RandomParameters, 'randomisation, noise, latency')
-    estimate: EstimateParameters = group(EstimateParameters, 'disturbance estimate')
     reward: RewardWeights = group(RewardWeights, 'weights')
     network: NetworkParameters = group(NetworkParameters, 'actor and critic')
     ppo: PpoParameters = group(PpoParameters, 'optimisation')
@@ -298,11 +258,7 @@ class TrainParameters(ParameterFile, file='train.yaml'):
 
 def read_parameters(file: Path | None, changes: dict) -> TrainParameters:
     """Read a parameter file (None: the shipped one) and replace values by dotted names."""
-    parameters = TrainParameters.load(file)
-    flat = parameters.plain()
-    for key, value in changes.items():
-        if key not in flat:
-            raise ParameterError(f'--set {key}: unknown; keys are those of params/train.yaml, '
-                                 'e.g. ppo.robots')
-        flat[key] = value
-    return bind(TrainParameters, nest(flat), '--set' if changes else str(file or ''))
+    flat = TrainParameters.load(file).plain()
+    for key in changes.keys() - flat.keys():
+        raise unknown(f'--set {key}', 'key', key, flat)
+    return bind(TrainParameters, nest(flat | changes), '--set' if changes else str(file or ''))

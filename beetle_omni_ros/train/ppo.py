@@ -69,7 +69,7 @@ class GraphPpo(PPO):
         """Run rsl-rl's own update with the schedule, which averages over several processes."""
         self.desired_kl, self.entropy_coef = self.scheduled[:2].tolist()
         losses = super().update()
-        self.actor.distribution.bound(self.scheduled[2:].repeat_interleave(4))
+        self._bound()
         low, high = self._limits
         self.set_rate(min(max(self.learning_rate, low), high))
         with torch.no_grad():    # release the last minibatch, whose graph cannot be copied
@@ -120,9 +120,9 @@ class GraphPpo(PPO):
         s.distribution_params[1].copy_(std.expand_as(s.distribution_params[1]))
         s.actions_log_prob.copy_(log_probability(
             s.actions, s.distribution_params[0], std)[..., None])
-        s.values.copy_(self.critic.value(s.observations['critic'].flatten(0, 1)).view_as(s.values))
+        s.values.copy_(self.critic.mean(s.observations['critic'].flatten(0, 1)).view_as(s.values))
         s.rewards.add_(self.gamma * s.values * s.advantages)
-        self._returns(self.critic.value(env.critic))
+        self._returns(self.critic.mean(env.critic))
 
     def _returns(self, last):
         """Generalised advantage estimation (Schulman et al. 2016)."""
@@ -149,7 +149,14 @@ class GraphPpo(PPO):
             for k in range(self.num_mini_batches):
                 self._step([column[k * size:(k + 1) * size] for column in shuffled], old_std)
         self.losses.div_(self.num_learning_epochs * self.num_mini_batches)
-        self.actor.distribution.bound(self.scheduled[2:].repeat_interleave(4))
+        self._bound()
+
+    @torch.no_grad()
+    def _bound(self):
+        """Limit the standard deviations as scheduled, which rsl-rl does not."""
+        log_std = self.actor.distribution.log_std_param
+        limits = self.scheduled[2:].repeat_interleave(4)
+        log_std.copy_(torch.minimum(log_std, torch.log(limits)))
 
     def _step(self, batch, old_std):
         self.optimizer.zero_grad(set_to_none=True)
@@ -168,7 +175,7 @@ class GraphPpo(PPO):
         ratio = torch.exp(log_probability(action, mean, std) - old_log[:, 0])
         clipped = ratio.clamp(1 - self.clip_param, 1 + self.clip_param)
         surrogate = torch.maximum(-advantage[:, 0] * ratio, -advantage[:, 0] * clipped).mean()
-        value = (returns - self.critic.value(state)).pow(2).mean()
+        value = (returns - self.critic.mean(state)).pow(2).mean()
         entropy = (log_std + 0.5 * (1 + log(2 * pi))).sum()
         divergence = (torch.log(std / old_std) + (old_std ** 2 + (old_mean - mean) ** 2)
                       / (2 * std ** 2) - 0.5).sum(-1).mean()

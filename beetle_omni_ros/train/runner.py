@@ -3,7 +3,6 @@
 from collections.abc import Callable
 import os
 from pathlib import Path
-import pickle
 import time
 
 import numpy as np
@@ -24,27 +23,26 @@ SCHEDULE_EVERY = 10      # iterations between two changes of the schedule
 
 
 def rsl_rl_configuration(p: TrainParameters) -> dict:
-    """Configuration of rsl-rl's runner for these parameters."""
+    """Configuration of rsl-rl's runner for these parameters; its numbers are published."""
     hidden, critic = ([int(size) for size in sizes]
                       for sizes in (p.network.hidden, p.network.critic))
     stds = [float(p.network.tilt_std)] * 4 + [float(p.network.thrust_std)] * 4
     place = 'beetle_omni_ros.train'
+    gaussian = {'class_name': 'GaussianDistribution', 'std_type': 'log'}
     return {
         'num_steps_per_env': p.ppo.steps, 'save_interval': p.save_every, 'logger': 'tensorboard',
         'obs_groups': {'actor': ['actor'], 'critic': ['critic']}, 'check_for_nan': False,
-        'actor': {'class_name': f'{place}.network:ActorModel', 'hidden_dims': hidden,
+        'actor': {'class_name': f'{place}.network:FeatureModel', 'hidden_dims': hidden,
                   'activation': 'elu', 'output_scale': p.network.output_scale,
                   'carry': p.network.carry, 'last_gain': p.network.last_gain,
-                  'distribution_cfg': {'class_name': f'{place}.network:BoundedGaussian',
-                                       'stds': stds}},
-        'critic': {'class_name': f'{place}.network:CriticModel', 'hidden_dims': critic,
+                  'stds': stds, 'distribution_cfg': gaussian},
+        'critic': {'class_name': f'{place}.network:FeatureModel', 'hidden_dims': critic,
                    'activation': 'elu'},
         'algorithm': {'class_name': f'{place}.ppo:GraphPpo', 'num_learning_epochs': p.ppo.epochs,
-                      'num_mini_batches': p.ppo.minibatches, 'clip_param': p.ppo.clip,
-                      'gamma': p.ppo.discount, 'lam': p.ppo.trace,
-                      'value_loss_coef': p.ppo.value_weight,
+                      'num_mini_batches': p.ppo.minibatches, 'clip_param': 0.2,
+                      'gamma': p.ppo.discount, 'lam': 0.95, 'value_loss_coef': 1.0,
                       'entropy_coef': float(p.schedule.entropy[0]),
-                      'learning_rate': p.ppo.learning_rate, 'max_grad_norm': p.ppo.gradient_norm,
+                      'learning_rate': p.ppo.learning_rate, 'max_grad_norm': 1.0,
                       'use_clipped_value_loss': False, 'desired_kl': float(p.schedule.kl[0]),
                       'rnd_cfg': None, 'symmetry_cfg': None}}
 
@@ -79,8 +77,7 @@ class Runner(OnPolicyRunner):
         self.parameters, self.folder = parameters, folder if is_rank_zero() else None
         self._robot_hash = robot.hash()
         torch.manual_seed(parameters.seed)
-        env = TiltableQuadrotorEnv(parameters, robot, device,
-                                   compiled=graphs if graphs is not None else None)
+        env = TiltableQuadrotorEnv(parameters, robot, device, compiled=graphs)
         super().__init__(env, rsl_rl_configuration(parameters),
                          str(self.folder) if self.folder else None, device)
         if self.is_distributed:
@@ -103,7 +100,6 @@ class Runner(OnPolicyRunner):
         self.alg.scheduled.copy_(torch.tensor([
             at(name) for name in ('kl', 'entropy', 'tilt_std_limit', 'thrust_std_limit')]))
         env.severity.fill_(at('severity'))
-        env.depth_limit.fill_(at('depth_limit'))
         factors = {term: at(name) for name, terms in SCHEDULED.items() for term in terms}
         env.weights.copy_(env.base_weights * torch.tensor(
             [factors.get(name, 1.0) for name in rewards.TERMS], device=env.device))
@@ -165,9 +161,8 @@ class Runner(OnPolicyRunner):
             group.update({key: ours[key] for key in ('capturable', 'fused', 'foreach')})
             self.alg.load(saved, None, True)
             self.current_learning_iteration, infos = int(saved['iter']), saved['infos'] or {}
-        except (OSError, RuntimeError, LookupError, ValueError, TypeError, EOFError,
-                pickle.UnpicklingError) as error:
-            text = ' '.join(str(error).split()) or type(error).__name__
+        except Exception as error:      # torch's errors for a bad file have no common base class
+            text = ' '.join(str(error).split())
             raise ParameterError(f'{path}: no checkpoint that fits this training '
                                  f'({text[:160]})') from None
         found = infos.get('robot_hash', self._robot_hash)

@@ -19,8 +19,9 @@ from beetle_omni_ros.train.model import actuators, nominal_body
 from beetle_omni_ros.train.parameters import STRATA, TrainParameters
 
 NEAR_POSITION, NEAR_ANGLE = 0.3, 0.6   # [m], [rad] of a target near the present pose
+MOVING_SPEED, MOVING_RATE = 1.5, 3.0   # [m/s], [rad/s] largest of a moving start, each axis
 DRAWN = 2048    # robots from the measured intervals, of which the robots of the training are made
-HISTORY = 2     # stored periods of commands and tilts
+LONGEST_DELAY = 2 * batch.PERIOD    # [s] of the stored commands and tilts
 LEAST = 0.2     # smallest drawn quantity of an actuator, as a fraction of the smallest measured
 PAYLOAD_DEPTH = 0.08                   # [m] below base_link, as in the simulated plant
 MISSED_POSITION, MISSED_ATTITUDE = 0.10, 0.10     # [m], [rad] at the end of a target's time
@@ -32,15 +33,15 @@ FORGET_FLOWN, FORGET_MISSED = 0.5, 0.1            # probability of deletion afte
 def latencies(parameters: TrainParameters, robot: RobotParameters) -> list[list[float]]:
     """Ranges of the delays of tilt and thrust commands, of the velocity and of the tilts [s]."""
     r, (tilt, thrust) = parameters.random, robot.command_delays
-    made, most = [], HISTORY * parameters.episode.period
+    made = []
     for name, span, more in (('tilt commands', r.command_latency, tilt),
                              ('thrust commands', r.command_latency, thrust),
                              ('velocity', r.velocity_latency, 0.0),
                              ('joint feedback', r.tilt_latency, robot.sensors.encoder_delay)):
         made.append([max(float(t) + more, 0.0) for t in span])
-        if more and made[-1][1] > most + 1e-9:
+        if more and made[-1][1] > LONGEST_DELAY + 1e-9:
             raise ParameterError(f'effects: {name} are up to {1e3 * made[-1][1]:g} ms late, '
-                                 f'the training environment stores {1e3 * most:g} ms')
+                                 f'the training environment stores {1e3 * LONGEST_DELAY:g} ms')
     return made
 
 
@@ -76,11 +77,9 @@ class Starts:
         self.severity = torch.ones((), device=device)
         self._limit = float(robot.joints.position_limit)
         # plain floats, because a compiler takes numpy scalars for tensors of the host
-        self._target_time = [float(t) / parameters.episode.period
-                             for t in parameters.episode.target_time]
+        self._target_time = [float(t) / batch.PERIOD for t in parameters.episode.target_time]
         r = parameters.random
         self._latencies = latencies(parameters, robot)
-        self._longest_delay = HISTORY * parameters.episode.period
         self._spread = [float(share) for share in r.actuator_spread]
         measured = RobotParameters.load(r.actuators)
         self._nominal = tensor([*actuators(robot), *robot.command_delays])
@@ -100,10 +99,9 @@ class Starts:
             self._is['wound_back'], -1.0, torch.where(self._is['mixed'], third, 0.0)))
         tilt = torch.where(hovering, tilt, torch.pi * wound)
         thrust = torch.where(hovering, thrust, self._robot.hover_thrust)
-        start = self._p.start
         moving = self._is['moving']
-        velocity = moving * d.around(start.velocity, 3)
-        rate = moving * d.around(start.rate, 3)
+        velocity = moving * d.around(MOVING_SPEED, 3)
+        rate = moving * d.around(MOVING_RATE, 3)
         zeros = torch.zeros_like(tilt)
         x = torch.cat((zeros[:, :3], velocity, attitude, rate, tilt, zeros, thrust), -1)
         body_velocity = batch.transpose_product(batch.matrix(attitude), velocity)
@@ -179,11 +177,10 @@ class Starts:
         bias = noise * torch.cat((
             d.around(r.position_bias, 3), d.around(r.attitude_bias, 3),
             d.around(r.velocity_bias, 3), d.around(r.rate_bias, 3), d.around(r.tilt_bias, 4),
-            d.around(self._p.estimate.force_bias, 3),
-            d.around(self._p.estimate.torque_bias, 3)), -1)
+            d.around(r.estimated_force_bias, 3), d.around(r.estimated_torque_bias, 3)), -1)
         actuators, later = self._actuators(d)
         delays = torch.cat([d.uniform(1, *span) for span in self._latencies], -1)
-        delays = torch.cat(((delays[:, :2] + later).clamp(0.0, self._longest_delay),
+        delays = torch.cat(((delays[:, :2] + later).clamp(0.0, LONGEST_DELAY),
                             delays[:, 2:]), -1)
         pushed = d.chance(r.push_share)
         extrapolated = d.chance(r.carried_share).float()

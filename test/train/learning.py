@@ -22,8 +22,8 @@ QUIET = {f'random.{name}': 0.0 for name in (
     'mass_scale', 'inertia_scale', 'centre_of_mass', 'position_bias', 'position_noise',
     'attitude_bias', 'attitude_noise', 'velocity_bias', 'velocity_noise', 'rate_bias',
     'rate_noise', 'tilt_bias', 'tilt_noise', 'force_share', 'strong_share', 'payload_share',
-    'push_share', 'carried_share')} | {f'estimate.{name}': 0.0 for name in (
-        'force_bias', 'force_noise', 'torque_bias', 'torque_noise')} | {
+    'push_share', 'carried_share', 'estimated_force_bias', 'estimated_force_noise',
+    'estimated_torque_bias', 'estimated_torque_noise')} | {
     'random.velocity_latency': [0.0, 0.0], 'random.tilt_latency': [0.0, 0.0],
     'random.command_latency': [0.01, 0.01], 'random.actuator_spread': [0.0, 0.0],
     'random.thrust_limit': [20.0, 20.0]}

@@ -11,7 +11,7 @@ from beetle_omni_ros.control.guidance import Trimming
 from beetle_omni_ros.control.policy import disturbed, observed
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.train import batch
-from beetle_omni_ros.train.batch import delayed, extrapolated, Signals
+from beetle_omni_ros.train.batch import delayed, extrapolated, sensed
 
 SEEN = {'velocity': slice(0, 3), 'rate': slice(3, 6), 'tilt': slice(21, 25)}
 
@@ -125,14 +125,14 @@ def test_extrapolation_amplifies_the_noise_of_the_rate():
 def widths(env, random, seed=1):
     """Errors of the signals of many robots."""
     s = env.state
-    seen = Signals(random, s, draw(env, seed))
+    position, attitude, velocity, rate, tilt = sensed(random, s, draw(env, seed))
     x = s['x']
     rotation = Rotation.from_quat(x[:, 6:10].numpy())
-    wrong = rotation.inv() * Rotation.from_matrix(seen.rotation.double().numpy())
+    wrong = rotation.inv() * Rotation.from_matrix(attitude.double().numpy())
     back = batch.transpose_product(batch.matrix(x[:, 6:10]), x[:, 3:6])
-    return {'position': (seen.position - x[:, :3]).numpy(), 'attitude': wrong.as_rotvec(),
-            'velocity': (seen.velocity - back).numpy(), 'rate': (seen.rate - x[:, 10:13]).numpy(),
-            'tilt': (seen.tilt - x[:, 13:17]).numpy()}
+    return {'position': (position - x[:, :3]).numpy(), 'attitude': wrong.as_rotvec(),
+            'velocity': (velocity - back).numpy(), 'rate': (rate - x[:, 10:13]).numpy(),
+            'tilt': (tilt - x[:, 13:17]).numpy()}
 
 
 @pytest.mark.parametrize('kind', ['noise', 'bias'])
@@ -151,8 +151,8 @@ def test_noise_and_bias_fill_their_half_width_in_their_entries_only(name, kind):
 
 
 def test_the_estimate_is_observed_with_its_noise_and_bias():
-    env = quiet({'memory': True, 'random.noise_power': 0.0, 'estimate.force_noise': 0.3,
-                 'estimate.torque_bias': 0.2}, robots=2000)
+    env = quiet({'memory': True, 'random.noise_power': 0.0, 'random.estimated_force_noise': 0.3,
+                 'random.estimated_torque_bias': 0.2}, robots=2000)
     scattered(env)
     seen, _ = env._observe(env.state, draw(env))
     s = env.state

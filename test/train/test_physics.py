@@ -73,13 +73,6 @@ def test_every_operation_of_the_tables_is_correct_with_constants_too():
     np.testing.assert_allclose(ours, np.array(function.map(60)(x.T, y.T)).T, atol=1e-14)
 
 
-def test_an_unknown_operation_is_refused_by_name():
-    x = ca.SX.sym('x', 2)
-    function = ca.Function('turning', [x], [ca.atan2(x[0], x[1])], ['x'], ['y'])
-    with pytest.raises(NotImplementedError, match='turning'):
-        physics.torch_function(function)
-
-
 @pytest.mark.skipif(not torch.cuda.is_available(), reason='triton compiles for a GPU')
 def test_the_kernel_agrees_with_torch():
     made = physics.Physics(EVERYTHING, 0.01, 4, 'cuda', kernel=True)

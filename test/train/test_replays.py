@@ -41,18 +41,6 @@ def store():
     return replays, s, first
 
 
-def test_an_episode_begins_with_a_stored_situation_and_the_longest_time():
-    replays, s, first = store()
-    after = step(replays, s, states(3), states(4), flags(done=[0, 5]))
-    for row in (0, 5):
-        torch.testing.assert_close(after['x'][row], first['x'][2])
-        torch.testing.assert_close(after['past'][row], first['past'][2])
-        assert after['age'][row] == 0 and after['target_left'][row] == 800
-        assert after['source'][row] == 2
-    torch.testing.assert_close(after['x'][1], states(3)['x'][1])
-    assert after['source'][1] == -1
-
-
 def test_samples_cover_the_stored_situations_only():
     replays, s, _ = store()
     s['filled'] = torch.tensor([0.0, 1, 0, 0, 1, 1, 0, 0])

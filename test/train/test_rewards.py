@@ -26,7 +26,7 @@ def moment(**changes):
     rows = max(len(value) for value in values.values())
     values = {key: torch.tensor(np.broadcast_to(value, (rows, *value.shape[1:])).copy())
               for key, value in values.items()}
-    return rewards.RewardInputs(**values, tilt_limit=TILT_LIMIT, thrust_limit=THRUST_LIMIT)
+    return {**values, 'tilt_limit': TILT_LIMIT, 'thrust_limit': THRUST_LIMIT}
 
 
 def moments(count, seed):
@@ -80,9 +80,9 @@ def published(m):
 
 def test_the_published_terms_are_those_of_the_table():
     made = moments(400, 0)
-    rows = [{key: value[k].numpy() for key, value in made._asdict().items()
+    rows = [{key: value[k].numpy() for key, value in made.items()
              if torch.is_tensor(value)} for k in range(400)]
-    expected, found = [published(row) for row in rows], rewards.terms(made)
+    expected, found = [published(row) for row in rows], rewards.terms(**made)
     for name in expected[0]:
         ours = found[name].double().numpy()
         theirs = np.array([float(row[name]) for row in expected])
@@ -92,7 +92,7 @@ def test_the_published_terms_are_those_of_the_table():
 
 def test_at_rest_at_the_target_only_thrust_is_penalised():
     at_target = moment()
-    costs = {name: float(term) for name, term in rewards.terms(at_target).items()
+    costs = {name: float(term) for name, term in rewards.terms(**at_target).items()
              if getattr(RewardWeights(), name) < 0}
     assert costs.pop('thrust_power') == pytest.approx(4 * HOVER ** 2)
     assert set(costs.values()) == {0.0}
@@ -101,7 +101,7 @@ def test_at_rest_at_the_target_only_thrust_is_penalised():
 def test_at_rest_at_the_target_every_bonus_is_the_largest_and_falls_with_distance():
     best = {'pose': 1, 'reach_position': 2, 'reach_pose': 4, 'near_position': 1,
             'near_attitude': 1, 'near_pose': 1, 'exact_pose': 1}
-    near, far = (rewards.terms(moment(position_error=distance, attitude_error=distance))
+    near, far = (rewards.terms(**moment(position_error=distance, attitude_error=distance))
                  for distance in (0.0, 0.015))
     assert {name: float(near[name]) for name in best} == best
     assert all(float(far[name]) < value for name, value in best.items())
@@ -109,7 +109,7 @@ def test_at_rest_at_the_target_every_bonus_is_the_largest_and_falls_with_distanc
 
 
 def test_command_changes_count_at_the_target_only():
-    found = rewards.terms(moment(position_error=[0.0, 1.0], tilt_command=np.full((2, 4), 0.1),
+    found = rewards.terms(**moment(position_error=[0.0, 1.0], tilt_command=np.full((2, 4), 0.1),
                                  thrust_command=np.full((2, 4), 9.0)))
     for name in ('hover_tilt_rate', 'hover_thrust_rate'):
         here, there = found[name]
@@ -118,9 +118,9 @@ def test_command_changes_count_at_the_target_only():
 
 def test_a_loss_of_height_costs_less_than_a_termination():
     p = TrainParameters.load()
-    deepest = float(rewards.terms(moment(depth=1e3))['sinking'])
+    deepest = float(rewards.terms(**moment(depth=1e3))['sinking'])
     assert -p.reward.sinking * deepest / (1 - p.ppo.discount) < -p.reward.termination
 
 
 def test_every_weight_has_a_term_and_every_term_a_weight():
-    assert tuple(rewards.terms(moment())) == rewards.TERMS
+    assert tuple(rewards.terms(**moment())) == rewards.TERMS

@@ -40,16 +40,15 @@ def test_the_schedule_is_linear_between_its_ends():
                      'schedule.entropy': [4e-4, 0.0], 'schedule.tilt_std_limit': [0.8, 0.2],
                      'schedule.thrust_std_limit': [3.0, 1.0], 'schedule.severity': [0.0, 1.0],
                      'schedule.smooth': [0.1, 1.0], 'schedule.near': [0.5, 1.0],
-                     'schedule.sinking': [0.1, 1.0], 'schedule.depth_limit': [5.0, 1.0]})
+                     'schedule.sinking': [0.1, 1.0]})
     reward = made.parameters.reward
-    for part, knobs, severity, depth, smooth, near in (
-            (0.1, [0.01, 4e-4, 0.8, 3.0], 0.0, 5.0, 0.1, 0.5),
-            (0.5, [0.0075, 2e-4, 0.5, 2.0], 0.5, 3.0, 0.55, 0.75),
-            (1.0, [0.005, 0.0, 0.2, 1.0], 1.0, 1.0, 1.0, 1.0)):
+    for part, knobs, severity, smooth, near in (
+            (0.1, [0.01, 4e-4, 0.8, 3.0], 0.0, 0.1, 0.5),
+            (0.5, [0.0075, 2e-4, 0.5, 2.0], 0.5, 0.55, 0.75),
+            (1.0, [0.005, 0.0, 0.2, 1.0], 1.0, 1.0, 1.0)):
         made.apply_schedule(part)
         np.testing.assert_allclose(made.alg.scheduled, knobs, rtol=1e-6)
         assert float(made.env._starts.severity) == pytest.approx(severity)
-        assert float(made.env.depth_limit) == pytest.approx(depth)
         weights = dict(zip(rewards.TERMS, made.env.weights.tolist()))
         for name, factor in (('hover_tilt_rate', smooth), ('sinking', smooth),
                              ('near_pose', near), ('position', 1.0)):

@@ -37,7 +37,6 @@ def test_two_processes_train_one_network_with_their_own_robots(tmp_path):
 
 
 def test_each_process_takes_the_gpu_of_its_rank(monkeypatch):
-    monkeypatch.setattr(command.torch.cuda, 'is_available', lambda: True)
     monkeypatch.setattr(command.torch.cuda, 'device_count', lambda: 4)
     assert command.choose_device('cuda:2') == 'cuda:2'
     monkeypatch.setenv('LOCAL_RANK', '3')
