@@ -167,7 +167,7 @@ class RecorderNode(FlightNode):
 
     def _write(self):
         # Before the first /clock the time is 0: a bag that begins in 1970 cannot be viewed.
-        if self._failure or not self.now() and len(self._received) < HELD:
+        if self._failure or not self._bag or not self.now() and len(self._received) < HELD:
             return
         received, self._received = self._received, []
         try:
@@ -193,13 +193,14 @@ class RecorderNode(FlightNode):
         return WARN if self._lost else OK, self.parameters.bag, values
 
     def close(self):
-        """Finish the bag."""
+        """Finish the bag; a second call does nothing."""
         try:
             if self._bag:
                 self._write()
                 self._bag.close()
         except BagError as error:
             print(f'recorder_node: error: {error}', file=sys.stderr)
+        self._bag = None
 
 
 # --- viewers ------------------------------------------------------------------------------------

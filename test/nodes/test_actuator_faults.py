@@ -8,7 +8,7 @@ faults.
 import numpy as np
 import pytest
 from std_srvs.srv import Trigger
-from witness import PATIENT, running_graph, Witness
+from witness import running_graph, Witness
 
 from beetle_omni_ros.nodes.graph import bridge_parameters, BRIDGES, BRIDGES_COMPOSED
 
@@ -50,7 +50,7 @@ LANDING = [
 
 
 def test_a_lost_servo_or_board_lands_and_killed_bridges_leave_nothing_on(tmp_path, ros_domain):
-    parameters = {'sim_node': {}, 'ekf_node': {}, 'nmpc_node': {}, 'supervisor_node': PATIENT}
+    parameters = {'sim_node': {}, 'ekf_node': {}, 'nmpc_node': {}, 'supervisor_node': {}}
     for node, values in bridge_parameters(tmp_path, {}).items():
         parameters[node] = {**parameters.get(node, {}), **values}
     with running_graph(parameters, tmp_path, ros_domain, operator=FaultOperator) \
