@@ -33,6 +33,8 @@ HANDOVER_TIME = 0.3     # [s] longest duration: half a turn of a joint
 TILT_RATE = 9.0         # [rad/s] as in hover.yaml: below the servos' 10
 THRUST_RATE = 300.0     # [N/s] as in hover.yaml: 3 N a period
 TURN_TIME = 0.2         # [s] of the present turn until it ends
+LOOK = 0.02             # [s] after a pause without a command: two periods of MoCap, because the
+                        # robot may lie on the floor
 RESUMING = 0.1          # [s] after a pause until every source has sent a message again
 FALLBACK_TIME = 30.0    # [s] of fallback until landing; enough to restart a controller
 MOCAP_PATIENCE = 1.5    # [s] of dead reckoning until landing; its velocity error is then 0.1 m/s
@@ -167,7 +169,7 @@ class Supervisor(Inputs):
 
     def _guarded(self, command, now):
         """Final check of the output: finite, inside limits, not too old."""
-        if command is None:
+        if command is None or now - self._resumed < LOOK:
             return None
         if now - command.stamp > AGE_LIMIT:
             self.say(ERROR, f'the command of {self.source} is '
