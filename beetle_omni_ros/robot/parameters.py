@@ -54,7 +54,7 @@ class RotorParameters:
     def __post_init__(self):
         """Bind the rows of the map, and check the thrust range and the spin."""
         rows = tuple(row if isinstance(row, RotorMapRow) else
-                     schema.bind(RotorMapRow, row, prefix=f'rotors.map[{k}]')
+                     schema.bind(RotorMapRow, row, prefix=f'rotors.map[{k}].')
                      for k, row in enumerate(self.map))
         object.__setattr__(self, 'map', rows)
         if self.thrust_min >= self.thrust_max:
