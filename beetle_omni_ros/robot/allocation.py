@@ -110,7 +110,7 @@ class Allocator:
 
     def __init__(self, robot: RobotParameters):
         rotors, scale = robot.rotors, robot.thrust_scale
-        self.mass = robot.true_mass
+        self.mass = robot.effect('mass.mass', robot.mass)
         self.weight = np.array([0.0, 0.0, self.mass * robot.gravity]) \
             - robot.effect('wind.force', (0.0, 0.0, 0.0))
         self.matrix = np.zeros((6, 2 * ROTORS))

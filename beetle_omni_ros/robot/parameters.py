@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 import hashlib
 import json
+from os.path import isfile
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,6 @@ from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import parameter, ParameterError, quoted
 
-LONGEST_NAME = 255      # characters of a file's name
 JOINT_NAMES = ('gimbal1', 'gimbal2', 'gimbal3', 'gimbal4')
 ROTOR_NAMES = ('rotor1', 'rotor2', 'rotor3', 'rotor4')
 TILT_LAG = 'tilt_lag'   # interval of a property; the logs determine it better than its parts
@@ -206,32 +205,10 @@ class RobotParameters:
             raise ParameterError(f'mass {self.mass:g} kg needs {hover:.1f} N a rotor to hover, '
                                  f'above rotors.thrust_max {self.rotors.thrust_max:g} N')
 
-    def _checked_interval(self, key, pair):
-        try:
-            value = np.array(self._value(key), dtype=float)
-            low, high = (np.broadcast_to(np.array(bound, dtype=float), value.shape)
-                         for bound in pair)
-            fits = bool(np.all((low <= value) & (value <= high)))
-        except (AttributeError, KeyError, TypeError, ValueError):
-            fits = False
-        if not fits:
-            raise ParameterError(f"key 'intervals': {quoted(key)}: expected [lowest, highest] "
-                                 f'around a number of this file, found {quoted(pair)}')
-        return low, high
-
-    def _value(self, key):
-        """Value of a dotted key: of an effect, or of a section."""
-        at: Any = self
-        for name in key.split('.'):
-            at = at[name] if isinstance(at, dict) else getattr(at, name)
-        return at
-
     def interval(self, key: str) -> tuple:
         """95 % interval (lowest, highest) of a value by its dotted key; unmeasured: the value."""
-        if key in self.intervals:
-            return self.intervals[key]
-        value = np.array(self._value(key), dtype=float)
-        return value, value
+        value = np.array(value_of(self, key), dtype=float)
+        return self.intervals.get(key, (value, value))
 
     def drawn(self, rng: np.random.Generator) -> RobotParameters:
         """
@@ -280,7 +257,8 @@ class RobotParameters:
         Read a robot file, see :func:`find_robot`; without a path, the shipped one.
 
         A file may begin with ``extends: FILE``, a file in the same folder or of the shipped
-        params. It then contains the differences only.
+        params. It then contains the differences only. The intervals of values that differ are
+        left out.
 
         Raises:
             ParameterError: names file, key and expected value.
@@ -292,26 +270,33 @@ class RobotParameters:
                              for each in share_path('params').glob('robot_*.yaml'))
             raise ParameterError(f'{path}: no such file; expected a robot file, or one of the '
                                  f"shipped {', '.join(shipped)}")
-        robot = schema.bind(cls, _merged(path, ()), str(path))
+        robot = schema.bind(cls, _merged(path), str(path))
         try:
             mass_properties(replace(robot, effects={}))     # refuses an impossible main body
-            # not in __post_init__, because copies without some effects keep the others' intervals
-            replaced = catalogue.settings(robot.effects)
-            return replace(robot, intervals={
-                key: robot._checked_interval(key, pair) for key, pair in robot.intervals.items()
-                if key not in replaced})
         except ParameterError as error:
             raise ParameterError(f'{path}: {error}') from None
+        # not in __post_init__, because copies without some effects keep the others' intervals
+        intervals = {key: pair for key, pair in robot.intervals.items()
+                     if key not in catalogue.settings(robot.effects)}
+        for key, pair in intervals.items():
+            try:
+                value = np.array(value_of(robot, key), dtype=float)
+                low, high = (np.broadcast_to(np.array(bound, dtype=float), value.shape)
+                             for bound in pair)
+                fits = np.all((low <= value) & (value <= high))
+            except (TypeError, ValueError):
+                fits = False
+            if not fits:
+                raise ParameterError(
+                    f"{path}: key 'intervals': {quoted(key)}: expected [lowest, highest] around "
+                    f'a number of this file, found {quoted(pair)}')
+            intervals[key] = low, high
+        return replace(robot, intervals=intervals)
 
     def effect(self, key: str, neutral):
         """Value of an effect's parameter, 'effect.parameter'; ``neutral`` without the effect."""
         name, parameter = key.split('.')
         return self.effects.get(name, {}).get(parameter, neutral)
-
-    @property
-    def true_mass(self) -> float:
-        """Mass with the effect ``mass`` [kg]."""
-        return self.effect('mass.mass', self.mass)
 
     @property
     def torque_ratio(self) -> float:
@@ -373,60 +358,52 @@ class RobotParameters:
         return json.loads(json.dumps(values, default=np.ndarray.tolist))
 
 
-def find_robot(name: str | Path, beside: Path | None = None) -> Path:
+def find_robot(name: str | Path, seen: tuple[Path, ...] = ()) -> Path:
     """
     Locate a robot file: the given path, else a shipped file of that name.
 
     Args:
         name: path of a file, or the name of a file of the shipped params, of which
             ``robot_NAME.yaml`` is also found as ``NAME``.
-        beside: the file that extends it; relative paths begin in its folder.
+        seen: files that it must not be, of which the last one extends it; relative paths begin in
+            the folder of that file.
 
     Returns:
-        The path; that of no file if neither exists.
+        The path; that of no file if none exists.
 
     """
-    path = beside.parent / name if beside else Path(name)
-    # `extends: robot.yaml` in a file named robot.yaml means the shipped file
-    if path.is_file() and not (beside and path.resolve() == beside.resolve()):
-        return path
-    for each in (name, f'robot_{name}.yaml'):
-        with suppress(FileNotFoundError):
-            shipped = share_path(f'params/{each}')
-            if shipped.is_file():
-                return shipped
+    path, shipped = (seen[-1].parent / name if seen else Path(name)), share_path('params')
+    for each in (path, shipped / name, shipped / f'robot_{name}.yaml'):
+        if isfile(each) and each.resolve() not in seen:
+            return each
     return path
 
 
-def _merged(path: Path, seen: tuple[Path, ...]) -> dict:
+def _merged(path: Path, seen: tuple[Path, ...] = ()) -> dict:
     """Content of a robot file, merged with the file that it extends."""
     content = schema.load_yaml(path)
     if 'extends' not in content:
         return content
-    name = content.pop('extends')
-    if not isinstance(name, str) or not name.isprintable() or len(name) > LONGEST_NAME:
-        raise ParameterError(f"{path}: key 'extends': expected the name of a file, "
-                             f'found {quoted(name)}')
-    base = find_robot(name, path)
-    if not base.is_file():
-        raise ParameterError(f"{path}: key 'extends': no file {name!r} beside it or among the "
-                             'shipped params')
-    if base.resolve() in (*seen, path.resolve()):
-        raise ParameterError(f"{path}: key 'extends': {name} extends itself")
-    below = _merged(base, (*seen, path.resolve()))
+    name, seen = content.pop('extends'), (*seen, path.resolve())
+    base = find_robot(str(name), seen)
+    if not isfile(base) or base.resolve() in seen:
+        raise ParameterError(f"{path}: key 'extends': expected the name of another file beside it "
+                             f'or among the shipped params, found {quoted(name)}')
+    below = _merged(base, seen)
+    merged = _overlaid(below, content)
     if 'intervals' in below:    # those of values that the file replaces do not hold for it
-        moved = {'effects', 'joints'} & set(content)
+        same_lag = all(merged.get(part) == below.get(part) for part in ('joints', 'effects'))
         below['intervals'] = {key: pair for key, pair in below['intervals'].items()
-                              if not _states(content, key.split('.'))
-                              and not (key == TILT_LAG and moved)}
+                              if value_of(merged, key) == value_of(below, key)
+                              and (key != TILT_LAG or same_lag)}
     return _overlaid(below, content)
 
 
-def _states(content: Any, names: list[str]) -> bool:
-    """Whether a file's content states the value of a dotted key, or replaces what held it."""
-    first, *rest = names
-    return isinstance(content, dict) and first in content and (
-        not rest or first == 'effects' or _states(content[first], rest))
+def value_of(content: Any, key: str) -> Any:
+    """Value of a dotted key of a robot, or of the content of its file; None: it has none."""
+    for name in str(key).split('.'):
+        content = content.get(name) if isinstance(content, dict) else getattr(content, name, None)
+    return content
 
 
 def _between(interval, share):
@@ -488,12 +465,7 @@ def combined(parts: list[RigidPart]) -> RigidPart:
     """Combine parts into one rigid part."""
     mass = sum(part.mass for part in parts)
     centre = np.sum([part.mass * part.centre for part in parts], axis=0) / mass
-    return RigidPart(mass, centre, inertia_about(centre, parts))
-
-
-def inertia_about(point: np.ndarray, parts: list[RigidPart]) -> np.ndarray:
-    """Inertia (3, 3) of several parts about ``point`` [m]."""
-    return np.sum([part.inertia_about(point) for part in parts], axis=0)
+    return RigidPart(mass, centre, sum(part.inertia_about(centre) for part in parts))
 
 
 def mass_properties(robot: RobotParameters, variation: Variation | None = None) -> MassProperties:
@@ -521,7 +493,7 @@ def mass_properties(robot: RobotParameters, variation: Variation | None = None) 
     ball = RigidPart(parts.end_effector.mass, main_origin + [0.0, 0.0, parts.end_effector.height],
                      np.zeros((3, 3)))
 
-    mass = robot.true_mass * variation.mass_scale
+    mass = robot.effect('mass.mass', robot.mass) * variation.mass_scale
     total_inertia = np.array(robot.effect('inertia.inertia', robot.inertia))
     centre = variation.centre_of_mass + robot.effect('centre_of_mass.offset', (0.0,) * 3)
     known = [*modules, ball]
@@ -531,8 +503,8 @@ def mass_properties(robot: RobotParameters, variation: Variation | None = None) 
                              f'the whole robot {mass:g} kg; expected a main body with mass')
     moment = mass * centre - np.sum([part.mass * part.centre for part in known], axis=0)
     main_body = RigidPart(rest, moment / rest, np.zeros((3, 3)))
-    inertia = np.diag(total_inertia * variation.inertia_scale) - inertia_about(
-        centre, [main_body, *known])
+    inertia = np.diag(total_inertia * variation.inertia_scale) - sum(
+        part.inertia_about(centre) for part in [main_body, *known])
     moments = np.linalg.eigvalsh(inertia)
     if moments[0] <= 0 or moments[0] + moments[1] < moments[2]:
         raise ParameterError(f'inertia: {_text(total_inertia)} kg m^2 leaves the main body the '
