@@ -71,7 +71,7 @@ def rigid_body(robot: RobotParameters, velocity, quaternion, angular_velocity, t
     rotors = robot.rotors
     places = rotors.positions if rotor_positions is None else rotor_positions
     terms = Terms(
-        mass=robot.mass, inertia=ca.DM(robot.inertia), centre_of_mass=None,
+        mass=robot.mass, inertia=ca.DM(robot.inertia), centre_of_mass=ca.DM.zeros(3),
         torque=_given(torque_body, 3), tilt=tilt, tilt_acceleration=_given(tilt_acceleration, 4),
         tilt_axes=[ca.DM(axis) for axis in robot.tilt_axes],
         thrust=thrust, velocity=velocity, angular_velocity=angular_velocity,
@@ -97,14 +97,12 @@ def rigid_body(robot: RobotParameters, velocity, quaternion, angular_velocity, t
     acceleration = (terms.rotation @ force + terms.force_world) / terms.mass \
         + ca.DM([0, 0, -robot.gravity])
     centre = terms.centre_of_mass
-    if centre is not None:
-        torque = torque - ca.cross(centre, force + terms.rotation.T @ terms.force_world)
+    torque = torque - ca.cross(centre, force + terms.rotation.T @ terms.force_world)
     angular_acceleration = (torque - ca.cross(angular_velocity, terms.inertia * angular_velocity)
                             ) / terms.inertia
-    if centre is not None:
-        acceleration = acceleration - terms.rotation @ (
-            ca.cross(angular_acceleration, centre)
-            + ca.cross(angular_velocity, ca.cross(angular_velocity, centre)))
+    acceleration = acceleration - terms.rotation @ (
+        ca.cross(angular_acceleration, centre)
+        + ca.cross(angular_velocity, ca.cross(angular_velocity, centre)))
     return acceleration, angular_acceleration
 
 

@@ -160,13 +160,12 @@ def plain(consumer):
 @pytest.mark.parametrize('name', CATALOGUE)
 @pytest.mark.parametrize('consumer', OUTPUTS)
 def test_a_consumer_applies_an_effect_or_states_why_not(consumer, name):
-    treatment, robot = effects.treatment(consumer, name), with_effect(name)
+    reason, robot = effects.ignored(consumer, name), with_effect(name)
     found = np.concatenate([np.ravel(part) for part in OUTPUTS[consumer](robot)])
     changed = found.shape != plain(consumer).shape or not np.array_equal(found, plain(consumer))
-    assert changed == treatment.acts, treatment.reason or f'{name} changes nothing'
-    assert treatment.acts or treatment.reason
+    assert changed != bool(reason), reason or f'{name} changes nothing'
 
 
 @pytest.mark.parametrize('name', CATALOGUE)
 def test_the_gap_finder_applies_every_effect(name):
-    assert gap(name) == effects.treatment('gap', name).acts
+    assert gap(name) != bool(effects.ignored('gap', name))
