@@ -3,12 +3,11 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite, radians
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from beetle_omni_ros.robot import rotations, schema
+from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.schema import parameter, ParameterError, ParameterFile, quoted
 
 BUTTONS = ('arm', 'land', 'hold', 'home')
@@ -55,36 +54,15 @@ class DriveParameters(ParameterFile, file='drive.yaml'):
     poses: dict = parameter(doc='name -> x, y, z [m], roll, pitch, yaw [deg]')
 
     def __post_init__(self):
-        """Check buttons and poses."""
         for name, number in self.buttons.items():
             if name not in BUTTONS or not isinstance(number, int) or not 0 <= number < 64:
                 raise ParameterError(f"key 'buttons.{name}': expected {', '.join(BUTTONS)} with "
                                      f'a number from 0 to 63, found {quoted(number)}')
-        check_poses(self.poses, "key 'poses.")
-
-
-def check_poses(poses: dict, where: str) -> None:
-    """Check names and values of named poses; raises ParameterError."""
-    for name, pose in poses.items():
-        if not isinstance(name, str) or not name.isidentifier():
-            raise ParameterError(f"{where}{name}': expected a name of letters and digits")
-        if not isinstance(pose, (list, tuple)) or len(pose) != 6 or not all(
-                isinstance(one, (int, float)) and isfinite(one) for one in pose):
-            raise ParameterError(f"{where}{name}': expected six numbers x, y, z [m], roll, pitch, "
-                                 f'yaw [deg], found {quoted(pose)}')
-
-
-def read_named_poses(path: str | Path) -> dict:
-    """
-    Read named poses: a YAML file with ``name: [x, y, z, roll, pitch, yaw]`` [m, deg].
-
-    Raises:
-        ParameterError: unusable file or pose; the message has file and name.
-
-    """
-    poses = schema.load_yaml(path)
-    check_poses(poses, f"{path}: key '")
-    return poses
+        for name, pose in self.poses.items():
+            if not isinstance(pose, list) or len(pose) != 6 or not all(
+                    isinstance(one, (int, float)) and isfinite(one) for one in pose):
+                raise ParameterError(f"key 'poses.{name}': expected six numbers x, y, z [m], "
+                                     f'roll, pitch, yaw [deg], found {quoted(pose)}')
 
 
 class Steering:
@@ -217,15 +195,12 @@ def pressed(before: Sequence[int], now: Sequence[int], p: DriveParameters) -> li
 
 
 class Action(NamedTuple):
-    """
-    A command of the operator.
-
-    Values: of 'shift' (3,) in world [m] and (3,) roll, pitch, yaw [rad]; of 'goto' (3,) in world
-    [m] and (4,) body to world, xyzw, or None to keep the attitude; of 'controller' a name; of
-    'wait' perhaps seconds.
-    """
+    """A command of the operator."""
 
     name: str
+    # Of 'shift' (3,) in world [m] and (3,) roll, pitch, yaw [rad]; of 'goto' (3,) in world [m] and
+    # (4,) body to world, xyzw, or None to keep the attitude; of 'controller' a name; of 'wait'
+    # perhaps seconds.
     values: tuple = ()
 
 
@@ -233,11 +208,7 @@ def parse(line: str, poses: Mapping[str, Sequence[float]]) -> Action | None:
     """
     Parse one line; None for an empty line or a comment after #.
 
-    ``poses``: name -> x, y, z [m], roll, pitch, yaw [deg].
-
-    Raises:
-        ParameterError: not a command.
-
+    ``poses``: name -> x, y, z [m], roll, pitch, yaw [deg]. A ParameterError refuses other lines.
     """
     word, *rest = line.partition('#')[0].split() or ['']
     word = word.lower()
@@ -273,9 +244,8 @@ def parse(line: str, poses: Mapping[str, Sequence[float]]) -> Action | None:
 
 
 def _pose(values):
-    position = np.array(values[:3], dtype=float)
-    return Action('goto', (position, rotations.from_rpy(*map(radians, values[3:]))
-                           if len(values) == 6 else None))
+    attitude = rotations.from_rpy(*map(radians, values[3:])) if len(values) == 6 else None
+    return Action('goto', (np.array(values[:3], dtype=float), attitude))
 
 
 def _numbers(word, texts, wanted, counts):

@@ -76,14 +76,11 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
         'command': shlex.join(['beetle_omni', *sys.argv[1:]]), 'version': __version__,
         'commit': commit(), 'date': datetime.now(timezone.utc).strftime('%Y-%m-%d'),
         'guidance': guidance, 'plant': str(plant) if plant else None},
-        'flights': [{key: value for key, value in one.items() if key != 'trace'}
-                    for one in flown],
-        'summary': page.summary(flown, {case.name: case for case in struck})}
+        'flights': flown, 'summary': page.summary(flown, {case.name: case for case in struck})}
     write_json(json_path, results)
     if output:
         write_json(output / 'faults.json', results)
         write_text(output / PAGE, page.as_page(results, output), 'page')
-        write_text(output / 'faults.md', page.as_markdown(results), 'page')
     print_grids([page.grid(results, narrow=True)], console)
     for text in (page.total_text(results), f'page: {output / PAGE}' if output
                  else 'no page written; --output DIR writes one'):
