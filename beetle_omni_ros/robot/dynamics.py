@@ -10,6 +10,7 @@ model is independent of it.
 import casadi as ca
 import numpy as np
 
+from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.effects import CATALOGUE, ServoTerms, Terms
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.servo import CASADI, Servo
@@ -38,10 +39,8 @@ def rotation_matrix(quaternion):
 
 def quaternion_rate(quaternion, angular_velocity):
     """Derivative of (x, y, z, w) for body rates [rad/s]: q' = q * (w, 0) / 2."""
-    x, y, z, w = ca.vertsplit(quaternion)
-    a, b, c = ca.vertsplit(angular_velocity)
-    return 0.5 * ca.vertcat(w * a + y * c - z * b, w * b - x * c + z * a,
-                            w * c + x * b - y * a, -x * a - y * b - z * c)
+    parts = (*ca.vertsplit(quaternion), *ca.vertsplit(angular_velocity), 0)
+    return 0.5 * ca.vertcat(*rotations.product(*parts))
 
 
 def thrust_direction(arm_yaw: float, tilt):

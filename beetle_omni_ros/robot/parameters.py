@@ -283,7 +283,7 @@ class RobotParameters:
                 value = np.array(value_of(robot, key), dtype=float)
                 low, high = (np.broadcast_to(np.array(bound, dtype=float), value.shape)
                              for bound in pair)
-                fits = np.all((low <= value) & (value <= high))
+                fits = bool(np.all((low <= value) & (value <= high)))
             except (TypeError, ValueError):
                 fits = False
             if not fits:
@@ -465,7 +465,8 @@ def combined(parts: list[RigidPart]) -> RigidPart:
     """Combine parts into one rigid part."""
     mass = sum(part.mass for part in parts)
     centre = np.sum([part.mass * part.centre for part in parts], axis=0) / mass
-    return RigidPart(mass, centre, sum(part.inertia_about(centre) for part in parts))
+    return RigidPart(mass, centre, sum((part.inertia_about(centre) for part in parts),
+                                       np.zeros((3, 3))))
 
 
 def mass_properties(robot: RobotParameters, variation: Variation | None = None) -> MassProperties:

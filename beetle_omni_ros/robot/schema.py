@@ -194,7 +194,8 @@ def bind(cls: type, mapping: dict, where: str = '', prefix: str = ''):
             if value is None:
                 values[name] = None
                 continue
-        values[name] = bind(hint, value, where, f'{prefix}{name}.') if is_dataclass(hint) \
+        nested = is_dataclass(hint)
+        values[name] = bind(hint, value, where, f'{prefix}{name}.') if nested \
             else check(entry, hint, value, at)
     try:
         return cls(**values)

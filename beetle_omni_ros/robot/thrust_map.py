@@ -29,20 +29,12 @@ class ThrustMap:
     """
 
     def __init__(self, rotors: RotorParameters):
-        """
-        Tabulate the cubics of a robot file.
-
-        Raises:
-            ParameterError: no row, two rows at one voltage, or a duty that does not rise from stop
-                to full.
-
-        """
+        """Tabulate the cubics of a robot file; a ParameterError refuses an impossible map."""
         rows = sorted(rotors.map, key=lambda row: row.voltage)
-        if not rows:
-            raise ParameterError('rotors.map: expected at least one row, found none')
         self.voltages = np.array([row.voltage for row in rows])
-        if np.any(np.diff(self.voltages) <= 0):
-            raise ParameterError(f'rotors.map: two rows at one voltage, {self.voltages} V')
+        if len(rows) < 2 or np.any(np.diff(self.voltages) <= 0):
+            raise ParameterError('rotors.map: expected rows at two or more voltages, found '
+                                 f'{self.voltages.tolist()} V')
         self.thrust_limits = np.array([row.thrust_max for row in rows])
         self._duty = np.empty((len(rows), CELLS + 1))
         for duty, row in zip(self._duty, rows):
@@ -77,9 +69,9 @@ class ThrustMap:
         """
         thrust = np.asarray(thrust, dtype=float)
         low, weight = self._rows(voltage)
+        table, high = self._duty, low + 1
         position = np.clip(thrust / self.thrust_limit(voltage), 0, 1) * CELLS
         cell = np.minimum(position.astype(int), CELLS - 1)
-        table, high = self._duty, np.minimum(low + 1, len(self.voltages) - 1)
         left = (1 - weight) * table[low, cell] + weight * table[high, cell]
         right = (1 - weight) * table[low, cell + 1] + weight * table[high, cell + 1]
         return np.where(thrust > 0, left + (position - cell) * (right - left), STOP_DUTY)
@@ -92,9 +84,8 @@ class ThrustMap:
         """
         if voltage != self._blend_voltage:
             low, weight = self._rows(voltage)
-            high = min(low + 1, len(self.voltages) - 1)
             self._blend_voltage = voltage
-            self._blend = (1 - weight) * self._duty[low] + weight * self._duty[high]
+            self._blend = (1 - weight) * self._duty[low] + weight * self._duty[low + 1]
         return np.interp(duty, self._blend, FRACTIONS) * self.thrust_limit(voltage)
 
     def command(self, thrust, voltage) -> np.ndarray:
@@ -104,8 +95,6 @@ class ThrustMap:
     def _rows(self, voltage):
         """Row below ``voltage`` and weight of the row above."""
         rows = len(self.voltages)
-        if rows == 1:
-            return np.zeros(np.shape(voltage), dtype=int)[()], np.zeros(np.shape(voltage))[()]
         place = np.interp(voltage, self.voltages, np.arange(rows))
         low = np.minimum(np.asarray(place).astype(int), rows - 2)[()]
         return low, place - low

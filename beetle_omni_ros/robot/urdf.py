@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 import xml.etree.ElementTree as ElementTree
 
 import numpy as np
@@ -37,7 +38,7 @@ def description() -> str:
 
 def links() -> list[Link]:
     """All links, parents before children."""
-    root = ElementTree.fromstring(description())
+    root: Any = ElementTree.fromstring(description())
     colours = {material.get('name'): _numbers(material.find('color'), 'rgba')
                for material in root.findall('material')}
     joints = {joint.find('child').get('link'): joint for joint in root.iter('joint')}
