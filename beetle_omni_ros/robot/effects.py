@@ -49,15 +49,6 @@ class EffectParameter:
 
 
 @dataclass(frozen=True)
-class LimitStarts:
-    """Start values of a fitted limit, relative to the demand of a flight."""
-
-    of: str                     # 'tilt_rate', 'torque' or 'thrust'
-    parts: tuple[float, ...]    # fractions of the largest demand, one start each
-    below: float                # fraction of the file's limit below which a start must lie
-
-
-@dataclass(frozen=True)
 class SensorErrors:
     """Errors of the robot's sensors by the effects of the robot file."""
 
@@ -168,8 +159,11 @@ class Effect:
     # Affected measurements. B: forces and torques, J: joints, A: MoCap's acceleration, W: MoCap's
     # angular velocity; A and W against the IMU.
     channels: str = 'B'
-    # Start values of a fit, if the effect has no slope at its neutral value.
-    starts: tuple[tuple[float, ...], ...] | LimitStarts = ()
+    # Start values of a fit, if the effect has no slope at its neutral value. Those of a limit are
+    # fractions of the largest 'tilt_rate', 'torque' or 'thrust' of a flight, and must be below a
+    # fraction of the robot file's limit.
+    starts: tuple[tuple[float, ...], ...] = ()
+    limit: tuple[str, float] | None = None
     forms: tuple[dict[str, float], ...] = ({},)     # the parameters that choose each form
     one_regime: bool = False    # it acts in one regime only, such as near the ground
     same_response: str = ''     # entry that is another form of the same response
@@ -498,7 +492,7 @@ CATALOGUE: dict[str, Effect] = {
         'rotor', {'thrust_max': _number('rotors.thrust_max', 'N', 1.0, 200, 0.3, 0.02)},
         'f = min(f*, f_max): voltage or speed controller limit', 'commands at the limit',
         ('voltage_sag', 'thrust_coefficient'), 'climb at full thrust',
-        starts=LimitStarts('thrust', (0.95, 0.8), 1.2)),
+        starts=((0.95,), (0.8,)), limit=('thrust', 1.2)),
     'command_latency': Effect(
         'timing', _delay(0.02), 'all commands act d later', 'fast tilting and thrust steps',
         ('joint_command_latency', 'rotor_dead_time', 'joint_bandwidth'),
@@ -523,7 +517,7 @@ CATALOGUE: dict[str, Effect] = {
             'velocity_limit': _number('joints.velocity_limit', 'rad/s', 0.1, 100, 0.5, 0.05)},
         "|q'| <= limit: voltage and gearing", 'large tilt steps',
         ('joint_torque_limit', 'joint_bandwidth'), 'tilt steps of 30, 90 and 180 deg',
-        channels='J', starts=LimitStarts('tilt_rate', (0.95, 0.8), 0.95)),
+        channels='J', starts=((0.95,), (0.8,)), limit=('tilt_rate', 0.95)),
     'joint_torque_limit': Effect(
         'joint', {
             # The file's 3 N m is 60 times the demand of quick poses; the real limit may be lower.
@@ -531,7 +525,7 @@ CATALOGUE: dict[str, Effect] = {
                                     least=1e-3)},
         '|tau| <= limit: current limit, stall', 'large tilt steps',
         ('joint_velocity_limit', 'joint_bandwidth'), 'tilt steps of 30, 90 and 180 deg',
-        channels='J', starts=LimitStarts('torque', (1.1, 0.8, 0.5), 0.98)),
+        channels='J', starts=((1.1,), (0.8,), (0.5,)), limit=('torque', 0.98)),
     'joint_friction': Effect(
         'joint', dict.fromkeys(('coulomb', 'stiction'), EffectParameter(
             'N m', 0.0, 0.0, 1.0, 0.01, 0.002, of_each=True, step=5e-4, curved=True)),
