@@ -636,16 +636,7 @@ def delaying(*what: str) -> tuple[str, ...]:
 
 
 def validated(effects: dict) -> dict[str, dict]:
-    """
-    Validate the effects of a robot against the catalogue.
-
-    Returns:
-        name -> parameter -> float or tuple of floats, with all parameters of each effect.
-
-    Raises:
-        ParameterError: unknown effect or parameter, wrong shape, value out of range.
-
-    """
+    """Complete and validate the parameters of effects: name -> parameter -> float or tuple."""
     checked: dict[str, dict] = {}
     for name, given in effects.items():
         if name not in CATALOGUE:

@@ -33,19 +33,8 @@ def built(name: str, source: str, options: Sequence[str] = ()) -> Path:
     Compile C source to a shared library, unless the cache has it.
 
     The cache is $XDG_CACHE_HOME (or ~/.cache) / beetle_omni_ros. Its key covers the source, the
-    compiler, its flags and the casadi version.
-
-    Args:
-        name: first part of the library's file name.
-        source: C source.
-        options: compiler options after ``FLAGS`` and the source file.
-
-    Returns:
-        path of the library.
-
-    Raises:
-        RunError: no compiler, no write access to the cache, or compilation failed.
-
+    compiler, its flags and the casadi version. The library's file name begins with ``name``.
+    ``options`` are compiler options after ``FLAGS`` and the source file.
     """
     compiler = os.environ.get('CC') or shutil.which('gcc') or shutil.which('cc')
     if not compiler or not shutil.which(compiler.split()[0]):

@@ -20,7 +20,7 @@ from beetle_omni_ros.robot.schema import parameter, ParameterError, quoted
 JOINT_NAMES = ('gimbal1', 'gimbal2', 'gimbal3', 'gimbal4')
 ROTOR_NAMES = ('rotor1', 'rotor2', 'rotor3', 'rotor4')
 TILT_LAG = 'tilt_lag'   # interval of a property; the logs determine it better than its parts
-DRAWS = 100             # of a robot with such a lag
+DRAWS = 1000            # of a robot with such a lag, of which the logs allow a fifth
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,11 +95,7 @@ class JointParameters:
 
     @property
     def time_constant(self) -> float:
-        """
-        Time constant [s] of the first-order reduction.
-
-        The ramp lag Kd / Kp; with little damping the inertia's sqrt(J / Kp).
-        """
+        """Time constant [s] of the first-order reduction: Kd / Kp, or sqrt(J / Kp) if larger."""
         return max(float(np.mean(self.kd) / np.mean(self.kp)), 1 / self.natural_frequency)
 
 
@@ -160,11 +156,8 @@ class MultibodyParameters:
         """
         Parts of a robot that has only totals and perhaps the effect ``module_reaction``.
 
-        Args:
-            module_inertia: inertia of a tilting module about its joint axis [kg m^2]. Half of it
-                is assigned to its own inertia, half to its mass below the axis.
-            mass_moment: moment of that mass [kg m].
-
+        Half of the inertia of a module about its joint axis [kg m^2] is assigned to its own
+        inertia, half to its mass below the axis, which has this moment [kg m].
         """
         depth = 0.5 * module_inertia / mass_moment if mass_moment else 0.0
         own = module_inertia - mass_moment * depth
@@ -215,34 +208,25 @@ class RobotParameters:
         A robot with measured values drawn from their intervals, positive ones by ratio.
 
         The values of one joint have one place in their intervals: logs determine their ratios, the
-        lag Kd / Kp and the angle at which friction holds, better than the values. Places whose
-        ``tilt_lag`` is outside its interval contradict the logs and are drawn again.
-
-        Raises:
-            ParameterError: no place has a ``tilt_lag`` inside its interval.
-
+        lag Kd / Kp and the angle at which friction holds, better than the values. A robot whose
+        ``tilt_lag`` is outside its interval contradicts the logs and is drawn again; a
+        ParameterError, if each does.
         """
-        each, shared = ({key: pair for key, pair in self.intervals.items()
-                         if key != TILT_LAG and (np.shape(pair[0]) == (4,)) == joint}
-                        for joint in (True, False))
         low, high = self.intervals.get(TILT_LAG, (-np.inf, np.inf))
         for _ in range(DRAWS):
-            drawn = {key: _between(pair, rng.random(np.shape(pair[0])))
-                     for key, pair in shared.items()}
-            places = rng.random((DRAWS, 4))
-            made = {key: _between(pair, places) for key, pair in each.items()}
-            kp, kd = (made.get(f'effects.joint_bandwidth.{name}', getattr(self.joints, name))
+            place = rng.random(4)
+            drawn = {key: _between(pair, place if np.shape(pair[0]) == (4,)
+                                   else rng.random(np.shape(pair[0])))
+                     for key, pair in self.intervals.items() if key != TILT_LAG}
+            kp, kd = (drawn.get(f'effects.joint_bandwidth.{name}', getattr(self.joints, name))
                       for name in ('kp', 'kd'))
             lag = kd / kp + drawn.get('effects.joint_command_latency.delay',
                                       self.command_delays[0])
-            fits = np.broadcast_to((low <= lag) & (lag <= high), places.shape)
-            if fits.any(axis=0).all():
+            if np.all((low <= lag) & (lag <= high)):
                 break
         else:
             raise ParameterError(f"key 'intervals.{TILT_LAG}': no values of the other intervals "
                                  f'have such a lag, {np.mean([low, high], axis=0).tolist()} s')
-        first = fits.argmax(axis=0), range(4)
-        drawn |= {key: value[first] for key, value in made.items()}
         nested = schema.nest({key: value if np.ndim(value) else float(value)
                               for key, value in drawn.items()})
         effects = nested.pop('effects', {})
@@ -258,11 +242,7 @@ class RobotParameters:
 
         A file may begin with ``extends: FILE``, a file in the same folder or of the shipped
         params. It then contains the differences only. The intervals of values that differ are
-        left out.
-
-        Raises:
-            ParameterError: names file, key and expected value.
-
+        left out. A ParameterError names file, key and expected value.
         """
         path = find_robot(path) if path else share_path('params/robot.yaml')
         if not path.is_file():
@@ -360,17 +340,10 @@ class RobotParameters:
 
 def find_robot(name: str | Path, seen: tuple[Path, ...] = ()) -> Path:
     """
-    Locate a robot file: the given path, else a shipped file of that name.
+    Path of a robot file: the given one, else a shipped file ``NAME`` or ``robot_NAME.yaml``.
 
-    Args:
-        name: path of a file, or the name of a file of the shipped params, of which
-            ``robot_NAME.yaml`` is also found as ``NAME``.
-        seen: files that it must not be, of which the last one extends it; relative paths begin in
-            the folder of that file.
-
-    Returns:
-        The path; that of no file if none exists.
-
+    ``seen`` are files that it must not be; the last one extends it, and relative paths begin in
+    the folder of that file. If there is no such file, the path is the given one.
     """
     path, shipped = (seen[-1].parent / name if seen else Path(name)), share_path('params')
     for each in (path, shipped / name, shipped / f'robot_{name}.yaml'):
@@ -446,12 +419,7 @@ class RigidPart:
 
 @dataclass(frozen=True)
 class MassProperties:
-    """
-    All parts of the robot with its tilts at zero, in base_link.
-
-    A robot file contains the totals (mass, inertia about the centre of gravity), the tilting
-    modules and the end-effector. The main body is the difference.
-    """
+    """All parts of the robot with its tilts at zero, in base_link."""
 
     main_body: RigidPart
     modules: tuple[RigidPart, ...]  # tilting, four
@@ -474,12 +442,7 @@ def mass_properties(robot: RobotParameters, variation: Variation | None = None) 
     Mass properties of all parts.
 
     The tilt axes contain the rotor centres of ``robot.rotors.positions``. Mass, centre and inertia
-    of the main body follow from the totals.
-
-    Raises:
-        ParameterError: the parts are heavier than the robot, or the inertia of the main body is
-            impossible.
-
+    of the main body follow from the totals; a ParameterError, if they are impossible.
     """
     variation = variation or Variation()
     parts, outward = robot.parts, robot.tilt_axes

@@ -63,16 +63,9 @@ def parameter(default: Any = MISSING, *, doc: str, unit: str = '', low: float | 
     """
     Declare one dataclass field as a parameter.
 
-    Args:
-        default: value if the file omits it; a list is copied into an array.
-        doc: meaning in one phrase, for the reference page and ROS.
-        unit: SI unit, '' for a pure number.
-        low: smallest legal value, inclusive (each element of an array).
-        high: largest legal value, inclusive.
-        shape: shape of an array parameter.
-        choices: legal strings.
-        read_only: whether it can change only at start.
-
+    ``default`` is the value if the file omits it, ``doc`` the meaning in one phrase, ``low`` and
+    ``high`` are the smallest and largest legal value of a number or of each element of an array.
+    A ``read_only`` parameter of a node can change only at its start.
     """
     metadata = {'doc': doc, 'unit': unit, 'low': low, 'high': high, 'shape': shape,
                 'choices': choices, 'read_only': read_only}
@@ -114,13 +107,7 @@ def parse_yaml(data: bytes | str, at: str = '') -> Any:
 
 
 def load_yaml(path: str | Path) -> dict:
-    """
-    Read a YAML mapping, plain or below ``ros__parameters``.
-
-    Raises:
-        ParameterError: missing or unreadable file, broken YAML, or no mapping.
-
-    """
+    """Read a YAML mapping, plain or below ``ros__parameters``; {} of an empty file."""
     data = read_yaml(path)
     for value in data.values() if isinstance(data, dict) else ():
         if isinstance(value, dict) and set(value) == {'ros__parameters'}:
@@ -148,30 +135,17 @@ class ParameterFile:
 
     @classmethod
     def load(cls, path: str | Path | None = None) -> Self:
-        """
-        Read a file, by default the shipped one.
-
-        Raises:
-            ParameterError: names file, key and expected value.
-
-        """
+        """Read a file, by default the shipped one; an error names file, key and expectation."""
         path = path or share_path(f'params/{cls._file}')
         return bind(cls, load_yaml(path), str(path))
 
 
 def bind(cls: type, mapping: dict, where: str = '', prefix: str = ''):
     """
-    Build ``cls`` from a nested mapping.
+    Build a dataclass of :func:`parameter` and :func:`group` fields from a nested mapping.
 
-    Args:
-        cls: a dataclass whose fields come from :func:`parameter` or :func:`group`.
-        mapping: keys to values, nested like the dataclass.
-        where: file name, for messages.
-        prefix: dotted path of ``cls`` in the file, with a dot at its end, for messages.
-
-    Raises:
-        ParameterError: unknown or missing key, wrong type, shape or range.
-
+    A ParameterError names ``where``, the file, and the key. ``prefix`` is the dotted path of
+    ``cls`` in the file, with a dot at its end.
     """
     if not isinstance(mapping, dict):
         raise ParameterError(f'{_at(where, prefix)}: expected a mapping, '
@@ -235,13 +209,7 @@ def unknown(at: str, what: str, name: Any, known: Iterable[str]) -> ParameterErr
 
 
 def numbers(value: Any, at: str, spec: Mapping[str, Any]) -> np.ndarray:
-    """
-    Convert to finite numbers from ``spec['low']`` to ``spec['high']`` [``spec['unit']``].
-
-    Raises:
-        ParameterError: the text starts with ``at``.
-
-    """
+    """Convert to finite numbers from ``spec['low']`` to ``spec['high']`` [``spec['unit']``]."""
     try:
         array = np.array(value, dtype=float)
     except (OverflowError, TypeError, ValueError):
@@ -268,13 +236,7 @@ def _at(where, key):
 
 
 def flatten(instance, prefix: str = ''):
-    """
-    Iterate over the leaves of a parameter dataclass.
-
-    Yields:
-        (dotted name, dataclass field, annotated type, value) of each leaf.
-
-    """
+    """Yield dotted name, dataclass field, annotated type and value of each parameter."""
     hints = get_type_hints(type(instance))
     for entry in fields(instance):
         value = getattr(instance, entry.name)
