@@ -69,17 +69,9 @@ class Steering:
     """
     Moves a target to a goal within the limits.
 
-    Args:
-        parameters: limits of the motion.
-        why_not: check of a pose, position (3,) [m] and quaternion (4,); returns '' or the reason
-            why it must not be flown.
-        position: (3,) initial target in world [m].
-        quaternion: (4,) initial target, body to world, xyzw.
-
-    Attributes:
-        position, quaternion: present target.
-        goal: position and quaternion of the goal.
-
+    ``position`` (3,) in world [m] and ``quaternion`` (4,) body to world, xyzw, are the present
+    target, ``goal`` has those of the goal. ``why_not`` returns '' or the reason why a pose must
+    not be flown.
     """
 
     def __init__(self, parameters: DriveParameters,
@@ -104,12 +96,9 @@ class Steering:
 
     def shift(self, way: np.ndarray, turn: np.ndarray) -> str:
         """
-        Shift the goal; returns as :meth:`go`.
+        Shift the goal by a way (3,) in world [m]; returns as :meth:`go`.
 
-        Args:
-            way: (3,) shift in world [m].
-            turn: (3,) rotation: roll and pitch about the body's axes, yaw about world's z [rad].
-
+        ``turn`` (3,) [rad]: roll and pitch about the body's axes, yaw about world's z.
         """
         position, quaternion = self.goal
         tilted = rotations.multiply(quaternion, rotations.exp([turn[0], turn[1], 0.0]))
@@ -122,15 +111,9 @@ class Steering:
 
     def update(self, seconds: float, robot: np.ndarray | None = None) -> str:
         """
-        Move the target.
+        Move the target by its motion in ``seconds``; it waits at a distance from the robot (3,).
 
-        Args:
-            seconds: time since the last update [s].
-            robot: (3,) position of the robot [m]; the target waits at a distance of ``leash``.
-
-        Returns:
-            '' or the reason why the next pose must not be flown; then the target stops.
-
+        Returned is '' or the reason why the next pose must not be flown; then the target stops.
         """
         if self.arrived:
             return ''
@@ -166,16 +149,10 @@ def shift_of_key(key: str, p: DriveParameters) -> tuple[np.ndarray, np.ndarray] 
 def shift_of_sticks(axes: Sequence[float], seconds: float, p: DriveParameters
                     ) -> tuple[np.ndarray, np.ndarray]:
     """
-    Shift by a joystick in ``seconds``; a fully deflected axis moves at full speed or rate.
+    Shift by a joystick in ``seconds``, (3,) [m] and (3,) roll, pitch, yaw [rad].
 
-    Args:
-        axes: axes of sensor_msgs/Joy, -1 to 1; a missing or not finite one counts as released.
-        seconds: time since the last shift [s].
-        p: mapping of the axes, and the dead zone, at whose edge the speed is zero.
-
-    Returns:
-        shift (3,) [m] and (3,) roll, pitch, yaw [rad].
-
+    A fully deflected axis, -1 or 1, moves at full speed or rate, at the edge of the dead zone at
+    none. A missing or not finite axis counts as released.
     """
     shift = np.zeros(6)
     for index, number, sign in zip(ORDER, p.axes.astype(int), p.signs):

@@ -61,11 +61,8 @@ def rigid_body(robot: RobotParameters, velocity, quaternion, angular_velocity, t
     of mass. Arguments are named as the fields of :class:`Terms`, ``quaternion`` is body to world.
     An absent argument counts as zero; without position, voltage_ratio or charge_drawn their
     effects are absent. ``effects`` (name -> parameter -> value or symbol) and ``rotor_positions``
-    (4, 3) [m] replace those of the robot file.
-
-    Returns:
-        (3,) acceleration in world [m/s^2], (3,) angular acceleration in body [rad/s^2].
-
+    (4, 3) [m] replace those of the robot file. Returned are the acceleration (3,) in world
+    [m/s^2] and the angular acceleration (3,) in body [rad/s^2].
     """
     rotors = robot.rotors
     places = rotors.positions if rotor_positions is None else rotor_positions
@@ -114,12 +111,8 @@ def added_wrench(robot: RobotParameters, names: list[str]) -> ca.Function:
     Force in world [N] and torque in base_link [N m] at base_link that the named effects add.
 
     The reference is the robot without these effects, with the mass and inertia of its file. It
-    has the effect torque_coefficient, because added thrusts also turn the body.
-
-    Returns:
-        f(quaternion, velocity, rate, tilt, tilt_rate, tilt_acceleration, thrust, thrust_rate,
-        position, voltage_ratio, charge_drawn) -> force, torque.
-
+    has the effect torque_coefficient, because added thrusts also turn the body. Arguments of the
+    function are those of ``sizes``.
     """
     sizes = {'quaternion': 4, 'velocity': 3, 'rate': 3, 'tilt': 4, 'tilt_rate': 4,
              'tilt_acceleration': 4, 'thrust': 4, 'thrust_rate': 4, 'position': 3,
@@ -153,15 +146,10 @@ def gyroscopic_load(robot: RobotParameters, angular_velocity, tilt, thrust, join
 def tilt_servo(robot: RobotParameters, joint: int, target, thrust=0.0,
                gyroscopic=0.0) -> tuple[Servo, ServoTerms]:
     """
-    Servo of one joint and the terms that act on it, with the robot file's effects.
+    Servo of a joint (0 to 3) and the terms that act on it, with the robot file's effects.
 
-    Args:
-        robot: parameters and effects.
-        joint: index, 0 to 3.
-        target: commanded angle [rad].
-        thrust: thrust of the joint's rotor [N].
-        gyroscopic: value of :func:`gyroscopic_load` [rad/s].
-
+    ``target`` is the commanded angle [rad], ``thrust`` that of the joint's rotor [N],
+    ``gyroscopic`` the value of :func:`gyroscopic_load` [rad/s].
     """
     terms = ServoTerms(target, thrust, gyroscopic)
     for name, values in robot.effects.items():

@@ -65,4 +65,4 @@ def test_saturation_is_reported_and_limited():
 def test_a_map_with_a_falling_part_is_refused(coefficients):
     row = RotorMapRow(voltage=23.0, thrust_max=16.0, coefficients=np.array(coefficients, float))
     with pytest.raises(ParameterError, match='at 23 V: duty .* expected a rise'):
-        ThrustMap(replace(ROTORS, map=(row, *ROTORS.map)))
+        ThrustMap(replace(ROTORS, map=(row,)))
