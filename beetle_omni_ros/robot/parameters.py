@@ -48,19 +48,8 @@ class RotorParameters:
     thrust_max: float = parameter(doc='largest thrust', unit='N', low=0.1, high=200)
     time_constant: float = parameter(
         doc='first-order thrust response', unit='s', low=0.001, high=2)
-    map: tuple = parameter((), doc='thrust-to-PWM rows, one for each measured voltage')
-
-    def __post_init__(self):
-        """Bind the rows of the map, and check the thrust range and the spin."""
-        rows = tuple(row if isinstance(row, RotorMapRow) else
-                     schema.bind(RotorMapRow, row, prefix=f'rotors.map[{k}].')
-                     for k, row in enumerate(self.map))
-        object.__setattr__(self, 'map', rows)
-        if self.thrust_min >= self.thrust_max:
-            raise ParameterError(f'rotors.thrust_min ({self.thrust_min:g} N) must be below '
-                                 f'rotors.thrust_max ({self.thrust_max:g} N)')
-        if not np.all(np.abs(self.spin) == 1):
-            raise ParameterError(f'rotors.spin must hold +1 or -1, found {self.spin}')
+    map: tuple[RotorMapRow, ...] = parameter(
+        (), doc='thrust-to-PWM rows, one for each measured voltage')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,10 +182,13 @@ class RobotParameters:
             part, name = key.split('.')
             object.__setattr__(self, part, replace(getattr(self, part), **{
                 name: np.array(value) if np.ndim(value) else value}))
-        hover = self.mass * self.gravity / 4
-        if hover > self.rotors.thrust_max:
-            raise ParameterError(f'mass {self.mass:g} kg needs {hover:.1f} N a rotor to hover, '
-                                 f'above rotors.thrust_max {self.rotors.thrust_max:g} N')
+        if max(self.hover_thrust, self.rotors.thrust_min) > self.rotors.thrust_max:
+            raise ParameterError(
+                f'mass {self.mass:g} kg needs {self.hover_thrust:.1f} N a rotor to hover; expected '
+                f'rotors.thrust_max ({self.rotors.thrust_max:g} N) above this and above '
+                f'rotors.thrust_min ({self.rotors.thrust_min:g} N)')
+        if not np.all(np.abs(self.rotors.spin) == 1):
+            raise ParameterError(f'rotors.spin must hold +1 or -1, found {self.rotors.spin}')
 
     def interval(self, key: str) -> tuple:
         """95 % interval (lowest, highest) of a value by its dotted key; unmeasured: the value."""

@@ -162,15 +162,17 @@ def bind(cls: type, mapping: dict, where: str = '', prefix: str = ''):
             if entry.default is MISSING and entry.default_factory is MISSING:
                 raise ParameterError(f'{at}: missing{_unit(entry.metadata)}')
             continue
-        value = mapping[name]
-        if NoneType in get_args(hint):      # Class | None
-            hint = get_args(hint)[0]
-            if value is None:
-                values[name] = None
-                continue
-        nested = is_dataclass(hint)
-        values[name] = bind(hint, value, where, f'{prefix}{name}.') if nested \
-            else check(entry, hint, value, at)
+        value, (inner, *more) = mapping[name], get_args(hint) or (hint,)
+        nested, optional = is_dataclass(inner), more == [NoneType]
+        if value is None and optional:
+            values[name] = None
+        elif nested and more == [...]:      # tuple[Class, ...]
+            values[name] = tuple(bind(inner, row, where, f'{prefix}{name}[{k}].')
+                                 for k, row in enumerate(check(entry, tuple, value, at)))
+        elif nested:
+            values[name] = bind(inner, value, where, f'{prefix}{name}.')
+        else:
+            values[name] = check(entry, inner if optional else hint, value, at)
     try:
         return cls(**values)
     except ParameterError as error:

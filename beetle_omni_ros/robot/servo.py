@@ -44,9 +44,8 @@ class Servo:
     @classmethod
     def of(cls, joints: JointParameters, **more) -> Servo:
         """Servo of a robot file; ``more`` adds or replaces numbers."""
-        own = {'inertia': joints.inertia, 'kp': joints.kp, 'kd': joints.kd,
-               'velocity_limit': joints.velocity_limit, 'effort_limit': joints.effort_limit}
-        return cls(**{**own, **more})
+        return cls(**{name: getattr(joints, name) for name in (
+            'inertia', 'kp', 'kd', 'velocity_limit', 'effort_limit')} | more)
 
     def fading(self, space, rate):
         """Remaining fraction of the excess of stiction at a rate."""
@@ -90,10 +89,8 @@ class Step:
         damping = 0.5 * per_torque * servo.kd
         self.gain = per_torque / (1 + damping)      # change of rate for each N m [rad/s]
         self._loss = 2 * damping / (1 + damping)    # fraction of the rate lost by damping
-        self._keep, self._stiff = 1 - self._loss, servo.kp * self.gain
+        self._stiff = servo.kp * self.gain
         self._per_torque, self._damping = per_torque, damping
-        if servo.effort_limit is not None:
-            self._push = -per_torque * servo.effort_limit, per_torque * servo.effort_limit
         if servo.coulomb is not None:
             self._slides = self.gain * servo.coulomb
             self._sticks = self.gain * (servo.stiction - servo.coulomb)
@@ -110,19 +107,14 @@ class Step:
 
         """
         space, servo = self._space, self._servo
-        push = self._stiff * (target - tilt)
-        if servo.effort_limit is None:
-            after = self._keep * rate + push
-            if load is not None:
-                after = after + self.gain * load
-        else:
-            push = push - self._loss * rate
-            if load is not None:
-                push = push - self._damping * self.gain * load
-            least, most = self._push
-            after = rate + space.minimum(space.maximum(push, least), most)
-            if load is not None:
-                after = after + self._per_torque * load
+        push = self._stiff * (target - tilt) - self._loss * rate
+        if load is not None:
+            push = push - self._damping * self.gain * load
+        if servo.effort_limit is not None:
+            push = _within(space, push, self._per_torque * servo.effort_limit)
+        after = rate + push
+        if load is not None:
+            after = after + self._per_torque * load
         if servo.coulomb is not None:
             after = after - _within(
                 space, after, self._slides + self._sticks * servo.fading(space, rate))
