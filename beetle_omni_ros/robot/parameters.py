@@ -184,8 +184,8 @@ class RobotParameters:
                 name: np.array(value) if np.ndim(value) else value}))
         if max(self.hover_thrust, self.rotors.thrust_min) > self.rotors.thrust_max:
             raise ParameterError(
-                f'mass {self.mass:g} kg needs {self.hover_thrust:.1f} N a rotor to hover; expected '
-                f'rotors.thrust_max ({self.rotors.thrust_max:g} N) above this and above '
+                f'mass {self.mass:g} kg needs {self.hover_thrust:.1f} N a rotor to hover, '
+                f'expected rotors.thrust_max ({self.rotors.thrust_max:g} N) above this and above '
                 f'rotors.thrust_min ({self.rotors.thrust_min:g} N)')
         if not np.all(np.abs(self.rotors.spin) == 1):
             raise ParameterError(f'rotors.spin must hold +1 or -1, found {self.rotors.spin}')
