@@ -81,6 +81,7 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
     if output:
         write_json(output / 'faults.json', results)
         write_text(output / PAGE, page.as_page(results, output), 'page')
+        write_text(output / 'faults.md', page.as_markdown(results), 'page')
     print_grids([page.grid(results, narrow=True)], console)
     for text in (page.total_text(results), f'page: {output / PAGE}' if output
                  else 'no page written; --output DIR writes one'):

@@ -1,4 +1,4 @@
-"""Results of a campaign: summary, table and one self-contained page."""
+"""Results of a campaign: summary, table, Markdown and one self-contained page."""
 
 from collections import Counter
 from pathlib import Path
@@ -7,7 +7,15 @@ import numpy as np
 
 from beetle_omni_ros.faults.flight import PLAN
 from beetle_omni_ros.pages import page as shared
-from beetle_omni_ros.pages.page import ABSENT, Grid, html, number, section, verdict_head
+from beetle_omni_ros.pages.page import (
+    ABSENT,
+    Grid,
+    html,
+    markdown,
+    number,
+    section,
+    verdict_head,
+)
 from beetle_omni_ros.sim.fault_lists import Case
 
 NOTE = ('good: flights with the expected outcome or a better one. impact: speed of base_link at '
@@ -97,6 +105,12 @@ def total_text(results: dict) -> str:
     return (f"{total['good']} of {total['flights']} flights ended as expected; "
             f"{total['flyaways']} flyaways, {total['motors_on_after_crash']} with motors on after "
             f"a crash, {total['takeoffs']} take-offs without arming, {total['errors']} errors.")
+
+
+def as_markdown(results: dict) -> str:
+    """All results as Markdown."""
+    return (f"# Faults\n\n{results['meta']['command']}\n\n{total_text(results)}\n\n"
+            + markdown(grid(results)))
 
 
 def as_page(results: dict, folder: Path | None = None) -> str:
