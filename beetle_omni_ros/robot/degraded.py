@@ -53,7 +53,6 @@ class DegradedAllocator(Allocator):
 
     If the wrench cannot be met, thrusts are the least-squares solution in linear and angular
     acceleration. Lost rotors get no thrust and keep their tilt. Stuck joints keep their angle.
-
     """
 
     def __init__(self, robot: RobotParameters, health: ActuatorHealth):

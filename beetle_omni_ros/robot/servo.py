@@ -47,6 +47,10 @@ class Servo:
         return cls(**{name: getattr(joints, name) for name in (
             'inertia', 'kp', 'kd', 'velocity_limit', 'effort_limit')} | more)
 
+    def friction(self, space, rate):
+        """Largest friction at a rate [N m]."""
+        return self.coulomb + (self.stiction - self.coulomb) * self.fading(space, rate)
+
     def fading(self, space, rate):
         """Remaining fraction of the excess of stiction at a rate."""
         x = rate / self.fading_rate
@@ -62,8 +66,7 @@ class Servo:
         torque = self.motor(space, target - tilt, rate) + load
         if self.coulomb is not None:
             speed = rate / SLIDING_RATE
-            friction = self.coulomb + (self.stiction - self.coulomb) * self.fading(space, rate)
-            torque = torque - speed / space.sqrt(1 + speed * speed) * friction
+            torque = torque - speed / space.sqrt(1 + speed * speed) * self.friction(space, rate)
         if self.velocity_limit is None:
             return torque / self.inertia
         fast = space.maximum(rate, -rate) >= self.velocity_limit
