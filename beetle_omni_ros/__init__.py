@@ -73,15 +73,8 @@ def evaluate(controllers: str | Callable | Sequence[str | Callable], task: Any =
     """
     Fly a task with each controller and compute metrics, as `beetle_omni evaluate` does.
 
-    Args:
-        controllers: one or several, each as in :func:`simulate`.
-        task: as in :func:`simulate`.
-        robot: robot file of estimator and controllers; None: the shipped file.
-        plant: robot file of the simulated plant; None: as ``robot``.
-        conditions: 'nominal' or 'published'.
-        seed: of everything random.
-        bag: new folder; with several controllers it contains one bag for each.
-        quiet: print no table.
+    Arguments are as in :func:`simulate`, but ``robot`` and ``plant`` are files. With several
+    controllers ``bag`` contains one bag for each. ``quiet`` prints no table.
 
     Returns:
         The content of `evaluate --json`: ``meta``, and a key for each controller's name.
@@ -100,17 +93,10 @@ def evaluate(controllers: str | Callable | Sequence[str | Callable], task: Any =
 
 def read_run(path: str | Path) -> FlightLog:
     """
-    Read a recorded bag into numpy arrays.
+    Read a recorded bag, a rosbag2 folder or one of its files, into numpy arrays.
 
-    Args:
-        path: rosbag2 folder, or one of its files.
-
-    Returns:
-        The flight; its ``warnings`` list missing topics and damage.
-
-    Raises:
-        ParameterError: the bag cannot be read; the message has one line.
-
+    ``warnings`` of the flight list missing topics and damage. A ParameterError of one line refuses
+    a file that is no bag.
     """
     from beetle_omni_ros.runs.bag import read_bag
     return read_bag(path)

@@ -3,12 +3,11 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite, radians
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from beetle_omni_ros.robot import rotations, schema
+from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.schema import parameter, ParameterError, ParameterFile, quoted
 
 BUTTONS = ('arm', 'land', 'hold', 'home')
@@ -55,53 +54,24 @@ class DriveParameters(ParameterFile, file='drive.yaml'):
     poses: dict = parameter(doc='name -> x, y, z [m], roll, pitch, yaw [deg]')
 
     def __post_init__(self):
-        """Check buttons and poses."""
         for name, number in self.buttons.items():
             if name not in BUTTONS or not isinstance(number, int) or not 0 <= number < 64:
                 raise ParameterError(f"key 'buttons.{name}': expected {', '.join(BUTTONS)} with "
                                      f'a number from 0 to 63, found {quoted(number)}')
-        check_poses(self.poses, "key 'poses.")
-
-
-def check_poses(poses: dict, where: str) -> None:
-    """Check names and values of named poses; raises ParameterError."""
-    for name, pose in poses.items():
-        if not isinstance(name, str) or not name.isidentifier():
-            raise ParameterError(f"{where}{name}': expected a name of letters and digits")
-        if not isinstance(pose, (list, tuple)) or len(pose) != 6 or not all(
-                isinstance(one, (int, float)) and isfinite(one) for one in pose):
-            raise ParameterError(f"{where}{name}': expected six numbers x, y, z [m], roll, pitch, "
-                                 f'yaw [deg], found {quoted(pose)}')
-
-
-def read_named_poses(path: str | Path) -> dict:
-    """
-    Read named poses: a YAML file with ``name: [x, y, z, roll, pitch, yaw]`` [m, deg].
-
-    Raises:
-        ParameterError: unusable file or pose; the message has file and name.
-
-    """
-    poses = schema.load_yaml(path)
-    check_poses(poses, f"{path}: key '")
-    return poses
+        for name, pose in self.poses.items():
+            if not isinstance(pose, list) or len(pose) != 6 or not all(
+                    isinstance(one, (int, float)) and isfinite(one) for one in pose):
+                raise ParameterError(f"key 'poses.{name}': expected six numbers x, y, z [m], "
+                                     f'roll, pitch, yaw [deg], found {quoted(pose)}')
 
 
 class Steering:
     """
     Moves a target to a goal within the limits.
 
-    Args:
-        parameters: limits of the motion.
-        why_not: check of a pose, position (3,) [m] and quaternion (4,); returns '' or the reason
-            why it must not be flown.
-        position: (3,) initial target in world [m].
-        quaternion: (4,) initial target, body to world, xyzw.
-
-    Attributes:
-        position, quaternion: present target.
-        goal: position and quaternion of the goal.
-
+    ``position`` (3,) in world [m] and ``quaternion`` (4,) body to world, xyzw, are the present
+    target, ``goal`` has those of the goal. ``why_not`` returns '' or the reason why a pose must
+    not be flown.
     """
 
     def __init__(self, parameters: DriveParameters,
@@ -126,12 +96,9 @@ class Steering:
 
     def shift(self, way: np.ndarray, turn: np.ndarray) -> str:
         """
-        Shift the goal; returns as :meth:`go`.
+        Shift the goal by a way (3,) in world [m]; returns as :meth:`go`.
 
-        Args:
-            way: (3,) shift in world [m].
-            turn: (3,) rotation: roll and pitch about the body's axes, yaw about world's z [rad].
-
+        ``turn`` (3,) [rad]: roll and pitch about the body's axes, yaw about world's z.
         """
         position, quaternion = self.goal
         tilted = rotations.multiply(quaternion, rotations.exp([turn[0], turn[1], 0.0]))
@@ -144,15 +111,9 @@ class Steering:
 
     def update(self, seconds: float, robot: np.ndarray | None = None) -> str:
         """
-        Move the target.
+        Move the target by its motion in ``seconds``; it waits at a distance from the robot (3,).
 
-        Args:
-            seconds: time since the last update [s].
-            robot: (3,) position of the robot [m]; the target waits at a distance of ``leash``.
-
-        Returns:
-            '' or the reason why the next pose must not be flown; then the target stops.
-
+        Returned is '' or the reason why the next pose must not be flown; then the target stops.
         """
         if self.arrived:
             return ''
@@ -188,16 +149,10 @@ def shift_of_key(key: str, p: DriveParameters) -> tuple[np.ndarray, np.ndarray] 
 def shift_of_sticks(axes: Sequence[float], seconds: float, p: DriveParameters
                     ) -> tuple[np.ndarray, np.ndarray]:
     """
-    Shift by a joystick in ``seconds``; a fully deflected axis moves at full speed or rate.
+    Shift by a joystick in ``seconds``, (3,) [m] and (3,) roll, pitch, yaw [rad].
 
-    Args:
-        axes: axes of sensor_msgs/Joy, -1 to 1; a missing or not finite one counts as released.
-        seconds: time since the last shift [s].
-        p: mapping of the axes, and the dead zone, at whose edge the speed is zero.
-
-    Returns:
-        shift (3,) [m] and (3,) roll, pitch, yaw [rad].
-
+    A fully deflected axis, -1 or 1, moves at full speed or rate, at the edge of the dead zone at
+    none. A missing or not finite axis counts as released.
     """
     shift = np.zeros(6)
     for index, number, sign in zip(ORDER, p.axes.astype(int), p.signs):
@@ -217,15 +172,12 @@ def pressed(before: Sequence[int], now: Sequence[int], p: DriveParameters) -> li
 
 
 class Action(NamedTuple):
-    """
-    A command of the operator.
-
-    Values: of 'shift' (3,) in world [m] and (3,) roll, pitch, yaw [rad]; of 'goto' (3,) in world
-    [m] and (4,) body to world, xyzw, or None to keep the attitude; of 'controller' a name; of
-    'wait' perhaps seconds.
-    """
+    """A command of the operator."""
 
     name: str
+    # Of 'shift' (3,) in world [m] and (3,) roll, pitch, yaw [rad]; of 'goto' (3,) in world [m] and
+    # (4,) body to world, xyzw, or None to keep the attitude; of 'controller' a name; of 'wait'
+    # perhaps seconds.
     values: tuple = ()
 
 
@@ -233,11 +185,7 @@ def parse(line: str, poses: Mapping[str, Sequence[float]]) -> Action | None:
     """
     Parse one line; None for an empty line or a comment after #.
 
-    ``poses``: name -> x, y, z [m], roll, pitch, yaw [deg].
-
-    Raises:
-        ParameterError: not a command.
-
+    ``poses``: name -> x, y, z [m], roll, pitch, yaw [deg]. A ParameterError refuses other lines.
     """
     word, *rest = line.partition('#')[0].split() or ['']
     word = word.lower()
@@ -273,9 +221,8 @@ def parse(line: str, poses: Mapping[str, Sequence[float]]) -> Action | None:
 
 
 def _pose(values):
-    position = np.array(values[:3], dtype=float)
-    return Action('goto', (position, rotations.from_rpy(*map(radians, values[3:]))
-                           if len(values) == 6 else None))
+    attitude = rotations.from_rpy(*map(radians, values[3:])) if len(values) == 6 else None
+    return Action('goto', (np.array(values[:3], dtype=float), attitude))
 
 
 def _numbers(word, texts, wanted, counts):

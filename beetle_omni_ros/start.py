@@ -16,20 +16,14 @@ INTERRUPTED = 130
 TOOL = 'beetle_omni'    # all other executables are nodes
 
 
-def load(name: str):
-    """Import an executable and return its entry point."""
-    if name == TOOL:
-        return import_module(f'{PACKAGE}.cli').main
-    return partial(import_module(f'{PACKAGE}.nodes.runner').main, name)
-
-
 def run(name: str) -> int | None:
     """Run an executable; returns the exit status."""
     # A shell starts background jobs with the signal ignored, which must stay so.
     handled = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if handled:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-    main = load(name)
+    main = import_module(f'{PACKAGE}.cli').main if name == TOOL else partial(
+        import_module(f'{PACKAGE}.nodes.runner').main, name)
     try:
         if handled:
             signal.signal(signal.SIGINT, signal.default_int_handler)

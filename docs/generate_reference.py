@@ -238,12 +238,12 @@ def _wrapped(text: str) -> str:
 
 def effects() -> str:
     """The catalogue of effects."""
-    from beetle_omni_ros.robot.effects import CATALOGUE, CONSUMERS, treatment
+    from beetle_omni_ros.robot.effects import CATALOGUE, CONSUMERS, ignored
     apart: dict[tuple, list] = {}
     for name in CATALOGUE:
         for key, consumer in CONSUMERS.items():
-            if not (found := treatment(key, name)).acts:
-                apart.setdefault((consumer, found.reason), []).append(f'`{name}`')
+            if reason := ignored(key, name):
+                apart.setdefault((consumer, reason), []).append(f'`{name}`')
     rows = [[f'`{name}`', f'`{key}`', spec.unit, _neutral(spec.neutral),
              f'{_number(spec.low)} to {_number(spec.high)}', 'not fitted' if spec.form
              else _known(spec.typical), _known(spec.smallest),

@@ -77,7 +77,7 @@ def test_every_executable_has_its_function(setup_arguments):
         module, function = target.split(':')
         program, = getattr(import_module(module), function).args
         if program == start.TOOL:
-            assert callable(start.load(program)), script
+            assert callable(import_module(f'{PACKAGE}.cli').main), script
         elif HAS_ROS:
             assert callable(import_module(f'{PACKAGE}.nodes.runner').maker(program)), script
 

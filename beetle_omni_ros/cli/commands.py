@@ -364,8 +364,6 @@ def drive(source: Annotated[str, Argument(metavar='keyboard|joystick|terminal', 
           parameters: Annotated[Path | None, Option('--params', metavar='FILE', help=(
               'Limits, axes, buttons and named poses. Default: the shipped '
               'params/drive.yaml.'))] = None,
-          poses: Annotated[Path | None, Option(metavar='FILE', help=(
-              'More named poses (YAML).'))] = None,
           robot: RobotOption = None,
           domain_id: DomainOption = None):
     """

@@ -76,9 +76,7 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
         'command': shlex.join(['beetle_omni', *sys.argv[1:]]), 'version': __version__,
         'commit': commit(), 'date': datetime.now(timezone.utc).strftime('%Y-%m-%d'),
         'guidance': guidance, 'plant': str(plant) if plant else None},
-        'flights': [{key: value for key, value in one.items() if key != 'trace'}
-                    for one in flown],
-        'summary': page.summary(flown, {case.name: case for case in struck})}
+        'flights': flown, 'summary': page.summary(flown, {case.name: case for case in struck})}
     write_json(json_path, results)
     if output:
         write_json(output / 'faults.json', results)

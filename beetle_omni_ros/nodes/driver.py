@@ -16,7 +16,7 @@ from sensor_msgs.msg import Joy
 from beetle_omni_ros import drive
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import PoseTarget
-from beetle_omni_ros.drive import Action, DriveParameters, read_named_poses, Steering
+from beetle_omni_ros.drive import Action, DriveParameters, Steering
 from beetle_omni_ros.messages.topics import SENSOR
 from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes import wire
@@ -138,9 +138,8 @@ class Driver(Operator):
         return '; '.join(parts)
 
 
-def run_drive(source: str, *, parameters: Path | None = None, poses: Path | None = None,
-              robot: Path | None = None, domain_id: int | None = None,
-              console: Console | None = None) -> int:
+def run_drive(source: str, *, parameters: Path | None = None, robot: Path | None = None,
+              domain_id: int | None = None, console: Console | None = None) -> int:
     """
     Drive until the user quits; arguments as of `beetle_omni drive`.
 
@@ -154,7 +153,6 @@ def run_drive(source: str, *, parameters: Path | None = None, poses: Path | None
     if source not in SOURCES:
         raise ParameterError(f"source '{source}': expected {' or '.join(SOURCES)}")
     p = DriveParameters.load(parameters)
-    named = {**p.poses, **(read_named_poses(poses) if poses else {})}
     robot_parameters = RobotParameters.load(robot)
     if source == 'keyboard' and not sys.stdin.isatty():
         raise ParameterError('keyboard: standard input is no terminal; expected one, or the '
@@ -180,7 +178,7 @@ def run_drive(source: str, *, parameters: Path | None = None, poses: Path | None
         say(driver.where())
         before = driver.time()
         try:
-            for actions in stack.enter_context(closing(SOURCES[source](driver, p, named, say))):
+            for actions in stack.enter_context(closing(SOURCES[source](driver, p, p.poses, say))):
                 for action in actions:
                     say(driver.execute(action))
                 now = driver.time()

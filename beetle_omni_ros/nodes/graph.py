@@ -22,7 +22,6 @@ import yaml
 
 import beetle_omni_ros
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 
@@ -211,7 +210,7 @@ def controller_nodes(controller: str, robot: dict, *, standby: bool = True, nmpc
         node = f'{entry.name}_node'
         values = {**({} if node in NODES else {'controller': entry.reference}), **robot}
         if nmpc and entry.option == '--nmpc' and entry.parameter_class:
-            schema.load(entry.parameter_class, nmpc)    # an error here, not in another process
+            entry.parameter_class.load(nmpc)    # an error here, not in another process
             values[entry.file_key] = nmpc
         if entry.policy_file:
             given = policy if entry.name == registry.owner('--policy') else ''

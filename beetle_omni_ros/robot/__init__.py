@@ -13,18 +13,10 @@ class _CallableModule(ModuleType):
 
     def __call__(self, file=None):
         """
-        Read a robot file.
+        Read a robot file, by default the shipped params/robot.yaml.
 
-        Args:
-            file: path; None for the shipped params/robot.yaml.
-
-        Returns:
-            :class:`~beetle_omni_ros.robot.parameters.RobotParameters`. Use
-            ``dataclasses.replace`` to derive another robot from it.
-
-        Raises:
-            ParameterError: one line with file, key and expected value.
-
+        ``dataclasses.replace`` derives another robot from the result,
+        :class:`~beetle_omni_ros.robot.parameters.RobotParameters`.
         """
         from beetle_omni_ros.robot.parameters import RobotParameters
         return RobotParameters.load(file)

@@ -3,11 +3,7 @@ Allocation of a body wrench to thrusts and tilts.
 
 In the rotor force components u = (f_1 cos q_1, f_1 sin q_1, ..., f_4 cos q_4, f_4 sin q_4) the
 wrench is linear, w = B u with B (6, 8). The minimum-norm components are u = B^+ w. The thrust of
-a rotor is the length of its component pair, and its tilt is the angle of the pair. Joints turn by
-more than a revolution. The tilt is therefore taken on the legal turn nearest the present angle.
-
-B and the hover wrench include the known effects of the robot file: mass, thrust and torque
-coefficients, wind.
+a rotor is the length of its component pair, and its tilt is the angle of the pair.
 """
 
 from __future__ import annotations
@@ -56,7 +52,7 @@ class ActuatorHealth:
                 (*other.stuck, *other.held, other.thrust_limit)))
 
     def limited(self, thrust: float) -> float:
-        """Limit ``thrust`` [N] to what the pack allows."""
+        """Thrust [N] that the pack allows."""
         return thrust if self.thrust_limit is None else min(thrust, self.thrust_limit)
 
     def possible(self, tilt: np.ndarray, thrust: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -95,13 +91,12 @@ class Allocator:
     """
     Precomputed minimum-norm allocation of one robot.
 
-    Args:
-        robot: parameters of the robot.
+    It includes the known effects of the robot file: mass, thrust and torque coefficients, wind.
 
     Attributes:
         matrix: (6, 8) map from the components u to (force, torque) in base_link.
         inverse: (8, 6) pseudo-inverse of ``matrix``.
-        mass: mass in the hover wrench [kg].
+        mass: [kg].
         weight: (3,) force in world that balances gravity and steady wind [N].
         axes: (4, 3) unit tilt axes in base_link.
         tilt_limit: travel of the joints to each side [rad].
@@ -110,7 +105,7 @@ class Allocator:
 
     def __init__(self, robot: RobotParameters):
         rotors, scale = robot.rotors, robot.thrust_scale
-        self.mass = robot.true_mass
+        self.mass = robot.effect('mass.mass', robot.mass)
         self.weight = np.array([0.0, 0.0, self.mass * robot.gravity]) \
             - robot.effect('wind.force', (0.0, 0.0, 0.0))
         self.matrix = np.zeros((6, 2 * ROTORS))
@@ -129,17 +124,7 @@ class Allocator:
         self.tilt_limit = robot.joints.position_limit
 
     def wrench(self, tilt: np.ndarray, thrust: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """
-        Wrench of given tilts and thrusts.
-
-        Args:
-            tilt: (4,) [rad].
-            thrust: (4,) [N].
-
-        Returns:
-            force (3,) [N] and torque (3,) [N m] about the centre of gravity, in base_link.
-
-        """
+        """Force (3,) [N] and torque (3,) [N m] at base_link of tilts [rad] and thrusts [N]."""
         components = np.empty(2 * ROTORS)
         components[0::2] = thrust * np.cos(tilt)
         components[1::2] = thrust * np.sin(tilt)
@@ -151,14 +136,14 @@ class Allocator:
         """
         Minimum-norm thrusts and tilts for a body wrench.
 
-        A rotor with negligible thrust keeps its present angle, because its direction is
-        undetermined. Thrust and tilt stay within their limits. A tilt that is less than OVERLAP
-        beyond a stop becomes the stop: otherwise noise would turn the joint to the other side.
+        A tilt is on the legal turn nearest the present angle. A rotor with negligible thrust
+        keeps that angle. A tilt that is less than OVERLAP beyond a stop becomes the stop:
+        otherwise noise would turn the joint to the other side.
 
         Args:
             force: (3,) in base_link [N].
             torque: (3,) about the centre of gravity in base_link [N m].
-            present_tilt: (4,) present angles, for the choice of the nearest turn [rad].
+            present_tilt: (4,) [rad].
 
         """
         pairs = (self._by_force.dot(force) + self._by_torque.dot(torque)).tolist()

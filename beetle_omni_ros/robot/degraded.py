@@ -1,24 +1,16 @@
 """
 Allocation for a robot with failed actuators, and the attitudes that it can hold.
 
-A lost rotor has no column in the wrench map. A rotor with a stuck joint has one column, along its
-present direction, and a thrust that cannot be negative: where the minimum-norm solution would need
-that, the rotor is off. Every other rotor keeps its two force components. A rotor with a fixed
-thrust pushes along its minimum-norm share. A rotor beyond its limit is fixed at the limit in its
-direction. The others are solved again for the remaining wrench (active set).
+A lost rotor has no column in the wrench map. A rotor with a stuck joint has one, and a thrust that
+cannot be negative. A rotor with a fixed thrust pushes along its minimum-norm share. A rotor beyond
+its limit is fixed there, and the others are solved again for the remaining wrench (active set).
 
-Whether an attitude can be held depends on the direction of up in the body, not on heading. For a
-grid of directions the allocation of the weight gives tilts and thrusts. About these the
-accelerations [m/s^2, rad/s^2] are linear in small changes of tilt and thrust,
-
-    (a, alpha) = J (thrust change / thrust reach, tilt change / tilt reach).
-
-The reach of a thrust is its distance from zero or from its limit. The reach of a tilt is the
-travel of its servo within the reach time. The margin is the radius of the largest ball of
-accelerations for which the minimum-norm change stays within every reach:
-1 / max_i |row i of J^+|. It is zero if the weight cannot be held, or if one of the six directions
-cannot be pushed. An example is level flight with a lost rotor: the opposite rotor has no thrust,
-so that its tilt has no effect.
+The margin of an attitude is the radius of the largest ball of accelerations [m/s^2, rad/s^2] about
+rest for which the minimum-norm change of thrusts and tilts stays within the reach of every
+actuator: 1 / max_i |row i of J^+| with (a, alpha) = J (change / reach). The reach of a thrust is
+its distance from zero or from its limit, that of a tilt the travel of its servo within the reach
+time. It is zero where a direction cannot be pushed: level with a lost rotor, the opposite rotor
+has no thrust, so that its tilt has no effect.
 """
 
 import numpy as np
@@ -61,26 +53,17 @@ class DegradedAllocator(Allocator):
 
     If the wrench cannot be met, thrusts are the least-squares solution in linear and angular
     acceleration. Lost rotors get no thrust and keep their tilt. Stuck joints keep their angle.
-
-    Args:
-        robot: parameters of the robot.
-        health: state of the actuators.
-
-    Attributes:
-        matrix: (6, 8) map of the base class, with zero columns for lost rotors.
-        columns: (6, 8) the map with the thrust of a stuck rotor in its first component.
-        scale: (6,) accelerations for each unit of a wrench.
-        stuck: list of rotors with a stuck joint.
-        held: rotor -> its fixed thrust [N].
-
     """
 
     def __init__(self, robot: RobotParameters, health: ActuatorHealth):
         super().__init__(robot)
         self._health = health
         self._thrust_max = health.limited(self._thrust_max)
-        self.matrix[:, np.repeat(~np.array(health.rotors), 2)] = 0.0
+        self.matrix[:, np.repeat(~np.array(health.rotors), 2)] = 0.0    # of lost rotors
+        # (6,) accelerations for each unit of a wrench.
         self.scale = 1 / np.r_[np.full(3, self.mass), robot.inertia]
+        # Rotor -> its fixed thrust [N]; rotors with a stuck joint, whose thrust is in the first of
+        # its two columns (6, 8).
         self.held = {i: thrust for i, thrust in enumerate(health.held)
                      if thrust is not None and health.rotors[i]}
         self.stuck, self.columns = [], self.matrix.copy()
@@ -160,19 +143,12 @@ class DegradedAllocator(Allocator):
     def allocate_near(self, force: np.ndarray, torque: np.ndarray, tilt: np.ndarray,
                       aim: Allocation) -> Allocation:
         """
-        Thrusts and tilts near the present tilts that approximate a wrench.
+        Thrusts and tilts near the present tilts (4,) [rad] that approximate a wrench.
 
         The minimum-norm solution turns a joint by half a revolution when the share of its rotor
         passes through zero. This method instead takes damped Gauss-Newton steps in tilts and
         thrusts. They minimise the squared error of the accelerations and the weighted distance
-        from the target, within the thrust range and a reach of tilt.
-
-        Args:
-            force: (3,) in base_link [N].
-            torque: (3,) in base_link [N m].
-            tilt: (4,) present tilts [rad].
-            aim: target of tilts and thrusts.
-
+        from ``aim``, within the thrust range and a reach of tilt.
         """
         scale = self.scale * np.repeat([1.0, TURNING], 3)
         matrix, wrench = scale[:, None] * self.matrix, scale * np.concatenate([force, torque])
@@ -259,11 +235,7 @@ def allocator(robot: RobotParameters, health: ActuatorHealth = ALL_HEALTHY) -> A
 
 class Holding:
     """
-    Table of the attitudes that a robot can hold.
-
-    Args:
-        robot: parameters of the robot.
-        health: state of the actuators.
+    Table of the attitudes that a robot can hold; computed in about 10 ms.
 
     Attributes:
         directions: (N, 3) unit vectors, up in base_link.
@@ -273,7 +245,6 @@ class Holding:
     """
 
     def __init__(self, robot: RobotParameters, health: ActuatorHealth):
-        """Compute the table in about 10 ms."""
         self._health = health
         self._tilt_rate = TILT_RATE_SHARE * robot.joints.velocity_limit
         self._allocator = DegradedAllocator(robot, health)
@@ -281,6 +252,7 @@ class Holding:
         self.directions = sphere(DIRECTIONS)
         self.tilts, self._thrusts, met = self._held(self.directions)
         self.margins = self._margins(self.tilts, self._thrusts, met)
+        self._attainable = NEARLY * float(self.margins.max())
 
     def margin(self, quaternion: np.ndarray) -> float:
         """Margin of one attitude (4,) [m/s^2, rad/s^2], 0 if it cannot be held."""
@@ -288,17 +260,11 @@ class Holding:
 
     def nearest(self, quaternion: np.ndarray, margin: float) -> np.ndarray:
         """
-        Nearest attitude with a margin.
+        Nearest attitude (4,) with a margin: the desired one, turned about a horizontal axis.
 
-        Args:
-            quaternion: (4,) desired attitude.
-            margin: required margin [m/s^2, rad/s^2]; if no attitude has it, 80 % of the largest.
-
-        Returns:
-            (4,) quaternion: the desired attitude, turned about a horizontal axis.
-
+        If no attitude has the margin [m/s^2, rad/s^2], the attitude has 80 % of the largest.
         """
-        margin = self._attainable(margin)
+        margin = min(margin, self._attainable)
         if self.margin(quaternion) >= margin:
             return rotations.normalized(quaternion)
         desired = up(quaternion)
@@ -332,17 +298,15 @@ class Holding:
 
         """
         quaternion = rotations.multiply(quaternion, rotations.exp(COAST_TIME * angular_velocity))
-        firm = np.flatnonzero(self.margins >= self._attainable(margin))
+        firm = np.flatnonzero(self.margins >= min(margin, self._attainable))
         angle = np.arccos(np.clip(self.directions[firm] @ up(quaternion), -1.0, 1.0))
-        travel = np.abs(self._on_nearest_turn(self.tilts[firm], tilt) - tilt)
+        turned, limit = nearest_turn(self.tilts[firm], tilt), self._allocator.tilt_limit
+        travel = np.abs(np.where(np.abs(turned) > limit, turned - 2 * np.pi * np.sign(turned),
+                                 turned) - tilt)
         travel[self._thrusts[firm] < LITTLE] = 0.0
         time = angle / TURN_RATE + travel.max(axis=1) / self._tilt_rate \
             + self._unheld_angle(self.directions[firm]) / levelling_rate
         return leaned(quaternion, self.directions[firm[np.argmin(time)]])
-
-    def _attainable(self, margin):
-        """Limit a margin [m/s^2, rad/s^2] to 80 % of the largest one."""
-        return min(margin, NEARLY * float(self.margins.max()))
 
     def _unheld_angle(self, directions):
         """Unheld part (N,) [rad] of the shortest paths from directions of up (N, 3) to level."""
@@ -355,14 +319,17 @@ class Holding:
         nearest = np.argmax(path @ self.directions.T, axis=1)
         return angle * (self.margins[nearest] <= 0.0).reshape(passed.shape).mean(axis=1)
 
-    def _on_nearest_turn(self, tilt, present):
-        """Tilts (N, 4) on the legal turn nearest the present ones (4,)."""
-        limit = self._allocator.tilt_limit
-        turned = nearest_turn(tilt, present)
-        return np.where(np.abs(turned) > limit, turned - 2 * np.pi * np.sign(turned), turned)
-
     def _margins(self, tilt, thrust, met):
-        jacobian = self._jacobian(tilt, thrust)
+        matrix = self._allocator.scale[:, None] * self._allocator.matrix
+        up_part, side_part = matrix[:, 0::2], matrix[:, 1::2]
+        cos, sin = np.cos(tilt)[:, None], np.sin(tilt)[:, None]
+        room = np.minimum(thrust, self._thrust_max - thrust).clip(0)
+        room[:, list(self._allocator.held)] = 0.0
+        swing = thrust * min(self._tilt_rate * REACH_TIME, 1.0) \
+            * [float(angle is None) for angle in self._health.stuck]
+        # (N, 6, 8) accelerations for each actuator going to the end of its reach.
+        jacobian = np.concatenate([(up_part * cos + side_part * sin) * room[:, None],
+                                   (side_part * cos - up_part * sin) * swing[:, None]], axis=2)
         squared = jacobian @ jacobian.transpose(0, 2, 1) + 1e-9 * np.eye(6)
         needed = jacobian.transpose(0, 2, 1) @ np.linalg.inv(squared)
         margins = 1 / np.maximum(np.linalg.norm(needed, axis=2).max(axis=1), 1e-6)
@@ -379,18 +346,6 @@ class Holding:
             if angle is not None:
                 tilt[:, i] = angle
         return tilt, thrust, self._allocator.error(pairs, wrenches) <= RESIDUAL
-
-    def _jacobian(self, tilt, thrust):
-        """(N, 6, 8) accelerations for each actuator going to the end of its reach."""
-        matrix = self._allocator.scale[:, None] * self._allocator.matrix
-        up_part, side_part = matrix[:, 0::2], matrix[:, 1::2]
-        cos, sin = np.cos(tilt)[:, None], np.sin(tilt)[:, None]
-        room = np.minimum(thrust, self._thrust_max - thrust).clip(0)
-        room[:, list(self._allocator.held)] = 0.0
-        swing = thrust * min(self._tilt_rate * REACH_TIME, 1.0) \
-            * [float(angle is None) for angle in self._health.stuck]
-        return np.concatenate([(up_part * cos + side_part * sin) * room[:, None],
-                               (side_part * cos - up_part * sin) * swing[:, None]], axis=2)
 
 
 def sphere(count: int) -> np.ndarray:

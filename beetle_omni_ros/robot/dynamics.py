@@ -10,6 +10,7 @@ model is independent of it.
 import casadi as ca
 import numpy as np
 
+from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.effects import CATALOGUE, ServoTerms, Terms
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.servo import CASADI, Servo
@@ -38,10 +39,8 @@ def rotation_matrix(quaternion):
 
 def quaternion_rate(quaternion, angular_velocity):
     """Derivative of (x, y, z, w) for body rates [rad/s]: q' = q * (w, 0) / 2."""
-    x, y, z, w = ca.vertsplit(quaternion)
-    a, b, c = ca.vertsplit(angular_velocity)
-    return 0.5 * ca.vertcat(w * a + y * c - z * b, w * b - x * c + z * a,
-                            w * c + x * b - y * a, -x * a - y * b - z * c)
+    parts = (*ca.vertsplit(quaternion), *ca.vertsplit(angular_velocity), 0)
+    return 0.5 * ca.vertcat(*rotations.product(*parts))
 
 
 def thrust_direction(arm_yaw: float, tilt):
@@ -62,16 +61,13 @@ def rigid_body(robot: RobotParameters, velocity, quaternion, angular_velocity, t
     of mass. Arguments are named as the fields of :class:`Terms`, ``quaternion`` is body to world.
     An absent argument counts as zero; without position, voltage_ratio or charge_drawn their
     effects are absent. ``effects`` (name -> parameter -> value or symbol) and ``rotor_positions``
-    (4, 3) [m] replace those of the robot file.
-
-    Returns:
-        (3,) acceleration in world [m/s^2], (3,) angular acceleration in body [rad/s^2].
-
+    (4, 3) [m] replace those of the robot file. Returned are the acceleration (3,) in world
+    [m/s^2] and the angular acceleration (3,) in body [rad/s^2].
     """
     rotors = robot.rotors
     places = rotors.positions if rotor_positions is None else rotor_positions
     terms = Terms(
-        mass=robot.mass, inertia=ca.DM(robot.inertia), centre_of_mass=None,
+        mass=robot.mass, inertia=ca.DM(robot.inertia), centre_of_mass=ca.DM.zeros(3),
         torque=_given(torque_body, 3), tilt=tilt, tilt_acceleration=_given(tilt_acceleration, 4),
         tilt_axes=[ca.DM(axis) for axis in robot.tilt_axes],
         thrust=thrust, velocity=velocity, angular_velocity=angular_velocity,
@@ -97,14 +93,12 @@ def rigid_body(robot: RobotParameters, velocity, quaternion, angular_velocity, t
     acceleration = (terms.rotation @ force + terms.force_world) / terms.mass \
         + ca.DM([0, 0, -robot.gravity])
     centre = terms.centre_of_mass
-    if centre is not None:
-        torque = torque - ca.cross(centre, force + terms.rotation.T @ terms.force_world)
+    torque = torque - ca.cross(centre, force + terms.rotation.T @ terms.force_world)
     angular_acceleration = (torque - ca.cross(angular_velocity, terms.inertia * angular_velocity)
                             ) / terms.inertia
-    if centre is not None:
-        acceleration = acceleration - terms.rotation @ (
-            ca.cross(angular_acceleration, centre)
-            + ca.cross(angular_velocity, ca.cross(angular_velocity, centre)))
+    acceleration = acceleration - terms.rotation @ (
+        ca.cross(angular_acceleration, centre)
+        + ca.cross(angular_velocity, ca.cross(angular_velocity, centre)))
     return acceleration, angular_acceleration
 
 
@@ -117,12 +111,8 @@ def added_wrench(robot: RobotParameters, names: list[str]) -> ca.Function:
     Force in world [N] and torque in base_link [N m] at base_link that the named effects add.
 
     The reference is the robot without these effects, with the mass and inertia of its file. It
-    has the effect torque_coefficient, because added thrusts also turn the body.
-
-    Returns:
-        f(quaternion, velocity, rate, tilt, tilt_rate, tilt_acceleration, thrust, thrust_rate,
-        position, voltage_ratio, charge_drawn) -> force, torque.
-
+    has the effect torque_coefficient, because added thrusts also turn the body. Arguments of the
+    function are those of ``sizes``.
     """
     sizes = {'quaternion': 4, 'velocity': 3, 'rate': 3, 'tilt': 4, 'tilt_rate': 4,
              'tilt_acceleration': 4, 'thrust': 4, 'thrust_rate': 4, 'position': 3,
@@ -156,15 +146,10 @@ def gyroscopic_load(robot: RobotParameters, angular_velocity, tilt, thrust, join
 def tilt_servo(robot: RobotParameters, joint: int, target, thrust=0.0,
                gyroscopic=0.0) -> tuple[Servo, ServoTerms]:
     """
-    Servo of one joint and the terms that act on it, with the robot file's effects.
+    Servo of a joint (0 to 3) and the terms that act on it, with the robot file's effects.
 
-    Args:
-        robot: parameters and effects.
-        joint: index, 0 to 3.
-        target: commanded angle [rad].
-        thrust: thrust of the joint's rotor [N].
-        gyroscopic: value of :func:`gyroscopic_load` [rad/s].
-
+    ``target`` is the commanded angle [rad], ``thrust`` that of the joint's rotor [N],
+    ``gyroscopic`` the value of :func:`gyroscopic_load` [rad/s].
     """
     terms = ServoTerms(target, thrust, gyroscopic)
     for name, values in robot.effects.items():

@@ -2,31 +2,25 @@
 The catalogue of named effects: terms that reality may add to the model.
 
 Each effect is declared once, with equation, source, parameters, excitation and the effects that
-it is confused with. A robot file enables an effect by naming it. Its place of action follows from
-its kind:
-
-- Effects on the body change the terms of the Newton-Euler equations.
-- Joint effects change the equation of the servo.
-- Effects that replace a number of the robot file (a lag, a gain, a limit) do so when the file is
-  read. Plant, NMPC and training then use the new number.
-- Delays of commands are in :attr:`RobotParameters.command_delays`.
-- Sensor effects are in :attr:`RobotParameters.sensors`. The gap finder fits them.
+it is confused with. A robot file enables an effect by naming it; the place of action follows from
+its kind, see :attr:`Effect.kind`.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from beetle_omni_ros.robot.schema import numbers, ParameterError, quoted, shortened, unknown
+from beetle_omni_ros.robot.schema import numbers, ParameterError, quoted, unknown
 
 NAN = float('nan')
 UP = ca.DM([0, 0, 1])
 REFERENCE_HEIGHT = 0.25     # [m] of the rotor, for which the gain of the ground effect is given
 EXPONENTIAL_HEIGHT = 0.25   # [m] over which the exponential form falls to 1/e
 LEAST_HEIGHT = 0.08         # [m] below which the forms are not valid
+NO_JOINTS = 'the filter does not read the joints'
 # Terms that the simulated plant and the gap finder have -> why NMPC and training leave out an
 # effect of them.
 MEASURED = {'voltage_ratio': 'it has no voltage and assumes a full pack',
@@ -52,15 +46,6 @@ class EffectParameter:
     step: float = 1e-3      # of a fit's derivatives; of the logarithm for the file's own numbers
     curved: bool = False    # these derivatives change during a fit
     form: bool = False      # it only chooses a form of the effect and is not fitted
-
-
-@dataclass(frozen=True)
-class LimitStarts:
-    """Start values of a fitted limit, relative to the demand of a flight."""
-
-    of: str                     # 'tilt_rate', 'torque' or 'thrust'
-    parts: tuple[float, ...]    # fractions of the largest demand, one start each
-    below: float                # fraction of the file's limit below which a start must lie
 
 
 @dataclass(frozen=True)
@@ -107,7 +92,7 @@ class Terms:
 
     mass: ca.SX                     # [kg]
     inertia: ca.SX                  # (3,) diagonal about the centre of mass [kg m^2]
-    centre_of_mass: ca.SX | None    # (3,) [m]; None: base_link's origin
+    centre_of_mass: ca.SX           # (3,) [m]
     torque: ca.SX                   # (3,) added on the body [N m]
     tilt: ca.SX                     # (4,) [rad]
     tilt_acceleration: ca.SX        # (4,) [rad/s^2]
@@ -153,13 +138,6 @@ class ServoTerms:
     stiction: Any = None    # friction at rest [N m]
 
 
-class Treatment(NamedTuple):
-    """Whether a change of an effect changes a consumer's results, else the reason."""
-
-    acts: bool
-    reason: str = ''
-
-
 @dataclass(frozen=True)
 class Effect:
     """One catalogue entry."""
@@ -181,8 +159,11 @@ class Effect:
     # Affected measurements. B: forces and torques, J: joints, A: MoCap's acceleration, W: MoCap's
     # angular velocity; A and W against the IMU.
     channels: str = 'B'
-    # Start values of a fit, if the effect has no slope at its neutral value.
-    starts: tuple[tuple[float, ...], ...] | LimitStarts = ()
+    # Start values of a fit, if the effect has no slope at its neutral value. Those of a limit are
+    # fractions of the largest 'tilt_rate', 'torque' or 'thrust' of a flight, and must be below a
+    # fraction of the robot file's limit.
+    starts: tuple[tuple[float, ...], ...] = ()
+    limit: tuple[str, float] | None = None
     forms: tuple[dict[str, float], ...] = ({},)     # the parameters that choose each form
     one_regime: bool = False    # it acts in one regime only, such as near the ground
     same_response: str = ''     # entry that is another form of the same response
@@ -191,8 +172,8 @@ class Effect:
     # How the simulated plant includes a body effect. 'model': numbers of its bodies and rotors,
     # 'own': equations of its own, '': the equation of this entry.
     plant: str = ''
-    # Name of CONSUMERS -> treatment that does not follow from the kind of effect.
-    treatments: dict[str, Treatment] = field(default_factory=dict)
+    # Name of CONSUMERS -> why it ignores the effect, where this does not follow from its kind.
+    ignored_by: dict[str, str] = field(default_factory=dict)
 
     @property
     def settings(self) -> dict[str, str]:
@@ -242,27 +223,21 @@ def _sets(term):
 
 
 def _centre_of_mass(terms, offset):
-    terms.centre_of_mass = _moved(terms.centre_of_mass, vector(offset))
-
-
-def _moved(centre, shift):
-    return shift if centre is None else centre + shift
+    terms.centre_of_mass = terms.centre_of_mass + vector(offset)
 
 
 def _module_reaction(terms, module_inertia, mass_moment):
-    shift = 0
     for i in range(4):
         rate, acceleration = terms.tilt_rate[i], terms.tilt_acceleration[i]
         n, e = terms.thrust_directions[i], terms.tilt_axes[i]
         terms.torque = terms.torque - module_inertia * acceleration * e
         # The centre of mass of the module is below the joint axis. It moves against the thrust,
         # and its acceleration pushes back on the axis.
-        shift = shift - mass_moment / terms.mass * (n - UP)
+        terms.centre_of_mass = terms.centre_of_mass - mass_moment / terms.mass * (n - UP)
         sideways = ca.cross(e, n)
         terms.rotor_forces[i] = terms.rotor_forces[i] + mass_moment * (
             acceleration * sideways - rate * rate * n
             + 2 * rate * ca.cross(terms.angular_velocity, sideways))
-    terms.centre_of_mass = _moved(terms.centre_of_mass, shift)
 
 
 def _thrust_coefficient(terms, scale):
@@ -377,10 +352,6 @@ def _delay(typical, smallest=0.003, **more):
     return {'delay': EffectParameter('s', 0.0, -0.05, 0.2, typical, smallest, curved=True, **more)}
 
 
-def _friction():
-    return EffectParameter('N m', 0.0, 0.0, 1.0, 0.01, 0.002, of_each=True, step=5e-4, curved=True)
-
-
 def _number(key, unit, low, high, typical, smallest, step=0.01, **more):
     return EffectParameter(unit, NAN, low, high, typical, smallest, number=key, step=step,
                            curved=True, **more)
@@ -421,9 +392,9 @@ CATALOGUE: dict[str, Effect] = {
         "reaction force moment (n'' + 2 w x n'); "
         'multibody section of the robot file', 'fast tilting, turned attitudes',
         ('centre_of_mass', 'inertia'), 'the same attitude with tilts turned by 180 deg',
-        _module_reaction, channels='BJ', plant='model', treatments={'plant': Treatment(
-            False, 'its modules are bodies with the masses of the multibody section; without '
-                   'that section it acts')}),
+        _module_reaction, channels='BJ', plant='model', ignored_by={
+            'plant': 'its modules are bodies with the masses of the multibody section; without '
+                     'that section it acts'}),
     'thrust_coefficient': Effect(
         'body', {'scale': EffectParameter('1', 1.0, 0.2, 2.0, 0.05, 0.01, tolerance='thrust')},
         'f = scale f*, all rotors', 'any flight', ('mass', 'voltage_sag', 'tilt_thrust_loss'),
@@ -521,7 +492,7 @@ CATALOGUE: dict[str, Effect] = {
         'rotor', {'thrust_max': _number('rotors.thrust_max', 'N', 1.0, 200, 0.3, 0.02)},
         'f = min(f*, f_max): voltage or speed controller limit', 'commands at the limit',
         ('voltage_sag', 'thrust_coefficient'), 'climb at full thrust',
-        starts=LimitStarts('thrust', (0.95, 0.8), 1.2)),
+        starts=((0.95,), (0.8,)), limit=('thrust', 1.2)),
     'command_latency': Effect(
         'timing', _delay(0.02), 'all commands act d later', 'fast tilting and thrust steps',
         ('joint_command_latency', 'rotor_dead_time', 'joint_bandwidth'),
@@ -546,7 +517,7 @@ CATALOGUE: dict[str, Effect] = {
             'velocity_limit': _number('joints.velocity_limit', 'rad/s', 0.1, 100, 0.5, 0.05)},
         "|q'| <= limit: voltage and gearing", 'large tilt steps',
         ('joint_torque_limit', 'joint_bandwidth'), 'tilt steps of 30, 90 and 180 deg',
-        channels='J', starts=LimitStarts('tilt_rate', (0.95, 0.8), 0.95)),
+        channels='J', starts=((0.95,), (0.8,)), limit=('tilt_rate', 0.95)),
     'joint_torque_limit': Effect(
         'joint', {
             # The file's 3 N m is 60 times the demand of quick poses; the real limit may be lower.
@@ -554,10 +525,10 @@ CATALOGUE: dict[str, Effect] = {
                                     least=1e-3)},
         '|tau| <= limit: current limit, stall', 'large tilt steps',
         ('joint_velocity_limit', 'joint_bandwidth'), 'tilt steps of 30, 90 and 180 deg',
-        channels='J', starts=LimitStarts('torque', (1.1, 0.8, 0.5), 0.98)),
+        channels='J', starts=((1.1,), (0.8,), (0.5,)), limit=('torque', 0.98)),
     'joint_friction': Effect(
-        'joint', {
-            'coulomb': _friction(), 'stiction': _friction()},
+        'joint', dict.fromkeys(('coulomb', 'stiction'), EffectParameter(
+            'N m', 0.0, 0.0, 1.0, 0.01, 0.002, of_each=True, step=5e-4, curved=True)),
         "-coulomb sgn(q') while sliding, up to stiction at rest (Armstrong-Helouvry 1994); "
         'smooth over 0.05 rad/s in the model', 'slow reversals of the tilts',
         ('joint_backlash', 'joint_bandwidth'), 'triangle of 2 deg at 0.1 Hz',
@@ -584,10 +555,9 @@ CATALOGUE: dict[str, Effect] = {
                       ('cosine', 'rad', 0.02, 0.008))},
         "encoder = q + gain q + sine sin q + cosine (cos q - 1): an axis off the encoder's",
         'large tilts', ('joint_offset', 'joint_bandwidth'), 'tilts held over the whole travel',
-        each='joint', channels='J', treatments={
-            'estimator': Treatment(False, 'the filter does not read the joints'),
-            'gap': Treatment(False, 'a flight does not separate it from joint_offset: fit it to a '
-                                    'response log')}),
+        each='joint', channels='J', ignored_by={
+            'estimator': NO_JOINTS, 'gap': 'a flight does not separate it from joint_offset: fit '
+                                           'it to a response log'}),
     'joint_feedback_delay': Effect(
         'timing', _delay(0.01, sensor='encoder_delay', tolerance='delay'),
         'the encoder reading is older than its stamp by d',
@@ -635,20 +605,17 @@ CATALOGUE: dict[str, Effect] = {
 
 CONSUMERS = {'nmpc': 'NMPC and allocation', 'training': 'training', 'plant': 'simulated plant',
              'estimator': 'estimator', 'buses': 'delays of the buses', 'gap': 'gap finder'}
-ACTS = Treatment(True)
-_CORRECTED = Treatment(False, 'the estimator corrects the readings first')
-_NO_MODEL = Treatment(False, 'the filter integrates the IMU and has no model of forces or servos')
-_NO_DELAY = Treatment(False, 'the effect delays no command')
-_NO_JOINTS = Treatment(False, 'the filter does not read the joints')
-_TREATMENTS = {
-    'nmpc': {'sensor': _CORRECTED, 'play': Treatment(
-        False, 'a play is an offset of the servos, which is estimated in flight')},
+_CORRECTED = 'the estimator corrects the readings first'
+_NO_MODEL = 'the filter integrates the IMU and has no model of forces or servos'
+# Consumer -> kind of effect -> why it ignores effects of this kind.
+_IGNORED = {
+    'nmpc': {'sensor': _CORRECTED,
+             'play': 'a play is an offset of the servos, which is estimated in flight'},
     'training': {'sensor': _CORRECTED},
-    'plant': {},
     'estimator': {**dict.fromkeys(('body', 'servo', 'number', 'command', 'play'), _NO_MODEL),
-                  'feedback': _NO_JOINTS},
-    'buses': dict.fromkeys(('body', 'servo', 'number', 'sensor', 'feedback', 'play'), _NO_DELAY),
-    'gap': {}}
+                  'feedback': NO_JOINTS},
+    'buses': dict.fromkeys(('body', 'servo', 'number', 'sensor', 'feedback', 'play'),
+                           'the effect delays no command')}
 
 
 def settings(effects: dict[str, dict]) -> dict[str, float]:
@@ -668,22 +635,10 @@ def delaying(*what: str) -> tuple[str, ...]:
     return tuple(name for name, entry in CATALOGUE.items() if set(what) & set(entry.delays))
 
 
-def validated(effects: dict | None) -> dict[str, dict]:
-    """
-    Validate a robot file's ``effects`` mapping against the catalogue.
-
-    Returns:
-        name -> parameter -> float or tuple of floats, with all parameters of each effect.
-
-    Raises:
-        ParameterError: unknown effect or parameter, wrong shape, value out of range.
-
-    """
+def validated(effects: dict) -> dict[str, dict]:
+    """Complete and validate the parameters of effects: name -> parameter -> float or tuple."""
     checked: dict[str, dict] = {}
-    if not isinstance(effects, dict | None):
-        raise ParameterError(f'effects: expected a mapping, found {quoted(effects)}')
-    for name, given in (effects or {}).items():
-        name = shortened(str(name))
+    for name, given in effects.items():
         if name not in CATALOGUE:
             raise unknown(f'effects.{name}', 'effect', name, CATALOGUE)
         entry = CATALOGUE[name]
@@ -707,21 +662,14 @@ def _value(at, spec, value):
     return tuple(map(float, array)) if shape else float(array)
 
 
-def treatment(consumer: str, name: str) -> Treatment:
+def ignored(consumer: str, name: str) -> str:
     """
-    How a consumer treats an effect: it acts on it or states why not.
+    Why a consumer of ``CONSUMERS`` ignores an effect; '' if the effect acts in it.
 
-    This follows from the kind of effect (:attr:`Effect.kind`), so that each new entry has a
-    treatment. ``test/gap/test_consumers.py`` checks every pair against the consumer's results.
-
-    Args:
-        consumer: one of ``CONSUMERS``.
-        name: name in the catalogue.
-
+    This follows from the kind of effect, so that each new entry has a treatment.
+    ``test/gap/test_consumers.py`` checks every pair against the consumer's results.
     """
     effect = CATALOGUE[name]
-    if consumer in effect.treatments:
-        return effect.treatments[consumer]
     if effect.measured and consumer in ('nmpc', 'training'):
-        return Treatment(False, '; '.join(MEASURED[term] for term in effect.measured))
-    return _TREATMENTS[consumer].get(effect.kind, ACTS)
+        return '; '.join(MEASURED[term] for term in effect.measured)
+    return effect.ignored_by.get(consumer) or _IGNORED.get(consumer, {}).get(effect.kind, '')

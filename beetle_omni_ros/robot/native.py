@@ -18,12 +18,6 @@ FLAGS = ('-O2', '-fPIC', '-shared', '-std=gnu99', '-w')
 EXACT = ('-ffp-contract=off', '-lm')     # rounds each operation, as CasADi's interpreter does
 
 
-def cache_folder() -> Path:
-    """Folder of compiled code: $XDG_CACHE_HOME (or ~/.cache) / beetle_omni_ros."""
-    base = os.environ.get('XDG_CACHE_HOME') or os.path.join(os.path.expanduser('~'), '.cache')
-    return Path(base) / 'beetle_omni_ros'
-
-
 def generated(functions: Sequence[ca.Function]) -> str:
     """C source of CasADi functions, each under its own name."""
     with tempfile.TemporaryDirectory() as folder:
@@ -38,25 +32,17 @@ def built(name: str, source: str, options: Sequence[str] = ()) -> Path:
     """
     Compile C source to a shared library, unless the cache has it.
 
-    The cache key covers the source, the compiler, its flags and the casadi version.
-
-    Args:
-        name: first part of the library's file name.
-        source: C source.
-        options: compiler options after ``FLAGS`` and the source file.
-
-    Returns:
-        path of the library.
-
-    Raises:
-        RunError: no compiler, no write access to the cache, or compilation failed.
-
+    The cache is $XDG_CACHE_HOME (or ~/.cache) / beetle_omni_ros. Its key covers the source, the
+    compiler, its flags and the casadi version. The library's file name begins with ``name``.
+    ``options`` are compiler options after ``FLAGS`` and the source file.
     """
     compiler = os.environ.get('CC') or shutil.which('gcc') or shutil.which('cc')
     if not compiler or not shutil.which(compiler.split()[0]):
         raise RunError('no C compiler found (looked for $CC, gcc, cc)')
     key = '\n'.join((source, compiler, ' '.join((*FLAGS, *options)), ca.__version__))
-    library = cache_folder() / f'{name}_{hashlib.sha256(key.encode()).hexdigest()[:20]}.so'
+    digest = hashlib.sha256(key.encode()).hexdigest()[:20]
+    cache = Path(os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache')
+    library = cache / 'beetle_omni_ros' / f'{name}_{digest}.so'
     if not library.is_file():
         _compile(compiler.split(), source, options, library)
     return library

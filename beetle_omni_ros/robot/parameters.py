@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 import hashlib
 import json
+from os.path import isfile
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +17,10 @@ from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import parameter, ParameterError, quoted
 
-LONGEST_NAME = 255      # characters of a file's name
 JOINT_NAMES = ('gimbal1', 'gimbal2', 'gimbal3', 'gimbal4')
 ROTOR_NAMES = ('rotor1', 'rotor2', 'rotor3', 'rotor4')
 TILT_LAG = 'tilt_lag'   # interval of a property; the logs determine it better than its parts
-DRAWS = 100             # of a robot with such a lag
+DRAWS = 1000            # of a robot with such a lag, of which the logs allow a fifth
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,19 +48,8 @@ class RotorParameters:
     thrust_max: float = parameter(doc='largest thrust', unit='N', low=0.1, high=200)
     time_constant: float = parameter(
         doc='first-order thrust response', unit='s', low=0.001, high=2)
-    map: tuple = parameter((), doc='thrust-to-PWM rows, one for each measured voltage')
-
-    def __post_init__(self):
-        """Bind the rows of the map, and check the thrust range and the spin."""
-        rows = tuple(row if isinstance(row, RotorMapRow) else
-                     schema.bind(RotorMapRow, row, prefix=f'rotors.map[{k}]')
-                     for k, row in enumerate(self.map))
-        object.__setattr__(self, 'map', rows)
-        if self.thrust_min >= self.thrust_max:
-            raise ParameterError(f'rotors.thrust_min ({self.thrust_min:g} N) must be below '
-                                 f'rotors.thrust_max ({self.thrust_max:g} N)')
-        if not np.all(np.abs(self.spin) == 1):
-            raise ParameterError(f'rotors.spin must hold +1 or -1, found {self.spin}')
+    map: tuple[RotorMapRow, ...] = parameter(
+        (), doc='thrust-to-PWM rows, one for each measured voltage')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,11 +84,7 @@ class JointParameters:
 
     @property
     def time_constant(self) -> float:
-        """
-        Time constant [s] of the first-order reduction.
-
-        The ramp lag Kd / Kp; with little damping the inertia's sqrt(J / Kp).
-        """
+        """Time constant [s] of the first-order reduction: Kd / Kp, or sqrt(J / Kp) if larger."""
         return max(float(np.mean(self.kd) / np.mean(self.kp)), 1 / self.natural_frequency)
 
 
@@ -161,11 +145,8 @@ class MultibodyParameters:
         """
         Parts of a robot that has only totals and perhaps the effect ``module_reaction``.
 
-        Args:
-            module_inertia: inertia of a tilting module about its joint axis [kg m^2]. Half of it
-                is assigned to its own inertia, half to its mass below the axis.
-            mass_moment: moment of that mass [kg m].
-
+        Half of the inertia of a module about its joint axis [kg m^2] is assigned to its own
+        inertia, half to its mass below the axis, which has this moment [kg m].
         """
         depth = 0.5 * module_inertia / mass_moment if mass_moment else 0.0
         own = module_inertia - mass_moment * depth
@@ -201,71 +182,43 @@ class RobotParameters:
             part, name = key.split('.')
             object.__setattr__(self, part, replace(getattr(self, part), **{
                 name: np.array(value) if np.ndim(value) else value}))
-        hover = self.mass * self.gravity / 4
-        if hover > self.rotors.thrust_max:
-            raise ParameterError(f'mass {self.mass:g} kg needs {hover:.1f} N a rotor to hover, '
-                                 f'above rotors.thrust_max {self.rotors.thrust_max:g} N')
-
-    def _checked_interval(self, key, pair):
-        try:
-            value = np.array(self._value(key), dtype=float)
-            low, high = (np.broadcast_to(np.array(bound, dtype=float), value.shape)
-                         for bound in pair)
-            fits = bool(np.all((low <= value) & (value <= high)))
-        except (AttributeError, KeyError, TypeError, ValueError):
-            fits = False
-        if not fits:
-            raise ParameterError(f"key 'intervals': {quoted(key)}: expected [lowest, highest] "
-                                 f'around a number of this file, found {quoted(pair)}')
-        return low, high
-
-    def _value(self, key):
-        """Value of a dotted key: of an effect, or of a section."""
-        at: Any = self
-        for name in key.split('.'):
-            at = at[name] if isinstance(at, dict) else getattr(at, name)
-        return at
+        if max(self.hover_thrust, self.rotors.thrust_min) > self.rotors.thrust_max:
+            raise ParameterError(
+                f'mass {self.mass:g} kg needs {self.hover_thrust:.1f} N a rotor to hover, '
+                f'expected rotors.thrust_max ({self.rotors.thrust_max:g} N) above this and above '
+                f'rotors.thrust_min ({self.rotors.thrust_min:g} N)')
+        if not np.all(np.abs(self.rotors.spin) == 1):
+            raise ParameterError(f'rotors.spin must hold +1 or -1, found {self.rotors.spin}')
 
     def interval(self, key: str) -> tuple:
         """95 % interval (lowest, highest) of a value by its dotted key; unmeasured: the value."""
-        if key in self.intervals:
-            return self.intervals[key]
-        value = np.array(self._value(key), dtype=float)
-        return value, value
+        value = np.array(value_of(self, key), dtype=float)
+        return self.intervals.get(key, (value, value))
 
     def drawn(self, rng: np.random.Generator) -> RobotParameters:
         """
         A robot with measured values drawn from their intervals, positive ones by ratio.
 
         The values of one joint have one place in their intervals: logs determine their ratios, the
-        lag Kd / Kp and the angle at which friction holds, better than the values. Places whose
-        ``tilt_lag`` is outside its interval contradict the logs and are drawn again.
-
-        Raises:
-            ParameterError: no place has a ``tilt_lag`` inside its interval.
-
+        lag Kd / Kp and the angle at which friction holds, better than the values. A robot whose
+        ``tilt_lag`` is outside its interval contradicts the logs and is drawn again; a
+        ParameterError, if each does.
         """
-        each, shared = ({key: pair for key, pair in self.intervals.items()
-                         if key != TILT_LAG and (np.shape(pair[0]) == (4,)) == joint}
-                        for joint in (True, False))
         low, high = self.intervals.get(TILT_LAG, (-np.inf, np.inf))
         for _ in range(DRAWS):
-            drawn = {key: _between(pair, rng.random(np.shape(pair[0])))
-                     for key, pair in shared.items()}
-            places = rng.random((DRAWS, 4))
-            made = {key: _between(pair, places) for key, pair in each.items()}
-            kp, kd = (made.get(f'effects.joint_bandwidth.{name}', getattr(self.joints, name))
+            place = rng.random(4)
+            drawn = {key: _between(pair, place if np.shape(pair[0]) == (4,)
+                                   else rng.random(np.shape(pair[0])))
+                     for key, pair in self.intervals.items() if key != TILT_LAG}
+            kp, kd = (drawn.get(f'effects.joint_bandwidth.{name}', getattr(self.joints, name))
                       for name in ('kp', 'kd'))
             lag = kd / kp + drawn.get('effects.joint_command_latency.delay',
                                       self.command_delays[0])
-            fits = np.broadcast_to((low <= lag) & (lag <= high), places.shape)
-            if fits.any(axis=0).all():
+            if np.all((low <= lag) & (lag <= high)):
                 break
         else:
             raise ParameterError(f"key 'intervals.{TILT_LAG}': no values of the other intervals "
                                  f'have such a lag, {np.mean([low, high], axis=0).tolist()} s')
-        first = fits.argmax(axis=0), range(4)
-        drawn |= {key: value[first] for key, value in made.items()}
         nested = schema.nest({key: value if np.ndim(value) else float(value)
                               for key, value in drawn.items()})
         effects = nested.pop('effects', {})
@@ -280,11 +233,8 @@ class RobotParameters:
         Read a robot file, see :func:`find_robot`; without a path, the shipped one.
 
         A file may begin with ``extends: FILE``, a file in the same folder or of the shipped
-        params. It then contains the differences only.
-
-        Raises:
-            ParameterError: names file, key and expected value.
-
+        params. It then contains the differences only. The intervals of values that differ are
+        left out. A ParameterError names file, key and expected value.
         """
         path = find_robot(path) if path else share_path('params/robot.yaml')
         if not path.is_file():
@@ -292,26 +242,33 @@ class RobotParameters:
                              for each in share_path('params').glob('robot_*.yaml'))
             raise ParameterError(f'{path}: no such file; expected a robot file, or one of the '
                                  f"shipped {', '.join(shipped)}")
-        robot = schema.bind(cls, _merged(path, ()), str(path))
+        robot = schema.bind(cls, _merged(path), str(path))
         try:
             mass_properties(replace(robot, effects={}))     # refuses an impossible main body
-            # not in __post_init__, because copies without some effects keep the others' intervals
-            replaced = catalogue.settings(robot.effects)
-            return replace(robot, intervals={
-                key: robot._checked_interval(key, pair) for key, pair in robot.intervals.items()
-                if key not in replaced})
         except ParameterError as error:
             raise ParameterError(f'{path}: {error}') from None
+        # not in __post_init__, because copies without some effects keep the others' intervals
+        intervals = {key: pair for key, pair in robot.intervals.items()
+                     if key not in catalogue.settings(robot.effects)}
+        for key, pair in intervals.items():
+            try:
+                value = np.array(value_of(robot, key), dtype=float)
+                low, high = (np.broadcast_to(np.array(bound, dtype=float), value.shape)
+                             for bound in pair)
+                fits = bool(np.all((low <= value) & (value <= high)))
+            except (TypeError, ValueError):
+                fits = False
+            if not fits:
+                raise ParameterError(
+                    f"{path}: key 'intervals': {quoted(key)}: expected [lowest, highest] around "
+                    f'a number of this file, found {quoted(pair)}')
+            intervals[key] = low, high
+        return replace(robot, intervals=intervals)
 
     def effect(self, key: str, neutral):
         """Value of an effect's parameter, 'effect.parameter'; ``neutral`` without the effect."""
         name, parameter = key.split('.')
         return self.effects.get(name, {}).get(parameter, neutral)
-
-    @property
-    def true_mass(self) -> float:
-        """Mass with the effect ``mass`` [kg]."""
-        return self.effect('mass.mass', self.mass)
 
     @property
     def torque_ratio(self) -> float:
@@ -373,60 +330,45 @@ class RobotParameters:
         return json.loads(json.dumps(values, default=np.ndarray.tolist))
 
 
-def find_robot(name: str | Path, beside: Path | None = None) -> Path:
+def find_robot(name: str | Path, seen: tuple[Path, ...] = ()) -> Path:
     """
-    Locate a robot file: the given path, else a shipped file of that name.
+    Path of a robot file: the given one, else a shipped file ``NAME`` or ``robot_NAME.yaml``.
 
-    Args:
-        name: path of a file, or the name of a file of the shipped params, of which
-            ``robot_NAME.yaml`` is also found as ``NAME``.
-        beside: the file that extends it; relative paths begin in its folder.
-
-    Returns:
-        The path; that of no file if neither exists.
-
+    ``seen`` are files that it must not be; the last one extends it, and relative paths begin in
+    the folder of that file. If there is no such file, the path is the given one.
     """
-    path = beside.parent / name if beside else Path(name)
-    # `extends: robot.yaml` in a file named robot.yaml means the shipped file
-    if path.is_file() and not (beside and path.resolve() == beside.resolve()):
-        return path
-    for each in (name, f'robot_{name}.yaml'):
-        with suppress(FileNotFoundError):
-            shipped = share_path(f'params/{each}')
-            if shipped.is_file():
-                return shipped
+    path, shipped = (seen[-1].parent / name if seen else Path(name)), share_path('params')
+    for each in (path, shipped / name, shipped / f'robot_{name}.yaml'):
+        if isfile(each) and each.resolve() not in seen:
+            return each
     return path
 
 
-def _merged(path: Path, seen: tuple[Path, ...]) -> dict:
+def _merged(path: Path, seen: tuple[Path, ...] = ()) -> dict:
     """Content of a robot file, merged with the file that it extends."""
     content = schema.load_yaml(path)
     if 'extends' not in content:
         return content
-    name = content.pop('extends')
-    if not isinstance(name, str) or not name.isprintable() or len(name) > LONGEST_NAME:
-        raise ParameterError(f"{path}: key 'extends': expected the name of a file, "
-                             f'found {quoted(name)}')
-    base = find_robot(name, path)
-    if not base.is_file():
-        raise ParameterError(f"{path}: key 'extends': no file {name!r} beside it or among the "
-                             'shipped params')
-    if base.resolve() in (*seen, path.resolve()):
-        raise ParameterError(f"{path}: key 'extends': {name} extends itself")
-    below = _merged(base, (*seen, path.resolve()))
+    name, seen = content.pop('extends'), (*seen, path.resolve())
+    base = find_robot(str(name), seen)
+    if not isfile(base) or base.resolve() in seen:
+        raise ParameterError(f"{path}: key 'extends': expected the name of another file beside it "
+                             f'or among the shipped params, found {quoted(name)}')
+    below = _merged(base, seen)
+    merged = _overlaid(below, content)
     if 'intervals' in below:    # those of values that the file replaces do not hold for it
-        moved = {'effects', 'joints'} & set(content)
+        same_lag = all(merged.get(part) == below.get(part) for part in ('joints', 'effects'))
         below['intervals'] = {key: pair for key, pair in below['intervals'].items()
-                              if not _states(content, key.split('.'))
-                              and not (key == TILT_LAG and moved)}
+                              if value_of(merged, key) == value_of(below, key)
+                              and (key != TILT_LAG or same_lag)}
     return _overlaid(below, content)
 
 
-def _states(content: Any, names: list[str]) -> bool:
-    """Whether a file's content states the value of a dotted key, or replaces what held it."""
-    first, *rest = names
-    return isinstance(content, dict) and first in content and (
-        not rest or first == 'effects' or _states(content[first], rest))
+def value_of(content: Any, key: str) -> Any:
+    """Value of a dotted key of a robot, or of the content of its file; None: it has none."""
+    for name in str(key).split('.'):
+        content = content.get(name) if isinstance(content, dict) else getattr(content, name, None)
+    return content
 
 
 def _between(interval, share):
@@ -469,12 +411,7 @@ class RigidPart:
 
 @dataclass(frozen=True)
 class MassProperties:
-    """
-    All parts of the robot with its tilts at zero, in base_link.
-
-    A robot file contains the totals (mass, inertia about the centre of gravity), the tilting
-    modules and the end-effector. The main body is the difference.
-    """
+    """All parts of the robot with its tilts at zero, in base_link."""
 
     main_body: RigidPart
     modules: tuple[RigidPart, ...]  # tilting, four
@@ -488,12 +425,8 @@ def combined(parts: list[RigidPart]) -> RigidPart:
     """Combine parts into one rigid part."""
     mass = sum(part.mass for part in parts)
     centre = np.sum([part.mass * part.centre for part in parts], axis=0) / mass
-    return RigidPart(mass, centre, inertia_about(centre, parts))
-
-
-def inertia_about(point: np.ndarray, parts: list[RigidPart]) -> np.ndarray:
-    """Inertia (3, 3) of several parts about ``point`` [m]."""
-    return np.sum([part.inertia_about(point) for part in parts], axis=0)
+    return RigidPart(mass, centre, sum((part.inertia_about(centre) for part in parts),
+                                       np.zeros((3, 3))))
 
 
 def mass_properties(robot: RobotParameters, variation: Variation | None = None) -> MassProperties:
@@ -501,12 +434,7 @@ def mass_properties(robot: RobotParameters, variation: Variation | None = None) 
     Mass properties of all parts.
 
     The tilt axes contain the rotor centres of ``robot.rotors.positions``. Mass, centre and inertia
-    of the main body follow from the totals.
-
-    Raises:
-        ParameterError: the parts are heavier than the robot, or the inertia of the main body is
-            impossible.
-
+    of the main body follow from the totals; a ParameterError, if they are impossible.
     """
     variation = variation or Variation()
     parts, outward = robot.parts, robot.tilt_axes
@@ -521,7 +449,7 @@ def mass_properties(robot: RobotParameters, variation: Variation | None = None) 
     ball = RigidPart(parts.end_effector.mass, main_origin + [0.0, 0.0, parts.end_effector.height],
                      np.zeros((3, 3)))
 
-    mass = robot.true_mass * variation.mass_scale
+    mass = robot.effect('mass.mass', robot.mass) * variation.mass_scale
     total_inertia = np.array(robot.effect('inertia.inertia', robot.inertia))
     centre = variation.centre_of_mass + robot.effect('centre_of_mass.offset', (0.0,) * 3)
     known = [*modules, ball]
@@ -531,8 +459,8 @@ def mass_properties(robot: RobotParameters, variation: Variation | None = None) 
                              f'the whole robot {mass:g} kg; expected a main body with mass')
     moment = mass * centre - np.sum([part.mass * part.centre for part in known], axis=0)
     main_body = RigidPart(rest, moment / rest, np.zeros((3, 3)))
-    inertia = np.diag(total_inertia * variation.inertia_scale) - inertia_about(
-        centre, [main_body, *known])
+    inertia = np.diag(total_inertia * variation.inertia_scale) - sum(
+        part.inertia_about(centre) for part in [main_body, *known])
     moments = np.linalg.eigvalsh(inertia)
     if moments[0] <= 0 or moments[0] + moments[1] < moments[2]:
         raise ParameterError(f'inertia: {_text(total_inertia)} kg m^2 leaves the main body the '

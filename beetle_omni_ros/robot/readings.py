@@ -73,16 +73,9 @@ class SpikeFilter:
     Rejects outliers of the IMU: a jump is used only if the next reading confirms it.
 
     An impact pushes again in about the same direction, and the rate that it causes remains. Two
-    independent errors in a row rarely agree in all six axes.
-
-    Args:
-        force_change: largest change of the specific force between two readings [m/s^2].
-        rate_change: largest change of the angular rate between two readings [rad/s].
-
-    Attributes:
-        lasted: whether the latest reading confirmed a held one. That is an impact, of which at
-            least one reading is missing.
-
+    independent errors in a row rarely agree in all six axes. A jump is a change between two
+    readings by more than ``force_change`` [m/s^2] or ``rate_change`` [rad/s]. ``lasted``: the
+    latest reading confirmed a held one, as in an impact.
     """
 
     def __init__(self, force_change: float, rate_change: float):

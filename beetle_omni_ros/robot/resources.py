@@ -13,10 +13,6 @@ def share_path(relative: str) -> Path:
 
     The order is: source checkout, prefixes of ``AMENT_PREFIX_PATH`` (colcon, apt), prefix of the
     Python environment (pip). Edits of a parameter file in a checkout thus take effect at once.
-
-    Raises:
-        FileNotFoundError: no installation has the file; the text lists the searched places.
-
     """
     roots = [Path(__file__).resolve().parents[2]]
     for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep):

@@ -1,10 +1,8 @@
 """
 Rotations with quaternions in scipy's order (x, y, z, w), body to world.
 
-The estimator calls these functions hundreds of times a second. They convert arrays to plain
-floats first, because arithmetic on numpy scalars takes several times as long. For the same reason
-this package uses ``ndarray.dot`` in each cycle: for a few numbers it takes a third of the time of
-``@``, with the same result.
+These functions convert arrays to plain floats first, because arithmetic on numpy scalars takes
+several times as long. For a few numbers ``ndarray.dot`` takes a third of the time of ``@``.
 """
 
 from collections.abc import Sequence

@@ -22,13 +22,13 @@ import yaml
 from beetle_omni_ros.robot.resources import share_path
 
 NAMES = tuple[str, ...]     # type of a parameter that is a list of names
-# Type of a field that is no number -> types of its value in a file, and their name.
+NUMBER = (int, float, np.number)
+# Type of a field -> types of its value in a file, and their name.
 KINDS: dict[Any, tuple[Any, str]] = {
-    bool: ((bool,), 'true or false'), str: ((str,), 'text'), tuple: ((list, tuple), 'a list'),
+    bool: (bool, 'true or false'), int: (NUMBER, 'an integer'), float: (NUMBER, 'a number'),
+    np.ndarray: (object, 'numbers'), str: (str, 'text'), tuple: ((list, tuple), 'a list'),
     NAMES: ((list, tuple), 'a list of names'), dict: ((dict, NoneType), 'a mapping')}
-MAX_BYTES = 1 << 20     # of a file; the shipped ones have up to 16 kB
-QUOTED = 200            # characters of a value in a message
-FILE_NAME, KEY, WHOLE = 500, 80, 1000    # characters of them in a message
+QUOTED, MESSAGE = 200, 1500     # characters of a value in a message, and of a message
 
 _short = reprlib.Repr()
 _short.maxlevel, _short.maxlist, _short.maxtuple, _short.maxdict = 3, 8, 8, 8
@@ -41,6 +41,9 @@ class RunError(RuntimeError):
 
 class ParameterError(ValueError):
     """A parameter file or value cannot be used; the text names file, key and expected value."""
+
+    def __init__(self, text: str):
+        super().__init__(shortened(text, MESSAGE))
 
 
 def quoted(value: Any) -> str:
@@ -60,16 +63,9 @@ def parameter(default: Any = MISSING, *, doc: str, unit: str = '', low: float | 
     """
     Declare one dataclass field as a parameter.
 
-    Args:
-        default: value if the file omits it; a list is copied into an array.
-        doc: meaning in one phrase, for the reference page and ROS.
-        unit: SI unit, '' for a pure number.
-        low: smallest legal value, inclusive (each element of an array).
-        high: largest legal value, inclusive.
-        shape: shape of an array parameter.
-        choices: legal strings.
-        read_only: whether it can change only at start.
-
+    ``default`` is the value if the file omits it, ``doc`` the meaning in one phrase, ``low`` and
+    ``high`` are the smallest and largest legal value of a number or of each element of an array.
+    A ``read_only`` parameter of a node can change only at its start.
     """
     metadata = {'doc': doc, 'unit': unit, 'low': low, 'high': high, 'shape': shape,
                 'choices': choices, 'read_only': read_only}
@@ -86,52 +82,32 @@ def group(cls: type, doc: str = ''):
 
 
 def read_yaml(path: str | Path) -> Any:
-    """
-    Read the one document of a YAML file.
-
-    Raises:
-        ParameterError: missing, unreadable or too large file, or broken YAML.
-
-    """
-    at = shortened(str(path), FILE_NAME)
+    """Read the one document of a YAML file; a ParameterError begins with the path."""
     try:
-        with open(path, 'rb') as file:
-            data = file.read(MAX_BYTES + 1)
+        data = Path(path).read_bytes()
     except (OSError, ValueError) as error:
-        raise ParameterError(f'{at}: cannot be read ({getattr(error, "strerror", error)})') \
+        raise ParameterError(f'{path}: cannot be read ({getattr(error, "strerror", error)})') \
             from None
-    if len(data) > MAX_BYTES:
-        raise ParameterError(f'{at}: larger than {MAX_BYTES} bytes')
-    return parse_yaml(data, f'{at}: ')
+    return parse_yaml(data, f'{path}: ')
 
 
 _parsed = lru_cache(maxsize=32)(yaml.safe_load)     # a flight reads files several times, in 40 ms
 
 
 def parse_yaml(data: bytes | str, at: str = '') -> Any:
-    """Read the one document of a YAML text; raises ParameterError that starts with ``at``."""
+    """Read the one document of a YAML text; a ParameterError begins with ``at``."""
     try:
         return deepcopy(_parsed(data))
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, RecursionError, AttributeError, LookupError, TypeError,
+            ValueError) as error:   # PyYAML raises the others at `0b_` or a date with month 13
         mark = getattr(error, 'problem_mark', None)
         where = f' at line {mark.line + 1}, column {mark.column + 1}' if mark else ''
         problem = getattr(error, 'problem', None) or str(error)
         raise ParameterError(f'{at}not valid YAML{where} ({shortened(problem)})') from None
-    except RecursionError:
-        raise ParameterError(f'{at}not valid YAML (too deep)') from None
-    except (AttributeError, LookupError, TypeError, ValueError) as error:
-        # PyYAML's own errors about values such as `0b_` or a date with month 13
-        raise ParameterError(f'{at}not valid YAML ({shortened(str(error))})') from None
 
 
 def load_yaml(path: str | Path) -> dict:
-    """
-    Read a YAML mapping, plain or below ``ros__parameters``.
-
-    Raises:
-        ParameterError: missing or unreadable file, broken YAML, or no mapping.
-
-    """
+    """Read a YAML mapping, plain or below ``ros__parameters``; {} of an empty file."""
     data = read_yaml(path)
     for value in data.values() if isinstance(data, dict) else ():
         if isinstance(value, dict) and set(value) == {'ros__parameters'}:
@@ -159,34 +135,17 @@ class ParameterFile:
 
     @classmethod
     def load(cls, path: str | Path | None = None) -> Self:
-        """
-        Read a file, by default the shipped one.
-
-        Raises:
-            ParameterError: names file, key and expected value.
-
-        """
-        return load(cls, path or share_path(f'params/{cls._file}'))
-
-
-def load(cls: type, path: str | Path):
-    """Read ``path`` and bind it to the parameter dataclass ``cls``."""
-    return bind(cls, load_yaml(path), str(path))
+        """Read a file, by default the shipped one; an error names file, key and expectation."""
+        path = path or share_path(f'params/{cls._file}')
+        return bind(cls, load_yaml(path), str(path))
 
 
 def bind(cls: type, mapping: dict, where: str = '', prefix: str = ''):
     """
-    Build ``cls`` from a nested mapping.
+    Build a dataclass of :func:`parameter` and :func:`group` fields from a nested mapping.
 
-    Args:
-        cls: a dataclass whose fields come from :func:`parameter` or :func:`group`.
-        mapping: keys to values, nested like the dataclass.
-        where: file name, for messages.
-        prefix: dotted path of ``cls`` in the file, for messages.
-
-    Raises:
-        ParameterError: unknown or missing key, wrong type, shape or range.
-
+    A ParameterError names ``where``, the file, and the key. ``prefix`` is the dotted path of
+    ``cls`` in the file, with a dot at its end.
     """
     if not isinstance(mapping, dict):
         raise ParameterError(f'{_at(where, prefix)}: expected a mapping, '
@@ -195,84 +154,64 @@ def bind(cls: type, mapping: dict, where: str = '', prefix: str = ''):
     known = {f.name: f for f in fields(cls) if f.init}
     for key in mapping:
         if key not in known:
-            raise unknown(_at(where, _join(prefix, key)), 'key', key, known)
+            raise unknown(_at(where, f'{prefix}{key}'), 'key', key, known)
     values: dict[str, Any] = {}
     for name, entry in known.items():
-        key, hint = _join(prefix, name), hints[name]
+        at, hint = _at(where, f'{prefix}{name}'), hints[name]
         if name not in mapping:
             if entry.default is MISSING and entry.default_factory is MISSING:
-                raise ParameterError(f'{_at(where, key)}: missing{_unit(entry.metadata)}')
+                raise ParameterError(f'{at}: missing{_unit(entry.metadata)}')
             continue
-        value = mapping[name]
-        if NoneType in get_args(hint):      # Class | None
-            hint = get_args(hint)[0]
-            if value is None:
-                values[name] = None
-                continue
-        nested = is_dataclass(hint)
-        values[name] = bind(hint, value, where, key) if nested \
-            else check(entry, hint, value, _at(where, key))
+        value, (inner, *more) = mapping[name], get_args(hint) or (hint,)
+        nested, optional = is_dataclass(inner), more == [NoneType]
+        if value is None and optional:
+            values[name] = None
+        elif nested and more == [...]:      # tuple[Class, ...]
+            values[name] = tuple(bind(inner, row, where, f'{prefix}{name}[{k}].')
+                                 for k, row in enumerate(check(entry, tuple, value, at)))
+        elif nested:
+            values[name] = bind(inner, value, where, f'{prefix}{name}.')
+        else:
+            values[name] = check(entry, inner if optional else hint, value, at)
     try:
         return cls(**values)
     except ParameterError as error:
-        text = f'{_at(where, prefix)}: {error}' if where else str(error)
-        raise ParameterError(shortened(text, FILE_NAME + WHOLE)) from None
+        raise ParameterError(f'{_at(where, prefix)}: {error}' if where else str(error)) from None
 
 
 def check(entry, hint: Any, value: Any, at: str) -> Any:
     """Validate a value of a field; ``at`` is file and key, for messages."""
-    if hint is np.ndarray:
-        return _array(entry, value, at)
-    if hint in (int, float):
-        return _number(entry, hint, value, at)
-    kinds, what = KINDS[hint]
-    if not isinstance(value, kinds) or (
-            hint == NAMES and not all(isinstance(name, str) for name in value)):
-        raise ParameterError(f'{at}: expected {what}, found {quoted(value)}')
-    choices = entry.metadata['choices']
+    spec, (kinds, what) = entry.metadata, KINDS[hint]
+    fits = isinstance(value, kinds) and isinstance(value, bool) == (hint is bool)
+    if fits and hint == NAMES:
+        fits = all(isinstance(name, str) for name in value)
+    if fits and hint in (int, float, np.ndarray):
+        array = numbers(value, at, spec)
+        if hint is np.ndarray:
+            shape = spec['shape'] or (array.size,)
+            if array.ndim == 1 and array.size == np.prod(shape):
+                return array.reshape(shape)     # ROS has flat arrays only
+            if array.shape != shape:
+                raise ParameterError(f'{at}: expected shape {shape}, found {array.shape}')
+            return array
+        fits = value == hint(value)
+    if not fits:
+        raise ParameterError(f'{at}: expected {what}{_unit(spec)}, found {quoted(value)}')
+    choices = spec['choices']
     if choices and value not in choices:
         raise ParameterError(f"{at}: expected one of {', '.join(choices)}, found {quoted(value)}")
-    return hint(value or ()) if hint in (tuple, dict, NAMES) else value
+    return hint(() if value is None else value)
 
 
 def unknown(at: str, what: str, name: Any, known: Iterable[str]) -> ParameterError:
     """Error of a name that is not one of the known ones."""
-    near = get_close_matches(str(name)[:KEY], known, n=1)
+    near = get_close_matches(str(name), known, n=1)
     hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(known)}"
     return ParameterError(f'{at}: unknown {what}; {hint}')
 
 
-def _number(entry, hint, value, at):
-    """Finite int or float within its range."""
-    found = numbers(value, at, entry.metadata) if isinstance(
-        value, (int, float, np.number)) and not isinstance(value, bool) else None
-    if found is None or value != hint(value):
-        kind = 'an integer' if hint is int else 'a number'
-        raise ParameterError(f'{at}: expected {kind}{_unit(entry.metadata)}, '
-                             f'found {quoted(value)}')
-    return hint(value)
-
-
-def _array(entry, value, at):
-    """(n,) or the declared shape, of finite numbers within their range."""
-    array, shape = numbers(value, at, entry.metadata), entry.metadata['shape']
-    if shape is not None and array.shape == (np.prod(shape),):
-        array = array.reshape(shape)    # ROS has flat arrays only
-    if shape is not None and array.shape != tuple(shape):
-        raise ParameterError(f'{at}: expected shape {tuple(shape)}, found {array.shape}')
-    if shape is None and array.ndim != 1:
-        raise ParameterError(f'{at}: expected a list of numbers, found {quoted(value)}')
-    return array
-
-
 def numbers(value: Any, at: str, spec: Mapping[str, Any]) -> np.ndarray:
-    """
-    Convert to finite numbers from ``spec['low']`` to ``spec['high']`` [``spec['unit']``].
-
-    Raises:
-        ParameterError: the text starts with ``at``.
-
-    """
+    """Convert to finite numbers from ``spec['low']`` to ``spec['high']`` [``spec['unit']``]."""
     try:
         array = np.array(value, dtype=float)
     except (OverflowError, TypeError, ValueError):
@@ -293,30 +232,19 @@ def _unit(spec):
     return f" [{spec['unit']}]" if spec['unit'] else ''
 
 
-def _join(prefix, key):
-    key = shortened(str(key), KEY)
-    return f'{prefix}.{key}' if prefix else key
-
-
 def _at(where, key):
-    parts = (shortened(where, FILE_NAME), f"key '{key}'" if key else '')
-    return ': '.join(part for part in parts if part) or 'parameters'
+    """Place in a message; ``key`` may end with a dot."""
+    return ': '.join(filter(None, (where, key and f"key '{key.strip('.')}'"))) or 'parameters'
 
 
 def flatten(instance, prefix: str = ''):
-    """
-    Iterate over the leaves of a parameter dataclass.
-
-    Yields:
-        (dotted name, dataclass field, annotated type, value) of each leaf.
-
-    """
+    """Yield dotted name, dataclass field, annotated type and value of each parameter."""
     hints = get_type_hints(type(instance))
     for entry in fields(instance):
         value = getattr(instance, entry.name)
-        name = _join(prefix, entry.name)
+        name = f'{prefix}{entry.name}'
         if is_dataclass(hints[entry.name]):
-            yield from flatten(value, name)
+            yield from flatten(value, f'{name}.')
         else:
             yield name, entry, hints[entry.name], value
 

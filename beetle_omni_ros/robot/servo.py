@@ -3,15 +3,15 @@ Equation and time step of the tilt servo, for numpy, CasADi and torch.
 
     J q'' = clip(Kp (q* - q) - Kd q', effort limit) + load - friction,   |q'| <= rate limit
 
-Friction is Coulomb friction, and at low rates up to the stiction (Armstrong-Helouvry 1994). The
-limit applies to the motor's torque, not to the load. A namespace holds the functions in which the
-libraries differ. Torch and C code for training and control are generated from CasADi.
+Friction is Coulomb friction, and at low rates up to the stiction (Armstrong-Helouvry 1994). Torch
+and C code for training and control are generated from CasADi.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from types import SimpleNamespace
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -20,22 +20,10 @@ from beetle_omni_ros.robot.effects import delaying
 from beetle_omni_ros.robot.parameters import JointParameters, RobotParameters
 
 SLIDING_RATE = 0.05     # [rad/s] over which friction falls from stiction to Coulomb friction
-
-
-class Namespace(NamedTuple):
-    """Functions of one library."""
-
-    minimum: Any
-    maximum: Any
-    exp: Any
-    sqrt: Any
-    where: Any
-    sin: Any
-    cos: Any
-
-
-NUMPY = Namespace(np.minimum, np.maximum, np.exp, np.sqrt, np.where, np.sin, np.cos)
-CASADI = Namespace(ca.fmin, ca.fmax, ca.exp, ca.sqrt, ca.if_else, ca.sin, ca.cos)
+# Functions in which the libraries differ, by numpy's names.
+NUMPY: Any = np
+CASADI: Any = SimpleNamespace(minimum=ca.fmin, maximum=ca.fmax, exp=ca.exp, sqrt=ca.sqrt,
+                              where=ca.if_else, sin=ca.sin, cos=ca.cos)
 
 
 @dataclass(frozen=True)
@@ -56,31 +44,25 @@ class Servo:
     @classmethod
     def of(cls, joints: JointParameters, **more) -> Servo:
         """Servo of a robot file; ``more`` adds or replaces numbers."""
-        own = {'inertia': joints.inertia, 'kp': joints.kp, 'kd': joints.kd,
-               'velocity_limit': joints.velocity_limit, 'effort_limit': joints.effort_limit}
-        return cls(**{**own, **more})
+        return cls(**{name: getattr(joints, name) for name in (
+            'inertia', 'kp', 'kd', 'velocity_limit', 'effort_limit')} | more)
 
-    def friction(self, space: Namespace, rate):
+    def friction(self, space, rate):
         """Largest friction at a rate [N m]."""
         return self.coulomb + (self.stiction - self.coulomb) * self.fading(space, rate)
 
-    def fading(self, space: Namespace, rate):
+    def fading(self, space, rate):
         """Remaining fraction of the excess of stiction at a rate."""
         x = rate / self.fading_rate
         return space.exp(-x * x if self.gaussian else space.minimum(x, -x))
 
-    def motor(self, space: Namespace, error, rate):
+    def motor(self, space, error, rate):
         """Torque of the motor [N m] at a position error [rad] and a rate [rad/s]."""
         torque = self.kp * error - self.kd * rate
         return torque if self.effort_limit is None else _within(space, torque, self.effort_limit)
 
-    def acceleration(self, space: Namespace, target, tilt, rate, load=0.0):
-        """
-        Acceleration [rad/s^2] at one instant, smooth except at the limits.
-
-        Friction changes its sign smoothly over the sliding rate. At the rate limit the
-        acceleration outward is zero.
-        """
+    def acceleration(self, space, target, tilt, rate, load=0.0):
+        """Acceleration [rad/s^2] at one instant, smooth except at the limits."""
         torque = self.motor(space, target - tilt, rate) + load
         if self.coulomb is not None:
             speed = rate / SLIDING_RATE
@@ -104,16 +86,14 @@ class Step:
 
     """
 
-    def __init__(self, space: Namespace, servo: Servo, duration: float):
+    def __init__(self, space, servo: Servo, duration: float):
         self._space, self._servo, self._half = space, servo, 0.5 * duration
         per_torque = duration / servo.inertia
         damping = 0.5 * per_torque * servo.kd
         self.gain = per_torque / (1 + damping)      # change of rate for each N m [rad/s]
         self._loss = 2 * damping / (1 + damping)    # fraction of the rate lost by damping
-        self._keep, self._stiff = 1 - self._loss, servo.kp * self.gain
+        self._stiff = servo.kp * self.gain
         self._per_torque, self._damping = per_torque, damping
-        if servo.effort_limit is not None:
-            self._push = -per_torque * servo.effort_limit, per_torque * servo.effort_limit
         if servo.coulomb is not None:
             self._slides = self.gain * servo.coulomb
             self._sticks = self.gain * (servo.stiction - servo.coulomb)
@@ -130,19 +110,14 @@ class Step:
 
         """
         space, servo = self._space, self._servo
-        push = self._stiff * (target - tilt)
-        if servo.effort_limit is None:
-            after = self._keep * rate + push
-            if load is not None:
-                after = after + self.gain * load
-        else:
-            push = push - self._loss * rate
-            if load is not None:
-                push = push - self._damping * self.gain * load
-            least, most = self._push
-            after = rate + space.minimum(space.maximum(push, least), most)
-            if load is not None:
-                after = after + self._per_torque * load
+        push = self._stiff * (target - tilt) - self._loss * rate
+        if load is not None:
+            push = push - self._damping * self.gain * load
+        if servo.effort_limit is not None:
+            push = _within(space, push, self._per_torque * servo.effort_limit)
+        after = rate + push
+        if load is not None:
+            after = after + self._per_torque * load
         if servo.coulomb is not None:
             after = after - _within(
                 space, after, self._slides + self._sticks * servo.fading(space, rate))
@@ -191,10 +166,10 @@ def _within(space, value, limit):
 class Responses:
     """Limits of the response of any servo and rotor of one robot, (lowest, highest)."""
 
-    servo_lag: tuple[float, float]      # time constant of the first-order reduction [s]
-    servo_delay: tuple[float, float]    # of tilt commands and encoders by the effects [s]
-    rotor_lag: tuple[float, float]      # time constant of the thrust [s]
-    rotor_delay: tuple[float, float]    # of thrust commands by the effects [s]
+    servo_lag: tuple[float, ...]    # time constant of the first-order reduction [s]
+    servo_delay: tuple[float, ...]  # of tilt commands and encoders by the effects [s]
+    rotor_lag: tuple[float, ...]    # time constant of the thrust [s]
+    rotor_delay: tuple[float, ...]  # of thrust commands by the effects [s]
     friction: float     # largest angle at which friction holds a servo beside its target [rad]
 
     @classmethod
@@ -212,7 +187,7 @@ class Responses:
         return cls(
             servo_lag=(float(np.min(fastest)), float(np.max(slowest))),
             servo_delay=_delay(robot, 'tilt', 'encoders'),
-            rotor_lag=_pair(_range(robot, 'rotors.time_constant', 'rotor_lag')),
+            rotor_lag=tuple(map(float, _range(robot, 'rotors.time_constant', 'rotor_lag'))),
             rotor_delay=_delay(robot, 'thrust'), friction=friction)
 
 
@@ -223,10 +198,6 @@ def _range(robot, key, effect):
 
 
 def _delay(robot, *what):
-    return _pair(sum(np.array(robot.interval(f'effects.{name}.delay'))
-                     for name in delaying(*what) if name in robot.effects) + np.zeros(2))
-
-
-def _pair(interval):
-    low, high = interval
-    return float(low), float(high)
+    return tuple(map(float, sum((np.array(robot.interval(f'effects.{name}.delay'))
+                                 for name in delaying(*what) if name in robot.effects),
+                                np.zeros(2))))

@@ -29,20 +29,12 @@ class ThrustMap:
     """
 
     def __init__(self, rotors: RotorParameters):
-        """
-        Tabulate the cubics of a robot file.
-
-        Raises:
-            ParameterError: no row, two rows at one voltage, or a duty that does not rise from stop
-                to full.
-
-        """
+        """Tabulate the cubics of a robot file; a ParameterError refuses an impossible map."""
         rows = sorted(rotors.map, key=lambda row: row.voltage)
-        if not rows:
-            raise ParameterError('rotors.map: expected at least one row, found none')
         self.voltages = np.array([row.voltage for row in rows])
-        if np.any(np.diff(self.voltages) <= 0):
-            raise ParameterError(f'rotors.map: two rows at one voltage, {self.voltages} V')
+        if not rows or np.any(np.diff(self.voltages) <= 0):
+            raise ParameterError('rotors.map: expected one or more rows, each at another voltage, '
+                                 f'found {self.voltages.tolist()} V')
         self.thrust_limits = np.array([row.thrust_max for row in rows])
         self._duty = np.empty((len(rows), CELLS + 1))
         for duty, row in zip(self._duty, rows):
@@ -53,7 +45,7 @@ class ThrustMap:
                     f'rotors.map at {row.voltage:g} V: duty {duty.min():.1f} to {duty.max():.1f} '
                     f'% over 0 to {row.thrust_max:g} N, expected a rise within {STOP_DUTY:g} to '
                     f'{FULL_DUTY:g} %')
-        self._blend_voltage, self._blend = np.nan, np.zeros(0)      # of the latest voltage
+        self._voltage, self._blend = np.nan, np.zeros(0)    # latest voltage, and its duties
 
     def thrust_limit(self, voltage):
         """Largest thrust [N] at ``voltage`` [V]; beyond the rows, that of the nearest row."""
@@ -69,20 +61,14 @@ class ThrustMap:
         """Whether ``thrust`` [N] exceeds the limit at ``voltage`` [V]; shapes broadcast."""
         return np.asarray(thrust) > self.thrust_limit(voltage)
 
-    def duty(self, thrust, voltage) -> np.ndarray:
+    def duty(self, thrust, voltage: float) -> np.ndarray:
         """
-        Duty [% of 2000 us] for ``thrust`` [N] at ``voltage`` [V]; shapes broadcast.
+        Duties [% of 2000 us] for thrusts [N] at one voltage [V].
 
         Thrust is limited to the largest at this voltage; zero or less stops the rotor.
         """
-        thrust = np.asarray(thrust, dtype=float)
-        low, weight = self._rows(voltage)
-        position = np.clip(thrust / self.thrust_limit(voltage), 0, 1) * CELLS
-        cell = np.minimum(position.astype(int), CELLS - 1)
-        table, high = self._duty, np.minimum(low + 1, len(self.voltages) - 1)
-        left = (1 - weight) * table[low, cell] + weight * table[high, cell]
-        right = (1 - weight) * table[low, cell + 1] + weight * table[high, cell + 1]
-        return np.where(thrust > 0, left + (position - cell) * (right - left), STOP_DUTY)
+        share = np.asarray(thrust) / self.thrust_limit(voltage)
+        return np.where(share > 0, np.interp(share, FRACTIONS, self._duties(voltage)), STOP_DUTY)
 
     def thrust(self, duty, voltage: float) -> np.ndarray:
         """
@@ -90,25 +76,20 @@ class ThrustMap:
 
         It is zero below the duty of zero thrust, and the limit above the largest measured duty.
         """
-        if voltage != self._blend_voltage:
-            low, weight = self._rows(voltage)
-            high = min(low + 1, len(self.voltages) - 1)
-            self._blend_voltage = voltage
-            self._blend = (1 - weight) * self._duty[low] + weight * self._duty[high]
-        return np.interp(duty, self._blend, FRACTIONS) * self.thrust_limit(voltage)
+        return np.interp(duty, self._duties(voltage), FRACTIONS) * self.thrust_limit(voltage)
 
     def command(self, thrust, voltage) -> np.ndarray:
         """Normalised command, 0 (stop) to 1 (2000 us), for ``thrust`` [N] at ``voltage`` [V]."""
         return (self.duty(thrust, voltage) - STOP_DUTY) / (FULL_DUTY - STOP_DUTY)
 
-    def _rows(self, voltage):
-        """Row below ``voltage`` and weight of the row above."""
-        rows = len(self.voltages)
-        if rows == 1:
-            return np.zeros(np.shape(voltage), dtype=int)[()], np.zeros(np.shape(voltage))[()]
-        place = np.interp(voltage, self.voltages, np.arange(rows))
-        low = np.minimum(np.asarray(place).astype(int), rows - 2)[()]
-        return low, place - low
+    def _duties(self, voltage):
+        """Duties (CELLS + 1,) at FRACTIONS of the largest thrust at a voltage."""
+        if voltage != self._voltage:
+            place = np.interp(voltage, self.voltages, np.arange(len(self.voltages)))
+            low, high = int(place), int(np.ceil(place))
+            self._voltage = voltage
+            self._blend = (1 - place + low) * self._duty[low] + (place - low) * self._duty[high]
+        return self._blend
 
 
 def duty_of_command(command) -> np.ndarray:

@@ -23,7 +23,7 @@ from beetle_omni_ros.messages.bag_types import from_bytes, new, offered, to_byte
 from beetle_omni_ros.messages.conversions import BODY, nanoseconds, WORLD
 from beetle_omni_ros.messages.topics import ALL, EVENT, LATCHED, Qos, topic_of, TOPICS
 from beetle_omni_ros.robot.schema import ParameterError, read_yaml
-from beetle_omni_ros.robot.urdf import description, joints
+from beetle_omni_ros.robot.urdf import description, links
 from beetle_omni_ros.runs.bag import META_KEY
 from beetle_omni_ros.runs.files import write_text
 from beetle_omni_ros.runs.log import Recorder, RUN_STATUS
@@ -68,9 +68,9 @@ class FrameWriter:
 
     def __init__(self, write: Callable[[str, str, bytes, float], None], prefix: str):
         self._write, self._text, self._prefix = write, description(), prefix
-        tree = joints()
-        self._fixed = [joint for joint in tree if joint.axis is None]
-        self._moving = {joint.name: joint for joint in tree if joint.axis is not None}
+        tree = [link for link in links() if link.parent]
+        self._fixed = [link for link in tree if not link.joint]
+        self._moving = {link.joint: link for link in tree if link.joint}
         self._latest = None     # message of joint_states
         self._due = None
 
@@ -91,15 +91,15 @@ class FrameWriter:
         at, turn = odom.pose.pose.position, odom.pose.pose.orientation
         frames = [(WORLD, BODY, odom.header.stamp, (at.x, at.y, at.z),
                    (turn.x, turn.y, turn.z, turn.w)),
-                  *((joint.parent, joint.child, stamp, joint.position, joint.turned(angles[name]))
-                    for name, joint in self._moving.items())]
+                  *((link.parent, link.name, stamp, link.position, link.turned(angles[name]))
+                    for name, link in self._moving.items())]
         if not all(isfinite(x) for *_, position, quaternion in frames
                    for x in (*position, *quaternion)):
             return
         if self._due is None:
             self._write('/tf_static', TRANSFORMS, _transforms(
-                [(joint.parent, joint.child, odom.header.stamp, joint.position, joint.quaternion)
-                 for joint in self._fixed]), t)
+                [(link.parent, link.name, odom.header.stamp, link.position, link.quaternion)
+                 for link in self._fixed]), t)
             text = new(TEXT)
             text.data = self._text
             self._write(f'{self._prefix}robot_description', TEXT, to_bytes(text, TEXT), t)

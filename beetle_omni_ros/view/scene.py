@@ -145,12 +145,11 @@ class Robot:
         self._root = scene.add_frame(name, show_axes=False, visible=False)
         self._joints, self._arrows, paths = {}, {}, {}
         for link in links():
-            above = name if link.joint is None else paths[link.joint.parent]
-            path = paths[link.name] = f'{above}/{link.name}'
-            node = scene.add_frame(path, show_axes=False, wxyz=wxyz(link.turned()), position=(
-                0.0, 0.0, 0.0) if link.joint is None else link.joint.position)
-            if link.moves in JOINT_NAMES:
-                self._joints[link.moves] = (link, node)
+            path = paths[link.name] = f'{paths.get(link.parent, name)}/{link.name}'
+            node = scene.add_frame(path, show_axes=False, wxyz=wxyz(link.quaternion),
+                                   position=link.position)
+            if link.joint in JOINT_NAMES:
+                self._joints[link.joint] = (link, node)
             if link.name in ROTOR_NAMES:
                 self._arrows[link.name] = scene.add_arrows(
                     f'{path}/thrust', np.zeros((1, 2, 3)), THRUST, shaft_radius=0.008,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters, ROTOR_NAMES
+from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 
@@ -69,14 +69,6 @@ def test_totals_equal_those_of_the_robot_file():
     assert mass == pytest.approx(ROBOT.mass, rel=1e-8)
     np.testing.assert_allclose(centre, 0, atol=1e-9)
     np.testing.assert_allclose(inertia, np.diag(ROBOT.inertia), atol=1e-9)
-
-
-def test_rotor_positions_and_axes_agree_with_the_robot_file():
-    placed = poses()
-    for k, name in enumerate(ROTOR_NAMES):
-        rotation, position = placed[name]
-        np.testing.assert_allclose(position, ROBOT.rotors.positions[k], atol=1e-8)
-        np.testing.assert_allclose(rotation[:, 2], [0, 0, 1], atol=1e-8)
 
 
 def test_gimbals_turn_about_their_arms_within_their_limits():

@@ -12,7 +12,7 @@ import yaml
 
 from beetle_omni_ros import cli
 from beetle_omni_ros.identify.servo.robot import own_delay
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.parameters import RobotParameters, value_of
 from beetle_omni_ros.robot.resources import share_path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -87,6 +87,6 @@ def test_the_recorded_command_gives_the_shipped_file(tmp_path, monkeypatch):
     again = RobotParameters.load(tmp_path / 'made.yaml')
     assert again.rotors.map[0].coefficients == pytest.approx(MEASURED.rotors.map[0].coefficients)
     for key, ends in MEASURED.intervals.items():
-        assert again._value(key) == pytest.approx(MEASURED._value(key), rel=0.02, abs=2e-5)
+        assert value_of(again, key) == pytest.approx(value_of(MEASURED, key), rel=0.02, abs=2e-5)
         for one, other in zip(again.interval(key), ends, strict=True):
             assert one == pytest.approx(other, rel=0.05, abs=2e-5)

@@ -123,7 +123,7 @@ def test_sticks_and_buttons_are_actions_until_the_joystick_is_silent():
 @pytest.mark.parametrize(('arguments', 'expected'), [
     (['wheel'], "source 'wheel': expected keyboard or joystick or terminal"),
     (['keyboard'], 'standard input is no terminal'),
-    (['terminal', '--poses', 'none.yaml'], 'none.yaml'),
+    (['terminal', '--params', 'none.yaml'], 'none.yaml'),
     (['terminal', '--domain-id', '300'], "'--domain-id': Input should be")])
 def test_an_unusable_source_is_refused_in_one_line(capsys, monkeypatch, arguments, expected):
     monkeypatch.setattr(sys, 'stdin', open(os.devnull))

@@ -18,8 +18,6 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 ROBOT = RobotParameters.load()
 LIMIT = ROBOT.joints.position_limit
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
-LOST = ActuatorHealth(rotors=(False, True, True, True))
-STUCK = ActuatorHealth(stuck=(None, 1.5, None, None))
 
 
 def lost(*rotors):
@@ -30,7 +28,9 @@ def stuck(joint, angle):
     return ActuatorHealth(stuck=tuple(angle if i == joint else None for i in range(4)))
 
 
-KINDS = [lost(0), lost(3), stuck(1, -0.3), stuck(2, 3.5)]
+KINDS = [lost(0), lost(3), stuck(1, -0.3), stuck(2, 3.5),
+         ActuatorHealth(held=(None, 9.0, None, None))]
+LOST, STUCK = lost(0), stuck(1, 1.5)
 
 
 def draws(count, seed):
@@ -42,6 +42,7 @@ def draws(count, seed):
 def keeps_to(health, tilt, thrust):
     assert all(thrust[i] == 0.0 for i in range(4) if not health.rotors[i])
     assert all(tilt[i] == angle for i, angle in enumerate(health.stuck) if angle is not None)
+    assert all(thrust[i] == pytest.approx(own) for i, own in enumerate(health.held) if own)
     assert np.all(np.abs(tilt) <= LIMIT)
     assert np.all((thrust >= 0.0) & (thrust <= ROBOT.rotors.thrust_max))
 
@@ -107,16 +108,6 @@ def test_solutions_near_the_present_tilts_respect_range_and_health(health):
         assert np.all(np.abs(got.tilt - present) <= TILT_REACH + 1e-9)
 
 
-def test_a_rotor_stuck_at_a_thrust_is_compensated_by_the_others():
-    ours = DegradedAllocator(ROBOT, ActuatorHealth(held=(None, 9.0, None, None)))
-    for force, torque, present in draws(50, 5):
-        got = ours.allocate(force, torque, present)
-        assert got.thrust[1] == pytest.approx(9.0)
-        if not got.saturated.any():
-            np.testing.assert_allclose(np.concatenate(ours.wrench(got.tilt, got.thrust)),
-                                       np.concatenate([force, torque]), atol=1e-6)
-
-
 @pytest.fixture(scope='module')
 def holdings():
     return {health: Holding(ROBOT, health) for health in (ALL_HEALTHY, LOST, STUCK)}
@@ -159,13 +150,13 @@ def test_the_nearest_attitude_has_the_margin_and_no_sample_is_nearer(holdings, h
         assert rotations.geodesic_angle(got, desired) <= least + 1e-6
 
 
-@pytest.mark.parametrize('lost, up_now, rate, tilt', [
+@pytest.mark.parametrize('rotor, up_now, rate, tilt', [
     # States of two random flights when the rotor was named. By angle and travel only, an inverted
     # attitude would be chosen, from which level is reached only with a fall of 2 m.
     (3, (0.99, 0.14, -0.04), -1.9, (1.6, 1.6, -1.6, -1.5)),
     (2, (-0.97, 0.24, -0.07), 1.8, (-1.6, -1.6, 1.6, 1.7))])
-def test_from_the_side_the_escape_leads_towards_level(lost, up_now, rate, tilt):
-    holding = Holding(ROBOT, ActuatorHealth(rotors=tuple(i != lost for i in range(4))))
+def test_from_the_side_the_escape_leads_towards_level(rotor, up_now, rate, tilt):
+    holding = Holding(ROBOT, lost(rotor))
     start = leaned(LEVEL, np.array(up_now) / np.linalg.norm(up_now))
     got = holding.quickest(start, np.array([0.0, 0.0, rate]), np.array(tilt), 2.0, 0.8)
     assert holding.margin(got) >= 2.0 - 1e-9

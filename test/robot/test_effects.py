@@ -1,14 +1,11 @@
 """Facts about an effect are in its declaration only, not in tables of names elsewhere."""
 
-
 import numpy as np
 import pytest
 
 from beetle_omni_ros.robot.effects import CATALOGUE
 
 
-# The response log's own terms (natural frequency, damping ratio, dead bands) and the numbers of
-# simulated faults share a few of the catalogue's words: delay, offset, stiction, velocity_limit.
 @pytest.mark.parametrize('name', CATALOGUE)
 def test_a_declaration_is_complete_and_consistent(name):
     effect = CATALOGUE[name]
@@ -19,8 +16,7 @@ def test_a_declaration_is_complete_and_consistent(name):
     assert not rival or CATALOGUE[rival].same_response == name
     for form in effect.forms:
         assert set(form) <= set(effect.parameters) - set(effect.numbers)
-    if isinstance(effect.starts, tuple):
-        assert all(len(start) == len(effect.numbers) for start in effect.starts)
+    assert all(len(start) == len(effect.numbers) for start in effect.starts)
     for spec in effect.parameters.values():
         neutral = np.array(spec.neutral, dtype=float)
         assert np.isnan(neutral).all() == bool(spec.number)

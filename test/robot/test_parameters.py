@@ -44,7 +44,7 @@ def test_the_hash_depends_on_physics_and_not_on_the_name(tmp_path, content):
     (lambda c: c.update(effects={'thrust_coeficient': {'scale': 1}}),
      "effects.thrust_coeficient: unknown effect; did you mean 'thrust_coefficient'?"),
     (lambda c: c.update(effects={'thrust_coefficient': {'scale': 93}}), 'is outside 0.2 to 2'),
-    (lambda c: c.update(extends=[1]), "key 'extends': expected the name of a file"),
+    (lambda c: c.update(extends=[1]), "key 'extends': expected the name of another file"),
     (lambda c: c.update(effects=3), "key 'effects': expected a mapping, found 3"),
 ])
 def test_a_bad_robot_file_is_refused_with_the_key(tmp_path, content, change, message):

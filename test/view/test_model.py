@@ -11,12 +11,9 @@ def placed(angles):
     """Link -> position and quaternion in the root's frame, with joints at ``angles``."""
     found = {}
     for link in links():
-        if link.joint is None:
-            found[link.name] = np.zeros(3), link.turned()
-            continue
-        position, quaternion = found[link.joint.parent]
-        found[link.name] = (position + rotations.matrix(quaternion) @ link.joint.position,
-                            rotations.multiply(quaternion, link.turned(angles.get(link.moves, 0))))
+        position, quaternion = found.get(link.parent, (np.zeros(3), [0.0, 0.0, 0.0, 1.0]))
+        found[link.name] = (position + rotations.matrix(quaternion) @ link.position,
+                            rotations.multiply(quaternion, link.turned(angles.get(link.joint, 0))))
     return found
 
 

@@ -8,7 +8,7 @@ from beetle_omni_ros.identify.gap.fit import State
 from beetle_omni_ros.identify.gap.keys import Key, MODULES
 from beetle_omni_ros.identify.gap.residual import FlightModel
 from beetle_omni_ros.identify.inference.blocks import HeldOut
-from beetle_omni_ros.robot.effects import CATALOGUE, LimitStarts
+from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.servo import NUMPY, Servo
 
 # Reasons of a rejection.
@@ -46,7 +46,7 @@ class Candidate:
 
     def large_enough(self, keys: dict[str, Key], theta: dict[str, float]) -> bool:
         """Whether a deviation has at least the smallest relevant size."""
-        if isinstance(CATALOGUE[self.name].starts, LimitStarts):
+        if CATALOGUE[self.name].limit:
             return True
         return any(abs(theta.get(name, 0.0)) >= keys[name].smallest for name in self.keys)
 
@@ -66,8 +66,7 @@ def candidates(keys: dict[str, Key], models: list[FlightModel]) -> list[Candidat
             result += [Candidate(name, own[:1], label=f'{name} (inertia)'),
                        Candidate(name, own, label=name)]
         else:
-            starts = _limit_starts(keys[own[0]], effect.starts, models) \
-                if isinstance(effect.starts, LimitStarts) else effect.starts
+            starts = _limit_starts(keys[own[0]], effect, models) if effect.limit else effect.starts
             if effect.starts and not starts:
                 continue
             result += [Candidate(name, own, {f'{name}.{part}': x for part, x in form.items()},
@@ -76,15 +75,16 @@ def candidates(keys: dict[str, Key], models: list[FlightModel]) -> list[Candidat
     return result
 
 
-def _limit_starts(key, limit, models):
+def _limit_starts(key, effect, models):
     """Starts at which a limit begins to act in these flights."""
+    what, below = effect.limit
     most = max(float({
         'tilt_rate': lambda m: np.abs(m.signals.joints({})[1]).max(),
         'torque': lambda m: np.quantile(np.abs(_torques(m)), 0.999),
-        'thrust': lambda m: np.quantile(m.flight.command[:, 4:], 0.999)}[limit.of](m))
+        'thrust': lambda m: np.quantile(m.flight.command[:, 4:], 0.999)}[what](m))
         for m in models)
-    return tuple((float(np.log(part * most / key.base)),) for part in limit.parts
-                 if part * most < limit.below * key.base)
+    return tuple((float(np.log(part * most / key.base)),) for part, in effect.starts
+                 if part * most < below * key.base)
 
 
 def _torques(model):

@@ -15,7 +15,7 @@ import numpy as np
 
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.inference.prior import Prior
-from beetle_omni_ros.robot.effects import CATALOGUE, delaying, EffectParameter, treatment
+from beetle_omni_ros.robot.effects import CATALOGUE, delaying, EffectParameter, ignored
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 MODULES = 'module_reaction'
@@ -120,7 +120,7 @@ def all_keys(robot: RobotParameters) -> dict[str, Key]:
         effects['joint_friction'] = dict(zip(CATALOGUE['joint_friction'].parameters,
                                              friction(robot), strict=True))
     for name, effect in CATALOGUE.items():
-        if not treatment('gap', name).acts:
+        if ignored('gap', name):
             continue
         # The file's modules load the joints by their share, so this entry is only the excess.
         groups = 'B' if name == MODULES and robot.multibody else effect.channels

@@ -22,7 +22,7 @@ from beetle_omni_ros.identify.gap.series import (
     turned,
     within,
 )
-from beetle_omni_ros.robot.effects import CATALOGUE, treatment
+from beetle_omni_ros.robot.effects import CATALOGUE, ignored
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.servo import play
 
@@ -74,7 +74,7 @@ class Signals:
         self.file = {key: float(value) for name, values in robot.effects.items()
                      for parameter, given in values.items()
                      if CATALOGUE[name].in_readings(parameter)
-                     if treatment('gap', name).acts
+                     if not ignored('gap', name)
                      for key, value in zip(names_of(name, parameter), base_of(
                          CATALOGUE[name].parameters[parameter], given))}
         self._kept: dict = {}
