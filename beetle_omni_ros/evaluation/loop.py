@@ -122,7 +122,7 @@ class Processes:
 
     def frame(self, frame: Frame) -> Frame:
         """Start a tick; returns the frame with stamps of the flight computer's clock."""
-        if self._schedule.empty:
+        if not self._schedule.states:
             return frame
         self._schedule.update(frame.time)
         self.clock_step = sum(self._schedule.each('clock'))
@@ -145,7 +145,7 @@ class Processes:
 
     def send(self, method: str, *message) -> None:
         """Call one of the supervisor's ``on_`` methods, or queue the message."""
-        if not self._schedule.empty and self.supervisor_waits:
+        if self._schedule.states and self.supervisor_waits:
             self._waiting.setdefault(method, deque(maxlen=QUEUE)).append(message)
         else:
             getattr(self._supervisor, method)(*message)
@@ -167,7 +167,7 @@ class Processes:
     @property
     def bridges(self) -> dict[str, str]:
         """Bridge -> its reported state, if that has changed."""
-        if self._schedule.empty:
+        if not self._schedule.states:
             return {}
         states = {name: text for bridges in self._schedule.each('bridges')
                   for name, text in bridges.items()}
@@ -261,8 +261,8 @@ class FlightLoop:
                 if battery.charge < SWAP_CHARGE or self.supervisor.battery_low:
                     battery.reset()
             if moment.changed:
-                self.simulator.set_wrench(moment.force_world, moment.torque_body)
-                self.simulator.set_payload(moment.payload)
+                self.simulator.wrench = np.r_[moment.force_world, moment.torque_body]
+                self.simulator.payload = moment.payload
                 self._recorder.write('disturbance', Wrench(
                     self.simulator.time, moment.force_world, moment.torque_body))
             if moment.finished or self._crashed:

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from math import degrees
 import time
 
+import numpy as np
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 
@@ -19,7 +20,7 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import group, parameter, ParameterError
 from beetle_omni_ros.sim.emulated.actuators import EmulatedActuators
 from beetle_omni_ros.sim.emulated.device import BoardFaults, ServoFaults, switched_on
-from beetle_omni_ros.sim.fault_lists import DEVICES, parse_faults
+from beetle_omni_ros.sim.faults import DEVICES, parse_faults
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.simulator import Simulator
 
@@ -157,15 +158,14 @@ class SimNode(FlightNode):
         self._simulator = Simulator(
             self._robot, SimulatorParameters.load(given.simulator_file or None),
             conditions=given.conditions, seed=given.seed)
-        self._simulator.set_payload(given.payload)
+        self._simulator.payload = given.payload
         self._set_faults(given)
         self._pacing = self._make_pacing(given)
         self._latency = Distribution()
         self._publish_to = {
             'mocap': self.publisher('mocap/pose'), 'imu': self.publisher('imu/data_raw')}
         self._truth = self.publisher('ground_truth/odom')
-        self.listen('disturbance', lambda wrench: self._simulator.set_wrench(
-            wrench.force, wrench.torque), stale_after=None)
+        self.listen('disturbance', self._on_disturbance, stale_after=None)
         self.track_compute(self._simulator.tick)
         self.report('pacing', self._pacing_status)
         self.report('robot', self._robot_status)
@@ -247,7 +247,7 @@ class SimNode(FlightNode):
             if self._devices.faults != before:
                 self.get_logger().info('faults: ' + (', '.join(self._devices.faults) or 'none'))
         if new.payload != self.parameters.payload:
-            self._simulator.set_payload(new.payload)
+            self._simulator.payload = new.payload
             self.get_logger().info(f'payload {new.payload:g} kg')
         self.parameters = new
 
@@ -294,6 +294,9 @@ class SimNode(FlightNode):
             self._pacing.answered('command', command.stamp)
         if self._pacing.epoch is not None:
             self._simulator.command(replace(command, stamp=command.stamp - self._pacing.epoch))
+
+    def _on_disturbance(self, wrench):
+        self._simulator.wrench = np.concatenate([wrench.force, wrench.torque])
 
     def _pacing_status(self):
         pacing = self._pacing

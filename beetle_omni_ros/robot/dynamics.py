@@ -121,7 +121,7 @@ def added_wrench(robot: RobotParameters, names: list[str]) -> ca.Function:
 
     Returns:
         f(quaternion, velocity, rate, tilt, tilt_rate, tilt_acceleration, thrust, thrust_rate,
-        position, voltage_ratio, charge_drawn) -> force, torque.
+        position, voltage_ratio, charge_drawn) -> force and torque (6,).
 
     """
     sizes = {'quaternion': 4, 'velocity': 3, 'rate': 3, 'tilt': 4, 'tilt_rate': 4,
@@ -141,8 +141,7 @@ def added_wrench(robot: RobotParameters, names: list[str]) -> ca.Function:
     without = wrench(both)
     acting = wrench(both | {name: robot.effects[name] for name in names})
     return ca.Function('added_wrench', list(x.values()), [
-        ca.cse(a - b) for a, b in zip(acting, without, strict=True)], list(x),
-        ['force', 'torque'])
+        ca.densify(ca.cse(ca.vertcat(*acting) - ca.vertcat(*without)))], list(x), ['wrench'])
 
 
 def gyroscopic_load(robot: RobotParameters, angular_velocity, tilt, thrust, joint: int):

@@ -12,8 +12,15 @@ from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.sim import sensors
 from beetle_omni_ros.sim import simulator as whole
-from beetle_omni_ros.sim.fault_lists import load_cases, load_faults, parse_faults
-from beetle_omni_ros.sim.faults import Fault, KINDS, OF_PROCESSES, READINGS
+from beetle_omni_ros.sim.faults import (
+    Fault,
+    KINDS,
+    load_cases,
+    load_faults,
+    OF_PROCESSES,
+    parse_faults,
+    READINGS,
+)
 from beetle_omni_ros.sim.simulator import Simulator
 
 HOVER = np.full(4, ROBOT.hover_thrust)
@@ -238,7 +245,7 @@ def test_a_soft_touchdown_breaks_nothing(monkeypatch):
 
 @pytest.mark.parametrize(('numbers', 'named'), [
     ({'rotor': 5}, '1 to 4'), ({'rotor': 1.5}, 'an integer'),
-    ({'rotor': 1, 'servo': 1}, "'servo' is unknown"), ({'x' * 9000: 1}, 'xxx... is unknown')])
+    ({'rotor': 1, 'servo': 1}, "'servo': unknown key"), ({'x' * 9000: 1}, "xxx...': unknown")])
 def test_numbers_are_checked_by_name(numbers, named):
     with pytest.raises(ParameterError, match=named):
         Fault('rotor_stops', **numbers)
