@@ -255,7 +255,7 @@ class SimNode(FlightNode):
     def _refuse_faults(given):
         """Refuse faults of emulated devices if there are none."""
         for group_name in ('servo_faults', 'board_faults'):
-            if wanted := switched_on(getattr(given, group_name), event=True):
+            if wanted := switched_on(getattr(given, group_name)):
                 raise ParameterError(f'{group_name}: {wanted[0]}: there are no devices with '
                                      'actuators direct; start with actuators:=emulated')
 

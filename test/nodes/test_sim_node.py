@@ -74,7 +74,7 @@ def test_faults_of_devices_change_in_flight_and_are_in_the_diagnostics(sim, tmp_
     assert put(node, servo_faults__silent=[], board_faults__drop_in=0.0).successful
     assert node._devices_status()[0] == base.OK
     refused = put(node, servo_faults__silent=[9])
-    assert not refused.successful and 'servo_faults.silent: no servo has' in refused.reason
+    assert not refused.successful and 'servo_faults: no servo has' in refused.reason
     assert node._devices.faults == []
     bus.servos[1]['Torque Enable'] = 1
     assert put(node, servo_faults__reboot=2).successful

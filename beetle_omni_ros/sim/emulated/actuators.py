@@ -66,11 +66,9 @@ class EmulatedActuators:
         A ParameterError reports an unknown servo, without any change.
         """
         ids = [one['ID'] for one in self.bus.servos]
-        for name in ('silent', 'overload', 'reboot'):
-            for wanted in np.ravel(getattr(servo, name)):
-                if wanted not in (*ids, *[0] * (name == 'reboot')):
-                    raise ParameterError(f'servo_faults.{name}: no servo has the id {wanted:g}; '
-                                         f'ids are {ids}')
+        for wanted in (*servo.silent, *servo.overload, servo.reboot or ids[0]):
+            if wanted not in ids:
+                raise ParameterError(f'servo_faults: no servo has the id {wanted:g}; ids are {ids}')
         self._faults = self.bus.faults, self.board.faults = servo, board
         if servo.reboot:
             self.bus.reboot(ids.index(servo.reboot))

@@ -4,7 +4,7 @@ The emulated motor board: the firmware of docs/reference/firmware.md on a pseudo
 The framing is that of the driver. ``test/drivers/reference_packets.py`` checks it independently.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 import math
 from pathlib import Path
 import time
@@ -255,14 +255,6 @@ class BoardFirmware:
                                                   message.get_srcComponent())
 
 
-def frames(data: bytes) -> Iterator[bytes]:
-    """Split a sequence of valid MAVLink 2 packets; an incomplete rest is one more piece."""
-    while data:
-        size = 12 + data[1] if len(data) > 1 and data[0] == 0xFD else len(data)
-        yield data[:size]
-        data = data[size:]
-
-
 class EmulatedMotorBoard(Device):
     """
     A motor board whose PWM the rotor map of the true ``robot`` converts to thrust.
@@ -335,32 +327,28 @@ class EmulatedMotorBoard(Device):
 
     def _due(self):
         telemetry = min(self._firmware.next.values())
-        return min(super()._due(), telemetry if telemetry > time.monotonic() else math.inf)
+        return telemetry if telemetry > time.monotonic() else math.inf
 
     def _serve(self, now):
         """Receive, execute and send."""
-        faults, received = self.faults, self._read()
+        received = self._spoilt(self._read(), self.faults.drop_in, self.faults.corrupt_in)
         # Read the clock after the bytes, as a board does, because this thread may have waited.
         now = time.monotonic()
-        for frame in frames(received):
-            self._incoming.put(frame, now, faults.drop_in, faults.corrupt_in, faults.delay_in)
-        data = self._incoming.take(now)
-        if self._firmware.runs(now):
-            self._measure(now)
-            # Before any answer: the first frame after a reset is a heartbeat.
-            self._send(self._firmware.due(now, self._receiver.counts), now)
-            for message in self._receiver.feed(data):
-                self._send(self._firmware.receive(message, now), now)
-                if self.on_target and message.get_type() == 'SET_ACTUATOR_CONTROL_TARGET':
-                    self.on_target(now, message.time_usec)
-        self._flush(now)
+        if not self._firmware.runs(now):
+            return
+        self._measure(now)
+        # Before any answer: the first frame after a reset is a heartbeat.
+        self._answer(self._firmware.due(now, self._receiver.counts))
+        for message in self._receiver.feed(received):
+            self._answer(self._firmware.receive(message, now))
+            if self.on_target and message.get_type() == 'SET_ACTUATOR_CONTROL_TARGET':
+                self.on_target(now, message.time_usec)
 
-    def _send(self, messages, now):
-        faults = self.faults
+    def _answer(self, messages):
         for message in messages:
             frame = message.pack(self._packer)
             self._packer.seq = (self._packer.seq + 1) % 256
-            self._outgoing.put(frame, now, faults.drop_out, faults.corrupt_out, faults.delay_out)
+            self._send(self._spoilt(frame, self.faults.drop_out, self.faults.corrupt_out))
 
     def _measure(self, now):
         """Set the measurements of the firmware."""

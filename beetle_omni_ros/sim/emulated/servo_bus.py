@@ -10,6 +10,7 @@ is that of the rest of the packet. In instruction and parameters an ``FD`` is st
 ``FF FF FD``, so that the header is unique.
 """
 
+from collections import deque
 from collections.abc import Container, Iterator, Sequence
 import itertools
 from math import floor, inf, pi
@@ -276,6 +277,7 @@ class EmulatedServoBus(Device):
         self.servos = [EmulatedServo(name, sign=sign, zero=zero, reboot_time=reboot_time)
                        for name, sign, zero in zip(identifiers, signs, zeros, strict=True)]
         self._speed, self._buffer = speed, bytearray()
+        self._answers: deque[tuple[float, bytes]] = deque()     # when they are sent [s]
         self._last_data = self._last_check = self._last_move = time.monotonic()
         super().__init__('servo_bus', port, seed)
 
@@ -313,6 +315,7 @@ class EmulatedServoBus(Device):
         with self._lock:
             super().unplug()
             self._buffer.clear()
+            self._answers.clear()
 
     def _serve(self, now):
         """Handle received packets, check the servos, send due answers."""
@@ -325,8 +328,9 @@ class EmulatedServoBus(Device):
             for received in packets(self._buffer):
                 self._move(now)
                 for answer in self.handle(received, now):
-                    self._outgoing.put(answer, now, faults.dropped, faults.bad_crc, faults.delay,
-                                       faults.delayed)
+                    late = faults.delay * (self._random.random() < faults.delayed)
+                    self._answers.append((now + late, self._spoilt(
+                        answer, faults.dropped, faults.bad_crc)))
         # After the data, so that waiting packets restart the watchdogs of a late thread.
         if now - self._last_check >= PERIOD:
             self._last_check = now
@@ -335,7 +339,11 @@ class EmulatedServoBus(Device):
                 if servo['ID'] in self.faults.overload and servo.torque:
                     servo.trip(OVERLOAD)
             self._move(now)
-        self._flush(now)
+        while self._due() <= now:
+            self._send(self._answers.popleft()[1])
+
+    def _due(self):
+        return self._answers[0][0] if self._answers else inf
 
     def _move(self, now):
         step, self._last_move = self._speed * (now - self._last_move), now
