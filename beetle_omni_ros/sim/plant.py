@@ -162,8 +162,9 @@ class Plant:
                 if self._has_friction:
                     self._rub(others)
                 mujoco.mj_step(model, data)
-        self._shaft = clipped(self._shaft, self._tilt - self._half_gap,
-                              self._tilt + self._half_gap)
+        if self._has_play:
+            self._shaft = clipped(self._shaft, self._tilt - self._half_gap,
+                                  self._tilt + self._half_gap)
         if fast:
             self._update()
         else:
@@ -266,8 +267,8 @@ class Plant:
         self._apply_forces()
         mujoco.mj_forward(self.model, data)
         self.state = self._qpos.copy(), self._qvel.copy()
-        self.tilt = self._shaft
-        self.encoder = self._shaft if self._at_encoder else self.state[0][7:]
+        self.tilt = self._shaft if self._has_play else self.state[0][7:]
+        self.encoder = self.tilt if self._at_encoder else self.state[0][7:]
         self.thrust, self.effort = self._scale * data.act, data.actuator_force[4:].copy()
         self.contact = data.ncon > 0
 

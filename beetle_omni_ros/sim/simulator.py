@@ -70,10 +70,9 @@ class Battery:
     def thrust_limit(self) -> float:
         """Largest thrust of a rotor at the present voltage [N], by the rotor map if given."""
         voltages, thrusts = self._limits
-        if not voltages:
+        if len(voltages) < 2:
             return self._thrust_max
-        limit = thrusts[0] if len(thrusts) == 1 else \
-            _interpolate(voltages, thrusts, min(self.voltage, voltages[-1]))
+        limit = _interpolate(voltages, thrusts, min(self.voltage, voltages[-1]))
         return min(self._thrust_max, max(0.0, limit))
 
 
@@ -152,6 +151,7 @@ class Simulator:
                                np.random.default_rng(np.random.SeedSequence(seed).spawn(1)[0]))
         # Of tilt and thrust commands from their stamps [s], effects included.
         self.command_delays = self.conditions.command_delays(robot)
+        self._rotor_gain = -np.expm1(-self.tick / robot.rotors.time_constant)
         self._plant = Plant(robot, self._parameters, self.conditions.variation)
         self.battery = Battery(robot, self._parameters)
         self.reset()
@@ -239,8 +239,7 @@ class Simulator:
         plant.charge_drawn = battery.drawn
         plant.step()
         # Wear shows with the thrust, which follows with the rotors' lag.
-        self._wear = self._wear - np.expm1(
-            -self.tick / self._robot.rotors.time_constant) * (drive.wear - self._wear)
+        self._wear = self._wear + self._rotor_gain * (drive.wear - self._wear)
         self._ticks += 1
         self.time = self._ticks * self.tick
         self._watch_contact(self.truth, plant.contact)
