@@ -5,10 +5,9 @@ import numpy as np
 
 from beetle_omni_ros.robot.parameters import (
     combined,
-    mass_properties,
+    MassProperties,
     RigidPart,
     RobotParameters,
-    Variation,
 )
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 
@@ -29,7 +28,7 @@ STOP_IMPEDANCE = 0.99, 0.999, 0.001
 
 
 def build_model(robot: RobotParameters, plant: SimulatorParameters,
-                variation: Variation | None = None) -> mujoco.MjModel:
+                parts: MassProperties) -> mujoco.MjModel:
     """
     Compile the plant; :func:`set_payload` gives base_link its mass.
 
@@ -42,7 +41,7 @@ def build_model(robot: RobotParameters, plant: SimulatorParameters,
     larger. The negative difference is the armature of the joint, an internal torque between module
     and body, so that the response is as identified and the momentum is conserved.
     """
-    model = mujoco.MjModel.from_xml_string(_mjcf(robot, plant, variation))
+    model = mujoco.MjModel.from_xml_string(_mjcf(robot, plant, parts))
     module = robot.parts.module
     sideways, up = module.centre_of_mass[1:]
     own = module.inertia[0] + module.mass * (sideways ** 2 + up ** 2)
@@ -50,10 +49,8 @@ def build_model(robot: RobotParameters, plant: SimulatorParameters,
     return model
 
 
-def set_payload(model: mujoco.MjModel, robot: RobotParameters, variation: Variation | None,
-                payload: float) -> None:
+def set_payload(model: mujoco.MjModel, parts: MassProperties, payload: float) -> None:
     """Give base_link the mass of main body, end-effector and a ``payload`` [kg]."""
-    parts = mass_properties(robot, variation)
     rigid = [parts.main_body, parts.end_effector]
     if payload:
         radius = (3 * payload / (4 * np.pi * PAYLOAD_DENSITY)) ** (1 / 3)
@@ -93,8 +90,8 @@ def _module(robot, plant, parts, k):
       </body>"""
 
 
-def _mjcf(robot, plant, variation):
-    parts, joints, rotors = mass_properties(robot, variation), robot.joints, robot.rotors
+def _mjcf(robot, plant, parts):
+    joints, rotors = robot.joints, robot.rotors
     scale, limit = robot.thrust_scale, joints.effort_limit
     actuators = [
         f'<general name="rotor{k + 1}" site="rotor{k + 1}" dyntype="filter" '

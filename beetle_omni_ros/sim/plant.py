@@ -8,7 +8,7 @@ import numpy as np
 from beetle_omni_ros.robot import dynamics, native, rotations
 from beetle_omni_ros.robot.allocation import clipped
 from beetle_omni_ros.robot.effects import CATALOGUE
-from beetle_omni_ros.robot.parameters import RobotParameters, Variation
+from beetle_omni_ros.robot.parameters import mass_properties, RobotParameters, Variation
 from beetle_omni_ros.robot.servo import NUMPY
 from beetle_omni_ros.sim.mjcf import BASE, build_model, CONTACT_TIME, set_payload
 from beetle_omni_ros.sim.parameters import SimulatorParameters
@@ -46,7 +46,8 @@ class Plant:
 
     def __init__(self, robot: RobotParameters, parameters: SimulatorParameters,
                  variation: Variation | None = None):
-        self._robot, self._parameters, self._variation = robot, parameters, variation
+        self._robot, self._parameters = robot, parameters
+        self._parts = mass_properties(robot, variation)
         # Effects that only change a number of the model are built into it.
         forces = [name for name in robot.effects
                   if CATALOGUE[name].apply and CATALOGUE[name].plant != 'model']
@@ -60,8 +61,8 @@ class Plant:
                                     if name != 'joint_friction')
         self._servo_terms = [dynamics.tilt_servo(robot, i, 0.0)[0] for i in range(4)]
         self._has_friction = self._servo_terms[0].coulomb is not None
-        self._scale, self.gravity = robot.thrust_scale, robot.gravity
-        self.model = build_model(robot, parameters, variation)
+        self._scale = robot.thrust_scale
+        self.model = build_model(robot, parameters, self._parts)
         self.data = mujoco.MjData(self.model)
         self._tick, self._substeps = parameters.tick, parameters.substeps
         self._flags = int(self.model.opt.disableflags)
@@ -138,7 +139,7 @@ class Plant:
         """Set the mass [kg] of the payload, a ball below the body."""
         if mass != self._payload:
             self._payload = mass
-            set_payload(self.model, self._robot, self._variation, mass)
+            set_payload(self.model, self._parts, mass)
 
     def step(self) -> None:
         """Advance one tick with the present targets; a RuntimeError reports a diverged state."""
@@ -276,5 +277,5 @@ class Plant:
     def specific_force(self) -> np.ndarray:
         """(3,) acceleration of base_link minus gravity, in base_link [m/s^2]."""
         acceleration = self.data.qacc[:3].copy()
-        acceleration[2] += self.gravity
+        acceleration[2] += self._robot.gravity
         return self.data.xmat[BASE].reshape(3, 3).T @ acceleration

@@ -38,14 +38,6 @@ def difference(found, expected):
     return np.linalg.norm(found - expected) / np.linalg.norm(expected)
 
 
-def module_reaction():
-    """The effect that is equivalent to the modules, by Steiner's theorem."""
-    module = ROBOT.multibody.module
-    depth = -module.centre_of_mass[2]
-    return {'module_inertia': module.inertia[0] + module.mass * depth ** 2,
-            'mass_moment': module.mass * depth}
-
-
 @pytest.mark.parametrize('robot', [
     *(massless_modules(effects=effects) for effects in EFFECTS.values()),
     replace(ROBOT, multibody=None)], ids=[*EFFECTS, 'not described'])
@@ -56,21 +48,6 @@ def test_plant_without_module_inertia_agrees_with_casadi(robot):
         found = acceleration(made, p, q, v, w, tilt, tilt_rate, thrust)
         assert difference(found[:3], np.array(linear).ravel()) < 1e-6
         assert difference(found[3:6], np.array(angular).ravel()) < 1e-6
-
-
-def test_modules_given_by_effect_act_as_described_ones():
-    """The plant with the effect instead of modules has the same motion."""
-    described = plant(ROBOT)
-    by_effect, rigid = (plant(replace(ROBOT, multibody=None, effects=e))
-                        for e in ({'module_reaction': module_reaction()}, {}))
-    missed, without = [], []
-    for state in random_states(30, seed=7):
-        true, found, bare = (acceleration(made, *state)[:6]
-                             for made in (described, by_effect, rigid))
-        missed.append(found - true)
-        without.append(bare - true)
-    missed, without = (np.linalg.norm(rows, axis=0) for rows in (missed, without))
-    assert (missed < 0.2 * without).all()
 
 
 @pytest.mark.parametrize('effects', [

@@ -110,16 +110,6 @@ def test_after_a_sensor_fault_the_readings_are_unchanged(kind, healthy):
     assert simulator.faults == []
 
 
-def test_a_stopped_rotor_fades_with_its_lag_and_shows_in_its_speed():
-    frames, _ = flight(Fault('rotor_stops', at=0.3, rotor=2), ticks=160)
-    thrust = np.array([frame.truth.thrust for frame in frames])
-    ratio = thrust[100, 1] / thrust[80, 1]
-    assert np.isclose(ratio, np.exp(-0.1 / ROBOT.rotors.time_constant), rtol=1e-3)
-    assert thrust[150, 0] > 3
-    speed = [frame.rotors.speed for frame in frames if frame.rotors is not None]
-    assert speed[-1][1] < 0.3 * speed[-1][0]
-
-
 def test_rotor_speeds_come_at_50_hz_and_are_those_of_the_thrust():
     frames, _ = flight(ticks=400)
     readings = [frame.rotors for frame in frames if frame.rotors is not None]

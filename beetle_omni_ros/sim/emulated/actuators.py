@@ -68,7 +68,8 @@ class EmulatedActuators:
         ids = [one['ID'] for one in self.bus.servos]
         for wanted in (*servo.silent, *servo.overload, servo.reboot or ids[0]):
             if wanted not in ids:
-                raise ParameterError(f'servo_faults: no servo has the id {wanted:g}; ids are {ids}')
+                raise ParameterError(f'servo_faults: no servo has the id {wanted:g}; the ids are '
+                                     f'{ids}')
         self._faults = self.bus.faults, self.board.faults = servo, board
         if servo.reboot:
             self.bus.reboot(ids.index(servo.reboot))
