@@ -87,7 +87,8 @@ class EmulatedActuators:
         bus, board = self.bus, self.board
         return {'servo_port': bus.port, 'board_port': board.port, 'armed': board.armed,
                 'torque': bus.drive()[1], 'servo refused': bus.refusals,
-                **{f'board refused: {reason}': count for reason, count in board.firmware.refused.items()}}
+                **{f'board refused: {reason}': count
+                   for reason, count in board.firmware.refused.items()}}
 
 
 def _line(delay, tick, make):
