@@ -4,20 +4,17 @@ Faults of the simulated robot, its devices and the flight stack: the table KINDS
 An example is ``Fault('rotor_weak', at=3.0, duration=1.0, rotor=2, share=0.5)``. Faults of robot
 and devices go to ``Simulator.set_faults``, those of processes to the in-process loop.
 
-A function of the table gets the state of an active fault, see :class:`Schedule`. What else it gets
-and returns depends on its signal:
+A function of the table gets the state of an active fault, see :class:`Schedule`. Those of the
+signals ``imu``, ``mocap``, ``joints``, ``rotors``, ``battery``, ``command`` (to the actuators),
+``request`` (of the active controller) and ``estimate`` also get the item that arrives, and return
+the changed one, or None; of a ``late`` kind the list of due ones, also without an item. ``drive``
+gets the Drive of this tick and changes it in place. The others return a value:
 
-- ``imu``, ``mocap``, ``joints``, ``rotors``, ``battery``: the reading that arrives; returns the
-  changed one, or None. ``command`` and ``request`` do the same for the commands to the actuators
-  and of the active controller, ``estimate`` for the state.
-- ``drive``: the Drive of this tick, changed in place.
 - ``charge``: largest charge of the battery; ``resistance``: added to it [ohm].
 - ``wrench``: (6,) force in world [N] and torque in base_link [N m]; ``payload``: mass [kg].
 - ``clock``: error of the flight computer's clock [s]; ``waits``: whether the supervisor is not
   scheduled; ``target``: position [m] and quaternion of another target; ``bridges``: bridge -> its
   reported state.
-
-The function of a ``late`` kind is also called without an item, and returns the list of due ones.
 """
 
 from __future__ import annotations
@@ -235,12 +232,6 @@ def vector(unit: str, names: str = 'x y z', **defaults: float) -> dict[str, Fiel
     return {name: number(defaults.get(name, 0.0), unit) for name in names.split()}
 
 
-def sizes(default: float) -> dict[str, Field]:
-    """Sizes of specific force and rate."""
-    return {'specific_force': number(default, 'm/s^2', 0, 1000),
-            'rate': number(default, 'rad/s', 0, 1000)}
-
-
 RPY = 'roll pitch yaw'
 WHOLE = 'rotor', 'servo', 'axis'
 ROTOR, SERVO = {'rotor': number(low=1, high=4)}, {'servo': number(low=1, high=4)}
@@ -310,11 +301,14 @@ KINDS = {
     'imu_clock': Kind(STEP, imu=added('stamp', lambda fault: fault.step)),
     'gyroscope_bias': Kind(vector('rad/s'), imu=added('angular_velocity', _axes)),
     'accelerometer_bias': Kind(vector('m/s^2'), imu=added('specific_force', _axes)),
-    'imu_saturated': Kind(sizes(1000.0), imu=of_motion(lambda fault, motion: np.clip(
-        motion, -_both(fault), _both(fault)))),
+    'imu_saturated': Kind(
+        {'specific_force': number(1000.0, 'm/s^2', 0, 1000),
+         'rate': number(1000.0, 'rad/s', 0, 1000)},
+        imu=of_motion(lambda fault, motion: np.clip(motion, -_both(fault), _both(fault)))),
     'imu_nan': Kind(imu=of_motion(lambda fault, motion: np.full(6, np.nan))),
-    'imu_spikes': Kind({'period': number(0.1, 's', 0.005, 100), **sizes(0.0)},
-                       imu=of_motion(imu_spikes)),
+    'imu_spikes': Kind(
+        {'period': number(0.1, 's', 0.005, 100), 'rate': number(0.0, 'rad/s', 0, 1000),
+         'specific_force': number(0.0, 'm/s^2', 0, 1000)}, imu=of_motion(imu_spikes)),
     'imu_axis_dead': Kind({'axis': number(low=1, high=6)}, imu=of_motion(imu_axis_dead)),
 
     'commands_lost': Kind(command=lost),

@@ -34,7 +34,6 @@ class EmulatedActuators:
         tilt, thrust = simulator.command_delays
         self._tilts = _line(tilt, simulator.tick, lambda: (np.zeros(4), [False] * 4))
         self._thrusts = _line(thrust, simulator.tick, lambda: np.zeros(4))
-        self._faults = ServoFaults(), BoardFaults()
         truth = simulator.truth
         bus.set_state(truth.tilt, truth.tilt_velocity, np.zeros(4))
         board.set_rotors(truth.thrust)
@@ -70,7 +69,7 @@ class EmulatedActuators:
             if wanted not in ids:
                 raise ParameterError(f'servo_faults: no servo has the id {wanted:g}; the ids are '
                                      f'{ids}')
-        self._faults = self.bus.faults, self.board.faults = servo, board
+        self.bus.faults, self.board.faults = servo, board
         if servo.reboot:
             self.bus.reboot(ids.index(servo.reboot))
         if board.reboot:
@@ -79,8 +78,8 @@ class EmulatedActuators:
     @property
     def faults(self) -> list[str]:
         """Active faults as texts such as 'servo silent [2]'."""
-        return [f'{device} {text}' for device, faults in zip(('servo', 'board'), self._faults)
-                for text in switched_on(faults)]
+        return [f'{name} {text}' for name, device in (('servo', self.bus), ('board', self.board))
+                for text in switched_on(device.faults)]
 
     def status(self) -> dict[str, object]:
         """States and refusals of the devices, for diagnostics."""
