@@ -122,7 +122,7 @@ class Processes:
 
     def frame(self, frame: Frame) -> Frame:
         """Start a tick; returns the frame with stamps of the flight computer's clock."""
-        if not self._schedule.states:
+        if self._schedule.empty:
             return frame
         self._schedule.update(frame.time)
         self.clock_step = sum(self._schedule.each('clock'))
@@ -145,7 +145,7 @@ class Processes:
 
     def send(self, method: str, *message) -> None:
         """Call one of the supervisor's ``on_`` methods, or queue the message."""
-        if self._schedule.states and self.supervisor_waits:
+        if not self._schedule.empty and self.supervisor_waits:
             self._waiting.setdefault(method, deque(maxlen=QUEUE)).append(message)
         else:
             getattr(self._supervisor, method)(*message)
@@ -167,7 +167,7 @@ class Processes:
     @property
     def bridges(self) -> dict[str, str]:
         """Bridge -> its reported state, if that has changed."""
-        if not self._schedule.states:
+        if self._schedule.empty:
             return {}
         states = {name: text for bridges in self._schedule.each('bridges')
                   for name, text in bridges.items()}

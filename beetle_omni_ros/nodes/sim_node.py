@@ -6,7 +6,6 @@ from math import degrees
 import time
 
 import numpy as np
-from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 
 from beetle_omni_ros.drivers.device_parameters import ServoBusParameters
@@ -33,8 +32,6 @@ SLEW = 0.01             # largest shift of a tick to a later time, in ticks
 LAG = 0.02              # s between the newest sample and the newest answered one
 PATIENCE = 0.3          # s of steady time without an answer after which a node has stopped
 COMMAND_AGE = 0.1       # s, older commands are not executed
-# Switches of single events, which are reset after they happened.
-EVENTS = {'servo_faults.reboot', 'board_faults.reboot'}
 
 
 class RealTimePacing:
@@ -217,8 +214,6 @@ class SimNode(FlightNode):
         self.report('devices', self._devices_status)
         self.get_logger().info(f'servos at {bus.port}, motor board at {board.port}')
         self._devices.set_faults(given.servo_faults, given.board_faults)
-        self._reset_events([self.get_parameter(name) for name in EVENTS])
-        self.add_post_set_parameters_callback(self._reset_events)
 
     def close(self) -> None:
         """Switch the emulated devices off."""
@@ -258,14 +253,6 @@ class SimNode(FlightNode):
             if wanted := switched_on(getattr(given, group_name)):
                 raise ParameterError(f'{group_name}: {wanted[0]}: there are no devices with '
                                      'actuators direct; start with actuators:=emulated')
-
-    def _reset_events(self, changed):
-        """Reset the parameters of events that have happened, so that they can be set again."""
-        happened = [Parameter(one.name, value=type(one.value)()) for one in changed
-                    if one.name in EVENTS and one.value]
-        if happened:
-            self.get_logger().info(', '.join(one.name for one in happened) + ': done')
-            self.set_parameters(happened)
 
     def _on_timer(self):
         for _ in range(self._pacing.due()):

@@ -374,23 +374,24 @@ class Schedule:
         self._tick, self._seed = tick, seed
         # The state of a fault: its numbers, k (index of its rotor or servo), tick, now, memory
         # (for its functions, at first None), and from its onset random, truth and held.
-        self.states: list[SimpleNamespace] = []
+        self._states: list[SimpleNamespace] = []
+        self.empty = True
 
     def set(self, faults: Sequence[Fault], now: float) -> None:
         """Replace the faults, ``at`` counts from ``now`` [s]; one that stays continues."""
-        before, self.states = self.states, []
+        before, self._states, self.empty = self._states, [], not faults
         for fault in faults:
             state = next((state for state in before if state.fault == fault), None)
             if state is not None:
                 before.remove(state)
-            self.states.append(state or SimpleNamespace(
+            self._states.append(state or SimpleNamespace(
                 **fault.numbers, fault=fault, begin=now + fault.at, active=False, over=False,
                 k=int(fault.numbers.get('rotor', fault.numbers.get('servo', 1))) - 1,
                 tick=self._tick, memory=None))
 
     def update(self, now: float, truth: Any = None, held: np.ndarray | None = None) -> None:
         """Start and end the faults due at ``now`` [s], with the true state and servo targets."""
-        for state in self.states:
+        for state in self._states:
             if not (state.active or state.over) and now >= state.begin - ROUNDING:
                 state.now, state.truth, state.held, state.active = now, truth, held, True
                 state.random = np.random.default_rng(self._seed.spawn(1)[0])
@@ -400,7 +401,7 @@ class Schedule:
     @property
     def active(self) -> list[tuple[Kind, Any]]:
         """Kind and state of each active fault, in the order of the list."""
-        return [(KINDS[state.fault.kind], state) for state in self.states if state.active]
+        return [(KINDS[state.fault.kind], state) for state in self._states if state.active]
 
     def through(self, signal: str, item: Any, now: float) -> list:
         """Items that arrive ``now`` [s] if ``item``, or None, is sent through the faults."""

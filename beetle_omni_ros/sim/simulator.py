@@ -216,7 +216,7 @@ class Simulator:
         """
         plant, link, battery, schedule = self._plant, self._link, self.battery, self._schedule
         devices = drive is not None
-        if schedule.states:
+        if not schedule.empty:
             schedule.update(self.time, self.truth, link.tilt)
             for late in schedule.through('command', None, self.time):
                 link.push(late, self.time)

@@ -60,20 +60,16 @@ class EmulatedActuators:
 
     def set_faults(self, servo: ServoFaults, board: BoardFaults) -> None:
         """
-        Switch faults on and off, and trigger the events that are set.
+        Switch faults on and off.
 
         A ParameterError reports an unknown servo, without any change.
         """
         ids = [one['ID'] for one in self.bus.servos]
-        for wanted in (*servo.silent, *servo.overload, servo.reboot or ids[0]):
+        for wanted in (*servo.silent, *servo.overload):
             if wanted not in ids:
                 raise ParameterError(f'servo_faults: no servo has the id {wanted:g}; the ids are '
                                      f'{ids}')
         self.bus.faults, self.board.faults = servo, board
-        if servo.reboot:
-            self.bus.reboot(ids.index(servo.reboot))
-        if board.reboot:
-            self.board.reboot()
 
     @property
     def faults(self) -> list[str]:

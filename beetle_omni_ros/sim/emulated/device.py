@@ -24,7 +24,7 @@ LISTED = {'low': 1, 'high': 252}
 
 @dataclass(kw_only=True)
 class ServoFaults:
-    """Faults of the servo bus. Levels may be changed at any time, ``reboot`` happens once."""
+    """Faults of the servo bus, which may be changed at any time."""
 
     bad_crc: float = parameter(0.0, doc='share of answers with a flipped bit', **SHARE)
     dropped: float = parameter(0.0, doc='share of lost answers', **SHARE)
@@ -34,7 +34,6 @@ class ServoFaults:
     overload: np.ndarray = parameter([], doc='IDs with a permanent overload', **LISTED)
     supply_voltage: float = parameter(12.0, doc='supply voltage of the servos', unit='V', low=0,
                                       high=30)
-    reboot: int = parameter(0, doc='ID to restart once', low=0, high=252)
 
 
 @dataclass(kw_only=True)
@@ -48,11 +47,10 @@ class BoardFaults:
     drop_out: float = parameter(0.0, doc='share of lost packets of the board', **SHARE)
     drop_in: float = parameter(0.0, doc='share of lost packets to the board', **SHARE)
     failed_escs: np.ndarray = parameter([], doc='rotors (1 to 4) that do not turn', low=1, high=4)
-    reboot: bool = parameter(False, doc='reset once')
 
 
 def switched_on(faults: ServoFaults | BoardFaults) -> list[str]:
-    """Levels and events that differ from their defaults, such as 'silent [2]'."""
+    """Faults that differ from their defaults, such as 'silent [2]'."""
     healthy = vars(type(faults)())
     return [f'{name} {value.astype(int).tolist() if isinstance(value, np.ndarray) else value}'
             for name, value in vars(faults).items() if not np.array_equal(value, healthy[name])]
