@@ -176,7 +176,8 @@ _POLICY = 'beetle_omni_ros.control.policy:PolicyController'
 SHIPPED: Mapping[str, ControllerEntry] = {entry.name: entry for entry in (
     ControllerEntry(
         name='nmpc', label='NMPC', description='offset-free, params/nmpc.yaml', controller=_NMPC,
-        parameters_file='params/nmpc.yaml', option='--nmpc', flies_degraded=True, stands_by=True,
+        parameters_file='params/nmpc.yaml', option='--nmpc', guidance='unwinding',
+        flies_degraded=True, stands_by=True,
         compared=True, line=('#c8281e', '-')),
     ControllerEntry(
         name='rl', label='RL', description='the learned policy, 33 observations',
