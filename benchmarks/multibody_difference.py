@@ -9,6 +9,7 @@ joints, which adds the reaction of the modules.
 
 import argparse
 
+import mujoco
 import numpy as np
 
 from beetle_omni_ros.robot import rotations
@@ -26,11 +27,20 @@ CASES = (                               # name, tilts, body rates, joint rates, 
     ('joints braked from 5 rad/s', np.pi, 2.0, 5.0, False))
 
 
+def acceleration(plant, state, target):
+    """Accelerations (10,) in a state with the tilt targets (4,) [rad]."""
+    position, quaternion, velocity, angular_velocity, tilt, tilt_rate, thrust = state
+    plant.reset(position, quaternion, [*velocity, *angular_velocity, *tilt_rate], tilt, thrust)
+    plant.set_targets(target, thrust)
+    mujoco.mj_forward(plant.model, plant.data)
+    return plant.data.qacc.copy()
+
+
 def held_target(plant, state, tilt):
     """Tilt targets at which no joint accelerates: the response to a target is linear."""
-    rest = plant.acceleration(*state, tilt_target=tilt)[6:]
+    rest = acceleration(plant, state, tilt)[6:]
     step = 0.01
-    response = np.stack([(plant.acceleration(*state, tilt_target=tilt + step * unit)[6:] - rest)
+    response = np.stack([(acceleration(plant, state, tilt + step * unit)[6:] - rest)
                          / step for unit in np.eye(4)], axis=1)
     return tilt - np.linalg.solve(response, rest)
 
@@ -48,7 +58,7 @@ def differences(robot, count, tilt_span, rate, joint_rate, held, seed):
         state = (HEIGHT, quaternion, velocity, angular_velocity, tilt,
                  joint_rate * generator.choice([-1, 1], 4), thrust)
         target = held_target(plant, state, tilt) if held else tilt
-        found = plant.acceleration(*state, tilt_target=target)
+        found = acceleration(plant, state, target)
         linear, angular = model(velocity, quaternion, angular_velocity, tilt, thrust)
         force[k] = robot.mass * np.linalg.norm(found[:3] - np.ravel(linear))
         torque[k] = np.linalg.norm(robot.inertia * (found[3:6] - np.ravel(angular)))
@@ -72,8 +82,7 @@ def main():
     plant = Plant(robot, SimulatorParameters.load())
     module = robot.multibody.module
     aligned = np.pi / 2 * np.array([1, 1, -1, -1])
-    plant.acceleration(HEIGHT, [0, 0, 0, 1], np.zeros(3), np.zeros(3), aligned, np.zeros(4),
-                       np.zeros(4))
+    plant.reset(HEIGHT, tilt=aligned)
     shift = plant.data.subtree_com[1] - HEIGHT
     weight = robot.mass * robot.gravity
     aside, up = np.linalg.norm(shift[:2]), shift[2]

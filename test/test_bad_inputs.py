@@ -66,8 +66,8 @@ CASES = {
     f'{EVALUATE} --faults': [
         ('none.yaml', 'none.yaml: no such file'),
         ('no_list.yaml', "key 'faults': expected a list"),
-        ('no_fault.yaml', 'near: rotor_stops'), ('no_rotor.yaml', "key 'rotor' is missing"),
-        ('key.yaml', "key 'fault': unknown key; known: faults"),
+        ('no_fault.yaml', "did you mean 'rotor_stops'"), ('no_rotor.yaml', "key 'rotor': missing"),
+        ('key.yaml', "key 'fault': unknown key; did you mean 'faults'"),
         ('rotor_9.yaml', "key 'rotor': 9 is outside 1 to 4")],
     f'{EVALUATE} --json': [
         ('no/result.json', 'there is no folder'), ('folder', 'it is a folder'),
@@ -106,7 +106,7 @@ CASES = {
         ('--json no/result.json', 'there is no folder')],
     FAULTS: [
         ('--faults no_list.yaml', "'faults'"),
-        ('--only rotor_9_stops', "fault 'rotor_9_stops' is unknown; near: rotor_4_stops"),
+        ('--only rotor_9_stops', "unknown fault 'rotor_9_stops'; did you mean 'rotor_4_stops'"),
         ('--from bed', "--from 'bed': expected hover, moving, upside_down"),
         ('--seeds 0', "'--seeds': Input should be"), ('--healthy nan', "'--healthy'"),
         ('--controller npmc', 'npmc'), ('--output notes.txt', 'notes.txt'),

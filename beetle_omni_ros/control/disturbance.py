@@ -9,7 +9,6 @@ of each servo, and the targets overcome it. docs/explanation/nmpc.md has the rea
 """
 
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import casadi as ca
@@ -18,6 +17,7 @@ import numpy as np
 from beetle_omni_ros.control.base import Command, State
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY, clipped
+from beetle_omni_ros.robot.native import buffered
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import parameter
 
@@ -40,25 +40,6 @@ class DisturbanceParameters:
         4.0, doc='bandwidth of the external torque', unit='rad/s', low=0, high=50)
     tilt_bandwidth: float = parameter(
         3.0, doc='bandwidth of the servo offsets', unit='rad/s', low=0, high=50)
-
-
-def buffered(function: ca.Function) -> Callable[..., np.ndarray]:
-    """Make a fast call of a CasADi function of vectors: numpy arrays in fixed buffers."""
-    buffer, evaluate = function.buffer()
-    arguments = [np.zeros(function.numel_in(i)) for i in range(function.n_in())]
-    result = np.zeros(function.numel_out(0))
-    for i, array in enumerate(arguments):
-        buffer.set_arg(i, array.data)
-    buffer.set_res(0, result.data)
-
-    def call(*values) -> np.ndarray:
-        for array, value in zip(arguments, values):
-            array[:] = value
-        evaluate()
-        return result.copy()
-
-    call.__dict__['buffer'] = buffer    # `evaluate` has its address only
-    return call
 
 
 class DisturbanceEstimator:

@@ -24,8 +24,7 @@ from beetle_omni_ros.runs.log import FlightLog, LogRecorder, Recorder
 from beetle_omni_ros.runs.metrics import metrics
 from beetle_omni_ros.runs.targets import check_steps
 from beetle_omni_ros.runs.tasks import make_task, Task
-from beetle_omni_ros.sim.fault_lists import load_faults
-from beetle_omni_ros.sim.faults import Fault
+from beetle_omni_ros.sim.faults import Fault, load_faults
 
 
 def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotParameters,

@@ -261,8 +261,8 @@ class FlightLoop:
                 if battery.charge < SWAP_CHARGE or self.supervisor.battery_low:
                     battery.reset()
             if moment.changed:
-                self.simulator.set_wrench(moment.force_world, moment.torque_body)
-                self.simulator.set_payload(moment.payload)
+                self.simulator.wrench = np.r_[moment.force_world, moment.torque_body]
+                self.simulator.payload = moment.payload
                 self._recorder.write('disturbance', Wrench(
                     self.simulator.time, moment.force_world, moment.torque_body))
             if moment.finished or self._crashed:

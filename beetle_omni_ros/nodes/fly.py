@@ -29,7 +29,7 @@ from beetle_omni_ros.runs.bag_writer import add_meta, check_new
 from beetle_omni_ros.runs.files import check_writable, write_json
 from beetle_omni_ros.runs.metrics import failed, metrics
 from beetle_omni_ros.runs.tasks import make_task, Task
-from beetle_omni_ros.sim import fault_lists as listed
+from beetle_omni_ros.sim import faults as listed
 
 INTERRUPTED = 130
 ACTUATORS, CLOCKS = ('emulated', 'direct'), ('system', 'simulated')

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from math import degrees
 import time
 
-from rclpy.parameter import Parameter
+import numpy as np
 from rosgraph_msgs.msg import Clock
 
 from beetle_omni_ros.drivers.device_parameters import ServoBusParameters
@@ -19,7 +19,7 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import group, parameter, ParameterError
 from beetle_omni_ros.sim.emulated.actuators import EmulatedActuators
 from beetle_omni_ros.sim.emulated.device import BoardFaults, ServoFaults, switched_on
-from beetle_omni_ros.sim.fault_lists import DEVICES, parse_faults
+from beetle_omni_ros.sim.faults import DEVICES, parse_faults
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.simulator import Simulator
 
@@ -32,8 +32,6 @@ SLEW = 0.01             # largest shift of a tick to a later time, in ticks
 LAG = 0.02              # s between the newest sample and the newest answered one
 PATIENCE = 0.3          # s of steady time without an answer after which a node has stopped
 COMMAND_AGE = 0.1       # s, older commands are not executed
-# Switches of single events, which are reset after they happened.
-EVENTS = {'servo_faults.reboot', 'board_faults.reboot'}
 
 
 class RealTimePacing:
@@ -157,15 +155,14 @@ class SimNode(FlightNode):
         self._simulator = Simulator(
             self._robot, SimulatorParameters.load(given.simulator_file or None),
             conditions=given.conditions, seed=given.seed)
-        self._simulator.set_payload(given.payload)
+        self._simulator.payload = given.payload
         self._set_faults(given)
         self._pacing = self._make_pacing(given)
         self._latency = Distribution()
         self._publish_to = {
             'mocap': self.publisher('mocap/pose'), 'imu': self.publisher('imu/data_raw')}
         self._truth = self.publisher('ground_truth/odom')
-        self.listen('disturbance', lambda wrench: self._simulator.set_wrench(
-            wrench.force, wrench.torque), stale_after=None)
+        self.listen('disturbance', self._on_disturbance, stale_after=None)
         self.track_compute(self._simulator.tick)
         self.report('pacing', self._pacing_status)
         self.report('robot', self._robot_status)
@@ -217,8 +214,6 @@ class SimNode(FlightNode):
         self.report('devices', self._devices_status)
         self.get_logger().info(f'servos at {bus.port}, motor board at {board.port}')
         self._devices.set_faults(given.servo_faults, given.board_faults)
-        self._reset_events([self.get_parameter(name) for name in EVENTS])
-        self.add_post_set_parameters_callback(self._reset_events)
 
     def close(self) -> None:
         """Switch the emulated devices off."""
@@ -247,7 +242,7 @@ class SimNode(FlightNode):
             if self._devices.faults != before:
                 self.get_logger().info('faults: ' + (', '.join(self._devices.faults) or 'none'))
         if new.payload != self.parameters.payload:
-            self._simulator.set_payload(new.payload)
+            self._simulator.payload = new.payload
             self.get_logger().info(f'payload {new.payload:g} kg')
         self.parameters = new
 
@@ -255,17 +250,9 @@ class SimNode(FlightNode):
     def _refuse_faults(given):
         """Refuse faults of emulated devices if there are none."""
         for group_name in ('servo_faults', 'board_faults'):
-            if wanted := switched_on(getattr(given, group_name), event=True):
+            if wanted := switched_on(getattr(given, group_name)):
                 raise ParameterError(f'{group_name}: {wanted[0]}: there are no devices with '
                                      'actuators direct; start with actuators:=emulated')
-
-    def _reset_events(self, changed):
-        """Reset the parameters of events that have happened, so that they can be set again."""
-        happened = [Parameter(one.name, value=type(one.value)()) for one in changed
-                    if one.name in EVENTS and one.value]
-        if happened:
-            self.get_logger().info(', '.join(one.name for one in happened) + ': done')
-            self.set_parameters(happened)
 
     def _on_timer(self):
         for _ in range(self._pacing.due()):
@@ -294,6 +281,9 @@ class SimNode(FlightNode):
             self._pacing.answered('command', command.stamp)
         if self._pacing.epoch is not None:
             self._simulator.command(replace(command, stamp=command.stamp - self._pacing.epoch))
+
+    def _on_disturbance(self, wrench):
+        self._simulator.wrench = np.concatenate([wrench.force, wrench.torque])
 
     def _pacing_status(self):
         pacing = self._pacing

@@ -111,8 +111,12 @@ def added_wrench(robot: RobotParameters, names: list[str]) -> ca.Function:
     Force in world [N] and torque in base_link [N m] at base_link that the named effects add.
 
     The reference is the robot without these effects, with the mass and inertia of its file. It
-    has the effect torque_coefficient, because added thrusts also turn the body. Arguments of the
-    function are those of ``sizes``.
+    has the effect torque_coefficient, because added thrusts also turn the body.
+
+    Returns:
+        f(quaternion, velocity, rate, tilt, tilt_rate, tilt_acceleration, thrust, thrust_rate,
+        position, voltage_ratio, charge_drawn) -> force and torque (6,).
+
     """
     sizes = {'quaternion': 4, 'velocity': 3, 'rate': 3, 'tilt': 4, 'tilt_rate': 4,
              'tilt_acceleration': 4, 'thrust': 4, 'thrust_rate': 4, 'position': 3,
@@ -131,8 +135,7 @@ def added_wrench(robot: RobotParameters, names: list[str]) -> ca.Function:
     without = wrench(both)
     acting = wrench(both | {name: robot.effects[name] for name in names})
     return ca.Function('added_wrench', list(x.values()), [
-        ca.cse(a - b) for a, b in zip(acting, without, strict=True)], list(x),
-        ['force', 'torque'])
+        ca.densify(ca.cse(ca.vertcat(*acting) - ca.vertcat(*without)))], list(x), ['wrench'])
 
 
 def gyroscopic_load(robot: RobotParameters, angular_velocity, tilt, thrust, joint: int):

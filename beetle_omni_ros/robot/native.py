@@ -1,6 +1,6 @@
 """Compilation of CasADi functions: generated C code, compiled once and cached."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 import hashlib
 import logging
 import os
@@ -10,6 +10,7 @@ import subprocess
 import tempfile
 
 import casadi as ca
+import numpy as np
 
 from beetle_omni_ros.robot.schema import RunError
 
@@ -60,6 +61,25 @@ def compiled(function: ca.Function) -> ca.Function:
     except RuntimeError as error:     # also of CasADi, which cannot load it
         log.info('%s stays interpreted: %s', function.name(), str(error).splitlines()[0])
         return function
+
+
+def buffered(function: ca.Function) -> Callable[..., np.ndarray]:
+    """Make a fast call of a CasADi function of vectors: numpy arrays in fixed buffers."""
+    buffer, evaluate = function.buffer()
+    arguments = [np.zeros(function.numel_in(i)) for i in range(function.n_in())]
+    result = np.zeros(function.numel_out(0))
+    for i, array in enumerate(arguments):
+        buffer.set_arg(i, array.data)
+    buffer.set_res(0, result.data)
+
+    def call(*values) -> np.ndarray:
+        for array, value in zip(arguments, values):
+            array[:] = value
+        evaluate()
+        return result.copy()
+
+    call.__dict__['buffer'] = buffer    # `evaluate` has its address only
+    return call
 
 
 def _compile(compiler, source, options, library):

@@ -1,43 +1,43 @@
 """
-Faults of the simulated robot, its devices and the flight stack, as one table KINDS.
+Faults of the simulated robot, its devices and the flight stack: the table KINDS, and their lists.
 
 An example is ``Fault('rotor_weak', at=3.0, duration=1.0, rotor=2, share=0.5)``. Faults of robot
 and devices go to ``Simulator.set_faults``, those of processes to the in-process loop.
 
-A function of the table gets the state of an active fault, see :class:`Schedule`. What else it gets
-and returns depends on its signal:
+A function of the table gets the state of an active fault, see :class:`Schedule`. Those of the
+signals ``imu``, ``mocap``, ``joints``, ``rotors``, ``battery``, ``command`` (to the actuators),
+``request`` (of the active controller) and ``estimate`` also get the item that arrives, and return
+the changed one, or None; of a ``late`` kind the list of due ones, also without an item. ``drive``
+gets the Drive of this tick and changes it in place. The others return a value:
 
-- ``imu``, ``mocap``, ``joints``, ``rotors``, ``battery``: the reading that arrives; returns the
-  changed one, or None. ``command`` and ``request`` do the same for the commands to the actuators
-  and of the active controller, ``estimate`` for the state.
-- ``drive``: the Drive of this tick, changed in place.
-- ``switch``: the Battery and whether the fault begins or ends.
+- ``charge``: largest charge of the battery; ``resistance``: added to it [ohm].
 - ``wrench``: (6,) force in world [N] and torque in base_link [N m]; ``payload``: mass [kg].
 - ``clock``: error of the flight computer's clock [s]; ``waits``: whether the supervisor is not
   scheduled; ``target``: position [m] and quaternion of another target; ``bridges``: bridge -> its
   reported state.
-
-The function of a ``late`` kind is also called without an item, and returns the list of due ones.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, Field, MISSING, replace
-from difflib import get_close_matches
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, Field, make_dataclass, MISSING, replace
 from math import exp, inf
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.schema import check, parameter, ParameterError, quoted
+from beetle_omni_ros.robot.resources import share_path
+from beetle_omni_ros.robot.schema import bind, load, parameter, ParameterError, quoted, unknown
 
 ROUNDING = 1e-9     # [s] bound of the rounding error of sums of ticks
 READINGS = 'imu', 'mocap', 'joints', 'rotors', 'battery'        # attributes of a Frame
 OF_PROCESSES = {'estimate', 'request', 'clock', 'waits', 'target', 'bridges'}
+DEVICES = 'joints', 'rotors', 'battery', 'command'      # without effect if devices are emulated
+OUTCOMES = ('flies_on', 'lands', 'stops', 'refused')
 
 
 class Kind:
@@ -111,17 +111,11 @@ def _both(fault):
 
 # Rotors and servos -----------------------------------------------------------------------------
 
-def thrust(change):
-    """Function that sets the thrust of a rotor to ``change(fault, its command)``."""
+def driven(field, change):
+    """Function that sets ``field`` of a rotor or servo to ``change(fault, its present value)``."""
     def changed(fault, drive):
-        drive.thrust[fault.k] = change(fault, drive.thrust[fault.k])
-    return changed
-
-
-def tilt(change):
-    """Function that sets the target of a servo to ``change(fault, its command)``."""
-    def changed(fault, drive):
-        drive.tilt[fault.k] = change(fault, drive.tilt[fault.k])
+        values = getattr(drive, field)
+        values[fault.k] = change(fault, values[fault.k])
     return changed
 
 
@@ -144,10 +138,6 @@ def servo_jammed(fault, drive):
     fault.memory = angle + step, remaining - step
     drive.tilt[fault.k] = angle + step
     drive.jammed[fault.k] = True
-
-
-def servo_limp(fault, drive):
-    drive.powered[fault.k] = False
 
 
 def slow(fault, command):
@@ -201,13 +191,9 @@ def imu_axis_dead(fault, motion):
     return motion
 
 
-def battery_charge(fault, battery, begins):
-    if begins:
-        battery.charge = min(battery.charge, fault.charge)
-
-
-def battery_resistance(fault, battery, begins):
-    battery.extra_resistance += fault.resistance if begins else -fault.resistance
+def battery_charge(fault):
+    first, fault.memory = fault.memory is None, True
+    return fault.charge if first else 1.0
 
 
 def estimator_diverges(fault, state):
@@ -246,12 +232,6 @@ def vector(unit: str, names: str = 'x y z', **defaults: float) -> dict[str, Fiel
     return {name: number(defaults.get(name, 0.0), unit) for name in names.split()}
 
 
-def sizes(default: float) -> dict[str, Field]:
-    """Sizes of specific force and rate."""
-    return {'specific_force': number(default, 'm/s^2', 0, 1000),
-            'rate': number(default, 'rad/s', 0, 1000)}
-
-
 RPY = 'roll pitch yaw'
 WHOLE = 'rotor', 'servo', 'axis'
 ROTOR, SERVO = {'rotor': number(low=1, high=4)}, {'servo': number(low=1, high=4)}
@@ -261,21 +241,23 @@ STEP = {'step': number(unit='s', low=-100, high=100)}
 
 # docs/faults.md describes each kind.
 KINDS = {
-    'rotor_stops': Kind(ROTOR, drive=thrust(lambda fault, command: 0.0)),
-    'rotor_weak': Kind(ROTOR | SHARE, drive=thrust(lambda fault, command: fault.share * command)),
+    'rotor_stops': Kind(ROTOR, drive=driven('thrust', lambda fault, command: 0.0)),
+    'rotor_weak': Kind(ROTOR | SHARE, drive=driven(
+        'thrust', lambda fault, command: fault.share * command)),
     'propeller_broken': Kind(ROTOR | SHARE, drive=propeller_broken),
-    'rotor_sticks': Kind(ROTOR, drive=thrust(lambda fault, _: fault.truth.thrust[fault.k])),
+    'rotor_sticks': Kind(ROTOR, drive=driven(
+        'thrust', lambda fault, _: fault.truth.thrust[fault.k])),
     'rotor_slow': Kind(ROTOR | {'time_constant': number(unit='s', low=0.005, high=10)},
-                       drive=thrust(lagging)),
+                       drive=driven('thrust', lagging)),
     'servo_jammed': Kind(SERVO | {'offset': number(0.0, 'rad', -8, 8),
                                   'rate': number(10.0, 'rad/s', 0.1, 100)}, drive=servo_jammed),
-    'servo_limp': Kind(SERVO, drive=servo_limp),
+    'servo_limp': Kind(SERVO, drive=driven('powered', lambda fault, _: False)),
     'servo_slow': Kind(SERVO | {'rate': number(unit='rad/s', low=0.01, high=100)},
-                       drive=tilt(slow)),
-    'servo_deaf': Kind(SERVO, drive=tilt(lambda fault, _: fault.held[fault.k])),
+                       drive=driven('tilt', slow)),
+    'servo_deaf': Kind(SERVO, drive=driven('tilt', lambda fault, _: fault.held[fault.k])),
     'encoder_shifted': Kind(
         SERVO | {'angle': number(unit='rad', low=-8, high=8)},
-        drive=tilt(lambda fault, command: command - fault.angle),
+        drive=driven('tilt', lambda fault, command: command - fault.angle),
         joints=added('position', lambda fault: fault.angle * np.eye(4)[fault.k])),
     'encoder_frozen': Kind(SERVO, joints=encoder_frozen),
     'joints_lost': Kind(joints=lost),
@@ -319,32 +301,29 @@ KINDS = {
     'imu_clock': Kind(STEP, imu=added('stamp', lambda fault: fault.step)),
     'gyroscope_bias': Kind(vector('rad/s'), imu=added('angular_velocity', _axes)),
     'accelerometer_bias': Kind(vector('m/s^2'), imu=added('specific_force', _axes)),
-    'imu_saturated': Kind(sizes(1000.0), imu=of_motion(lambda fault, motion: np.clip(
-        motion, -_both(fault), _both(fault)))),
+    'imu_saturated': Kind(
+        {'specific_force': number(1000.0, 'm/s^2', 0, 1000),
+         'rate': number(1000.0, 'rad/s', 0, 1000)},
+        imu=of_motion(lambda fault, motion: np.clip(motion, -_both(fault), _both(fault)))),
     'imu_nan': Kind(imu=of_motion(lambda fault, motion: np.full(6, np.nan))),
-    'imu_spikes': Kind({'period': number(0.1, 's', 0.005, 100), **sizes(0.0)},
-                       imu=of_motion(imu_spikes)),
+    'imu_spikes': Kind(
+        {'period': number(0.1, 's', 0.005, 100), 'rate': number(0.0, 'rad/s', 0, 1000),
+         'specific_force': number(0.0, 'm/s^2', 0, 1000)}, imu=of_motion(imu_spikes)),
     'imu_axis_dead': Kind({'axis': number(low=1, high=6)}, imu=of_motion(imu_axis_dead)),
 
     'commands_lost': Kind(command=lost),
     'commands_drop': Kind(SHARE, command=dropped),
     'commands_delayed': Kind(DELAY, late=True, command=delayed),
-    'battery_charge': Kind({'charge': number(low=0, high=1)}, switch=battery_charge),
+    'battery_charge': Kind({'charge': number(low=0, high=1)}, charge=battery_charge),
     'battery_resistance': Kind({'resistance': number(unit='ohm', low=0, high=2)},
-                               switch=battery_resistance),
+                               resistance=lambda fault: fault.resistance),
     'battery_unread': Kind(battery=lost),
     'payload': Kind({'mass': number(unit='kg', low=0, high=10)},
                     payload=lambda fault: fault.mass),
     'push': Kind(vector('N') | vector('N m', RPY), wrench=lambda fault: np.array(
         [fault.x, fault.y, fault.z, fault.roll, fault.pitch, fault.yaw])),
 }
-TIME = number(unit='s', low=0)
-
-
-def near(name: str, known: Collection[str]) -> str:
-    """Names that are like a wrong one, or some of the known, for a message."""
-    like = get_close_matches(name[:60], known, 8, 0.4)
-    return f"; near: {', '.join(like)}" if like else f"; for example {', '.join([*known][:4])}"
+TIMES = {'at': number(0.0, 's', low=0), 'duration': number(inf, 's', low=0)}
 
 
 @dataclass(frozen=True, init=False)
@@ -359,23 +338,14 @@ class Fault:
     def __init__(self, kind: str, /, at: float = 0.0, duration: float = inf, **numbers: float):
         """Check all arguments; a ParameterError has kind and key of an illegal one."""
         if kind not in KINDS:
-            raise ParameterError(f'fault {quoted(kind)} is unknown{near(kind, KINDS)}')
-        declared, prefix = KINDS[kind].numbers, f"fault '{kind}': key"
-        for key in numbers:
-            if key not in declared:
-                known = ', '.join(('at', 'duration', *declared))
-                raise ParameterError(f'{prefix} {quoted(key)} is unknown; known: {known}')
-        values = {}
-        for key, entry in declared.items():
-            value = numbers.get(key, entry.default)
-            if value is MISSING:
-                raise ParameterError(f"{prefix} '{key}' is missing")
-            values[key] = float(check(entry, int if key in WHOLE else float, value,
-                                      f"{prefix} '{key}'"))
-        vars(self).update(
-            kind=kind, numbers=values, at=check(TIME, float, at, f"{prefix} 'at'"),
-            duration=inf if duration == inf else check(TIME, float, duration,
-                                                       f"{prefix} 'duration'"))
+            raise unknown('faults', f'fault {quoted(kind)}', kind, KINDS)
+        entries = TIMES | KINDS[kind].numbers
+        declared = make_dataclass(kind, [(key, int if key in WHOLE else float, entry)
+                                         for key, entry in entries.items()], kw_only=True)
+        limited = {} if duration == inf else {'duration': duration}
+        values = vars(bind(declared, {**numbers, 'at': at, **limited}, f"fault '{kind}'"))
+        vars(self).update(kind=kind, at=values.pop('at'), duration=values.pop('duration'),
+                          numbers=values)
 
     @property
     def is_process(self) -> bool:
@@ -397,21 +367,19 @@ class Schedule:
     """
     Starts and ends faults by their times, updated once in each ``tick`` [s].
 
-    Equal faults, seeds and calls give equal results. ``active`` are kind and state of the active
-    faults, ``names`` their kinds, in the order of the list.
+    Equal faults, seeds and calls give equal results.
     """
 
-    def __init__(self, tick: float, seed: np.random.SeedSequence, battery=None):
-        self._tick, self._seed, self._battery = tick, seed, battery
+    def __init__(self, tick: float, seed: np.random.SeedSequence):
+        self._tick, self._seed = tick, seed
         # The state of a fault: its numbers, k (index of its rotor or servo), tick, now, memory
         # (for its functions, at first None), and from its onset random, truth and held.
         self._states: list[SimpleNamespace] = []
-        self.active: list[tuple[Kind, Any]] = []
-        self.names: list[str] = []
+        self.empty = True
 
     def set(self, faults: Sequence[Fault], now: float) -> None:
         """Replace the faults, ``at`` counts from ``now`` [s]; one that stays continues."""
-        before, self._states = self._states, []
+        before, self._states, self.empty = self._states, [], not faults
         for fault in faults:
             state = next((state for state in before if state.fault == fault), None)
             if state is not None:
@@ -420,35 +388,20 @@ class Schedule:
                 **fault.numbers, fault=fault, begin=now + fault.at, active=False, over=False,
                 k=int(fault.numbers.get('rotor', fault.numbers.get('servo', 1))) - 1,
                 tick=self._tick, memory=None))
-        for state in before:
-            if state.active:
-                self._switch(state, False)
-        self._collect()
 
     def update(self, now: float, truth: Any = None, held: np.ndarray | None = None) -> None:
         """Start and end the faults due at ``now`` [s], with the true state and servo targets."""
-        changed = False
         for state in self._states:
             if not (state.active or state.over) and now >= state.begin - ROUNDING:
-                state.now, state.truth, state.held = now, truth, held
+                state.now, state.truth, state.held, state.active = now, truth, held, True
                 state.random = np.random.default_rng(self._seed.spawn(1)[0])
-                self._switch(state, True)
-                changed = True
             if state.active and now >= state.begin + state.fault.duration - ROUNDING:
-                self._switch(state, False)
-                state.over = changed = True
-        if changed:
-            self._collect()
+                state.active, state.over = False, True
 
-    def _switch(self, state, begins):
-        state.active = begins
-        if switch := KINDS[state.fault.kind].functions.get('switch'):
-            switch(state, self._battery, begins)
-
-    def _collect(self):
-        running = [state for state in self._states if state.active]
-        self.active = [(KINDS[state.fault.kind], state) for state in running]
-        self.names = [state.fault.kind for state in running]
+    @property
+    def active(self) -> list[tuple[Kind, Any]]:
+        """Kind and state of each active fault, in the order of the list."""
+        return [(KINDS[state.fault.kind], state) for state in self._states if state.active]
 
     def through(self, signal: str, item: Any, now: float) -> list:
         """Items that arrive ``now`` [s] if ``item``, or None, is sent through the faults."""
@@ -469,7 +422,86 @@ class Schedule:
         return [kind.functions[signal](state, *arguments) for kind, state in self.active
                 if signal in kind.functions]
 
-    @property
-    def empty(self) -> bool:
-        """Whether the list is empty."""
-        return not self._states
+
+# Lists -----------------------------------------------------------------------------------------
+
+@dataclass(frozen=True)
+class Case:
+    """One named fault of the campaign."""
+
+    name: str = parameter(doc='')
+    expected: str = parameter(doc='', choices=OUTCOMES)
+    what: str = parameter(doc='')       # description
+    strike: tuple = parameter(doc='')   # its faults; ``at`` counts from the onset
+
+
+def _content(path, kind):
+    """Value of the key 'faults', the only one of a file."""
+    return load(make_dataclass('File', [('faults', kind, parameter(doc=''))]), path).faults
+
+
+def load_cases(path: str | Path | None = None) -> dict[str, Case]:
+    """Read named faults, by default the shipped ones; a ParameterError has file and key."""
+    path = path or share_path('params/faults.yaml')
+    cases = {}
+    for name, entry in _content(path, dict).items():
+        case = bind(Case, entry | {'name': name} if isinstance(entry, dict) else entry, str(path),
+                    f'faults.{name}')
+        cases[name] = replace(case, strike=tuple(
+            _fault(one, f"{path}: key 'faults.{name}': strike {k}")
+            for k, one in enumerate(case.strike, 1)))
+    return cases
+
+
+def chosen(cases: dict[str, Case], names: list[str]) -> list[Case]:
+    """Cases by name; a ParameterError reports an unknown one."""
+    for name in names:
+        if name not in cases:
+            raise unknown('faults', f'fault {quoted(name)}', name, cases)
+    return [cases[name] for name in names]
+
+
+def _fault(entry, at, key='kind'):
+    """Fault of a mapping whose ``key`` is the kind."""
+    if not isinstance(entry, dict) or not isinstance(entry.get(key), str):
+        raise ParameterError(f"{at}: expected a mapping with the key '{key}'")
+    try:
+        return Fault(entry[key], **{str(name): value for name, value in entry.items()
+                                    if name != key})
+    except ParameterError as error:
+        raise ParameterError(f'{at}: {error}') from None
+
+
+def load_faults(path: str | Path) -> list[Fault]:
+    """
+    Read the faults of one flight, each with the keys what, at [s], duration [s] and numbers.
+
+    ``what`` is a name of the shipped list without numbers, or a kind. A ParameterError has file
+    and key.
+    """
+    named, faults = load_cases(), []
+    for k, entry in enumerate(_content(path, tuple), 1):
+        at = f'{path}: fault {k}'
+        what = entry.get('what') if isinstance(entry, dict) else None
+        if isinstance(what, str) and what in named and set(entry) <= {'what', 'at', 'duration'}:
+            times = {key: value for key, value in entry.items() if key != 'what'}
+            faults += [_fault({'kind': fault.kind, **fault.numbers, 'duration': fault.duration,
+                               **times}, at) for fault in named[what].strike]
+        else:
+            faults.append(_fault(entry, at, 'what'))
+    return faults
+
+
+def parse_faults(text: str) -> list[Fault]:
+    """Parse a text such as 'rotor_stops rotor=2; mocap_lost duration=3'."""
+    faults = []
+    for part in filter(None, (part.strip() for part in text.split(';'))):
+        kind, *given = part.split()
+        try:
+            numbers = {key: float(value) for key, _, value in (one.partition('=')
+                                                               for one in given)}
+        except ValueError:
+            raise ParameterError(f'faults: {quoted(part)}: expected KIND NAME=NUMBER '
+                                 '...') from None
+        faults.append(_fault({'kind': kind, **numbers}, 'faults'))
+    return faults

@@ -5,10 +5,9 @@ import numpy as np
 
 from beetle_omni_ros.robot.parameters import (
     combined,
-    mass_properties,
+    MassProperties,
     RigidPart,
     RobotParameters,
-    Variation,
 )
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 
@@ -29,66 +28,48 @@ STOP_IMPEDANCE = 0.99, 0.999, 0.001
 
 
 def build_model(robot: RobotParameters, plant: SimulatorParameters,
-                variation: Variation | None = None) -> mujoco.MjModel:
+                parts: MassProperties) -> mujoco.MjModel:
     """
-    Compile the plant.
+    Compile the plant; :func:`set_payload` gives base_link its mass.
 
     Generalised velocities: base_link's velocity in world (3) and angular velocity in
     base_link (3), then the four tilt rates. Controls: four thrust commands [N], four tilt
     targets [rad]; activations: the four lagged thrusts [N].
+
+    An unloaded joint has the dynamics J q'' = Kp (q* - q) - Kd q'. J was identified from step
+    responses of a servo with its module, but the module's own inertia about the joint axis is
+    larger. The negative difference is the armature of the joint, an internal torque between module
+    and body, so that the response is as identified and the momentum is conserved.
     """
-    model = mujoco.MjModel.from_xml_string(_mjcf(robot, plant, variation))
-    _reflect_servo_inertia(model, robot)
+    model = mujoco.MjModel.from_xml_string(_mjcf(robot, plant, parts))
+    module = robot.parts.module
+    sideways, up = module.centre_of_mass[1:]
+    own = module.inertia[0] + module.mass * (sideways ** 2 + up ** 2)
+    model.dof_armature[6:] = robot.joints.inertia - own
     return model
 
 
-def base_part(robot: RobotParameters, variation: Variation | None, payload: float) -> RigidPart:
-    """All parts fixed to base_link: main body, end-effector, payload of ``payload`` [kg]."""
-    parts = mass_properties(robot, variation)
+def set_payload(model: mujoco.MjModel, parts: MassProperties, payload: float) -> None:
+    """Give base_link the mass of main body, end-effector and a ``payload`` [kg]."""
     rigid = [parts.main_body, parts.end_effector]
     if payload:
         radius = (3 * payload / (4 * np.pi * PAYLOAD_DENSITY)) ** (1 / 3)
         rigid.append(RigidPart(payload, np.array([0.0, 0.0, -PAYLOAD_DEPTH]),
                                0.4 * payload * radius ** 2 * np.eye(3)))
-    return combined(rigid)
-
-
-def set_base_part(model: mujoco.MjModel, part: RigidPart) -> None:
-    """Change mass, centre of mass and inertia of base_link in a compiled model."""
-    moments, axes = np.linalg.eigh(part.inertia)
+    whole = combined(rigid)
+    moments, axes = np.linalg.eigh(whole.inertia)
     if np.linalg.det(axes) < 0:
         axes[:, 0] *= -1
-    model.body_mass[BASE] = part.mass
-    model.body_ipos[BASE] = part.centre
+    model.body_mass[BASE] = whole.mass
+    model.body_ipos[BASE] = whole.centre
     model.body_inertia[BASE] = moments
     mujoco.mju_mat2Quat(model.body_iquat[BASE], axes.ravel())
     model.body_sameframe[BASE] = 0      # the inertial frame may differ from the compiled one
     mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
-def _reflect_servo_inertia(model, robot):
-    """
-    Give an unloaded joint the dynamics J q'' = Kp (q* - q) - Kd q'.
-
-    J was identified from step responses of a servo with its module, but the module's own inertia
-    about the joint axis is larger. The negative difference is the armature of the joint, an
-    internal torque between module and body, so that the response is as identified and the
-    momentum is conserved.
-    """
-    module = robot.parts.module
-    sideways, up = module.centre_of_mass[1:]
-    own = module.inertia[0] + module.mass * (sideways ** 2 + up ** 2)
-    model.dof_armature[6:] = robot.joints.inertia - own
-
-
 def _text(*numbers):
     return ' '.join(repr(float(x)) for x in np.ravel(numbers))
-
-
-def _inertial(part: RigidPart) -> str:
-    i = part.inertia
-    return (f'<inertial pos="{_text(part.centre)}" mass="{part.mass!r}" '
-            f'fullinertia="{_text(i[0, 0], i[1, 1], i[2, 2], i[0, 1], i[0, 2], i[1, 2])}"/>')
 
 
 def _module(robot, plant, parts, k):
@@ -109,22 +90,17 @@ def _module(robot, plant, parts, k):
       </body>"""
 
 
-def _actuators(robot):
-    rotors, joints, scale = robot.rotors, robot.joints, robot.thrust_scale
-    rotor = ''.join(
+def _mjcf(robot, plant, parts):
+    joints, rotors = robot.joints, robot.rotors
+    scale, limit = robot.thrust_scale, joints.effort_limit
+    actuators = [
         f'<general name="rotor{k + 1}" site="rotor{k + 1}" dyntype="filter" '
         f'dynprm="{rotors.time_constant!r}" gear="{_text(0, 0, scale[k], 0, 0)} '
-        f'{_text(-rotors.spin[k] * robot.torque_ratio * scale[k])}"/>\n' for k in range(4))
-    servo = ''.join(
+        f'{_text(-rotors.spin[k] * robot.torque_ratio * scale[k])}"/>' for k in range(4)]
+    actuators += [
         f'<general name="servo{k + 1}" joint="gimbal{k + 1}" gainprm="{joints.of(k).kp!r}" '
         f'biastype="affine" biasprm="{_text(0, -joints.of(k).kp, -joints.of(k).kd)}" '
-        f'forcelimited="true" forcerange="{_text(-joints.effort_limit, joints.effort_limit)}"/>\n'
-        for k in range(4))
-    return rotor + servo
-
-
-def _mjcf(robot, plant, variation):
-    parts = mass_properties(robot, variation)
+        f'forcelimited="true" forcerange="{_text(-limit, limit)}"/>' for k in range(4)]
     foot_z = plant.foot_radius - plant.foot_depth
     feet = ''.join(f'<geom name="foot{k + 1}" type="sphere" size="{plant.foot_radius!r}" '
                    f'pos="{_text(x * plant.foot_spread, y * plant.foot_spread, foot_z)}"/>\n'
@@ -148,14 +124,12 @@ def _mjcf(robot, plant, variation):
     <geom name="floor" type="plane" size="0 0 1" contype="0" conaffinity="1"/>
     <body name="base_link">
       <freejoint name="base"/>
-      {_inertial(base_part(robot, variation, 0.0))}
+      <inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>
       <geom name="main_body" type="cylinder" size="{_text(0.5 * plant.foot_spread, 0.03)}"/>
       <geom name="end_effector" type="sphere" size="{plant.end_effector_radius!r}"
             pos="{_text(ball)}"/>
       {feet}{modules}
     </body>
   </worldbody>
-  <actuator>
-    {_actuators(robot)}
-  </actuator>
+  <actuator>{''.join(actuators)}</actuator>
 </mujoco>"""

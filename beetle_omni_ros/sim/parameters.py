@@ -1,6 +1,6 @@
 """Parameters of the simulator from params/simulator.yaml, and the conditions of one flight."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -73,27 +73,22 @@ class SimulatorParameters(ParameterFile, file='simulator.yaml'):
                                        unit='s', low=0, high=1)
 
 
-def _zeros(size):
-    return field(default_factory=lambda: np.zeros(size))
-
-
 @dataclass(frozen=True, kw_only=True)
 class Conditions:
-    """Constants of one flight."""
+    """Constants of one flight; the noises are half-widths of uniform ones, in units of biases."""
 
-    variation: Variation = field(default_factory=Variation)     # of the body from the robot file
-    position_bias: np.ndarray = _zeros(3)           # of the MoCap [m]
-    orientation_bias: np.ndarray = _zeros(3)        # of the MoCap, a rotation vector [rad]
-    imu_bias: np.ndarray = _zeros(6)                # specific force [m/s^2], rate [rad/s]
-    tilt_bias: np.ndarray = _zeros(4)               # encoder reading minus true tilt [rad]
-    # Half-widths of uniform noise, in the units of the biases.
-    imu_uniform_noise: np.ndarray = _zeros(6)
-    mocap_uniform_noise: np.ndarray = _zeros(6)
-    tilt_uniform_noise: float = 0.0
-    imu_latency: float = 0.0                        # that its stamps do not contain [s]
-    tilt_latency: float                             # age of joint feedback [s]
-    tilt_command_delay: float                       # from a command's stamp until it acts [s]
-    thrust_command_delay: float                     # [s]
+    variation: Variation                # of the body from the robot file
+    position_bias: np.ndarray           # (3,) of the MoCap [m]
+    orientation_bias: np.ndarray        # (3,) of the MoCap, a rotation vector [rad]
+    imu_bias: np.ndarray                # (6,) specific force [m/s^2], rate [rad/s]
+    tilt_bias: np.ndarray               # (4,) encoder reading minus true tilt [rad]
+    imu_uniform_noise: np.ndarray       # (6,)
+    mocap_uniform_noise: np.ndarray     # (6,)
+    tilt_uniform_noise: float
+    imu_latency: float                  # that its stamps do not contain [s]
+    tilt_latency: float                 # age of joint feedback [s]
+    tilt_command_delay: float           # from a command's stamp until it acts [s]
+    thrust_command_delay: float         # [s]
 
     def command_delays(self, robot: RobotParameters) -> tuple[float, float]:
         """Delays of tilt and thrust commands [s], with the effects of the robot file."""
@@ -110,19 +105,17 @@ def draw(name: str, parameters: SimulatorParameters,
         ParameterError: unknown name.
 
     """
-    if name == 'nominal':
-        delay = parameters.command_delay
-        return Conditions(tilt_latency=parameters.encoder_latency, tilt_command_delay=delay,
-                          thrust_command_delay=delay)
-    if name != 'published':
+    if name not in ('nominal', 'published'):
         raise ParameterError(f"conditions: '{name}' is unknown; expected one of nominal, "
                              'published')
+    published = name == 'published'
 
     def uniform(half_width, size=None):
-        return generator.uniform(-half_width, half_width, size)
+        return published * generator.uniform(-half_width, half_width, size)
 
-    def latency(span):
-        return float(generator.integers(span[0], span[1] + 1) * LATENCY_UNIT)
+    def latency(span, nominal):
+        drawn = float(generator.integers(span[0], span[1] + 1) * LATENCY_UNIT)
+        return drawn if published else nominal
 
     variation = Variation(1 + uniform(MASS_SCALE), 1 + uniform(INERTIA_SCALE, 3),
                           uniform(CENTRE_OF_MASS, 3))
@@ -133,10 +126,10 @@ def draw(name: str, parameters: SimulatorParameters,
         orientation_bias=uniform(ORIENTATION_BIAS, 3),
         imu_bias=np.concatenate([acceleration_bias, uniform(RATE_BIAS, 3)]),
         tilt_bias=uniform(TILT_BIAS, 4),
-        imu_uniform_noise=np.repeat([ACCELERATION_NOISE, RATE_NOISE], 3),
-        mocap_uniform_noise=np.repeat([POSITION_NOISE, ORIENTATION_NOISE], 3),
-        tilt_uniform_noise=TILT_NOISE,
-        imu_latency=latency(IMU_LATENCY),
-        tilt_latency=latency(TILT_LATENCY),
-        tilt_command_delay=latency(COMMAND_LATENCY),
-        thrust_command_delay=latency(COMMAND_LATENCY))
+        imu_uniform_noise=published * np.repeat([ACCELERATION_NOISE, RATE_NOISE], 3),
+        mocap_uniform_noise=published * np.repeat([POSITION_NOISE, ORIENTATION_NOISE], 3),
+        tilt_uniform_noise=published * TILT_NOISE,
+        imu_latency=latency(IMU_LATENCY, 0.0),
+        tilt_latency=latency(TILT_LATENCY, parameters.encoder_latency),
+        tilt_command_delay=latency(COMMAND_LATENCY, parameters.command_delay),
+        thrust_command_delay=latency(COMMAND_LATENCY, parameters.command_delay))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.effects import SensorErrors
+from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import (
     BatteryReading,
     ImuReading,
@@ -94,10 +94,10 @@ class Sensors:
 
     def __init__(self, parameters: SimulatorParameters, conditions: Conditions,
                  seeds: list[np.random.SeedSequence], first: Truth, plant: Plant,
-                 errors: SensorErrors = SensorErrors()):
-        self._tick, self._plant, self._errors = parameters.tick, plant, errors
-        self._to_imu = rotations.matrix(rotations.exp(errors.imu_rotation)) \
-            if any(errors.imu_rotation) else None
+                 robot: RobotParameters):
+        self._tick, self._plant, self._gravity = parameters.tick, plant, robot.gravity
+        self._errors = errors = robot.sensors
+        self._to_imu = np.kron(np.eye(2), rotations.matrix(rotations.exp(errors.imu_rotation)))
         self._lever_arm = np.array(errors.imu_position) if any(errors.imu_position) else None
         imu, mocap, tilt, pack, rotors = (np.random.Generator(np.random.PCG64(seed))
                                           for seed in seeds)
@@ -116,53 +116,55 @@ class Sensors:
                                  conditions.tilt_uniform_noise)
         self._battery_noise = noise(pack, [0.0, 0.0], [VOLTAGE_NOISE, CURRENT_NOISE])
         self._rotor_noise = noise(rotors, np.ones(4), np.full(4, ROTOR_NOISE))
-        self._rotor_period = self._ticks('rotor period', ROTOR_PERIOD, least=1)
-        self._mocap_period = self._ticks('mocap_period', parameters.mocap_period, least=1)
-        self._battery_period = self._ticks('battery period', BATTERY_PERIOD, least=1)
-        # The delay of the IMU is realised in whole ticks and corrected by the stamps.
-        self._imu_shift = errors.imu_delay - self._tick * self._hidden_ticks(errors.imu_delay)
-        motion = self._in_imu_axes(np.concatenate([plant.specific_force, first.angular_velocity]))
+        self._rotor_period = self._ticks('rotor period', ROTOR_PERIOD)
+        self._mocap_period = self._ticks('mocap_period', parameters.mocap_period)
+        self._battery_period = self._ticks('battery period', BATTERY_PERIOD)
+        # Queues, whose first reading arrives when the last is captured. A delay that the stamp
+        # does not contain makes them longer; the IMU's is realised in whole ticks, its stamps are
+        # corrected by the rest.
+        imu_delay, encoder_delay, mocap_delay = (
+            max(0, int(np.ceil(delay / self._tick - 1e-9)))
+            for delay in (errors.imu_delay, errors.encoder_delay, errors.mocap_delay))
+        self._imu_shift = errors.imu_delay - self._tick * imu_delay
         self._before = first
-        self._imu = self._line('imu latency', conditions.imu_latency, errors.imu_delay,
-                               lambda age: motion)
-        self._rotors = self._line('rotor latency', ROTOR_LATENCY, 0.0, lambda age: None)
-        self._joints = self._line(
-            'encoder latency', conditions.tilt_latency, errors.encoder_delay, lambda age: (
-                first.stamp - self._tick * age, first.tilt, first.tilt_velocity, plant.effort))
-        self._mocap = self._line(
-            'mocap_latency', parameters.mocap_latency, errors.mocap_delay,
-            lambda age: None if age else self._capture(first))
+        length = 1 + self._ticks('imu latency', conditions.imu_latency) + imu_delay
+        self._imu = deque([self._to_imu.T @ np.concatenate(
+            [plant.specific_force, first.angular_velocity])] * length, length)
+        length = 1 + self._ticks('rotor latency', ROTOR_LATENCY)
+        self._rotors: deque = deque([None] * length, length)
+        length = 1 + self._ticks('encoder latency', conditions.tilt_latency) + encoder_delay
+        self._joints = deque([(first.stamp - self._tick * age, first.tilt, first.tilt_velocity,
+                               plant.effort) for age in reversed(range(length))], length)
+        length = 1 + self._ticks('mocap_latency', parameters.mocap_latency) + mocap_delay
+        self._mocap = deque([*[None] * (length - 1), self._capture(first)], length)
 
-    def _ticks(self, name, seconds, least=0):
+    def _ticks(self, name, seconds):
         ticks = round(seconds / self._tick)
-        if ticks < least or abs(ticks * self._tick - seconds) > 1e-6:
+        if abs(ticks * self._tick - seconds) > 1e-6:
             raise ParameterError(f'{name}: {seconds:g} s must be a multiple of the simulator tick '
-                                 f'{self._tick:g} s' + (', one or more' if least else ''))
+                                 f'{self._tick:g} s')
         return ticks
 
-    def _line(self, name, latency, hidden, make):
-        """Queue of ``make(age in ticks)``; its first element is older than its last by both."""
-        length = 1 + self._ticks(name, latency) + self._hidden_ticks(hidden)
-        return deque((make(age) for age in reversed(range(length))), maxlen=length)
+    def _motion(self, before, after):
+        """
+        Mean specific force [m/s^2] and angular rate [rad/s] (6,) of the IMU between two states.
 
-    def _hidden_ticks(self, delay):
-        """Additional latency in ticks of a reading whose stamp does not contain a delay [s]."""
-        return max(0, int(np.ceil(delay / self._tick - 1e-9)))
-
-    def _motion(self, truth):
-        """(6,) specific force and angular rate at the place of the IMU, in its axes."""
-        before, self._before = self._before, truth
-        motion = mean_motion(before, truth, self._plant.gravity)
-        if self._lever_arm is not None:
-            rate, arm = motion[3:], self._lever_arm
-            acceleration = (truth.angular_velocity - before.angular_velocity) / self._tick
-            motion[:3] += np.cross(acceleration, arm) + np.cross(rate, np.cross(rate, arm))
-        return self._in_imu_axes(motion)
-
-    def _in_imu_axes(self, motion):
-        if self._to_imu is None:
-            return motion
-        return np.concatenate([motion[:3] @ self._to_imu, motion[3:] @ self._to_imu])
+        A MEMS IMU samples at several kHz and filters before it decimates to 200 Hz. A sample of
+        one instant would alias the fast accelerations of a tilting module into velocity errors.
+        """
+        dt = after.stamp - before.stamp
+        x, y, z, w = own = before.quaternion.tolist()
+        turn = rotations.log(rotations.product(-x, -y, -z, w, *after.quaternion.tolist()))
+        middle = rotations.product(*own, *rotations.exp_parts(*(0.5 * turn).tolist()))
+        acceleration = (after.velocity - before.velocity) / dt
+        acceleration[2] += self._gravity
+        motion = np.empty(6)
+        motion[:3] = acceleration.dot(rotations.matrix(middle))
+        motion[3:] = rate = turn / dt
+        if (arm := self._lever_arm) is not None:
+            turning = (after.angular_velocity - before.angular_velocity) / dt
+            motion[:3] += np.cross(turning, arm) + np.cross(rate, np.cross(rate, arm))
+        return self._to_imu.T @ motion
 
     def read(self, tick: int, truth: Truth, battery, wear: np.ndarray,
              devices: bool = False) -> Frame:
@@ -172,15 +174,22 @@ class Sensors:
         ``wear`` is that of :class:`.faults.Drive`; with ``devices``, joints are inputs of emulated
         devices.
         """
-        self._imu.append(self._motion(truth))
+        self._imu.append(self._motion(self._before, truth))
+        self._before = truth
         imu = self._imu[0] + next(self._imu_noise)
         self._mocap.append(self._capture(truth) if tick % self._mocap_period == 0 else None)
         tilt, effort = self._plant.encoder, self._plant.effort
         if self._errors.encoders_err:
             tilt = self._errors.encoders(tilt)
         self._joints.append((truth.stamp, tilt, truth.tilt_velocity, effort))
-        joints = JointReading(truth.stamp, tilt + next(self._tilt_noise), truth.tilt_velocity,
-                              effort) if devices else self._joint_reading()
+        error = next(self._tilt_noise)
+        if devices:
+            joints = JointReading(truth.stamp, tilt + error, truth.tilt_velocity, effort)
+        else:
+            stamp, tilt, velocity, effort = self._joints[0]
+            joints = JointReading(
+                stamp + self._errors.encoder_delay, np.rint((tilt + error) / RESOLUTION)
+                * RESOLUTION, np.rint(velocity / RATE_RESOLUTION) * RATE_RESOLUTION, effort)
         rotors = pack = None
         if tick % self._battery_period == 0:
             voltage, current = next(self._battery_noise).tolist()
@@ -198,28 +207,3 @@ class Sensors:
         return PoseReading(truth.stamp + self._errors.mocap_delay, truth.position + row[:3],
                            np.array(rotations.product(*truth.quaternion.tolist(),
                                                       *rotations.exp_parts(*row[3:].tolist()))))
-
-    def _joint_reading(self):
-        stamp, tilt, velocity, effort = self._joints[0]
-        tilt = np.rint((tilt + next(self._tilt_noise)) / RESOLUTION) * RESOLUTION
-        velocity = np.rint(velocity / RATE_RESOLUTION) * RATE_RESOLUTION
-        return JointReading(stamp + self._errors.encoder_delay, tilt, velocity, effort)
-
-
-def mean_motion(before: Truth, after: Truth, gravity: float) -> np.ndarray:
-    """
-    Mean specific force [m/s^2] and angular rate [rad/s] (6,) in base_link between two states.
-
-    A MEMS IMU samples at several kHz and filters before it decimates to 200 Hz. A sample of one
-    instant would alias the fast accelerations of a tilting module into velocity errors.
-    """
-    dt = after.stamp - before.stamp
-    x, y, z, w = own = before.quaternion.tolist()
-    turn = rotations.log(rotations.product(-x, -y, -z, w, *after.quaternion.tolist()))
-    middle = rotations.product(*own, *rotations.exp_parts(*(0.5 * turn).tolist()))
-    acceleration = (after.velocity - before.velocity) / dt
-    acceleration[2] += gravity
-    motion = np.empty(6)
-    motion[:3] = acceleration.dot(rotations.matrix(middle))
-    motion[3:] = turn / dt
-    return motion

@@ -18,7 +18,6 @@ from beetle_omni_ros.sim.plant import Plant, XYZW
 from beetle_omni_ros.sim.sensors import Frame, Impact, Sensors, Truth
 
 ROUNDING = 1e-9     # [s] bound of the rounding error of sums of ticks
-INTACT = np.ones(4)
 FUTURE_LIMIT = 0.1  # [s] stamps further ahead come from a wrong clock and are refused
 AIRBORNE_TIME = 0.3     # [s] without contact, after which a contact is a touchdown; chosen
 # Charge of a pack, and its open-circuit voltage relative to a full one: a typical lithium-polymer
@@ -71,10 +70,9 @@ class Battery:
     def thrust_limit(self) -> float:
         """Largest thrust of a rotor at the present voltage [N], by the rotor map if given."""
         voltages, thrusts = self._limits
-        if not voltages:
+        if len(voltages) < 2:
             return self._thrust_max
-        limit = thrusts[0] if len(thrusts) == 1 else \
-            _interpolate(voltages, thrusts, min(self.voltage, voltages[-1]))
+        limit = _interpolate(voltages, thrusts, min(self.voltage, voltages[-1]))
         return min(self._thrust_max, max(0.0, limit))
 
 
@@ -133,7 +131,9 @@ class Simulator:
 
     Equal robots, parameters, conditions ('nominal' or 'published'), seeds and calls give equal
     results. ``time`` is that since reset [s], ``tick`` the duration of one step [s]. The reset of
-    ``battery`` inserts a new one, also in flight.
+    ``battery`` inserts a new one, also in flight. In flight ``wrench`` may be set, an external
+    force in world [N] and torque in base_link [N m] there (6,), and ``payload``, the mass [kg] of
+    a ball that is fixed below the body.
 
     Raises:
         ParameterError: impossible mass properties, unknown conditions, or a latency that is not a
@@ -151,6 +151,7 @@ class Simulator:
                                np.random.default_rng(np.random.SeedSequence(seed).spawn(1)[0]))
         # Of tilt and thrust commands from their stamps [s], effects included.
         self.command_delays = self.conditions.command_delays(robot)
+        self._rotor_gain = -np.expm1(-self.tick / robot.rotors.time_constant)
         self._plant = Plant(robot, self._parameters, self.conditions.variation)
         self.battery = Battery(robot, self._parameters)
         self.reset()
@@ -169,15 +170,14 @@ class Simulator:
         self.battery.reset()
         self._impact: Impact | None = None
         self._airborne, self._flown, self._broken = 0.0, False, False
-        self._wrench, self._payload = np.zeros(6), 0.0
-        self._wear = INTACT
+        self.wrench, self.payload, self._wear = np.zeros(6), 0.0, np.ones(4)
         self._link = CommandLink(self._robot, self._parameters.command_timeout,
                                  self.command_delays)
         self.truth = self._truth()
         *seeds, fault_seed = np.random.SeedSequence(self._seed).spawn(7)[1:]
-        self._schedule = Schedule(self.tick, fault_seed, self.battery)
+        self._schedule = Schedule(self.tick, fault_seed)
         self._sensors = Sensors(self._parameters, self.conditions, seeds, self.truth,
-                                self._plant, self._robot.sensors)
+                                self._plant, self._robot)
 
     def command(self, command) -> None:
         """Send a command, see :meth:`CommandLink.push`."""
@@ -196,33 +196,16 @@ class Simulator:
                 raise ParameterError(f"fault '{fault.kind}': affects a process, not the simulated "
                                      'robot')
         self._schedule.set(faults, self.time)
-        self._apply_wrench()
 
     @property
     def faults(self) -> list[str]:
         """Kinds of the active faults."""
-        return self._schedule.names
+        return [state.fault.kind for _, state in self._schedule.active]
 
     @property
     def thrust_command(self) -> np.ndarray:
         """(4,) thrusts commanded to the rotors [N]; zero after the command timeout."""
         return self._link.thrust
-
-    def _apply_wrench(self):
-        """Set wrench and payload of the plant: those of the task and those of the faults."""
-        wrench = sum(self._schedule.each('wrench'), self._wrench)
-        self._plant.set_wrench(wrench[:3], wrench[3:])
-        self._plant.set_payload(sum(self._schedule.each('payload'), self._payload))
-
-    def set_wrench(self, force_world: np.ndarray, torque_body: np.ndarray) -> None:
-        """Apply an external force (3,) in world [N] and torque (3,) in base_link [N m] there."""
-        self._wrench = np.concatenate([force_world, torque_body])
-        self._apply_wrench()
-
-    def set_payload(self, mass: float) -> None:
-        """Set the mass [kg] of the payload, a ball that is fixed below the body."""
-        self._payload = mass
-        self._apply_wrench()
 
     def step(self, drive: Drive | None = None) -> Frame:
         """
@@ -231,52 +214,44 @@ class Simulator:
         Servos and rotors follow :meth:`command`, or ``drive`` of external actuators, without
         delay or timeout.
         """
-        plant, link, battery, devices = self._plant, self._link, self.battery, True
-        if not self._schedule.empty:
-            before = self._schedule.active
-            self._schedule.update(self.time, self.truth, link.tilt)
-            if self._schedule.active is not before:
-                self._apply_wrench()
-            for late in self._schedule.through('command', None, self.time):
+        plant, link, battery, schedule = self._plant, self._link, self.battery, self._schedule
+        devices = drive is not None
+        if not schedule.empty:
+            schedule.update(self.time, self.truth, link.tilt)
+            for late in schedule.through('command', None, self.time):
                 link.push(late, self.time)
         if drive is None:
             link.update(self.time)
             drive = Drive(link.tilt, np.minimum(link.thrust, battery.thrust_limit))
-            devices = False
-        wear = self._actuate(drive)
+        struck = bool(schedule.active)
+        if struck or self._broken:
+            drive = Drive(*map(np.array, (drive.tilt, drive.thrust, drive.powered, drive.jammed,
+                                          drive.wear)))
+            schedule.each('drive', drive)
+            limit = self._robot.joints.position_limit
+            drive.tilt = clipped(drive.tilt, -limit, limit)
+        if self._broken:
+            drive.thrust, drive.powered = np.zeros(4), np.zeros(4, dtype=bool)
+        plant.set_targets(drive.tilt, drive.thrust, drive.powered, drive.jammed)
+        plant.wrench[:] = sum(schedule.each('wrench'), self.wrench)
+        plant.set_payload(sum(schedule.each('payload'), self.payload))
         plant.voltage_ratio = battery.voltage / self._robot.battery.full_voltage
         plant.charge_drawn = battery.drawn
         plant.step()
-        if wear is not self._wear:      # shows with the thrust, which follows with the rotors' lag
-            wear = self._wear = self._wear - np.expm1(
-                -self.tick / self._robot.rotors.time_constant) * (wear - self._wear)
+        # Wear shows with the thrust, which follows with the rotors' lag.
+        self._wear = self._wear + self._rotor_gain * (drive.wear - self._wear)
         self._ticks += 1
         self.time = self._ticks * self.tick
         self._watch_contact(self.truth, plant.contact)
         self.truth = self._truth()
+        battery.extra_resistance = sum(schedule.each('resistance'))
+        battery.charge = min(battery.charge, *schedule.each('charge'), 1.0)
         battery.step(self.truth.thrust, self.tick)
-        frame = self._sensors.read(self._ticks, self.truth, battery, wear, devices)
-        if self._schedule.active:
-            frame = replace(frame, **{name: next(iter(self._schedule.through(
+        frame = self._sensors.read(self._ticks, self.truth, battery, self._wear, devices)
+        if struck:
+            frame = replace(frame, **{name: next(iter(schedule.through(
                 name, getattr(frame, name), self.time)), None) for name in READINGS})
         return frame
-
-    def _actuate(self, drive):
-        """Set the inputs of servos and rotors with faults and damage; return the rotors' wear."""
-        plant, broken = self._plant, self._broken
-        if not (self._schedule.active or broken):
-            plant.set_powered(drive.powered)
-            plant.set_targets(drive.tilt, drive.thrust)
-            return INTACT
-        drive = Drive(*map(np.array, (drive.tilt, drive.thrust, drive.powered, drive.jammed,
-                                      INTACT)))
-        self._schedule.each('drive', drive)
-        if broken:
-            drive.thrust[:], drive.powered[:] = 0.0, False
-        limit = self._robot.joints.position_limit
-        plant.set_powered(drive.powered, drive.jammed)
-        plant.set_targets(clipped(drive.tilt, -limit, limit), drive.thrust)
-        return drive.wear
 
     def _watch_contact(self, before, contact):
         """

@@ -1,6 +1,5 @@
 """`beetle_omni report`: a self-contained HTML page with several runs side by side."""
 
-from html import escape
 from pathlib import Path
 import sys
 
@@ -8,7 +7,7 @@ from rich.console import Console
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.pages.figures import COLOURS
-from beetle_omni_ros.pages.page import frame, Grid, html, section, Terminal
+from beetle_omni_ros.pages.page import Grid, rendered, Terminal
 from beetle_omni_ros.robot.schema import shortened
 from beetle_omni_ros.runs import table
 from beetle_omni_ros.runs.bag import read_flights
@@ -65,9 +64,9 @@ def make_runs(logs: dict[str, FlightLog]) -> list[Run]:
 
 def results_of(runs: list[Run]) -> dict:
     """Return the results of all runs as in ``evaluate --json``; meta: their common metadata."""
-    metas = [run.log.meta for run in runs]
-    shared = {key: value for key, value in metas[0].items()
-              if all(meta.get(key) == value for meta in metas)} if metas else {}
+    first, *others = [run.log.meta for run in runs]
+    shared = {key: value for key, value in first.items()
+              if all(meta.get(key) == value for meta in others)}
     results: dict = {'meta': {**shared, 'version': __version__}}
     for run in runs:
         results.update(run.results)
@@ -76,39 +75,29 @@ def results_of(runs: list[Run]) -> dict:
 
 def make_page(runs: list[Run], results: dict) -> str:
     """Return the HTML of the page."""
-    shown = table.grids(results, with_poses=True)
-    tables = ''.join(html(grid) for grid in shown if grid.title != 'Poses')
-    poses = ''.join(html(grid) for grid in shown if grid.title == 'Poses')
-    folded = f'<section><details><summary>Every pose</summary>{poses}</details></section>'
-    scene = recorded_scene({run.label: run.log for run in runs})
-    content = f"""<div class="cards">{''.join(map(_card, runs))}</div>
-<section>{tables}</section>
-<section><h2>Flight</h2><p>Frame: target, arrows: thrust. Drag to turn.</p>
-<iframe title="3D" srcdoc="{escape(scene)}"></iframe></section>
-{section('In time', 'Grey: L window, green: U window. Drag over a chart to zoom all, click twice '
-         'to see all; click in the legend to hide a run.', charts.html(runs))}
-{folded if poses else ''}
-<section class="faults"><h2>Faults</h2>{''.join(map(_faults, runs))}</section>"""
-    meta = results['meta']
-    subtitle = ', '.join(filter(None, [table.title(meta), f"beetle_omni_ros {meta['version']}"]))
-    return frame('Flight report', subtitle, content)
+    grids, meta = table.grids(results, with_poses=True), results['meta']
+    return rendered(
+        'report.html', title='Flight report', cards=map(_card, runs), charts=charts.html(runs),
+        subtitle=', '.join(filter(None, [table.title(meta),
+                                         f"beetle_omni_ros {meta['version']}"])),
+        tables=[grid for grid in grids if grid.title != 'Poses'],
+        poses=[grid for grid in grids if grid.title == 'Poses'],
+        scene=recorded_scene({run.label: run.log for run in runs}),
+        faults=[grid for run in runs for grid in _faults(run) if grid.rows])
 
 
 def _card(run):
+    """The run, facts about it and warnings."""
     log, meta = run.log, run.log.meta
     facts = [', '.join(log.controllers()), *(f'{key} {meta[key]}' for key in
              ('task', 'conditions', 'seed', 'robot', 'plant') if meta.get(key) is not None),
              f'{log.end - log.start:.0f} s', log.source]
     injected = meta.get('faults') or []
     injected = injected if isinstance(injected, list) else [injected]
-    named = [f'fault: {shortened(name)} at {at - run.log.begin:.2f} s'
+    named = [f'fault: {shortened(name)} at {at - log.begin:.2f} s'
              for name, at in log.named_faults().items()]
-    lines = ''.join(f'<span class="warning">{escape(text)}</span>' for text in (
-        *(f'injected: {shortened(str(fault))}' for fault in injected[:MOST_ROWS]),
-        *named[:MOST_ROWS], *log.warnings))
-    text = escape(' · '.join(fact for fact in facts if fact))
-    return (f'<div class="card" style="border-top-color: {run.colour}"><strong>'
-            f'{escape(run.label)}</strong><span>{text}</span>{lines}</div>')
+    return run, facts, [*(f'injected: {shortened(str(fault))}' for fault in injected[:MOST_ROWS]),
+                        *named[:MOST_ROWS], *log.warnings]
 
 
 def _faults(run):
@@ -125,7 +114,6 @@ def _faults(run):
     rejected = [[name, key, value] for name, values in last.items()
                 for key, value in values.items()
                 if ('reject' in key or 'refused' in key) and value not in ('0', '0.0', '', '{}')]
-    made = [Grid(f'{run.label}: {title}', header, rows[:MOST_ROWS]) for title, header, rows in (
-        ('warnings and errors', ['node', 'level', 'text', 'first at [s]', 'reports'], warnings),
-        ('rejected', ['node', 'reason', 'count'], rejected))]
-    return ''.join(html(grid) for grid in made if grid.rows)
+    return (Grid(f'{run.label}: warnings and errors',
+                 ['node', 'level', 'text', 'first at [s]', 'reports'], warnings[:MOST_ROWS]),
+            Grid(f'{run.label}: rejected', ['node', 'reason', 'count'], rejected[:MOST_ROWS]))

@@ -171,11 +171,9 @@ class Robot:
             return
         self._root.position, self._root.wxyz = moment.position, wxyz(moment.quaternion)
         for name, tilt, rotor, thrust in zip(JOINT_NAMES, moment.tilt, ROTOR_NAMES, moment.thrust):
-            if name in self._joints:
-                link, node = self._joints[name]
-                node.wxyz = wxyz(link.turned(tilt))
-            if rotor in self._arrows:
-                self._arrows[rotor].points = _arrow(np.zeros(3), [0.0, 0.0, thrust])
+            link, node = self._joints[name]
+            node.wxyz = wxyz(link.turned(tilt))
+            self._arrows[rotor].points = _arrow(np.zeros(3), [0.0, 0.0, thrust])
         if moment.target is not None:
             self._target.position, self._target.wxyz = moment.target[0], wxyz(moment.target[1])
         self._force.points = _arrow(moment.position, moment.force)

@@ -3,10 +3,10 @@
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, State
-from beetle_omni_ros.control.disturbance import buffered
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import ALL_HEALTHY, Allocator
+from beetle_omni_ros.robot.native import buffered
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 ROBOT = RobotParameters.load()

@@ -1,4 +1,4 @@
-"""Configurations of RViz, Foxglove, PlotJuggler and the aggregator name what the package has."""
+"""Configurations of RViz and Foxglove name what the package has."""
 
 import json
 import re
@@ -10,7 +10,6 @@ import yaml
 
 from beetle_omni_ros.messages.bag_types import from_bytes, TYPESTORE
 from beetle_omni_ros.messages.topics import ALL
-from beetle_omni_ros.robot.parameters import JOINT_NAMES, ROTOR_NAMES
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.urdf import description
 from beetle_omni_ros.runs.bag import read_messages
@@ -20,7 +19,6 @@ from beetle_omni_ros.runs.tasks import make_task
 VIEWERS = share_path('viewers')
 SHOWN = {'robot_description': 'std_msgs/msg/String'}       # beside the topics of a flight
 TYPES = {**{name: topic.type for name, topic in ALL.items()}, **SHOWN}
-JOINT_STATE = 'sensor_msgs/msg/JointState'
 
 
 def split(path):
@@ -58,19 +56,6 @@ def test_each_path_of_the_foxglove_layout_has_a_value():
     for topic in panels['3D!robot']['topics']:
         assert topic.lstrip('/') in TYPES
     assert panels['3D!robot']['topics']['/robot_description']['visible']
-
-
-def test_each_curve_of_the_plotjuggler_layout_has_a_value():
-    curves = [curve.get('name') for curve in
-              ElementTree.parse(VIEWERS / 'plotjuggler.xml').getroot().iter('curve')]
-    assert len(curves) > 30
-    for curve in curves:
-        topic, fields = split(curve)
-        if TYPES[topic] == JOINT_STATE:     # shown by the names in the message
-            name, field = fields.split('/')
-            assert name in (JOINT_NAMES if field == 'position' else ROTOR_NAMES)
-        else:
-            walk(TYPES[topic], fields.split('/'))
 
 
 def test_rviz_shows_topics_of_the_graph_with_a_quality_of_service_that_matches():

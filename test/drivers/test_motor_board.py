@@ -30,7 +30,7 @@ def test_refused_arming_is_reported_with_the_reason():
         assert board.start(True).wait().reason == 'refused by the board: battery low'
         emulated.set_battery(25.0, 0.0)
         assert board.start(True).wait().accepted and emulated.armed
-        emulated._firmware._heartbeat = lambda state, now: common.MAVLink_heartbeat_message(
+        emulated.firmware._heartbeat = lambda state, now: common.MAVLink_heartbeat_message(
             2, 0, 1, 1 | 9 << 24, 3, 3)
         assert until(lambda: board.state.status.contract == 9)
         assert board.start(True).wait().reason == 'firmware follows contract 9, this driver 1'
@@ -92,7 +92,7 @@ def test_a_step_of_the_computers_clock_does_not_stop_the_rotors():
             assert not board.send(HOVER, time.time() + shift[0])
             time.sleep(0.005)
             assert k < 10 or emulated.commands.all()
-        assert sum(emulated.refused.values()) <= 2
+        assert sum(emulated.firmware.refused.values()) <= 2
 
 
 CHILD = """
@@ -118,4 +118,4 @@ def test_a_process_disarms_after_an_exception():
             stderr=subprocess.DEVNULL, env={**os.environ, 'PYTHONPATH': os.pathsep.join(
                 [str(folder.parents[1]), *sys.path])})
         assert arrivals and not emulated.armed
-        assert emulated._firmware._stop_reason == 1         # requested by the host
+        assert emulated.firmware._stop_reason == 1         # requested by the host

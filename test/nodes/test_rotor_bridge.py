@@ -81,7 +81,7 @@ def test_the_bridge_arms_at_takeoff_follows_thrusts_and_disarms_with_the_supervi
     board, operator = bridge.board, bridge.operator
     operator.thrust = np.zeros(4)
     operator.spin(0.2)
-    assert not board.armed and not board.refused      # nothing is sent before it is armed
+    assert not board.armed and not board.firmware.refused      # nothing is sent before it is armed
     bridge.take_off()
     for state, thrust in (('flying:nmpc', [3.0, 12.0, 0.5, 20.0]), ('landing', [9, 9, 1, 0])):
         operator.supervise(state)
@@ -104,7 +104,7 @@ def test_commands_are_repeated_and_the_rotors_stop_with_the_stream_or_with_old_c
     # 100 ms after the last new target, however often it was repeated.
     operator.until(lambda: not board.commands.any())
     newest = next(now for now, stamp in arrivals if stamp == arrivals[-1][1])
-    assert board._firmware.timeouts and board._firmware._target_at == newest
+    assert board.firmware.timeouts and board.firmware._target_at == newest
     flying.follow(HOVER)
     operator.age = 0.2
     operator.until(lambda: not board.commands.any())
@@ -158,4 +158,4 @@ def test_without_autostart_it_arms_only_while_activated_and_disarms_at_its_end(t
         made.graph.processes[ROTOR].send_signal(signal.SIGTERM)
         operator.reaches('lost: the bridge has stopped')
         assert made.graph.processes[ROTOR].wait(WITHIN) == 0
-        assert not board.armed and board._firmware._stop_reason == 1    # requested by the host
+        assert not board.armed and board.firmware._stop_reason == 1    # requested by the host

@@ -33,6 +33,12 @@ def plant(robot=ROBOT, position=HIGH, quaternion=LEVEL, variation=None):
     return made
 
 
+def acceleration(made, position, quaternion, velocity, rate, tilt, tilt_rate, thrust):
+    """Accelerations (10,) of a state whose tilts are their targets, away from the floor."""
+    made.reset(position, quaternion, [*velocity, *rate, *tilt_rate], tilt, thrust)
+    return made.data.qacc.copy()
+
+
 def momenta(made):
     """Linear momentum, angular momentum about the centre of mass, centre of mass."""
     model, data = made.model, made.data

@@ -39,18 +39,6 @@ def test_totals_hold_for_a_robot_whose_parts_are_not_described(effects):
             module_effect.get('module_inertia', 0.0))
 
 
-def test_parts_agree_with_the_published_description():
-    """Numbers that the residual does not use: main body's mass and centre, joint origins."""
-    properties, parts = mass_properties(ROBOT), ROBOT.multibody
-    assert properties.main_body.mass == pytest.approx(2.27739, abs=1e-5)
-    # The published rotor positions put the centre of gravity 0.2 mm beside the arms' middle.
-    np.testing.assert_allclose(properties.main_body.centre - properties.main_origin,
-                               parts.main_body['centre_of_mass'], atol=3e-4)
-    assert -properties.main_origin[2] == pytest.approx(parts.centre_of_gravity_height, abs=1e-5)
-    np.testing.assert_allclose(np.abs(properties.joint_origins - properties.main_origin)[:, :2],
-                               parts.module.joint_offset, atol=1e-6)
-
-
 def test_mujoco_sees_the_same_totals():
     made = plant()
     model, data = made.model, made.data

@@ -35,7 +35,7 @@ def test_servo_sags_by_load_over_stiffness():
     made.set_targets(np.full(4, np.pi / 2), np.zeros(4))
     acceleration = 9.8
     for _ in range(300):
-        made.set_wrench([0, 0, 190 * acceleration], np.zeros(3))
+        made.wrench[2] = 190 * acceleration
         made.step()
     module = ROBOT.multibody.module
     tilt = made.state[0][7:]
@@ -83,8 +83,7 @@ def damped(time, rate):
 
 def test_a_joint_without_torque_ignores_its_target_and_only_its_damping_slows_it():
     made = plant(immovable())
-    made.set_powered([True, False, False, True])
-    made.set_targets(np.full(4, 0.1), np.zeros(4))
+    made.set_targets(np.full(4, 0.1), np.zeros(4), [True, False, False, True])
     made.data.qvel[6:] = [0.0, 8.0, 30.0, 0.0]      # the last beyond the motor's rate limit
     for k in range(1, 31):
         made.step()

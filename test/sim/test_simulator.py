@@ -32,8 +32,7 @@ def test_same_seed_same_numbers_other_seed_others(conditions):
     first = Simulator(ROBOT, WORLD, conditions, seed=7)
     expected = numbers(first)
     np.testing.assert_array_equal(numbers(Simulator(ROBOT, WORLD, conditions, seed=7)), expected)
-    first.set_wrench([1, 0, 0], [0, 0, 0])
-    first.set_payload(0.5)
+    first.wrench[0], first.payload = 1.0, 0.5
     first.reset()
     np.testing.assert_array_equal(numbers(first), expected)
     assert np.any(numbers(Simulator(ROBOT, WORLD, conditions, seed=8)) != expected)
@@ -52,7 +51,7 @@ def test_weak_battery_caps_the_thrust(charge, low, high):
 def test_broken_state_is_an_error_and_not_a_silent_restart():
     simulator = Simulator(ROBOT, WORLD)
     simulator.reset(HIGH)
-    simulator.set_wrench([1e200, 0, 0], [0, 1e200, 0])
+    simulator.wrench[[0, 4]] = 1e200
     with pytest.raises(RuntimeError, match='the simulated plant diverged'):
         for _ in range(5):
             simulator.step()

@@ -34,7 +34,6 @@ class EmulatedActuators:
         tilt, thrust = simulator.command_delays
         self._tilts = _line(tilt, simulator.tick, lambda: (np.zeros(4), [False] * 4))
         self._thrusts = _line(thrust, simulator.tick, lambda: np.zeros(4))
-        self._faults = ServoFaults(), BoardFaults()
         truth = simulator.truth
         bus.set_state(truth.tilt, truth.tilt_velocity, np.zeros(4))
         board.set_rotors(truth.thrust)
@@ -61,34 +60,30 @@ class EmulatedActuators:
 
     def set_faults(self, servo: ServoFaults, board: BoardFaults) -> None:
         """
-        Switch faults on and off, and trigger the events that are set.
+        Switch faults on and off.
 
         A ParameterError reports an unknown servo, without any change.
         """
         ids = [one['ID'] for one in self.bus.servos]
-        for name in ('silent', 'overload', 'reboot'):
-            for wanted in np.ravel(getattr(servo, name)):
-                if wanted not in (*ids, *[0] * (name == 'reboot')):
-                    raise ParameterError(f'servo_faults.{name}: no servo has the id {wanted:g}; '
-                                         f'ids are {ids}')
-        self._faults = self.bus.faults, self.board.faults = servo, board
-        if servo.reboot:
-            self.bus.reboot(ids.index(servo.reboot))
-        if board.reboot:
-            self.board.reboot()
+        for wanted in (*servo.silent, *servo.overload):
+            if wanted not in ids:
+                raise ParameterError(f'servo_faults: no servo has the id {wanted:g}; the ids are '
+                                     f'{ids}')
+        self.bus.faults, self.board.faults = servo, board
 
     @property
     def faults(self) -> list[str]:
         """Active faults as texts such as 'servo silent [2]'."""
-        return [f'{device} {text}' for device, faults in zip(('servo', 'board'), self._faults)
-                for text in switched_on(faults)]
+        return [f'{name} {text}' for name, device in (('servo', self.bus), ('board', self.board))
+                for text in switched_on(device.faults)]
 
     def status(self) -> dict[str, object]:
         """States and refusals of the devices, for diagnostics."""
         bus, board = self.bus, self.board
         return {'servo_port': bus.port, 'board_port': board.port, 'armed': board.armed,
                 'torque': bus.drive()[1], 'servo refused': bus.refusals,
-                **{f'board refused: {reason}': count for reason, count in board.refused.items()}}
+                **{f'board refused: {reason}': count
+                   for reason, count in board.firmware.refused.items()}}
 
 
 def _line(delay, tick, make):

@@ -1,10 +1,7 @@
 """Base of the emulated devices: a serial port without hardware, served by a thread, and faults."""
 
 from contextlib import suppress
-from dataclasses import dataclass, fields
-import heapq
-import itertools
-from math import inf
+from dataclasses import dataclass
 import os
 from pathlib import Path
 from random import Random
@@ -23,22 +20,20 @@ CHUNK = 4096    # [B] size of the kernel's buffer
 PERIOD = 0.01   # [s] longest sleep of the thread
 SHARE = {'low': 0, 'high': 1}
 LISTED = {'low': 1, 'high': 252}
-DELAY = {'unit': 's', 'low': 0, 'high': 10}
 
 
 @dataclass(kw_only=True)
 class ServoFaults:
-    """Faults of the servo bus. Levels may be changed at any time, ``reboot`` happens once."""
+    """Faults of the servo bus, which may be changed at any time."""
 
     bad_crc: float = parameter(0.0, doc='share of answers with a flipped bit', **SHARE)
     dropped: float = parameter(0.0, doc='share of lost answers', **SHARE)
     delayed: float = parameter(0.0, doc='share of late answers', **SHARE)
-    delay: float = parameter(0.02, doc='delay of late answers', **DELAY)
+    delay: float = parameter(0.02, doc='delay of late answers', unit='s', low=0, high=10)
     silent: np.ndarray = parameter([], doc='IDs that receive and answer nothing', **LISTED)
     overload: np.ndarray = parameter([], doc='IDs with a permanent overload', **LISTED)
     supply_voltage: float = parameter(12.0, doc='supply voltage of the servos', unit='V', low=0,
                                       high=30)
-    reboot: int = parameter(0, doc='ID to restart once', low=0, high=252)
 
 
 @dataclass(kw_only=True)
@@ -51,60 +46,14 @@ class BoardFaults:
                                   **SHARE)
     drop_out: float = parameter(0.0, doc='share of lost packets of the board', **SHARE)
     drop_in: float = parameter(0.0, doc='share of lost packets to the board', **SHARE)
-    delay_out: float = parameter(0.0, doc='delay of packets of the board', **DELAY)
-    delay_in: float = parameter(0.0, doc='delay of packets to the board', **DELAY)
     failed_escs: np.ndarray = parameter([], doc='rotors (1 to 4) that do not turn', low=1, high=4)
-    reboot: bool = parameter(False, doc='reset once')
 
 
-def switched_on(faults: ServoFaults | BoardFaults, event: bool = False) -> list[str]:
-    """Levels, and the event if asked, that differ from their defaults, such as 'silent [2]'."""
-    healthy, found = type(faults)(), []
-    for name in (entry.name for entry in fields(faults)):
-        value = getattr(faults, name)
-        if name == 'delay' or name == 'reboot' and not event \
-                or np.array_equal(value, getattr(healthy, name)):
-            continue
-        if isinstance(value, np.ndarray):
-            found.append(f'{name} {sorted({int(one) for one in value})}')
-        else:
-            found.append(name if value is True else f'{name} {value:g}')
-    return found
-
-
-class Line:
-    """One direction of a cable, which loses, corrupts and delays packets."""
-
-    def __init__(self, seed: int):
-        self._random, self._count = Random(seed), itertools.count()
-        self._waiting: list[tuple[float, int, bytes]] = []
-
-    def put(self, data: bytes, now: float, drop: float = 0.0, corrupt: float = 0.0,
-            delay: float = 0.0, delayed: float = 1.0) -> None:
-        """Send a packet at ``now`` [s]; ``drop``, ``corrupt`` and ``delayed`` are shares."""
-        draw = self._random.random
-        if draw() < drop:
-            return
-        if draw() < corrupt:
-            place, bit = self._random.randrange(len(data)), 1 << self._random.randrange(8)
-            data = data[:place] + bytes((data[place] ^ bit,)) + data[place + 1:]
-        due = now + delay * (draw() < delayed)
-        heapq.heappush(self._waiting, (due, next(self._count), data))
-
-    def take(self, now: float) -> bytes:
-        """Receive everything that has arrived by ``now`` [s]."""
-        pieces = []
-        while self.next() <= now:
-            pieces.append(heapq.heappop(self._waiting)[2])
-        return b''.join(pieces)
-
-    def next(self) -> float:
-        """Arrival of the next packet [s], inf without one."""
-        return self._waiting[0][0] if self._waiting else inf
-
-    def clear(self) -> None:
-        """Lose all packets that have not arrived."""
-        self._waiting.clear()
+def switched_on(faults: ServoFaults | BoardFaults) -> list[str]:
+    """Faults that differ from their defaults, such as 'silent [2]'."""
+    healthy = vars(type(faults)())
+    return [f'{name} {value.astype(int).tolist() if isinstance(value, np.ndarray) else value}'
+            for name, value in vars(faults).items() if not np.array_equal(value, healthy[name])]
 
 
 class Device:
@@ -120,7 +69,7 @@ class Device:
         self._folder = None if port else tempfile.mkdtemp(prefix='emulated_')
         self.port = str(port or Path(self._folder) / name)
         self._lock, self._device, self._line = RLock(), -1, -1
-        self._incoming, self._outgoing = Line(seed), Line(seed + 1)
+        self._random = Random(seed)
         self._running = True
         self.plug()
         self._thread = Thread(target=self._run, name=f'emulated {name}', daemon=True)
@@ -144,7 +93,6 @@ class Device:
     def plug(self) -> None:
         """Plug the cable in, unless it is."""
         link = Path(self.port)
-        fresh = link.with_name(f'{link.name}.new')
         with self._lock:
             if self._device >= 0:
                 return
@@ -155,9 +103,8 @@ class Device:
             tty.setraw(self._line)
             os.set_blocking(self._device, False)
             try:
-                fresh.unlink(missing_ok=True)
-                fresh.symlink_to(os.ttyname(self._line))
-                fresh.replace(link)
+                link.unlink(missing_ok=True)
+                link.symlink_to(os.ttyname(self._line))
             except OSError as error:
                 self.unplug()
                 raise OSError(f'{link}: cannot be used as a port ({error.strerror})') from None
@@ -173,8 +120,6 @@ class Device:
             os.close(self._line)
             os.close(self._device)
             self._device = self._line = -1
-            self._incoming.clear()
-            self._outgoing.clear()
 
     def _run(self):
         while self._running:
@@ -192,14 +137,23 @@ class Device:
             return os.read(self._device, CHUNK)
         return b''
 
-    def _flush(self, now: float) -> None:
-        """Send what is due; it is lost if the buffer is full or the cable unplugged."""
-        if data := self._outgoing.take(now):
-            with suppress(OSError):
-                os.write(self._device, data)
+    def _send(self, data: bytes) -> None:
+        """Send; it is lost if the buffer is full or the cable unplugged."""
+        with suppress(OSError):
+            os.write(self._device, data)
+
+    def _spoilt(self, data: bytes, lost: float, corrupt: float) -> bytes:
+        """Bytes after a cable that loses them, or flips a bit, with these probabilities."""
+        draw = self._random.random
+        if not data or draw() < lost:
+            return b''
+        if draw() < corrupt:
+            bit = self._random.randrange(8 * len(data))
+            return (int.from_bytes(data, 'big') ^ 1 << bit).to_bytes(len(data), 'big')
+        return data
 
     def _due(self) -> float:
-        return min(self._incoming.next(), self._outgoing.next())
+        raise NotImplementedError
 
     def _serve(self, now: float) -> None:
         raise NotImplementedError

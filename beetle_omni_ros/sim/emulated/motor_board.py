@@ -4,7 +4,7 @@ The emulated motor board: the firmware of docs/reference/firmware.md on a pseudo
 The framing is that of the driver. ``test/drivers/reference_packets.py`` checks it independently.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 import math
 from pathlib import Path
 import time
@@ -255,22 +255,14 @@ class BoardFirmware:
                                                   message.get_srcComponent())
 
 
-def frames(data: bytes) -> Iterator[bytes]:
-    """Split a sequence of valid MAVLink 2 packets; an incomplete rest is one more piece."""
-    while data:
-        size = 12 + data[1] if len(data) > 1 and data[0] == 0xFD else len(data)
-        yield data[:size]
-        data = data[size:]
-
-
 class EmulatedMotorBoard(Device):
     """
     A motor board whose PWM the rotor map of the true ``robot`` converts to thrust.
 
     A plant reads :attr:`thrust_targets` and sets the sensors, from any thread. Before
-    :meth:`set_battery` the battery is full, and before :meth:`set_rotors` the rotors follow their
-    targets without lag. ``changes`` are of NUMBERS. ``on_target`` is called in the board's thread
-    after each target with its arrival [s, monotonic] and its stamp [us], for measurements.
+    :meth:`set_battery` the battery is full, and before :meth:`set_rotors` the rotors report no
+    speed. ``changes`` are of NUMBERS. ``on_target`` is called in the board's thread after each
+    target with its arrival [s, monotonic] and its stamp [us], for measurements.
     """
 
     def __init__(self, robot: RobotParameters | None = None, *, seed: int = 0,
@@ -279,9 +271,8 @@ class EmulatedMotorBoard(Device):
         self._map = ThrustMap(robot.rotors)
         self.faults = BoardFaults()
         self.on_target: Callable[[float, int], None] | None = None
-        self._firmware = BoardFirmware(robot.battery.cells, time.monotonic(), **changes)
-        self._voltage, self._current = robot.battery.full_voltage, 0.0
-        self._thrust: np.ndarray | None = None
+        self.firmware = BoardFirmware(robot.battery.cells, time.monotonic(), **changes)
+        self.set_battery(robot.battery.full_voltage, 0.0)
         self._clear_stream()
         super().__init__('motor_board', port, seed)
 
@@ -289,7 +280,7 @@ class EmulatedMotorBoard(Device):
     def armed(self) -> bool:
         """Whether the board is armed."""
         with self._lock:
-            return self._firmware.state(time.monotonic()) >= ARMED
+            return self.firmware.state(time.monotonic()) >= ARMED
 
     @property
     def commands(self) -> np.ndarray:
@@ -298,75 +289,53 @@ class EmulatedMotorBoard(Device):
             # Handle received bytes, because the thread may not have been scheduled.
             now = time.monotonic()
             self._serve(now)
-            return np.array(self._firmware.outputs(now))
+            return np.array(self.firmware.outputs(now))
 
     @property
     def thrust_targets(self) -> np.ndarray:
         """(4,) targets of the rotors [N] for the PWM commands at the true voltage."""
-        return self._thrusts(self.commands)
-
-    def _thrusts(self, commands):
-        thrust = self._map.thrust(duty_of_command(commands), self._voltage)
-        for rotor in self.faults.failed_escs:
-            thrust[int(rotor) - 1] = 0.0
+        thrust = self._map.thrust(duty_of_command(self.commands), self.firmware.voltage)
+        thrust[list(self.firmware.failed)] = 0.0
         return thrust
-
-    @property
-    def refused(self) -> dict[str, int]:
-        """Reason -> number of refused targets since the start of the board."""
-        return dict(self._firmware.refused)
 
     def set_battery(self, voltage: float, current: float) -> None:
         """Set voltage [V] and drawn current [A]."""
-        self._voltage, self._current = float(voltage), float(current)
+        self.firmware.voltage, self.firmware.current = float(voltage), float(current)
 
     def set_rotors(self, thrust: np.ndarray) -> None:
         """Set present thrusts (4,) [N] of the rotors."""
-        self._thrust = np.array(thrust, dtype=float)
+        self.firmware.rpm = (RPM_AT_1_NEWTON * np.sqrt(np.maximum(thrust, 0.0))).tolist()
 
     def reboot(self) -> None:
         """Reset the board, as its watchdog does."""
         with self._lock:
-            self._firmware.reboot(time.monotonic())
+            self.firmware.reboot(time.monotonic())
             self._clear_stream()
 
     def _clear_stream(self):
         self._receiver, self._packer = MavlinkReceiver(*HOST), common.MAVLink(None, *BOARD)
 
     def _due(self):
-        telemetry = min(self._firmware.next.values())
-        return min(super()._due(), telemetry if telemetry > time.monotonic() else math.inf)
+        telemetry = min(self.firmware.next.values())
+        return telemetry if telemetry > time.monotonic() else math.inf
 
     def _serve(self, now):
         """Receive, execute and send."""
-        faults, received = self.faults, self._read()
+        received = self._spoilt(self._read(), self.faults.drop_in, self.faults.corrupt_in)
         # Read the clock after the bytes, as a board does, because this thread may have waited.
         now = time.monotonic()
-        for frame in frames(received):
-            self._incoming.put(frame, now, faults.drop_in, faults.corrupt_in, faults.delay_in)
-        data = self._incoming.take(now)
-        if self._firmware.runs(now):
-            self._measure(now)
-            # Before any answer: the first frame after a reset is a heartbeat.
-            self._send(self._firmware.due(now, self._receiver.counts), now)
-            for message in self._receiver.feed(data):
-                self._send(self._firmware.receive(message, now), now)
-                if self.on_target and message.get_type() == 'SET_ACTUATOR_CONTROL_TARGET':
-                    self.on_target(now, message.time_usec)
-        self._flush(now)
+        if not self.firmware.runs(now):
+            return
+        self.firmware.failed = frozenset(int(rotor) - 1 for rotor in self.faults.failed_escs)
+        # Before any answer: the first frame after a reset is a heartbeat.
+        self._answer(self.firmware.due(now, self._receiver.counts))
+        for message in self._receiver.feed(received):
+            self._answer(self.firmware.receive(message, now))
+            if self.on_target and message.get_type() == 'SET_ACTUATOR_CONTROL_TARGET':
+                self.on_target(now, message.time_usec)
 
-    def _send(self, messages, now):
-        faults = self.faults
+    def _answer(self, messages):
         for message in messages:
             frame = message.pack(self._packer)
             self._packer.seq = (self._packer.seq + 1) % 256
-            self._outgoing.put(frame, now, faults.drop_out, faults.corrupt_out, faults.delay_out)
-
-    def _measure(self, now):
-        """Set the measurements of the firmware."""
-        firmware = self._firmware
-        firmware.voltage, firmware.current = self._voltage, self._current
-        firmware.failed = frozenset(int(rotor) - 1 for rotor in self.faults.failed_escs)
-        thrust = self._thrusts(np.array(firmware.outputs(now))) if self._thrust is None \
-            else self._thrust
-        firmware.rpm = (RPM_AT_1_NEWTON * np.sqrt(np.maximum(thrust, 0.0))).tolist()
+            self._send(self._spoilt(frame, self.faults.drop_out, self.faults.corrupt_out))

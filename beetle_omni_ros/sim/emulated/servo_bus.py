@@ -10,6 +10,7 @@ is that of the rest of the packet. In instruction and parameters an ``FD`` is st
 ``FF FF FD``, so that the header is unique.
 """
 
+from collections import deque
 from collections.abc import Container, Iterator, Sequence
 import itertools
 from math import floor, inf, pi
@@ -18,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from beetle_omni_ros.sim.emulated.device import Device, PERIOD, ServoFaults
+from beetle_omni_ros.sim.emulated.device import Device, ServoFaults
 
 HEADER = b'\xff\xff\xfd\x00'
 BROADCAST = 0xFE
@@ -95,8 +96,6 @@ DEFINED = frozenset(address for register in TABLE.values()
                     for address in range(register.address, register.address + register.size))
 
 
-# --- packets ----------------------------------------------------------------------------------
-
 # Remainders of the polynomial x^16 + x^15 + x^2 + 1 for each leading byte.
 CRC_TABLE = []
 for byte in range(256):
@@ -138,8 +137,6 @@ def packets(buffer: bytearray) -> Iterator[tuple[int, int, bytes]]:
         body = raw[HEAD_SIZE:-2].replace(b'\xff\xff\xfd\xfd', b'\xff\xff\xfd')
         yield raw[4], body[0], body[1:]
 
-
-# --- servos -----------------------------------------------------------------------------------
 
 class EmulatedServo:
     """
@@ -258,8 +255,6 @@ class EmulatedServo:
         self._turns = floor(self._present() / COUNTS_PER_TURN)
 
 
-# --- the line ---------------------------------------------------------------------------------
-
 class EmulatedServoBus(Device):
     """
     XC330 servos on one serial port, with IDs, signs and zeros [counts] in the order of the joints.
@@ -276,7 +271,8 @@ class EmulatedServoBus(Device):
         self.servos = [EmulatedServo(name, sign=sign, zero=zero, reboot_time=reboot_time)
                        for name, sign, zero in zip(identifiers, signs, zeros, strict=True)]
         self._speed, self._buffer = speed, bytearray()
-        self._last_data = self._last_check = self._last_move = time.monotonic()
+        self._answers: deque[tuple[float, bytes]] = deque()     # when they are sent [s]
+        self._last_data = self._last_move = time.monotonic()
         super().__init__('servo_bus', port, seed)
 
     def drive(self) -> tuple[list[float], list[bool]]:
@@ -308,14 +304,12 @@ class EmulatedServoBus(Device):
         with self._lock:
             self.servos[index].reboot(time.monotonic())
 
-    def unplug(self):
-        """Unplug the adapter; the servos keep their power."""
-        with self._lock:
-            super().unplug()
-            self._buffer.clear()
-
     def _serve(self, now):
-        """Handle received packets, check the servos, send due answers."""
+        """Move the servos, handle received packets, check the servos, send due answers."""
+        step, self._last_move = self._speed * (now - self._last_move), now
+        for servo in self.servos if step else ():
+            if servo.torque:
+                servo.angle += max(-step, min(step, servo.goal - servo.angle))
         if data := self._read():
             if now - self._last_data > PAUSE:
                 self._buffer.clear()
@@ -323,25 +317,20 @@ class EmulatedServoBus(Device):
             self._buffer += data
             faults = self.faults
             for received in packets(self._buffer):
-                self._move(now)
                 for answer in self.handle(received, now):
-                    self._outgoing.put(answer, now, faults.dropped, faults.bad_crc, faults.delay,
-                                       faults.delayed)
+                    late = faults.delay * (self._random.random() < faults.delayed)
+                    self._answers.append((now + late, self._spoilt(
+                        answer, faults.dropped, faults.bad_crc)))
         # After the data, so that waiting packets restart the watchdogs of a late thread.
-        if now - self._last_check >= PERIOD:
-            self._last_check = now
-            for servo in self.servos:
-                servo.advance(now, self.faults.supply_voltage)
-                if servo['ID'] in self.faults.overload and servo.torque:
-                    servo.trip(OVERLOAD)
-            self._move(now)
-        self._flush(now)
+        for servo in self.servos:
+            servo.advance(now, self.faults.supply_voltage)
+            if servo['ID'] in self.faults.overload and servo.torque:
+                servo.trip(OVERLOAD)
+        while self._due() <= now:
+            self._send(self._answers.popleft()[1])
 
-    def _move(self, now):
-        step, self._last_move = self._speed * (now - self._last_move), now
-        for servo in self.servos if step else ():
-            if servo.torque:
-                servo.angle += max(-step, min(step, servo.goal - servo.angle))
+    def _due(self):
+        return self._answers[0][0] if self._answers else inf
 
     def handle(self, received: tuple[int, int, bytes], now: float) -> list[bytes]:
         """Execute a packet in every servo that receives it; return the answers in order."""
@@ -350,38 +339,29 @@ class EmulatedServoBus(Device):
         for servo in listening.values():
             servo.last_packet = now
         name, code, given = received
-        if name != BROADCAST:
-            return [self._single(listening[name], code, given, now)] if name in listening else []
         address, length = (int.from_bytes(given[k:k + 2], 'little') for k in (0, 2))
         if code == SYNC_WRITE:
             for k in range(4, len(given), length + 1):
                 if given[k] in listening:
                     error = listening[given[k]].write(address, given[k + 1:k + 1 + length])
                     self.refusals += error != NONE
+            return []
         answers = []
-        if code == SYNC_READ:       # each waits for the previous one, so a silent one ends it
-            for one in itertools.takewhile(listening.__contains__, given[4:]):
-                answers.append(self._answer(listening[one],
-                                            *listening[one].read(address, length)))
+        # Each waits for the previous one, so a silent one ends a common answer.
+        for one in itertools.takewhile(listening.__contains__,
+                                       given[4:] if code == SYNC_READ else [name]):
+            servo, data, error = listening[one], b'', NONE
+            if code == PING:
+                data = servo.read(0, 2)[1] + bytes((servo['Firmware Version'],))
+            elif code in (READ, SYNC_READ):
+                error, data = servo.read(address, length)
+            elif code == WRITE:
+                error = servo.write(address, given[2:])
+            elif code == REBOOT:
+                servo.reboot(now)
+            else:
+                error = INSTRUCTION
+            self.refusals += error != NONE
+            answers.append(packet(one, STATUS, bytes((
+                error | ALERT * bool(servo['Hardware Error Status']),)) + data))
         return answers
-
-    def _single(self, servo, code, given, now):
-        """Execute an instruction in one servo; return its answer."""
-        data, error = b'', NONE
-        address = int.from_bytes(given[:2], 'little')
-        if code == PING:
-            data = servo.read(0, 2)[1] + bytes((servo['Firmware Version'],))
-        elif code == READ:
-            error, data = servo.read(address, int.from_bytes(given[2:4], 'little'))
-        elif code == WRITE:
-            error = servo.write(address, given[2:])
-        elif code == REBOOT:
-            servo.reboot(now)
-        else:
-            error = INSTRUCTION
-        return self._answer(servo, error, data)
-
-    def _answer(self, servo, error, data):
-        self.refusals += error != NONE
-        return packet(servo['ID'], STATUS, bytes((
-            error | ALERT * bool(servo['Hardware Error Status']),)) + data)
