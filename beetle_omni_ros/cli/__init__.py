@@ -5,15 +5,11 @@ A subcommand imports its modules when it runs, so that `--help` is fast and an a
 ROS. Unusable input gives status 2 and one line on standard error.
 """
 
-from __future__ import annotations
-
 import sys
-from typing import Annotated
 
 import typer
 from typer.main import get_command
 
-from beetle_omni_ros import __version__
 from beetle_omni_ros.cli.commands import app
 from beetle_omni_ros.cli.options import FAILED, INTERRUPTED, UNUSABLE
 from beetle_omni_ros.robot.resources import PACKAGE
@@ -25,18 +21,6 @@ HARDWARE_MODULES = ('dynamixel_sdk', 'pymavlink', 'serial')
 TRAIN_MODULES = ('onnx', 'onnxscript', 'rsl_rl', 'tensorboard', 'tensordict', 'torch')
 SEVERAL = ('--holdout', '--validate')   # options with several values
 MAY_BE_EMPTY = ('--namespace',)
-
-
-def _version(wanted: bool):
-    if wanted:
-        typer.echo(f'beetle_omni {__version__}')
-        raise typer.Exit()
-
-
-@app.callback()
-def _common(version: Annotated[bool, typer.Option(
-        '--version', callback=_version, is_eager=True, help='Show the version.')] = False):
-    pass
 
 
 def main(args: list[str] | None = None) -> int:
