@@ -1,15 +1,14 @@
 """Tasks: targets, external wrenches and payloads over time."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import partial
-from math import cos, exp, pi, sin, sqrt
+from dataclasses import dataclass, field, replace
+from math import exp, pi, sqrt
 from pathlib import Path
 import re
 
 import numpy as np
 
-from beetle_omni_ros.control.base import PoseTarget, Reference, Target, TrajectoryTarget
+from beetle_omni_ros.control.base import PoseTarget, Target, TrajectoryTarget
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.targets import read_poses
@@ -345,68 +344,22 @@ def _pose_task(name, poses, kind='poses'):
 
 
 def _lemniscate_task(name):
-    tilt = TILTS[name]
-    first = lemniscate(0.0, tilt)
-    pose = np.concatenate([first.position, np.degrees(rotations.to_rpy(first.quaternion))])
-    begin = POSE_DURATION + RAMP
-    path = Segment(DURATION, partial(lemniscate_target, tilt=tilt))
-    return Task(name, 'trajectory', (Segment(POSE_DURATION, _builder(pose)), path), pose[None],
-                tuple((begin + k * PERIOD, begin + (k + 1) * PERIOD) for k in range(ROUNDS)))
-
-
-def lemniscate_phase(time: float) -> tuple[float, float]:
-    """Return phase [rad], 0 at the begin of round one, and rate [rad/s] at ``time`` [s]."""
-    rate = 2 * pi / PERIOD
-    if time < RAMP:
-        return -_ramp_phase(RAMP, rate) + _ramp_phase(max(time, 0.0), rate), \
-            rate * _smoothstep(time / RAMP)
-    rest = DURATION - time
-    if rest < RAMP:
-        total = 2 * pi * ROUNDS + _ramp_phase(RAMP, rate)
-        return total - _ramp_phase(max(rest, 0.0), rate), rate * _smoothstep(rest / RAMP)
-    return rate * (time - RAMP), rate
-
-
-def _smoothstep(s):
-    s = min(max(s, 0.0), 1.0)
-    return s ** 3 * (10 - 15 * s + 6 * s * s)
-
-
-def _ramp_phase(time, rate):
-    """Integral of ``rate * smoothstep`` over the ramp, from rest."""
-    s = time / RAMP
-    return rate * RAMP * s ** 4 * (2.5 - 3 * s + s * s)
-
-
-def lemniscate(time: float, tilt: float) -> Reference:
-    """
-    Return pose and velocity in world and body rates at ``time`` since the start [s].
-
-    ``tilt`` is the largest roll and pitch [rad].
-    """
-    phi, rate = lemniscate_phase(time)
-    once, twice = phi + pi / 2, 2 * phi + pi
-    position = np.array([LENGTH * cos(once), LENGTH / 2 * sin(twice),
-                         HEIGHT + RISE * sin(twice + pi / 2)])
-    velocity = rate * np.array([-LENGTH * sin(once), LENGTH * cos(twice),
-                                2 * RISE * cos(twice + pi / 2)])
-    roll, pitch, yaw = -tilt * sin(twice), tilt * cos(once), pi / 2 * (1 - sin(once))
-    roll_rate, pitch_rate, yaw_rate = rate * np.array([
-        -2 * tilt * cos(twice), -tilt * sin(once), -pi / 2 * cos(once)])
-    angular_velocity = np.array([  # body rates of R = Rz(yaw) Ry(pitch) Rx(roll)
-        roll_rate - yaw_rate * sin(pitch),
-        pitch_rate * cos(roll) + yaw_rate * cos(pitch) * sin(roll),
-        -pitch_rate * sin(roll) + yaw_rate * cos(pitch) * cos(roll)])
-    return Reference(position, rotations.from_rpy(roll, pitch, yaw), velocity, angular_velocity)
-
-
-def lemniscate_target(start: float, tilt: float) -> TrajectoryTarget:
-    """Return the whole lemniscate of largest roll and pitch ``tilt``, from ``start`` [s]."""
+    tilt, rate = TILTS[name], 2 * pi / PERIOD
     times = np.linspace(0.0, DURATION, round(DURATION / SAMPLE_PERIOD) + 1)
-    samples = [lemniscate(float(t), tilt) for t in times]
-    columns = (np.array([getattr(sample, name) for sample in samples])
-               for name in ('position', 'quaternion', 'velocity', 'angular_velocity'))
-    return TrajectoryTarget(start + times, *columns, stamp=start)
+    # Integral of the smoothstep s^3 (10 - 15 s + 6 s^2) over each ramp; the phase is 0 at the
+    # beginning of the first round.
+    rising, falling = (RAMP * s ** 4 * (2.5 - 3 * s + s * s) for s in (
+        np.clip(times / RAMP, 0, 1), np.clip((DURATION - times) / RAMP, 0, 1)))
+    phase = rate * (rising - falling + np.clip(times - RAMP, 0, ROUNDS * PERIOD))
+    once, twice = phase + pi / 2, 2 * phase + pi
+    positions = np.stack([LENGTH * np.cos(once), LENGTH / 2 * np.sin(twice),
+                          HEIGHT + RISE * np.sin(twice + pi / 2)], axis=1)
+    angles = np.stack([-tilt * np.sin(twice), tilt * np.cos(once),
+                       pi / 2 * (1 - np.sin(once))], axis=1)
+    task = trajectory_task(name, times, positions, np.array([
+        rotations.from_rpy(*row) for row in angles]))
+    begins = [POSE_DURATION + RAMP + k * PERIOD for k in range(ROUNDS)]
+    return replace(task, rounds=tuple((begin, begin + PERIOD) for begin in begins))
 
 
 def trajectory_task(name: str, times: np.ndarray, positions: np.ndarray,

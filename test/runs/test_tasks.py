@@ -6,14 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.control.base import TrajectoryTarget
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.runs.tasks import (
-    DURATION,
-    lemniscate,
-    make_task,
-    NAMES,
-    pose_target,
-    TaskPlayer,
-)
+from beetle_omni_ros.runs.tasks import make_task, NAMES, pose_target, TaskPlayer
 
 
 @pytest.mark.parametrize('name', NAMES)
@@ -38,18 +31,6 @@ def test_random_poses_fill_the_stated_ranges_and_follow_the_seed():
     assert np.array_equal(poses, make_task('random1000', seed=1).poses)
     assert not np.array_equal(poses, make_task('random1000', seed=2).poses)
     assert np.array_equal(make_task('random100', seed=1).poses, poses[:100])
-
-
-@pytest.mark.parametrize('tilt', [0.5, 2.5])
-def test_lemniscate_derivatives_agree_with_finite_differences(tilt):
-    step = 1e-5
-    for t in np.linspace(0.01, DURATION - 0.01, 301):
-        before, now, after = (lemniscate(t + dt, tilt) for dt in (-step, 0, step))
-        velocity = (after.position - before.position) / (2 * step)
-        turn = rotations.log(rotations.multiply(rotations.conjugate(before.quaternion),
-                                                after.quaternion))
-        assert now.velocity == pytest.approx(velocity, abs=1e-6)
-        assert now.angular_velocity == pytest.approx(turn / (2 * step), abs=1e-6)
 
 
 @pytest.mark.parametrize(('name', 'tilt'), [('lemniscate', 0.5), ('lemniscate_large', 2.5)])
