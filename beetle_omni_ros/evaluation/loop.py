@@ -36,7 +36,7 @@ from beetle_omni_ros.messages.values import Odom, Wrench
 from beetle_omni_ros.robot.allocation import ALL_HEALTHY
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError, RunError
-from beetle_omni_ros.runs.log import Recorder
+from beetle_omni_ros.runs.log import COMPUTE_STATUS, Recorder
 from beetle_omni_ros.runs.targets import TargetChecks
 from beetle_omni_ros.runs.tasks import Task, TaskPlayer
 from beetle_omni_ros.safety.parameters import SupervisorParameters
@@ -89,10 +89,10 @@ class ComputeTimer:
         return result
 
     def summary(self) -> dict[str, float | int]:
-        """Median, 99th percentile and maximum [ms], deadline misses, number of steps."""
+        """Values of the status '<name>_node: compute'."""
         times = 1e3 * np.array(self._times or [0.0])
-        return {'median': float(np.median(times)), 'p99': float(np.percentile(times, 99)),
-                'max': float(times.max()),
+        return {'median_ms': float(np.median(times)), 'p99_ms': float(np.percentile(times, 99)),
+                'max_ms': float(times.max()),
                 'deadline_misses': int(np.sum(times > 1e3 * self._period)),
                 'count': len(self._times)}
 
@@ -440,5 +440,6 @@ class FlightLoop:
 
     def _report_compute(self):
         for name, timer in self._timers.items():
-            self._recorder.write_compute(self.simulator.time, name, **timer.summary())
+            self._recorder.write_diagnostic(
+                self.simulator.time, f'{name}_node: {COMPUTE_STATUS}', timer.summary())
 
