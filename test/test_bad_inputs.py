@@ -64,7 +64,7 @@ CASES = {
     f'{EVALUATE} --seed': [
         ('1.5', "'--seed': Input should be"), ('99999999999', "'--seed': Input should be")],
     f'{EVALUATE} --faults': [
-        ('none.yaml', 'none.yaml: no such file'),
+        ('none.yaml', "'none.yaml' does not exist"),
         ('no_list.yaml', "key 'faults': expected a list"),
         ('no_fault.yaml', 'near: rotor_stops'), ('no_rotor.yaml', "key 'rotor' is missing"),
         ('key.yaml', "key 'fault': unknown key; known: faults"),
@@ -77,7 +77,7 @@ CASES = {
         ("''", "--controllers '"), ("' , '", "--controllers '"),
         ('nmpc,nmpc', "--controllers '"),
         ('npmc', "controller 'npmc': expected one of nmpc"), ('none.py:Mine', 'none.py'),
-        ('no_module:Mine', 'no_module'), ('rl --policy none.onnx', 'none.onnx: no such file'),
+        ('no_module:Mine', 'no_module'), ('rl --policy none.onnx', "'none.onnx' does not exist"),
         ('rl --policy policy.onnx', "metadata 'checksum' is missing"),
         ('hover --nmpc horizon.yaml', '--nmpc horizon.yaml'),
         ('hover --policy policy.onnx', '--policy policy.onnx')],
@@ -101,7 +101,7 @@ CASES = {
         ('--controllers npmc', 'npmc'), ('--tasks hover,hover', "--tasks 'hover,hover'"),
         ('--seeds 0,x', "'x'"), ('--seeds -1', "'-1'"), ('--conditions windy', 'windy'),
         ('--jobs 0', "'--jobs' / '-j': Input should be"), ('--backend threads', 'threads'),
-        ('--policy none.onnx', 'none.onnx: no such file'), ('--output notes.txt', 'notes'),
+        ('--policy none.onnx', "'none.onnx' does not exist"), ('--output notes.txt', 'notes'),
         ('--json no/result.json', 'there is no folder')],
     FAULTS: [
         ('--faults no_list.yaml', "'faults'"),

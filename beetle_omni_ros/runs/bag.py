@@ -23,11 +23,10 @@ from beetle_omni_ros.messages.topics import (
     TOPICS,
 )
 from beetle_omni_ros.robot.schema import ParameterError, quoted, read_yaml
-from beetle_omni_ros.runs.log import FlightLog, LogRecorder, motion, SERIES_OF
+from beetle_omni_ros.runs.log import FlightLog, LogRecorder, META_KEY, motion, SERIES_OF
 
 BagError = ParameterError   # its name in identify and nodes
 AT_ONCE = 4096      # messages that are read together
-META_KEY = 'beetle_omni'  # under custom_data of metadata.yaml
 # Entries of the metadata that readers of a log rely on; a task may be the name of a file.
 LONGEST_TEXT = 250
 META_TYPES = {'seed': int, **dict.fromkeys(

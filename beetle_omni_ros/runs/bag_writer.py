@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager, suppress
-from io import BytesIO
 import json
 from math import isfinite
 import os
@@ -14,7 +13,6 @@ from typing import Any
 
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.rosbag2.storage_mcap import McapWriter, write_channel, write_string
 from rosbags.serde import SerdeError
 import yaml
 
@@ -23,40 +21,13 @@ from beetle_omni_ros.messages.conversions import BODY, nanoseconds, WORLD
 from beetle_omni_ros.messages.topics import ALL, EVENT, LATCHED, Qos, topic_of, TOPICS
 from beetle_omni_ros.robot.schema import ParameterError, read_yaml
 from beetle_omni_ros.robot.urdf import description, joints
-from beetle_omni_ros.runs.bag import META_KEY
 from beetle_omni_ros.runs.files import write_text
-from beetle_omni_ros.runs.log import Recorder, RUN_STATUS
+from beetle_omni_ros.runs.log import META_KEY, Recorder, RUN_STATUS
 
 VERSION = 9     # of metadata.yaml
-DISTRIBUTION = 'jazzy'
 TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 TEXT = 'std_msgs/msg/String'
 PERIOD = 0.02       # [s] between transforms
-
-
-def _from_jazzy(metadata):
-    return metadata.replace('ros_distro: rosbags', f'ros_distro: {DISTRIBUTION}')
-
-
-class JazzyStorage(McapWriter):
-    """rosbags' MCAP with the hash of each type."""
-
-    def add_connection(self, connection: Connection, offered_qos_profiles: str) -> None:
-        """Declare a topic."""
-        buffer = self.chunk.bio
-        start = buffer.tell()
-        super().add_connection(connection, offered_qos_profiles)
-        entry = BytesIO()
-        write_string(entry, 'topic_type_hash')
-        write_string(entry, connection.digest)
-        channel = self.channels[-1]
-        self.channels[-1] = channel._replace(metadata=channel.metadata + entry.getvalue())
-        buffer.seek(start)
-        write_channel(buffer, self.channels[-1], self.schemas)
-
-    def close(self, version: int, metadata: str) -> None:
-        """Write index and metadata."""
-        super().close(version, _from_jazzy(metadata))
 
 
 class FrameWriter:
@@ -151,7 +122,6 @@ class BagWriter(Recorder):
         check_new(self.path)
         self._writer: Writer | None = Writer(self.path, version=VERSION,
                                              storage_plugin=StoragePlugin.MCAP)
-        self._writer.STORAGE_PLUGINS = {StoragePlugin.MCAP: JazzyStorage}
         with self._disk():
             self._writer.open()
         for name in topics:
@@ -247,7 +217,6 @@ class BagWriter(Recorder):
             writer.storage.chunk.message_start_time = 0
         with self._disk():
             writer.close()
-            writer.metapath.write_text(_from_jazzy(writer.metapath.read_text('utf8')), 'utf8')
 
     @contextmanager
     def _disk(self):

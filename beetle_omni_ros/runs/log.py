@@ -36,6 +36,7 @@ SERIES_OF = {'ground_truth/odom': 'truth', 'odom': 'odom', 'imu/data_raw': 'imu'
              'command': 'command', 'disturbance': 'wrench'}
 """Topic -> series of its values."""
 
+META_KEY = 'beetle_omni'    # a flight's metadata in custom_data of metadata.yaml
 RUN_STATUS = 'run'  # diagnostic status '<node>: run' with a flight's metadata
 COMPUTE_STATUS = 'compute'  # diagnostic status '<name>_node: compute'
 SUPERVISOR_STATUS, FAULT_KEY = 'supervisor_node: supervisor', 'fault.'

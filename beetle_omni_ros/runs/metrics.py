@@ -278,10 +278,6 @@ def _summary_if_flown(body, target, begin, end):
     return _summary(body, target, begin, end if body.covers(begin, end) else -np.inf)
 
 
-def _hover(log, body, task, start):
-    return _summary(body, log.targets[0], start + POSE_DURATION, start + task.duration)
-
-
 def _tracking(log, body, task, start):
     """Tracking errors over all rounds and of each; None for an incomplete round."""
     windows = [t for t in log.targets if isinstance(t, TrajectoryTarget)]
@@ -437,4 +433,6 @@ def _payloads(log, body, task, start):
 
 # Kind of a task -> function of log, motion, task and its start [s].
 KINDS = {'trajectory': _tracking, 'force': _levels, 'torque': _levels, 'wind': _winds,
-         'pushes': _pushes, 'steps': _steps, 'payload': _payloads, 'hover': _hover}
+         'pushes': _pushes, 'steps': _steps, 'payload': _payloads,
+         'hover': lambda log, body, task, start: _summary(
+             body, log.targets[0], start + POSE_DURATION, start + task.duration)}

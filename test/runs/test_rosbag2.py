@@ -7,7 +7,6 @@ import shutil
 import subprocess
 import sys
 
-from mcap.reader import make_reader
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
@@ -41,14 +40,13 @@ def topics(bag):
             for entry in information(bag)['topics_with_message_count']}
 
 
-def test_metadata_has_the_fields_of_version_9_and_names_jazzy(plain):
+def test_metadata_has_the_fields_of_version_9(plain):
     found = information(plain)
     assert set(found) == {
         'version', 'storage_identifier', 'duration', 'starting_time', 'message_count',
         'topics_with_message_count', 'compression_format', 'compression_mode',
         'relative_file_paths', 'files', 'custom_data', 'ros_distro'}
-    assert (found['version'], found['storage_identifier'], found['ros_distro']) \
-        == (9, 'mcap', 'jazzy')
+    assert (found['version'], found['storage_identifier']) == (9, 'mcap')
     assert found['starting_time']['nanoseconds_since_epoch'] >= 1_699_999_999 * 10**9
     state = topics(plain)['/supervisor/state']
     assert set(state) == {'name', 'type', 'serialization_format', 'offered_qos_profiles',
@@ -58,19 +56,6 @@ def test_metadata_has_the_fields_of_version_9_and_names_jazzy(plain):
         == ('keep_last', 1, 'reliable', 'transient_local')
     qos, = topics(plain)['/imu/data_raw']['offered_qos_profiles']
     assert qos['reliability'] == 'best_effort'
-
-
-def test_the_file_contains_the_same_metadata_and_hashes(plain):
-    with next(plain.glob('*.mcap')).open('rb') as stream:
-        reader = make_reader(stream)
-        assert reader.get_header().profile == 'ros2'
-        channels = {c.topic: c.metadata for c in reader.get_summary().channels.values()}
-        record, = (r for r in reader.iter_metadata() if r.name == 'rosbag2')
-    assert yaml.safe_load(record.metadata['serialized_metadata']) == information(plain)
-    for topic in topics(plain).values():
-        own = channels[topic['name']]
-        assert own['topic_type_hash'] == topic['type_description_hash']
-        assert yaml.safe_load(own['offered_qos_profiles']) == topic['offered_qos_profiles']
 
 
 @pytest.mark.skipif(not (INTERFACES / 'std_msgs/msg/String.json').is_file(),
