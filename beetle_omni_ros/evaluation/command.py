@@ -18,7 +18,6 @@ from beetle_omni_ros.evaluation.loop import FlightLoop
 from beetle_omni_ros.messages.topics import topics_with
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs import table
-from beetle_omni_ros.runs.bag_writer import BagWriter
 from beetle_omni_ros.runs.files import write_json
 from beetle_omni_ros.runs.log import FlightLog, LogRecorder, Recorder
 from beetle_omni_ros.runs.metrics import metrics
@@ -60,6 +59,7 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
     with ExitStack() as stack:
         recorder: Recorder = memory
         if bag is not None:
+            from beetle_omni_ros.runs.bag_writer import BagWriter
             recorder = Recorder(memory, stack.enter_context(BagWriter(
                 bag, meta=meta, topics=tuple(topics_with([entry.name])), frames=True,
                 epoch=int(time()))))

@@ -22,7 +22,7 @@ from beetle_omni_ros.messages.topics import ALL, EVENT, LATCHED, Qos, topic_of, 
 from beetle_omni_ros.robot.schema import ParameterError, read_yaml
 from beetle_omni_ros.robot.urdf import description, joints
 from beetle_omni_ros.runs.files import write_text
-from beetle_omni_ros.runs.log import META_KEY, Recorder, RUN_STATUS
+from beetle_omni_ros.runs.log import META_KEY, Recorder
 
 VERSION = 9     # of metadata.yaml
 TRANSFORMS = 'tf2_msgs/msg/TFMessage'
@@ -115,7 +115,7 @@ class BagWriter(Recorder):
 
         """
         self.path = Path(path)
-        self.meta: dict = {}
+        self.meta = dict(meta or {})
         self._epoch = int(epoch)
         self._connections: dict[str, Connection] = {}
         self._prefix = '/' + namespace.strip('/') + '/' if namespace.strip('/') else '/'
@@ -132,9 +132,6 @@ class BagWriter(Recorder):
             self._declare('/tf', TRANSFORMS, EVENT)
             self._declare('/tf_static', TRANSFORMS, LATCHED)
             self._declare(f'{self._prefix}robot_description', TEXT, LATCHED)
-        self._last_t = None      # [s] of the newest message
-        if meta:
-            self.write_meta(meta)
 
     def __enter__(self) -> BagWriter:
         return self
@@ -188,9 +185,6 @@ class BagWriter(Recorder):
         if connection is None:
             ours = ALL.get(topic.removeprefix(self._prefix))
             connection = self._declare(topic, msgtype, ours.qos if ours else EVENT)
-        first, self._last_t = self._last_t is None, t
-        if first and self.meta:     # now a time of the flight is known
-            self._tell_meta()
         with self._disk():
             self._writer.write(connection, max(0, nanoseconds(t)) + self._epoch * 1_000_000_000,
                                data)
@@ -226,13 +220,8 @@ class BagWriter(Recorder):
             raise ParameterError(f'{self.path}: {error.strerror}') from error
 
     def write_meta(self, meta: dict) -> None:
-        """Add metadata; also written as a message, for a bag without metadata.yaml."""
+        """Add metadata."""
         self.meta.update(meta)
-        if self._last_t is not None:
-            self._tell_meta()
-
-    def _tell_meta(self):
-        self.write_diagnostic(self._last_t, f'recorder_node: {RUN_STATUS}', self.meta)
 
 
 def check_new(path: str | Path) -> None:

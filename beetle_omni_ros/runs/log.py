@@ -37,7 +37,6 @@ SERIES_OF = {'ground_truth/odom': 'truth', 'odom': 'odom', 'imu/data_raw': 'imu'
 """Topic -> series of its values."""
 
 META_KEY = 'beetle_omni'    # a flight's metadata in custom_data of metadata.yaml
-RUN_STATUS = 'run'  # diagnostic status '<node>: run' with a flight's metadata
 COMPUTE_STATUS = 'compute'  # diagnostic status '<name>_node: compute'
 SUPERVISOR_STATUS, FAULT_KEY = 'supervisor_node: supervisor', 'fault.'
 COMPUTE_KEYS = {'median_ms': 'median', 'p99_ms': 'p99', 'max_ms': 'max',
@@ -263,10 +262,7 @@ class LogRecorder(Recorder):
     def _take(self, entry):
         values = entry.values
         node, _, kind = entry.name.rpartition(': ')
-        if kind == RUN_STATUS:
-            seed = values.get('seed', '')
-            self.write_meta({**values, 'seed': int(seed)} if seed.isdigit() else values)
-        elif kind == COMPUTE_STATUS and set(COMPUTE_KEYS) <= set(values):
+        if kind == COMPUTE_STATUS and set(COMPUTE_KEYS) <= set(values):
             report = {name: int(values[key]) if name in ('deadline_misses', 'count')
                       else float(values[key]) for key, name in COMPUTE_KEYS.items()}
             name = node.rpartition('/')[2].removesuffix('_node')

@@ -6,6 +6,7 @@ mean error over 1.0 to 7.0 s, measures how fast the pose is reached (docs/refere
 """
 
 from collections import Counter
+from itertools import groupby
 
 import numpy as np
 
@@ -90,14 +91,14 @@ def _split(log, task):
         (begin, end) of the flight towards its targets [s].
 
     """
-    parts: dict[str, tuple[list, list]] = {name: ([], []) for name in log.controllers()}
+    changes = log.active_controller()
+    parts: dict[str, tuple[list, list]] = {name: ([], []) for _, name in changes if name}
     if not parts or not log.targets:
         return {}
     last = log.targets[-1]
     ends = [target.stamp for target in log.targets[1:]]
     ends.append(log.targets[0].stamp + task.duration if task else
                 last.stamp + POSE_DURATION if isinstance(last, PoseTarget) else last.times[-1])
-    changes = log.active_controller()
     name = next(iter(parts))
     for k, (target, end) in enumerate(zip(log.targets, ends, strict=True)):
         shares: Counter = Counter()
@@ -115,7 +116,7 @@ def _split(log, task):
             landed = next((float(t) for t, state in zip(log.state_t, log.states, strict=True)
                            if t > target.stamp
                            and state.partition(':')[0] in ('landing', 'disarmed')), np.inf)
-            intervals.append((target.stamp, min(end, log.end, landed)))
+            intervals.append((target.stamp, min(end, landed)))
     return {name: part for name, part in parts.items() if any(part)}
 
 
@@ -399,17 +400,14 @@ def settling_time(times: np.ndarray, outside: np.ndarray) -> float | None:
 
 def _level_windows(task, start):
     """(level, begin, end) of consecutive segments with the same level other than 0."""
-    windows: list[list[float]] = []
-    begin = start
-    for segment in task.segments:
-        end = begin + segment.duration
-        if segment.level:
-            if windows and windows[-1][0] == segment.level:
-                windows[-1][2] = end
-            else:
-                windows.append([segment.level, begin, end])
-        begin = end
-    return [tuple(float(v) for v in window) for window in windows]
+    windows = []
+    for level, group in groupby(zip(task.segments, start + task.ends, strict=True),
+                                key=lambda pair: pair[0].level):
+        (first, end), *rest = group
+        if level:
+            windows.append((float(level), float(end - first.duration),
+                            float(rest[-1][1] if rest else end)))
+    return windows
 
 
 def _payloads(log, body, task, start):
