@@ -261,10 +261,10 @@ class FlightLoop:
                 if battery.charge < SWAP_CHARGE or self.supervisor.battery_low:
                     battery.reset()
             if moment.changed:
-                self.simulator.set_wrench(moment.force_world, moment.torque_body)
-                self.simulator.set_payload(moment.payload)
-                self._recorder.write('disturbance', Wrench(
-                    self.simulator.time, moment.force_world, moment.torque_body))
+                wrench = moment.segment.force_world, moment.segment.torque_body
+                self.simulator.set_wrench(*wrench)
+                self.simulator.set_payload(moment.segment.payload)
+                self._recorder.write('disturbance', Wrench(self.simulator.time, *wrench))
             if moment.finished or self._crashed:
                 break
             self.step()
@@ -274,7 +274,8 @@ class FlightLoop:
                 progress(min(1.0, (self.simulator.time - player.start) / task.duration))
         self._report_compute()
         progress(1.0)
-        return not (self._crashed or moment.lost or self.simulator.truth.broken)
+        return not (self._crashed or player.lost_level is not None
+                    or self.simulator.truth.broken)
 
     def start_faults(self) -> None:
         """Start the time of the faults."""

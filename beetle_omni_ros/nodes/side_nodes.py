@@ -100,11 +100,14 @@ class ReferenceNode(FlightNode):
         if self._trajectory is not None and now > self._window_end - WINDOW_PERIOD:
             self._publish_window(now)
         if moment.changed and self._task.kind in WITH_WRENCHES:
-            self._wrenches.publish(Wrench(now, moment.force_world, moment.torque_body))
+            self._wrenches.publish(Wrench(now, moment.segment.force_world,
+                                          moment.segment.torque_body))
         if moment.changed and self._task.kind == 'payload':
-            self._payload.call_async(wire.parameter_request('payload', float(moment.payload)))
+            self._payload.call_async(wire.parameter_request(
+                'payload', float(moment.segment.payload)))
         if moment.finished:
-            lost = f': control lost at level {self._player.lost_level:g}' if moment.lost else ''
+            level = self._player.lost_level
+            lost = '' if level is None else f': control lost at level {level:g}'
             self._player = self._trajectory = None
             self._set_state(f'done{lost}')
         else:

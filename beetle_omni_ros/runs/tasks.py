@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from math import exp, pi, sqrt
 from pathlib import Path
 import re
+from typing import NamedTuple
 
 import numpy as np
 
@@ -155,29 +156,13 @@ class Task:
                 for begin, segment in zip(begins, self.segments, strict=True) if segment.target]
 
 
-@dataclass(frozen=True)
-class Moment:
-    """
-    State of a task at one time.
+class Moment(NamedTuple):
+    """A task at one time: its segment, and the target to publish now, or None."""
 
-    Attributes:
-        target: target to publish now, or None.
-        force_world: (3,) external force in world [N].
-        torque_body: (3,) external torque in base_link [N m].
-        payload: [kg].
-        changed: whether a new segment has begun.
-        finished: whether the task is over.
-        lost: whether control was lost, which ends the task.
-
-    """
-
+    segment: Segment
     target: Target | None
-    force_world: np.ndarray
-    torque_body: np.ndarray
-    payload: float
-    changed: bool = False
-    finished: bool = False
-    lost: bool = False
+    changed: bool
+    finished: bool
 
 
 class TaskPlayer:
@@ -185,13 +170,15 @@ class TaskPlayer:
     Plays a task in time, by periodic calls of :meth:`update`.
 
     Targets are stamped with the time at which they are due, not with the time of the call, so
-    that the 8 s of a pose are exact.
+    that the 8 s of a pose are exact. ``lost_level`` is the level at which control was lost, which
+    ends the task.
     """
 
     def __init__(self, task: Task, start: float):
         self.task = task
         self.start = start
         self.lost_level: float | None = None
+        self._segments = (*task.segments, Segment(0.0))     # after the task
         self._ends = task.ends
         self._index = -1
         self._target: Target | None = None
@@ -204,32 +191,19 @@ class TaskPlayer:
         Pose (3,) in world [m] and (4,) of the robot serve to detect a loss of control.
         """
         index = int(self._ends.searchsorted(now - self.start + 1e-6, side='right'))
-        if position is not None and self._lost(position, quaternion, index):
-            self.lost_level = self.task.segments[max(self._index, 0)].level
-        if index >= len(self._ends) or self.lost_level is not None:
-            changed, self._index = self._index != len(self._ends), len(self._ends)
-            return Moment(None, np.zeros(3), np.zeros(3), 0.0, changed=changed, finished=True,
-                          lost=self.lost_level is not None)
-        target = None
-        changed = index != self._index
+        level = self._segments[self._index].level
+        if position is not None and level and self.task.kind in ('force', 'torque') \
+                and control_lost(self._target, position, quaternion if
+                                 self._segments[index].level != level else None):
+            self.lost_level = level
+        if self.lost_level is not None:
+            index = len(self._ends)
+        target, changed = None, index != self._index
         for k in range(self._index + 1, index + 1):
-            segment = self.task.segments[k]
-            if segment.target:
-                begin = self.start + (self._ends[k - 1] if k else 0.0)
-                target = self._target = segment.target(float(begin))
+            if build := self._segments[k].target:
+                target = self._target = build(float(self.start + (self._ends[k - 1] if k else 0)))
         self._index = index
-        segment = self.task.segments[index]
-        return Moment(target, segment.force_world, segment.torque_body, segment.payload, changed)
-
-    def _lost(self, position, quaternion, index):
-        if self.task.kind not in ('force', 'torque') or self._target is None \
-                or not 0 <= self._index < len(self._ends) or self.lost_level is not None:
-            return False
-        segments = self.task.segments
-        if segments[self._index].level == 0:
-            return False
-        due = index >= len(segments) or segments[index].level != segments[self._index].level
-        return control_lost(self._target, position, quaternion if due else None)
+        return Moment(self._segments[index], target, changed, index == len(self._ends))
 
 
 def control_lost(target: PoseTarget, position: np.ndarray,

@@ -55,7 +55,7 @@ def _played(task, tick=0.005):
     """Times (N,) and wrenches (N, 6) of a task."""
     player, t, rows = TaskPlayer(task, 0.0), 0.0, []
     while not (moment := player.update(t)).finished:
-        rows.append(np.concatenate([[t], moment.force_world, moment.torque_body]))
+        rows.append(np.concatenate([[t], moment.segment.force_world, moment.segment.torque_body]))
         t += tick
     rows = np.array(rows)
     return rows[:, 0], rows[:, 1:]
