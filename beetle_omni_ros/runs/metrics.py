@@ -78,7 +78,7 @@ def task_of(log: FlightLog) -> Task | None:
         return None
     try:
         return make_task(name, int(log.meta.get('seed') or 0))
-    except ValueError:
+    except (OSError, TypeError, ValueError):    # whatever the metadata contains
         return None
 
 
