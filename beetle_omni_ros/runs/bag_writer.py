@@ -179,8 +179,6 @@ class BagWriter(Recorder):
             ParameterError: the file cannot be written.
 
         """
-        if self._writer is None:    # a node may still receive while it ends
-            raise ParameterError(f'{self.path}: the bag is closed')
         connection = self._connections.get(topic)
         if connection is None:
             ours = ALL.get(topic.removeprefix(self._prefix))
