@@ -1,11 +1,8 @@
-"""Bags have the format of ``ros2 bag record`` of Jazzy: metadata, type hashes, frames."""
+"""Bags as ``ros2 bag`` reads them: metadata and frames."""
 
 from importlib.util import find_spec
-import json
-from pathlib import Path
 import shutil
 import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -19,8 +16,6 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.bag_writer import BagWriter
 from beetle_omni_ros.runs.tasks import make_task
 
-INTERFACES = Path(sys.prefix) / 'share'     # of the message packages, where ROS is of PyPI
-
 
 @pytest.fixture(scope='module')
 def plain(tmp_path_factory):
@@ -30,41 +25,16 @@ def plain(tmp_path_factory):
     return folder
 
 
-def information(bag):
-    return yaml.safe_load((bag / 'metadata.yaml').read_text())['rosbag2_bagfile_information']
-
-
-def topics(bag):
-    """Name -> metadata of a topic."""
-    return {entry['topic_metadata']['name']: entry['topic_metadata']
-            for entry in information(bag)['topics_with_message_count']}
-
-
-def test_metadata_has_the_fields_of_version_9(plain):
-    found = information(plain)
-    assert set(found) == {
-        'version', 'storage_identifier', 'duration', 'starting_time', 'message_count',
-        'topics_with_message_count', 'compression_format', 'compression_mode',
-        'relative_file_paths', 'files', 'custom_data', 'ros_distro'}
+def test_metadata_has_real_times_and_the_quality_of_service_of_each_topic(plain):
+    found = yaml.safe_load((plain / 'metadata.yaml').read_text())['rosbag2_bagfile_information']
     assert (found['version'], found['storage_identifier']) == (9, 'mcap')
     assert found['starting_time']['nanoseconds_since_epoch'] >= 1_699_999_999 * 10**9
-    state = topics(plain)['/supervisor/state']
-    assert set(state) == {'name', 'type', 'serialization_format', 'offered_qos_profiles',
-                          'type_description_hash'}
-    qos, = state['offered_qos_profiles']
+    offered = {entry['topic_metadata']['name']: entry['topic_metadata']['offered_qos_profiles']
+               for entry in found['topics_with_message_count']}
+    qos, = offered['/supervisor/state']
     assert (qos['history'], qos['depth'], qos['reliability'], qos['durability']) \
         == ('keep_last', 1, 'reliable', 'transient_local')
-    qos, = topics(plain)['/imu/data_raw']['offered_qos_profiles']
-    assert qos['reliability'] == 'best_effort'
-
-
-@pytest.mark.skipif(not (INTERFACES / 'std_msgs/msg/String.json').is_file(),
-                    reason='no message packages in this environment')
-def test_type_hashes_are_those_of_the_installed_message_packages(plain):
-    for topic in topics(plain).values():
-        described = json.loads((INTERFACES / f"{topic['type']}.json").read_text())
-        hashes = {one['type_name']: one['hash_string'] for one in described['type_hashes']}
-        assert topic['type_description_hash'] == hashes[topic['type']], topic['type']
+    assert offered['/imu/data_raw'][0]['reliability'] == 'best_effort'
 
 
 @pytest.mark.skipif(not shutil.which('ros2') or find_spec('ros2bag') is None,
