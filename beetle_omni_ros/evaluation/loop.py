@@ -32,7 +32,7 @@ from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.estimation.state import pose_covariance, twist_covariance
-from beetle_omni_ros.messages.values import Odom, Wrench
+from beetle_omni_ros.messages.values import Diagnostic, Odom, Wrench
 from beetle_omni_ros.robot.allocation import ALL_HEALTHY
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError, RunError
@@ -288,7 +288,8 @@ class FlightLoop:
         """Set the target in force."""
         for host in self._hosts.values():
             host.target = target
-        self._recorder.write_target(target)
+        self._recorder.write('target_pose' if isinstance(target, PoseTarget) else
+                             'target_trajectory', target)
 
     @property
     def now(self) -> float:
@@ -441,6 +442,7 @@ class FlightLoop:
 
     def _report_compute(self):
         for name, timer in self._timers.items():
-            self._recorder.write_diagnostic(
-                self.simulator.time, f'{name}_node: {COMPUTE_STATUS}', timer.summary())
+            self._recorder.write('diagnostics', [Diagnostic(
+                self.simulator.time, f'{name}_node: {COMPUTE_STATUS}', 0, '',
+                {key: str(value) for key, value in timer.summary().items()})])
 

@@ -202,17 +202,6 @@ class Recorder:
         for other in self._others:
             other.write_meta(meta)
 
-    def write_target(self, target: Target, received=None) -> None:
-        """Record a pose or trajectory target, valid from its stamp."""
-        self.write('target_pose' if isinstance(target, PoseTarget) else 'target_trajectory',
-                   target, received)
-
-    def write_diagnostic(self, t, name: str, values: dict, level: int = 0,
-                         message: str = '') -> None:
-        """Record one status such as 'ekf_node: estimator', with numbers or text as values."""
-        self.write('diagnostics', [Diagnostic(t, name, int(level), message, {
-            str(key): str(value) for key, value in values.items()})])
-
 
 class LogRecorder(Recorder):
     """Collects a :class:`FlightLog`; see there for units and frames."""
@@ -233,7 +222,15 @@ class LogRecorder(Recorder):
             self._states.append((received, value))
         elif topic == 'diagnostics':
             for entry in value:
-                self._take(entry)
+                node, _, kind = entry.name.rpartition(': ')
+                if kind != COMPUTE_STATUS or not set(COMPUTE_KEYS) <= set(entry.values):
+                    self._log.diagnostics.append(entry)
+                    continue
+                report = {key: int(entry.values[name]) if key in ('deadline_misses', 'count')
+                          else float(entry.values[name]) for name, key in COMPUTE_KEYS.items()}
+                name = node.rpartition('/')[2].removesuffix('_node')
+                self._log.compute[name] = report
+                self._log.compute_history.setdefault(name, []).append((entry.t, report))
 
     @staticmethod
     def _add(rows, channels, value, received):
@@ -258,18 +255,6 @@ class LogRecorder(Recorder):
     def write_meta(self, meta: dict) -> None:
         """Add metadata of the flight."""
         self._log.meta.update(meta)
-
-    def _take(self, entry):
-        values = entry.values
-        node, _, kind = entry.name.rpartition(': ')
-        if kind == COMPUTE_STATUS and set(COMPUTE_KEYS) <= set(values):
-            report = {name: int(values[key]) if name in ('deadline_misses', 'count')
-                      else float(values[key]) for key, name in COMPUTE_KEYS.items()}
-            name = node.rpartition('/')[2].removesuffix('_node')
-            self._log.compute[name] = report
-            self._log.compute_history.setdefault(name, []).append((entry.t, report))
-        else:
-            self._log.diagnostics.append(entry)
 
     def log(self) -> FlightLog:
         """Return the flight so far, each series sorted by time."""

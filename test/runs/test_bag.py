@@ -9,6 +9,7 @@ from rosbags.highlevel import AnyReader
 from synthetic_flights import (
     fly,
     write_command,
+    write_diagnostic,
     write_imu,
     write_joints,
     write_request,
@@ -112,7 +113,7 @@ def test_namespaces_are_removed_and_several_robots_refused(tmp_path):
 def test_compute_times_come_from_the_diagnostics_of_the_nodes(tmp_path):
     with BagWriter(tmp_path / 'bag') as writer:
         for count in (10, 20):
-            writer.write_diagnostic(count, 'robot1/nmpc_node: compute', {
+            write_diagnostic(writer, count, 'robot1/nmpc_node: compute', {
                 'median_ms': '0.2', 'p99_ms': '0.5', 'max_ms': count, 'deadline_misses': '1',
                 'count': count, 'wall_max_ms': 9})
     log = read_bag(tmp_path / 'bag')
