@@ -11,7 +11,6 @@ from rich.text import Text
 from beetle_omni_ros import __version__
 from beetle_omni_ros.bringup.devices import check_board, check_servos
 from beetle_omni_ros.bringup.findings import (
-    BRIDGES,
     check_topics,
     FAIL,
     Findings,
@@ -55,22 +54,18 @@ def run_check(*, listen: Callable[[float], ObservedGraph], servo_port: str | Non
     robot_parameters = RobotParameters.load(robot)
     bus = replace(bus, port=servo_port or bus.port)
     link = replace(link, port=board_port or link.port)
-    graph, found = None, {}
+    graph, found, ros = None, {}, Findings()
     if 'ros' not in skip:
-        found['ros'] = Findings()
         with console.status(f'listening to ROS for {seconds:g} s'):
-            graph = _observed(listen, seconds, found['ros'])
+            graph = _observed(listen, seconds, ros)
     if 'servos' not in skip:
         with console.status(f'checking the servos on {bus.port}'):
             found['servos'] = check_servos(bus, robot_parameters.joints, graph)
     if 'board' not in skip:
         with console.status(f'listening to the motor board on {link.port}'):
             found['board'] = check_board(link, robot_parameters, seconds, graph)
-    if graph is not None:
-        items = {finding.item for rows in found.values() for finding in rows}
-        found['ros'] = check_topics(graph, robot_parameters.gravity,
-                                    {bridge for bridge in BRIDGES if f'{bridge} state' in items})
-    found = {part: found[part] for part in PARTS if part in found}
+    if 'ros' not in skip:
+        found['ros'] = check_topics(graph, robot_parameters.gravity) if graph else ros
     _print(console, found, skip)
     is_ok = all(finding.level != FAIL for rows in found.values() for finding in rows)
     write_json(json_path, {

@@ -15,7 +15,7 @@ import time
 
 import numpy as np
 
-from beetle_omni_ros.bringup.findings import Findings, ObservedGraph, reported
+from beetle_omni_ros.bringup.findings import Findings, ObservedGraph
 from beetle_omni_ros.drivers import servo_registers as registers
 from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters, ServoBusParameters
 from beetle_omni_ros.robot.parameters import JointParameters, RobotParameters
@@ -71,7 +71,7 @@ def open_port(findings, device, name, path, bridge, graph):
     Open ``device`` on its port ``path``; return whether it is open.
 
     Adds the port and the latency timer of a USB adapter, or why it is closed. A port that a
-    running bridge has open is judged by the reports of this bridge in ``graph``.
+    running bridge has open is judged by the topics of this bridge in ``graph``.
     """
     from beetle_omni_ros.drivers.serial_port import SerialPortError, usb_ports
     item = f'{name} port'
@@ -82,8 +82,7 @@ def open_port(findings, device, name, path, bridge, graph):
         except SerialPortError as error:
             found, remedy = str(error), GUIDE
     if found and graph and graph.runs(bridge) and 'another process' in found:
-        findings.add(item, f'{found}; not opened, judged by what {bridge}_node reports')
-        findings += reported(bridge, graph)
+        findings.add(item, f'{found}; not opened, see what {bridge}_node reports')
     elif found:
         findings.add(item, found, fail=remedy)
     if found:

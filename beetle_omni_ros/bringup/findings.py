@@ -1,7 +1,7 @@
 """Findings of `beetle_omni check`, and those about the observed ROS graph."""
 
 from collections import Counter
-from collections.abc import Container, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import inf
 from statistics import fmean, median
@@ -132,10 +132,9 @@ class ObservedGraph:
         return bridge in self.states or bool(self.of_bridge(bridge))
 
 
-def reported(bridge: str, graph: ObservedGraph) -> Findings:
-    """State and diagnostics of a running bridge as findings."""
-    findings, state = Findings(), graph.states.get(bridge)
-    item = f'{bridge} state'
+def _reports_of(findings, bridge, graph):
+    """State and diagnostics of a running bridge."""
+    state, item = graph.states.get(bridge), f'{bridge} state'
     if state is None:
         findings.add(item, f'no {bridge}/state', warn='check the version of the bridge')
     elif state.startswith('waiting'):
@@ -144,24 +143,19 @@ def reported(bridge: str, graph: ObservedGraph) -> Findings:
     else:
         findings.add(item, state, fail='' if state == 'ready' else
                      'remove the cause, then disarm and arm again')
-    for name, status in graph.of_bridge(bridge).items():
+    statuses = graph.of_bridge(bridge)
+    for name, status in statuses.items():
         if name not in UNUSED:
             level = {0: OK, 1: WARN}.get(status.level, FAIL)
             findings.append(Finding(f'{bridge} {name}', level, status.message or 'no message',
                                     '' if level == OK else BRIDGES[bridge], status.values))
-    if len(findings) == 1:
+    if not statuses:
         findings.add(f'{bridge} diagnostics', f'none within {graph.seconds:g} s',
                      warn='increase the time: --seconds 5')
-    return findings
 
 
-def check_topics(graph: ObservedGraph, gravity: float,
-                 reported_bridges: Container[str] = ()) -> Findings:
-    """
-    Check rates, ages and contents of the sensor topics; ``gravity`` in m/s^2.
-
-    Reports of a running bridge are added unless it is in ``reported_bridges``.
-    """
+def check_topics(graph: ObservedGraph, gravity: float) -> Findings:
+    """Check the sensor topics and what running bridges report; ``gravity`` in m/s^2."""
     findings = Findings()
     for topic, (source, bridge, rate, *ages) in TOPICS.items():
         stream, runs = graph.streams.get(topic, Stream()), bool(bridge) and graph.runs(bridge)
@@ -173,8 +167,8 @@ def check_topics(graph: ObservedGraph, gravity: float,
             _rate_of(findings, topic, stream, rate)
             _age_of(findings, topic, stream, *ages)
             _content_of(findings, topic, source, stream, gravity)
-        if runs and bridge not in reported_bridges:
-            findings += reported(bridge, graph)
+        if runs:
+            _reports_of(findings, bridge, graph)
     return findings
 
 

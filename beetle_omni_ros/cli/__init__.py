@@ -5,38 +5,24 @@ A subcommand imports its modules when it runs, so that `--help` is fast and an a
 ROS. Unusable input gives status 2 and one line on standard error.
 """
 
-from __future__ import annotations
-
 import sys
-from typing import Annotated
 
 import typer
 from typer.main import get_command
 
-from beetle_omni_ros import __version__
 from beetle_omni_ros.cli.commands import app
 from beetle_omni_ros.cli.options import FAILED, INTERRUPTED, UNUSABLE
 from beetle_omni_ros.robot.resources import PACKAGE
 from beetle_omni_ros.robot.schema import ParameterError, RunError
 
-# Modules of ROS (also of the extra 'ros') and of the other extras of the package.
-ROS_MODULES, ROS_ENDINGS = ('rclpy', 'ament_index_python'), ('_msgs', '_srvs', '_interfaces')
-HARDWARE_MODULES = ('dynamixel_sdk', 'pymavlink', 'serial')
-TRAIN_MODULES = ('onnx', 'onnxscript', 'rsl_rl', 'tensorboard', 'tensordict', 'torch')
+ROS_ENDINGS = ('rclpy', 'ament_index_python', '_msgs', '_srvs', '_interfaces')     # of modules
+CURES = {       # module -> how to install it
+    **dict.fromkeys(('dynamixel_sdk', 'pymavlink', 'serial'),
+                    "pip install 'beetle_omni_ros[hardware]'"),
+    **dict.fromkeys(('onnx', 'onnxscript', 'rsl_rl', 'tensorboard', 'tensordict', 'torch'),
+                    "run make setup-train in a checkout, or pip install 'beetle_omni_ros[train]'")}
 SEVERAL = ('--holdout', '--validate')   # options with several values
 MAY_BE_EMPTY = ('--namespace',)
-
-
-def _version(wanted: bool):
-    if wanted:
-        typer.echo(f'beetle_omni {__version__}')
-        raise typer.Exit()
-
-
-@app.callback()
-def _common(version: Annotated[bool, typer.Option(
-        '--version', callback=_version, is_eager=True, help='Show the version.')] = False):
-    pass
 
 
 def main(args: list[str] | None = None) -> int:
@@ -50,13 +36,8 @@ def main(args: list[str] | None = None) -> int:
         top = (error.name or '').partition('.')[0]
         if top == PACKAGE:
             raise
-        cure = 'pip install beetle_omni_ros'
-        if top in ROS_MODULES or top.endswith(ROS_ENDINGS):
-            cure = "source a ROS 2 Jazzy environment or pip install 'beetle_omni_ros[ros]'"
-        elif top in HARDWARE_MODULES:
-            cure = "pip install 'beetle_omni_ros[hardware]'"
-        elif top in TRAIN_MODULES:
-            cure = "run make setup-train in a checkout, or pip install 'beetle_omni_ros[train]'"
+        cure = "source a ROS 2 Jazzy environment or pip install 'beetle_omni_ros[ros]'" \
+            if top.endswith(ROS_ENDINGS) else CURES.get(top, 'pip install beetle_omni_ros')
         return _fail(f"the module '{top}' is not installed; {cure}", UNUSABLE)
     except ParameterError as error:
         return _fail(error, UNUSABLE)

@@ -10,7 +10,6 @@ from typing import Annotated
 from typer import Argument, echo, Option, Typer
 
 from beetle_omni_ros.cli.options import (
-    CompressionOption,
     CONDITIONS,
     ConditionsOption,
     ControllerOption,
@@ -40,7 +39,6 @@ from beetle_omni_ros.cli.options import (
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.registry import ControllerOptions, DEFAULT, owner
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.files import write_json
 
 HELP = {'help_option_names': ['-h', '--help']}
 
@@ -55,7 +53,6 @@ def fly(controller: ControllerOption = DEFAULT,
         task: TaskOption = 'waypoints',
         bag: Annotated[Path | None, Option(metavar='DIR', help=(
             'New folder for the recorded bag. Default: runs_out/fly_DATE.'))] = None,
-        compression: CompressionOption = 'none',
         conditions: ConditionsOption = 'nominal',
         seed: SeedOption = 0,
         actuators: Annotated[str | None, Option(metavar='emulated|direct', help=(
@@ -110,7 +107,6 @@ def evaluate(controllers: Annotated[str, Option(callback=several, metavar='NAME,
              bag: Annotated[Path | None, Option(metavar='DIR', help=(
                  'New folder for the bag; with several controllers it contains one bag for '
                  'each.'))] = None,
-             compression: CompressionOption = 'none',
              faults: FaultsOption = None,
              json_path: JsonOption = None):
     """
@@ -136,8 +132,8 @@ def evaluate(controllers: Annotated[str, Option(callback=several, metavar='NAME,
     from beetle_omni_ros.evaluation.command import run_evaluate
     from beetle_omni_ros.runs.metrics import failed
     results = run_evaluate(controllers=controllers, task=task, conditions=conditions, robot=robot,
-                           plant=plant, seed=seed, bag=bag, compression=compression,
-                           json_path=json_path, faults=faults, options=options)
+                           plant=plant, seed=seed, bag=bag, json_path=json_path,
+                           faults=faults, options=options)
     return FAILED if any(map(failed, results.values())) else 0
 
 
@@ -374,37 +370,6 @@ def drive(source: Annotated[str, Argument(metavar='keyboard|joystick|terminal', 
     given = dict(locals())
     from beetle_omni_ros.nodes.driver import run_drive
     return run_drive(**given)
-
-
-@app.command()
-def controllers(json_path: JsonOption = None):
-    """
-    List the registered controllers.
-
-    Others fly as FILE.py:Class or package.module:Class, see docs/how-to/own_controller.md.
-    Example: beetle_omni controllers --json controllers.json
-    """
-    from beetle_omni_ros.pages.page import Grid, print_grids, Terminal
-    found = {name: _known(name) for name in registry.names()}
-    header = ['name', 'description', 'rate [Hz]', 'parameters', 'policy', 'actuators lost',
-              'guidance']
-    rows = [[name, known['error'], *[''] * 5] if 'error' in known else
-            [name, known['description'], f"{known['rate_hz']:g}", known['parameters_file'] or '–',
-             known['policy_file'] or '–', 'flies' if known['flies_degraded'] else '–',
-             known['guidance']] for name, known in found.items()]
-    print_grids([Grid('', header, rows)], Terminal())
-    write_json(json_path, found)
-
-
-def _known(name):
-    """Properties of a controller, or the error of its import."""
-    try:
-        entry = registry.find(name)
-    except ParameterError as error:
-        return {'error': str(error)}
-    return {'description': entry.description, 'rate_hz': 1 / entry.period,
-            **{key: getattr(entry, key) for key in (
-                'parameters_file', 'policy_file', 'flies_degraded', 'guidance', 'stands_by')}}
 
 
 @identify.command()

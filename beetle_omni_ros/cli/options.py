@@ -24,13 +24,6 @@ def one_of(param: CallbackParam, value: str) -> str:
     return value
 
 
-def existing(file: Path | None) -> Path | None:
-    """Refuse a file that does not exist."""
-    if file is not None and not file.is_file():
-        raise ParameterError(f'{file}: no such file')
-    return file
-
-
 def writable(file: Path | None) -> Path | None:
     """Refuse a file that cannot be written."""
     check_writable(file)
@@ -76,22 +69,23 @@ TheRobotOption = Annotated[Path | None, Option(
 PlantOption = Annotated[Path | None, Option(metavar='FILE', help=(
     'Robot file of the simulated plant; measured: the shipped one of the measured robot. '
     'Default: as --robot.'))]
-NmpcOption = Annotated[Path | None, Option(callback=existing, metavar='FILE', help=(
-    f"Parameters of the controller '{registry.owner('--nmpc')}'. Default: the shipped "
-    'params/nmpc.yaml.'))]
-PolicyOption = Annotated[Path | None, Option(callback=existing, metavar='FILE', help=(
-    f"Policy (ONNX) for the controller '{registry.owner('--policy')}'. Default: the shipped "
-    'one.'))]
+NmpcOption = Annotated[Path | None, Option(
+    exists=True, dir_okay=False, metavar='FILE', help=(
+        f"Parameters of the controller '{registry.owner('--nmpc')}'. Default: the shipped "
+        'params/nmpc.yaml.'))]
+PolicyOption = Annotated[Path | None, Option(
+    exists=True, dir_okay=False, metavar='FILE', help=(
+        f"Policy (ONNX) for the controller '{registry.owner('--policy')}'. Default: the shipped "
+        'one.'))]
 OtherRobotOption = Annotated[bool, Option('--allow-other-robot', help=(
     'Fly a policy although it was trained for other robot parameters.'))]
 DomainOption = Annotated[int | None, Option(
     min=0, max=101, help='ROS domain. Default: ROS_DOMAIN_ID; of fly, a free one.')]
 NamespaceOption = Annotated[str, Option(
     metavar='NAME', help="Namespace of the robot's topics in a running graph.")]
-CompressionOption = Annotated[str, Option(
-    callback=one_of, metavar='none|zstd', help='Compression of the chunks in the bag.')]
-FaultsOption = Annotated[Path | None, Option(callback=existing, metavar='FILE', help=(
-    'Faults with times and durations (YAML, see docs/faults.md).'))]
+FaultsOption = Annotated[Path | None, Option(
+    exists=True, dir_okay=False, metavar='FILE', help=(
+        'Faults with times and durations (YAML, see docs/faults.md).'))]
 JobsOption = Annotated[int | None, Option(
     '--jobs', '-j', min=1, help='Parallel flights. Default: one on each core.')]
 OutputOption = Annotated[Path | None, Option(

@@ -18,7 +18,6 @@ from beetle_omni_ros.evaluation.loop import FlightLoop
 from beetle_omni_ros.messages.topics import topics_with
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs import table
-from beetle_omni_ros.runs.bag_writer import BagWriter
 from beetle_omni_ros.runs.files import write_json
 from beetle_omni_ros.runs.log import FlightLog, LogRecorder, Recorder
 from beetle_omni_ros.runs.metrics import metrics
@@ -30,8 +29,8 @@ from beetle_omni_ros.sim.faults import Fault, load_faults
 def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotParameters,
         conditions: str = 'nominal', seed: int = 0,
         options: Mapping[str, ControllerOptions] = MappingProxyType({}),
-        built: Controller | None = None, bag: Path | None = None, compression: str = 'none',
-        meta: dict | None = None, faults: Sequence[Fault] = (),
+        built: Controller | None = None, bag: Path | None = None, meta: dict | None = None,
+        faults: Sequence[Fault] = (),
         progress=lambda part: None) -> FlightLog:
     """
     Fly one task with one controller; :func:`run_evaluate` describes the other arguments.
@@ -59,9 +58,10 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
     with ExitStack() as stack:
         recorder: Recorder = memory
         if bag is not None:
+            from beetle_omni_ros.runs.bag_writer import BagWriter
             recorder = Recorder(memory, stack.enter_context(BagWriter(
-                bag, meta=meta, topics=tuple(topics_with([entry.name])), compression=compression,
-                frames=True, epoch=int(time()))))
+                bag, meta=meta, topics=tuple(topics_with([entry.name])), frames=True,
+                epoch=int(time()))))
         loop = FlightLoop(robot, plant, aboard, recorder, conditions=conditions, seed=seed,
                           faults=faults)
         stayed, truth = loop.fly(task, progress), loop.simulator.truth
@@ -76,7 +76,6 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
 def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 'nominal',
                  robot: Path | None = None, plant: Path | None = None, seed: int = 0,
                  bag: Path | None = None, json_path: Path | None = None,
-                 compression: str = 'none',
                  options: Mapping[str, ControllerOptions] = MappingProxyType({}),
                  faults: Path | None = None, console: Console | None = None) -> dict:
     """
@@ -90,7 +89,6 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
         plant: robot file of the simulated plant; default ``robot``.
         seed: seed of the task's poses and of the simulation.
         bag: folder of a bag; with several controllers it contains one bag for each.
-        compression: compression of the bags, 'none' or 'zstd'.
         json_path: file for the results.
         options: controller -> files in place of its own.
         faults: file of faults with times since the task's start and durations.
@@ -131,8 +129,8 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
             bar = bars.add_task(f'{name}: {task.name}, {conditions}', total=1.0)
             log = fly(entry.reference, task, robot=believed, plant=true, conditions=conditions,
                       seed=seed, options=options, built=controller,
-                      bag=bag / name if bag and len(built) > 1 else bag, compression=compression,
-                      meta=meta, faults=injected,
+                      bag=bag / name if bag and len(built) > 1 else bag, meta=meta,
+                      faults=injected,
                       progress=lambda part, bar=bar: bars.update(bar, completed=part))
             results[name] = metrics(log, task)
             if not console.is_terminal:     # which shows no progress bar

@@ -32,11 +32,11 @@ from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.estimation.state import pose_covariance, twist_covariance
-from beetle_omni_ros.messages.values import Odom, Wrench
+from beetle_omni_ros.messages.values import Diagnostic, Odom, Wrench
 from beetle_omni_ros.robot.allocation import ALL_HEALTHY
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError, RunError
-from beetle_omni_ros.runs.log import Recorder
+from beetle_omni_ros.runs.log import COMPUTE_STATUS, Recorder
 from beetle_omni_ros.runs.targets import TargetChecks
 from beetle_omni_ros.runs.tasks import Task, TaskPlayer
 from beetle_omni_ros.safety.parameters import SupervisorParameters
@@ -89,10 +89,10 @@ class ComputeTimer:
         return result
 
     def summary(self) -> dict[str, float | int]:
-        """Median, 99th percentile and maximum [ms], deadline misses, number of steps."""
+        """Values of the status '<name>_node: compute'."""
         times = 1e3 * np.array(self._times or [0.0])
-        return {'median': float(np.median(times)), 'p99': float(np.percentile(times, 99)),
-                'max': float(times.max()),
+        return {'median_ms': float(np.median(times)), 'p99_ms': float(np.percentile(times, 99)),
+                'max_ms': float(times.max()),
                 'deadline_misses': int(np.sum(times > 1e3 * self._period)),
                 'count': len(self._times)}
 
@@ -261,10 +261,11 @@ class FlightLoop:
                 if battery.charge < SWAP_CHARGE or self.supervisor.battery_low:
                     battery.reset()
             if moment.changed:
-                self.simulator.wrench = np.r_[moment.force_world, moment.torque_body]
-                self.simulator.payload = moment.payload
+                segment = moment.segment
+                self.simulator.wrench = np.r_[segment.force_world, segment.torque_body]
+                self.simulator.payload = segment.payload
                 self._recorder.write('disturbance', Wrench(
-                    self.simulator.time, moment.force_world, moment.torque_body))
+                    self.simulator.time, segment.force_world, segment.torque_body))
             if moment.finished or self._crashed:
                 break
             self.step()
@@ -274,7 +275,8 @@ class FlightLoop:
                 progress(min(1.0, (self.simulator.time - player.start) / task.duration))
         self._report_compute()
         progress(1.0)
-        return not (self._crashed or moment.lost or self.simulator.truth.broken)
+        return not (self._crashed or player.lost_level is not None
+                    or self.simulator.truth.broken)
 
     def start_faults(self) -> None:
         """Start the time of the faults."""
@@ -287,7 +289,8 @@ class FlightLoop:
         """Set the target in force."""
         for host in self._hosts.values():
             host.target = target
-        self._recorder.write_target(target)
+        self._recorder.write('target_pose' if isinstance(target, PoseTarget) else
+                             'target_trajectory', target)
 
     @property
     def now(self) -> float:
@@ -440,5 +443,7 @@ class FlightLoop:
 
     def _report_compute(self):
         for name, timer in self._timers.items():
-            self._recorder.write_compute(self.simulator.time, name, **timer.summary())
+            self._recorder.write('diagnostics', [Diagnostic(
+                self.simulator.time, f'{name}_node: {COMPUTE_STATUS}', 0, '',
+                {key: str(value) for key, value in timer.summary().items()})])
 

@@ -75,28 +75,22 @@ class Grid:
 
 
 def print_grids(shown: list[Grid], console: Console) -> None:
-    """Print tables to the terminal."""
+    """Print tables; lines break between words only, and the first column never breaks."""
     for grid in shown:
-        console.print(_rich(grid, console.width), crop=False)
+        columns = list(zip(grid.header, *grid.rows, strict=True))
+        table = Table(title=Text(grid.title) if grid.title else None, title_justify='left',
+                      title_style='', box=None, min_width=min(len(grid.title), LONGEST_TITLE),
+                      header_style='dim', padding=(0, SPACE, 0, 0))
+        for k, (name, *cells) in enumerate(columns):
+            words = [word for cell in (name, *cells) for word in (cell.split() if k else [cell])]
+            table.add_column(Text(name), justify='right' if k else 'left', no_wrap=not k,
+                             min_width=max(map(len, words), default=0),
+                             style='dim' if k in grid.faint_columns else None)
+        for k, row in enumerate(grid.rows):
+            table.add_row(*map(Text, row), style='dim' if k in grid.faint else None)
+        console.print(table, crop=False)
         if grid.note:
             console.print(grid.note, style='dim', highlight=False, markup=False)
-
-
-def _rich(grid, available):
-    """Table whose lines break between words only, and whose first column never breaks."""
-    columns = list(zip(grid.header, *grid.rows, strict=True))
-    least = [max((len(word) for cell in column for word in (cell.split() if k else [cell])),
-                 default=0) for k, column in enumerate(columns)]
-    table = Table(title=Text(grid.title) if grid.title else None, title_justify='left',
-                  title_style='', box=None, min_width=min(len(grid.title), LONGEST_TITLE),
-                  header_style='dim', padding=(0, SPACE, 0, 0))
-    for k, name in enumerate(grid.header):
-        table.add_column(Text(name), justify='right' if k else 'left', min_width=least[k],
-                         no_wrap=not k, style='dim' if k in grid.faint_columns else None)
-    for k, row in enumerate(grid.rows):
-        table.add_row(*(Text(cell) for cell in row),
-                      style='dim' if k in grid.faint else None)
-    return table
 
 
 def markdown(grid: Grid, numeric: bool = False) -> str:

@@ -22,16 +22,11 @@ from beetle_omni_ros.messages.topics import (
     topic_of,
     TOPICS,
 )
-from beetle_omni_ros.robot.schema import ParameterError, quoted, read_yaml
-from beetle_omni_ros.runs.log import FlightLog, LogRecorder, motion, SERIES_OF
+from beetle_omni_ros.robot.schema import ParameterError, read_yaml
+from beetle_omni_ros.runs.log import FlightLog, LogRecorder, META_KEY, motion, SERIES_OF
 
 BagError = ParameterError   # its name in identify and nodes
 AT_ONCE = 4096      # messages that are read together
-META_KEY = 'beetle_omni'  # under custom_data of metadata.yaml
-# Entries of the metadata that readers of a log rely on; a task may be the name of a file.
-LONGEST_TEXT = 250
-META_TYPES = {'seed': int, **dict.fromkeys(
-    ('task', 'conditions', 'robot', 'plant', 'controller', 'guidance', 'version'), str)}
 
 
 class Recorded(NamedTuple):
@@ -305,13 +300,7 @@ def _metadata(path, warnings):
         return {}
     try:
         custom = read_yaml(file)['rosbag2_bagfile_information']['custom_data']
-        meta = dict(json.loads((custom or {}).get(META_KEY, '{}')))
+        return dict(json.loads((custom or {}).get(META_KEY, '{}')))
     except (KeyError, TypeError, AttributeError, ValueError, RecursionError):
         warnings.append('metadata.yaml is not readable')
         return {}
-    used = {key: value for key, value in meta.items()
-            if key not in META_TYPES or value is None
-            or isinstance(value, META_TYPES[key]) and len(str(value)) <= LONGEST_TEXT}
-    warnings.extend(f'metadata.yaml: {quoted(key)} is not usable, found {quoted(value)}'
-                    for key, value in meta.items() if key not in used)
-    return used

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager, suppress
-from io import BytesIO
 import json
 from math import isfinite
 import os
@@ -14,8 +13,6 @@ from typing import Any
 
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
-from rosbags.rosbag2.storage_mcap import McapWriter, write_channel, write_string
 from rosbags.serde import SerdeError
 import yaml
 
@@ -24,43 +21,13 @@ from beetle_omni_ros.messages.conversions import BODY, nanoseconds, WORLD
 from beetle_omni_ros.messages.topics import ALL, EVENT, LATCHED, Qos, topic_of, TOPICS
 from beetle_omni_ros.robot.schema import ParameterError, read_yaml
 from beetle_omni_ros.robot.urdf import description, links
-from beetle_omni_ros.runs.bag import META_KEY
 from beetle_omni_ros.runs.files import write_text
-from beetle_omni_ros.runs.log import Recorder, RUN_STATUS
+from beetle_omni_ros.runs.log import META_KEY, Recorder
 
 VERSION = 9     # of metadata.yaml
-DISTRIBUTION = 'jazzy'
-# Compression of the chunks in the MCAP file, which every reader supports; 'zstd' is like the
-# preset `zstd_fast` of rosbag2.
-COMPRESSIONS = ('none', 'zstd')
 TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 TEXT = 'std_msgs/msg/String'
 PERIOD = 0.02       # [s] between transforms
-
-
-def _from_jazzy(metadata):
-    return metadata.replace('ros_distro: rosbags', f'ros_distro: {DISTRIBUTION}')
-
-
-class JazzyStorage(McapWriter):
-    """rosbags' MCAP with the hash of each type."""
-
-    def add_connection(self, connection: Connection, offered_qos_profiles: str) -> None:
-        """Declare a topic."""
-        buffer = self.chunk.bio
-        start = buffer.tell()
-        super().add_connection(connection, offered_qos_profiles)
-        entry = BytesIO()
-        write_string(entry, 'topic_type_hash')
-        write_string(entry, connection.digest)
-        channel = self.channels[-1]
-        self.channels[-1] = channel._replace(metadata=channel.metadata + entry.getvalue())
-        buffer.seek(start)
-        write_channel(buffer, self.channels[-1], self.schemas)
-
-    def close(self, version: int, metadata: str) -> None:
-        """Write index and metadata."""
-        super().close(version, _from_jazzy(metadata))
 
 
 class FrameWriter:
@@ -131,8 +98,7 @@ class BagWriter(Recorder):
     keeps_covariances = True
 
     def __init__(self, path: str | Path, meta: dict | None = None, *, namespace: str = '',
-                 topics: Sequence[str] = tuple(TOPICS), compression: str = 'none',
-                 frames: bool = False, epoch: int = 0):
+                 topics: Sequence[str] = tuple(TOPICS), frames: bool = False, epoch: int = 0):
         """
         Create the folder and the bag in it.
 
@@ -141,7 +107,6 @@ class BagWriter(Recorder):
             meta: metadata of the flight: task, conditions, seed, robot, version.
             namespace: namespace of the topics, '' or e.g. '/robot1'.
             topics: names to declare, see :func:`~beetle_omni_ros.messages.topics.topic_of`.
-            compression: compression of the chunks in the file, 'none' or 'zstd'.
             frames: whether the description and the frames of the robot are recorded.
             epoch: UNIX time of time 0 [s], so that a flight that begins at 0 s gets a real date.
 
@@ -150,16 +115,13 @@ class BagWriter(Recorder):
 
         """
         self.path = Path(path)
-        self.meta: dict = {}
+        self.meta = dict(meta or {})
         self._epoch = int(epoch)
         self._connections: dict[str, Connection] = {}
         self._prefix = '/' + namespace.strip('/') + '/' if namespace.strip('/') else '/'
         check_new(self.path)
         self._writer: Writer | None = Writer(self.path, version=VERSION,
                                              storage_plugin=StoragePlugin.MCAP)
-        self._writer.STORAGE_PLUGINS = {StoragePlugin.MCAP: JazzyStorage}
-        if compression == 'zstd':
-            self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
         with self._disk():
             self._writer.open()
         for name in topics:
@@ -170,9 +132,6 @@ class BagWriter(Recorder):
             self._declare('/tf', TRANSFORMS, EVENT)
             self._declare('/tf_static', TRANSFORMS, LATCHED)
             self._declare(f'{self._prefix}robot_description', TEXT, LATCHED)
-        self._last_t = None      # [s] of the newest message
-        if meta:
-            self.write_meta(meta)
 
     def __enter__(self) -> BagWriter:
         return self
@@ -220,15 +179,10 @@ class BagWriter(Recorder):
             ParameterError: the file cannot be written.
 
         """
-        if self._writer is None:    # a node may still receive while it ends
-            raise ParameterError(f'{self.path}: the bag is closed')
         connection = self._connections.get(topic)
         if connection is None:
             ours = ALL.get(topic.removeprefix(self._prefix))
             connection = self._declare(topic, msgtype, ours.qos if ours else EVENT)
-        first, self._last_t = self._last_t is None, t
-        if first and self.meta:     # now a time of the flight is known
-            self._tell_meta()
         with self._disk():
             self._writer.write(connection, max(0, nanoseconds(t)) + self._epoch * 1_000_000_000,
                                data)
@@ -255,7 +209,6 @@ class BagWriter(Recorder):
             writer.storage.chunk.message_start_time = 0
         with self._disk():
             writer.close()
-            writer.metapath.write_text(_from_jazzy(writer.metapath.read_text('utf8')), 'utf8')
 
     @contextmanager
     def _disk(self):
@@ -265,13 +218,8 @@ class BagWriter(Recorder):
             raise ParameterError(f'{self.path}: {error.strerror}') from error
 
     def write_meta(self, meta: dict) -> None:
-        """Add metadata; also written as a message, for a bag without metadata.yaml."""
+        """Add metadata."""
         self.meta.update(meta)
-        if self._last_t is not None:
-            self._tell_meta()
-
-    def _tell_meta(self):
-        self.write_diagnostic(self._last_t, f'recorder_node: {RUN_STATUS}', self.meta)
 
 
 def check_new(path: str | Path) -> None:

@@ -14,7 +14,7 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from beetle_omni_ros.control.base import PoseTarget, Target, TrajectoryTarget
+from beetle_omni_ros.control.base import PoseTarget, Target
 from beetle_omni_ros.messages.topics import controller_of
 from beetle_omni_ros.messages.values import Diagnostic
 from beetle_omni_ros.robot import rotations
@@ -36,7 +36,7 @@ SERIES_OF = {'ground_truth/odom': 'truth', 'odom': 'odom', 'imu/data_raw': 'imu'
              'command': 'command', 'disturbance': 'wrench'}
 """Topic -> series of its values."""
 
-RUN_STATUS = 'run'  # diagnostic status '<node>: run' with a flight's metadata
+META_KEY = 'beetle_omni'    # a flight's metadata in custom_data of metadata.yaml
 COMPUTE_STATUS = 'compute'  # diagnostic status '<name>_node: compute'
 SUPERVISOR_STATUS, FAULT_KEY = 'supervisor_node: supervisor', 'fault.'
 COMPUTE_KEYS = {'median_ms': 'median', 'p99_ms': 'p99', 'max_ms': 'max',
@@ -48,18 +48,14 @@ EDGE = 1e-5
 SAME_TIME = 2.5e-3  # [s] between stamps of an estimate and of the truth that are compared
 
 
-def _empty(width):
-    return field(default_factory=lambda: np.zeros((0, width) if width else 0))
-
-
 @dataclass
 class Commands:
     """Commands: t (M,) stamps [s], received (M,) [s], tilt (M, 4) [rad], thrust (M, 4) [N]."""
 
-    t: np.ndarray = _empty(0)
-    received: np.ndarray = _empty(0)
-    tilt: np.ndarray = _empty(4)
-    thrust: np.ndarray = _empty(4)
+    t: np.ndarray
+    received: np.ndarray
+    tilt: np.ndarray
+    thrust: np.ndarray
 
 
 @dataclass
@@ -97,7 +93,7 @@ class FlightLog:
 
     requests: dict[str, Commands] = field(default_factory=dict)
     targets: list[Target] = field(default_factory=list)
-    state_t: np.ndarray = _empty(0)
+    state_t: np.ndarray = field(init=False)
     states: list[str] = field(default_factory=list)
     compute: dict[str, dict] = field(default_factory=dict)
     compute_history: dict[str, list] = field(default_factory=dict)
@@ -109,10 +105,6 @@ class FlightLog:
     if TYPE_CHECKING:
         def __getattr__(self, name: str) -> np.ndarray:
             """Return a channel of SERIES."""
-
-    def __post_init__(self):
-        for series, channels in SERIES.items():
-            _unpack(self, f'{series}_', (), channels)
 
     @property
     def begin(self) -> float:
@@ -167,14 +159,12 @@ class FlightLog:
             return [(self.start, self.meta.get('controller', only))]
         changes: list[tuple[float, str | None]] = []
         for t, state in zip(self.state_t, self.states, strict=True):
-            if state.startswith('flying:'):
-                name = state.partition(':')[2]
-            elif state.partition(':')[0] == 'fallback':
-                name = changes[-1][1] if changes else None
-            else:
-                name = None
-            if not changes or changes[-1][1] != name:
-                changes.append((float(t), name))
+            kind, _, name = state.partition(':')
+            active = name if kind == 'flying' else None
+            if kind == 'fallback' and changes:
+                active = changes[-1][1]
+            if not changes or changes[-1][1] != active:
+                changes.append((float(t), active))
         return changes
 
 
@@ -212,106 +202,68 @@ class Recorder:
         for other in self._others:
             other.write_meta(meta)
 
-    def write_target(self, target: Target, received=None) -> None:
-        """Record a pose or trajectory target, valid from its stamp."""
-        self.write('target_pose' if isinstance(target, PoseTarget) else 'target_trajectory',
-                   target, received)
-
-    def write_compute(self, t, controller: str, **times) -> None:
-        """
-        Record the CPU time of a controller's steps since its start, reported at ``t`` [s].
-
-        ``times`` are median, p99, max [ms], deadline_misses, count.
-        """
-        self.write_diagnostic(t, f'{controller}_node: {COMPUTE_STATUS}',
-                              {key: times[name] for key, name in COMPUTE_KEYS.items()})
-
-    def write_diagnostic(self, t, name: str, values: dict, level: int = 0,
-                         message: str = '') -> None:
-        """Record one status such as 'ekf_node: estimator', with numbers or text as values."""
-        self.write('diagnostics', [Diagnostic(t, name, int(level), message, {
-            str(key): str(value) for key, value in values.items()})])
-
 
 class LogRecorder(Recorder):
     """Collects a :class:`FlightLog`; see there for units and frames."""
 
     def __init__(self, meta: dict | None = None):
-        self._rows = {name: array('d') for name in SERIES}  # flat: hours of flight fit
-        self._requests: dict[str, array] = {}
+        self._rows: dict[str, array] = {}     # topic -> flat rows: hours of flight fit
         self._log = FlightLog(meta=dict(meta or {}))
         self._states: list[tuple[float, str]] = []
 
     def write(self, topic: str, value: Any, received: float | None = None) -> None:
         """Record one value; other topics than those of a log are ignored."""
-        series = SERIES_OF.get(topic)
+        series = SERIES_OF.get(topic) or ('command' if controller_of(topic) else '')
         if series:
-            self._add(series, self._rows[series], value, received)
-        elif controller_of(topic):
-            rows = self._requests.setdefault(controller_of(topic), array('d'))
-            self._add('command', rows, value, received)
+            self._add(self._rows.setdefault(topic, array('d')), SERIES[series], value, received)
         elif topic in ('target_pose', 'target_trajectory'):
             self._log.targets.append(value)
         elif topic == 'supervisor/state':
             self._states.append((received, value))
         elif topic == 'diagnostics':
             for entry in value:
-                self._take(entry)
+                node, _, kind = entry.name.rpartition(': ')
+                if kind != COMPUTE_STATUS or not set(COMPUTE_KEYS) <= set(entry.values):
+                    self._log.diagnostics.append(entry)
+                    continue
+                report = {key: int(entry.values[name]) if key in ('deadline_misses', 'count')
+                          else float(entry.values[name]) for name, key in COMPUTE_KEYS.items()}
+                name = node.rpartition('/')[2].removesuffix('_node')
+                self._log.compute[name] = report
+                self._log.compute_history.setdefault(name, []).append((entry.t, report))
 
-    def _add(self, series, rows, value, received):
+    @staticmethod
+    def _add(rows, channels, value, received):
+        """Add a row, or the rows of a value whose fields are arrays over several messages."""
         stamp = value.stamp
-        if isinstance(stamp, np.ndarray) and stamp.ndim:
-            self._add_all(series, rows, value, received)
+        parts = [((stamp if received is None else received) if channel == 'received' else
+                  getattr(value, channel), width) for channel, width in channels.items()]
+        if isinstance(stamp, np.ndarray):
+            rows.frombytes(np.column_stack([stamp, *(
+                np.full((len(stamp), width), np.nan) if part is None else part
+                for part, width in parts)]).astype(float).tobytes())
             return
-        row = [stamp]
-        for channel, width in SERIES[series].items():
-            if channel == 'received':
-                row.append(stamp if received is None else received)
-                continue
-            part = getattr(value, channel)
+        rows.append(stamp)
+        for part, width in parts:
             if not width:
-                row.append(part)
+                rows.append(part)
             elif isinstance(part, np.ndarray):
-                row += part.tolist()    # floats are added faster than numpy's numbers
+                rows.extend(part.tolist())      # floats are added faster than numpy's numbers
             else:
-                row += [np.nan] * width if part is None else part
-        rows.extend(row)
-
-    def _add_all(self, series, rows, value, received):
-        """Add a value whose fields are arrays over several messages."""
-        count = len(value.stamp)
-        parts = [value.stamp]
-        for channel, width in SERIES[series].items():
-            part = received if channel == 'received' else getattr(value, channel)
-            parts.append(np.full((count, width), np.nan) if part is None else part)
-        rows.frombytes(np.column_stack(parts).astype(float).tobytes())
+                rows.extend([np.nan] * width if part is None else part)
 
     def write_meta(self, meta: dict) -> None:
         """Add metadata of the flight."""
         self._log.meta.update(meta)
 
-    def _take(self, entry):
-        values = entry.values
-        node, _, kind = entry.name.rpartition(': ')
-        if kind == RUN_STATUS:
-            seed = values.get('seed', '')
-            self.write_meta({**values, 'seed': int(seed)} if seed.isdigit() else values)
-        elif kind == COMPUTE_STATUS and set(COMPUTE_KEYS) <= set(values):
-            report = {name: int(values[key]) if name in ('deadline_misses', 'count')
-                      else float(values[key]) for key, name in COMPUTE_KEYS.items()}
-            name = node.rpartition('/')[2].removesuffix('_node')
-            self._log.compute[name] = report
-            self._log.compute_history.setdefault(name, []).append((entry.t, report))
-        else:
-            self._log.diagnostics.append(entry)
-
     def log(self) -> FlightLog:
         """Return the flight so far, each series sorted by time."""
         log = self._log
-        for series, channels in SERIES.items():
-            _unpack(log, series + '_', self._rows[series], channels)
-        log.requests = {name: _unpack(Commands(), '', rows, SERIES['command'])
-                        for name, rows in self._requests.items()}
+        for topic, series in SERIES_OF.items():
+            for name, values in _columns(self._rows.get(topic, ()), SERIES[series]).items():
+                setattr(log, f'{series}_{name}', values)
+        log.requests = {controller_of(topic): Commands(**_columns(rows, SERIES['command']))
+                        for topic, rows in self._rows.items() if topic not in SERIES_OF}
         # A latched topic repeats its target: of equal stamps, the last one is kept.
         log.targets = list({(target.stamp, type(target)): target for target in sorted(
             log.targets, key=lambda target: target.stamp)}.values())
@@ -322,17 +274,14 @@ class LogRecorder(Recorder):
         return log
 
 
-def _unpack(into, prefix, rows, channels):
-    width = 1 + sum(max(1, width) for width in channels.values())
-    table = np.array(rows, dtype=float).reshape(-1, width)
+def _columns(rows, channels):
+    """'t' and the channels of flat rows, sorted by time."""
+    widths = {'t': 0, **channels}
+    ends = np.cumsum([max(1, width) for width in widths.values()])
+    table = np.array(rows, dtype=float).reshape(-1, ends[-1])
     table = table[np.argsort(table[:, 0], kind='stable')]
-    setattr(into, prefix + 't', table[:, 0].copy())
-    column = 1
-    for name, w in channels.items():
-        values = table[:, column:column + w] if w else table[:, column]
-        setattr(into, prefix + name, values.copy())
-        column += max(1, w)
-    return into
+    return {name: (table[:, end - width:end] if width else table[:, end - 1]).copy()
+            for (name, width), end in zip(widths.items(), ends, strict=True)}
 
 
 @dataclass(frozen=True)
@@ -397,10 +346,7 @@ def errors(body: Motion, target: Target, window: slice = slice(None)):
         (n,) position error [m] and (n,) orientation error [deg].
 
     """
-    if isinstance(target, PoseTarget):
-        position, quaternion = target.position, target.quaternion
-    else:
-        position, quaternion = reference_poses(target, body.t[window])
+    position, quaternion = reference_poses(target, body.t[window])
     return (np.linalg.norm(body.position[window] - position, axis=1),
             np.degrees(geodesic_angles(body.quaternion[window], quaternion)))
 
@@ -425,25 +371,11 @@ def estimate_errors(log: FlightLog) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 def reference_poses(target: Target, times: np.ndarray):
     """Return (n, 3) positions and (n, 4) quaternions of a target at ``times`` (n,) [s]."""
-    references = [target.at(float(t)) for t in times]
-    return (np.array([r.position for r in references]).reshape(-1, 3),
-            np.array([r.quaternion for r in references]).reshape(-1, 4))
-
-
-def target_ends(log: FlightLog, last: float) -> list[float]:
-    """
-    Return the time at which each target of a log ended.
-
-    Args:
-        log: the flight.
-        last: duration of the last target if it is a pose [s].
-
-    """
-    ends = [target.stamp for target in log.targets[1:]]
-    if log.targets:
-        final = log.targets[-1]
-        ends.append(final.times[-1] if isinstance(final, TrajectoryTarget) else final.stamp + last)
-    return ends
+    if isinstance(target, PoseTarget):
+        return np.tile(target.position, (len(times), 1)), np.tile(target.quaternion,
+                                                                  (len(times), 1))
+    references = target.sample(times)
+    return references.position, references.quaternion
 
 
 def hold(times: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:

@@ -5,7 +5,8 @@ A pose lasts 8 s. U, the mean error over 7.0 to 7.5 s, measures the accuracy of 
 mean error over 1.0 to 7.0 s, measures how fast the pose is reached (docs/reference/metrics.md).
 """
 
-from typing import NamedTuple
+from collections import Counter
+from itertools import groupby
 
 import numpy as np
 
@@ -18,10 +19,8 @@ from beetle_omni_ros.runs.log import (
     FlightLog,
     hold,
     inside,
-    Motion,
     motion,
     roll_pitch_yaw,
-    target_ends,
 )
 from beetle_omni_ros.runs.tasks import (
     control_lost,
@@ -48,19 +47,6 @@ SUMMARY = (('mean', np.mean), ('std', np.std), ('min', np.min), ('max', np.max))
 POSE_KEYS = ('U_position_m', 'U_orientation_deg', 'L_position_m', 'L_orientation_deg')
 
 
-class ControllerPart(NamedTuple):
-    """
-    Part of a flight with one controller.
-
-    ``poses`` are indices of pose targets in the log that lasted to the end of U, ``intervals``
-    (begin, end) of the flight towards targets [s].
-    """
-
-    name: str
-    poses: list[int]
-    intervals: list[tuple[float, float]]
-
-
 def metrics(log: FlightLog, task: Task | None = None) -> dict:
     """
     Compute the metrics of a flight with one controller.
@@ -74,20 +60,15 @@ def metrics(log: FlightLog, task: Task | None = None) -> dict:
         keys contain the units.
 
     """
-    results = metrics_by_controller(log, task)
-    if not results:
-        nothing = ControllerPart('unknown', [], [])
-        return _controller_metrics(log, task or task_of(log), nothing, None)
-    return next(iter(results.values()))
+    return next(iter(metrics_by_controller(log, task).values()))
 
 
 def metrics_by_controller(log: FlightLog, task: Task | None = None) -> dict[str, dict]:
-    """Compute the metrics of each controller of a flight; see :func:`metrics`."""
+    """Compute the metrics of each controller of a flight; 'unknown' if none flew."""
     task = task or task_of(log)
-    parts = _split(log, task)
-    # If one controller flew the whole task, poses after an early end count as missed.
-    expected = len(task.poses) if task and len(parts) == 1 else None
-    return {part.name: _controller_metrics(log, task, part, expected) for part in parts}
+    parts = _split(log, task) or {'unknown': ([], [])}
+    return {name: _controller_metrics(log, task, name, *part, is_alone=len(parts) == 1)
+            for name, part in parts.items()}
 
 
 def task_of(log: FlightLog) -> Task | None:
@@ -97,83 +78,85 @@ def task_of(log: FlightLog) -> Task | None:
         return None
     try:
         return make_task(name, int(log.meta.get('seed') or 0))
-    except ValueError:
+    except (OSError, TypeError, ValueError):    # whatever the metadata contains
         return None
 
 
 def _split(log, task):
-    last = POSE_DURATION
-    if task and log.targets:
-        last = max(0.0, log.targets[0].stamp + task.duration - log.targets[-1].stamp)
-    ends = target_ends(log, last)
+    """
+    Split a flight by controllers.
+
+    Returns:
+        Controller -> indices of its pose targets that lasted to the end of U, and intervals
+        (begin, end) of the flight towards its targets [s].
+
+    """
     changes = log.active_controller()
-    poses: dict[str, list[int]] = {}
-    intervals: dict[str, list] = {}
-    for name in log.controllers():
-        poses[name], intervals[name] = [], []
-    previous = next(iter(poses), None)
+    parts: dict[str, tuple[list, list]] = {name: ([], []) for _, name in changes if name}
+    if not parts or not log.targets:
+        return {}
+    last = log.targets[-1]
+    ends = [target.stamp for target in log.targets[1:]]
+    ends.append(log.targets[0].stamp + task.duration if task else
+                last.stamp + POSE_DURATION if isinstance(last, PoseTarget) else last.times[-1])
+    name = next(iter(parts))
     for k, (target, end) in enumerate(zip(log.targets, ends, strict=True)):
-        shares = _shares(changes, target.stamp, end)
-        name = max(shares, key=shares.get) if shares else previous
-        previous = name
-        if name is None:
-            continue
-        lasted = end >= target.stamp + U_WINDOW[1] - 1e-3
-        if isinstance(target, PoseTarget) and lasted:
-            poses[name].append(k)
-        if shares:
-            intervals[name].append((target.stamp, min(end, log.end, _landing(log, target.stamp))))
-    return [ControllerPart(name, poses[name], intervals[name]) for name in poses
-            if poses[name] or intervals[name]]
+        shares: Counter = Counter()
+        for (t, active), until in zip(changes, [*(t for t, _ in changes[1:]), np.inf],
+                                      strict=True):
+            if active:
+                shares[active] += max(0.0, min(until, end) - max(t, target.stamp))
+        flew = shares.total() > 0
+        if flew:
+            name = max(shares, key=lambda active: shares[active])
+        poses, intervals = parts[name]
+        if isinstance(target, PoseTarget) and end >= target.stamp + U_WINDOW[1] - 1e-3:
+            poses.append(k)
+        if flew:
+            landed = next((float(t) for t, state in zip(log.state_t, log.states, strict=True)
+                           if t > target.stamp
+                           and state.partition(':')[0] in ('landing', 'disarmed')), np.inf)
+            intervals.append((target.stamp, min(end, landed)))
+    return {name: part for name, part in parts.items() if any(part)}
 
 
-def _shares(changes, begin, end):
-    """Controller -> its flight time between ``begin`` and ``end`` [s]."""
-    shares: dict[str, float] = {}
-    for k, (t, name) in enumerate(changes):
-        until = changes[k + 1][0] if k + 1 < len(changes) else np.inf
-        time = min(until, end) - max(t, begin)
-        if name and time > 0:
-            shares[name] = shares.get(name, 0.0) + time
-    return shares
-
-
-def _landing(log, after):
-    """Time of the first landing or disarming after ``after`` [s]; infinity for none."""
-    return next((float(t) for t, state in zip(log.state_t, log.states, strict=True)
-                 if t > after and state.partition(':')[0] in ('landing', 'disarmed')), np.inf)
-
-
-def _controller_metrics(log, task, part, expected):
+def _controller_metrics(log, task, name, poses, intervals, *, is_alone):
     body = motion(log)
     ended_at, ending = _early_end(log, task)
-    poses = [_pose(body, log.targets[k], task, ended_at) for k in part.poses]
-    for missing in (task.poses[len(poses):] if expected else ()):
-        poses.append({'target': [float(v) for v in missing], **dict.fromkeys(POSE_KEYS),
+    flown = [_pose(body, log.targets[k], task, ended_at) for k in poses]
+    # If one controller flew the whole task, poses after an early end count as missed.
+    for missing in task.poses[len(flown):] if task and is_alone else ():
+        flown.append({'target': [float(v) for v in missing], **dict.fromkeys(POSE_KEYS),
                       'reached': False})
-    result: dict = {'poses': poses}
-    for name, reduce in (('mean', np.mean), ('median', np.median), ('max', np.max),
+    result: dict = {'poses': flown}
+    for word, reduce in (('mean', np.mean), ('median', np.median), ('max', np.max),
                          ('min', np.min)):
-        result[name] = {key: _reduced(reduce, [pose[key] for pose in poses]) for key in POSE_KEYS}
-    result['success_rate'] = float(np.mean([p['reached'] for p in poses])) if poses else None
-    result['crashed'] = _crashed(log, body, part)
+        result[word] = {key: _reduced(reduce, [pose[key] for pose in flown]) for key in POSE_KEYS}
+    result['success_rate'] = _reduced(np.mean, [pose['reached'] for pose in flown])
+    result['crashed'] = _crashed(log, body, intervals)
     if ending:
         result['ended'] = ending
     if log.meta.get('controller_error'):
         result['controller_error'] = log.meta['controller_error']
-    result['guidance'] = _guidance(log, part.name)
-    result['lowest'] = _lowest(log, body, part)
-    compute = log.compute.get(part.name, {})
+    reports = [entry.values['guidance'] for entry in log.diagnostics
+               if entry.name.rpartition('/')[2] == f'{name}_node: controller'
+               and 'guidance' in entry.values]
+    own = log.meta.get('guidance') if log.meta.get('controller') == name else None
+    result['guidance'] = reports[-1] if reports else own
+    compute = log.compute.get(name, {})
     result['compute_ms'] = {key: compute.get(key)
                             for key in ('median', 'p99', 'max', 'deadline_misses')}
     windows = [(log.targets[k].stamp + U_WINDOW[0], log.targets[k].stamp + U_WINDOW[1])
-               for k in part.poses if log.targets[k].stamp + U_WINDOW[1] <= ended_at]
-    result.update(_effort(log, part.intervals, windows))
-    result.update(_stillness(body, windows))
-    result.update(_timing(log, part.intervals))
-    result.update(_estimation(log, part.intervals))
-    if task:
-        result.update(_task_metrics(log, body, task))
+               for k in poses if log.targets[k].stamp + U_WINDOW[1] <= ended_at]
+    result.update(_effort(log, body, intervals, windows))
+    t, distance, angle = estimate_errors(log)
+    if np.any(used := inside(t, intervals)):
+        result['estimation'] = {
+            f'{name}_{what}_{unit}': _reduced(reduce, values[used])
+            for what, reduce in (('rms', _rms), ('max', np.max))
+            for name, unit, values in (('position', 'm', distance), ('orientation', 'deg', angle))}
+    if task and log.targets and task.kind in KINDS:
+        result[task.kind] = KINDS[task.kind](log, body, task, log.targets[0].stamp)
     return result
 
 
@@ -195,27 +178,16 @@ def _early_end(log, task):
     return np.inf, ''
 
 
-def _guidance(log, controller):
-    """Guidance of the controller, from its diagnostics or the metadata; None if unknown."""
-    reports = [entry.values['guidance'] for entry in log.diagnostics
-            if entry.name.rpartition('/')[2] == f'{controller}_node: controller'
-            and 'guidance' in entry.values]
-    if not reports and log.meta.get('controller') == controller:
-        return log.meta.get('guidance')
-    return reports[-1] if reports else None
-
-
-def _pose(body: Motion, target, task, ended_at):
-    means = []
-    for window in (U_WINDOW, L_WINDOW):
+def _pose(body, target, task, ended_at):
+    result: dict = {'target': _numbers(target, task), **dict.fromkeys(POSE_KEYS)}
+    for keys, window in ((POSE_KEYS[:2], U_WINDOW), (POSE_KEYS[2:], L_WINDOW)):
         begin, end = target.stamp + window[0], target.stamp + window[1]
         if end <= ended_at and body.covers(begin, end):
-            means += [float(np.mean(e)) for e in errors(body, target, body.window(begin, end))]
-        else:
-            means += [None, None]
-    result = {'target': _numbers(target, task), **dict(zip(POSE_KEYS, means, strict=True))}
-    result['reached'] = bool(means[0] is not None and means[0] < REACHED_POSITION
-                             and means[1] < REACHED_ORIENTATION)
+            both = errors(body, target, body.window(begin, end))
+            result.update(zip(keys, (float(np.mean(values)) for values in both), strict=True))
+    position, orientation = (result[key] for key in POSE_KEYS[:2])
+    result['reached'] = bool(position is not None and position < REACHED_POSITION
+                             and orientation < REACHED_ORIENTATION)
     return result
 
 
@@ -229,8 +201,14 @@ def _numbers(target, task):
 
 
 def _reduced(reduce, values):
-    values = [value for value in values if value is not None]
-    return float(reduce(values)) if values else None
+    """One number of the known and finite values, or None."""
+    values = np.array(values, dtype=float)
+    values = values[np.isfinite(values)]
+    return float(reduce(values)) if values.size else None
+
+
+def _rms(values):
+    return np.sqrt(np.mean(values ** 2))
 
 
 def failed(result: dict) -> bool:
@@ -238,137 +216,59 @@ def failed(result: dict) -> bool:
     return bool(result.get('crashed')) and not {'force', 'torque'} & result.keys()
 
 
-def _crashed(log, body, part):
+def _crashed(log, body, intervals):
     """Whether the robot hit the ground, had an emergency stop, or has a non-finite position."""
-    if any(state == CRASH for state in log.states):
-        return True
-    for begin, end in part.intervals:
-        position = body.position[body.window(begin, end)]
-        if not np.all(np.isfinite(position)) or np.any(position[:, 2] < GROUND_HEIGHT):
-            return True
-        if any(begin <= t <= end and state.startswith('emergency_stop')
-               for t, state in zip(log.state_t, log.states, strict=True)):
-            return True
-    return False
+    position = body.position[inside(body.t, intervals)]
+    stopped = any(state.startswith('emergency_stop') for state, is_flown in zip(
+        log.states, inside(log.state_t, intervals), strict=True) if is_flown)
+    return bool(CRASH in log.states or stopped or not np.all(np.isfinite(position))
+                or np.any(position[:, 2] < GROUND_HEIGHT))
 
 
-def _lowest(log, body, part):
-    """Lowest height of base_link and the pose during which it occurred; {} without samples."""
-    rows = np.flatnonzero(inside(body.t, part.intervals))
-    rows = rows[np.isfinite(body.position[rows, 2])]
-    if not len(rows):
-        return {}
-    row = rows[np.argmin(body.position[rows, 2])]
-    started = [n for n, k in enumerate(part.poses) if log.targets[k].stamp <= body.t[row]]
-    return {'height_m': float(body.position[row, 2]), 'pose': started[-1] if started else None}
-
-
-def _effort(log, intervals, windows):
-    """Joint error |q* - q|, thrust, and change of the command while hovering."""
+def _effort(log, body, intervals, windows):
+    """Joint error |q* - q|, thrust, motion and change of the command in the U windows."""
     stamps, first = np.unique(log.command_t, return_index=True)
-    tilt, thrust = log.command_tilt[first], log.command_thrust[first]
+    command = np.hstack([log.command_tilt[first], log.command_thrust[first]])
+    thrust = command[:, 4:]
     joint = inside(log.joint_t, intervals)
     joint &= log.joint_t >= (stamps[0] if len(stamps) else np.inf)
     error = np.zeros((0, 4))
     if np.any(joint):
-        error = np.abs(hold(stamps, tilt, log.joint_t[joint]) - log.joint_position[joint])
-    hovering = inside(log.joint_t[joint], windows)
-    used, still = inside(stamps, intervals), inside(stamps, windows)
-    return {'joint_error_mean_rad': _mean(error), 'joint_error_std_rad': _std(error),
-            'joint_error_hover_mean_rad': _mean(error[hovering]),
-            'thrust_mean_N': _mean(thrust[used]), 'thrust_std_N': _std(thrust[used]),
-            'thrust_hover_mean_N': _mean(thrust[still]),
-            'thrust_max_N': float(np.max(thrust[used])) if np.any(used) else None,
-            'hover_command_change_rms': {
-                'joint_rad': _change_rms(stamps, tilt, windows),
-                'thrust_N': _change_rms(stamps, thrust, windows)}}
-
-
-def _change_rms(stamps, values, windows):
-    """RMS change of a command per 10 ms over the windows; None without commands."""
-    changes = []
-    for begin, end in windows:
-        mask = inside(stamps, [(begin, end)])
-        times, inner = stamps[mask], values[mask]
+        error = np.abs(hold(stamps, command[:, :4], log.joint_t[joint])
+                       - log.joint_position[joint])
+    still = inside(body.t, windows)
+    speed = np.linalg.norm(body.velocity[still], axis=1)
+    rate = np.linalg.norm(body.angular_velocity[still], axis=1)
+    used = thrust[inside(stamps, intervals)]
+    changes = [np.zeros((0, 8))]
+    for window in windows:
+        mask = inside(stamps, [window])
+        times, inner = stamps[mask], command[mask]
         if len(times) < 2:
             continue
         if not 0.8 <= np.median(np.diff(times)) / COMMAND_PERIOD <= 1.25:
             inner = hold(times, inner, np.arange(times[0], times[-1], COMMAND_PERIOD))
         changes.append(np.diff(inner, axis=0))
-    stacked = np.concatenate(changes) if changes else np.zeros((0, 4))
-    return float(np.sqrt(np.mean(stacked ** 2))) if len(stacked) else None
-
-
-def _stillness(body, windows):
-    mask = inside(body.t, windows)
-    speed = np.linalg.norm(body.velocity[mask], axis=1)
-    rate = np.linalg.norm(body.angular_velocity[mask], axis=1)
-    return {'hover_speed_mean_m_s': _mean(speed), 'hover_speed_std_m_s': _std(speed),
-            'hover_angular_speed_mean_rad_s': _mean(rate),
-            'hover_angular_speed_std_rad_s': _std(rate)}
-
-
-def _timing(log, intervals):
-    """Delay from the stamp of the answered estimate to the recording; {} without delays."""
-    mask = inside(log.command_t, intervals)
-    delay = 1e3 * (log.command_received[mask] - log.command_t[mask])
-    if not np.any(delay > 0):
-        return {}
-    return {'stamp_to_command_ms': {'median': float(np.median(delay)),
-                                    'p99': float(np.percentile(delay, 99)),
-                                    'max': float(np.max(delay))}}
-
-
-def _estimation(log, intervals):
-    """RMS and largest error of the estimate; {} without truth."""
-    t, distance, angle = estimate_errors(log)
-    used = inside(t, intervals)
-    if not np.any(used):
-        return {}
-    distance, angle = distance[used], angle[used]
-    return {'estimation': {'position_rms_m': float(np.sqrt(np.mean(distance ** 2))),
-                           'orientation_rms_deg': float(np.sqrt(np.mean(angle ** 2))),
-                           'position_max_m': float(np.max(distance)),
-                           'orientation_max_deg': float(np.max(angle))}}
-
-
-def _mean(values):
-    values = values[np.isfinite(values)]
-    return float(np.mean(values)) if values.size else None
-
-
-def _std(values):
-    values = values[np.isfinite(values)]
-    return float(np.std(values)) if values.size else None
-
-
-def _task_metrics(log: FlightLog, body: Motion, task: Task) -> dict:
-    """Additional metrics of the task's kind, which began with the log's first target."""
-    if not log.targets:
-        return {}
-    start = log.targets[0].stamp
-    if task.kind == 'trajectory':
-        return {'trajectory': _tracking(log, body, task, start)}
-    if task.kind in ('force', 'torque'):
-        return {task.kind: _levels(log, body, task, start)}
-    if task.kind == 'payload':
-        return {'payload': _payloads(log, body, task)}
-    if task.kind == 'hover':
-        return {'hover': _summary(body, log.targets[0], start + POSE_DURATION,
-                                  start + task.duration)}
-    if task.kind == 'wind':
-        return {'wind': _winds(log, body, task, start)}
-    if task.kind == 'pushes':
-        return {'pushes': _pushes(log, body, task, start)}
-    if task.kind == 'steps':
-        return {'steps': _steps(log, body)}
-    return {}
+    change = np.concatenate(changes)
+    return {'joint_error_mean_rad': _reduced(np.mean, error),
+            'joint_error_std_rad': _reduced(np.std, error),
+            'joint_error_hover_mean_rad': _reduced(
+                np.mean, error[inside(log.joint_t[joint], windows)]),
+            'thrust_mean_N': _reduced(np.mean, used), 'thrust_std_N': _reduced(np.std, used),
+            'thrust_hover_mean_N': _reduced(np.mean, thrust[inside(stamps, windows)]),
+            'thrust_max_N': _reduced(np.max, used),
+            'hover_command_change_rms': {'joint_rad': _reduced(_rms, change[:, :4]),
+                                         'thrust_N': _reduced(_rms, change[:, 4:])},
+            'hover_speed_mean_m_s': _reduced(np.mean, speed),
+            'hover_speed_std_m_s': _reduced(np.std, speed),
+            'hover_angular_speed_mean_rad_s': _reduced(np.mean, rate),
+            'hover_angular_speed_std_rad_s': _reduced(np.std, rate)}
 
 
 def _summary(body, target, begin, end):
     """Mean, std, min, max of both errors in a window; None without samples."""
     both = errors(body, target, body.window(begin, end))
-    return {f'{name}_{what}_{unit}': float(reduce(values)) if len(values) else None
+    return {f'{name}_{what}_{unit}': _reduced(reduce, values)
             for (name, unit), values in zip((('position', 'm'), ('orientation', 'deg')), both,
                                             strict=True)
             for what, reduce in SUMMARY}
@@ -384,23 +284,17 @@ def _tracking(log, body, task, start):
     windows = [t for t in log.targets if isinstance(t, TrajectoryTarget)]
     if not windows:
         return {**_summary(body, log.targets[0], np.inf, np.inf), 'rounds': []}
-    target = _joined(windows)
+    # Of the overlapping windows of reference_node, newer ones precede.
+    ends = [window.times[0] for window in windows[1:]] + [np.inf]
+    kept = [window.times < end for window, end in zip(windows, ends, strict=True)]
+    target = TrajectoryTarget(*(
+        np.concatenate([getattr(window, name)[mask]
+                        for window, mask in zip(windows, kept, strict=True)])
+        for name in ('times', 'positions', 'quaternions', 'velocities', 'angular_velocities')))
     rounds = [_summary_if_flown(body, target, start + begin, start + end)
               for begin, end in task.rounds]
     whole = _summary(body, target, start + task.rounds[0][0], start + task.rounds[-1][1])
     return {**whole, 'rounds': rounds}
-
-
-def _joined(windows):
-    """One trajectory of the overlapping windows of reference_node; newer windows precede."""
-    ends = [window.times[0] for window in windows[1:]] + [np.inf]
-    kept = [window.times < end for window, end in zip(windows, ends, strict=True)]
-    return TrajectoryTarget(*(
-        np.concatenate([getattr(window, name)[mask]
-                        for window, mask in zip(windows, kept, strict=True)])
-        for name in ('times', 'positions', 'quaternions', 'velocities', 'angular_velocities')),
-        stamp=windows[0].stamp)
-
 
 
 def _levels(log, body, task, start):
@@ -413,8 +307,9 @@ def _levels(log, body, task, start):
         if body.t[window].size == 0:
             break
         position, orientation = errors(body, target, window)
-        ended_early = not body.covers(begin, end)
-        lost = ended_early or _lost(body, target, window)
+        where, turned = body.position[window], body.quaternion[window]
+        lost = not body.covers(begin, end) or control_lost(target, where[-1], turned[-1]) \
+            or any(control_lost(target, position) for position in where)
         levels.append({f'level_{unit}': level, 'peak_position_m': float(np.max(position)),
                        'peak_orientation_deg': float(np.max(orientation)),
                        'end_position_m': float(position[-1]),
@@ -425,12 +320,6 @@ def _levels(log, body, task, start):
     held = [entry[f'level_{unit}'] for entry in levels if not entry['lost']]
     return {'levels': levels, f'lost_at_{unit}': lost_at,
             f'withstood_{unit}': max(held, default=0.0)}
-
-
-def _lost(body, target, window):
-    last = window.stop - 1
-    return any(control_lost(target, position) for position in body.position[window]) or \
-        control_lost(target, body.position[last], body.quaternion[last])
 
 
 def _winds(log, body, task, start):
@@ -454,13 +343,14 @@ def _pushes(log, body, task, start):
                     'recovery_s': settling_time(body.t[window] - begin, outside)}
         pushes.append(push)
     whole = body.window(windows[0][1], windows[-1][2])
-    return {'speed_mean_m_s': _mean(np.linalg.norm(body.velocity[whole], axis=1)),
-            'angular_speed_mean_rad_s': _mean(
-                np.linalg.norm(body.angular_velocity[whole], axis=1)),
+    return {'speed_mean_m_s': _reduced(
+                np.mean, np.linalg.norm(body.velocity[whole], axis=1)),
+            'angular_speed_mean_rad_s': _reduced(
+                np.mean, np.linalg.norm(body.angular_velocity[whole], axis=1)),
             'pushes': pushes}
 
 
-def _steps(log, body):
+def _steps(log, body, task, start):
     """Response of each axis to its step away from the hover; None for one not flown to its end."""
     responses = []
     for k, (axis, step) in enumerate(zip(AXES, STEPS, strict=True)):
@@ -510,20 +400,17 @@ def settling_time(times: np.ndarray, outside: np.ndarray) -> float | None:
 
 def _level_windows(task, start):
     """(level, begin, end) of consecutive segments with the same level other than 0."""
-    windows: list[list[float]] = []
-    begin = start
-    for segment in task.segments:
-        end = begin + segment.duration
-        if segment.level:
-            if windows and windows[-1][0] == segment.level:
-                windows[-1][2] = end
-            else:
-                windows.append([segment.level, begin, end])
-        begin = end
-    return [tuple(float(v) for v in window) for window in windows]
+    windows = []
+    for level, group in groupby(zip(task.segments, start + task.ends, strict=True),
+                                key=lambda pair: pair[0].level):
+        (first, end), *rest = group
+        if level:
+            windows.append((float(level), float(end - first.duration),
+                            float(rest[-1][1] if rest else end)))
+    return windows
 
 
-def _payloads(log, body, task):
+def _payloads(log, body, task, start):
     """Steady height error, positive above the target, and steady errors for each payload."""
     results = []
     targets = [t for t in log.targets if isinstance(t, PoseTarget)]
@@ -540,3 +427,10 @@ def _payloads(log, body, task):
                          orientation_deg=float(np.mean(orientation)))
         results.append(entry)
     return results
+
+
+# Kind of a task -> function of log, motion, task and its start [s].
+KINDS = {'trajectory': _tracking, 'force': _levels, 'torque': _levels, 'wind': _winds,
+         'pushes': _pushes, 'steps': _steps, 'payload': _payloads,
+         'hover': lambda log, body, task, start: _summary(
+             body, log.targets[0], start + POSE_DURATION, start + task.duration)}

@@ -107,6 +107,33 @@ RISE = {'x': 0.71, 'y': 0.70, 'z': 0.58, 'roll': 0.91, 'pitch': 0.89, 'yaw': 0.6
 POSES = {'random100': RANDOM_POSES, 'waypoints': WAYPOINTS}     # of a task
 
 
+# Columns of a table: heading, path in a part, digits. {} stands for mean, std and max of an error.
+SPREADS = (('position mean ± std (max) [m]', 'position_{}_m', 3),
+           ('orientation mean ± std (max) [deg]', 'orientation_{}_deg', 2))
+PEAKS = (('peak position [m]', 'peak_position_m', 3),
+         ('peak orientation [deg]', 'peak_orientation_deg', 2))
+# Key of a result -> title of its table, heading and names of its parts, and columns.
+KINDS: dict[str, tuple[str, str, Callable, tuple]] = {
+    'trajectory': ('Trajectory tracking', 'round', lambda found: [
+        *_numbered(found['rounds']), ('all', found)], SPREADS),
+    'force': ('Disturbance: force', 'force [N]', lambda found: _levels(found, 'N'), PEAKS),
+    'torque': ('Disturbance: torque', 'torque [N m]', lambda found: _levels(found, 'N_m'), PEAKS),
+    'payload': ('Payload, steady errors', 'payload [kg]', lambda found: [
+        (f"{part['payload_kg']:g}", part) for part in found], (
+            ('height error [m]', 'height_error_m', 4),
+            ('orientation [deg]', 'orientation_deg', 2))),
+    'hover': ('Hover after 8 s', 'part', lambda found: [('all', found)], SPREADS),
+    'wind': ('Hover before a fan', 'wind', lambda found: [
+        (f"{part['speed_m_s']:g} m/s", part) for part in found], SPREADS),
+    'pushes': ('Stick pushes', 'push', lambda found: [
+        *_numbered(found['pushes']), ('all', found)], (
+            *PEAKS, ('recovery [s]', 'recovery_s', 2), ('mean speed [m/s]', 'speed_mean_m_s', 3),
+            ('mean rate [rad/s]', 'angular_speed_mean_rad_s', 3))),
+    'steps': ('Step responses', 'step', lambda found: [(step['axis'], step) for step in found], (
+        ('rise [s]', 'rise_s', 2), ('settling [s]', 'settling_s', 2),
+        ('overshoot [%]', 'overshoot_percent', 1)))}
+
+
 def grids(results: dict, *, with_poses: bool | None = None) -> list[Grid]:
     """
     Make the tables of a result.
@@ -129,74 +156,36 @@ def grids(results: dict, *, with_poses: bool | None = None) -> list[Grid]:
             if key == 'steps':
                 printed = [('published NMPC', axis, {'rise_s': rise})
                            for axis, rise in RISE.items()]
-            rows = [[label, name, *(cell(part) for cell in columns.values())]
+            rows = [[label, name, *(_cell(part, path, digits) for _, path, digits in columns)]
                     for label, name, part in found + printed]
-            made.append(Grid(title, ['', heading, *columns], rows,
+            made.append(Grid(title, ['', heading, *(text for text, *_ in columns)], rows,
                              frozenset(range(len(found), len(rows)))))
-    for group in _same_poses(by_label):
-        count = len(next(iter(group.values()))['poses'])
-        if with_poses or (with_poses is None and 1 < count <= MANY_POSES):
+    groups: dict[tuple, dict] = {}      # results with equal targets, which one table compares
+    for label, result in by_label.items():
+        targets = tuple(round(v, 6) for pose in result['poses'] for v in pose['target'])
+        groups.setdefault(targets, {})[label] = result['poses']
+    for group in groups.values():
+        count = len(next(iter(group.values())))
+        if count and with_poses or (with_poses is None and 1 < count <= MANY_POSES):
             made.append(_poses(group))
     return made
 
 
-def _value(key, digits):
-    """Cell of a number."""
-    return lambda part: number(part.get(key), digits)
+def _cell(part, path, digits):
+    if '{}' not in path:
+        return number(at(part, path), digits)
+    mean, std, worst = (number(part.get(path.format(what)), digits)
+                        for what in ('mean', 'std', 'max'))
+    return f'{mean} ± {std} ({worst})' if worst != ABSENT else f'{mean} ± {std}'
 
 
-def _spread(name, unit, digits):
-    """Cell of mean, standard deviation and largest value of an error."""
-    def cell(part):
-        mean, std, worst = (number(part.get(f'{name}_{what}_{unit}'), digits)
-                            for what in ('mean', 'std', 'max'))
-        return f'{mean} ± {std} ({worst})' if worst != ABSENT else f'{mean} ± {std}'
-    return cell
-
-
-def _levels(unit):
-    return lambda found: [(f"{level[f'level_{unit}']:g}" + (' lost' if level['lost'] else ''),
-                           level) for level in found.get('levels', [])]
+def _levels(found, unit):
+    return [(f"{level[f'level_{unit}']:g}" + (' lost' if level['lost'] else ''), level)
+            for level in found['levels']]
 
 
 def _numbered(parts):
     return [(str(k + 1), part) for k, part in enumerate(parts)]
-
-
-SPREADS = {'position mean ± std (max) [m]': _spread('position', 'm', 3),
-           'orientation mean ± std (max) [deg]': _spread('orientation', 'deg', 2)}
-PEAKS = {'peak position [m]': _value('peak_position_m', 3),
-         'peak orientation [deg]': _value('peak_orientation_deg', 2)}
-# Key of a result -> title of its table, heading and names of its parts, and cells of a part.
-KINDS: dict[str, tuple[str, str, Callable, dict[str, Callable]]] = {
-    'trajectory': ('Trajectory tracking', 'round', lambda found: [
-        *_numbered(found['rounds']), ('all', found)], SPREADS),
-    'force': ('Disturbance: force', 'force [N]', _levels('N'), PEAKS),
-    'torque': ('Disturbance: torque', 'torque [N m]', _levels('N_m'), PEAKS),
-    'payload': ('Payload, steady errors', 'payload [kg]', lambda found: [
-        (f"{part['payload_kg']:g}", part) for part in found], {
-            'height error [m]': _value('height_error_m', 4),
-            'orientation [deg]': _value('orientation_deg', 2)}),
-    'hover': ('Hover after 8 s', 'part', lambda found: [('all', found)], SPREADS),
-    'wind': ('Hover before a fan', 'wind', lambda found: [
-        (f"{part['speed_m_s']:g} m/s", part) for part in found], SPREADS),
-    'pushes': ('Stick pushes', 'push', lambda found: [
-        *_numbered(found['pushes']), ('all', found)], {
-            **PEAKS, 'recovery [s]': _value('recovery_s', 2),
-            'mean speed [m/s]': _value('speed_mean_m_s', 3),
-            'mean rate [rad/s]': _value('angular_speed_mean_rad_s', 3)}),
-    'steps': ('Step responses', 'step', lambda found: [(step['axis'], step) for step in found], {
-        'rise [s]': _value('rise_s', 2), 'settling [s]': _value('settling_s', 2),
-        'overshoot [%]': _value('overshoot_percent', 1)})}
-
-
-def _same_poses(by_label):
-    """Groups of results with the same targets, which one table can compare."""
-    groups: dict[tuple, dict] = {}
-    for name, result in by_label.items():
-        key = tuple(round(v, 6) for pose in result['poses'] for v in pose['target'])
-        groups.setdefault(key, {})[name] = result
-    return [group for key, group in groups.items() if key]
 
 
 def _summary(by_label, task):
@@ -205,45 +194,31 @@ def _summary(by_label, task):
     columns = [*by_label.values(), *others.values()]
     # The only pose of a trajectory is its start: to reach it says nothing about the path.
     posed = not all('trajectory' in result for result in by_label.values())
-    rows = [[text, *(number(at(column, path), digits) for column in columns)]
-            for text, path, digits in ERROR_ROWS]
-    rows.append(['poses reached', *(_reached(column) for column in columns)])
-    rows = [*(rows if posed else []),
-             *([['ended', *(column.get('ended', ABSENT) for column in columns)]]
-               if any('ended' in column for column in columns) else []),
-             ['crashed', *({True: 'yes', False: 'no'}.get(column.get('crashed'), ABSENT)
-                           for column in columns)],
-             ['lowest point [m]', *(_lowest(column) for column in columns)]]
-    rows += [[text, *(number(at(column, path), digits) for column in columns)]
+    rows = [[text, *(_cell(column, path, digits) for column in columns)]
+            for text, path, digits in (ERROR_ROWS if posed else ())]
+    if posed:
+        rows.append(['poses reached', *(
+            f"{sum(pose['reached'] for pose in column['poses'])} of {len(column['poses'])}"
+            if 'poses' in column else ABSENT for column in columns)])
+    if any('ended' in column for column in columns):
+        rows.append(['ended', *(column.get('ended', ABSENT) for column in columns)])
+    rows.append(['crashed', *({True: 'yes', False: 'no'}.get(column.get('crashed'), ABSENT)
+                              for column in columns)])
+    rows += [[text, *(_cell(column, path, digits) for column in columns)]
              for text, path, digits in EFFORT_ROWS]
     if any(column.get('guidance') for column in columns):
         rows.append(['guidance', *(column.get('guidance') or ABSENT for column in columns)])
-    if any('stamp_to_command_ms' in column for column in columns):
-        rows.append(['stamp to command, 99 % [ms]', *(
-            number(at(column, 'stamp_to_command_ms.p99'), 2) for column in columns)])
     first = len(by_label) + 1
     return Grid(POSE_ROWS if posed else 'Flight',
                 ['', *by_label, *(f'published {name}' for name in others)], rows,
                 faint_columns=frozenset(range(first, first + len(others))))
 
 
-def _lowest(result):
-    found = result.get('lowest') or {}
-    pose = None if 'trajectory' in result else found.get('pose')
-    return number(found.get('height_m'), 2) + ('' if pose is None else f' (pose {pose + 1})')
-
-
-def _reached(result):
-    if 'poses' not in result:
-        return ABSENT
-    return f"{sum(pose['reached'] for pose in result['poses'])} of {len(result['poses'])}"
-
-
 def _poses(by_label):
     header = ['', 'x y z [m] roll pitch yaw [deg]'] + [
         f'{name}: {what}' for name in by_label for what in ('U [m]', '[deg]')]
     rows = []
-    for k, poses in enumerate(zip(*(r['poses'] for r in by_label.values()), strict=True)):
+    for k, poses in enumerate(zip(*by_label.values(), strict=True)):
         target = poses[0]['target']
         row = [str(k + 1), ' '.join([*(f'{v:.2f}' for v in target[:3]),
                                      *(f'{v:.0f}' for v in target[3:])])]

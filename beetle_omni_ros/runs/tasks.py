@@ -1,15 +1,15 @@
 """Tasks: targets, external wrenches and payloads over time."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import partial
-from math import cos, exp, pi, sin, sqrt
+from dataclasses import dataclass, field, replace
+from math import exp, pi, sqrt
 from pathlib import Path
 import re
+from typing import NamedTuple
 
 import numpy as np
 
-from beetle_omni_ros.control.base import PoseTarget, Reference, Target, TrajectoryTarget
+from beetle_omni_ros.control.base import PoseTarget, Target, TrajectoryTarget
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.targets import read_poses
@@ -156,29 +156,13 @@ class Task:
                 for begin, segment in zip(begins, self.segments, strict=True) if segment.target]
 
 
-@dataclass(frozen=True)
-class Moment:
-    """
-    State of a task at one time.
+class Moment(NamedTuple):
+    """A task at one time: its segment, and the target to publish now, or None."""
 
-    Attributes:
-        target: target to publish now, or None.
-        force_world: (3,) external force in world [N].
-        torque_body: (3,) external torque in base_link [N m].
-        payload: [kg].
-        changed: whether a new segment has begun.
-        finished: whether the task is over.
-        lost: whether control was lost, which ends the task.
-
-    """
-
+    segment: Segment
     target: Target | None
-    force_world: np.ndarray
-    torque_body: np.ndarray
-    payload: float
-    changed: bool = False
-    finished: bool = False
-    lost: bool = False
+    changed: bool
+    finished: bool
 
 
 class TaskPlayer:
@@ -186,13 +170,15 @@ class TaskPlayer:
     Plays a task in time, by periodic calls of :meth:`update`.
 
     Targets are stamped with the time at which they are due, not with the time of the call, so
-    that the 8 s of a pose are exact.
+    that the 8 s of a pose are exact. ``lost_level`` is the level at which control was lost, which
+    ends the task.
     """
 
     def __init__(self, task: Task, start: float):
         self.task = task
         self.start = start
         self.lost_level: float | None = None
+        self._segments = (*task.segments, Segment(0.0))     # after the task
         self._ends = task.ends
         self._index = -1
         self._target: Target | None = None
@@ -205,32 +191,19 @@ class TaskPlayer:
         Pose (3,) in world [m] and (4,) of the robot serve to detect a loss of control.
         """
         index = int(self._ends.searchsorted(now - self.start + 1e-6, side='right'))
-        if position is not None and self._lost(position, quaternion, index):
-            self.lost_level = self.task.segments[max(self._index, 0)].level
-        if index >= len(self._ends) or self.lost_level is not None:
-            changed, self._index = self._index != len(self._ends), len(self._ends)
-            return Moment(None, np.zeros(3), np.zeros(3), 0.0, changed=changed, finished=True,
-                          lost=self.lost_level is not None)
-        target = None
-        changed = index != self._index
+        level = self._segments[self._index].level
+        if position is not None and level and self.task.kind in ('force', 'torque') \
+                and control_lost(self._target, position, quaternion if
+                                 self._segments[index].level != level else None):
+            self.lost_level = level
+        if self.lost_level is not None:
+            index = len(self._ends)
+        target, changed = None, index != self._index
         for k in range(self._index + 1, index + 1):
-            segment = self.task.segments[k]
-            if segment.target:
-                begin = self.start + (self._ends[k - 1] if k else 0.0)
-                target = self._target = segment.target(float(begin))
+            if build := self._segments[k].target:
+                target = self._target = build(float(self.start + (self._ends[k - 1] if k else 0)))
         self._index = index
-        segment = self.task.segments[index]
-        return Moment(target, segment.force_world, segment.torque_body, segment.payload, changed)
-
-    def _lost(self, position, quaternion, index):
-        if self.task.kind not in ('force', 'torque') or self._target is None \
-                or not 0 <= self._index < len(self._ends) or self.lost_level is not None:
-            return False
-        segments = self.task.segments
-        if segments[self._index].level == 0:
-            return False
-        due = index >= len(segments) or segments[index].level != segments[self._index].level
-        return control_lost(self._target, position, quaternion if due else None)
+        return Moment(self._segments[index], target, changed, index == len(self._ends))
 
 
 def control_lost(target: PoseTarget, position: np.ndarray,
@@ -345,68 +318,22 @@ def _pose_task(name, poses, kind='poses'):
 
 
 def _lemniscate_task(name):
-    tilt = TILTS[name]
-    first = lemniscate(0.0, tilt)
-    pose = np.concatenate([first.position, np.degrees(rotations.to_rpy(first.quaternion))])
-    begin = POSE_DURATION + RAMP
-    path = Segment(DURATION, partial(lemniscate_target, tilt=tilt))
-    return Task(name, 'trajectory', (Segment(POSE_DURATION, _builder(pose)), path), pose[None],
-                tuple((begin + k * PERIOD, begin + (k + 1) * PERIOD) for k in range(ROUNDS)))
-
-
-def lemniscate_phase(time: float) -> tuple[float, float]:
-    """Return phase [rad], 0 at the begin of round one, and rate [rad/s] at ``time`` [s]."""
-    rate = 2 * pi / PERIOD
-    if time < RAMP:
-        return -_ramp_phase(RAMP, rate) + _ramp_phase(max(time, 0.0), rate), \
-            rate * _smoothstep(time / RAMP)
-    rest = DURATION - time
-    if rest < RAMP:
-        total = 2 * pi * ROUNDS + _ramp_phase(RAMP, rate)
-        return total - _ramp_phase(max(rest, 0.0), rate), rate * _smoothstep(rest / RAMP)
-    return rate * (time - RAMP), rate
-
-
-def _smoothstep(s):
-    s = min(max(s, 0.0), 1.0)
-    return s ** 3 * (10 - 15 * s + 6 * s * s)
-
-
-def _ramp_phase(time, rate):
-    """Integral of ``rate * smoothstep`` over the ramp, from rest."""
-    s = time / RAMP
-    return rate * RAMP * s ** 4 * (2.5 - 3 * s + s * s)
-
-
-def lemniscate(time: float, tilt: float) -> Reference:
-    """
-    Return pose and velocity in world and body rates at ``time`` since the start [s].
-
-    ``tilt`` is the largest roll and pitch [rad].
-    """
-    phi, rate = lemniscate_phase(time)
-    once, twice = phi + pi / 2, 2 * phi + pi
-    position = np.array([LENGTH * cos(once), LENGTH / 2 * sin(twice),
-                         HEIGHT + RISE * sin(twice + pi / 2)])
-    velocity = rate * np.array([-LENGTH * sin(once), LENGTH * cos(twice),
-                                2 * RISE * cos(twice + pi / 2)])
-    roll, pitch, yaw = -tilt * sin(twice), tilt * cos(once), pi / 2 * (1 - sin(once))
-    roll_rate, pitch_rate, yaw_rate = rate * np.array([
-        -2 * tilt * cos(twice), -tilt * sin(once), -pi / 2 * cos(once)])
-    angular_velocity = np.array([  # body rates of R = Rz(yaw) Ry(pitch) Rx(roll)
-        roll_rate - yaw_rate * sin(pitch),
-        pitch_rate * cos(roll) + yaw_rate * cos(pitch) * sin(roll),
-        -pitch_rate * sin(roll) + yaw_rate * cos(pitch) * cos(roll)])
-    return Reference(position, rotations.from_rpy(roll, pitch, yaw), velocity, angular_velocity)
-
-
-def lemniscate_target(start: float, tilt: float) -> TrajectoryTarget:
-    """Return the whole lemniscate of largest roll and pitch ``tilt``, from ``start`` [s]."""
+    tilt, rate = TILTS[name], 2 * pi / PERIOD
     times = np.linspace(0.0, DURATION, round(DURATION / SAMPLE_PERIOD) + 1)
-    samples = [lemniscate(float(t), tilt) for t in times]
-    columns = (np.array([getattr(sample, name) for sample in samples])
-               for name in ('position', 'quaternion', 'velocity', 'angular_velocity'))
-    return TrajectoryTarget(start + times, *columns, stamp=start)
+    # Integral of the smoothstep s^3 (10 - 15 s + 6 s^2) over each ramp; the phase is 0 at the
+    # beginning of the first round.
+    rising, falling = (RAMP * s ** 4 * (2.5 - 3 * s + s * s) for s in (
+        np.clip(times / RAMP, 0, 1), np.clip((DURATION - times) / RAMP, 0, 1)))
+    phase = rate * (rising - falling + np.clip(times - RAMP, 0, ROUNDS * PERIOD))
+    once, twice = phase + pi / 2, 2 * phase + pi
+    positions = np.stack([LENGTH * np.cos(once), LENGTH / 2 * np.sin(twice),
+                          HEIGHT + RISE * np.sin(twice + pi / 2)], axis=1)
+    angles = np.stack([-tilt * np.sin(twice), tilt * np.cos(once),
+                       pi / 2 * (1 - np.sin(once))], axis=1)
+    task = trajectory_task(name, times, positions, np.array([
+        rotations.from_rpy(*row) for row in angles]))
+    begins = [POSE_DURATION + RAMP + k * PERIOD for k in range(ROUNDS)]
+    return replace(task, rounds=tuple((begin, begin + PERIOD) for begin in begins))
 
 
 def trajectory_task(name: str, times: np.ndarray, positions: np.ndarray,

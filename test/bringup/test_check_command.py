@@ -88,4 +88,4 @@ def test_a_port_in_use_by_the_bridge_is_not_opened(robot, tmp_path):
     assert status == 1 and not packets
     assert rows['servo port']['level'] == rows['joint_bridge state']['level'] == 'ok'
     assert rows['joint_bridge gimbal2']['level'] == 'fail'
-    assert rows['joint_bridge gimbal2']['part'] == 'servos'
+    assert rows['joint_bridge gimbal2']['part'] == 'ros'

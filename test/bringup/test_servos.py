@@ -1,7 +1,5 @@
 """The check of the servo bus finds each fault, with a remedy, and changes nothing."""
 
-import sys
-
 import numpy as np
 import pytest
 
@@ -66,36 +64,27 @@ def put(**faults):
     return lambda emulated: [setattr(emulated.faults, *item) for item in faults.items()]
 
 
-# options of the bus and of the check, what is wrong, levels that are not ok, item, its words
+# what is wrong, levels that are not ok, item, its words
 FAULTS = {
-    'missing': ({}, {}, put(silent={4}), {'gimbal4': 'fail'}, 'gimbal4', ('connector',)),
-    'empty': ({}, {}, put(silent={1, 2, 3, 4}), {'servo bus': 'fail'}, 'servo bus', ('supply',)),
-    **{f'{volts} V': ({}, {}, put(supply_voltage=volts), {
+    'missing': (put(silent={4}), {'gimbal4': 'fail'}, 'gimbal4', ('connector',)),
+    'empty': (put(silent={1, 2, 3, 4}), {'servo bus': 'fail'}, 'servo bus', ('supply',)),
+    **{f'{volts} V': (put(supply_voltage=volts), {
         f'{name} supply': level for name in NAMES}, 'gimbal1 supply', ())
        for volts, level in ((6.0, 'fail'), (9.0, 'warn'))},
-    'hot': ({}, {}, hot, {'gimbal4': 'fail', 'gimbal4 temperature': 'warn'}, 'gimbal4', ()),
-    'turn': ({}, {}, turned, {'gimbal2 turn': 'fail'}, 'gimbal2 turn',
+    'hot': (hot, {'gimbal4': 'fail', 'gimbal4 temperature': 'warn'}, 'gimbal4', ()),
+    'turn': (turned, {'gimbal2 turn': 'fail'}, 'gimbal2 turn',
              ('-3.48 or +2.80 rad', '2.32 rad')),
-    'line': ({}, {}, put(bad_crc=0.4), {'servo bus': 'fail'}, 'servo bus', ())}
+    'line': (put(bad_crc=0.4), {'servo bus': 'fail'}, 'servo bus', ())}
 
 
 @pytest.mark.parametrize('name', FAULTS)
 def test_each_fault_is_found_and_named(name):
-    options, changes, break_it, bad, item, words = FAULTS[name]
-    with EmulatedServoBus(**options) as emulated:
+    break_it, bad, item, words = FAULTS[name]
+    with EmulatedServoBus() as emulated:
         break_it(emulated)
-        found = repeated(lambda: servos(emulated.port, **changes),
+        found = repeated(lambda: servos(emulated.port),
                          lambda found: levels(found) == bad)
     # A bad line may hide servos too.
     assert levels(found) == bad or name == 'line' and levels(found).items() > bad.items()
     text = found[item].found + found[item].remedy
     assert all(word in text for word in words), text
-
-
-def test_without_the_sdk_the_extra_is_named(monkeypatch):
-    monkeypatch.delitem(sys.modules, 'beetle_omni_ros.drivers.servo_link')
-    with EmulatedServoBus() as emulated:
-        monkeypatch.setitem(sys.modules, 'dynamixel_sdk', None)
-        found = servos(emulated.port)
-    assert levels(found) == {'servo bus': 'fail'}
-    assert "'beetle_omni_ros[hardware]'" in found['servo bus'].remedy

@@ -14,7 +14,7 @@ from beetle_omni_ros.control.references import (
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.runs.tasks import lemniscate_target
+from beetle_omni_ros.runs.tasks import make_task
 
 ROBOT = RobotParameters.load()
 TIMES = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.4])
@@ -87,7 +87,7 @@ def test_joints_with_half_a_turn_to_go_turn_with_the_body_in_spite_of_noise(axis
 
 
 def test_commands_lead_a_moving_reference_so_that_the_lag_arrives_on_time():
-    target = lemniscate_target(0.0, 0.5)
+    target = make_task('lemniscate').segments[1].target(0.0)
     reference = planner().plan(target, 20.0, LEVEL, np.zeros(4), np.zeros(10))
     for values, lead, lag in ((TILT, TILT_LEAD, LAG),
                               (THRUST, THRUST_LEAD, ROBOT.rotors.time_constant)):

@@ -6,8 +6,10 @@ import os
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from rich.console import Console
+from rotor_logs import bench, write
 
 from beetle_omni_ros.pages.page import Grid, print_grids
 
@@ -26,12 +28,13 @@ def test_a_printed_table_breaks_no_name_and_no_number(width):
 
 
 def test_a_command_whose_reader_has_ended_still_writes_its_files(tmp_path):
+    log = write(tmp_path / 'bench.csv', bench(np.random.default_rng(0)))
     reader, writer = os.pipe()
     os.close(reader)
     done = subprocess.run(
-        [sys.executable, '-m', 'beetle_omni_ros.start', 'beetle_omni', 'controllers', '--json',
-         str(tmp_path / 'list.json')],
+        [sys.executable, '-m', 'beetle_omni_ros.start', 'beetle_omni', 'identify', 'rotor',
+         str(log), '--json', str(tmp_path / 'rotor.json')],
         stdout=writer, stderr=subprocess.PIPE, text=True, timeout=60, check=False)
     os.close(writer)
     assert (done.returncode, done.stderr) == (0, '')
-    assert 'nmpc' in json.loads((tmp_path / 'list.json').read_text())
+    assert 'verdict' in json.loads((tmp_path / 'rotor.json').read_text())

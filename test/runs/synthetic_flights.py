@@ -3,7 +3,7 @@
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, PoseTarget
-from beetle_omni_ros.messages.values import Odom, Wrench
+from beetle_omni_ros.messages.values import Diagnostic, Odom, Wrench
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.readings import BatteryReading, ImuReading, JointReading, PoseReading
 
@@ -41,7 +41,7 @@ def fly(recorder, task, *, start=1.0, controller='nmpc', offset=0.02, angle=3.0,
             if target is not None:
                 previous = target.at(t).position
             target = targets[current]
-            recorder.write_target(target)
+            write_target(recorder, target)
         reference = (target or PoseTarget(previous, np.array([0.0, 0, 0, 1]))).at(t)
         decay = 0.0
         if isinstance(target, PoseTarget):
@@ -69,10 +69,12 @@ def _record(recorder, t, k, rng, position, quaternion, reference, controller):
     if k % 20 == 0:
         recorder.write('battery_state', BatteryReading(t, 25.0 - 0.001 * k * TICK, -20.0))
     if k % 200 == 0:
-        recorder.write_compute(t, controller, median=0.2, p99=0.4, max=0.9, deadline_misses=0,
-                               count=max(0, k // 2))
-        recorder.write_diagnostic(t, 'ekf_node: estimator', {'rejected_mocap': max(0, k) // 400},
-                                  1 if k == 400 else 0, 'one MoCap pose was no unit quaternion')
+        write_diagnostic(recorder, t, f'{controller}_node: compute', {
+            'median_ms': 0.2, 'p99_ms': 0.4, 'max_ms': 0.9, 'deadline_misses': 0,
+            'count': max(0, k // 2)})
+        write_diagnostic(
+            recorder, t, 'ekf_node: estimator', {'rejected_mocap': max(0, k) // 400},
+            1 if k == 400 else 0, 'one MoCap pose was no unit quaternion')
 
 
 def write_truth(recorder, t, position, quaternion, velocity, angular_velocity):
@@ -114,3 +116,15 @@ def write_wrench(recorder, t, force_world, torque_body):
 def write_state(recorder, t, state):
     """Record the supervisor's state, e.g. 'flying:nmpc', whenever it changes."""
     recorder.write('supervisor/state', state, t)
+
+
+def write_target(recorder, target):
+    """Record a target, valid from its stamp."""
+    recorder.write('target_pose' if isinstance(target, PoseTarget) else 'target_trajectory',
+                   target)
+
+
+def write_diagnostic(recorder, t, name, values, level=0, message=''):
+    """Record one status such as 'ekf_node: estimator', with numbers or text as values."""
+    recorder.write('diagnostics', [Diagnostic(t, name, level, message, {
+        key: str(value) for key, value in values.items()})])

@@ -6,14 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.control.base import TrajectoryTarget
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.runs.tasks import (
-    DURATION,
-    lemniscate,
-    make_task,
-    NAMES,
-    pose_target,
-    TaskPlayer,
-)
+from beetle_omni_ros.runs.tasks import make_task, NAMES, pose_target, TaskPlayer
 
 
 @pytest.mark.parametrize('name', NAMES)
@@ -40,18 +33,6 @@ def test_random_poses_fill_the_stated_ranges_and_follow_the_seed():
     assert np.array_equal(make_task('random100', seed=1).poses, poses[:100])
 
 
-@pytest.mark.parametrize('tilt', [0.5, 2.5])
-def test_lemniscate_derivatives_agree_with_finite_differences(tilt):
-    step = 1e-5
-    for t in np.linspace(0.01, DURATION - 0.01, 301):
-        before, now, after = (lemniscate(t + dt, tilt) for dt in (-step, 0, step))
-        velocity = (after.position - before.position) / (2 * step)
-        turn = rotations.log(rotations.multiply(rotations.conjugate(before.quaternion),
-                                                after.quaternion))
-        assert now.velocity == pytest.approx(velocity, abs=1e-6)
-        assert now.angular_velocity == pytest.approx(turn / (2 * step), abs=1e-6)
-
-
 @pytest.mark.parametrize(('name', 'tilt'), [('lemniscate', 0.5), ('lemniscate_large', 2.5)])
 def test_each_round_of_the_lemniscate_is_the_curve_of_the_authors(name, tilt):
     period, task = 20.0, make_task(name)
@@ -74,7 +55,7 @@ def _played(task, tick=0.005):
     """Times (N,) and wrenches (N, 6) of a task."""
     player, t, rows = TaskPlayer(task, 0.0), 0.0, []
     while not (moment := player.update(t)).finished:
-        rows.append(np.concatenate([[t], moment.force_world, moment.torque_body]))
+        rows.append(np.concatenate([[t], moment.segment.force_world, moment.segment.torque_body]))
         t += tick
     rows = np.array(rows)
     return rows[:, 0], rows[:, 1:]
