@@ -23,6 +23,7 @@ from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.bag_writer import BagWriter
 from beetle_omni_ros.runs.log import Recorder
+from beetle_omni_ros.runs.tasks import random_poses
 from beetle_omni_ros.safety.events import INFO
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.sim.faults import Case, Fault
@@ -57,9 +58,6 @@ class Plan:
     """Flights of the campaign, and limits of their outcomes."""
 
     height: float = 1.5             # [m] of hover and inverted hover
-    spread: float = 2.0             # [m] largest |x| and |y| of poses on the move, as random100
-    lowest: float = 0.6             # [m] of poses on the move, as random100
-    highest: float = 2.0            # [m] the same
     hover_time: float = 3.0         # [s] until the fault in hover
     turn_time: float = 6.0          # [s] until the fault upside down; half a turn takes 4 s
     move_time: float = 4.0          # [s] of a pose on the move; the fault occurs in the second
@@ -230,11 +228,9 @@ class Flight:
                                  self.loop.now))
 
     def aim_randomly(self) -> None:
-        """Set a random target pose of any attitude."""
-        plan = self.plan
-        self.aim(self.random.uniform([-plan.spread, -plan.spread, plan.lowest],
-                                     [plan.spread, plan.spread, plan.highest]),
-                 self.random.uniform(-np.pi, np.pi, 3))
+        """Set a random target pose, as of random100."""
+        pose = random_poses(1, self.random)[0]
+        self.aim(pose[:3], np.radians(pose[3:]))
 
     def fly(self, duration: float, over: Callable[[], bool] = lambda: False) -> bool:
         """Fly for ``duration`` [s] or until ``over`` is true; returns whether it became true."""

@@ -134,17 +134,11 @@ class Allocator:
     def allocate(self, force: np.ndarray, torque: np.ndarray,
                  present_tilt: np.ndarray) -> Allocation:
         """
-        Minimum-norm thrusts and tilts for a body wrench.
+        Minimum-norm thrusts and tilts for a force [N] and a torque [N m] in base_link.
 
         A tilt is on the legal turn nearest the present angle. A rotor with negligible thrust
         keeps that angle. A tilt that is less than OVERLAP beyond a stop becomes the stop:
         otherwise noise would turn the joint to the other side.
-
-        Args:
-            force: (3,) in base_link [N].
-            torque: (3,) about the centre of gravity in base_link [N m].
-            present_tilt: (4,) [rad].
-
         """
         pairs = (self._by_force.dot(force) + self._by_torque.dot(torque)).tolist()
         tilt, thrust, saturated = [], [], []
@@ -166,14 +160,9 @@ class Allocator:
               extra_force_world: np.ndarray | None = None,
               extra_torque_body: np.ndarray | None = None) -> Allocation:
         """
-        Allocate the wrench that holds the robot at rest at an attitude.
+        Allocate the wrench that holds the robot at rest at an attitude (4,), body to world.
 
-        Args:
-            quaternion: (4,) body to world (x, y, z, w), unit.
-            present_tilt: (4,) [rad].
-            extra_force_world: (3,) force beside the support of the weight, in world [N].
-            extra_torque_body: (3,) in base_link [N m].
-
+        Forces (3,) in world [N] and torques (3,) in base_link [N m] are added to it.
         """
         force = self.weight if extra_force_world is None else self.weight + extra_force_world
         torque = np.zeros(3) if extra_torque_body is None else extra_torque_body
@@ -181,14 +170,9 @@ class Allocator:
 
     def upright(self, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
-        Tilts and thrusts of hovering at many attitudes, without limits of travel and thrust.
+        Tilts (P, 4) within +-pi [rad] and thrusts (P, 4) [N] of hovering, without limits.
 
-        Args:
-            up: (P, 3) world z axis in base_link.
-
-        Returns:
-            tilts (P, 4) within +-pi [rad] and thrusts (P, 4) [N].
-
+        ``up`` (P, 3) is the world z axis in base_link.
         """
         components = (np.linalg.norm(self.weight) * up) @ self.inverse[:, :3].T
         along, across = components[:, 0::2], components[:, 1::2]

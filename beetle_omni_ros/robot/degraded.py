@@ -282,20 +282,10 @@ class Holding:
     def quickest(self, quaternion: np.ndarray, angular_velocity: np.ndarray, tilt: np.ndarray,
                  margin: float, levelling_rate: float) -> np.ndarray:
         """
-        Attitude with a margin that body and joints reach soonest.
+        Attitude (4,) with a margin that body and joints reach soonest.
 
-        The unheld part of the path from there to level adds to the time.
-
-        Args:
-            quaternion: (4,) present attitude.
-            angular_velocity: (3,) in base_link [rad/s]; includes the turn until the body stops.
-            tilt: (4,) present [rad].
-            margin: as of :meth:`nearest`.
-            levelling_rate: rate of the later turn to level [rad/s].
-
-        Returns:
-            (4,) quaternion: attitude at which the present turn stops, leaned.
-
+        It is the attitude at which the present turn [rad/s] stops, leaned. The unheld part of the
+        path from there to level, at the levelling rate [rad/s], adds to the time.
         """
         quaternion = rotations.multiply(quaternion, rotations.exp(COAST_TIME * angular_velocity))
         firm = np.flatnonzero(self.margins >= min(margin, self._attainable))

@@ -26,6 +26,7 @@ TILT_COMMAND, THRUST_COMMAND = slice(0, 4), slice(4, 8)
 # angle of each servo from its target [rad].
 FORCE, TORQUE, TILT_OFFSET = slice(0, 3), slice(3, 6), slice(6, 10)
 DISTURBANCE_SIZE = 10
+ZERO_3, ZERO_4 = ca.DM.zeros(3), ca.DM.zeros(4)
 
 
 def rotation_matrix(quaternion):
@@ -50,8 +51,8 @@ def thrust_direction(arm_yaw: float, tilt):
 
 
 def rigid_body(robot: RobotParameters, velocity, quaternion, angular_velocity, tilt, thrust,
-               force_world=None, torque_body=None, tilt_acceleration=None, effects=None, *,
-               tilt_rate=None, thrust_rate=None, position=None, voltage_ratio=None,
+               force_world=ZERO_3, torque_body=ZERO_3, tilt_acceleration=ZERO_4, effects=None, *,
+               tilt_rate=ZERO_4, thrust_rate=ZERO_4, position=None, voltage_ratio=None,
                charge_drawn=None, rotor_positions=None):
     """
     Newton-Euler equations of the robot as one rigid body.
@@ -59,26 +60,26 @@ def rigid_body(robot: RobotParameters, velocity, quaternion, angular_velocity, t
     Forces are summed at base_link, and the body turns about its centre of mass. The acceleration
     is that of the origin of base_link. The two points differ only if an effect moves the centre
     of mass. Arguments are named as the fields of :class:`Terms`, ``quaternion`` is body to world.
-    An absent argument counts as zero; without position, voltage_ratio or charge_drawn their
-    effects are absent. ``effects`` (name -> parameter -> value or symbol) and ``rotor_positions``
-    (4, 3) [m] replace those of the robot file. Returned are the acceleration (3,) in world
-    [m/s^2] and the angular acceleration (3,) in body [rad/s^2].
+    Without position, voltage_ratio or charge_drawn their effects are absent. ``effects`` (name ->
+    parameter -> value or symbol) and ``rotor_positions`` (4, 3) [m] replace those of the robot
+    file. Returned are the acceleration (3,) in world [m/s^2] and the angular acceleration (3,) in
+    body [rad/s^2].
     """
     rotors = robot.rotors
     places = rotors.positions if rotor_positions is None else rotor_positions
     terms = Terms(
-        mass=robot.mass, inertia=ca.DM(robot.inertia), centre_of_mass=ca.DM.zeros(3),
-        torque=_given(torque_body, 3), tilt=tilt, tilt_acceleration=_given(tilt_acceleration, 4),
+        mass=robot.mass, inertia=ca.DM(robot.inertia), centre_of_mass=ZERO_3,
+        torque=torque_body, tilt=tilt, tilt_acceleration=tilt_acceleration,
         tilt_axes=[ca.DM(axis) for axis in robot.tilt_axes],
         thrust=thrust, velocity=velocity, angular_velocity=angular_velocity,
         rotation=rotation_matrix(quaternion),
         thrust_directions=[thrust_direction(rotors.arm_yaw[i], tilt[i]) for i in range(4)],
         rotor_positions=[ca.DM(places[i]) if rotor_positions is None else places[i, :].T
                          for i in range(4)],
-        hover_thrust=robot.hover_thrust, force_world=_given(force_world, 3), rotor_forces=[0] * 4,
-        torque_ratio=rotors.torque_to_thrust_ratio, tilt_rate=_given(tilt_rate, 4),
-        thrust_rate=_given(thrust_rate, 4), spin=tuple(map(float, rotors.spin)),
-        position=position, voltage_ratio=voltage_ratio, charge_drawn=charge_drawn)
+        hover_thrust=robot.hover_thrust, force_world=force_world, rotor_forces=[0] * 4,
+        torque_ratio=rotors.torque_to_thrust_ratio, tilt_rate=tilt_rate, thrust_rate=thrust_rate,
+        spin=tuple(map(float, rotors.spin)), position=position, voltage_ratio=voltage_ratio,
+        charge_drawn=charge_drawn)
     effects = robot.effects if effects is None else effects
     for name, effect in CATALOGUE.items():
         if name in effects and effect.apply is not None and not any(
@@ -100,10 +101,6 @@ def rigid_body(robot: RobotParameters, velocity, quaternion, angular_velocity, t
         ca.cross(angular_acceleration, centre)
         + ca.cross(angular_velocity, ca.cross(angular_velocity, centre)))
     return acceleration, angular_acceleration
-
-
-def _given(value, size):
-    return ca.DM.zeros(size) if value is None else value
 
 
 def added_wrench(robot: RobotParameters, names: list[str]) -> ca.Function:

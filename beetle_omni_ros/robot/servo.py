@@ -78,12 +78,7 @@ class Step:
     Motion of servos over one step: leapfrog, second order, stable for any damping.
 
     Damping and friction are implicit, so that a joint below its stiction is exactly at rest.
-
-    Args:
-        space: functions for the type of the numbers and states.
-        servo: numbers of the servo.
-        duration: duration of the step [s].
-
+    ``space`` has the functions for the type of the numbers, ``duration`` is in s.
     """
 
     def __init__(self, space, servo: Servo, duration: float):
@@ -102,12 +97,8 @@ class Step:
         """
         Rate after the step [rad/s].
 
-        Args:
-            target: commanded angle [rad].
-            tilt: angle in the middle of the step [rad].
-            rate: rate before the step [rad/s].
-            load: torque beside the motor's [N m].
-
+        ``tilt`` is the angle in the middle of the step [rad], ``rate`` that before the step, and
+        ``load`` the torque beside the motor's [N m].
         """
         space, servo = self._space, self._servo
         push = self._stiff * (target - tilt) - self._loss * rate
@@ -140,16 +131,10 @@ class Step:
 def play(positions: np.ndarray, half: float | np.ndarray,
          first: np.ndarray | None = None) -> np.ndarray:
     """
-    Motion of a shaft that is coupled with play.
+    Positions (K, ...) of a shaft that is driven with a play of ``half`` to each side [rad].
 
-    Args:
-        positions: (K, ...) positions of the driving side [rad].
-        half: play to each side [rad].
-        first: (...) first position of the driven side; by default the driving side's.
-
-    Returns:
-        (K, ...) positions of the driven side.
-
+    ``positions`` (K, ...) are those of the driving side. ``first`` (...) is the first one of the
+    driven side, by default the driving side's.
     """
     made, shown = np.empty_like(positions), positions[0] if first is None else first
     low, high = positions - half, positions + half

@@ -267,7 +267,7 @@ def make_task(name: str | Path, seed: int = 0, reach: float = np.inf) -> Task:
                          f"or one of {', '.join(NAMES)}")
 
 
-def random_poses(count: int, seed: int) -> np.ndarray:
+def random_poses(count: int, seed: int | np.random.Generator) -> np.ndarray:
     """Return (count, 6) uniform poses: x, y +-2 m, z 0.6 to 2 m, angles +-180 deg."""
     low = [-2.0, -2.0, 0.6, -180.0, -180.0, -180.0]
     high = [2.0, 2.0, 2.0, 180.0, 180.0, 180.0]
