@@ -1,6 +1,5 @@
 """The battery: sag under load, voltage by charge, thrust limit."""
 
-
 import numpy as np
 import pytest
 from sim_robots import ROBOT, WORLD

@@ -1,6 +1,5 @@
 """The state machine of the emulated firmware against the protocol, without port or clock."""
 
-
 from hypothesis import given, settings, strategies
 import pytest
 
