@@ -172,7 +172,7 @@ class Simulator:
         self._airborne, self._flown, self._broken = 0.0, False, False
         self.wrench, self.payload, self._wear = np.zeros(6), 0.0, np.ones(4)
         self.link = CommandLink(self._robot, self._parameters.command_timeout,
-                                 self.command_delays)
+                                self.command_delays)
         self.truth = self._truth()
         *seeds, fault_seed = np.random.SeedSequence(self._seed).spawn(7)[1:]
         self._schedule = Schedule(self.tick, fault_seed)
