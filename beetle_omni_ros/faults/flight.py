@@ -272,7 +272,7 @@ class Watcher:
         """Observe the last tick; returns whether the flight is over."""
         simulator, supervisor = self._flight.simulator, self._flight.supervisor
         truth, tick = simulator.truth, simulator.tick
-        self.step(truth, float(simulator.thrust_command.sum()), tick)
+        self.step(truth, float(simulator.link.thrust.sum()), tick)
         self.said = self.said or next((event.text for event in supervisor.events[
             self._past_events:] if event.severity != INFO), '')
         if not self.named[0]:

@@ -57,12 +57,7 @@ class Truth:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """
-    Readings that arrive in one tick, or None, and the true state.
-
-    With emulated devices, joints are inputs of their sensors: with bias and noise, without latency
-    and rounding, which the devices add.
-    """
+    """Readings that arrive in one tick, or None, and the true state."""
 
     time: float
     imu: ImuReading | None
@@ -171,8 +166,8 @@ class Sensors:
         """
         Readings that arrive at ``truth.stamp``, the end of the tick number ``tick``.
 
-        ``wear`` is that of :class:`.faults.Drive`; with ``devices``, joints are inputs of emulated
-        devices.
+        ``wear`` is that of :class:`.faults.Drive`. With emulated ``devices``, joints are inputs of
+        their sensors: with bias and noise, without latency and rounding, which the devices add.
         """
         self._imu.append(self._motion(self._before, truth))
         self._before = truth

@@ -133,7 +133,7 @@ class Simulator:
     results. ``time`` is that since reset [s], ``tick`` the duration of one step [s]. The reset of
     ``battery`` inserts a new one, also in flight. In flight ``wrench`` may be set, an external
     force in world [N] and torque in base_link [N m] there (6,), and ``payload``, the mass [kg] of
-    a ball that is fixed below the body.
+    a ball that is fixed below the body. ``link`` has the present targets of the actuators.
 
     Raises:
         ParameterError: impossible mass properties, unknown conditions, or a latency that is not a
@@ -171,8 +171,8 @@ class Simulator:
         self._impact: Impact | None = None
         self._airborne, self._flown, self._broken = 0.0, False, False
         self.wrench, self.payload, self._wear = np.zeros(6), 0.0, np.ones(4)
-        self._link = CommandLink(self._robot, self._parameters.command_timeout,
-                                 self.command_delays)
+        self.link = CommandLink(self._robot, self._parameters.command_timeout,
+                                self.command_delays)
         self.truth = self._truth()
         *seeds, fault_seed = np.random.SeedSequence(self._seed).spawn(7)[1:]
         self._schedule = Schedule(self.tick, fault_seed)
@@ -182,7 +182,7 @@ class Simulator:
     def command(self, command) -> None:
         """Send a command, see :meth:`CommandLink.push`."""
         for one in self._schedule.through('command', command, self.time):
-            self._link.push(one, self.time)
+            self.link.push(one, self.time)
 
     def set_faults(self, faults: Sequence[Fault]) -> None:
         """
@@ -202,11 +202,6 @@ class Simulator:
         """Kinds of the active faults."""
         return [state.fault.kind for _, state in self._schedule.active]
 
-    @property
-    def thrust_command(self) -> np.ndarray:
-        """(4,) thrusts commanded to the rotors [N]; zero after the command timeout."""
-        return self._link.thrust
-
     def step(self, drive: Drive | None = None) -> Frame:
         """
         Advance one tick; return the readings that arrive in it.
@@ -214,7 +209,7 @@ class Simulator:
         Servos and rotors follow :meth:`command`, or ``drive`` of external actuators, without
         delay or timeout.
         """
-        plant, link, battery, schedule = self._plant, self._link, self.battery, self._schedule
+        plant, link, battery, schedule = self._plant, self.link, self.battery, self._schedule
         devices = drive is not None
         if not schedule.empty:
             schedule.update(self.time, self.truth, link.tilt)

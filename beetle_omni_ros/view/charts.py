@@ -37,20 +37,12 @@ ROW, STRIP = 130, 40    # [px] height of a chart, and of a state
 
 @dataclass(frozen=True)
 class Run:
-    """
-    One flight of a report.
+    """One flight of a report."""
 
-    Attributes:
-        label, colour: name and colour of its lines.
-        log: the flight.
-        results: label -> metrics, one entry for each controller that flew.
-
-    """
-
-    label: str
+    label: str      # name of its lines
     colour: str
     log: FlightLog
-    results: dict[str, dict]
+    results: dict[str, dict]        # label -> metrics, for each controller that flew
 
     def line(self, t: np.ndarray, values: np.ndarray, name: str = '', **style) -> go.Scatter:
         """Return a line through values (N,) at times (N,) [s] of the flight's clock."""

@@ -15,18 +15,11 @@ LOW, HIGH = np.array([-1.8, -1.8, 0.0]), np.array([1.8, 1.8, 2.0])      # [m] se
 
 
 class Newest(Recorder):
-    """
-    Newest value of each topic.
-
-    Attributes:
-        values: topic -> value.
-        statuses: name -> newest diagnostic status.
-
-    """
+    """Newest value of each topic."""
 
     def __init__(self):
-        self.values: dict[str, Any] = {}
-        self.statuses: dict[str, Any] = {}
+        self.values: dict[str, Any] = {}        # topic -> value
+        self.statuses: dict[str, Any] = {}      # name -> newest diagnostic status
 
     def write(self, topic: str, value: Any, received: float | None = None) -> None:
         """Keep one value."""

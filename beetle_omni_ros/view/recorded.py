@@ -21,13 +21,7 @@ LOCAL = '127.0.0.1'
 
 
 def recorded_scene(logs: Mapping[str, FlightLog]) -> str:
-    """
-    Return the HTML of a player of flights, aligned by their first targets.
-
-    Args:
-        logs: name -> flight with poses; the first is drawn solid.
-
-    """
+    """Return the HTML of a player of flights by name, aligned by their first targets."""
     begin = max(-BEFORE, min(motion(log).t[0] - log.begin for log in logs.values()))
     end = max(motion(log).t[-1] - log.begin for log in logs.values())
     step = max(1 / RATE, (end - begin) * len(logs) / MOST)
@@ -56,13 +50,7 @@ def recorded_scene(logs: Mapping[str, FlightLog]) -> str:
 
 
 def run_view(runs: list[Path], *, host: str, port: int) -> None:
-    """
-    Serve a player of recorded runs until Ctrl-C; arguments are options of `beetle_omni view`.
-
-    Raises:
-        ParameterError: unusable input.
-
-    """
+    """Serve a player of recorded runs until Ctrl-C; a ParameterError reports unusable input."""
     page = recorded_scene(read_flights(runs, len(COLOURS))).encode()
 
     class Answer(BaseHTTPRequestHandler):

@@ -25,16 +25,10 @@ LEVELS = {1: 'warning', 2: 'error', 3: 'stale'}     # of diagnostics
 def run_report(paths: list[Path], output: Path, *, json_path: Path | None = None,
                console: Console | None = None) -> dict:
     """
-    Read runs, print their result table and write the page.
+    Read runs, print their result table, write the page; return :func:`results_of` the runs.
 
-    ``paths`` are bags, or folders of bags.
-
-    Returns:
-        The results: ``meta`` and one key for each run and controller.
-
-    Raises:
-        ParameterError: a run cannot be read, too many runs, or the page cannot be written.
-
+    ``paths`` are bags, or folders of bags. A ParameterError reports a run that cannot be read, too
+    many runs, or a page that cannot be written.
     """
     console = console or Terminal()
     logs = read_flights(paths, MAX_RUNS)

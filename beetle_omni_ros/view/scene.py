@@ -31,26 +31,15 @@ Placed = tuple[np.ndarray, np.ndarray]      # position (3,) in world [m], quater
 
 @dataclass
 class Moment:
-    """
-    One robot at one time.
+    """One robot at one time; its pose is the true one if it is known, else the estimate."""
 
-    Attributes:
-        position, quaternion: (3,) in world [m] and (4,) body to world; the truth if it is known,
-            else the estimate.
-        tilt, thrust: (4,) measured tilt [rad] and commanded thrust [N].
-        force: (3,) external force in world [N].
-        target: position and quaternion, or None.
-        state: state of the supervisor.
-
-    """
-
-    position: np.ndarray
-    quaternion: np.ndarray
-    tilt: np.ndarray = field(default_factory=lambda: np.zeros(4))
-    thrust: np.ndarray = field(default_factory=lambda: np.zeros(4))
-    force: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    position: np.ndarray        # (3,) in world [m]
+    quaternion: np.ndarray      # (4,) body to world
+    tilt: np.ndarray = field(default_factory=lambda: np.zeros(4))       # measured [rad]
+    thrust: np.ndarray = field(default_factory=lambda: np.zeros(4))     # commanded [N]
+    force: np.ndarray = field(default_factory=lambda: np.zeros(3))      # external, in world [N]
     target: Placed | None = None
-    state: str = ''
+    state: str = ''             # of the supervisor
 
     def text(self) -> str:
         """Return state and errors as one line."""
@@ -77,11 +66,7 @@ def target_at(targets: list[Target], t: float) -> Placed | None:
 
 
 def moments(log: FlightLog, times: np.ndarray) -> list[Moment | None]:
-    """
-    Return what is shown at ``times`` (N,) [s] on the clock of the flight.
-
-    None before the first pose and after the last one.
-    """
+    """Return what is shown at ``times`` (N,) [s] of the flight's clock; None without a pose."""
     body = motion(log)
 
     def held(t, values, width):
@@ -106,13 +91,7 @@ def wxyz(quaternion: np.ndarray) -> np.ndarray:
 
 
 def serve(host: str, port: int) -> viser.ViserServer:
-    """
-    Start a server; if the port is in use, the next free one is taken.
-
-    Raises:
-        ParameterError: the address cannot be used.
-
-    """
+    """Start a server at a port or the next free one; ParameterError: an unusable address."""
     try:
         with contextlib.redirect_stdout(io.StringIO()):     # viser prints its own addresses
             server = viser.ViserServer(host, port, label='beetle_omni', verbose=False)
@@ -133,10 +112,7 @@ class Robot:
     """
     A robot in the scene, with its target and a text above it.
 
-    Args:
-        scene: scene of the server.
-        number: 0 for the robot in the colours of the model, the others are transparent.
-
+    The robot with the ``number`` 0 has the colours of the model, the others are transparent.
     """
 
     def __init__(self, scene, number: int):

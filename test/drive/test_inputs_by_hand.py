@@ -1,6 +1,5 @@
 """Keys, joystick axes and typed commands give shifts and goals; other input is refused."""
 
-
 import numpy as np
 import pytest
 

@@ -1,6 +1,5 @@
 """The state machine of the emulated firmware against the protocol, without port or clock."""
 
-
 from hypothesis import given, settings, strategies
 import pytest
 
@@ -11,7 +10,6 @@ from beetle_omni_ros.sim.emulated import motor_board as firmware
 from beetle_omni_ros.sim.emulated.motor_board import BoardFirmware, NUMBERS
 
 BOOTED = 100.0
-NOTHING = {'lost': 0, 'bad_crc': 0}
 
 
 class Bench:

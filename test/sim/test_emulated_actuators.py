@@ -1,6 +1,5 @@
 """Coupled devices and simulator: timing as without devices, effects of faults."""
 
-
 import numpy as np
 import pytest
 from sim_robots import HIGH, ROBOT, WORLD

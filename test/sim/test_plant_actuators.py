@@ -1,6 +1,5 @@
 """Servos and rotors of the plant have the response of their parameters."""
 
-
 import numpy as np
 from sim_robots import immovable, plant, ROBOT
 

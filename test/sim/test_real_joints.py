@@ -37,18 +37,6 @@ def test_a_joint_below_its_stiction_rests():
     assert beyond[-1].min() > 0.5 * targets[-1, 0]
 
 
-@pytest.mark.parametrize('friction', [0.003, 0.01])
-def test_a_slow_reversal_shows_a_dead_band_of_friction_over_stiffness(friction):
-    t = ticks(8.0)
-    ramp = np.tile(0.2 * np.interp(t, [0, 4, 8], [0, 1, 0])[:, None], (1, 4))
-    encoder, _, _ = flown(ramp, joint_friction={'coulomb': friction, 'stiction': friction})
-    middle = [np.argmin(np.abs(t - at)) for at in (2.0, 6.0)]
-    band = encoder[middle[1]] - encoder[middle[0]]
-    # Lag of the ramp in both directions; encoders are read at the end of a tick.
-    lag = 2 * 0.05 * (ROBOT.joints.kd / KP - TICK / 2)
-    assert np.allclose(band, 2 * friction / KP + lag, atol=2e-4)
-
-
 def test_servos_with_friction_move_as_the_servo_model():
     gains, damping = (0.18, 0.16, 0.2, 0.22), (0.0042, 0.004, 0.005, 0.0045)
     coulomb = (0.002, 0.004, 0.003, 0.001)

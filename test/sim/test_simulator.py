@@ -1,13 +1,14 @@
-"""The interface of the simulator."""
+"""The interface of the simulator, its battery and its command link."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from sim_robots import HIGH, ROBOT, WORLD
 
 from beetle_omni_ros.control.base import Command
-from beetle_omni_ros.sim.simulator import Simulator
+from beetle_omni_ros.sim.simulator import Battery, CommandLink, Simulator
 
 HOVER = np.full(4, ROBOT.hover_thrust)
 
@@ -57,3 +58,104 @@ def test_broken_state_is_an_error_and_not_a_silent_restart():
             simulator.step()
     simulator.reset(HIGH)
     assert np.isfinite(simulator.step().truth.position).all()
+
+
+# Battery --------------------------------------------------------------------------------------
+
+def test_ohms_law_and_the_power_balance_hold():
+    battery = Battery(ROBOT, WORLD)
+    rest = battery.rest_voltage
+    battery.step(HOVER, 1e-6)
+    power = WORLD.idle_power + WORLD.rotor_power * (HOVER ** 1.5).sum()
+    assert rest == pytest.approx(ROBOT.battery.full_voltage)
+    assert battery.voltage == pytest.approx(rest - ROBOT.battery.resistance * battery.current)
+    assert battery.voltage * battery.current == pytest.approx(power)
+
+
+def test_rest_voltage_falls_with_the_charge_drawn():
+    battery = Battery(ROBOT, WORLD)
+    voltages, drawn = [battery.rest_voltage], 0.0
+    for _ in range(30):
+        battery.step(HOVER, 60.0)
+        drawn += battery.current * 60 / 3600
+        voltages.append(battery.rest_voltage)
+    assert np.all(np.diff(voltages) < 0)
+    assert battery.charge == pytest.approx(1 - drawn / WORLD.battery_capacity)
+    assert battery.drawn == pytest.approx(drawn)
+    battery.reset()
+    assert battery.drawn == 0
+
+
+def test_the_thrust_limit_equals_that_of_the_map_and_falls_below_it():
+    battery = Battery(ROBOT, WORLD)
+    for row in ROBOT.rotors.map:
+        battery.voltage = row.voltage
+        assert battery.thrust_limit == pytest.approx(min(row.thrust_max, ROBOT.rotors.thrust_max))
+    battery.voltage = 20.0
+    below = battery.thrust_limit
+    battery.voltage = 21.40
+    assert 0 < below < battery.thrust_limit
+
+
+# Command link ---------------------------------------------------------------------------------
+
+def link():
+    """A link under nominal conditions: 10 ms delay, 100 ms timeout."""
+    return CommandLink(ROBOT, WORLD.command_timeout, (0.01, 0.01))
+
+
+def command(stamp, tilt=0.1, thrust=5.0):
+    return SimpleNamespace(stamp=stamp, tilt=np.full(4, tilt), thrust=np.full(4, thrust))
+
+
+def test_command_acts_at_stamp_plus_delay():
+    made = link()
+    assert made.push(command(0.0), 0.0)
+    made.update(0.0099)
+    assert made.thrust[0] == 0
+    made.update(0.010)
+    assert made.thrust[0] == 5 and made.tilt[0] == 0.1
+
+
+def test_late_command_acts_at_once_but_never_overtakes_a_newer_one():
+    made = link()
+    made.push(command(1.000, thrust=5), 1.020)
+    made.update(1.020)
+    assert made.thrust[0] == 5
+    assert made.push(command(1.015, thrust=7), 1.020)
+    assert not made.push(command(1.010, thrust=6), 1.021)
+    made.update(1.025)
+    assert made.thrust[0] == 7
+
+
+@pytest.mark.parametrize('field, value', [
+    ('tilt', np.array([0, np.nan, 0, 0])), ('stamp', 1e9)], ids=['not finite', 'future'])
+def test_unusable_command_is_refused(field, value):
+    made, bad = link(), command(0.0)
+    setattr(bad, field, value)
+    assert not made.push(bad, 0.0)
+    assert made.push(command(0.0), 0.0)
+
+
+def test_targets_are_clipped_to_the_limits():
+    made = link()
+    made.push(command(0.0, tilt=9.0, thrust=50.0), 0.0)
+    made.update(0.01)
+    np.testing.assert_array_equal(made.tilt, ROBOT.joints.position_limit)
+    np.testing.assert_array_equal(made.thrust, ROBOT.rotors.thrust_max)
+    made.push(command(0.005, tilt=-9.0, thrust=-5.0), 0.01)
+    made.update(0.02)
+    np.testing.assert_array_equal(made.tilt, -ROBOT.joints.position_limit)
+    np.testing.assert_array_equal(made.thrust, ROBOT.rotors.thrust_min)
+
+
+def test_rotors_stop_when_commands_cease_and_tilts_hold():
+    made = link()
+    made.push(command(0.0), 0.0)
+    made.update(0.095)
+    assert made.thrust[0] == 5
+    made.update(0.100)
+    assert made.thrust[0] == 0 and made.tilt[0] == 0.1
+    made.push(command(0.2), 0.2)
+    made.update(0.21)
+    assert made.thrust[0] == 5

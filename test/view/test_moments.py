@@ -1,6 +1,5 @@
 """What a picture shows agrees with the recording, and with the newest messages."""
 
-
 from types import SimpleNamespace
 
 import numpy as np
