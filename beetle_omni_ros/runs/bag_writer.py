@@ -239,18 +239,9 @@ def check_new(path: str | Path) -> None:
 
 
 def add_meta(path: str | Path, meta: dict) -> None:
-    """
-    Add metadata of the flight to a finished bag of a :class:`BagWriter`.
-
-    Raises:
-        ParameterError: the folder has no metadata.yaml, or it cannot be written.
-
-    """
+    """Add metadata of the flight to a finished bag of a :class:`BagWriter`."""
     file = Path(path) / 'metadata.yaml'
-    try:
-        content = read_yaml(file)
-    except ParameterError as error:
-        raise ParameterError(f'{file}: {error}') from None
+    content = read_yaml(file)
     information = content['rosbag2_bagfile_information']
     known = json.loads((information['custom_data'] or {}).get(META_KEY, '{}'))
     information['custom_data'] = {META_KEY: json.dumps({**known, **meta})}

@@ -129,6 +129,3 @@ def test_meta_data_can_be_added_to_a_finished_bag(tmp_path):
     assert read_bag(tmp_path / 'bag').meta == {'task': 'hover', 'seed': 3}
     with AnyReader([tmp_path / 'bag'], default_typestore=TYPESTORE) as reader:
         assert reader.message_count == 1
-    (tmp_path / 'bag' / 'metadata.yaml').unlink()
-    with pytest.raises(ParameterError, match=r'metadata\.yaml'):
-        add_meta(tmp_path / 'bag', {})
