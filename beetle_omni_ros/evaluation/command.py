@@ -2,13 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict
 from pathlib import Path
-from time import monotonic, time
+from time import time
 from types import MappingProxyType
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import Progress
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.control import registry
@@ -65,12 +64,8 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
                 frames=True, epoch=int(time()))))
         loop = FlightLoop(robot, plant, aboard, recorder, conditions=conditions, seed=seed,
                           faults=faults)
-        stayed, truth = loop.fly(task, progress), loop.simulator.truth
-        recorder.write_meta({'crashed': not stayed, 'ended': loop.ending,
-                             'controller_error': loop.controller_error,
-                             'broken': truth.broken})
-        if truth.impact is not None:
-            recorder.write_meta({'impact': asdict(truth.impact)})
+        recorder.write_meta({'crashed': not loop.fly(task, progress),
+                             'controller_error': loop.controller_error})
     return memory.log()
 
 
@@ -124,11 +119,9 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
     if injected:
         meta['faults'] = [str(fault) for fault in injected]
     results: dict = {'meta': meta}
-    columns = (TextColumn('{task.description}'), BarColumn(),
-               TextColumn('{task.percentage:>3.0f} %'), TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True) as bars:
+    with Progress(console=console, transient=True) as bars:
         for entry, controller in built.items():
-            name, begin = entry.name, monotonic()
+            name = entry.name
             bar = bars.add_task(f'{name}: {task.name}, {conditions}', total=1.0)
             log = fly(entry.reference, task, robot=believed, plant=true, conditions=conditions,
                       seed=seed, options=options, built=controller,
@@ -136,14 +129,8 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
                       meta=meta, faults=injected,
                       progress=lambda part, bar=bar: bars.update(bar, completed=part))
             results[name] = metrics(log, task)
-            if not console.is_terminal:     # which shows no progress bar
-                console.print(f'{name}: {task.name} flown in {monotonic() - begin:.0f} s',
-                              highlight=False)
-            for text in (log.meta['ended'] and f'the flight ended early, {log.meta["ended"]}',
-                         log.meta['controller_error']):
-                if text:
-                    console.print(f'{name}: {text}', style='yellow', markup=False,
-                                  highlight=False)
+            if error := log.meta['controller_error']:
+                console.print(f'{name}: {error}', style='yellow', markup=False, highlight=False)
     table.print_results(results, console)
     write_json(json_path, results)
     return results

@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 import gc
 import time
 
@@ -21,7 +22,6 @@ import numpy as np
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import (
-    Command,
     Controller,
     ControllerHost,
     PoseTarget,
@@ -41,7 +41,7 @@ from beetle_omni_ros.runs.targets import TargetChecks
 from beetle_omni_ros.runs.tasks import Task, TaskPlayer
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.supervisor import Supervisor
-from beetle_omni_ros.sim.faults import Fault, Schedule
+from beetle_omni_ros.sim.faults import Fault, READINGS, Schedule
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.sensors import Frame
 from beetle_omni_ros.sim.simulator import Simulator
@@ -70,110 +70,69 @@ def collector_off():
         gc.enable()
 
 
-class ComputeTimer:
-    """
-    CPU times of all steps of one controller; a deadline miss takes longer than ``period`` [s].
+def timed(times: list[float], function: Callable, *arguments):
+    """Run ``function(*arguments)`` and add its CPU time [s]; wall time includes other programs."""
+    start = time.thread_time()
+    result = function(*arguments)
+    times.append(time.thread_time() - start)
+    return result
 
-    The CPU time of the calling thread is measured, because wall time on a shared computer includes
-    other programs.
-    """
 
-    def __init__(self, period: float):
-        self._period, self._times = period, []
-
-    def call(self, function, *arguments):
-        """Run ``function(*arguments)`` and store its CPU time."""
-        start = time.thread_time()
-        result = function(*arguments)
-        self._times.append(time.thread_time() - start)
-        return result
-
-    def summary(self) -> dict[str, float | int]:
-        """Median, 99th percentile and maximum [ms], deadline misses, number of steps."""
-        times = 1e3 * np.array(self._times or [0.0])
-        return {'median': float(np.median(times)), 'p99': float(np.percentile(times, 99)),
-                'max': float(times.max()),
-                'deadline_misses': int(np.sum(times > 1e3 * self._period)),
-                'count': len(self._times)}
+def compute_summary(times: Sequence[float], period: float) -> dict[str, float | int]:
+    """Median, 99th percentile, maximum [ms], misses of ``period`` and number of ``times`` [s]."""
+    used = 1e3 * np.array(times or [0.0])
+    return {'median': float(np.median(used)), 'p99': float(np.percentile(used, 99)),
+            'max': float(used.max()), 'deadline_misses': int(np.sum(used > 1e3 * period)),
+            'count': len(times)}
 
 
 class Processes:
     """
-    Messages from and to estimator, controllers and supervisor, modified by faults of processes.
-
-    Without a fault all messages pass unchanged.
+    Messages to the supervisor, and the faults of estimator, controllers and supervisor.
 
     Attributes:
+        schedule: faults; those of estimates, commands and targets are applied by the caller.
         clock_step: error of the flight computer's clock [s].
+        supervisor_waits: whether the supervisor is not scheduled at present.
 
     """
 
     def __init__(self, tick: float, supervisor: Supervisor):
         """``tick``: time between two calls of :meth:`frame` [s]."""
+        self.schedule = Schedule(tick, np.random.SeedSequence(0))
+        self.clock_step, self.supervisor_waits = 0.0, False
         self._supervisor = supervisor
-        self._schedule = Schedule(tick, np.random.SeedSequence(0))
         self._waiting: dict[str, deque] = {}
         self._reported: dict[str, str] = {}     # bridge -> last reported state
-        self.clock_step = 0.0
-
-    def set_faults(self, faults: Sequence[Fault], now: float) -> None:
-        """Set the faults of processes; their ``at`` counts from ``now`` [s]."""
-        self._schedule.set(faults, now)
 
     def frame(self, frame: Frame) -> Frame:
         """Start a tick; returns the frame with stamps of the flight computer's clock."""
-        if self._schedule.empty:
+        if self.schedule.empty:
             return frame
-        self._schedule.update(frame.time)
-        self.clock_step = sum(self._schedule.each('clock'))
+        self.schedule.update(frame.time)
+        self.clock_step = sum(self.schedule.each('clock'))
+        self.supervisor_waits = bool(self.schedule.each('waits'))
         if not self.supervisor_waits:
             waiting, self._waiting = self._waiting, {}
             for method, messages in waiting.items():
                 for message in messages:
                     getattr(self._supervisor, method)(*message)
-        if not self.clock_step:
-            return frame
         shifted = {name: replace(reading, stamp=reading.stamp + self.clock_step)
-                   for name in ('imu', 'mocap', 'joints', 'rotors', 'battery')
-                   if (reading := getattr(frame, name)) is not None}
-        return replace(frame, time=frame.time + self.clock_step, **shifted)
-
-    @property
-    def supervisor_waits(self) -> bool:
-        """Whether the supervisor is not scheduled at present."""
-        return bool(self._schedule.each('waits'))
+                   for name in READINGS if (reading := getattr(frame, name)) is not None}
+        frame = replace(frame, time=frame.time + self.clock_step, **shifted)
+        for bridges in self.schedule.each('bridges'):
+            for name, text in bridges.items():
+                if self._reported.get(name) != text:
+                    self._reported[name] = text
+                    self.send('on_actuators', name, text, frame.time)
+        return frame
 
     def send(self, method: str, *message) -> None:
         """Call one of the supervisor's ``on_`` methods, or queue the message."""
-        if not self._schedule.empty and self.supervisor_waits:
+        if self.supervisor_waits:
             self._waiting.setdefault(method, deque(maxlen=QUEUE)).append(message)
         else:
             getattr(self._supervisor, method)(*message)
-
-    def estimate(self, state: State) -> State | None:
-        """Estimate after the faults; None if it is not sent."""
-        return next(iter(self._schedule.through('estimate', state, 0.0)), None)
-
-    def requests(self, command: Command | None, now: float) -> list[Command]:
-        """Commands of the active controller that arrive now; None: delayed ones only."""
-        return self._schedule.through('request', command, now)
-
-    def target(self, target: Target) -> PoseTarget | None:
-        """Target of a fault while ``target`` is in force, or None."""
-        for pose in self._schedule.each('target'):
-            return PoseTarget(*pose, stamp=target.stamp)
-        return None
-
-    @property
-    def bridges(self) -> dict[str, str]:
-        """Bridge -> its reported state, if that has changed."""
-        if self._schedule.empty:
-            return {}
-        states = {name: text for bridges in self._schedule.each('bridges')
-                  for name, text in bridges.items()}
-        new = {name: text for name, text in states.items() if self._reported.get(name) != text}
-        self._reported.update(new)
-        return new
 
 
 class FlightLoop:
@@ -192,7 +151,6 @@ class FlightLoop:
     Attributes:
         simulator, supervisor: parts of the loop.
         refusals: reasons of refused targets.
-        ending: time in the task and reason of an early end of the flight by the supervisor, or ''.
 
     """
 
@@ -206,7 +164,6 @@ class FlightLoop:
                                      tuple(dict.fromkeys((*registry.names(), active))))
         self.supervisor.select(active)
         self.refusals: list[str] = []
-        self.ending = ''
         self._estimator = ErrorStateEkf(estimator, robot.gravity)
         self._gyroscope_noise, self._errors = estimator.imu.gyroscope_noise, robot.sensors
         self._recorder, self._faults = recorder, tuple(faults)
@@ -214,17 +171,16 @@ class FlightLoop:
         self._processes = Processes(self.simulator.tick, self.supervisor)
         self._other_target: Target | None = None     # of a fault
         self._accepts_other = False
-        self._timers = {name: ComputeTimer(c.period) for name, c in controllers.items()}
+        self._times: dict[str, list[float]] = {name: [] for name in controllers}    # CPU [s]
         self._every = {name: max(1, round(c.period / self.simulator.tick))
                        for name, c in controllers.items()}
-        self._hosts = {name: ControllerHost(name, c, self._timers[name].call)
+        self._hosts = {name: ControllerHost(name, c, partial(timed, self._times[name]))
                        for name, c in controllers.items()}
         self._joints = self._command = self._estimated = None
         self._ticks = 0
-        self._state_name = self._recorded_state = ''
+        self._reported = ''
         self._health = ALL_HEALTHY
         self._crashed = False
-        self._began = 0.0       # of the task, simulated time
 
     @property
     def controller_error(self) -> str:
@@ -243,45 +199,41 @@ class FlightLoop:
             ParameterError, RunError: no take-off.
 
         """
+        simulator = self.simulator
         with collector_off():
             self.take_off()
-            return self._play(task, progress)
-
-    def _play(self, task, progress):
-        self._began = self.simulator.time
-        player = TaskPlayer(task, self._began)
-        self.start_faults()
-        reported = self.simulator.time
-        while True:
-            truth = self.simulator.truth
-            moment = player.update(self.simulator.time, truth.position, truth.quaternion)
-            if moment.target is not None:
-                self.aim(moment.target)
-                battery = self.simulator.battery
-                if battery.charge < SWAP_CHARGE or self.supervisor.battery_low:
-                    battery.reset()
-            if moment.changed:
-                self.simulator.set_wrench(moment.force_world, moment.torque_body)
-                self.simulator.set_payload(moment.payload)
-                self._recorder.write('disturbance', Wrench(
-                    self.simulator.time, moment.force_world, moment.torque_body))
-            if moment.finished or self._crashed:
-                break
-            self.step()
-            if self.simulator.time - reported >= COMPUTE_REPORT:
-                reported += COMPUTE_REPORT
-                self._report_compute()
-                progress(min(1.0, (self.simulator.time - player.start) / task.duration))
-        self._report_compute()
-        progress(1.0)
-        return not (self._crashed or moment.lost or self.simulator.truth.broken)
+            began = reported = simulator.time
+            player = TaskPlayer(task, began)
+            self.start_faults()
+            while True:
+                truth = simulator.truth
+                moment = player.update(simulator.time, truth.position, truth.quaternion)
+                if moment.target is not None:
+                    self.aim(moment.target)
+                    if simulator.battery.charge < SWAP_CHARGE or self.supervisor.battery_low:
+                        simulator.battery.reset()
+                if moment.changed:
+                    simulator.set_wrench(moment.force_world, moment.torque_body)
+                    simulator.set_payload(moment.payload)
+                    self._recorder.write('disturbance', Wrench(
+                        simulator.time, moment.force_world, moment.torque_body))
+                over = moment.finished or self._crashed
+                if not over:
+                    self.step()
+                if over or simulator.time - reported >= COMPUTE_REPORT:
+                    reported += COMPUTE_REPORT
+                    for name, times in self._times.items():
+                        self._recorder.write_compute(simulator.time, name, **compute_summary(
+                            times, self._hosts[name].controller.period))
+                    progress(1.0 if over else (simulator.time - began) / task.duration)
+                if over:
+                    return not (self._crashed or moment.lost or truth.broken)
 
     def start_faults(self) -> None:
         """Start the time of the faults."""
-        if self._faults:
-            self.simulator.set_faults([fault for fault in self._faults if not fault.is_process])
-            self._processes.set_faults([fault for fault in self._faults if fault.is_process],
-                                       self.simulator.time)
+        self.simulator.set_faults([fault for fault in self._faults if not fault.is_process])
+        self._processes.schedule.set([fault for fault in self._faults if fault.is_process],
+                                     self.simulator.time)
 
     def aim(self, target: Target) -> None:
         """Set the target in force."""
@@ -303,59 +255,59 @@ class FlightLoop:
             RunError: no take-off.
 
         """
-        while self.simulator.time < SETTLE_TIME or (
-                self._estimator.status != 'tracking' and self.simulator.time < START_TIMEOUT):
-            self._step_before_flight()
-        answer = self.supervisor.arm(self.simulator.time)
-        if not answer:
-            raise RunError(answer.text)
+        asked = False
         while self.supervisor.state != 'flying':
-            self._step_before_flight()
-            if self.simulator.time > TAKEOFF_TIMEOUT or self.supervisor.state == 'disarmed':
+            self.step()
+            if error := self._hosts[self.supervisor.active].error:
+                raise ParameterError(error)
+            now = self.simulator.time
+            if asked and (now > TAKEOFF_TIMEOUT or self.supervisor.state == 'disarmed'):
                 events = list(dict.fromkeys(     # the newest first, each once
                     event.text for event in reversed(self.supervisor.events)))
                 raise RunError(f'no take-off within {TAKEOFF_TIMEOUT:g} s, supervisor in '
                                f"'{self.supervisor.state}' ({'; '.join(events[2::-1])})")
-
-    def _step_before_flight(self):
-        self.step()
-        if error := self._hosts[self.supervisor.active].error:
-            raise ParameterError(error)
+            if not asked and now >= SETTLE_TIME and (
+                    self._estimator.status == 'tracking' or now >= START_TIMEOUT):
+                asked = True
+                answer = self.supervisor.arm(now)
+                if not answer:
+                    raise RunError(answer.text)
 
     def step(self) -> Frame:
         """Run one tick of the simulator and of every process that is due in it."""
-        simulator, processes = self.simulator, self._processes
-        frame = processes.frame(simulator.step())
+        processes, recorder = self._processes, self._recorder
+        frame = processes.frame(self.simulator.step())
         self._ticks += 1
         now = frame.time
         self._sense(frame)
-        estimate = self._estimator.estimate
+        estimate, commands = self._estimator.estimate, {}
         new = estimate is not None and estimate.stamp != self._estimated
         if new and self._joints is not None:
             self._estimated = estimate.stamp    # each estimate is sent once
-            state = processes.estimate(State.join(estimate, self._joints, self._command))
-            if state is not None:
+            for state in processes.schedule.through('estimate', State.join(
+                    estimate, self._joints, self._command), 0.0):
                 processes.send('on_state', state, self._estimator.status)
-                self._control(state, now)
-                self._recorder.write('odom', Odom.of(state, *(
+                commands = self._control(state)
+                recorder.write('odom', Odom.of(state, *(
                     (pose_covariance(estimate), twist_covariance(estimate, self._gyroscope_noise))
-                    if self._recorder.keeps_covariances else ())))
-        for late in processes.requests(None, now):
-            self._request(self.supervisor.active, late, now)
-        if not processes.supervisor_waits:
-            self._execute(self.supervisor.update(now), now)
-            self._note_state(now)
-        return frame
-
-    def _execute(self, command, now):
-        if command is None:
-            self._command = None
-        elif self._command is None or command.stamp > self._command.stamp \
-                or command.stamp < self._command.stamp - CLOCK_SET_BACK:
+                    if recorder.keeps_covariances else ())))
+        active = self.supervisor.active
+        arrived = processes.schedule.through('request', commands.pop(active, None), now)
+        for name, command in [*((active, one) for one in arrived), *commands.items()]:
+            recorder.write(f'{name}/command', command, now)
+            processes.send('on_command', name, command, now)
+        if processes.supervisor_waits:
+            return frame
+        command, last = self.supervisor.update(now), self._command
+        if command is None or last is None \
+                or not 0 <= last.stamp - command.stamp <= CLOCK_SET_BACK:
             self._command = command
-            self.simulator.command(replace(
-                command, stamp=command.stamp - self._processes.clock_step))
-            self._recorder.write('command', command, now)
+            if command is not None:
+                self.simulator.command(replace(
+                    command, stamp=command.stamp - processes.clock_step))
+                recorder.write('command', command, now)
+        self._note_state(now)
+        return frame
 
     def _sense(self, frame):
         recorder, send, now = self._recorder, self._processes.send, frame.time
@@ -378,12 +330,10 @@ class FlightLoop:
             recorder.write('imu/data_raw', imu)
         if frame.rotors is not None:
             send('on_rotors', frame.rotors.stamp, frame.rotors.speed)
-        for name, text in self._processes.bridges.items():
-            send('on_actuators', name, text, now)
 
-    def _control(self, state, now):
-        """Step the controllers that are due."""
-        supervisor = self.supervisor
+    def _control(self, state):
+        """Step the controllers that are due; returns their commands."""
+        supervisor, commands = self.supervisor, {}
         for name, host in self._hosts.items():
             host.on_estimate(state)
             host.override = supervisor.target_override
@@ -392,26 +342,20 @@ class FlightLoop:
             if self._ticks % self._every[name]:
                 continue
             command = host.step(state, self._target_of_fault(host))
-            if name == supervisor.active:
-                for passed in self._processes.requests(command, now):
-                    self._request(name, passed, now)
-            elif command is not None:
-                self._request(name, command, now)
+            if command is not None:
+                commands[name] = command
         self._health = supervisor.health
-
-    def _request(self, name, command, now):
-        self._recorder.write(f'{name}/command', command, now)
-        self._processes.send('on_command', name, command, now)
+        return commands
 
     def _target_of_fault(self, host):
         """Return the accepted target of a fault, which replaces that of the task, or None."""
         if self.supervisor.target_override is not None:
             return None
-        other = self._processes.target(host.target_in_force)
-        if other is None:
+        others = self._processes.schedule.each('target')
+        if not others:
             self._other_target = None
         elif self._other_target is None:
-            self._other_target = other
+            self._other_target = other = PoseTarget(*others[0], stamp=host.target_in_force.stamp)
             active = self._hosts[self.supervisor.active]
             reason = self._check_target(other) or active.too_far(other, self.now)
             self._accepts_other = not reason
@@ -419,26 +363,14 @@ class FlightLoop:
         return self._other_target if self._accepts_other else None
 
     def _note_state(self, now):
-        reported = self.supervisor.reported_state
-        name = self.supervisor.state if self.supervisor.state != 'flying' else reported
-        if reported != self._recorded_state:
-            self._recorded_state = reported
-            self._recorder.write('supervisor/state', reported, now)
-            for host in self._hosts.values():
-                reason = host.on_mode(reported, self.now)
-                self.refusals += [reason] if reason else []
-        if name != self._state_name:
-            if self._state_name.startswith(('flying', 'fallback')) \
-                    and name in ('landing', 'emergency_stop', 'disarmed'):
-                last = [e.text for e in self.supervisor.events][-1:]
-                self.ending = (f'{name} at {self.simulator.time - self._began:.1f} s: '
-                               f'{last[0] if last else "unknown"}')
-            if self._state_name.startswith(('flying', 'fallback', 'landing')) \
-                    and name in ('disarmed', 'emergency_stop'):
-                self._crashed = True
-            self._state_name = name
-
-    def _report_compute(self):
-        for name, timer in self._timers.items():
-            self._recorder.write_compute(self.simulator.time, name, **timer.summary())
-
+        reported, before = self.supervisor.reported_state, self._reported
+        if reported == before:
+            return
+        self._reported = reported
+        self._recorder.write('supervisor/state', reported, now)
+        for host in self._hosts.values():
+            reason = host.on_mode(reported, now)
+            self.refusals += [reason] if reason else []
+        if before.startswith(('flying', 'fallback', 'landing')) \
+                and self.supervisor.state in ('disarmed', 'emergency_stop'):
+            self._crashed = True

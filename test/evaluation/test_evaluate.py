@@ -3,7 +3,6 @@
 from dataclasses import replace
 import io
 import json
-import re
 
 import numpy as np
 import pytest
@@ -85,8 +84,6 @@ def test_a_flight_ended_by_the_supervisor_is_reported_with_time_and_reason(poses
                                    console=Console(file=text, width=200))
     assert 'battery' in results['nmpc']['ended']     # empty, or too weak before that
     assert results['nmpc']['ended'].startswith('landing: ')
-    at, = re.findall('nmpc: the flight ended early, landing at ([0-9.]+ s): ', text.getvalue())
-    assert results['nmpc']['ended'].endswith(f' at {at}')   # both since the start of the task
     assert results['nmpc']['ended'] in text.getvalue().partition('crashed')[0]
 
 
@@ -156,8 +153,6 @@ def test_faults_of_a_file_act_and_are_listed_in_the_results(tmp_path):
     log = read_bag(tmp_path / 'bag')
     assert log.meta['faults'] == listed
     assert 'fallback:controller_silent' in log.states
-    assert log.meta['broken'] == results['hover']['crashed']
-    assert not log.meta['broken'] or log.meta['impact']['speed'] > 1.0
 
 
 def test_flights_of_an_own_controller_are_kept_with_its_code(tmp_path):
