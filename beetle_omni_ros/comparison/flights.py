@@ -29,9 +29,7 @@ CONDITIONS = ('nominal', 'published')
 SEEDS = {50.0: 10, 300.0: 6, np.inf: 3}
 
 START_COST, COST = 2.0, 0.1  # core seconds to build simulator and controller; for a second
-TRACE_PERIOD = 0.02  # [s] between samples of a trace
-LONG_TRACE_PERIOD = 0.05  # [s] between samples in a long task
-TRACED_FINELY = 300.0  # [s] longest task with TRACE_PERIOD
+TRACE_PERIOD = 0.05  # [s] between samples of a trace
 
 
 @dataclass(frozen=True, order=True)
@@ -171,9 +169,8 @@ def trace(log: FlightLog, task: Task) -> dict[str, np.ndarray]:
     if not log.targets:
         return {}
     body, start = motion(log), log.targets[0].stamp
-    every = LONG_TRACE_PERIOD if task.duration > TRACED_FINELY else TRACE_PERIOD
     end = min(body.t[-1], start + task.duration)
-    index = np.unique(np.searchsorted(body.t, np.arange(start, end, every)))
+    index = np.unique(np.searchsorted(body.t, np.arange(start, end, TRACE_PERIOD)))
     index = index[index < len(body.t)]
     apart = np.full((2, len(body.t)), np.nan)
     for target, until in zip(log.targets, [*(t.stamp for t in log.targets[1:]), np.inf],

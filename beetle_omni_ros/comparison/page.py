@@ -1,9 +1,8 @@
 """The comparison as one self-contained HTML page, and as Markdown with pictures."""
 
 from base64 import b64encode
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from io import BytesIO
-from pathlib import Path
 
 import matplotlib
 from matplotlib.figure import Figure
@@ -22,15 +21,12 @@ from beetle_omni_ros.comparison.summary import (
     task_title,
 )
 from beetle_omni_ros.pages import figures
-from beetle_omni_ros.pages.page import ABSENT, Grid, markdown, number, rendered
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.pages.page import ABSENT, Grid, number
 from beetle_omni_ros.runs.tasks import RISING
 
 DOTS = 180  # per inch
 COLOURS = 128  # of a picture; enough for thin lines with smooth edges
 TITLE = 'RL and NMPC under one architecture'
-README = ('rl', 'nmpc')     # columns of the table in the readme
-BEGIN, END = '<!-- compare -->\n', '<!-- end of compare -->\n'    # around that table
 COMPUTED = ('"0.3 on average"', '"typically within 10"')    # published times of a step
 TEXTS = {
     'random': 'One pose after the other, 8 s each, x and y within 2 m, z from 0.6 to 2 m, any '
@@ -101,7 +97,7 @@ class Section:
 
     title: str
     text: str
-    blocks: list[Grid | Picture] = field(default_factory=list)
+    blocks: list[Grid | Picture]
 
 
 def interval(entry: dict, digits: int) -> str:
@@ -171,11 +167,10 @@ def compute(results: dict) -> Grid:
             ('over 10 ms', 'deadline_misses', 0, ABSENT, '"occasionally"'), ('steps', 'steps', 0)):
         rows.append([text, *(number(times[name][key], digits) for name in ours),
                      *(published or [ABSENT] * len(PUBLISHED))])
-    machine = results['meta'].get('machine', {})
     return Grid('CPU time of one controller step', [
         '', *(look(name).label for name in ours),
         *(f'{look(name).label} (published, real robot)' for name in PUBLISHED)], rows,
-        note=NOTES['compute'].format(processor=machine.get('processor', 'unknown processor')),
+        note=NOTES['compute'].format(processor=results['meta']['machine']['processor']),
         faint_columns=frozenset(range(len(ours) + 1, len(ours) + len(PUBLISHED) + 1)))
 
 
@@ -209,34 +204,6 @@ def glance(results: dict) -> Grid:
         faint_columns=frozenset(range(len(ours) + 1, len(ours) + len(PUBLISHED) + 1)))
 
 
-def parted(path: Path) -> tuple[str, str]:
-    """Text of a Markdown file before and after its table; ParameterError without its place."""
-    try:
-        before, begin, rest = path.read_text(encoding='utf-8').partition(BEGIN)
-        _, end, after = rest.partition(END)
-    except OSError as error:
-        raise ParameterError(f'--readme {path}: {error.strerror}') from None
-    if not (begin and end):
-        raise ParameterError(f'--readme {path}: expected the lines {BEGIN.strip()} and '
-                             f'{END.strip()} around the table')
-    return before + begin, end + after
-
-
-def with_table(path: Path, results: dict) -> str:
-    """Text of a Markdown file with the nominal rows of :func:`glance`, of the columns README."""
-    whole = glance(results)
-    shown = [0, *(k for k, name in enumerate(results['meta']['controllers'], 1)
-                  if name in README), *sorted(whole.faint_columns)]
-    rows = [k for k, row in enumerate(whole.rows) if ', published: ' not in row[0]]
-    table = replace(whole, header=[whole.header[k] for k in shown], rows=[
-        [whole.rows[row][k].replace(', nominal: ', ': ') for k in shown] for row in rows],
-        best=frozenset((n, m) for n, row in enumerate(rows) for m, k in enumerate(shown)
-                       if (row, k) in whole.best))
-    meta, (before, after) = results['meta'], parted(path)
-    return (f"{before}\n{markdown(table)}\nCommand: `make compare` (commit {meta['commit']}, "
-            f"seeds {meta['seeds'][0]} to {meta['seeds'][-1]}).\n\n{after}")
-
-
 def sections(results: dict, flown: dict) -> list[Section]:
     """
     Pictures and tables of all flights.
@@ -263,11 +230,6 @@ def sections(results: dict, flown: dict) -> list[Section]:
     return made
 
 
-def pictures(made: list[Section]) -> list[Picture]:
-    """All pictures of all sections."""
-    return [block for section in made for block in section.blocks if isinstance(block, Picture)]
-
-
 def png(figure: Figure) -> bytes:
     """Figure as PNG with few colours, a third of the full size."""
     buffer, small = BytesIO(), BytesIO()
@@ -277,15 +239,13 @@ def png(figure: Figure) -> bytes:
     return small.getvalue()
 
 
-def _content(results, made):
+def content(results: dict, made: list[Section]) -> dict:
     """What both forms of the page show: terms with their meaning, facts, sections, flights."""
     meta = results['meta']
     terms = []
     for name in meta['controllers']:
-        moved = meta.get('guidance', {}).get(name)
-        terms.append((look(name).label, '; '.join(filter(None, [
-            look(name).text or meta.get('specs', {}).get(name, ''),
-            f'guidance: {moved}' if moved else '']))))
+        what = look(name).text or meta['specs'].get(name, '')
+        terms.append((look(name).label, f"{what}; guidance: {meta['guidance'][name]}"))
     terms += [(f'{name} conditions', CONDITIONS[name]) for name in meta['conditions']]
     terms += [(f'{name}: not flown', reason) for name, reason in meta['skipped'].items()]
     failed = sum(bool(flight['failure']) for flight in results['flights'])
@@ -294,7 +254,7 @@ def _content(results, made):
              f"{len(results['flights'])} flights, {failed} failed; seeds "
              f"{', '.join(map(str, meta['seeds']))}",
              f"{meta['cpu_s'] / 60:.1f} core minutes on {meta['machine']['processor']}",
-             *(f'simulated plant: {plant}' for plant in [meta.get('plant')] if plant),
+             *([f"simulated plant: {meta['plant']}"] if meta['plant'] else []),
              *(f'{look(name).label}: policy {digest}'
                for name, digest in meta['policies'].items())]
     flights = Grid('', ['task', 'conditions', 'controller', 'seed', 'end', 'core s'], [
@@ -304,13 +264,3 @@ def _content(results, made):
          number(flight['cpu_s'], 1)] for flight in results['flights']])
     return {'title': TITLE, 'terms': terms, 'facts': facts, 'sections': made, 'flights': flights,
             'command': meta['command']}
-
-
-def as_page(results: dict, made: list[Section]) -> str:
-    """The self-contained HTML page."""
-    return rendered('comparison.html', **_content(results, made))
-
-
-def as_markdown(results: dict, made: list[Section], how: str = '') -> str:
-    """The page as Markdown; ``how`` is a link to the how-to page, or ''."""
-    return rendered('comparison.md', how=how, **_content(results, made))

@@ -25,7 +25,7 @@ import zipfile
 import joblib
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import Progress
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -37,7 +37,6 @@ SOURCE = Path(__file__).resolve().parents[1]
 # Folders whose code decides the numbers of a flight and its metrics.
 FLOWN = ('control', 'estimation', 'evaluation', 'messages', 'robot', 'runs', 'safety', 'sim')
 LENGTH = 16  # hexadecimal digits kept of a digest
-BACKENDS = ('processes', 'ray')
 OBJECT_STORE = 200 * 2**20  # [byte] shared memory of a local Ray; results are far smaller
 REACH_TIMEOUT = 5.0  # [s] for an answer of a cluster
 LOST_WORKER = ('TerminatedWorkerError', 'BrokenProcessPool', 'RayActorError', 'ActorDiedError',
@@ -203,14 +202,12 @@ def sweep(function: Callable[..., dict], calls: Sequence[tuple], *, store: Store
         the results in the order of ``calls``.
 
     Raises:
-        ParameterError: unknown backend, or Ray is absent or not reachable.
+        ParameterError: Ray is absent or not reachable.
         RunError: a worker was killed, or has another version of the code.
 
     """
     results: dict[int, dict] = {}
-    columns = (TextColumn('{task.description}'), BarColumn(), TimeElapsedColumn(),
-               TextColumn('left'), TimeRemainingColumn())
-    with Progress(*columns, console=console or Console(quiet=True), transient=True,
+    with Progress(console=console or Console(quiet=True), transient=True,
                   speed_estimate_period=1200) as progress:
         bar = progress.add_task('', total=sum(call[0].cost for call in calls))
 
@@ -262,16 +259,9 @@ def _fly_one(k, code, function, call):
     return k, function(*call)
 
 
-def check_backend(backend: str) -> None:
-    """Raise a ParameterError for an unknown backend."""
-    if backend not in BACKENDS:
-        raise ParameterError(f"--backend '{backend}': expected {' or '.join(BACKENDS)}")
-
-
 @contextmanager
 def workers(backend: str = 'processes', jobs: int | None = None, address: str | None = None):
     """Configure joblib with one thread for the numerical libraries of each worker."""
-    check_backend(backend)
     if backend == 'processes':
         with joblib.parallel_config('loky', n_jobs=jobs or -1, inner_max_num_threads=1):
             yield

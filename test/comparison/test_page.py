@@ -11,7 +11,6 @@ from rich.console import Console
 
 from beetle_omni_ros.comparison import command, page
 from beetle_omni_ros.comparison.flights import Flight
-from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs import table as published
 
 CONTROLLERS = ('rl', 'nmpc', 'nmpc_published')
@@ -20,9 +19,8 @@ CONTROLLERS = ('rl', 'nmpc', 'nmpc_published')
 def written(folder, flown, tasks=TASKS, skipped=()):
     """Write the page of ``flown`` and read back page, JSON and Markdown."""
     conditions = list(dict.fromkeys(flight.conditions for flight in flown))
-    seeds = sorted({flight.seed for flight in flown})
-    results = command.results_of(flown, (CONTROLLERS, tasks, conditions, seeds), CONTROLLERS,
-                               dict(skipped), None)
+    results = command.results_of(flown, tasks, conditions, dict.fromkeys(CONTROLLERS, 'none'),
+                                 dict(skipped))
     folder.mkdir(exist_ok=True)
     command.write(results, flown, folder, Console(file=io.StringIO(), width=160))
     return (folder / 'comparison.html').read_text(), \
@@ -71,22 +69,6 @@ def test_numbers_of_a_table_follow_from_the_flights_and_are_on_both_pages(whole)
     glance = table_of(numbers, 'All experiments')
     row = row_of(glance, '3 random poses, published: U ‖p error‖ [m]')
     assert glance.rows[row][1] == f'{means[0]:.4f}' and (row, 1) in glance.best
-
-
-def test_a_part_of_the_readme_is_renewed(whole, tmp_path):
-    _, _, numbers, _ = whole
-    path = tmp_path / 'README.md'
-    path.write_text(f'before\n{page.BEGIN}old\n{page.END}after\n')
-    for _ in range(2):      # again in place of itself
-        path.write_text(page.with_table(path, numbers))
-    text = path.read_text()
-    assert text.startswith('before\n') and text.endswith('after\n') and 'old' not in text
-    rows = [line for line in text.splitlines() if line.startswith('| Five waypoints: U')]
-    assert [row.count('|') for row in rows] == [6, 6]     # RL, NMPC, and both as published
-    assert rows[0].endswith('| 0.077 * | 0.042 * |')
-    path.write_text('no place')
-    with pytest.raises(ParameterError, match='--readme .*expected the lines'):
-        page.with_table(path, numbers)
 
 
 def test_the_page_needs_no_network(whole):
