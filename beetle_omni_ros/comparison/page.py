@@ -118,8 +118,6 @@ def table(results: dict, task: str, conditions: str) -> Grid:
     for key, metric in METRICS[kind].items():
         of, given = numbers['metrics'][key], [printed(task, metric, name) for name in paper]
         most = max(of[name]['count'] for name in ours)
-        if metric.detail and not most:      # a level that no controller met
-            continue
         best |= {(len(rows), column) for column, name in enumerate(ours, 1) if of[name]['best']}
         rows.append([metric.title, *(
             interval(of[name], metric.digits)
@@ -127,7 +125,7 @@ def table(results: dict, task: str, conditions: str) -> Grid:
             *(number(entry.get('mean'), None)
               + (f" ± {number(entry['std'], None)}" if entry.get('std') else '')
               for entry in given)])
-        if len(ours) > 1 and not metric.detail:
+        if len(ours) > 1:
             rows.append(['difference to the best', *(
                 ABSENT if of[name]['difference'] is None
                 else interval(of[name]['difference'], metric.digits) for name in ours),

@@ -11,7 +11,6 @@ from rich.console import Console
 
 from beetle_omni_ros.comparison import command, page
 from beetle_omni_ros.comparison.flights import Flight
-from beetle_omni_ros.runs import table as published
 
 CONTROLLERS = ('rl', 'nmpc', 'nmpc_published')
 
@@ -83,10 +82,6 @@ def test_published_numbers_keep_their_printed_form(whole):
     row = row_of(table, 'U ‖θ error‖ [deg]')
     assert table.rows[row][-1] == '40.99' and table.rows[row + 2][-1] == '0.41 to 136.97'
     assert table.rows[row_of(table, '‖v‖ at the target [m/s]')][-1] == '0.008 ± 0.0005'
-    poses = [float(row[-2]) for row in table_of(whole[2], 'Five way').rows
-             if row[0].endswith('deg: U [m]')]
-    mean = published.WAYPOINTS['RL, real robot']['mean']['U_position_m']
-    assert len(poses) == 5 and np.mean(poses) == pytest.approx(mean, abs=5e-4)
 
 
 def test_pictures_named_in_the_markdown_exist(whole):
@@ -117,10 +112,8 @@ def test_failed_and_crashed_flights_are_reported_and_affect_no_other(tmp_path):
     waypoints = numbers['summary']['tasks']['waypoints']['nominal']
     assert waypoints['flights']['rl']['failures'] == {'0': FAILED['failure']}
     assert [waypoints['flights'][name]['lost'] for name in CONTROLLERS] == [0, 1, 0]
-    reached, last = waypoints['metrics']['reached'], waypoints['metrics']['4.U_position_m']
+    reached = waypoints['metrics']['reached']
     assert reached['nmpc']['mean'] == pytest.approx(200 / 15)
     assert [reached[name]['count'] for name in CONTROLLERS[1:]] == [1, 1]
-    assert [last[name]['count'] for name in CONTROLLERS] == [0, 0, 1]
     force = numbers['summary']['tasks']['force']['nominal']['metrics']
     assert force['lost']['rl']['mean'] == 30.0
-    assert force['20.peak_position_m']['rl']['count'] == 1
