@@ -212,8 +212,8 @@ class MotorBoard:
         self._last_stamp = stamp, micros
         return micros
 
-    def poll(self) -> tuple[BatteryReading | None, RotorStates | None, tuple]:
-        """Return battery, rotors and (level, text) of each event since the last call."""
+    def poll(self) -> tuple[BatteryReading | None, RotorStates | None]:
+        """Return battery and rotors since the last call."""
         with self._lock:
             return self.state.take()
 
@@ -222,6 +222,7 @@ class MotorBoard:
         clock = self.state.clock
         return {**self._receiver.counts, **self._counts,
                 **{f'board {name}': count for name, count in self.state.reception.items()},
+                'implausible voltages': self.state.implausible,
                 'clock_offset_s': clock.offset(),
                 'clock_uncertainty_ms': 1e3 * clock.uncertainty(time.monotonic())}
 
@@ -260,15 +261,10 @@ class MotorBoard:
                 if self._port is None:
                     time.sleep(RECONNECT)
                     self._connect()
-                    with self._lock:
-                        self.state.connection('')
                 else:
                     self._serve(self._port)
-            except SerialPortError as error:
-                if self._port is not None:      # lost, and not still missing
-                    self._disconnect()
-                    with self._lock:
-                        self.state.connection(str(error))
+            except SerialPortError:
+                self._disconnect()
             self._tick(time.monotonic())
 
     def _serve(self, port):
@@ -294,7 +290,6 @@ class MotorBoard:
 
     def _tick(self, now):
         with self._lock:
-            self.state.tick(now, self.connected)
             if self._command:
                 self._command.tick(now)
         if now >= self._next_heartbeat:

@@ -388,15 +388,13 @@ class RotorBridgeNode(BridgeNode):
         return True
 
     def _poll(self):
-        battery, rotors, events = self._board.poll()
+        battery, rotors = self._board.poll()
         if battery is not None:
             self._battery = battery
             self._batteries.publish(replace(battery, cells=self._cells))
         if rotors is not None:
             self._speeds = rotors
             self._rotors.publish(RotorReading(rotors.stamp, RPM * rotors.rpm))
-        for event in events:
-            self.log_line(*event)
 
     def state_text(self):
         """Return the state of the board, or why its port is closed."""
