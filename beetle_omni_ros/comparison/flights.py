@@ -91,17 +91,8 @@ def plan(controllers: Sequence[str], tasks: Sequence[str] = TASKS,
     """
     List all flights, longest first, so that none of the long ones remains at the end.
 
-    Args:
-        controllers: names, or references to classes.
-        tasks: names, or paths of pose files.
-        conditions: 'nominal', 'published'.
-        seeds: numbers from 0; None: those of ``SEEDS``.
-        policy: file that replaces the shipped policy, for the controller of `--policy`.
-        plant: robot file of the simulated plant.
-
-    Raises:
-        ParameterError: unknown conditions or task.
-
+    Seeds are those of ``SEEDS`` by default. ``policy`` is for the controller of `--policy`. A
+    ParameterError reports unknown conditions or an unknown task.
     """
     for entry in conditions:
         if entry not in CONDITIONS:
@@ -120,17 +111,10 @@ def plan(controllers: Sequence[str], tasks: Sequence[str] = TASKS,
 
 def fly_flight(flight: Flight, task: Task) -> dict:
     """
-    Fly a flight and compute its metrics; a failed flight has a result, too.
+    Fly a flight and compute its metrics; ``task`` was made on the computer with the pose file.
 
-    Args:
-        flight: the flight.
-        task: its task, made on the computer with the pose file.
-
-    Returns:
-        A dictionary with ``failure`` (None or one line), ``metrics`` (None or as in INTERFACES,
-        with ``steps``, the number of controller steps), ``cpu_s``, ``host`` and ``trace`` (name ->
-        array, see :func:`trace`).
-
+    Returned are ``failure`` (None or one line), ``metrics`` (None or as in INTERFACES),
+    ``cpu_s``, ``host`` and ``trace``, see :func:`trace`.
     """
     start = time.process_time()
     result = {'failure': None, 'metrics': None, 'trace': {}, 'host': platform.node()}
@@ -146,8 +130,7 @@ def fly_flight(flight: Flight, task: Task) -> dict:
                           policy=Path(flight.policy) if flight.policy else None)},
                       meta={'task': flight.task, 'conditions': flight.conditions,
                             'seed': flight.seed})
-            result['metrics'] = judged = metrics(log, task)
-            judged['steps'] = log.compute.get(flight.controller, {}).get('count', 0)
+            result['metrics'] = metrics(log, task)
             result['trace'] = trace(log, task)
     except Exception as error:  # the other flights continue after any failure of a controller
         text = ' '.join(str(error).split())

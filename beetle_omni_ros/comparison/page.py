@@ -70,11 +70,9 @@ NOTES = {
     'hover': 'At [0, 0, 1] m. Errors from 8 s to the end of 60 s; command changes from 7.0 to '
              '7.5 s.',
     'glance': 'Published numbers are of Gazebo, or of the real robot where marked with *; ours '
-              'are simulated. Bold as in the tables below, which have the intervals.',
-    'compute': 'Everything a controller does for one command, over all flights of this page: '
-               "median of the flights' medians, otherwise the worst flight. One core each, while "
-               "the other cores fly too ({processor}). Published times: on the robot's ARM "
-               'board; its RL number is the inference alone.'}
+              'are simulated. Bold as in the tables below, which have the intervals. CPU times: '
+              "everything for one command on one core, median of the flights' medians; the "
+              "published ones are of the robot's ARM board, that of RL of the inference alone."}
 
 
 @dataclass(frozen=True)
@@ -154,24 +152,6 @@ def table(results: dict, task: str, conditions: str) -> Grid:
                        NOTES[kind]]))
 
 
-def compute(results: dict) -> Grid:
-    """CPU time of a step of each controller."""
-    times = results['summary']['compute']
-    ours = [name for name in results['meta']['controllers'] if name in times]
-    rows = []
-    for text, key, digits, *published in (
-            ('median [ms]', 'median', 3, *COMPUTED),
-            ('99th percentile [ms]', 'p99', 2), ('largest [ms]', 'max', 2),
-            ('over 10 ms', 'deadline_misses', 0, ABSENT, '"occasionally"'), ('steps', 'steps', 0)):
-        rows.append([text, *(number(times[name][key], digits) for name in ours),
-                     *(published or [ABSENT] * len(PUBLISHED))])
-    return Grid('CPU time of one controller step', [
-        '', *(look(name).label for name in ours),
-        *(f'{look(name).label} (published, real robot)' for name in PUBLISHED)], rows,
-        note=NOTES['compute'].format(processor=results['meta']['machine']['processor']),
-        faint_columns=frozenset(range(len(ours) + 1, len(ours) + len(PUBLISHED) + 1)))
-
-
 def glance(results: dict) -> Grid:
     """Every experiment in one table."""
     ours = results['meta']['controllers']
@@ -193,7 +173,7 @@ def glance(results: dict) -> Grid:
                     for name in ours), *(
                     number(entry.get('mean'), None) + real * bool(entry) for entry in given)])
     rows.append(['CPU time of a step: median [ms]', *(
-        number(results['summary']['compute'].get(name, {}).get('median'), 3) for name in ours),
+        number(results['summary']['compute_ms'].get(name), 3) for name in ours),
         *(f'{text} *' for text in COMPUTED)])
     return Grid('All experiments', [
         '', *(look(name).label for name in ours),
@@ -224,7 +204,6 @@ def sections(results: dict, flown: dict) -> list[Section]:
                                               f'{caption} ({conditions} conditions)',
                                               png(figure)))
             made.append(Section(task_title(task), TEXTS.get(kind_of(task), ''), blocks))
-    made.append(Section('Compute time', '', [compute(results)]))
     return made
 
 

@@ -201,8 +201,8 @@ def summarise(flown: dict[Flight, dict]) -> dict:
 
     Returns:
         ``tasks``: task -> conditions -> ``flights`` (controller -> seeds, failures, lost) and
-        ``metrics`` (name in :data:`METRICS` -> :func:`statistics.compared`); ``compute``: CPU
-        times.
+        ``metrics`` (name in :data:`METRICS` -> :func:`statistics.compared`); ``compute_ms``:
+        controller -> CPU time of a step, median of the flights' medians.
 
     """
     summary: dict = {}
@@ -223,7 +223,13 @@ def summarise(flown: dict[Flight, dict]) -> dict:
             'metrics': {key: compared({name: _sample(metric, by_seed)
                                        for name, by_seed in judged.items()}, metric.more)
                         for key, metric in METRICS[kind_of(task)].items()}}
-    return {'tasks': summary, 'compute': _compute(flown)}
+    times: dict[str, list] = {}
+    for flight, result in flown.items():
+        median = at(result, 'metrics.compute_ms.median')
+        if median is not None:
+            times.setdefault(flight.controller, []).append(median)
+    return {'tasks': summary, 'compute_ms': {
+        name: float(np.median(values)) for name, values in times.items()}}
 
 
 def _sample(metric, by_seed):
@@ -234,23 +240,6 @@ def _sample(metric, by_seed):
         sample |= {(seed, k): each for k, each in enumerate(value)} \
             if isinstance(value, list) else {(seed,): value}
     return sample
-
-
-def _compute(flown):
-    """CPU time of a step of each controller over all its flights."""
-    made = {}
-    for controller in dict.fromkeys(flight.controller for flight in flown):
-        times = [{**result['metrics']['compute_ms'], 'steps': result['metrics'].get('steps', 0)}
-                 for flight, result in flown.items()
-                 if flight.controller == controller and result['metrics']
-                 and result['metrics']['compute_ms'].get('median') is not None]
-        if times:
-            made[controller] = {
-                'median': float(np.median([t['median'] for t in times])),
-                **{key: max(t[key] for t in times) for key in ('p99', 'max')},
-                **{key: sum(t[key] for t in times) for key in ('deadline_misses', 'steps')},
-                'flights': len(times)}
-    return made
 
 
 def printed(task: str, metric: Metric, column: str) -> dict:

@@ -17,7 +17,6 @@ import os
 from pathlib import Path
 import platform
 import re
-import socket
 import subprocess
 import warnings
 import zipfile
@@ -38,7 +37,6 @@ SOURCE = Path(__file__).resolve().parents[1]
 FLOWN = ('control', 'estimation', 'evaluation', 'messages', 'robot', 'runs', 'safety', 'sim')
 LENGTH = 16  # hexadecimal digits kept of a digest
 OBJECT_STORE = 200 * 2**20  # [byte] shared memory of a local Ray; results are far smaller
-REACH_TIMEOUT = 5.0  # [s] for an answer of a cluster
 LOST_WORKER = ('TerminatedWorkerError', 'BrokenProcessPool', 'RayActorError', 'ActorDiedError',
                'OutOfMemoryError')
 
@@ -73,15 +71,9 @@ def code_fingerprint(file: str) -> str:
 def flight_key(function: Callable, controller: str, *given: str, policy: str = '',
                plant: str = '') -> str:
     """
-    Digest of everything that determines the result of a flight.
+    Digest of everything that determines the result of a flight by ``function``.
 
-    Args:
-        function: function that flies it.
-        controller: name or class, as in the registry.
-        given: its other inputs.
-        policy: file in place of the controller's policy, '' for its own.
-        plant: robot file of the simulated plant, '' for the shipped one.
-
+    ``policy`` and ``plant`` are files, '' for the shipped ones; ``given`` are its other inputs.
     """
     file = policy_file(controller, policy)
     return digest(
@@ -185,7 +177,7 @@ def sweep(function: Callable[..., dict], calls: Sequence[tuple], *, store: Store
           line: Callable[[object, dict, bool], str] = lambda flight, result, kept: '',
           ) -> list[dict]:
     """
-    Fly all flights that are not stored, with a progress bar.
+    Fly all flights that are not stored, with a progress bar; return the results of all.
 
     Args:
         function: function at the top of a module that flies one flight.
@@ -197,9 +189,6 @@ def sweep(function: Callable[..., dict], calls: Sequence[tuple], *, store: Store
         address: address of a running Ray cluster; None: a Ray on this computer.
         console: console for the progress and the lines.
         line: text about a flight from its result and whether it was stored before; '' for none.
-
-    Returns:
-        the results in the order of ``calls``.
 
     Raises:
         ParameterError: Ray is absent or not reachable.
@@ -300,10 +289,6 @@ def _start_ray(jobs, address):
     quiet = {'logging_level': 'ERROR', 'log_to_driver': False}
     try:
         if address:
-            # Connect first, because Ray itself tries for a minute and prints many lines.
-            host, _, port = address.rpartition('://')[2].rpartition(':')
-            if host and port.isdecimal():
-                socket.create_connection((host, int(port)), timeout=REACH_TIMEOUT).close()
             ray.init(address=address, **quiet)
         else:
             ray.init(address='local', num_cpus=max(2, jobs or joblib.cpu_count()),

@@ -76,28 +76,11 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
                  options: Mapping[str, ControllerOptions] = MappingProxyType({}),
                  faults: Path | None = None, console: Console | None = None) -> dict:
     """
-    Fly a task with each controller and report.
+    Fly a task with each controller and report; arguments as of `beetle_omni evaluate`.
 
-    Args:
-        controllers: names or references to classes, see :func:`control.registry.find`.
-        task: task, or its name or pose file.
-        conditions: 'nominal' or 'published'.
-        robot: robot file of estimator and controllers; default the shipped one.
-        plant: robot file of the simulated plant; default ``robot``.
-        seed: seed of the task's poses and of the simulation.
-        bag: folder of a bag; with several controllers it contains one bag for each.
-        compression: compression of the bags, 'none' or 'zstd'.
-        json_path: file for the results.
-        options: controller -> files in place of its own.
-        faults: file of faults with times since the task's start and durations.
-        console: console for the output.
-
-    Returns:
-        the results as in INTERFACES: ``meta`` and a key for each controller.
-
-    Raises:
-        ParameterError: unusable input, one line.
-
+    ``options`` are files in place of a controller's own. With several controllers, ``bag``
+    contains one bag for each. Returned are ``meta`` and a key for each controller, as in
+    INTERFACES. A ParameterError reports unusable input.
     """
     console = console or table.Terminal()
     believed = RobotParameters.load(robot)
