@@ -1,7 +1,8 @@
 """`beetle_omni evaluate`: flies tasks in one process with one or several controllers."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from time import time
 from types import MappingProxyType
@@ -32,7 +33,7 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
         options: Mapping[str, ControllerOptions] = MappingProxyType({}),
         built: Controller | None = None, bag: Path | None = None, compression: str = 'none',
         meta: dict | None = None, faults: Sequence[Fault] = (),
-        progress=lambda part: None) -> FlightLog:
+        progress: Callable[..., None] | None = None) -> FlightLog:
     """
     Fly one task with one controller; :func:`run_evaluate` describes the other arguments.
 
@@ -62,10 +63,8 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
             recorder = Recorder(memory, stack.enter_context(BagWriter(
                 bag, meta=meta, topics=tuple(topics_with([entry.name])), compression=compression,
                 frames=True, epoch=int(time()))))
-        loop = FlightLoop(robot, plant, aboard, recorder, conditions=conditions, seed=seed,
-                          faults=faults)
-        recorder.write_meta({'crashed': not loop.fly(task, progress),
-                             'controller_error': loop.controller_error})
+        FlightLoop(robot, plant, aboard, recorder, conditions=conditions, seed=seed,
+                   faults=faults).fly(task, progress)
     return memory.log()
 
 
@@ -110,7 +109,7 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
                       seed=seed, options=options, built=controller,
                       bag=bag / name if bag and len(built) > 1 else bag, compression=compression,
                       meta=meta, faults=injected,
-                      progress=lambda part, bar=bar: bars.update(bar, completed=part))
+                      progress=partial(bars.update, bar))
             results[name] = metrics(log, task)
             if error := log.meta['controller_error']:
                 console.print(f'{name}: {error}', style='yellow', markup=False, highlight=False)

@@ -182,22 +182,12 @@ class FlightLoop:
         self._health = ALL_HEALTHY
         self._crashed = False
 
-    @property
-    def controller_error(self) -> str:
-        """The last exception of each controller with their number, or ''."""
-        return '; '.join(f'{host.error}, {host.errors} times' for host in self._hosts.values()
-                         if host.errors)
-
-    def fly(self, task: Task, progress: Callable[[float], None] = lambda part: None) -> bool:
+    def fly(self, task: Task, progress: Callable[..., None] | None = None) -> bool:
         """
-        Take off and fly the task; ``progress`` is called with its completed fraction, 0 to 1.
+        Take off and fly the task; return whether the robot was airborne to the end.
 
-        Returns:
-            whether the robot was airborne to the end.
-
-        Raises:
-            ParameterError, RunError: no take-off.
-
+        ``progress`` gets the fraction ``completed``, 0 to 1. ParameterError and RunError: no
+        take-off.
         """
         simulator = self.simulator
         with collector_off():
@@ -225,9 +215,15 @@ class FlightLoop:
                     for name, times in self._times.items():
                         self._recorder.write_compute(simulator.time, name, **compute_summary(
                             times, self._hosts[name].controller.period))
-                    progress(1.0 if over else (simulator.time - began) / task.duration)
+                    if progress:
+                        progress(completed=(simulator.time - began) / task.duration)
                 if over:
-                    return not (self._crashed or moment.lost or truth.broken)
+                    break
+        stayed = not (self._crashed or moment.lost or truth.broken)
+        self._recorder.write_meta({'crashed': not stayed, 'controller_error': '; '.join(
+            f'{host.error}, {host.errors} times' for host in self._hosts.values()
+            if host.errors)})
+        return stayed
 
     def start_faults(self) -> None:
         """Start the time of the faults."""
@@ -341,7 +337,7 @@ class FlightLoop:
                 host.on_health(supervisor.health)
             if self._ticks % self._every[name]:
                 continue
-            command = host.step(state, self._target_of_fault(host))
+            command = host.step(state, self._target_of_fault(host) if self._faults else None)
             if command is not None:
                 commands[name] = command
         self._health = supervisor.health

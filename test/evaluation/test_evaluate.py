@@ -105,6 +105,7 @@ def test_a_crash_ends_the_command_with_status_1_after_the_results(poses, tmp_pat
     assert cli.main(['evaluate', '--controllers', f'{own}:Own', '--task', str(poses), '--json',
                      str(result)]) == 1
     assert json.loads(result.read_text())['own']['crashed']
+    assert own_files(f'{own}:Own') == (own,) and own_files('nmpc') == ()
 
 
 def test_an_exception_in_flight_falls_back_and_is_in_the_results(tmp_path):
@@ -153,12 +154,6 @@ def test_faults_of_a_file_act_and_are_listed_in_the_results(tmp_path):
     log = read_bag(tmp_path / 'bag')
     assert log.meta['faults'] == listed
     assert 'fallback:controller_silent' in log.states
-
-
-def test_flights_of_an_own_controller_are_kept_with_its_code(tmp_path):
-    own = tmp_path / 'own.py'
-    own.write_text(OPEN_LOOP)
-    assert own_files(f'{own}:Own') == (own,) and own_files('nmpc') == ()
 
 
 def test_a_task_beyond_the_declared_reach_of_a_controller_is_refused(tmp_path):
