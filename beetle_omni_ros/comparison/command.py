@@ -6,7 +6,6 @@ import platform
 import shlex
 import sys
 
-import joblib
 from rich.console import Console
 
 from beetle_omni_ros import __version__
@@ -129,9 +128,7 @@ def results_of(flown: dict, tasks: Sequence[str], conditions: Sequence[str],
                  'policies': {name: f'{file.name} ({file_digest(file)})'
                               for name, file in files.items() if file},
                  'cpu_s': sum(result.get('cpu_s', 0.0) for result in flown.values()),
-                 'machine': {'processor': _processor(), 'cores': joblib.cpu_count(),
-                             'system': f'{platform.system()} {platform.machine()}'},
-                 'versions': versions()},
+                 'processor': _processor(), 'versions': versions()},
         'summary': summarise({flight: flown[flight] for flight in flights}),
         'flights': [{'task': flight.task, 'conditions': flight.conditions,
                      'controller': flight.controller, 'seed': flight.seed,

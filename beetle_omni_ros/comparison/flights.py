@@ -34,27 +34,15 @@ TRACE_PERIOD = 0.05  # [s] between samples of a trace
 
 @dataclass(frozen=True, order=True)
 class Flight:
-    """
-    One flight of a comparison.
+    """One flight of a comparison."""
 
-    Attributes:
-        task: name, or path of a pose file.
-        conditions: 'nominal' or 'published'.
-        controller: name in the results.
-        seed: seed of the task's poses and of the simulation.
-        policy: file in place of its shipped policy, '' for none.
-        spec: reference to its class, '' for a registered controller.
-        plant: robot file of the simulated plant, '' for the shipped one.
-
-    """
-
-    task: str
-    conditions: str
-    controller: str
-    seed: int
-    policy: str = ''
-    spec: str = ''
-    plant: str = ''
+    task: str           # name, or path of a pose file
+    conditions: str     # 'nominal' or 'published'
+    controller: str     # name in the results
+    seed: int           # of the task's poses and of the simulation
+    policy: str = ''    # file in place of its shipped policy, '' for none
+    spec: str = ''      # reference to its class, '' for a registered controller
+    plant: str = ''     # robot file of the simulated plant, '' for the shipped one
 
     @property
     def name(self) -> str:

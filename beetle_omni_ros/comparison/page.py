@@ -230,7 +230,7 @@ def content(results: dict, made: list[Section]) -> dict:
              + (f", commit {meta['commit']}" if meta.get('commit') else ''),
              f"{len(results['flights'])} flights, {failed} failed; seeds "
              f"{', '.join(map(str, meta['seeds']))}",
-             f"{meta['cpu_s'] / 60:.1f} core minutes on {meta['machine']['processor']}",
+             f"{meta['cpu_s'] / 60:.1f} core minutes on {meta['processor']}",
              *([f"simulated plant: {meta['plant']}"] if meta['plant'] else []),
              *(f'{look(name).label}: policy {digest}'
                for name, digest in meta['policies'].items())]

@@ -47,15 +47,11 @@ class ServoBusParameters(ParameterFile, file='servo_bus.yaml'):
 
 @dataclass(frozen=True, kw_only=True)
 class MotorBoardParameters(ParameterFile, file='motor_board.yaml'):
-    """Port, rate and time limits of the driver of the motor board."""
+    """Port of the motor board, and when it is silent."""
 
     port: str = parameter(doc='serial port')
     baud: int = parameter(
         921600, doc='baud rate of the port', unit='bit/s', low=9600, high=4000000)
-    target_rate: float = parameter(
-        200.0, doc='rate of the targets, new or repeated', unit='Hz', low=20, high=1000)
-    stamp_age_limit: float = parameter(
-        0.1, doc='oldest stamp of a target that is sent', unit='s', low=0.01, high=1)
     silence: float = parameter(
         0.3, doc='time without a packet after which the board is silent', unit='s', low=0.05,
         high=5)

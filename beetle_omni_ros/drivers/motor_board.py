@@ -20,6 +20,7 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import BatteryReading
 from beetle_omni_ros.robot.thrust_map import ThrustMap
 
+TARGET_AGE = 0.1        # [s] of the oldest stamp of a target that is sent
 TICK = 0.01             # [s] longest sleep of the thread, a tenth of its shortest period
 CORRECTION = 50_000     # [us] a larger backward step of the board's clock is a restart
 HEARTBEAT_PERIOD = 0.2  # [s] by the contract, as the next three
@@ -186,7 +187,7 @@ class MotorBoard:
         time of the state estimate that they answer [s].
         """
         age = self._clock() - stamp
-        if abs(age) > self.parameters.stamp_age_limit:
+        if abs(age) > TARGET_AGE:
             return 'stale stamp' if age > 0 else 'stamp in the future'
         if not self.state.clock.known:
             return "offset of the board's clock unknown"

@@ -199,7 +199,6 @@ class ServoBus:
                 problems.append(f'{servo.name} (id {servo.identifier}): {problem}; {remedy}')
                 continue
             try:
-                servo.turns_known &= self._is_marked(servo)
                 self._apply_settings(servo)
             except ServoBusError as error:
                 problems.append(f'{servo.name}: {error}')
@@ -383,16 +382,17 @@ class ServoBus:
             self.link.close()
 
     def _apply_settings(self, servo):
-        given, identifier = self.parameters, servo.identifier
+        link, identifier = self.link, servo.identifier
+        current = round(self.parameters.current_limit / registers.CURRENT_UNIT)
         permanent = [       # in EEPROM; the mode is first, because it resets the gains
             (registers.OPERATING_MODE, registers.EXTENDED_POSITION),
             (registers.DRIVE_MODE, 0), (registers.HOMING_OFFSET, 0), (registers.RETURN_DELAY, 0),
-            (registers.CURRENT_LIMIT, round(given.current_limit / registers.CURRENT_UNIT))]
+            (registers.CURRENT_LIMIT, current)]
         if servo.firmware >= registers.STARTUP_FIRMWARE:
             permanent.append((registers.STARTUP, 0))    # nothing is restored after power-up
-        link = self.link
-        link.write(identifier, registers.WATCHDOG, 0)
-        link.write(identifier, registers.TORQUE_ENABLE, 0)
+        servo.turns_known &= self._is_marked(servo)
+        for register in (registers.WATCHDOG, registers.TORQUE_ENABLE):
+            link.write(identifier, register, 0)
         for register, value in permanent:
             if link.read(identifier, register, ATTEMPTS) != value:
                 link.write(identifier, register, value)

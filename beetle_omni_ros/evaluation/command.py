@@ -35,16 +35,10 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
         meta: dict | None = None, faults: Sequence[Fault] = (),
         progress: Callable[..., None] | None = None) -> FlightLog:
     """
-    Fly one task with one controller; :func:`run_evaluate` describes the other arguments.
+    Fly one task with one controller, a name or a reference to a class; ``built`` is that one.
 
-    ``controller`` is a name or a reference to a class, ``built`` the same if it was built before.
-
-    Returns:
-        the flight, also after a crash (``meta['crashed']``).
-
-    Raises:
-        ParameterError: a pose of the task is beyond the controller's reach.
-
+    Other arguments are those of :func:`run_evaluate`. The flight is returned after a crash, too
+    (``meta['crashed']``). ParameterError: a pose of the task is beyond the controller's reach.
     """
     entry = registry.find(controller)
     flying = built or entry.make(robot, options.get(entry.reference, ControllerOptions()))

@@ -1,11 +1,8 @@
 """
 One flight in one process: plant, sensors, estimator, controllers and supervisor.
 
-The parts are those of the ROS graph, called in the order in which messages would arrive. A tick of
-the simulator produces readings, and the estimator uses them. In every second tick the controllers
-compute a command from the estimate. The supervisor selects and checks the command, and the
-actuators execute it after its delay. Nothing depends on wall time, so that a seed determines all
-numbers.
+The parts are those of the ROS graph, called in the order in which messages would arrive. Nothing
+depends on wall time, so that a seed determines all numbers.
 """
 
 from __future__ import annotations

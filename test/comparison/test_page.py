@@ -87,7 +87,7 @@ def test_published_numbers_keep_their_printed_form(whole):
 def test_pictures_named_in_the_markdown_exist(whole):
     folder, _, _, text = whole
     names = re.findall(r'!\[[^\]]*\]\(([^)]+)\)', text)
-    assert len(names) == 16
+    assert len(names) == 14
     for name in names:
         assert (folder / name).read_bytes().startswith(b'\x89PNG')
     assert {path.name for path in folder.glob('*.png')} == set(names)
