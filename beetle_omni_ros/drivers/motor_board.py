@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import atexit
 from collections.abc import Callable
 import math
 import select
@@ -128,11 +127,9 @@ class MotorBoard:
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name='motor_board', daemon=True)
         self._thread.start()
-        atexit.register(self.close)
 
     def close(self) -> None:
         """Disarm, wait shortly for the acknowledgement, close the port."""
-        atexit.unregister(self.close)
         if self._thread is None:
             return
         self.start(False).wait()

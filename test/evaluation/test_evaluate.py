@@ -74,19 +74,6 @@ def test_each_controller_has_a_bag_that_gives_the_numbers_of_its_flight(poses, f
     assert again['success_rate'] == results['nmpc']['success_rate'] == 1.0
 
 
-def test_a_flight_ended_by_the_supervisor_is_reported_with_time_and_reason(poses, monkeypatch):
-    small = SimulatorParameters.load()
-    small = replace(small, battery_capacity=0.04)
-    monkeypatch.setattr(SimulatorParameters, 'load', lambda: small)
-    monkeypatch.setattr(loop, 'SWAP_CHARGE', 0.0)
-    text = io.StringIO()
-    results = command.run_evaluate(controllers=['nmpc'], task=str(poses),
-                                   console=Console(file=text, width=200))
-    assert 'battery' in results['nmpc']['ended']     # empty, or too weak before that
-    assert results['nmpc']['ended'].startswith('landing: ')
-    assert results['nmpc']['ended'] in text.getvalue().partition('crashed')[0]
-
-
 OPEN_LOOP = """
 import numpy as np
 from beetle_omni_ros.control.base import Command
