@@ -42,7 +42,7 @@ evaluate: setup  ## 100 random poses, in one process and faster than real time
 
 compare: setup  ## every experiment for RL and NMPC, to docs/comparison/; continues an interrupted run
 	@mkdir -p docs/comparison runs_out
-	$(TOOL) compare --output docs/comparison --cache runs_out/comparison --readme README.md $(ARGS)
+	$(TOOL) compare --output docs/comparison --cache runs_out/comparison $(ARGS)
 
 faults: setup  ## every listed fault from hover, on the move, upside down; to runs_out/faults/ (ARGS='--seeds 10')
 	@mkdir -p runs_out

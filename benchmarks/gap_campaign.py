@@ -63,7 +63,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument('--robot', type=Path, default=ROBOT_FILE, help='file for the workflows')
     parser.add_argument('--command-age', type=float, default=load_numbers()['command_age'],
                         metavar='S', help="from a command's stamp until it acts (%(default)s)")
-    parser.add_argument('--backend', default='processes', help='processes or ray')
+    parser.add_argument('--backend', default='processes', choices=('processes', 'ray'))
     parser.add_argument('--jobs', type=int, help='at a time (every core)')
     parser.add_argument('--address', help='of a running Ray cluster')
     parser.add_argument('--timeout', type=float, default=300.0, metavar='S', help='for a case')
@@ -136,8 +136,7 @@ def main(arguments: list[str] | None = None) -> int:
         cases = select(make_cases(settings, given.set, given.seed, given.command_age),
                        given.only)
         workflows = choose_workflows(given)
-        from beetle_omni_ros.evaluation.campaign import check_backend, workers
-        check_backend(given.backend)
+        from beetle_omni_ros.evaluation.campaign import workers
     except ValueError as error:
         console.print(str(error), style='red', markup=False)
         return 2

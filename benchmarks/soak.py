@@ -32,7 +32,6 @@ from beetle_omni_ros.nodes.graph import (
     BRIDGES,
     confine,
     Graph,
-    in_simulated_time,
     reserved_domain,
 )
 from beetle_omni_ros.nodes.operator import Operator
@@ -59,27 +58,6 @@ class Sample:
     files: int
 
 
-@dataclass(frozen=True)
-class Growth:
-    """Growth of one process after the warm-up."""
-
-    process: str
-    memory_start_MB: float
-    memory_end_MB: float
-    memory_MB_per_hour: float
-    threads_start: int
-    threads_end: int
-    files_start: int
-    files_end: int
-    samples: int
-
-    @property
-    def grows(self) -> bool:
-        """Whether the growth exceeds its limits."""
-        return not self.memory_MB_per_hour <= LIMIT or self.threads_end > self.threads_start \
-            or self.files_end > self.files_start
-
-
 def read_sample(pid: int, t: float) -> Sample | None:
     """Read a sample of a process; None if it has ended."""
     place = Path(f'/proc/{pid}')
@@ -92,24 +70,29 @@ def read_sample(pid: int, t: float) -> Sample | None:
         return None
 
 
-def growth(process: str, samples: list[Sample], warm_up: float) -> Growth | None:
+def growth(process: str, samples: list[Sample], warm_up: float) -> dict | None:
     """Fit the samples after ``warm_up`` [s]; None for fewer than three."""
     kept = [sample for sample in samples if sample.t >= warm_up]
     if len(kept) < 3:
         return None
     t, memory = np.array([[sample.t, sample.memory] for sample in kept]).T
     slope, start = np.polyfit(t - t[0], memory, 1)
-    return Growth(process, float(start), float(start + slope * (t[-1] - t[0])),
-                  float(3600 * slope), kept[0].threads, kept[-1].threads,
-                  kept[0].files, kept[-1].files, len(kept))
+    first, last = kept[0], kept[-1]
+    return {'process': process, 'memory_start_MB': float(start),
+            'memory_end_MB': float(start + slope * (t[-1] - t[0])),
+            'memory_MB_per_hour': float(3600 * slope),
+            'threads_start': first.threads, 'threads_end': last.threads,
+            'files_start': first.files, 'files_end': last.files,
+            'grows': not 3600 * slope <= LIMIT or last.threads > first.threads
+            or last.files > first.files}
 
 
-def make_graph(folder: Path, number: int, given) -> Graph:
+def make_graph(folder: Path, number: int, minutes: float) -> Graph:
     """Make the graph of ``fly`` in ``folder``, with a larger pack."""
     simulator = yaml.safe_load(share_path('params/simulator.yaml').read_text())
     simulator['/**/sim_node']['ros__parameters']['battery_capacity'] = CAPACITY
     (folder / 'simulator.yaml').write_text(yaml.safe_dump(simulator))
-    count = int(60 * given.minutes / POSE_DURATION) + 2
+    count = int(60 * minutes / POSE_DURATION) + 2
     rows = [','.join(f'{v:g}' for v in WAYPOINTS[k % len(WAYPOINTS)]) for k in range(count)]
     (folder / 'poses.csv').write_text('\n'.join([','.join(COLUMNS), *rows]) + '\n')
     parameters = {
@@ -117,11 +100,8 @@ def make_graph(folder: Path, number: int, given) -> Graph:
         'sim_node': {'simulator_file': str(folder / 'simulator.yaml')},
         'ekf_node': {}, 'nmpc_node': {}, 'rl_node': {}, 'supervisor_node': {},
         'reference_node': {'task': str(folder / 'poses.csv')}}
-    if given.actuators == 'emulated':
-        for node, values in bridge_parameters(folder, {}).items():
-            parameters[node] = {**parameters.get(node, {}), **values}
-    if given.clock == 'simulated':
-        parameters = in_simulated_time(parameters)
+    for node, values in bridge_parameters(folder, {}).items():
+        parameters[node] = {**parameters.get(node, {}), **values}
     return Graph(parameters, folder, number)
 
 
@@ -162,7 +142,7 @@ def watch(graph: Graph, operator: Operator, seconds: float, say: Callable[[str],
     return samples, ''
 
 
-def soak(given, console: Console) -> dict:
+def soak(minutes: float, console: Console) -> dict:
     """Fly, sample, land and stop; return the results."""
     confine()
     folder = Path(tempfile.mkdtemp(prefix='soak_'))
@@ -171,11 +151,11 @@ def soak(given, console: Console) -> dict:
     try:
         with reserved_domain() as number:
             try:
-                graph = make_graph(folder, number, given)
+                graph = make_graph(folder, number, minutes)
                 graph.start()
                 operator = Operator(number)
                 take_off(operator, [node for node in graph.nodes if node in BRIDGES])
-                samples, ended = watch(graph, operator, 60 * given.minutes, console.log)
+                samples, ended = watch(graph, operator, 60 * minutes, console.log)
                 operator.call('land')
                 operator.wait(lambda: operator.state in ('disarmed', 'emergency_stop'), LANDING)
             finally:
@@ -187,11 +167,11 @@ def soak(given, console: Console) -> dict:
             console.print(line, markup=False, highlight=False, style='yellow')
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-    warm_up = max(WARM_UP * 60 * given.minutes, WARM_UP_LEAST)
+    warm_up = max(WARM_UP * 60 * minutes, WARM_UP_LEAST)
     found = [growth(name, taken, warm_up) for name, taken in samples.items()]
-    return {'minutes': given.minutes, 'warm_up_s': warm_up, 'limit_MB_per_hour': LIMIT,
+    return {'minutes': minutes, 'warm_up_s': warm_up, 'limit_MB_per_hour': LIMIT,
             'ended_early': ended, 'killed': stubborn, 'bag_MB': bag_mb,
-            'processes': [{**asdict(one), 'grows': one.grows} for one in found if one],
+            'processes': [one for one in found if one],
             'samples': {name: [asdict(one) for one in taken] for name, taken in samples.items()}}
 
 
@@ -214,15 +194,10 @@ def main(arguments: list[str] | None = None) -> int:
     """Fly and print the growth; status 1 if a limit is exceeded."""
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument('--minutes', type=float, default=60.0, help='of flight')
-    parser.add_argument('--actuators', choices=('emulated', 'direct'), default='emulated')
-    parser.add_argument('--clock', choices=('system', 'simulated'), default='system',
-                        help='simulated needs --actuators direct; minutes are of real time')
     parser.add_argument('--json', type=Path, help='file for the numbers')
     given = parser.parse_args(arguments)
-    if given.clock == 'simulated' and given.actuators == 'emulated':
-        parser.error('serial devices keep real time; expected --actuators direct')
     console = Console()
-    result = soak(given, console)
+    result = soak(given.minutes, console)
     print_table(result, console)
     if given.json:
         given.json.write_text(json.dumps(result, indent=1) + '\n')

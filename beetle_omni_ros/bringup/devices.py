@@ -257,7 +257,7 @@ def _listen(board, seconds):
     receptions = []
     started = time.monotonic()
     while (passed := time.monotonic() - started) < seconds:
-        new_battery, new_rotors, _ = board.poll()
+        new_battery, new_rotors = board.poll()
         rotors, battery = new_rotors or rotors, new_battery or battery
         reception = board.state.reception
         # The restart of our sequence numbers looks like lost packets to the board.

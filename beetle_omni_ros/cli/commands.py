@@ -21,6 +21,7 @@ from beetle_omni_ros.cli.options import (
     KNOWN,
     NamespaceOption,
     NmpcOption,
+    one_of,
     OtherRobotOption,
     OutputOption,
     PageOption,
@@ -150,7 +151,7 @@ def compare(controllers: Annotated[str | None, Option(callback=several, metavar=
             policy: PolicyOption = None,
             plant: PlantOption = None,
             jobs: JobsOption = None,
-            backend: Annotated[str, Option(metavar='processes|ray', help=(
+            backend: Annotated[str, Option(callback=one_of, metavar='processes|ray', help=(
                 'Run the flights on this computer, or on Ray.'))] = 'processes',
             address: Annotated[str | None, Option(
                 '--ray-address', metavar='ADDRESS', envvar='RAY_ADDRESS', help=(
@@ -158,8 +159,6 @@ def compare(controllers: Annotated[str | None, Option(callback=several, metavar=
             output: OutputOption = Path('comparison'),
             cache: Annotated[Path | None, Option(metavar='DIR', help=(
                 'Cache of finished flights. Default: .flights in the output.'))] = None,
-            readme: Annotated[Path | None, Option(metavar='FILE', help=(
-                'Markdown file whose table of results is renewed.'))] = None,
             json_path: JsonOption = None):
     """
     Fly every experiment with several controllers and write one page about it.

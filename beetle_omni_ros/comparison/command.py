@@ -1,11 +1,11 @@
 """`beetle_omni compare`: flies every experiment with several controllers and writes the page."""
 
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
 import platform
+import shlex
 import sys
 
-import joblib
 from rich.console import Console
 
 from beetle_omni_ros import __version__
@@ -16,7 +16,6 @@ from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import guidance_of
 from beetle_omni_ros.control.registry import ControllerOptions
 from beetle_omni_ros.evaluation.campaign import (
-    check_backend,
     commit,
     file_digest,
     policy_file,
@@ -24,15 +23,12 @@ from beetle_omni_ros.evaluation.campaign import (
     sweep,
     versions,
 )
-from beetle_omni_ros.pages.page import print_grids, Terminal
+from beetle_omni_ros.pages.page import print_grids, rendered, Terminal
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.files import write_json, write_text
-from beetle_omni_ros.runs.metrics import failed
 
 PAGE, NUMBERS, TEXT = 'comparison.html', 'comparison.json', 'README.md'
-HOW = '../how-to/comparison.md'     # link from a folder in docs/
-WIDE = 120  # columns of a terminal that shows the published numbers
 FLIGHTS = '.flights'  # default folder of finished flights, in the output folder
 
 
@@ -41,8 +37,8 @@ def run_compare(*, output: Path, controllers: list[str] | None = None,
                 seeds: list[int] | None = None, jobs: int | None = None,
                 backend: str = 'processes', address: str | None = None,
                 cache: Path | None = None, policy: Path | None = None,
-                plant: Path | None = None, readme: Path | None = None,
-                json_path: Path | None = None, console: Console | None = None) -> dict:
+                plant: Path | None = None, json_path: Path | None = None,
+                console: Console | None = None) -> dict:
     """
     Fly the missing flights, then write page, pictures and numbers.
 
@@ -57,26 +53,21 @@ def run_compare(*, output: Path, controllers: list[str] | None = None,
 
     """
     console = console or Terminal()
-    names = controllers or registry.compared()
-    arguments = (names, tasks or TASKS, conditions or CONDITIONS, seeds)
-    check_backend(backend)
-    if readme:
-        page.parted(readme)     # refuses a file without the place
-    if plant:
-        RobotParameters.load(plant)
-    plan(*arguments)  # refuses unusable input before any work
-    available, skipped = _available(names, policy, refuse=controllers is not None)
+    RobotParameters.load(plant)     # refuses an unusable file before any work
+    available, skipped = _available(controllers or registry.compared(), policy,
+                                    refuse=controllers is not None)
     for name, reason in skipped.items():
         print(f'beetle_omni: {name} is left out: {reason}', file=sys.stderr)
-    flights = plan([entry.reference for entry in available], *arguments[1:], policy=policy,
-                   plant=plant)
+    flights = plan([entry.reference for entry in available], tasks or TASKS,
+                   conditions or CONDITIONS, seeds, policy, plant)
     output = Path(output)
     store = Store(cache or output / FLIGHTS)
     try:
         output.mkdir(parents=True, exist_ok=True)
         made = sweep(fly_flight, [(flight, flight.make_task()) for flight in flights],
                      store=store, backend=backend, jobs=jobs, address=address, console=console,
-                     line=_line)
+                     line=lambda flight, result, kept: f'{flight.name}: ' + (
+                         result['failure'] or ('kept' if kept else f"{result['cpu_s']:.0f} s")))
     except KeyboardInterrupt:
         print(f'beetle_omni: finished flights are kept in {store.folder}; the same command '
               'continues from there', file=sys.stderr)
@@ -84,12 +75,9 @@ def run_compare(*, output: Path, controllers: list[str] | None = None,
     except OSError as error:
         raise ParameterError(f'{output}: cannot write there ({error.strerror})') from None
     flown = dict(zip(flights, made, strict=True))
-    results = results_of(flown, arguments, [entry.name for entry in available], skipped, policy,
-                         plant)
-    results['meta']['guidance'] = {entry.name: text for entry, text in available.items()}
+    results = results_of(flown, tasks or TASKS, conditions or CONDITIONS,
+                         {entry.name: text for entry, text in available.items()}, skipped)
     write(results, flown, output, console)
-    if readme:
-        write_text(readme, page.with_table(readme, results), '--readme')
     write_json(json_path, results)
     return results
 
@@ -117,52 +105,30 @@ def _available(names, policy, refuse):
     return available, skipped
 
 
-def _line(flight, result, kept):
-    if result['failure']:
-        return f"{flight.name}: failed, {result['failure']}"
-    metrics, parts = result['metrics'], []
-    poses = metrics['poses']
-    if len(poses) > 1:
-        parts.append(f"{sum(pose['reached'] for pose in poses)} of {len(poses)} reached")
-    for kind, unit in (('force', 'N'), ('torque', 'N_m')):
-        if kind in metrics:
-            level = metrics[kind][f'lost_at_{unit}']
-            parts.append('control never lost' if level is None else
-                         f"control lost at {level:g} {unit.replace('_', ' ')}")
-    if failed(metrics):
-        parts.append(metrics.get('ended') or 'touched the ground')
-    parts.append('kept' if kept else f"{result['cpu_s']:.0f} s")
-    return f"{flight.name}: {', '.join(parts)}"
+def results_of(flown: dict, tasks: Sequence[str], conditions: Sequence[str],
+               guidance: dict[str, str], skipped: dict) -> dict:
+    """
+    Content of the JSON file, from plain values, so that it is equal after reading.
 
-
-def results_of(flown: dict, arguments: tuple, names: list[str], skipped: dict,
-               policy: Path | None = None, plant: Path | None = None) -> dict:
-    """Content of the JSON file, from plain values, so that it is equal after reading."""
-    _, tasks, conditions, seeds = arguments
-    order = {name: k for k, name in enumerate((*tasks, *conditions, *names))}
+    ``guidance`` is that of each controller, ``skipped`` the reason for each other one.
+    """
+    order = {name: k for k, name in enumerate((*tasks, *conditions, *guidance))}
     flights = sorted(flown, key=lambda flight: (
         order[flight.task], order[flight.conditions], order[flight.controller], flight.seed))
-    specs = {flight.controller: flight.spec for flight in flights if flight.spec}
-    references = [specs.get(name, name) for name in names]
     files = {flight.controller: policy_file(flight.reference, flight.policy)
              for flight in flights}
-    command = (f"beetle_omni compare --controllers {','.join(references)} "
-               f"--tasks {','.join(tasks)} --conditions {','.join(conditions)}"
-               + (f" --seeds {','.join(map(str, seeds))}" if seeds else '')
-               + (f' --policy {policy}' if policy else '')
-               + (f' --plant {plant}' if plant else ''))
     return {
-        'meta': {'version': __version__, 'commit': commit(), 'command': command,
-                 'controllers': names, 'specs': specs, 'skipped': skipped, 'tasks': list(tasks),
-                 'conditions': list(conditions),
+        'meta': {'version': __version__, 'commit': commit(),
+                 'command': shlex.join(['beetle_omni', *sys.argv[1:]]),
+                 'controllers': list(guidance), 'guidance': guidance, 'skipped': skipped,
+                 'specs': {flight.controller: flight.spec for flight in flights if flight.spec},
+                 'tasks': list(tasks), 'conditions': list(conditions),
                  'seeds': sorted({flight.seed for flight in flights}),
-                 'plant': str(plant) if plant else None,
-                 'policies': {name: f'{files[name].name} ({file_digest(files[name])})'
-                              for name in names if files[name]},
+                 'plant': flights[0].plant,
+                 'policies': {name: f'{file.name} ({file_digest(file)})'
+                              for name, file in files.items() if file},
                  'cpu_s': sum(result.get('cpu_s', 0.0) for result in flown.values()),
-                 'machine': {'processor': _processor(), 'cores': joblib.cpu_count(),
-                             'system': f'{platform.system()} {platform.machine()}'},
-                 'versions': versions()},
+                 'processor': _processor(), 'versions': versions()},
         'summary': summarise({flight: flown[flight] for flight in flights}),
         'flights': [{'task': flight.task, 'conditions': flight.conditions,
                      'controller': flight.controller, 'seed': flight.seed,
@@ -183,18 +149,14 @@ def write(results: dict, flown: dict, output: Path, console: Console) -> None:
     controllers = results['meta']['controllers']
     sections = page.sections(results, {flight: flown[flight] for flight in sorted(
         flown, key=lambda flight: (controllers.index(flight.controller), flight))})
-    for picture in page.pictures(sections):
-        (output / f'{picture.name}.png').write_bytes(picture.data)
-    write_text(output / PAGE, page.as_page(results, sections), 'page')
-    write_text(output / TEXT, page.as_markdown(
-        results, sections, HOW if (output / HOW).is_file() else ''), 'page')
+    for block in (block for section in sections for block in section.blocks):
+        if isinstance(block, page.Picture):
+            (output / f'{block.name}.png').write_bytes(block.data)
+    content = page.content(results, sections)
+    for name in (PAGE, TEXT):
+        write_text(output / name, rendered(f'comparison{Path(name).suffix}', **content), 'page')
     write_json(output / NUMBERS, results)
-    glance = page.glance(results)
-    if console.width < WIDE:
-        shown = [k for k in range(len(glance.header)) if k not in glance.faint_columns]
-        glance = replace(glance, header=[glance.header[k] for k in shown], rows=[
-            [row[k] for k in shown] for row in glance.rows], faint_columns=frozenset())
-    print_grids([glance], console)
+    print_grids([page.glance(results)], console)
     broken = sum(bool(result['failure']) for result in flown.values())
     if broken:
         console.print(f'{broken} of {len(flown)} flights failed, see above and on the page',

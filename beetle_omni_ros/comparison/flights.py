@@ -29,34 +29,20 @@ CONDITIONS = ('nominal', 'published')
 SEEDS = {50.0: 10, 300.0: 6, np.inf: 3}
 
 START_COST, COST = 2.0, 0.1  # core seconds to build simulator and controller; for a second
-TRACE_PERIOD = 0.02  # [s] between samples of a trace
-LONG_TRACE_PERIOD = 0.05  # [s] between samples in a long task
-TRACED_FINELY = 300.0  # [s] longest task with TRACE_PERIOD
+TRACE_PERIOD = 0.05  # [s] between samples of a trace
 
 
 @dataclass(frozen=True, order=True)
 class Flight:
-    """
-    One flight of a comparison.
+    """One flight of a comparison."""
 
-    Attributes:
-        task: name, or path of a pose file.
-        conditions: 'nominal' or 'published'.
-        controller: name in the results.
-        seed: seed of the task's poses and of the simulation.
-        policy: file in place of its shipped policy, '' for none.
-        spec: reference to its class, '' for a registered controller.
-        plant: robot file of the simulated plant, '' for the shipped one.
-
-    """
-
-    task: str
-    conditions: str
-    controller: str
-    seed: int
-    policy: str = ''
-    spec: str = ''
-    plant: str = ''
+    task: str           # name, or path of a pose file
+    conditions: str     # 'nominal' or 'published'
+    controller: str     # name in the results
+    seed: int           # of the task's poses and of the simulation
+    policy: str = ''    # file in place of its shipped policy, '' for none
+    spec: str = ''      # reference to its class, '' for a registered controller
+    plant: str = ''     # robot file of the simulated plant, '' for the shipped one
 
     @property
     def name(self) -> str:
@@ -93,17 +79,8 @@ def plan(controllers: Sequence[str], tasks: Sequence[str] = TASKS,
     """
     List all flights, longest first, so that none of the long ones remains at the end.
 
-    Args:
-        controllers: names, or references to classes.
-        tasks: names, or paths of pose files.
-        conditions: 'nominal', 'published'.
-        seeds: numbers from 0; None: those of ``SEEDS``.
-        policy: file that replaces the shipped policy, for the controller of `--policy`.
-        plant: robot file of the simulated plant.
-
-    Raises:
-        ParameterError: unknown conditions or task.
-
+    Seeds are those of ``SEEDS`` by default. ``policy`` is for the controller of `--policy`. A
+    ParameterError reports unknown conditions or an unknown task.
     """
     for entry in conditions:
         if entry not in CONDITIONS:
@@ -122,17 +99,10 @@ def plan(controllers: Sequence[str], tasks: Sequence[str] = TASKS,
 
 def fly_flight(flight: Flight, task: Task) -> dict:
     """
-    Fly a flight and compute its metrics; a failed flight has a result, too.
+    Fly a flight and compute its metrics; ``task`` was made on the computer with the pose file.
 
-    Args:
-        flight: the flight.
-        task: its task, made on the computer with the pose file.
-
-    Returns:
-        A dictionary with ``failure`` (None or one line), ``metrics`` (None or as in INTERFACES,
-        with ``steps``, the number of controller steps), ``cpu_s``, ``host`` and ``trace`` (name ->
-        array, see :func:`trace`).
-
+    Returned are ``failure`` (None or one line), ``metrics`` (None or as in INTERFACES),
+    ``cpu_s``, ``host`` and ``trace``, see :func:`trace`.
     """
     start = time.process_time()
     result = {'failure': None, 'metrics': None, 'trace': {}, 'host': platform.node()}
@@ -148,8 +118,7 @@ def fly_flight(flight: Flight, task: Task) -> dict:
                           policy=Path(flight.policy) if flight.policy else None)},
                       meta={'task': flight.task, 'conditions': flight.conditions,
                             'seed': flight.seed})
-            result['metrics'] = judged = metrics(log, task)
-            judged['steps'] = log.compute.get(flight.controller, {}).get('count', 0)
+            result['metrics'] = metrics(log, task)
             result['trace'] = trace(log, task)
     except Exception as error:  # the other flights continue after any failure of a controller
         text = ' '.join(str(error).split())
@@ -171,9 +140,8 @@ def trace(log: FlightLog, task: Task) -> dict[str, np.ndarray]:
     if not log.targets:
         return {}
     body, start = motion(log), log.targets[0].stamp
-    every = LONG_TRACE_PERIOD if task.duration > TRACED_FINELY else TRACE_PERIOD
     end = min(body.t[-1], start + task.duration)
-    index = np.unique(np.searchsorted(body.t, np.arange(start, end, every)))
+    index = np.unique(np.searchsorted(body.t, np.arange(start, end, TRACE_PERIOD)))
     index = index[index < len(body.t)]
     apart = np.full((2, len(body.t)), np.nan)
     for target, until in zip(log.targets, [*(t.stamp for t in log.targets[1:]), np.inf],

@@ -1,9 +1,8 @@
 """The comparison as one self-contained HTML page, and as Markdown with pictures."""
 
 from base64 import b64encode
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from io import BytesIO
-from pathlib import Path
 
 import matplotlib
 from matplotlib.figure import Figure
@@ -22,15 +21,12 @@ from beetle_omni_ros.comparison.summary import (
     task_title,
 )
 from beetle_omni_ros.pages import figures
-from beetle_omni_ros.pages.page import ABSENT, Grid, markdown, number, rendered
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.pages.page import ABSENT, Grid, number
 from beetle_omni_ros.runs.tasks import RISING
 
 DOTS = 180  # per inch
 COLOURS = 128  # of a picture; enough for thin lines with smooth edges
 TITLE = 'RL and NMPC under one architecture'
-README = ('rl', 'nmpc')     # columns of the table in the readme
-BEGIN, END = '<!-- compare -->\n', '<!-- end of compare -->\n'    # around that table
 COMPUTED = ('"0.3 on average"', '"typically within 10"')    # published times of a step
 TEXTS = {
     'random': 'One pose after the other, 8 s each, x and y within 2 m, z from 0.6 to 2 m, any '
@@ -74,11 +70,9 @@ NOTES = {
     'hover': 'At [0, 0, 1] m. Errors from 8 s to the end of 60 s; command changes from 7.0 to '
              '7.5 s.',
     'glance': 'Published numbers are of Gazebo, or of the real robot where marked with *; ours '
-              'are simulated. Bold as in the tables below, which have the intervals.',
-    'compute': 'Everything a controller does for one command, over all flights of this page: '
-               "median of the flights' medians, otherwise the worst flight. One core each, while "
-               "the other cores fly too ({processor}). Published times: on the robot's ARM "
-               'board; its RL number is the inference alone.'}
+              'are simulated. Bold as in the tables below, which have the intervals. CPU times: '
+              "everything for one command on one core, median of the flights' medians; the "
+              "published ones are of the robot's ARM board, that of RL of the inference alone."}
 
 
 @dataclass(frozen=True)
@@ -101,7 +95,7 @@ class Section:
 
     title: str
     text: str
-    blocks: list[Grid | Picture] = field(default_factory=list)
+    blocks: list[Grid | Picture]
 
 
 def interval(entry: dict, digits: int) -> str:
@@ -122,8 +116,6 @@ def table(results: dict, task: str, conditions: str) -> Grid:
     for key, metric in METRICS[kind].items():
         of, given = numbers['metrics'][key], [printed(task, metric, name) for name in paper]
         most = max(of[name]['count'] for name in ours)
-        if metric.detail and not most:      # a level that no controller met
-            continue
         best |= {(len(rows), column) for column, name in enumerate(ours, 1) if of[name]['best']}
         rows.append([metric.title, *(
             interval(of[name], metric.digits)
@@ -131,7 +123,7 @@ def table(results: dict, task: str, conditions: str) -> Grid:
             *(number(entry.get('mean'), None)
               + (f" ± {number(entry['std'], None)}" if entry.get('std') else '')
               for entry in given)])
-        if len(ours) > 1 and not metric.detail:
+        if len(ours) > 1:
             rows.append(['difference to the best', *(
                 ABSENT if of[name]['difference'] is None
                 else interval(of[name]['difference'], metric.digits) for name in ours),
@@ -160,25 +152,6 @@ def table(results: dict, task: str, conditions: str) -> Grid:
                        NOTES[kind]]))
 
 
-def compute(results: dict) -> Grid:
-    """CPU time of a step of each controller."""
-    times = results['summary']['compute']
-    ours = [name for name in results['meta']['controllers'] if name in times]
-    rows = []
-    for text, key, digits, *published in (
-            ('median [ms]', 'median', 3, *COMPUTED),
-            ('99th percentile [ms]', 'p99', 2), ('largest [ms]', 'max', 2),
-            ('over 10 ms', 'deadline_misses', 0, ABSENT, '"occasionally"'), ('steps', 'steps', 0)):
-        rows.append([text, *(number(times[name][key], digits) for name in ours),
-                     *(published or [ABSENT] * len(PUBLISHED))])
-    machine = results['meta'].get('machine', {})
-    return Grid('CPU time of one controller step', [
-        '', *(look(name).label for name in ours),
-        *(f'{look(name).label} (published, real robot)' for name in PUBLISHED)], rows,
-        note=NOTES['compute'].format(processor=machine.get('processor', 'unknown processor')),
-        faint_columns=frozenset(range(len(ours) + 1, len(ours) + len(PUBLISHED) + 1)))
-
-
 def glance(results: dict) -> Grid:
     """Every experiment in one table."""
     ours = results['meta']['controllers']
@@ -200,41 +173,13 @@ def glance(results: dict) -> Grid:
                     for name in ours), *(
                     number(entry.get('mean'), None) + real * bool(entry) for entry in given)])
     rows.append(['CPU time of a step: median [ms]', *(
-        number(results['summary']['compute'].get(name, {}).get('median'), 3) for name in ours),
+        number(results['summary']['compute_ms'].get(name), 3) for name in ours),
         *(f'{text} *' for text in COMPUTED)])
     return Grid('All experiments', [
         '', *(look(name).label for name in ours),
         *(f'{look(name).label} (published)' for name in PUBLISHED)], rows, note=NOTES['glance'],
         best=frozenset(best),
         faint_columns=frozenset(range(len(ours) + 1, len(ours) + len(PUBLISHED) + 1)))
-
-
-def parted(path: Path) -> tuple[str, str]:
-    """Text of a Markdown file before and after its table; ParameterError without its place."""
-    try:
-        before, begin, rest = path.read_text(encoding='utf-8').partition(BEGIN)
-        _, end, after = rest.partition(END)
-    except OSError as error:
-        raise ParameterError(f'--readme {path}: {error.strerror}') from None
-    if not (begin and end):
-        raise ParameterError(f'--readme {path}: expected the lines {BEGIN.strip()} and '
-                             f'{END.strip()} around the table')
-    return before + begin, end + after
-
-
-def with_table(path: Path, results: dict) -> str:
-    """Text of a Markdown file with the nominal rows of :func:`glance`, of the columns README."""
-    whole = glance(results)
-    shown = [0, *(k for k, name in enumerate(results['meta']['controllers'], 1)
-                  if name in README), *sorted(whole.faint_columns)]
-    rows = [k for k, row in enumerate(whole.rows) if ', published: ' not in row[0]]
-    table = replace(whole, header=[whole.header[k] for k in shown], rows=[
-        [whole.rows[row][k].replace(', nominal: ', ': ') for k in shown] for row in rows],
-        best=frozenset((n, m) for n, row in enumerate(rows) for m, k in enumerate(shown)
-                       if (row, k) in whole.best))
-    meta, (before, after) = results['meta'], parted(path)
-    return (f"{before}\n{markdown(table)}\nCommand: `make compare` (commit {meta['commit']}, "
-            f"seeds {meta['seeds'][0]} to {meta['seeds'][-1]}).\n\n{after}")
 
 
 def sections(results: dict, flown: dict) -> list[Section]:
@@ -259,13 +204,7 @@ def sections(results: dict, flown: dict) -> list[Section]:
                                               f'{caption} ({conditions} conditions)',
                                               png(figure)))
             made.append(Section(task_title(task), TEXTS.get(kind_of(task), ''), blocks))
-    made.append(Section('Compute time', '', [compute(results)]))
     return made
-
-
-def pictures(made: list[Section]) -> list[Picture]:
-    """All pictures of all sections."""
-    return [block for section in made for block in section.blocks if isinstance(block, Picture)]
 
 
 def png(figure: Figure) -> bytes:
@@ -277,15 +216,13 @@ def png(figure: Figure) -> bytes:
     return small.getvalue()
 
 
-def _content(results, made):
+def content(results: dict, made: list[Section]) -> dict:
     """What both forms of the page show: terms with their meaning, facts, sections, flights."""
     meta = results['meta']
     terms = []
     for name in meta['controllers']:
-        moved = meta.get('guidance', {}).get(name)
-        terms.append((look(name).label, '; '.join(filter(None, [
-            look(name).text or meta.get('specs', {}).get(name, ''),
-            f'guidance: {moved}' if moved else '']))))
+        what = look(name).text or meta['specs'].get(name, '')
+        terms.append((look(name).label, f"{what}; guidance: {meta['guidance'][name]}"))
     terms += [(f'{name} conditions', CONDITIONS[name]) for name in meta['conditions']]
     terms += [(f'{name}: not flown', reason) for name, reason in meta['skipped'].items()]
     failed = sum(bool(flight['failure']) for flight in results['flights'])
@@ -293,8 +230,8 @@ def _content(results, made):
              + (f", commit {meta['commit']}" if meta.get('commit') else ''),
              f"{len(results['flights'])} flights, {failed} failed; seeds "
              f"{', '.join(map(str, meta['seeds']))}",
-             f"{meta['cpu_s'] / 60:.1f} core minutes on {meta['machine']['processor']}",
-             *(f'simulated plant: {plant}' for plant in [meta.get('plant')] if plant),
+             f"{meta['cpu_s'] / 60:.1f} core minutes on {meta['processor']}",
+             *([f"simulated plant: {meta['plant']}"] if meta['plant'] else []),
              *(f'{look(name).label}: policy {digest}'
                for name, digest in meta['policies'].items())]
     flights = Grid('', ['task', 'conditions', 'controller', 'seed', 'end', 'core s'], [
@@ -304,13 +241,3 @@ def _content(results, made):
          number(flight['cpu_s'], 1)] for flight in results['flights']])
     return {'title': TITLE, 'terms': terms, 'facts': facts, 'sections': made, 'flights': flights,
             'command': meta['command']}
-
-
-def as_page(results: dict, made: list[Section]) -> str:
-    """The self-contained HTML page."""
-    return rendered('comparison.html', **_content(results, made))
-
-
-def as_markdown(results: dict, made: list[Section], how: str = '') -> str:
-    """The page as Markdown; ``how`` is a link to the how-to page, or ''."""
-    return rendered('comparison.md', how=how, **_content(results, made))

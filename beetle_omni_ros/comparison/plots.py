@@ -11,7 +11,7 @@ import numpy as np
 from beetle_omni_ros.comparison.flights import Flight
 from beetle_omni_ros.comparison.summary import look
 from beetle_omni_ros.pages.figures import FAINT, INK, legend, panels
-from beetle_omni_ros.runs.metrics import L_WINDOW, REACHED_ORIENTATION, REACHED_POSITION, U_WINDOW
+from beetle_omni_ros.runs.metrics import L_WINDOW, U_WINDOW
 from beetle_omni_ros.runs.tasks import make_task, POSE_DURATION, RISING, TILTS
 
 FLOOR = {'position': 2e-4, 'orientation': 1e-2}  # of logarithmic errors [m], [deg]
@@ -34,33 +34,6 @@ def of(flown: dict[Flight, dict], task: str, conditions: str) -> Groups:
     return chosen
 
 
-def plain_ticks(axis) -> None:
-    """Label a logarithmic axis with 0.01, 0.1, 1 instead of powers."""
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
-
-
-def distributions(groups: Groups, task: str) -> Figure:
-    """Share of the poses with at most an error at the target; lost ones never count."""
-    figure, axes = panels(1, 2, height=2.8)
-    for panel, what, limit in zip(axes[0], FLOOR, (REACHED_POSITION, REACHED_ORIENTATION),
-                                  strict=True):
-        for name, results in groups.items():
-            found = [pose[f'U_{what}_{UNITS[what]}'] for result in results
-                     for pose in result['metrics']['poses']]
-            known = np.sort([max(value, FLOOR[what]) for value in found if value is not None])
-            values, style = np.concatenate([known[:1], known]), look(name)
-            panel.step(values, 100 * np.arange(len(values)) / len(found), where='post',
-                       color=style.colour, ls=style.dashes, lw=1.5, label=style.label)
-        panel.axvline(limit, color=FAINT, lw=1, ls=(0, (3, 2)))
-        panel.set_xscale('log')
-        plain_ticks(panel.xaxis)
-        panel.set_ylim(0, 101)
-        panel.set_xlabel(f'U {what} error [{UNITS[what]}]')
-    axes[0, 0].set_ylabel('share of the poses [%]')
-    legend(figure, axes[0, 0])
-    return figure
-
-
 def convergence(groups: Groups, task: str) -> Figure:
     """Errors in the 8 s of a pose: median and 10 to 90 % band over all poses."""
     figure, axes = panels(1, 2, height=2.8)
@@ -81,7 +54,7 @@ def convergence(groups: Groups, task: str) -> Figure:
             panel.text(np.mean(window), 0.985, name, transform=panel.get_xaxis_transform(),
                        va='top', ha='center', color=FAINT, fontsize=8)
         panel.set_yscale('log')
-        plain_ticks(panel.yaxis)
+        panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
         panel.set_xlim(0, POSE_DURATION)
         panel.set_ylabel(f'{what} error [{UNITS[what]}]')
         panel.set_xlabel('time since the pose was asked for [s]')
@@ -147,9 +120,7 @@ def _error_curve(panel, result, what, name):
     return float(np.max(shown)) if shown.size else 0.0
 
 
-_POSES = [('errors', 'Share of the poses with at most an error at the target; dashed: reached',
-           distributions),
-          ('convergence', 'Errors after a pose was asked for: median and 10 to 90 % band over all '
+_POSES = [('convergence', 'Errors after a pose was asked for: median and 10 to 90 % band over all '
            'poses', convergence)]
 _TIME = [('errors', 'Errors in time in the first flight, the disturbance dashed; × where control '
           'was lost', in_time)]

@@ -18,7 +18,7 @@ from beetle_omni_ros.control import registry
 from beetle_omni_ros.pages.page import at
 from beetle_omni_ros.runs import table as published
 from beetle_omni_ros.runs.metrics import failed, POSE_KEYS
-from beetle_omni_ros.runs.tasks import PAYLOADS, PUSH_PERIOD, RISING, TILTS, WAYPOINTS
+from beetle_omni_ros.runs.tasks import PUSH_PERIOD, RISING, TILTS
 
 PREFIX = 'published_'    # prefix of a controller in the publication
 # Colours of controllers outside the package, chosen by name.
@@ -88,7 +88,6 @@ class Metric:
         printed: path of the published mean.
         more: whether more is better.
         glance: whether it is in the table of all experiments.
-        detail: whether it is part of another number, and its differences are not displayed.
 
     """
 
@@ -98,17 +97,11 @@ class Metric:
     printed: str = ''
     more: bool = False
     glance: bool = False
-    detail: bool = False
 
 
 def _at(title, digits, path, printed='', **options):
     """Metric at a path of keys in the metrics of a flight."""
     return Metric(title, digits, lambda judged: at(judged, path), printed, **options)
-
-
-def _mean(values):
-    values = [value for value in values if value is not None]
-    return float(np.mean(values)) if values else None
 
 
 def _poses():
@@ -136,20 +129,11 @@ def _changes(glance):
 
 
 def _waypoints():
-    made = {}
-    for k, target in enumerate(WAYPOINTS):
-        text = '[{:g}, {:g}, {:g}] m, [{:g}, {:g}, {:g}] deg: '.format(*target)
-        for key, digits in ((POSE_KEYS[0], 4), (POSE_KEYS[1], 2)):
-            made[f'{k}.{key}'] = Metric(
-                text + f"U [{'m' if key == POSE_KEYS[0] else 'deg'}]", digits,
-                lambda judged, k=k, key=key: _mean(
-                    pose[key] for pose in judged['poses'][k::len(WAYPOINTS)]),
-                f'by_pose.{k}.{key}', detail=True)
     means = {key: _at(metric.title, metric.digits, *2 * [metric.printed],
                       glance=key in POSE_KEYS[:2])
              for key, metric in _poses().items() if key in POSE_KEYS}
     return {**means, 'reached': Metric('poses reached [%]', 1, lambda judged: 100.0 * (
-        judged['success_rate'] or 0.0), more=True), **made}
+        judged['success_rate'] or 0.0), more=True)}
 
 
 def _errors(kind):
@@ -165,22 +149,14 @@ def _errors(kind):
 
 def _disturbance(kind, _, levels, *times):
     unit = 'N' if kind == 'force' else 'N_m'
-    key, text, beyond = f'{kind}_{unit}', unit.replace('_', ' '), 2 * levels[-1] - levels[-2]
+    beyond = 2.0 * levels[-1] - levels[-2]
 
     def lost(judged):
         level = judged[kind][f'lost_at_{unit}']
         return float(beyond if level is None else level)
 
-    def peak(judged, level, name):
-        return next((entry[name] for entry in judged[kind]['levels']
-                     if entry[f'level_{unit}'] == level), None)
-
-    return {'lost': Metric(f'control lost at [{text}]', 1, lost, key, more=True, glance=True), **{
-        f'{level:g}.{name}': Metric(
-            f'{level:g} {text}: largest error [{size}]', digits,
-            lambda judged, level=level, name=name: peak(judged, level, name), detail=True)
-        for level in map(float, levels) for name, size, digits in (
-            ('peak_position_m', 'm', 3), ('peak_orientation_deg', 'deg', 1))}}
+    return {'lost': Metric(f"control lost at [{unit.replace('_', ' ')}]", 1, lost,
+                           f'{kind}_{unit}', more=True, glance=True)}
 
 
 def _wind():
@@ -205,21 +181,11 @@ def _pushes():
 
 
 def _payload():
-    def height(judged, mass):
-        return next((abs(entry['height_error_m']) for entry in judged['payload']
-                     if entry['payload_kg'] == mass and entry['height_error_m'] is not None), None)
-
     def worst(judged):
-        found = [height(judged, mass) for mass in PAYLOADS]
-        return None if None in found else max(found)
+        found = [entry['height_error_m'] for entry in judged['payload']]
+        return None if None in found else max(map(abs, found))
 
-    return {'worst': Metric('largest height error [m]', 4, worst, glance=True), **{
-        f'{mass:g}.height': Metric(f'{mass:g} kg: height error [m]', 4, lambda judged, mass=mass:
-                                   height(judged, mass), detail=True) for mass in PAYLOADS}, **{
-        f'{mass:g}.orientation': Metric(
-            f'{mass:g} kg: orientation error [deg]', 2, lambda judged, mass=mass: next(
-                (entry['orientation_deg'] for entry in judged['payload']
-                 if entry['payload_kg'] == mass), None), detail=True) for mass in PAYLOADS}}
+    return {'worst': Metric('largest height error [m]', 4, worst, glance=True)}
 
 
 METRICS: dict[str, dict[str, Metric]] = {
@@ -235,8 +201,8 @@ def summarise(flown: dict[Flight, dict]) -> dict:
 
     Returns:
         ``tasks``: task -> conditions -> ``flights`` (controller -> seeds, failures, lost) and
-        ``metrics`` (name in :data:`METRICS` -> :func:`statistics.compared`); ``compute``: CPU
-        times.
+        ``metrics`` (name in :data:`METRICS` -> :func:`statistics.compared`); ``compute_ms``:
+        controller -> CPU time of a step, median of the flights' medians.
 
     """
     summary: dict = {}
@@ -257,7 +223,13 @@ def summarise(flown: dict[Flight, dict]) -> dict:
             'metrics': {key: compared({name: _sample(metric, by_seed)
                                        for name, by_seed in judged.items()}, metric.more)
                         for key, metric in METRICS[kind_of(task)].items()}}
-    return {'tasks': summary, 'compute': _compute(flown)}
+    times: dict[str, list] = {}
+    for flight, result in flown.items():
+        median = at(result, 'metrics.compute_ms.median')
+        if median is not None:
+            times.setdefault(flight.controller, []).append(median)
+    return {'tasks': summary, 'compute_ms': {
+        name: float(np.median(values)) for name, values in times.items()}}
 
 
 def _sample(metric, by_seed):
@@ -268,23 +240,6 @@ def _sample(metric, by_seed):
         sample |= {(seed, k): each for k, each in enumerate(value)} \
             if isinstance(value, list) else {(seed,): value}
     return sample
-
-
-def _compute(flown):
-    """CPU time of a step of each controller over all its flights."""
-    made = {}
-    for controller in dict.fromkeys(flight.controller for flight in flown):
-        times = [{**result['metrics']['compute_ms'], 'steps': result['metrics'].get('steps', 0)}
-                 for flight, result in flown.items()
-                 if flight.controller == controller and result['metrics']
-                 and result['metrics']['compute_ms'].get('median') is not None]
-        if times:
-            made[controller] = {
-                'median': float(np.median([t['median'] for t in times])),
-                **{key: max(t[key] for t in times) for key in ('p99', 'max')},
-                **{key: sum(t[key] for t in times) for key in ('deadline_misses', 'steps')},
-                'flights': len(times)}
-    return made
 
 
 def printed(task: str, metric: Metric, column: str) -> dict:

@@ -21,13 +21,9 @@ class ServoBusParameters(ParameterFile, file='servo_bus.yaml'):
     zeros: np.ndarray = parameter(doc='reading at zero tilt', unit='counts', shape=(4,), low=0,
                                   high=4095)
     current_limit: float = parameter(0.91, doc='largest current', unit='A', low=0.02, high=0.91)
-    torque_per_current: float = parameter(
-        0.671, doc='torque in joint_states for each ampere', unit='N m/A', low=0, high=100)
     position_p_gain: int = parameter(900, doc='Position P Gain(84)', low=0, high=16383)
     position_i_gain: int = parameter(0, doc='Position I Gain(82)', low=0, high=16383)
     position_d_gain: int = parameter(0, doc='Position D Gain(80)', low=0, high=16383)
-    feedforward_1st_gain: int = parameter(0, doc='Feedforward 1st Gain(90)', low=0, high=16383)
-    feedforward_2nd_gain: int = parameter(0, doc='Feedforward 2nd Gain(88)', low=0, high=16383)
     reply_time: float = parameter(
         0.003, doc='time limit of an answer, without its time on the wire', unit='s', low=0.0002,
         high=0.1)
@@ -51,15 +47,11 @@ class ServoBusParameters(ParameterFile, file='servo_bus.yaml'):
 
 @dataclass(frozen=True, kw_only=True)
 class MotorBoardParameters(ParameterFile, file='motor_board.yaml'):
-    """Port, rate and time limits of the driver of the motor board."""
+    """Port of the motor board, and when it is silent."""
 
     port: str = parameter(doc='serial port')
     baud: int = parameter(
         921600, doc='baud rate of the port', unit='bit/s', low=9600, high=4000000)
-    target_rate: float = parameter(
-        200.0, doc='rate of the targets, new or repeated', unit='Hz', low=20, high=1000)
-    stamp_age_limit: float = parameter(
-        0.1, doc='oldest stamp of a target that is sent', unit='s', low=0.01, high=1)
     silence: float = parameter(
         0.3, doc='time without a packet after which the board is silent', unit='s', low=0.05,
         high=5)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import atexit
 from collections.abc import Callable
 import math
 import select
@@ -20,6 +19,7 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import BatteryReading
 from beetle_omni_ros.robot.thrust_map import ThrustMap
 
+TARGET_AGE = 0.1        # [s] of the oldest stamp of a target that is sent
 TICK = 0.01             # [s] longest sleep of the thread, a tenth of its shortest period
 CORRECTION = 50_000     # [us] a larger backward step of the board's clock is a restart
 HEARTBEAT_PERIOD = 0.2  # [s] by the contract, as the next three
@@ -127,11 +127,9 @@ class MotorBoard:
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name='motor_board', daemon=True)
         self._thread.start()
-        atexit.register(self.close)
 
     def close(self) -> None:
         """Disarm, wait shortly for the acknowledgement, close the port."""
-        atexit.unregister(self.close)
         if self._thread is None:
             return
         self.start(False).wait()
@@ -186,7 +184,7 @@ class MotorBoard:
         time of the state estimate that they answer [s].
         """
         age = self._clock() - stamp
-        if abs(age) > self.parameters.stamp_age_limit:
+        if abs(age) > TARGET_AGE:
             return 'stale stamp' if age > 0 else 'stamp in the future'
         if not self.state.clock.known:
             return "offset of the board's clock unknown"
@@ -212,8 +210,8 @@ class MotorBoard:
         self._last_stamp = stamp, micros
         return micros
 
-    def poll(self) -> tuple[BatteryReading | None, RotorStates | None, tuple]:
-        """Return battery, rotors and (level, text) of each event since the last call."""
+    def poll(self) -> tuple[BatteryReading | None, RotorStates | None]:
+        """Return battery and rotors since the last call."""
         with self._lock:
             return self.state.take()
 
@@ -222,6 +220,7 @@ class MotorBoard:
         clock = self.state.clock
         return {**self._receiver.counts, **self._counts,
                 **{f'board {name}': count for name, count in self.state.reception.items()},
+                'implausible voltages': self.state.implausible,
                 'clock_offset_s': clock.offset(),
                 'clock_uncertainty_ms': 1e3 * clock.uncertainty(time.monotonic())}
 
@@ -260,15 +259,10 @@ class MotorBoard:
                 if self._port is None:
                     time.sleep(RECONNECT)
                     self._connect()
-                    with self._lock:
-                        self.state.connection('')
                 else:
                     self._serve(self._port)
-            except SerialPortError as error:
-                if self._port is not None:      # lost, and not still missing
-                    self._disconnect()
-                    with self._lock:
-                        self.state.connection(str(error))
+            except SerialPortError:
+                self._disconnect()
             self._tick(time.monotonic())
 
     def _serve(self, port):
@@ -294,7 +288,6 @@ class MotorBoard:
 
     def _tick(self, now):
         with self._lock:
-            self.state.tick(now, self.connected)
             if self._command:
                 self._command.tick(now)
         if now >= self._next_heartbeat:

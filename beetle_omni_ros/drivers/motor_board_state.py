@@ -14,18 +14,16 @@ from beetle_omni_ros.robot.readings import BatteryReading
 # The bytes of HEARTBEAT.custom_mode and COMMAND_ACK.result_param2.
 CONTRACT_VERSION = 1
 STATES = {0: 'boot', 1: 'disarmed', 2: 'armed', 3: 'running'}
-REQUESTED, WATCHDOG_RESET = 'requested by the host', 'watchdog reset'
-STOP_REASONS = {0: 'none', 1: REQUESTED, 2: 'heartbeat of the host lost',
+WATCHDOG_RESET = 'watchdog reset'
+STOP_REASONS = {0: 'none', 1: 'requested by the host', 2: 'heartbeat of the host lost',
                 3: 'no target for too long', 4: WATCHDOG_RESET}
 NO_HOST_HEARTBEAT, THROTTLE = 'no heartbeat of the host', 'throttle not low'
 CONDITIONS = {1: 'booting', 2: NO_HOST_HEARTBEAT, 4: THROTTLE,
               8: 'battery low', 16: 'ESC failure', 32: 'targets timed out', 64: 'saturated'}
 BLOCKS_ARMING = tuple(text for bit, text in CONDITIONS.items() if bit <= 16)
-SEVERE = ('ESC failure', 'targets timed out')
 ESC_FAILURES = {1: 'over-current', 2: 'over-voltage', 4: 'overheated', 8: 'over-rpm',
                 16: 'inconsistent command', 32: 'stuck', 64: 'generic'}
 UNKNOWN_TEMPERATURE, UNKNOWN_CELL, UNKNOWN_CURRENT = 32767, 65535, -1
-EVENTS_KEPT = 200
 REQUESTS_KEPT = 50      # TIMESYNC requests; later answers are ignored
 CLOCK_DRIFT = 100e-6    # [s/s] bound of the clocks against each other
 VOLTAGE_TIME_CONSTANT = 0.05    # [s] of the voltage filter before the thrust map
@@ -55,16 +53,15 @@ class ClockOffset:
         """Whether an answer arrived since the restart."""
         return math.isfinite(self._bounds[0])
 
-    def add(self, sent: float, remote: float, received: float) -> bool:
-        """Use one exchange; return whether it contradicts the earlier ones, then forgotten."""
+    def add(self, sent: float, remote: float, received: float) -> None:
+        """Use one exchange; earlier ones that it contradicts are forgotten."""
         within = CLOCK_DRIFT * (received - sent)
         low, high = remote - received - within, remote - sent + within
         known_low, known_high, at = self._bounds
         widening = CLOCK_DRIFT * max(0.0, received - at)
         new_low, new_high = max(low, known_low - widening), min(high, known_high + widening)
-        jumped = new_low > new_high
-        self._bounds = (low, high, received) if jumped else (new_low, new_high, received)
-        return jumped
+        self._bounds = (low, high, received) if new_low > new_high \
+            else (new_low, new_high, received)
 
     def offset(self) -> float:
         """Remote minus local clock [s]; NaN while unknown."""
@@ -107,13 +104,13 @@ class RotorStates:
 
 class BoardState:
     """
-    Newest state and measurements of the board, stamped by ``clock`` [s], and events.
+    Newest state and measurements of the board, stamped by ``clock`` [s].
 
     ``silence`` is the time without a message after which the board is silent [s].
 
     ``status`` is the last heartbeat, ``voltage`` the filtered pack voltage [V] for the thrust map,
-    ``reception`` the last counts of the board, and ``clock`` the offset of the board's clock
-    against the monotonic clock.
+    ``implausible`` the number of refused voltages, ``reception`` the last counts of the board, and
+    ``clock`` the offset of the board's clock against the monotonic clock.
     """
 
     def __init__(self, cells: int, silence: float, clock: Callable[[], float]):
@@ -123,12 +120,10 @@ class BoardState:
         self.battery: BatteryReading | None = None
         self.rotors: RotorStates | None = None
         self.voltage: float | None = None
-        self.reception: dict[str, int] = {}
+        self.implausible, self.reception = 0, dict[str, int]()
         self._info = None       # last ESC_INFO
-        self._events: deque[tuple[str, str]] = deque(maxlen=EVENTS_KEPT)
         self._requests: deque[int] = deque(maxlen=REQUESTS_KEPT)
-        self._received_at = self._opened = self._battery_at = -math.inf
-        self._conditions: dict[str, bool] = {}      # of the last call, for events about changes
+        self._received_at = self._battery_at = -math.inf
         self._handlers = {
             'HEARTBEAT': self._on_heartbeat, 'TIMESYNC': self._on_timesync,
             'BATTERY_STATUS': self._on_battery, 'SYS_STATUS': self._on_reception,
@@ -149,85 +144,38 @@ class BoardState:
         """Whether no message arrived for too long."""
         return now - self._received_at > self._silence
 
-    def tick(self, now: float, connected: bool) -> None:
-        """Update the events about silence."""
-        # After a reconnection the board has the same time for its first message.
-        silent = math.isfinite(self._received_at) and \
-            now - max(self._received_at, self._opened) > self._silence
-        if connected and self._changed('silent', silent):
-            self._event('error' if silent else 'info',
-                        f'no message for {self._silence:g} s' if silent
-                        else 'messages again')
-
-    def _changed(self, name, value):
-        """Whether a condition differs from the last call."""
-        before, self._conditions[name] = self._conditions.get(name, False), value
-        return value != before
-
     def acknowledged(self, arm: bool) -> None:
         """Update the status after an acknowledged command, before the next heartbeat."""
         if self.status is not None and self.status.armed != arm:
             # The next heartbeat contains the conditions that prevent arming again.
             self.status = replace(self.status, state='armed' if arm else 'disarmed',
                                   conditions=self.status.conditions if arm else (THROTTLE,))
-            self._event('info', self.status.state)
-
-    def connection(self, error: str) -> None:
-        """Record that the port was opened again, or lost with an ``error``."""
-        self._opened = time.monotonic()
-        self._event('error' if error else 'info', error or 'port opened again')
 
     def take(self) -> tuple:
-        """Return battery, rotors and (level, text) of the events since the last call."""
-        news = self.battery, self.rotors, tuple(self._events)
+        """Return battery and rotors since the last call, or None."""
+        news = self.battery, self.rotors
         self.battery = self.rotors = None
-        self._events.clear()
         return news
-
-    def _event(self, level, text):
-        self._events.append((level, f'motor board: {text}'))
 
     def _on_heartbeat(self, message, now):
         state, reason, conditions, contract = message.custom_mode.to_bytes(4, 'little')
-        old = self.status
-        self.status = new = BoardStatus(
+        self.status = BoardStatus(
             STATES.get(state, f'state {state}'),
             STOP_REASONS.get(reason, f'reason {reason}'), conditions_of(conditions), contract)
-        if new.state == 'boot':
+        if self.status.state == 'boot':
             self.clock.restart()
             self._info = None
-            if old is not None and old.state != 'boot':
-                level = 'error' if old.armed else 'warning'
-                self._event(level, f'restarted ({new.stop_reason})')
-            return
-        if old is None:
-            self._event('info', f'found, {new.state}, contract {new.contract}')
-            return
-        if old.armed != new.armed:
-            asked = new.stop_reason == REQUESTED
-            self._event('info' if new.armed or asked else 'error',
-                        'armed' if new.armed else f'disarmed ({new.stop_reason})')
-        for condition in new.conditions if new.armed else ():
-            if condition not in old.conditions:
-                self._event('error' if condition in SEVERE else 'warning', condition)
 
     def _on_timesync(self, message, now):
-        if not message.tc1 or message.ts1 not in self._requests:
-            return
-        self._requests.remove(message.ts1)
-        if self.clock.add(message.ts1 / 1e9, message.tc1 / 1e9, now) and self.status is not None:
-            self._event('warning', 'its clock jumped, perhaps by a restart')
+        if message.tc1 and message.ts1 in self._requests:
+            self._requests.remove(message.ts1)
+            self.clock.add(message.ts1 / 1e9, message.tc1 / 1e9, now)
 
     def _on_battery(self, message, now):
         cells = [cell for cell in message.voltages if cell != UNKNOWN_CELL]
         voltage = sum(cells) / 1000 if cells else math.nan
-        plausible = PLAUSIBLE_CELL[0] <= voltage / self._cells <= PLAUSIBLE_CELL[1]
-        if self._changed('implausible', not plausible):
-            self._event('info' if plausible else 'warning',
-                        'battery voltage plausible again' if plausible else
-                        f'battery voltage {voltage:.1f} V not plausible, the last good one is '
-                        'used')
-        if not plausible:
+        if not PLAUSIBLE_CELL[0] <= voltage / self._cells <= PLAUSIBLE_CELL[1]:
+            self.implausible += 1
             return
         current = message.current_battery
         self.battery = BatteryReading(self._host_clock(), voltage, math.nan if
@@ -245,11 +193,6 @@ class BoardState:
 
     def _on_info(self, message, now):
         self._info = message
-        for k in range(4):
-            online = bool(message.info >> k & 1)
-            if self._changed(f'offline {k}', not online):
-                self._event('info' if online else 'error',
-                            f"ESC of rotor {k + 1} {'online again' if online else 'offline'}")
 
     def _on_rotors(self, message, now):
         measured = now      # the time of arrival, while the board's clock is unknown

@@ -7,7 +7,6 @@ write waits in a busy loop, without a time limit, if the output buffer is full.
 
 import errno
 import os
-import select
 import termios
 
 import serial
@@ -36,7 +35,9 @@ class SerialPort:
         """Open ``name`` at ``baud`` [bit/s] and empty its buffers."""
         self.name, self.rest = name, b''
         try:
-            self._serial = serial.Serial(name, baud, timeout=0, exclusive=True)
+            # With the last argument an empty read of a lost port differs from one without bytes.
+            self._serial = serial.Serial(name, baud, timeout=0, exclusive=True,
+                                         inter_byte_timeout=0)
         except (OSError, ValueError, termios.error) as error:
             raise SerialPortError(f'{name}: cannot be opened ({_cause(error)})') from None
         try:
@@ -48,16 +49,13 @@ class SerialPort:
 
     def read(self, size: int = 4096) -> bytes:
         """Return the received bytes, at most ``size``, also if there are none."""
-        # Asked before the read: bytes that arrive after an empty read are no lost port.
-        if not select.select([self.fd], [], [], 0)[0]:
-            return b''
         try:
             data = os.read(self.fd, size)
         except BlockingIOError:
             return b''
         except OSError as error:
             raise SerialPortError(f'{self.name}: {_cause(error)}') from None
-        if not data:    # a tty whose other end is closed is readable and empty
+        if not data:    # the other end is closed
             raise SerialPortError(f'{self.name}: unplugged')
         return data
 

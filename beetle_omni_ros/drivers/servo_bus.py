@@ -23,8 +23,7 @@ FEEDBACK, FEEDBACK_LAYOUT = registers.PRESENT_CURRENT.address, struct.Struct('<h
 # First register and number of bytes, read in turn from all servos at once. A range has no gap,
 # because a servo may refuse undefined addresses. All lengths differ, because an answer does not
 # contain its address, and a late answer must not be mistaken for another register.
-HEALTH = ((registers.TORQUE_ENABLE, 2), (registers.STATUS_LEVEL, 3), (registers.WATCHDOG, 1),
-          (registers.INPUT_VOLTAGE, 4))
+HEALTH = (registers.TORQUE_ENABLE, 2), (registers.WATCHDOG, 1), (registers.INPUT_VOLTAGE, 4)
 # A value that only a configured servo has: a restart sets the register to its default, 1200. The
 # register has an effect only in velocity mode.
 MARK = (registers.VELOCITY_I, 1201)
@@ -200,7 +199,6 @@ class ServoBus:
                 problems.append(f'{servo.name} (id {servo.identifier}): {problem}; {remedy}')
                 continue
             try:
-                servo.turns_known &= self._is_marked(servo)
                 self._apply_settings(servo)
             except ServoBusError as error:
                 problems.append(f'{servo.name}: {error}')
@@ -286,14 +284,24 @@ class ServoBus:
 
     def read(self) -> np.ndarray:
         """Read current, velocity and position of all servos except silent ones; return whose."""
-        self.stamp, answered = self._clock(), set()
+        self.stamp, now, answered = self._clock(), time.monotonic(), []
         if not self.link.is_open:
             self._reconnect()
         else:
             asked = sorted((servo for servo in self.servos if not servo.silent),
                            key=lambda servo: servo.misses)
             try:
-                answered = self._read_feedback(asked)
+                for servo, data in self._sync_read(asked, FEEDBACK, FEEDBACK_LAYOUT.size):
+                    answered.append(servo)
+                    if servo.update(data, now, self.enabled):
+                        servo.turns_known &= self.enabled
+                        if servo.recovery is None:
+                            self.log(f'{servo.where}: lost its turn count, taken as '
+                                     f'{servo.position:+.2f} rad')
+                            self._recover(servo)
+                # Only the first without answer missed: those behind it cannot answer.
+                for missing in [servo for servo in asked if servo not in answered][:1]:
+                    self._count_miss(missing)
             except SerialPortError as error:
                 self._port_lost(error)
         return np.array([servo in answered for servo in self.servos])
@@ -304,15 +312,15 @@ class ServoBus:
         return JointReading(
             self.stamp, np.array([servo.position for servo in chosen]),
             np.array([servo.velocity for servo in chosen]),
-            self.parameters.torque_per_current * np.array([servo.current for servo in chosen]),
+            registers.TORQUE_PER_CURRENT * np.array([servo.current for servo in chosen]),
             [servo.name for servo in chosen])
 
     def upkeep(self):
         """
         Do at most one transaction besides goals and feedback; none after a timeout in this tick.
 
-        It is a step of a servo's recovery, a ping of a silent servo, or a read of torque, hardware
-        error, watchdog, voltage and temperature of all servos.
+        It is a step of a servo's recovery, a ping of a silent servo, or a read of torque,
+        watchdog, voltage and temperature of all servos.
         """
         if not self.link.is_open:
             return
@@ -374,16 +382,17 @@ class ServoBus:
             self.link.close()
 
     def _apply_settings(self, servo):
-        given, identifier = self.parameters, servo.identifier
+        link, identifier = self.link, servo.identifier
+        current = round(self.parameters.current_limit / registers.CURRENT_UNIT)
         permanent = [       # in EEPROM; the mode is first, because it resets the gains
             (registers.OPERATING_MODE, registers.EXTENDED_POSITION),
             (registers.DRIVE_MODE, 0), (registers.HOMING_OFFSET, 0), (registers.RETURN_DELAY, 0),
-            (registers.CURRENT_LIMIT, round(given.current_limit / registers.CURRENT_UNIT))]
+            (registers.CURRENT_LIMIT, current)]
         if servo.firmware >= registers.STARTUP_FIRMWARE:
             permanent.append((registers.STARTUP, 0))    # nothing is restored after power-up
-        link = self.link
-        link.write(identifier, registers.WATCHDOG, 0)
-        link.write(identifier, registers.TORQUE_ENABLE, 0)
+        servo.turns_known &= self._is_marked(servo)
+        for register in (registers.WATCHDOG, registers.TORQUE_ENABLE):
+            link.write(identifier, register, 0)
         for register, value in permanent:
             if link.read(identifier, register, ATTEMPTS) != value:
                 link.write(identifier, register, value)
@@ -397,8 +406,6 @@ class ServoBus:
                 (registers.POSITION_P, given.position_p_gain),
                 (registers.POSITION_I, given.position_i_gain),
                 (registers.POSITION_D, given.position_d_gain),
-                (registers.FEEDFORWARD_1, given.feedforward_1st_gain),
-                (registers.FEEDFORWARD_2, given.feedforward_2nd_gain),
                 (registers.PROFILE_ACCELERATION, 0), (registers.PROFILE_VELOCITY, 0)]
 
     def _is_marked(self, servo):
@@ -429,36 +436,22 @@ class ServoBus:
     # --- feedback and health ------------------------------------------------------------------
 
     def _sync_read(self, asked, address, length):
-        """Pairs of the asked servos and their data, None without a valid answer."""
+        """Pairs of the servos with a valid answer and their data."""
         answers = self.link.sync_read(address, length, [servo.identifier for servo in asked]) \
             if asked else {}
         found = []
         for servo in asked:
-            error, data = answers.get(servo.identifier, (0, None))
-            if data is not None and not error & registers.ALERT:
+            if servo.identifier not in answers:
+                continue
+            error, data = answers[servo.identifier]
+            if not error & registers.ALERT:
                 servo.error = 0
-            elif data is not None and not servo.error and servo.recovery is None:
+            elif not servo.error and servo.recovery is None:
                 servo.kept_off = False
                 self._recover(servo)    # its recovery reads the hardware error
-            found.append((servo, None if error & ~registers.ALERT else data))
+            if not error & ~registers.ALERT:
+                found.append((servo, data))
         return found
-
-    def _read_feedback(self, asked):
-        """Read and update servos; return those that answered. The first without answer missed."""
-        answered, now = set(), time.monotonic()
-        for servo, data in self._sync_read(asked, FEEDBACK, FEEDBACK_LAYOUT.size):
-            if data is None:
-                continue
-            answered.add(servo)
-            if servo.update(data, now, self.enabled):
-                servo.turns_known &= self.enabled
-                if servo.recovery is None:
-                    self.log(f'{servo.where}: lost its turn count, taken as '
-                              f'{servo.position:+.2f} rad')
-                    self._recover(servo)
-        for missing in [servo for servo in asked if servo not in answered][:1]:
-            self._count_miss(missing)
-        return answered
 
     def _count_miss(self, servo):
         """Count a missing answer; after several in a row the servo is silent and only pinged."""
@@ -490,8 +483,6 @@ class ServoBus:
         self._group = (self._group + 1) % len(HEALTH)
         asked = [servo for servo in self.servos if not servo.silent]
         for servo, data in self._sync_read(asked, register.address, length):
-            if data is None:
-                continue
             if register is registers.TORQUE_ENABLE:
                 servo.torque = bool(data[0])
                 if self.enabled and not servo.torque and not servo.kept_off:
@@ -500,8 +491,6 @@ class ServoBus:
                     # It did not answer when the torque was switched off.
                     self.link.sync_write(register, {servo.identifier: 0})
                     self.log(f'{servo.where}: still had torque, switched off')
-            elif register is registers.STATUS_LEVEL:
-                servo.error = data[2]  # Hardware Error Status is the third
             elif register is registers.WATCHDOG:
                 if data[0] == registers.WATCHDOG_EXPIRED and self.enabled:
                     self.log(f'{servo.where}: was stopped by its watchdog, continues')

@@ -134,13 +134,10 @@ class ServoLink:
         return data
 
     def _reply(self, identifier, length, sent):
+        """Receive the answer of one servo: data, the SDK's result, error byte."""
         if sent != COMM_SUCCESS:
             return b'', sent, 0
         self.setPacketTimeout(STATUS_SIZE + length)
-        return self._status(identifier, length)
-
-    def _status(self, identifier, length):
-        """Receive the answer of one servo: data, the SDK's result, error byte."""
         while True:
             found, error, data, result = self._receive()
             if result != COMM_SUCCESS or found == identifier and _fits(length, error, data):

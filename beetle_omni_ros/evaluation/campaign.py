@@ -17,7 +17,6 @@ import os
 from pathlib import Path
 import platform
 import re
-import socket
 import subprocess
 import warnings
 import zipfile
@@ -25,7 +24,7 @@ import zipfile
 import joblib
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import Progress
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -37,9 +36,7 @@ SOURCE = Path(__file__).resolve().parents[1]
 # Folders whose code decides the numbers of a flight and its metrics.
 FLOWN = ('control', 'estimation', 'evaluation', 'messages', 'robot', 'runs', 'safety', 'sim')
 LENGTH = 16  # hexadecimal digits kept of a digest
-BACKENDS = ('processes', 'ray')
 OBJECT_STORE = 200 * 2**20  # [byte] shared memory of a local Ray; results are far smaller
-REACH_TIMEOUT = 5.0  # [s] for an answer of a cluster
 LOST_WORKER = ('TerminatedWorkerError', 'BrokenProcessPool', 'RayActorError', 'ActorDiedError',
                'OutOfMemoryError')
 
@@ -74,15 +71,9 @@ def code_fingerprint(file: str) -> str:
 def flight_key(function: Callable, controller: str, *given: str, policy: str = '',
                plant: str = '') -> str:
     """
-    Digest of everything that determines the result of a flight.
+    Digest of everything that determines the result of a flight by ``function``.
 
-    Args:
-        function: function that flies it.
-        controller: name or class, as in the registry.
-        given: its other inputs.
-        policy: file in place of the controller's policy, '' for its own.
-        plant: robot file of the simulated plant, '' for the shipped one.
-
+    ``policy`` and ``plant`` are files, '' for the shipped ones; ``given`` are its other inputs.
     """
     file = policy_file(controller, policy)
     return digest(
@@ -186,7 +177,7 @@ def sweep(function: Callable[..., dict], calls: Sequence[tuple], *, store: Store
           line: Callable[[object, dict, bool], str] = lambda flight, result, kept: '',
           ) -> list[dict]:
     """
-    Fly all flights that are not stored, with a progress bar.
+    Fly all flights that are not stored, with a progress bar; return the results of all.
 
     Args:
         function: function at the top of a module that flies one flight.
@@ -199,18 +190,13 @@ def sweep(function: Callable[..., dict], calls: Sequence[tuple], *, store: Store
         console: console for the progress and the lines.
         line: text about a flight from its result and whether it was stored before; '' for none.
 
-    Returns:
-        the results in the order of ``calls``.
-
     Raises:
-        ParameterError: unknown backend, or Ray is absent or not reachable.
+        ParameterError: Ray is absent or not reachable.
         RunError: a worker was killed, or has another version of the code.
 
     """
     results: dict[int, dict] = {}
-    columns = (TextColumn('{task.description}'), BarColumn(), TimeElapsedColumn(),
-               TextColumn('left'), TimeRemainingColumn())
-    with Progress(*columns, console=console or Console(quiet=True), transient=True,
+    with Progress(console=console or Console(quiet=True), transient=True,
                   speed_estimate_period=1200) as progress:
         bar = progress.add_task('', total=sum(call[0].cost for call in calls))
 
@@ -262,16 +248,9 @@ def _fly_one(k, code, function, call):
     return k, function(*call)
 
 
-def check_backend(backend: str) -> None:
-    """Raise a ParameterError for an unknown backend."""
-    if backend not in BACKENDS:
-        raise ParameterError(f"--backend '{backend}': expected {' or '.join(BACKENDS)}")
-
-
 @contextmanager
 def workers(backend: str = 'processes', jobs: int | None = None, address: str | None = None):
     """Configure joblib with one thread for the numerical libraries of each worker."""
-    check_backend(backend)
     if backend == 'processes':
         with joblib.parallel_config('loky', n_jobs=jobs or -1, inner_max_num_threads=1):
             yield
@@ -310,10 +289,6 @@ def _start_ray(jobs, address):
     quiet = {'logging_level': 'ERROR', 'log_to_driver': False}
     try:
         if address:
-            # Connect first, because Ray itself tries for a minute and prints many lines.
-            host, _, port = address.rpartition('://')[2].rpartition(':')
-            if host and port.isdecimal():
-                socket.create_connection((host, int(port)), timeout=REACH_TIMEOUT).close()
             ray.init(address=address, **quiet)
         else:
             ray.init(address='local', num_cpus=max(2, jobs or joblib.cpu_count()),

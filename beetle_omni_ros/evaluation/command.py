@@ -1,14 +1,14 @@
 """`beetle_omni evaluate`: flies tasks in one process with one or several controllers."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict
+from functools import partial
 from pathlib import Path
-from time import monotonic, time
+from time import time
 from types import MappingProxyType
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import Progress
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.control import registry
@@ -30,19 +30,12 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
         conditions: str = 'nominal', seed: int = 0,
         options: Mapping[str, ControllerOptions] = MappingProxyType({}),
         built: Controller | None = None, bag: Path | None = None, meta: dict | None = None,
-        faults: Sequence[Fault] = (),
-        progress=lambda part: None) -> FlightLog:
+        faults: Sequence[Fault] = (), progress: Callable[..., None] | None = None) -> FlightLog:
     """
-    Fly one task with one controller; :func:`run_evaluate` describes the other arguments.
+    Fly one task with one controller, a name or a reference to a class; ``built`` is that one.
 
-    ``controller`` is a name or a reference to a class, ``built`` the same if it was built before.
-
-    Returns:
-        the flight, also after a crash (``meta['crashed']``).
-
-    Raises:
-        ParameterError: a pose of the task is beyond the controller's reach.
-
+    Other arguments are those of :func:`run_evaluate`. The flight is returned after a crash, too
+    (``meta['crashed']``). ParameterError: a pose of the task is beyond the controller's reach.
     """
     entry = registry.find(controller)
     flying = built or entry.make(robot, options.get(entry.reference, ControllerOptions()))
@@ -62,14 +55,8 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
             recorder = Recorder(memory, stack.enter_context(BagWriter(
                 bag, meta=meta, topics=tuple(topics_with([entry.name])), frames=True,
                 epoch=int(time()))))
-        loop = FlightLoop(robot, plant, aboard, recorder, conditions=conditions, seed=seed,
-                          faults=faults)
-        stayed, truth = loop.fly(task, progress), loop.simulator.truth
-        recorder.write_meta({'crashed': not stayed, 'ended': loop.ending,
-                             'controller_error': loop.controller_error,
-                             'broken': truth.broken})
-        if truth.impact is not None:
-            recorder.write_meta({'impact': asdict(truth.impact)})
+        FlightLoop(robot, plant, aboard, recorder, conditions=conditions, seed=seed,
+                   faults=faults).fly(task, progress)
     return memory.log()
 
 
@@ -79,27 +66,11 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
                  options: Mapping[str, ControllerOptions] = MappingProxyType({}),
                  faults: Path | None = None, console: Console | None = None) -> dict:
     """
-    Fly a task with each controller and report.
+    Fly a task with each controller and report; arguments as of `beetle_omni evaluate`.
 
-    Args:
-        controllers: names or references to classes, see :func:`control.registry.find`.
-        task: task, or its name or pose file.
-        conditions: 'nominal' or 'published'.
-        robot: robot file of estimator and controllers; default the shipped one.
-        plant: robot file of the simulated plant; default ``robot``.
-        seed: seed of the task's poses and of the simulation.
-        bag: folder of a bag; with several controllers it contains one bag for each.
-        json_path: file for the results.
-        options: controller -> files in place of its own.
-        faults: file of faults with times since the task's start and durations.
-        console: console for the output.
-
-    Returns:
-        the results as in INTERFACES: ``meta`` and a key for each controller.
-
-    Raises:
-        ParameterError: unusable input, one line.
-
+    ``options`` are files in place of a controller's own. With several controllers, ``bag``
+    contains one bag for each. Returned are ``meta`` and a key for each controller, as in
+    INTERFACES. A ParameterError reports unusable input.
     """
     console = console or table.Terminal()
     believed = RobotParameters.load(robot)
@@ -121,26 +92,17 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
     if injected:
         meta['faults'] = [str(fault) for fault in injected]
     results: dict = {'meta': meta}
-    columns = (TextColumn('{task.description}'), BarColumn(),
-               TextColumn('{task.percentage:>3.0f} %'), TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True) as bars:
+    with Progress(console=console, transient=True) as bars:
         for entry, controller in built.items():
-            name, begin = entry.name, monotonic()
+            name = entry.name
             bar = bars.add_task(f'{name}: {task.name}, {conditions}', total=1.0)
             log = fly(entry.reference, task, robot=believed, plant=true, conditions=conditions,
                       seed=seed, options=options, built=controller,
                       bag=bag / name if bag and len(built) > 1 else bag, meta=meta,
-                      faults=injected,
-                      progress=lambda part, bar=bar: bars.update(bar, completed=part))
+                      faults=injected, progress=partial(bars.update, bar))
             results[name] = metrics(log, task)
-            if not console.is_terminal:     # which shows no progress bar
-                console.print(f'{name}: {task.name} flown in {monotonic() - begin:.0f} s',
-                              highlight=False)
-            for text in (log.meta['ended'] and f'the flight ended early, {log.meta["ended"]}',
-                         log.meta['controller_error']):
-                if text:
-                    console.print(f'{name}: {text}', style='yellow', markup=False,
-                                  highlight=False)
+            if error := log.meta['controller_error']:
+                console.print(f'{name}: {error}', style='yellow', markup=False, highlight=False)
     table.print_results(results, console)
     write_json(json_path, results)
     return results

@@ -1,11 +1,8 @@
 """
 One flight in one process: plant, sensors, estimator, controllers and supervisor.
 
-The parts are those of the ROS graph, called in the order in which messages would arrive. A tick of
-the simulator produces readings, and the estimator uses them. In every second tick the controllers
-compute a command from the estimate. The supervisor selects and checks the command, and the
-actuators execute it after its delay. Nothing depends on wall time, so that a seed determines all
-numbers.
+The parts are those of the ROS graph, called in the order in which messages would arrive. Nothing
+depends on wall time, so that a seed determines all numbers.
 """
 
 from __future__ import annotations
@@ -14,6 +11,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 import gc
 import time
 
@@ -21,7 +19,6 @@ import numpy as np
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import (
-    Command,
     Controller,
     ControllerHost,
     PoseTarget,
@@ -41,7 +38,7 @@ from beetle_omni_ros.runs.targets import TargetChecks
 from beetle_omni_ros.runs.tasks import Task, TaskPlayer
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.supervisor import Supervisor
-from beetle_omni_ros.sim.faults import Fault, Schedule
+from beetle_omni_ros.sim.faults import Fault, READINGS, Schedule
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.sensors import Frame
 from beetle_omni_ros.sim.simulator import Simulator
@@ -70,110 +67,69 @@ def collector_off():
         gc.enable()
 
 
-class ComputeTimer:
-    """
-    CPU times of all steps of one controller; a deadline miss takes longer than ``period`` [s].
+def timed(times: list[float], function: Callable, *arguments):
+    """Run ``function(*arguments)`` and add its CPU time [s]; wall time includes other programs."""
+    start = time.thread_time()
+    result = function(*arguments)
+    times.append(time.thread_time() - start)
+    return result
 
-    The CPU time of the calling thread is measured, because wall time on a shared computer includes
-    other programs.
-    """
 
-    def __init__(self, period: float):
-        self._period, self._times = period, []
-
-    def call(self, function, *arguments):
-        """Run ``function(*arguments)`` and store its CPU time."""
-        start = time.thread_time()
-        result = function(*arguments)
-        self._times.append(time.thread_time() - start)
-        return result
-
-    def summary(self) -> dict[str, float | int]:
-        """Values of the status '<name>_node: compute'."""
-        times = 1e3 * np.array(self._times or [0.0])
-        return {'median_ms': float(np.median(times)), 'p99_ms': float(np.percentile(times, 99)),
-                'max_ms': float(times.max()),
-                'deadline_misses': int(np.sum(times > 1e3 * self._period)),
-                'count': len(self._times)}
+def compute_summary(times: Sequence[float], period: float) -> dict[str, float | int]:
+    """Values of the status '<name>_node: compute', from ``times`` and ``period`` [s]."""
+    used = 1e3 * np.array(times or [0.0])
+    return {'median_ms': float(np.median(used)), 'p99_ms': float(np.percentile(used, 99)),
+            'max_ms': float(used.max()), 'deadline_misses': int(np.sum(used > 1e3 * period)),
+            'count': len(times)}
 
 
 class Processes:
     """
-    Messages from and to estimator, controllers and supervisor, modified by faults of processes.
-
-    Without a fault all messages pass unchanged.
+    Messages to the supervisor, and the faults of estimator, controllers and supervisor.
 
     Attributes:
+        schedule: faults; those of estimates, commands and targets are applied by the caller.
         clock_step: error of the flight computer's clock [s].
+        supervisor_waits: whether the supervisor is not scheduled at present.
 
     """
 
     def __init__(self, tick: float, supervisor: Supervisor):
         """``tick``: time between two calls of :meth:`frame` [s]."""
+        self.schedule = Schedule(tick, np.random.SeedSequence(0))
+        self.clock_step, self.supervisor_waits = 0.0, False
         self._supervisor = supervisor
-        self._schedule = Schedule(tick, np.random.SeedSequence(0))
         self._waiting: dict[str, deque] = {}
         self._reported: dict[str, str] = {}     # bridge -> last reported state
-        self.clock_step = 0.0
-
-    def set_faults(self, faults: Sequence[Fault], now: float) -> None:
-        """Set the faults of processes; their ``at`` counts from ``now`` [s]."""
-        self._schedule.set(faults, now)
 
     def frame(self, frame: Frame) -> Frame:
         """Start a tick; returns the frame with stamps of the flight computer's clock."""
-        if self._schedule.empty:
+        if self.schedule.empty:
             return frame
-        self._schedule.update(frame.time)
-        self.clock_step = sum(self._schedule.each('clock'))
+        self.schedule.update(frame.time)
+        self.clock_step = sum(self.schedule.each('clock'))
+        self.supervisor_waits = bool(self.schedule.each('waits'))
         if not self.supervisor_waits:
             waiting, self._waiting = self._waiting, {}
             for method, messages in waiting.items():
                 for message in messages:
                     getattr(self._supervisor, method)(*message)
-        if not self.clock_step:
-            return frame
         shifted = {name: replace(reading, stamp=reading.stamp + self.clock_step)
-                   for name in ('imu', 'mocap', 'joints', 'rotors', 'battery')
-                   if (reading := getattr(frame, name)) is not None}
-        return replace(frame, time=frame.time + self.clock_step, **shifted)
-
-    @property
-    def supervisor_waits(self) -> bool:
-        """Whether the supervisor is not scheduled at present."""
-        return bool(self._schedule.each('waits'))
+                   for name in READINGS if (reading := getattr(frame, name)) is not None}
+        frame = replace(frame, time=frame.time + self.clock_step, **shifted)
+        for bridges in self.schedule.each('bridges'):
+            for name, text in bridges.items():
+                if self._reported.get(name) != text:
+                    self._reported[name] = text
+                    self.send('on_actuators', name, text, frame.time)
+        return frame
 
     def send(self, method: str, *message) -> None:
         """Call one of the supervisor's ``on_`` methods, or queue the message."""
-        if not self._schedule.empty and self.supervisor_waits:
+        if self.supervisor_waits:
             self._waiting.setdefault(method, deque(maxlen=QUEUE)).append(message)
         else:
             getattr(self._supervisor, method)(*message)
-
-    def estimate(self, state: State) -> State | None:
-        """Estimate after the faults; None if it is not sent."""
-        return next(iter(self._schedule.through('estimate', state, 0.0)), None)
-
-    def requests(self, command: Command | None, now: float) -> list[Command]:
-        """Commands of the active controller that arrive now; None: delayed ones only."""
-        return self._schedule.through('request', command, now)
-
-    def target(self, target: Target) -> PoseTarget | None:
-        """Target of a fault while ``target`` is in force, or None."""
-        for pose in self._schedule.each('target'):
-            return PoseTarget(*pose, stamp=target.stamp)
-        return None
-
-    @property
-    def bridges(self) -> dict[str, str]:
-        """Bridge -> its reported state, if that has changed."""
-        if self._schedule.empty:
-            return {}
-        states = {name: text for bridges in self._schedule.each('bridges')
-                  for name, text in bridges.items()}
-        new = {name: text for name, text in states.items() if self._reported.get(name) != text}
-        self._reported.update(new)
-        return new
 
 
 class FlightLoop:
@@ -192,7 +148,6 @@ class FlightLoop:
     Attributes:
         simulator, supervisor: parts of the loop.
         refusals: reasons of refused targets.
-        ending: time in the task and reason of an early end of the flight by the supervisor, or ''.
 
     """
 
@@ -206,7 +161,6 @@ class FlightLoop:
                                      tuple(dict.fromkeys((*registry.names(), active))))
         self.supervisor.select(active)
         self.refusals: list[str] = []
-        self.ending = ''
         self._estimator = ErrorStateEkf(estimator, robot.gravity)
         self._gyroscope_noise, self._errors = estimator.imu.gyroscope_noise, robot.sensors
         self._recorder, self._faults = recorder, tuple(faults)
@@ -214,76 +168,68 @@ class FlightLoop:
         self._processes = Processes(self.simulator.tick, self.supervisor)
         self._other_target: Target | None = None     # of a fault
         self._accepts_other = False
-        self._timers = {name: ComputeTimer(c.period) for name, c in controllers.items()}
+        self._times: dict[str, list[float]] = {name: [] for name in controllers}    # CPU [s]
         self._every = {name: max(1, round(c.period / self.simulator.tick))
                        for name, c in controllers.items()}
-        self._hosts = {name: ControllerHost(name, c, self._timers[name].call)
+        self._hosts = {name: ControllerHost(name, c, partial(timed, self._times[name]))
                        for name, c in controllers.items()}
         self._joints = self._command = self._estimated = None
         self._ticks = 0
-        self._state_name = self._recorded_state = ''
+        self._reported = ''
         self._health = ALL_HEALTHY
         self._crashed = False
-        self._began = 0.0       # of the task, simulated time
 
-    @property
-    def controller_error(self) -> str:
-        """The last exception of each controller with their number, or ''."""
-        return '; '.join(f'{host.error}, {host.errors} times' for host in self._hosts.values()
-                         if host.errors)
-
-    def fly(self, task: Task, progress: Callable[[float], None] = lambda part: None) -> bool:
+    def fly(self, task: Task, progress: Callable[..., None] | None = None) -> bool:
         """
-        Take off and fly the task; ``progress`` is called with its completed fraction, 0 to 1.
+        Take off and fly the task; return whether the robot was airborne to the end.
 
-        Returns:
-            whether the robot was airborne to the end.
-
-        Raises:
-            ParameterError, RunError: no take-off.
-
+        ``progress`` gets the fraction ``completed``, 0 to 1. ParameterError and RunError: no
+        take-off.
         """
+        simulator = self.simulator
         with collector_off():
             self.take_off()
-            return self._play(task, progress)
-
-    def _play(self, task, progress):
-        self._began = self.simulator.time
-        player = TaskPlayer(task, self._began)
-        self.start_faults()
-        reported = self.simulator.time
-        while True:
-            truth = self.simulator.truth
-            moment = player.update(self.simulator.time, truth.position, truth.quaternion)
-            if moment.target is not None:
-                self.aim(moment.target)
-                battery = self.simulator.battery
-                if battery.charge < SWAP_CHARGE or self.supervisor.battery_low:
-                    battery.reset()
-            if moment.changed:
-                segment = moment.segment
-                self.simulator.wrench = np.r_[segment.force_world, segment.torque_body]
-                self.simulator.payload = segment.payload
-                self._recorder.write('disturbance', Wrench(
-                    self.simulator.time, segment.force_world, segment.torque_body))
-            if moment.finished or self._crashed:
-                break
-            self.step()
-            if self.simulator.time - reported >= COMPUTE_REPORT:
-                reported += COMPUTE_REPORT
-                self._report_compute()
-                progress(min(1.0, (self.simulator.time - player.start) / task.duration))
-        self._report_compute()
-        progress(1.0)
-        return not (self._crashed or player.lost_level is not None
-                    or self.simulator.truth.broken)
+            began = reported = simulator.time
+            player = TaskPlayer(task, began)
+            self.start_faults()
+            while True:
+                truth = simulator.truth
+                moment = player.update(simulator.time, truth.position, truth.quaternion)
+                if moment.target is not None:
+                    self.aim(moment.target)
+                    if simulator.battery.charge < SWAP_CHARGE or self.supervisor.battery_low:
+                        simulator.battery.reset()
+                if moment.changed:
+                    segment = moment.segment
+                    simulator.wrench = np.r_[segment.force_world, segment.torque_body]
+                    simulator.payload = segment.payload
+                    self._recorder.write('disturbance', Wrench(
+                        simulator.time, segment.force_world, segment.torque_body))
+                over = moment.finished or self._crashed
+                if not over:
+                    self.step()
+                if over or simulator.time - reported >= COMPUTE_REPORT:
+                    reported += COMPUTE_REPORT
+                    for name, times in self._times.items():
+                        summary = compute_summary(times, self._hosts[name].controller.period)
+                        self._recorder.write('diagnostics', [Diagnostic(
+                            simulator.time, f'{name}_node: {COMPUTE_STATUS}', 0, '',
+                            {key: str(value) for key, value in summary.items()})])
+                    if progress:
+                        progress(completed=(simulator.time - began) / task.duration)
+                if over:
+                    break
+        stayed = not (self._crashed or player.lost_level is not None or truth.broken)
+        self._recorder.write_meta({'crashed': not stayed, 'controller_error': '; '.join(
+            f'{host.error}, {host.errors} times' for host in self._hosts.values()
+            if host.errors)})
+        return stayed
 
     def start_faults(self) -> None:
         """Start the time of the faults."""
-        if self._faults:
-            self.simulator.set_faults([fault for fault in self._faults if not fault.is_process])
-            self._processes.set_faults([fault for fault in self._faults if fault.is_process],
-                                       self.simulator.time)
+        self.simulator.set_faults([fault for fault in self._faults if not fault.is_process])
+        self._processes.schedule.set([fault for fault in self._faults if fault.is_process],
+                                     self.simulator.time)
 
     def aim(self, target: Target) -> None:
         """Set the target in force."""
@@ -306,59 +252,59 @@ class FlightLoop:
             RunError: no take-off.
 
         """
-        while self.simulator.time < SETTLE_TIME or (
-                self._estimator.status != 'tracking' and self.simulator.time < START_TIMEOUT):
-            self._step_before_flight()
-        answer = self.supervisor.arm(self.simulator.time)
-        if not answer:
-            raise RunError(answer.text)
+        asked = False
         while self.supervisor.state != 'flying':
-            self._step_before_flight()
-            if self.simulator.time > TAKEOFF_TIMEOUT or self.supervisor.state == 'disarmed':
+            self.step()
+            if error := self._hosts[self.supervisor.active].error:
+                raise ParameterError(error)
+            now = self.simulator.time
+            if asked and (now > TAKEOFF_TIMEOUT or self.supervisor.state == 'disarmed'):
                 events = list(dict.fromkeys(     # the newest first, each once
                     event.text for event in reversed(self.supervisor.events)))
                 raise RunError(f'no take-off within {TAKEOFF_TIMEOUT:g} s, supervisor in '
                                f"'{self.supervisor.state}' ({'; '.join(events[2::-1])})")
-
-    def _step_before_flight(self):
-        self.step()
-        if error := self._hosts[self.supervisor.active].error:
-            raise ParameterError(error)
+            if not asked and now >= SETTLE_TIME and (
+                    self._estimator.status == 'tracking' or now >= START_TIMEOUT):
+                asked = True
+                answer = self.supervisor.arm(now)
+                if not answer:
+                    raise RunError(answer.text)
 
     def step(self) -> Frame:
         """Run one tick of the simulator and of every process that is due in it."""
-        simulator, processes = self.simulator, self._processes
-        frame = processes.frame(simulator.step())
+        processes, recorder = self._processes, self._recorder
+        frame = processes.frame(self.simulator.step())
         self._ticks += 1
         now = frame.time
         self._sense(frame)
-        estimate = self._estimator.estimate
+        estimate, commands = self._estimator.estimate, {}
         new = estimate is not None and estimate.stamp != self._estimated
         if new and self._joints is not None:
             self._estimated = estimate.stamp    # each estimate is sent once
-            state = processes.estimate(State.join(estimate, self._joints, self._command))
-            if state is not None:
+            for state in processes.schedule.through('estimate', State.join(
+                    estimate, self._joints, self._command), 0.0):
                 processes.send('on_state', state, self._estimator.status)
-                self._control(state, now)
-                self._recorder.write('odom', Odom.of(state, *(
+                commands = self._control(state)
+                recorder.write('odom', Odom.of(state, *(
                     (pose_covariance(estimate), twist_covariance(estimate, self._gyroscope_noise))
-                    if self._recorder.keeps_covariances else ())))
-        for late in processes.requests(None, now):
-            self._request(self.supervisor.active, late, now)
-        if not processes.supervisor_waits:
-            self._execute(self.supervisor.update(now), now)
-            self._note_state(now)
-        return frame
-
-    def _execute(self, command, now):
-        if command is None:
-            self._command = None
-        elif self._command is None or command.stamp > self._command.stamp \
-                or command.stamp < self._command.stamp - CLOCK_SET_BACK:
+                    if recorder.keeps_covariances else ())))
+        active = self.supervisor.active
+        arrived = processes.schedule.through('request', commands.pop(active, None), now)
+        for name, command in [*((active, one) for one in arrived), *commands.items()]:
+            recorder.write(f'{name}/command', command, now)
+            processes.send('on_command', name, command, now)
+        if processes.supervisor_waits:
+            return frame
+        command, last = self.supervisor.update(now), self._command
+        if command is None or last is None \
+                or not 0 <= last.stamp - command.stamp <= CLOCK_SET_BACK:
             self._command = command
-            self.simulator.command(replace(
-                command, stamp=command.stamp - self._processes.clock_step))
-            self._recorder.write('command', command, now)
+            if command is not None:
+                self.simulator.command(replace(
+                    command, stamp=command.stamp - processes.clock_step))
+                recorder.write('command', command, now)
+        self._note_state(now)
+        return frame
 
     def _sense(self, frame):
         recorder, send, now = self._recorder, self._processes.send, frame.time
@@ -381,12 +327,10 @@ class FlightLoop:
             recorder.write('imu/data_raw', imu)
         if frame.rotors is not None:
             send('on_rotors', frame.rotors.stamp, frame.rotors.speed)
-        for name, text in self._processes.bridges.items():
-            send('on_actuators', name, text, now)
 
-    def _control(self, state, now):
-        """Step the controllers that are due."""
-        supervisor = self.supervisor
+    def _control(self, state):
+        """Step the controllers that are due; returns their commands."""
+        supervisor, commands = self.supervisor, {}
         for name, host in self._hosts.items():
             host.on_estimate(state)
             host.override = supervisor.target_override
@@ -394,27 +338,21 @@ class FlightLoop:
                 host.on_health(supervisor.health)
             if self._ticks % self._every[name]:
                 continue
-            command = host.step(state, self._target_of_fault(host))
-            if name == supervisor.active:
-                for passed in self._processes.requests(command, now):
-                    self._request(name, passed, now)
-            elif command is not None:
-                self._request(name, command, now)
+            command = host.step(state, self._target_of_fault(host) if self._faults else None)
+            if command is not None:
+                commands[name] = command
         self._health = supervisor.health
-
-    def _request(self, name, command, now):
-        self._recorder.write(f'{name}/command', command, now)
-        self._processes.send('on_command', name, command, now)
+        return commands
 
     def _target_of_fault(self, host):
         """Return the accepted target of a fault, which replaces that of the task, or None."""
         if self.supervisor.target_override is not None:
             return None
-        other = self._processes.target(host.target_in_force)
-        if other is None:
+        others = self._processes.schedule.each('target')
+        if not others:
             self._other_target = None
         elif self._other_target is None:
-            self._other_target = other
+            self._other_target = other = PoseTarget(*others[0], stamp=host.target_in_force.stamp)
             active = self._hosts[self.supervisor.active]
             reason = self._check_target(other) or active.too_far(other, self.now)
             self._accepts_other = not reason
@@ -422,28 +360,14 @@ class FlightLoop:
         return self._other_target if self._accepts_other else None
 
     def _note_state(self, now):
-        reported = self.supervisor.reported_state
-        name = self.supervisor.state if self.supervisor.state != 'flying' else reported
-        if reported != self._recorded_state:
-            self._recorded_state = reported
-            self._recorder.write('supervisor/state', reported, now)
-            for host in self._hosts.values():
-                reason = host.on_mode(reported, self.now)
-                self.refusals += [reason] if reason else []
-        if name != self._state_name:
-            if self._state_name.startswith(('flying', 'fallback')) \
-                    and name in ('landing', 'emergency_stop', 'disarmed'):
-                last = [e.text for e in self.supervisor.events][-1:]
-                self.ending = (f'{name} at {self.simulator.time - self._began:.1f} s: '
-                               f'{last[0] if last else "unknown"}')
-            if self._state_name.startswith(('flying', 'fallback', 'landing')) \
-                    and name in ('disarmed', 'emergency_stop'):
-                self._crashed = True
-            self._state_name = name
-
-    def _report_compute(self):
-        for name, timer in self._timers.items():
-            self._recorder.write('diagnostics', [Diagnostic(
-                self.simulator.time, f'{name}_node: {COMPUTE_STATUS}', 0, '',
-                {key: str(value) for key, value in timer.summary().items()})])
-
+        reported, before = self.supervisor.reported_state, self._reported
+        if reported == before:
+            return
+        self._reported = reported
+        self._recorder.write('supervisor/state', reported, now)
+        for host in self._hosts.values():
+            reason = host.on_mode(reported, now)
+            self.refusals += [reason] if reason else []
+        if before.startswith(('flying', 'fallback', 'landing')) \
+                and self.supervisor.state in ('disarmed', 'emergency_stop'):
+            self._crashed = True

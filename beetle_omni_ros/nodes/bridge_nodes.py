@@ -25,7 +25,8 @@ from beetle_omni_ros.robot.schema import parameter
 
 UNCONFIGURED, INACTIVE, ACTIVE = 'unconfigured', 'inactive', 'active'
 RETRY = 1.0             # [s] between attempts to start by itself
-COMMAND_AGE = 0.1       # [s] older commands are not written to the servos
+COMMAND_AGE = 0.1       # [s] older commands are not sent to servos and motor board
+TARGET_PERIOD = 0.005   # [s] of the targets of the board, new or repeated
 LOST_AFTER = 0.3        # [s] after which a servo without response or torque is lost
 CHECK_PERIOD = 0.05     # [s] between checks of the bus thread's events
 RPM = math.pi / 30      # [rad/s]
@@ -287,7 +288,6 @@ class RotorBridgeNode(BridgeNode):
         given = self.parameters
         robot = RobotParameters.load(given.robot_file or None)
         self._cells = robot.battery.cells
-        self._period = 1 / given.target_rate
         self._board = MotorBoard(given, robot, clock=self.now)
         self._arming = Arming(self._board)
         self._arming.inhibit('not configured')
@@ -303,9 +303,9 @@ class RotorBridgeNode(BridgeNode):
         self.report('board', self._board_status)
         for k in range(4):
             self.report(f'rotor{k + 1}', partial(self._rotor_status, k))
-        self.listen('command', self._on_command, max_age=given.stamp_age_limit, stale_after=None)
+        self.listen('command', self._on_command, max_age=COMMAND_AGE, stale_after=None)
         self.follow('supervisor/state', self._on_supervisor)
-        self._timer = self.create_timer(self._period, self._on_timer, clock=self.steady_clock)
+        self._timer = self.create_timer(TARGET_PERIOD, self._on_timer, clock=self.steady_clock)
         self.start_by_itself()
         if given.autostart != 'none':
             self.try_to_start()     # at once; nothing is refused here
@@ -350,7 +350,7 @@ class RotorBridgeNode(BridgeNode):
         self._open(now)
         self._arming.update(now - self._updated)
         self._updated = now
-        if now - self._sent_at < self._period / 2:
+        if now - self._sent_at < TARGET_PERIOD / 2:
             # A command came between this expiry and its callback; its reset of the timer was
             # too late.
             self._timer.reset()
@@ -377,7 +377,7 @@ class RotorBridgeNode(BridgeNode):
         """Send the newest thrusts while flying; return whether they were sent."""
         command = self._command
         if self._arming.phase != FLIES or command is None \
-                or self.now() - command.stamp > self.parameters.stamp_age_limit:
+                or self.now() - command.stamp > COMMAND_AGE:
             return False
         reason = self._board.send(command.thrust, command.stamp)
         self._sent_at = time.monotonic()
@@ -388,15 +388,13 @@ class RotorBridgeNode(BridgeNode):
         return True
 
     def _poll(self):
-        battery, rotors, events = self._board.poll()
+        battery, rotors = self._board.poll()
         if battery is not None:
             self._battery = battery
             self._batteries.publish(replace(battery, cells=self._cells))
         if rotors is not None:
             self._speeds = rotors
             self._rotors.publish(RotorReading(rotors.stamp, RPM * rotors.rpm))
-        for event in events:
-            self.log_line(*event)
 
     def state_text(self):
         """Return the state of the board, or why its port is closed."""

@@ -60,19 +60,9 @@ RANDOM_POSES = {
 
 WAYPOINTS = {  # real robot; poses in the order of tasks.WAYPOINTS
     'NMPC, real robot': {'mean': {'U_position_m': 0.042, 'U_orientation_deg': 4.350},
-                         'max': {'U_position_m': 0.074, 'U_orientation_deg': 8.225},
-                         'by_pose': [{'U_position_m': 0.026, 'U_orientation_deg': 2.644},
-                                     {'U_position_m': 0.074, 'U_orientation_deg': 4.372},
-                                     {'U_position_m': 0.054, 'U_orientation_deg': 8.225},
-                                     {'U_position_m': 0.028, 'U_orientation_deg': 4.742},
-                                     {'U_position_m': 0.028, 'U_orientation_deg': 1.768}]},
+                         'max': {'U_position_m': 0.074, 'U_orientation_deg': 8.225}},
     'RL, real robot': {'mean': {'U_position_m': 0.077, 'U_orientation_deg': 4.261},
-                       'max': {'U_position_m': 0.114, 'U_orientation_deg': 5.561},
-                       'by_pose': [{'U_position_m': 0.114, 'U_orientation_deg': 2.589},
-                                   {'U_position_m': 0.060, 'U_orientation_deg': 4.350},
-                                   {'U_position_m': 0.046, 'U_orientation_deg': 4.214},
-                                   {'U_position_m': 0.074, 'U_orientation_deg': 5.561},
-                                   {'U_position_m': 0.091, 'U_orientation_deg': 4.590}]},
+                       'max': {'U_position_m': 0.114, 'U_orientation_deg': 5.561}},
 }
 
 # Levels at which control was lost in Gazebo, from the text; other levels are not published.

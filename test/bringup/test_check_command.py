@@ -24,7 +24,6 @@ PATIENT = """/**/joint_bridge_node:
     ids: [1, 2, 3, 4]
     signs: [1, 1, 1, 1]
     zeros: [2048, 2048, 2048, 2048]
-    torque_per_current: 0.671
     reply_time: 0.05
 """
 

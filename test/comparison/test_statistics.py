@@ -22,22 +22,6 @@ def test_the_interval_of_normal_values_is_that_of_students_t(count):
     assert (found['low'], found['high']) == pytest.approx((low, high), abs=width)
 
 
-@pytest.mark.parametrize('draw', [np.random.Generator.standard_normal,
-                                  np.random.Generator.standard_exponential])
-def test_intervals_of_ten_values_contain_the_mean_as_often_as_they_say(draw):
-    generator = np.random.default_rng(3)
-    truth = 0.0 if draw is np.random.Generator.standard_normal else 1.0
-    found = [described(draw(generator, 10)) for _ in range(400)]
-    share = np.mean([entry['low'] <= truth <= entry['high'] for entry in found])
-    assert 0.88 <= share <= 0.98        # skewed values: 0.9, as with Student's t
-
-
-def test_a_resampled_mean_of_a_skewed_sample_is_not_symmetric():
-    found = described(np.random.default_rng(1).lognormal(0, 1.5, 300))
-    assert found['high'] - found['mean'] > 1.1 * (found['mean'] - found['low'])
-    assert found['low'] > 0
-
-
 def test_pairing_finds_a_small_difference_below_a_large_spread():
     generator = np.random.default_rng(0)
     poses = generator.uniform(0.0, 1.0, 300)    # the same poses are hard for both

@@ -3,10 +3,6 @@
 import importlib.util
 import io
 import json
-import os
-import shutil
-import subprocess
-import sys
 
 import pytest
 from rich.console import Console
@@ -90,29 +86,6 @@ def test_a_stored_flight_is_reused_for_equal_inputs_only(poses, tmp_path, monkey
     kept, = (tmp_path / 'kept').glob('*.npz')       # in place of the old one
     kept.write_bytes(kept.read_bytes()[:200])
     assert store.load(flight) is None
-
-
-def test_a_copy_of_the_stored_flights_continues_in_another_checkout(tmp_path):
-    flight = Flight('hover', 'nominal', 'rl', 0)        # with a policy
-    Store(tmp_path / 'kept').save(flight, {'failure': None, 'metrics': {}, 'trace': {}})
-    for name in ('beetle_omni_ros', 'params', 'policies'):
-        shutil.copytree(campaign.SOURCE.parent / name, tmp_path / 'other' / name)
-    shutil.copy(campaign.SOURCE.parent / 'package.xml', tmp_path / 'other')
-    shutil.move(tmp_path / 'kept', tmp_path / 'other' / 'kept')
-    asked = ('from beetle_omni_ros.comparison.flights import Flight\n'
-             'from beetle_omni_ros.evaluation.campaign import Store, SOURCE\n'
-             "print(SOURCE, Store('kept').load(Flight('hover', 'nominal', 'rl', 0)))")
-    found = subprocess.run([sys.executable, '-c', asked], cwd=tmp_path / 'other', text=True,
-                           env={**os.environ, 'PYTHONPATH': str(tmp_path / 'other')},
-                           capture_output=True, check=True).stdout
-    assert found == f"{tmp_path / 'other' / 'beetle_omni_ros'} " \
-        "{'failure': None, 'metrics': {}, 'trace': {}}\n"
-
-
-def test_the_default_seeds_are_few_for_long_tasks():
-    counts = {task: len(plan(['rl'], [task], ['nominal'])) for task in flights_module.TASKS}
-    assert counts == {'random100': 3, 'waypoints': 6, 'lemniscate': 6, 'hover': 6,
-                      **dict.fromkeys(('force', 'torque', 'wind', 'pushes', 'payload'), 10)}
 
 
 def test_a_failed_flight_is_a_result_with_its_reason_and_not_stored(poses, tmp_path, monkeypatch):

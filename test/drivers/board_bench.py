@@ -43,7 +43,7 @@ class Pilot:
     """Sends thrusts at 200 Hz in a thread, as a bridge does."""
 
     def __init__(self, board):
-        self.board, self.thrust, self.results, self.events = board, HOVER, [], []
+        self.board, self.thrust, self.results = board, HOVER, []
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
@@ -53,10 +53,6 @@ class Pilot:
             self.results.append(self.board.send(self.thrust, time.time()))
             due += 0.005
             time.sleep(max(0.0, due - time.monotonic()))
-
-    def has_event(self, text):
-        self.events += self.board.poll()[2]
-        return any(text in event for _, event in self.events)
 
     def __enter__(self):
         self._thread.start()

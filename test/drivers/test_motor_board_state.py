@@ -24,10 +24,9 @@ def board():
     return BoardState(CELLS, 0.3, time.time)
 
 
-def tell(board, number, values, now=None):
+def tell(board, number, values, now):
     (message,) = MavlinkReceiver(1, 1).feed(reference.pack(number, values))
-    board.message(message, time.monotonic() if now is None else now)
-    return board.take()[2]
+    board.message(message, now)
 
 
 @settings(max_examples=400, deadline=None)
@@ -37,11 +36,9 @@ def test_valid_frames_with_arbitrary_content_are_tolerated(frames):
     board = BoardState(CELLS, 0.3, time.time)
     for message in MavlinkReceiver(1, 1).feed(b''.join(frames)):
         board.message(message, time.monotonic())
-        board.tick(time.monotonic(), True)
         restarted(message)
     assert board.voltage is None or 15.0 <= board.voltage <= 26.4
     assert not board.clock.known        # without a request
-    assert all(len(text.splitlines()) == 1 for _, text in board.take()[2])
 
 
 def test_the_documented_packets_are_read_in_si_units(board):
@@ -55,14 +52,13 @@ def test_the_documented_packets_are_read_in_si_units(board):
     assert (board.battery.voltage, board.battery.current) == (24.0, -12.34)
     for message in MavlinkReceiver(1, 1).feed(reference.ESC_INFO + reference.ESC_STATUS):
         board.message(message, 5.0)
-    _, rotors, events = board.take()
+    _, rotors = board.take()
     assert rotors.rpm[:3].tolist() == [6000, 6001, 6002]
     assert rotors.temperature[0] == 35.0
     assert rotors.failures == ((), (), (), ('generic',))
     assert all(math.isnan(values[3]) for values in (rotors.rpm, rotors.voltage, rotors.current,
                                                     rotors.temperature))
     assert rotors.error_count.tolist() == [0, 0, 0, 2]
-    assert events.count(('error', 'motor board: ESC of rotor 4 offline')) == 1
 
 
 def test_only_answers_to_own_requests_count_and_only_once(board):
@@ -100,7 +96,7 @@ def test_the_true_offset_is_within_the_bound(start, drift, delays):
 
     for there, back in delays:
         remote = now + there + truth(now + there)
-        assert not clock.add(now, remote, now + there + back)
+        clock.add(now, remote, now + there + back)
         now += there + back
         assert abs(clock.offset() - truth(now)) <= clock.uncertainty(now) + 1e-9
         now += 0.2
@@ -109,6 +105,6 @@ def test_the_true_offset_is_within_the_bound(start, drift, delays):
 
 def test_a_restarted_clock_is_detected_and_the_offset_replaced():
     clock = ClockOffset()
-    assert not clock.add(10.0, 500.001, 10.002)
-    assert clock.add(11.0, 0.001, 11.002)
+    clock.add(10.0, 500.001, 10.002)
+    clock.add(11.0, 0.001, 11.002)
     assert clock.offset() == pytest.approx(-11, abs=1e-6)

@@ -22,8 +22,7 @@ ZERO = np.zeros(4)
 
 @pytest.mark.real_time
 def test_configuring_writes_all_settings_and_eeprom_once(monkeypatch):
-    with bench(position_p_gain=640, position_d_gain=300, feedforward_1st_gain=12,
-               current_limit=0.5) as (bus, emulated):
+    with bench(position_p_gain=640, position_d_gain=300, current_limit=0.5) as (bus, emulated):
         for servo in emulated.servos:
             servo['Torque Enable'], servo['Drive Mode'] = 1, 5
         bus.configure()
@@ -33,7 +32,7 @@ def test_configuring_writes_all_settings_and_eeprom_once(monkeypatch):
             assert (servo['Return Delay Time'], servo['Drive Mode']) == (0, 0)
             # The mode resets the gains, so it was written first.
             assert (servo['Position P Gain'], servo['Position D Gain']) == (640, 300)
-            assert (servo['Feedforward 1st Gain'], servo['Current Limit']) == (12, 500)
+            assert servo['Current Limit'] == 500
         assert not emulated.refusals, 'nothing that the servo refuses was tried'
         written = []
         for servo in emulated.servos:

@@ -1,12 +1,14 @@
 """Faults of processes: messages of estimator, controllers and supervisor."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from beetle_omni_ros.control.base import Command, PoseTarget, State
+from beetle_omni_ros.control.base import Command, State
 from beetle_omni_ros.evaluation.loop import Processes, QUEUE
 from beetle_omni_ros.robot.readings import BatteryReading, ImuReading
-from beetle_omni_ros.sim.faults import Fault
+from beetle_omni_ros.sim.faults import Fault, Schedule
 from beetle_omni_ros.sim.sensors import Frame
 
 TICK = 0.005
@@ -31,7 +33,7 @@ def make_faulty():
     def make(*faults):
         stub = SupervisorStub()
         processes = Processes(TICK, stub)
-        processes.set_faults(faults, 0.0)
+        processes.schedule.set(faults, 0.0)
         processes.frame(frame(0.0))
         return processes, stub
     return make
@@ -68,36 +70,38 @@ def test_a_clock_step_shifts_every_stamp_and_is_reversible(make_faulty):
         assert shifted.time == time + step == shifted.imu.stamp == shifted.battery.stamp
 
 
-def test_a_silent_controller_sends_nothing_and_a_slow_one_sends_late(make_faulty):
-    silent, _ = make_faulty(Fault('controller_silent'))
-    assert silent.requests(command(1.0), 1.0) == []
-    slow, _ = make_faulty(Fault('controller_slow', delay=0.08))
-    assert slow.requests(command(1.0), 1.0) == []
-    assert slow.requests(None, 1.075) == []
-    late, = slow.requests(None, 1.08)
-    assert late.stamp == 1.0
+def through(fault, signal, *items):
+    """Items that pass through a fault which is active from 0 s."""
+    schedule = Schedule(TICK, np.random.SeedSequence(0))
+    schedule.set([fault], 0.0)
+    schedule.update(0.0)
+    return [schedule.through(signal, item, now) for item, now in items]
 
 
-def test_faults_of_estimates(make_faulty):
-    assert make_faulty(Fault('estimator_dead'))[0].estimate(STATE) is None
-    assert np.isnan(make_faulty(Fault('estimator_nan'))[0].estimate(STATE).position).all()
-    frozen, _ = make_faulty(Fault('estimator_frozen'))
-    frozen.estimate(STATE)
-    later = State(**{**vars(STATE), 'stamp': 2.0, 'position': np.zeros(3)})
-    estimate = frozen.estimate(later)
-    assert estimate.stamp == 2.0 and estimate.position[0] == 1.0
-    away, _ = make_faulty(Fault('estimator_diverges', acceleration=2.0))
-    for _ in range(200):
-        estimate = away.estimate(STATE)
-    assert np.isclose(estimate.position[0] - 1.0, 1.0) and np.isclose(estimate.velocity[0], 2.0)
-    random, _ = make_faulty(Fault('estimator_rubbish'))
-    assert np.isclose(np.linalg.norm(random.estimate(STATE).quaternion), 1.0)
+def test_a_silent_controller_sends_nothing_and_a_slow_one_sends_late():
+    assert through(Fault('controller_silent'), 'request', (command(1.0), 1.0)) == [[]]
+    at_once, early, (late,) = through(Fault('controller_slow', delay=0.08), 'request',
+                                      (command(1.0), 1.0), (None, 1.075), (None, 1.08))
+    assert at_once == early == [] and late.stamp == 1.0
 
 
-def test_foreign_targets_and_faults_of_bridge_states(make_faulty):
-    processes, _ = make_faulty(Fault('target', z=-5.0, roll=np.pi),
-                               Fault('motor_board_lost', at=0.0))
-    target = processes.target(PoseTarget(np.zeros(3), STATE.quaternion, 4.0))
-    assert target.position[2] == -5.0 and target.stamp == 4.0
-    assert processes.bridges == {'rotor': 'lost: motor board silent'}
-    assert processes.bridges == {}
+def test_faults_of_estimates():
+    def estimates(kind, *states, **numbers):
+        return through(Fault(kind, **numbers), 'estimate', *((state, 0.0) for state in states))
+
+    assert estimates('estimator_dead', STATE) == [[]]
+    (spoilt,), = estimates('estimator_nan', STATE)
+    assert np.isnan(spoilt.position).all()
+    _, (frozen,) = estimates('estimator_frozen', STATE, replace(
+        STATE, stamp=2.0, position=np.zeros(3)))
+    assert frozen.stamp == 2.0 and frozen.position[0] == 1.0
+    *_, (away,) = estimates('estimator_diverges', *200 * [STATE], acceleration=2.0)
+    assert np.isclose(away.position[0] - 1.0, 1.0) and np.isclose(away.velocity[0], 2.0)
+    (random,), = estimates('estimator_rubbish', STATE)
+    assert np.isclose(np.linalg.norm(random.quaternion), 1.0)
+
+
+def test_a_bridge_reports_a_changed_state_once(make_faulty):
+    processes, stub = make_faulty(Fault('motor_board_lost', at=0.0))
+    processes.frame(frame(0.1))
+    assert stub.received == [('on_actuators', 'rotor', 'lost: motor board silent', 0.0)]
