@@ -8,15 +8,23 @@ gravity: an IMU with wrong axes or units predicts a motion that the poses contra
 """
 
 from bisect import bisect_right
-from collections import Counter, deque
+from collections import deque
 from math import sqrt
+from operator import attrgetter
 
 import numpy as np
 
 from beetle_omni_ros.estimation.inputs import DELAY_LIMIT, GAP, InputGuard, NoiseMonitor
 from beetle_omni_ros.estimation.model import ErrorStateModel, MEASUREMENTS
 from beetle_omni_ros.estimation.parameters import EkfParameters
-from beetle_omni_ros.estimation.state import ATTITUDE, Estimate, Node, POSITION, SAME_INSTANT
+from beetle_omni_ros.estimation.state import (
+    ATTITUDE,
+    Estimate,
+    Node,
+    POSITION,
+    propagate,
+    SAME_INSTANT,
+)
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.readings import ImuReading, PoseReading
 from beetle_omni_ros.robot.rotations import geodesic_angle
@@ -35,6 +43,7 @@ JUMP_ATTITUDE = 0.35    # [rad] largest jump that is followed; the gyroscope rul
 # [m] and angle [rad], and their increase for each second since [m/s], [rad/s].
 DOUBT_POSES, DOUBT_TIME = 3, 1.0
 DISTANCE, ANGLE, SPEED, RATE = 0.05, 0.05, 2.0, 8.0
+STAMP = attrgetter('stamp')
 VELOCITY_KNOWN = 5  # poses after which the velocity is known, so that the time can be uncertain
 
 
@@ -78,13 +87,12 @@ class Track:
 
     def at(self, stamp: float) -> Node:
         """Last state not after ``stamp`` [s], or the oldest one."""
-        return self.nodes[max(0, bisect_right(self.nodes, stamp + SAME_INSTANT, key=_stamp) - 1)]
+        return self.nodes[max(0, bisect_right(self.nodes, stamp + SAME_INSTANT, key=STAMP) - 1)]
 
-    def predict(self, stamp: float, force: np.ndarray, rate: np.ndarray,
-                after_impact: bool) -> None:
+    def predict(self, stamp: float, force: np.ndarray, rate: np.ndarray) -> None:
         """Append the state at the next reading."""
         nodes = self.nodes
-        nodes.append(self._model.predict(nodes[-1], stamp, force, rate, after_impact))
+        nodes.append(propagate(nodes[-1], stamp, force, rate, self._model.gravity))
         while nodes[1].stamp < stamp - DELAY_LIMIT:
             del nodes[0]
             self._model.covariance(nodes[0])    # otherwise it would keep its predecessors
@@ -115,15 +123,15 @@ class Track:
         """
         nodes = self.nodes
         stamp = max(stamp, nodes[0].stamp)
-        index = bisect_right(nodes, stamp + SAME_INSTANT, key=_stamp) - 1
+        index = bisect_right(nodes, stamp + SAME_INSTANT, key=STAMP) - 1
         prior = nodes[index]
         since, turn = self._aligned or (np.inf, None)
         aligned = prior.stamp >= since
         if stamp - prior.stamp > SAME_INSTANT:
             after = nodes[index + 1]
-            prior = self._model.predict(prior, stamp, *interpolate(
+            prior = propagate(prior, stamp, *interpolate(
                 stamp, (prior.stamp, prior.force, prior.rate),
-                (after.stamp, after.force, after.rate)), after.after_impact)
+                (after.stamp, after.force, after.rate)), self._model.gravity)
         if turn is not None and aligned:    # poses refer to the markers
             prior = self._model.turned(prior, turn)
         if doubt_span:
@@ -136,16 +144,12 @@ class Track:
             self._model.add_time_uncertainty(posterior, self._time_deviation)
         replayed = [posterior]
         for node in nodes[index + 1:]:
-            replayed.append(self._model.predict(replayed[-1], node.stamp, node.force, node.rate,
-                                                node.after_impact))
+            replayed.append(propagate(replayed[-1], node.stamp, node.force, node.rate,
+                                      self._model.gravity))
         self.nodes = replayed
         self.last_fix = stamp
         self._waits_since = self._aligned = None
         return True
-
-
-def _stamp(node):
-    return node.stamp
 
 
 class ErrorStateEkf:
@@ -167,10 +171,9 @@ class ErrorStateEkf:
     def reset(self) -> None:
         """Return to the state before the first sample."""
         self._guard = InputGuard(self._parameters)
+        self.rejected = self._guard.rejected    # reason -> number of inputs refused for it
         self._noise = NoiseMonitor(self._parameters.mocap)
-        self._noise_scale = self._noise.scale
-        self._model.scale_noise(*self._noise_scale)
-        self._readings: deque = deque()  # (stamp, force, rate, after_impact), base_link axes
+        self._readings: deque = deque()     # (stamp, force, rate), base_link axes
         self._early: deque = deque()     # poses captured after the newest IMU sample
         self._track: Track | None = None
         self._candidate: Track | None = None
@@ -178,11 +181,6 @@ class ErrorStateEkf:
         self._good_pose: tuple | None = None    # last used one: stamp, position, quaternion
         self._contradictions, self._doubt_until = 0, -np.inf
         self._residual = np.zeros(MEASUREMENTS)     # of the last refused pose, in deviations
-
-    @property
-    def rejected(self) -> Counter:
-        """Reason -> number of inputs refused for it since :meth:`reset`."""
-        return self._guard.rejected
 
     @property
     def status(self) -> str:
@@ -222,7 +220,7 @@ class ErrorStateEkf:
         if checked is None:
             return False
         stamp = checked[0]
-        reading = (stamp, *self._model.aligned(*checked[1:3]), self._guard.after_impact)
+        reading = (stamp, *self._model.aligned(*checked[1:]))
         self._estimate = None
         self._readings.append(reading)
         while self._readings[0][0] < stamp - DELAY_LIMIT:
@@ -250,16 +248,14 @@ class ErrorStateEkf:
         if checked is None:
             return False
         self._noise.add(*checked)
-        stamp = max(checked[0] + self._time_offset(), self._readings[0][0])
+        # to the clock of the IMU, by the estimate of the leading track
+        leader = self._track if self._valid or self._candidate is None else self._candidate
+        offset = leader.newest.time_offset if leader is not None else 0.0
+        stamp = max(checked[0] + offset, self._readings[0][0])
         if stamp > self._readings[-1][0] + SAME_INSTANT:
             self._early.append((stamp, *checked[1:]))
             return True
         return self._apply(stamp, *checked[1:])
-
-    def _time_offset(self) -> float:
-        """Offset from a pose's stamp to the IMU's clock, estimated by the leading track."""
-        leader = self._track if self._valid or self._candidate is None else self._candidate
-        return leader.newest.time_offset if leader is not None else 0.0
 
     @property
     def _valid(self) -> bool:
@@ -267,9 +263,7 @@ class ErrorStateEkf:
 
     def _apply(self, stamp, position, quaternion) -> bool:
         self._estimate = None
-        if self._noise.scale != self._noise_scale:
-            self._noise_scale = self._noise.scale
-            self._model.scale_noise(*self._noise_scale)
+        self._model.scale_noise(*self._noise.scale)
         track = self._track if self._valid else None
         if track is not None:
             if track.correct(stamp, position, quaternion) \

@@ -12,8 +12,7 @@ from beetle_omni_ros.robot.readings import SpikeFilter
 Checked = tuple[float, np.ndarray, np.ndarray]   # stamp and two vectors of a sample
 GAP = 0.1           # [s] longest bridged time between two IMU samples
 RESYNC = 20         # refused consistent stamps in a row after which the clock itself has jumped
-# Samples equal to the last digit while the other sensor moves come from a frozen driver; noise
-# never repeats exactly.
+# Samples equal to the last digit come from a frozen driver; noise never repeats exactly.
 FROZEN_READINGS, FROZEN_POSES = 10, 5
 # [m/s^2] change of the specific force between two samples that is an impact of unknown impulse
 IMPACT = 30.0
@@ -41,20 +40,17 @@ class InputGuard:
     Attributes:
         rejected: reason -> count.
         clock_jumped: whether enough refused stamps of the IMU continue each other.
-        after_impact: whether readings just before it were beyond the sensor's range.
 
     """
 
     def __init__(self, parameters: EkfParameters):
         self._offset = parameters.mocap.time_offset
         self.rejected: Counter = Counter()
-        self.after_impact = self._out_of_range = False
         self._last_reading: float | None = None
         self._last_pose = -inf
         self._pose_values: tuple[float, ...] | None = None
         self._reading_values: tuple[float, ...] | None = None
         self._same_pose = self._same_reading = 0
-        self._pose_moved = self._moved = False
         self._spikes = SpikeFilter(IMPACT, SPIKE)
         self._refused: list[float] = []  # consecutive refused stamps at regular distances
 
@@ -74,7 +70,6 @@ class InputGuard:
             return self._refuse('not_finite')
         if (_squared_norm(*values[:3]) > FORCE_LIMIT ** 2
                 or _squared_norm(*values[3:]) > RATE_LIMIT ** 2):
-            self._out_of_range = True
             return self._refuse('out_of_range')
         if self._last_reading is not None:
             step = stamp - self._last_reading
@@ -84,18 +79,14 @@ class InputGuard:
                 self._refused.append(stamp)
                 return self._refuse('duplicate' if step == 0 else
                                     'backwards' if step < 0 else 'forward_gap')
-        same = values == self._reading_values
-        self._moved |= self._reading_values is not None and not same
+        self._same_reading = self._same_reading + 1 if values == self._reading_values else 0
         self._reading_values = values
-        self._same_reading = self._same_reading + 1 if same else 0
-        self._pose_moved &= same
-        if self._same_reading >= FROZEN_READINGS and self._pose_moved:
+        if self._same_reading >= FROZEN_READINGS:
             return self._refuse('frozen')
         if not self._spikes.passes(force, rate):
             return self._refuse('spike')
         self._last_reading = stamp
         self._refused.clear()
-        self.after_impact, self._out_of_range = self._out_of_range or self._spikes.lasted, False
         return stamp, force, rate
 
     @property
@@ -130,16 +121,13 @@ class InputGuard:
             return self._refuse('no_imu')
         if stamp <= self._last_pose:
             return self._refuse('duplicate' if stamp == self._last_pose else 'backwards')
-        if stamp < oldest or stamp < self._last_reading - DELAY_LIMIT:
+        if stamp < oldest:
             return self._refuse('too_old')
         if stamp > self._last_reading + GAP:
             return self._refuse('future')
         self._last_pose = stamp
-        same = values == self._pose_values
-        self._pose_moved |= self._pose_values is not None and not same
+        self._same_pose = self._same_pose + 1 if values == self._pose_values else 0
         self._pose_values = values
-        self._same_pose = self._same_pose + 1 if same and self._moved else 0
-        self._moved = False
         if self._same_pose >= FROZEN_POSES:
             return self._refuse('frozen')
         return stamp, position, quaternion / norm

@@ -15,7 +15,6 @@ from filterpy.kalman import KalmanFilter
 import numpy as np
 from scipy.special import gammaincinv
 
-from beetle_omni_ros.estimation.inputs import FORCE_LIMIT, IMPACT, RATE_LIMIT
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.estimation.state import (
     ACCELEROMETER_BIAS,
@@ -25,7 +24,6 @@ from beetle_omni_ros.estimation.state import (
     GYROSCOPE_BIAS,
     Node,
     POSITION,
-    propagate,
     STATES,
     TIME_OFFSET,
     transition,
@@ -86,10 +84,6 @@ class ErrorStateModel:
         density[TIME_OFFSET] = OFFSET_WALK ** 2
         self._process = np.diag(density)
         self._period = 1 / imu.rate
-        # a missing reading was at the limit of the sensor's range or beyond, in any direction
-        self._shock = np.zeros(STATES)
-        self._shock[VELOCITY] = FORCE_LIMIT ** 2
-        self._shock[ATTITUDE] = RATE_LIMIT ** 2
         self._doubt = np.diag([*np.repeat(np.square(DOUBT), 3), *np.zeros(4)])
 
         self._axes = rotations.matrix(rotations.exp(imu.rotation))
@@ -217,16 +211,16 @@ class ErrorStateModel:
             + (1 - share) * MARKER_STD ** 2 * change @ change.T
         return corrected, turn
 
-    def predict(self, node: Node, stamp: float, force: np.ndarray, rate: np.ndarray,
-                after_impact: bool = False) -> Node:
-        """Predict ``node`` to the next IMU reading, its covariance only on demand."""
-        return propagate(node, stamp, force, rate, self.gravity, after_impact)
-
     def covariance(self, node: Node) -> np.ndarray:
         """Covariance (16, 16) of a node, predicted now if it is pending."""
+        kalman = self.filter
         for before, after in node.pending():
-            after.covariance = self._predicted_covariance(before, after)
-            after.before = None
+            dt = after.stamp - before.stamp
+            kalman.x, kalman.P = self._no_error, before.covariance
+            # Missing samples are interpolated, and the error grows with each of them.
+            kalman.predict(F=transition(before, after, self._transition),
+                           Q=self._process * (dt * max(1.0, dt / self._period) ** 3))
+            after.covariance, after.before = kalman.P, None
         return node.covariance
 
     def time_deviation(self, node: Node) -> float:
@@ -234,23 +228,6 @@ class ErrorStateModel:
         steps = node.pending()
         known = steps[0][0] if steps else node
         return sqrt(known.covariance[TIME_OFFSET, TIME_OFFSET])
-
-    def _predicted_covariance(self, before: Node, after: Node) -> np.ndarray:
-        """Covariance (16, 16) after one step of :func:`propagate`."""
-        dt, kalman = after.stamp - before.stamp, self.filter
-        kalman.x = self._no_error
-        kalman.P = before.covariance
-        # Missing samples are interpolated, and the error grows with each of them.
-        kalman.predict(F=transition(before, after, self._transition),
-                       Q=self._process * (dt * max(1.0, dt / self._period) ** 3))
-        change = after.force - before.force
-        squared_change = float(change.dot(change))
-        if not (after.after_impact or squared_change > IMPACT ** 2):
-            return kalman.P
-        # an impulse, after missing readings also of the attitude
-        density = self._shock.copy() if after.after_impact else np.zeros(STATES)
-        density[VELOCITY] += squared_change
-        return kalman.P + np.diag(density * dt ** 2)
 
     def correct(self, prior: Node, position: np.ndarray, quaternion: np.ndarray) -> Node | None:
         """
@@ -265,35 +242,27 @@ class ErrorStateModel:
             The corrected node, or None if the pose fails the chi-square gate.
 
         """
-        kalman = self.filter
+        kalman, jacobian = self.filter, self.filter.H
         residual = np.empty(MEASUREMENTS)
         residual[:3] = position - prior.position
         x, y, z, w = prior.quaternion.tolist()
         measured = rotations.product(*quaternion.tolist(), *self.marker_to_base.tolist())
         residual[3:] = rotations.log(rotations.product(-x, -y, -z, w, *measured))
         residual[:3] -= prior.rotation @ self._lever
-        kalman.H[0:3, ATTITUDE] = -prior.rotation @ rotations.skew(self._lever)
-        self._linearise_time(prior)
-        kalman.P = self.covariance(prior)
-        kalman.x = self._no_error
-        kalman.update(residual, H=kalman.H)
-        # The innovation is filterpy's y with inverse covariance SI; not <= also catches NaN.
-        if not kalman.y.dot(kalman.SI).dot(kalman.y) <= self.gate:
-            return None
-        return self._inject(prior, kalman.x, kalman.P)
-
-    def _linearise_time(self, prior) -> None:
-        """
-        Set the columns of the time offset: a moving pose is displaced by motion times offset.
-
-        At rest they are zero. The estimated velocity and rate are then mostly noise, which is
-        correlated with the residual and would bias the offset.
-        """
-        jacobian = self.filter.H
+        jacobian[0:3, ATTITUDE] = -prior.rotation @ rotations.skew(self._lever)
+        # A moving pose is displaced by motion times clock offset. Near rest velocity and rate are
+        # mostly noise, which is correlated with the residual and would bias the offset.
         rate = prior.rate - prior.gyroscope_bias
         velocity = prior.velocity + prior.rotation @ rotations.cross(rate, self._lever)
         jacobian[0:3, TIME_OFFSET] = velocity if velocity.dot(velocity) > LEAST_SPEED ** 2 else 0.0
         jacobian[3:6, TIME_OFFSET] = rate if rate.dot(rate) > LEAST_RATE ** 2 else 0.0
+        kalman.P = self.covariance(prior)
+        kalman.x = self._no_error
+        kalman.update(residual, H=jacobian)
+        # The innovation is filterpy's y with inverse covariance SI; not <= also catches NaN.
+        if not kalman.y.dot(kalman.SI).dot(kalman.y) <= self.gate:
+            return None
+        return self._inject(prior, kalman.x, kalman.P)
 
     def _inject(self, prior: Node, error: np.ndarray, covariance: np.ndarray) -> Node:
         """Add the estimated error to the state; the remaining error has mean zero."""
@@ -313,7 +282,7 @@ class ErrorStateModel:
                     prior.gyroscope_bias + error[GYROSCOPE_BIAS],
                     min(LARGEST_OFFSET,
                         max(-LARGEST_OFFSET, prior.time_offset + float(error[TIME_OFFSET]))),
-                    prior.after_impact, 0.5 * (covariance + covariance.T))
+                    0.5 * (covariance + covariance.T))
 
     def aligned(self, force: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Specific force and rate (3,) minus their known biases, in base_link axes."""
@@ -327,7 +296,7 @@ class ErrorStateModel:
 
         Args:
             node: newest state of the filter.
-            readings: IMU readings (stamp, specific force, rate, after impact) up to the node's.
+            readings: IMU readings (stamp, specific force, rate) up to the node's.
 
         """
         age = node.time_offset
@@ -349,14 +318,11 @@ class ErrorStateModel:
 
     def trend(self, readings) -> np.ndarray:
         """(3,) angular acceleration [rad/s^2], by least squares through the last readings."""
-        last = [readings[i] for i in range(max(0, len(readings) - TREND), len(readings))]
-        if len(last) < max(TREND, 2):
+        if len(readings) < TREND:
             return np.zeros(3)
-        stamps, _, rates, after_impact = zip(*last)
-        if any(after_impact):
-            return np.zeros(3)
+        stamps, _, rates = zip(*(readings[k] for k in range(-TREND, 0)))
         times = np.array(stamps)
-        times -= np.add.reduce(times) / len(last)
+        times -= np.add.reduce(times) / TREND
         return times.dot(rates) / times.dot(times)
 
     def _extrapolated(self, node, age, trend) -> tuple[np.ndarray, ...]:
@@ -368,18 +334,13 @@ class ErrorStateModel:
         not delayed. The acceleration is constant over these few milliseconds, and the rate
         continues its trend. Without the trend, 25 ms are a phase lag of 18 deg at 2 Hz.
         """
-        velocity0, rate0, slopes = node.velocity.tolist(), node.rate.tolist(), trend.tolist()
-        turn = [age * (w - bias + 0.5 * age * slope)
-                for w, bias, slope in zip(rate0, node.gyroscope_bias.tolist(), slopes)]
-        quaternion = np.array(rotations.product(*node.quaternion.tolist(),
-                                                *rotations.exp_parts(*turn)))
-        acceleration = node.rotation.dot(node.force - node.accelerometer_bias).tolist()
+        turn = age * (node.rate - node.gyroscope_bias + 0.5 * age * trend)
+        acceleration = node.rotation.dot(node.force - node.accelerometer_bias)
         acceleration[2] -= self.gravity
-        position = [p + age * v + 0.5 * age ** 2 * a
-                    for p, v, a in zip(node.position.tolist(), velocity0, acceleration)]
-        velocity = [v + age * a for v, a in zip(velocity0, acceleration)]
-        rate = [w + age * slope for w, slope in zip(rate0, slopes)]
-        return np.array(position), np.array(velocity), quaternion, np.array(rate)
+        return (node.position + age * node.velocity + 0.5 * age ** 2 * acceleration,
+                node.velocity + age * acceleration,
+                rotations.multiply(node.quaternion, rotations.exp(turn)),
+                node.rate + age * trend)
 
     def _covariance_at_base(self, rotation, rate, covariance, lever: np.ndarray) -> np.ndarray:
         """

@@ -53,7 +53,6 @@ class Node:
     accelerometer_bias: np.ndarray  # (3,) base_link axes [m/s^2]
     gyroscope_bias: np.ndarray      # (3,) base_link axes [rad/s]
     time_offset: float              # stamps of the IMU minus those of the MoCap [s]
-    after_impact: bool = False      # readings just before were beyond the sensor's range
     # (16, 16) of the error states and the time offset; NaN while pending
     covariance: np.ndarray = field(default_factory=lambda: UNKNOWN)
     before: Node | None = None      # from which a pending covariance is predicted
@@ -68,7 +67,7 @@ class Node:
 
 
 def propagate(node: Node, stamp: float, force: np.ndarray, rate: np.ndarray,
-              gravity: float, after_impact: bool = False) -> Node:
+              gravity: float) -> Node:
     """
     Propagate the state, without its covariance, to the next IMU reading.
 
@@ -78,7 +77,6 @@ def propagate(node: Node, stamp: float, force: np.ndarray, rate: np.ndarray,
         force: (3,) specific force of the next reading, base_link axes [m/s^2].
         rate: (3,) angular rate of the next reading, base_link axes [rad/s].
         gravity: magnitude along world -z [m/s^2].
-        after_impact: whether readings just before the next one were beyond the sensor's range.
 
     """
     dt = stamp - node.stamp
@@ -94,18 +92,15 @@ def propagate(node: Node, stamp: float, force: np.ndarray, rate: np.ndarray,
     rotation = rotations.matrix(unit)
 
     # ndarray.dot takes a third of the time of @ at this size
-    acceleration0 = node.rotation.dot(node.force - node.accelerometer_bias).tolist()
-    acceleration1 = rotation.dot(force - node.accelerometer_bias).tolist()
-    velocity0, sixth = node.velocity.tolist(), dt * dt / 6
-    velocity = [v + h * (a0 + a1)
-                for v, a0, a1 in zip(velocity0, acceleration0, acceleration1)]
+    acceleration0 = node.rotation.dot(node.force - node.accelerometer_bias)
+    acceleration1 = rotation.dot(force - node.accelerometer_bias)
+    velocity = node.velocity + h * (acceleration0 + acceleration1)
     velocity[2] -= gravity * dt
-    position = [p + dt * v + sixth * (a0 + a0 + a1) for p, v, a0, a1 in zip(
-        node.position.tolist(), velocity0, acceleration0, acceleration1)]
+    position = node.position + dt * node.velocity \
+        + dt * dt / 6 * (acceleration0 + acceleration0 + acceleration1)
     position[2] -= 0.5 * gravity * dt * dt
-    return Node(stamp, force, rate, np.array(position), np.array(velocity), np.array(unit),
-                rotation, node.accelerometer_bias, node.gyroscope_bias, node.time_offset,
-                after_impact, UNKNOWN, before=node)
+    return Node(stamp, force, rate, position, velocity, np.array(unit), rotation,
+                node.accelerometer_bias, node.gyroscope_bias, node.time_offset, before=node)
 
 
 def transition(before: Node, after: Node, out: np.ndarray) -> np.ndarray:
