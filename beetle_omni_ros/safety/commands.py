@@ -39,8 +39,7 @@ class CommandStream:
     """
 
     def __init__(self, robot: RobotParameters):
-        self._tilt_limit = robot.joints.position_limit
-        self._low, self._high = robot.rotors.thrust_min, robot.rotors.thrust_max
+        self._robot = robot
         self.accepted: Command | None = None
         self.clipped, self.refused = 0, Counter[str]()
         self._last_refusal = ''
@@ -101,7 +100,8 @@ class CommandStream:
     def _check(self, command, now):
         """Reason of a refusal and, without one, a copy within the limits."""
         stamp, tilt, thrust = command.stamp, command.tilt, command.thrust
-        if not all(map(isfinite, [stamp, *tilt.tolist(), *thrust.tolist()])):
+        clean = within_limits(command, self._robot)
+        if clean is None or not isfinite(stamp):
             return NOT_FINITE, None
         if now - stamp > STALE_AFTER:
             return 'stale stamp', None
@@ -109,12 +109,10 @@ class CommandStream:
             return 'stamp in the future', None
         if self.accepted is not None and stamp <= self.accepted.stamp:
             return 'repeated or older stamp', None
-        clean = Command(stamp, clipped(tilt, -self._tilt_limit, self._tilt_limit),
-                        clipped(thrust, self._low, self._high))
         beyond = _farthest(tilt, clean.tilt), _farthest(thrust, clean.thrust)
-        if beyond[0] > OVERSTEP * self._tilt_limit:
+        if beyond[0] > OVERSTEP * self._robot.joints.position_limit:
             return 'tilt out of range', None
-        if beyond[1] > OVERSTEP * (self._high - self._low):
+        if beyond[1] > OVERSTEP * self._robot.rotors.thrust_max:
             return 'thrust out of range', None
         self.clipped += max(beyond) > 0
         before, self._offered = self._offered, clean
