@@ -1,15 +1,13 @@
 """
 Error-state EKF: IMU prediction and MoCap correction at capture time.
 
-The guard checks the inputs, a track is one hypothesis of the motion, and the filter here selects
-the valid hypothesis. The first track, or a new one after a long dropout or a persistent jump, is a
-candidate until enough poses agree with it and the IMU. This includes agreement of the IMU with
-gravity: an IMU with wrong axes or units predicts a motion that the poses contradict.
+The guard checks the inputs, and a track is one hypothesis of the motion. The first track, or a new
+one when the state is lost, is a candidate until enough poses agree with it and the IMU. This
+includes gravity: an IMU with wrong axes or units predicts a motion that the poses contradict.
 """
 
 from bisect import bisect_right
 from collections import deque
-from math import sqrt
 from operator import attrgetter
 
 import numpy as np
@@ -18,7 +16,6 @@ from beetle_omni_ros.estimation.inputs import DELAY_LIMIT, GAP, InputGuard, Nois
 from beetle_omni_ros.estimation.model import ErrorStateModel, MEASUREMENTS
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.estimation.state import (
-    ATTITUDE,
     Estimate,
     Node,
     POSITION,
@@ -34,10 +31,7 @@ __all__ = ['EkfParameters', 'ErrorStateEkf', 'Estimate', 'ImuReading', 'PoseRead
 DEAD_RECKONING, LOST = 0.1, 20.0    # [s] without an accepted pose until these states
 LOST_POSITION_STD = 5.0     # [m] of the position, each axis, above which the state is lost
 ALIGNED = 0.8   # least cosine between residuals of one cause; 3 % of random pairs in 6-D reach it
-SURE = 5.0      # standard deviations of the attitude that noise does not reach
 START_POSES = 20    # in a row that must agree with the IMU before the first fix, and when lost
-JUMP_POSES = 100    # that must agree with the IMU and each other before a jump is followed
-JUMP_ATTITUDE = 0.35    # [rad] largest jump that is followed; the gyroscope rules out larger ones
 # Poses that contradict the IMU, and not each other: number of the first, and the time [s] in which
 # one suffices afterwards. Further steps from the last good pose are jumps of the MoCap: distance
 # [m] and angle [rad], and their increase for each second since [m/s], [rad/s].
@@ -63,31 +57,17 @@ class Track:
     """
 
     def __init__(self, model: ErrorStateModel, first: Node, time_deviation: float):
-        """
-        Start with one state.
-
-        Args:
-            model: prediction and correction.
-            first: state with its covariance.
-            time_deviation: standard deviation of the first state's time offset [s].
-
-        """
+        """Start with one state, whose time offset has a standard deviation [s]."""
         self._time_deviation = time_deviation
         self._model = model
         self.nodes = [first]
         self.last_fix = first.stamp
-        self._waits_since: float | None = None     # first reading after a pose was used
-        self._aligned: tuple[float, np.ndarray] | None = None   # stamp and turn of expect_poses
         self.fixes = 1
 
     @property
     def newest(self) -> Node:
         """State at the newest reading."""
         return self.nodes[-1]
-
-    def at(self, stamp: float) -> Node:
-        """Last state not after ``stamp`` [s], or the oldest one."""
-        return self.nodes[max(0, bisect_right(self.nodes, stamp + SAME_INSTANT, key=STAMP) - 1)]
 
     def predict(self, stamp: float, force: np.ndarray, rate: np.ndarray) -> None:
         """Append the state at the next reading."""
@@ -96,15 +76,6 @@ class Track:
         while nodes[1].stamp < stamp - DELAY_LIMIT:
             del nodes[0]
             self._model.covariance(nodes[0])    # otherwise it would keep its predecessors
-
-    def expect_poses(self) -> None:
-        """Prepare the newest state for dead reckoning if no pose was used for some time."""
-        if self._waits_since is None:
-            self._waits_since = self.newest.stamp
-        if self.newest.stamp - self._waits_since > DEAD_RECKONING:
-            self._waits_since = np.inf      # once after each pose
-            self.nodes[-1], turn = self._model.without_marker_error(self.newest)
-            self._aligned = self.newest.stamp, turn
 
     def correct(self, stamp: float, position: np.ndarray, quaternion: np.ndarray,
                 doubt_span: float = 0.0) -> bool:
@@ -125,15 +96,11 @@ class Track:
         stamp = max(stamp, nodes[0].stamp)
         index = bisect_right(nodes, stamp + SAME_INSTANT, key=STAMP) - 1
         prior = nodes[index]
-        since, turn = self._aligned or (np.inf, None)
-        aligned = prior.stamp >= since
         if stamp - prior.stamp > SAME_INSTANT:
             after = nodes[index + 1]
             prior = propagate(prior, stamp, *interpolate(
                 stamp, (prior.stamp, prior.force, prior.rate),
                 (after.stamp, after.force, after.rate)), self._model.gravity)
-        if turn is not None and aligned:    # poses refer to the markers
-            prior = self._model.turned(prior, turn)
         if doubt_span:
             prior = self._model.doubt(prior, doubt_span)
         posterior = self._model.correct(prior, position, quaternion)
@@ -148,7 +115,6 @@ class Track:
                                       self._model.gravity))
         self.nodes = replayed
         self.last_fix = stamp
-        self._waits_since = self._aligned = None
         return True
 
 
@@ -156,14 +122,7 @@ class ErrorStateEkf:
     """Position, velocity, attitude and IMU biases of base_link, at any attitude."""
 
     def __init__(self, parameters: EkfParameters, gravity: float):
-        """
-        Construct the filter without a state.
-
-        Args:
-            parameters: noise, extrinsics, gates and times.
-            gravity: magnitude along world -z [m/s^2].
-
-        """
+        """Construct the filter without a state; ``gravity`` [m/s^2] along world -z."""
         self._parameters = parameters
         self._model = ErrorStateModel(parameters, gravity)
         self.reset()
@@ -230,8 +189,6 @@ class ErrorStateEkf:
                 track.predict(*reading)
         while self._early and self._early[0][0] <= stamp + SAME_INSTANT:
             self._apply(*self._early.popleft())
-        if self._track is not None:
-            self._track.expect_poses()
         return True
 
     def pose(self, sample: PoseReading) -> bool:
@@ -264,18 +221,25 @@ class ErrorStateEkf:
     def _apply(self, stamp, position, quaternion) -> bool:
         self._estimate = None
         self._model.scale_noise(*self._noise.scale)
-        track = self._track if self._valid else None
-        if track is not None:
-            if track.correct(stamp, position, quaternion) \
-                    or self._corrected_with_doubt(track, stamp, position, quaternion):
-                self._candidate, self._contradictions = None, 0
+        if self._track is not None and self._valid:
+            if self._track.correct(stamp, position, quaternion) \
+                    or self._corrected_with_doubt(self._track, stamp, position, quaternion):
+                self._contradictions = 0
                 self._good_pose = stamp, position, quaternion
                 return True
             self.rejected['outlier'] += 1
-        agrees = self._update_candidate(track, stamp, position, quaternion)
-        if not agrees and track is None:
+            return False
+        candidate = self._candidate
+        if candidate is not None and candidate.correct(stamp, position, quaternion):
+            if candidate.fixes >= START_POSES:
+                self._track, self._candidate = candidate, None
+            return True
+        # The known biases are used once; if they contradict the poses, start without them.
+        known = self._track.newest if candidate is None and self._track is not None else None
+        self._candidate = self._started(stamp, position, quaternion, known)
+        if candidate is not None:
             self.rejected['inconsistent_start'] += 1
-        return agrees and track is None
+        return candidate is None
 
     def _corrected_with_doubt(self, track: Track, stamp, position, quaternion) -> bool:
         """
@@ -306,47 +270,15 @@ class ErrorStateEkf:
             return False
         before, from_position, from_quaternion = self._good_pose
         dt = stamp - before
-        repeats = np.array_equal(position, from_position) \
-            and np.array_equal(quaternion, from_quaternion)
-        if repeats or not 0 < dt <= GAP:
+        if not 0 < dt <= GAP:
             return False
-        node = track.at(stamp)
+        node = track.newest
         step = position - from_position - dt * node.velocity
         was, now = (rotations.multiply(q, self._model.marker_to_base)
                     for q in (from_quaternion, quaternion))
         turned = rotations.multiply(was, rotations.exp(dt * (node.rate - node.gyroscope_bias)))
         return float(np.linalg.norm(step)) < DISTANCE + SPEED * dt \
             and geodesic_angle(turned, now) < ANGLE + RATE * dt
-
-    def _update_candidate(self, valid: Track | None, stamp, position, quaternion) -> bool:
-        """
-        Update the candidate with a pose that the track cannot use, and accept it if confirmed.
-
-        Returns:
-            False if the pose contradicts the candidate, which then restarts from this pose.
-
-        """
-        candidate = self._candidate
-        agrees = candidate is None
-        if candidate is not None:
-            agrees = candidate.correct(stamp, position, quaternion)
-            if agrees:
-                if candidate.fixes >= (START_POSES if valid is None else JUMP_POSES):
-                    if valid is not None and self._attitude_jumped(valid, candidate):
-                        self.rejected['attitude_jump'] += 1
-                        return True
-                    self._track, self._candidate = candidate, None
-                return True
-        # The known biases are used once; if they contradict the poses, start without them.
-        known = self._track.newest if agrees and self._track is not None else None
-        self._candidate = self._started(stamp, position, quaternion, known)
-        return agrees
-
-    def _attitude_jumped(self, track: Track, candidate: Track) -> bool:
-        """Whether the gyroscope rules out the candidate's attitude."""
-        deviation = sqrt(np.trace(self._model.covariance(track.newest)[ATTITUDE, ATTITUDE]))
-        return geodesic_angle(track.newest.quaternion, candidate.newest.quaternion) \
-            > JUMP_ATTITUDE + SURE * deviation
 
     def _started(self, stamp, position, quaternion, known) -> Track:
         """Start a track at a pose, with the biases of ``known``, and predict it to now."""

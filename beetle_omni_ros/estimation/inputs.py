@@ -12,8 +12,7 @@ from beetle_omni_ros.robot.readings import SpikeFilter
 Checked = tuple[float, np.ndarray, np.ndarray]   # stamp and two vectors of a sample
 GAP = 0.1           # [s] longest bridged time between two IMU samples
 RESYNC = 20         # refused consistent stamps in a row after which the clock itself has jumped
-# Samples equal to the last digit come from a frozen driver; noise never repeats exactly.
-FROZEN_READINGS, FROZEN_POSES = 10, 5
+FROZEN_READINGS = 10    # equal to the last digit, of a frozen driver; noise never repeats
 # [m/s^2] change of the specific force between two samples that is an impact of unknown impulse
 IMPACT = 30.0
 # [rad/s] a larger change of the rate in one reading is a fault; full thrust turns the body by 0.5
@@ -50,18 +49,12 @@ class InputGuard:
         self._last_pose = -inf
         self._pose_values: tuple[float, ...] | None = None
         self._reading_values: tuple[float, ...] | None = None
-        self._same_pose = self._same_reading = 0
+        self._same_reading = 0
         self._spikes = SpikeFilter(IMPACT, SPIKE)
         self._refused: list[float] = []  # consecutive refused stamps at regular distances
 
     def reading(self, sample) -> Checked | None:
-        """
-        Check an IMU sample.
-
-        Returns:
-            (stamp, specific force, angular rate) in copies, or None if it is refused.
-
-        """
+        """Copies of stamp, specific force and rate of an IMU sample, None if it is refused."""
         stamp = float(sample.stamp)
         force = np.array(sample.specific_force, dtype=float)
         rate = np.array(sample.angular_velocity, dtype=float)
@@ -96,15 +89,9 @@ class InputGuard:
 
     def pose(self, sample, oldest: float) -> Checked | None:
         """
-        Check a MoCap pose.
+        Stamp on the IMU's clock, position and unit quaternion of a pose, None if it is refused.
 
-        Args:
-            sample: stamp, position and quaternion.
-            oldest: stamp of the oldest stored IMU reading [s].
-
-        Returns:
-            (stamp on the IMU's clock, position, unit quaternion), or None if it is refused.
-
+        ``oldest`` is the stamp of the oldest stored IMU reading [s].
         """
         stamp = float(sample.stamp) + self._offset
         position = np.array(sample.position, dtype=float)
@@ -126,10 +113,9 @@ class InputGuard:
         if stamp > self._last_reading + GAP:
             return self._refuse('future')
         self._last_pose = stamp
-        self._same_pose = self._same_pose + 1 if values == self._pose_values else 0
-        self._pose_values = values
-        if self._same_pose >= FROZEN_POSES:
+        if values == self._pose_values:     # a measured pose never repeats to the last digit
             return self._refuse('frozen')
+        self._pose_values = values
         return stamp, position, quaternion / norm
 
     def _refuse(self, reason: str) -> Checked | None:

@@ -1,10 +1,7 @@
 """
-The error-state model: inputs of filterpy's Kalman filter at each step.
+The error-state model: a rigid body for filterpy, which computes covariance and gain.
 
-filterpy keeps the error state and computes its covariance and gain. This module adds the parts of
-a rigid body: propagation and residual on SO(3), and the injection of the estimated error into the
-state. The filter estimates the motion of the IMU at the IMU's stamps. The output is that of
-base_link now.
+The filter estimates the motion of the IMU at the IMU's stamps; the output is that of base_link.
 """
 
 from collections.abc import Sequence
@@ -35,9 +32,6 @@ MEASUREMENTS = 6  # position in world, rotation vector in base_link
 GATE = 0.99999          # share of good poses that passes the chi-square gate
 FIRST_SPEED = 5.0       # [m/s] standard deviation of the velocity before the second pose
 ACCELEROMETER_BIAS_STD, GYROSCOPE_BIAS_STD = 0.2, 0.05  # [m/s^2], [rad/s] at the start
-# For dead reckoning: standard deviations of the accelerometer's true bias [m/s^2] and of the
-# markers' attitude error [rad], each axis.
-TRUE_BIAS_STD, MARKER_STD = 0.03, 0.006
 # The offset between the clocks: largest [s], random walk [s/sqrt(s)], and the speed [m/s] and rate
 # [rad/s] below which it is not estimated, because both are then mostly noise.
 LARGEST_OFFSET, OFFSET_WALK, LEAST_SPEED, LEAST_RATE = 0.05, 1e-5, 0.1, 0.2
@@ -54,7 +48,7 @@ DOUBT_RATE = 3.0
 
 class ErrorStateModel:
     """
-    Prediction and correction of one node; contains constants and buffers, no state.
+    Covariance and correction of one node; contains constants and buffers, no state.
 
     Attributes:
         marker_to_base: (4,) quaternion from base_link's axes to those of the marker body.
@@ -62,14 +56,6 @@ class ErrorStateModel:
     """
 
     def __init__(self, parameters: EkfParameters, gravity: float):
-        """
-        Compute the constant matrices.
-
-        Args:
-            parameters: noise and extrinsics.
-            gravity: magnitude along world -z [m/s^2].
-
-        """
         imu, mocap = parameters.imu, parameters.mocap
         self.gravity = gravity
         self.parameters = parameters
@@ -140,12 +126,8 @@ class ErrorStateModel:
         Make the time offset uncertain in a node that was estimated with an exact offset.
 
         With another offset the same poses would have given the state of another instant. The
-        errors of the states are therefore the error of the offset times their rates.
-
-        Args:
-            node: node with known velocity; its covariance is replaced.
-            deviation: standard deviation of the offset [s].
-
+        errors of the states are therefore the error of the offset times their rates. ``deviation``
+        [s] is that of the offset; the velocity of the node is known.
         """
         acceleration = node.rotation @ (node.force - node.accelerometer_bias)
         acceleration[2] -= self.gravity
@@ -168,49 +150,6 @@ class ErrorStateModel:
         covariance += DOUBT_RATE ** 2 * change @ change.T
         return replace(node, covariance=covariance)
 
-    def turned(self, node: Node, turn: np.ndarray) -> Node:
-        """
-        Give a state the attitude error of the markers, and the bias that has the same effect.
-
-        Args:
-            node: state without this error.
-            turn: (3,) the error, a rotation vector in base_link [rad].
-
-        """
-        quaternion = rotations.normalized(rotations.multiply(
-            node.quaternion, rotations.exp(turn)))
-        bias = node.accelerometer_bias - self.gravity * rotations.cross(node.rotation[2], turn)
-        return replace(node, quaternion=quaternion, rotation=rotations.matrix(quaternion),
-                       accelerometer_bias=bias, covariance=self.covariance(node), before=None)
-
-    def without_marker_error(self, node: Node) -> tuple[Node, np.ndarray]:
-        """
-        Correct attitude and bias of a state, for the time after the last pose.
-
-        An attitude error of the markers appears as an accelerometer bias perpendicular to gravity,
-        which is wrong as soon as the robot turns. In one attitude only the sum of both errors is
-        known, and their priors divide it.
-
-        Returns:
-            the state, and the error of the markers (3,), a rotation vector in base_link [rad]; it
-            is zero if the bias is beyond three standard deviations of both: then it is another
-            error.
-
-        """
-        up, markers = node.rotation[2], (self.gravity * MARKER_STD) ** 2
-        both = TRUE_BIAS_STD ** 2 + markers
-        share = markers / both
-        turn = share / self.gravity * rotations.cross(up, node.accelerometer_bias)
-        if turn.dot(turn) > (3 * share / self.gravity) ** 2 * both:
-            return node, np.zeros(3)
-        corrected = self.turned(node, -turn)
-        change = np.zeros((STATES, 3))
-        change[ATTITUDE] = np.eye(3)
-        change[ACCELEROMETER_BIAS] = -self.gravity * rotations.skew(up)
-        corrected.covariance = corrected.covariance \
-            + (1 - share) * MARKER_STD ** 2 * change @ change.T
-        return corrected, turn
-
     def covariance(self, node: Node) -> np.ndarray:
         """Covariance (16, 16) of a node, predicted now if it is pending."""
         kalman = self.filter
@@ -231,15 +170,10 @@ class ErrorStateModel:
 
     def correct(self, prior: Node, position: np.ndarray, quaternion: np.ndarray) -> Node | None:
         """
-        Correct a node with a pose that was captured at its stamp.
-
-        Args:
-            prior: predicted node.
-            position: (3,) of the marker body in world [m].
-            quaternion: (4,) marker body to world, unit, either sign.
+        Correct a node with a pose of the marker body in world, captured at its stamp.
 
         Returns:
-            The corrected node, or None if the pose fails the chi-square gate.
+            the corrected node, or None if the pose fails the chi-square gate.
 
         """
         kalman, jacobian = self.filter, self.filter.H
@@ -292,12 +226,9 @@ class ErrorStateModel:
 
     def estimate(self, node: Node, readings: Sequence = ()) -> Estimate:
         """
-        Convert a node to the state of base_link at its stamp, with its covariance.
+        State of base_link at the stamp of the newest node, with its covariance.
 
-        Args:
-            node: newest state of the filter.
-            readings: IMU readings (stamp, specific force, rate) up to the node's.
-
+        ``readings`` (stamp, specific force, rate) end with the node's.
         """
         age = node.time_offset
         late = age > SIGNIFICANT * self.time_deviation(node)
@@ -344,10 +275,9 @@ class ErrorStateModel:
 
     def _covariance_at_base(self, rotation, rate, covariance, lever: np.ndarray) -> np.ndarray:
         """
-        Transform a state's covariance (15, 15) from the IMU to base_link's origin.
+        Transform a covariance (15, 15) from the IMU: p = p_imu - R r, v = v_imu - R (w x r).
 
-        With arm r and rate w, p = p_imu - R r and v = v_imu - R (w x r). The noise of the rate
-        sample affects the velocity through the arm.
+        The noise of the rate w affects the velocity through the arm r.
         """
         swing = rotations.cross(rate, lever)
         arm = rotation @ rotations.skew(lever)

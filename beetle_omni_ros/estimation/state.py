@@ -1,10 +1,9 @@
 """
 State of the filter, its propagation between two IMU samples, and the output.
 
-The measured signals are linear between two samples. The attitude uses the mean rate and the first
-commutator (Magnus) term, so that coning motion does not drift. Velocity and position use the
-trapezoidal rule in world, which needs no midpoint. The navigated point is the IMU. Its
-accelerometer then needs no correction by the angular acceleration, which is not measured.
+The signals are linear between two samples. The attitude uses the mean rate and the first
+commutator (Magnus) term, so that coning motion does not drift, velocity and position the
+trapezoidal rule in world. The navigated point is the IMU: no angular acceleration is measured.
 """
 
 from __future__ import annotations
@@ -68,17 +67,7 @@ class Node:
 
 def propagate(node: Node, stamp: float, force: np.ndarray, rate: np.ndarray,
               gravity: float) -> Node:
-    """
-    Propagate the state, without its covariance, to the next IMU reading.
-
-    Args:
-        node: initial state.
-        stamp: stamp of the next reading [s].
-        force: (3,) specific force of the next reading, base_link axes [m/s^2].
-        rate: (3,) angular rate of the next reading, base_link axes [rad/s].
-        gravity: magnitude along world -z [m/s^2].
-
-    """
+    """Propagate the state, without its covariance, to the next IMU reading, in base_link axes."""
     dt = stamp - node.stamp
     ax, ay, az = (node.rate - node.gyroscope_bias).tolist()
     bx, by, bz = (rate - node.gyroscope_bias).tolist()
@@ -107,11 +96,7 @@ def transition(before: Node, after: Node, out: np.ndarray) -> np.ndarray:
     """
     Linearise :func:`propagate`: error after = ``out`` @ error before.
 
-    Args:
-        before: initial node of the step.
-        after: result of :func:`propagate`.
-        out: (16, 16) buffer, identity in all unwritten blocks.
-
+    ``out`` is a (16, 16) buffer, identity in all unwritten blocks.
     """
     dt = after.stamp - before.stamp
     r0, r1 = before.rotation, after.rotation
@@ -172,10 +157,7 @@ def twist_covariance(estimate: Estimate, gyroscope_noise: float) -> np.ndarray:
     """
     Covariance (6, 6) of linear [m/s] and angular [rad/s] velocity in base_link.
 
-    Args:
-        estimate: output of the filter.
-        gyroscope_noise: standard deviation of one angular-rate sample, each axis [rad/s].
-
+    ``gyroscope_noise`` is the standard deviation of one angular-rate sample, each axis [rad/s].
     """
     to_body = rotations.matrix(estimate.quaternion).T
     jacobian = np.zeros((6, ERROR_STATES))

@@ -11,10 +11,8 @@ from beetle_omni_ros.estimation.ekf import EkfParameters, ErrorStateEkf, PoseRea
 
 
 @pytest.mark.parametrize(('delay', 'capture'), [(0.037, 0.0), (0.15, 0.0017)])
-def test_replay_equals_processing_in_order(monkeypatch, delay, capture):
+def test_replay_equals_processing_in_order(delay, capture):
     """For any latency of poses and any phase relative to the IMU samples."""
-    # in order, the last pose is older than the IMU by `delay`
-    monkeypatch.setattr(ekf_module, 'DEAD_RECKONING', 1.0)
     flight = fly(1, 1.5)
     poses = flight.trajectory(np.array([s.stamp + capture for s in flight.poses]))
     flight.poses = [PoseReading(s.stamp + capture, p, q) for s, p, q in
