@@ -28,10 +28,7 @@ LARGEST_ERROR = 0.2     # [m or rad] larger MoCap corrections are limited to thi
 
 class BackupEstimator:
     """
-    Complementary filter on raw IMU and MoCap; all inputs are finite.
-
-    Args:
-        gravity: [m/s^2].
+    Complementary filter on raw IMU and MoCap.
 
     Attributes:
         imu_alive: set by the caller; without it rates come from MoCap.

@@ -26,9 +26,6 @@ class CommandStream:
     """
     Commands of one controller: the last accepted one, and refusals with reasons.
 
-    Args:
-        robot: thrust and tilt ranges.
-
     Attributes:
         accepted: the last valid command, clipped to the ranges, or None.
         clipped: number of accepted commands that were clipped.
@@ -67,13 +64,7 @@ class CommandStream:
         return f'good for only {self.good_for:.2f} s of {RETURN_AFTER:g} s'
 
     def offer(self, command: Command, now: float) -> str:
-        """
-        Check one command; store a copy of a valid command.
-
-        Returns:
-            '' when accepted, else the reason.
-
-        """
+        """Check one command; '' when a copy is stored, else the reason of the refusal."""
         reason, clean = self._check(command, now)
         if reason:
             self.refused[reason] += 1

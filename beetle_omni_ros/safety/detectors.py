@@ -30,7 +30,6 @@ MOVED = 0.02            # [rad] the same for the angle of a stuck joint
 # Of the pack
 DIRECTIONS = 200        # of up in the body, with a computed hover load, 14 deg apart
 STEPS = 500             # between no and full thrust, for the thrust of all rotors together
-LEAST = 1.0             # [V] a smaller reading is that of a disconnected sensor
 TIME = 0.2              # [s] three readings; full thrust in a manoeuvre is shorter
 
 
@@ -40,10 +39,6 @@ class FaultWatch:
 
     A detected fault stays until :meth:`reset`: an actuator that has failed once is not used again
     in the same flight.
-
-    Args:
-        robot: nominal robot.
-        allocator: of the robot.
 
     Attributes:
         faults: name -> time of detection [s].
@@ -196,11 +191,6 @@ class PackWatch:
     drop * load / V`` with the load being the sum of those powers. With the highest voltage of the
     flight as ``rest``, a reading gives ``drop``, and this the thrust of all rotors together.
 
-    Args:
-        robot: nominal robot.
-        allocator: of the robot.
-        rotor_map: thrust limits by voltage.
-
     Attributes:
         limit: thrust that all rotors can give at the same time [N], None while the pack is strong
             enough; it only falls.
@@ -221,8 +211,6 @@ class PackWatch:
     def on_voltage(self, stamp: float, voltage: float, thrust: np.ndarray) -> None:
         """Receive a reading [V] under modelled thrusts (4,) [N]."""
         since, self._read_at = min(stamp - self._read_at, 1.0), stamp
-        if since <= 0 or voltage < LEAST:
-            return
         self._rest = max(self._rest, voltage)
         allowed, load = float(self._map.thrust_limit_below(voltage)), float((thrust ** 1.5).sum())
         self._weak_for = self._weak_for + since if allowed < self._need else 0.0

@@ -27,7 +27,7 @@ JOINT_TIMEOUT = 0.2     # [s]
 IMU_TIMEOUT = 0.05      # [s]
 MOCAP_TIMEOUT = 0.2     # [s]
 ABSURD = 1e4            # [m, m/s, m/s^2, rad/s] beyond any robot and sensor; no overflow
-VOLTAGE_END = 1000.0    # [V] from which a reading is refused
+VOLTAGES = 1.0, 1000.0  # [V] plausible readings; that of a disconnected sensor is smaller
 UNIT_TOLERANCE = 0.02   # of a quaternion's squared length
 JUMP_POSITION, JUMP_ATTITUDE = 1.0, 1.0     # [m], [rad] a single larger jump of the estimate is
                         # refused, a lasting one is accepted with the next. 20 m/s and 20 rad/s
@@ -212,24 +212,20 @@ class Inputs:
                 return
         self.backup.correct(stamp, position, quaternion)
         if self.airborne and self.imu.silent:
-            self.watch.contact.on_pose(stamp, position, quaternion, self.height)
+            self.watch.contact.on_pose(quaternion, self.height)
         self.mocap.reset()
 
     def on_battery(self, voltage: float) -> None:
-        """Receive the pack voltage under load [V]; ignored if not finite, negative or absurd."""
-        if self._now is not None and 0 <= voltage < VOLTAGE_END:
+        """Receive the pack voltage under load [V]; ignored if not finite or not plausible."""
+        if self._now is not None and VOLTAGES[0] <= voltage < VOLTAGES[1]:
             self.voltage = float(voltage)
             self.watch.on_voltage(self._now, self.voltage)
 
     def on_actuators(self, name: str, text: str, now: float) -> None:
         """
-        Receive the reported state of an actuator bridge; the next update acts on it.
+        Receive the state of the bridge 'joint' or 'rotor'; the next update acts on it.
 
-        Args:
-            name: 'joint' or 'rotor'.
-            text: 'ready', 'waiting: WHY', 'silent: WHY' or 'lost: WHY'.
-            now: time [s].
-
+        It is 'ready', 'waiting: WHY', 'silent: WHY' or 'lost: WHY'.
         """
         self.bridges[name] = text
 

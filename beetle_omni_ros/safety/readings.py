@@ -36,9 +36,6 @@ class JointWatch:
     Both follow the commands with a first-order lag, at a limited rate and after a delay. A joint
     between them, or within the noise and its friction beside them, follows its commands.
 
-    Args:
-        robot: nominal robot.
-
     Attributes:
         astray: joints (4,) bool that do not follow their command.
         jump: (4,) [rad] jump of the last reading relative to the motion before it, if it is larger
@@ -111,16 +108,7 @@ class MocapWatch:
 
     def on_pose(self, stamp: float, position: np.ndarray, quaternion: np.ndarray,
                 state: State | None) -> None:
-        """
-        Receive a pose.
-
-        Args:
-            stamp: of its capture [s].
-            position: (3,) in world [m].
-            quaternion: (4,) xyzw, unit.
-            state: estimate of about that time, None: there is none.
-
-        """
+        """Receive a pose and the estimate of about that time, None: there is none."""
         before, self._before = self._before, (stamp, position, quaternion)
         turning = 0.0 if state is None else sqrt(state.angular_velocity.dot(
             state.angular_velocity))

@@ -12,7 +12,6 @@ from beetle_omni_ros.robot.servo import Responses
 LEARNT = 1.0            # [s] time constant of the learnt factor between speed and thrust
 DELAY = 0.01            # [s] from a command's stamp until it acts
 KEPT = 64               # commands, 0.3 s at 200 Hz
-LONGEST = 0.2           # [s] longest time between two reports of one sequence
 STALLED, SHORTEST = 2.5, 0.05   # [intervals], [s]: a longer pause of the reports is a stall
 SETTLED = 0.3           # [s] after a stall, three time constants of a rotor
 SHARE = 0.5             # [-] missing share of the thrust of a lost rotor
@@ -36,9 +35,6 @@ class SpeedWatch:
     If the reports of the motor board pause, its commands were probably late, too. For SETTLED
     seconds the thrusts then differ from the model, and no rotor is suspected.
 
-    Args:
-        robot: nominal robot.
-
     Attributes:
         lost: the rotor (0 to 3) that turns too slowly, or None.
         deaf: the rotor (0 to 3) that gives more than commanded, or None.
@@ -55,7 +51,7 @@ class SpeedWatch:
 
     def reset(self) -> None:
         """Reset all learnt factors."""
-        self._stamp, self._interval, self._settled_at = -inf, inf, -inf
+        self._stamp, self._interval, self._settled_at = -inf, 0.0, -inf
         self._commands: deque = deque(maxlen=KEPT)
         self._modelled = np.zeros((2, ROTORS))      # with the shortest and with the longest lag
         self._learnt_for, self._mean_thrust, self._mean_square = np.zeros((3, ROTORS))
@@ -74,14 +70,7 @@ class SpeedWatch:
         self._commands.append((stamp, thrust))
 
     def on_speeds(self, stamp: float, speed: np.ndarray) -> None:
-        """
-        Receive a report.
-
-        Args:
-            stamp: [s].
-            speed: (4,) [rad/s], nan where the ESC is offline.
-
-        """
+        """Receive a report of the time ``stamp`` [s]: (4,) [rad/s], nan where offline."""
         dt, before = stamp - self._stamp, self._stamp
         if dt <= 0:
             return
@@ -89,10 +78,6 @@ class SpeedWatch:
         if dt > max(SHORTEST, STALLED * self._interval):
             self._settled_at = stamp + SETTLED
         self._interval = dt
-        if dt > LONGEST:
-            if self._commands:
-                self._modelled[:] = self._commands[-1][1]
-            return self.forget()
         self._follow(before, stamp)
         if stamp < self._settled_at:
             return self.forget()

@@ -48,11 +48,8 @@ class Supervisor(Inputs):
     """
     Arms, selects, checks, falls back, lands.
 
-    Args:
-        parameters: thresholds.
-        robot: the model of the robot.
-        fallback: for takeoff, fallback and landing; a HoverController or similar.
-        controllers: names of the controllers that may be active; None: those on standby.
+    ``fallback`` flies takeoff, fallback and landing. ``controllers`` may be active; None: those on
+    standby.
 
     Attributes:
         state: 'disarmed', 'takeoff', 'flying', 'fallback', 'landing' or 'emergency_stop'.
@@ -141,11 +138,9 @@ class Supervisor(Inputs):
 
     def update(self, now: float) -> Command | None:
         """
-        Select the command of the actuators; call it at least every 10 ms.
+        A finite command within limits, or None: nothing is sent.
 
-        Returns:
-            a finite command within limits, or None: nothing is sent.
-
+        Call it at least every 10 ms.
         """
         dt = self._tick(now)
         self._in_state += dt

@@ -262,13 +262,9 @@ def test_a_rotor_that_gives_more_thrust_than_asked_is_deaf_and_not_lost(sticks):
     assert watch.health.held[2] == (pytest.approx(7.0, abs=1.5) if sticks else None)
 
 
-@pytest.mark.parametrize(('speed', 'height', 'roll', 'crashed'), [
-    (2.0, 0.1, 0.0, True), (0.4, 0.1, 0.2, False), (2.0, 1.0, 0.0, False), (0.4, 0.1, 1.0, True)])
-def test_without_imu_a_fall_or_a_tipped_robot_at_the_floor_is_a_crash(
-        speed, height, roll, crashed):
-    """A landing ends at 0.3 m/s."""
+@pytest.mark.parametrize(('height', 'roll', 'crashed'), [
+    (0.1, 0.2, False), (1.0, 1.0, False), (0.1, 1.0, True)])
+def test_without_imu_a_tipped_robot_at_the_floor_is_a_crash(height, roll, crashed):
     contact = ContactWatch(ROBOT.gravity)
-    for n in range(20):
-        z = height + speed * 0.01 * max(10 - n, 0)
-        contact.on_pose(0.01 * n, np.array([0.0, 0.0, z]), rotations.from_rpy(roll, 0, 0), height)
+    contact.on_pose(rotations.from_rpy(roll, 0, 0), height)
     assert bool(contact.reason) == crashed
