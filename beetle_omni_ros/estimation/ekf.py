@@ -64,11 +64,6 @@ class Track:
         self.last_fix = first.stamp
         self.fixes = 1
 
-    @property
-    def newest(self) -> Node:
-        """State at the newest reading."""
-        return self.nodes[-1]
-
     def predict(self, stamp: float, force: np.ndarray, rate: np.ndarray) -> None:
         """Append the state at the next reading."""
         nodes = self.nodes
@@ -125,6 +120,9 @@ class ErrorStateEkf:
         """Construct the filter without a state; ``gravity`` [m/s^2] along world -z."""
         self._parameters = parameters
         self._model = ErrorStateModel(parameters, gravity)
+        imu = parameters.imu
+        self._axes = rotations.matrix(rotations.exp(imu.rotation))
+        self._known_biases = imu.accelerometer_bias, imu.gyroscope_bias
         self.reset()
 
     def reset(self) -> None:
@@ -146,7 +144,7 @@ class ErrorStateEkf:
         """'uninitialised', 'tracking', 'dead_reckoning' or 'lost' at the newest IMU sample."""
         if self._track is None:
             return 'uninitialised'
-        newest = self._track.newest
+        newest = self._track.nodes[-1]
         age = newest.stamp - self._track.last_fix
         if age <= DEAD_RECKONING:
             return 'tracking'
@@ -159,7 +157,7 @@ class ErrorStateEkf:
     def estimate(self) -> Estimate | None:
         """State at the newest IMU sample; None while uninitialised."""
         if self._estimate is None and self._track is not None:
-            self._estimate = self._model.estimate(self._track.newest, self._readings)
+            self._estimate = self._model.estimate(self._track.nodes[-1], self._readings)
         return self._estimate
 
     def imu(self, sample: ImuReading) -> bool:
@@ -179,7 +177,8 @@ class ErrorStateEkf:
         if checked is None:
             return False
         stamp = checked[0]
-        reading = (stamp, *self._model.aligned(*checked[1:]))
+        reading = (stamp, *(self._axes.dot(measured - bias)
+                            for measured, bias in zip(checked[1:], self._known_biases)))
         self._estimate = None
         self._readings.append(reading)
         while self._readings[0][0] < stamp - DELAY_LIMIT:
@@ -206,22 +205,18 @@ class ErrorStateEkf:
             return False
         self._noise.add(*checked)
         # to the clock of the IMU, by the estimate of the leading track
-        leader = self._track if self._valid or self._candidate is None else self._candidate
-        offset = leader.newest.time_offset if leader is not None else 0.0
+        leader = self._candidate or self._track
+        offset = leader.nodes[-1].time_offset if leader is not None else 0.0
         stamp = max(checked[0] + offset, self._readings[0][0])
         if stamp > self._readings[-1][0] + SAME_INSTANT:
             self._early.append((stamp, *checked[1:]))
             return True
         return self._apply(stamp, *checked[1:])
 
-    @property
-    def _valid(self) -> bool:
-        return self.status in ('tracking', 'dead_reckoning')
-
     def _apply(self, stamp, position, quaternion) -> bool:
         self._estimate = None
         self._model.scale_noise(*self._noise.scale)
-        if self._track is not None and self._valid:
+        if self._track is not None and self.status != 'lost':
             if self._track.correct(stamp, position, quaternion) \
                     or self._corrected_with_doubt(self._track, stamp, position, quaternion):
                 self._contradictions = 0
@@ -235,7 +230,7 @@ class ErrorStateEkf:
                 self._track, self._candidate = candidate, None
             return True
         # The known biases are used once; if they contradict the poses, start without them.
-        known = self._track.newest if candidate is None and self._track is not None else None
+        known = self._track.nodes[-1] if candidate is None and self._track is not None else None
         self._candidate = self._started(stamp, position, quaternion, known)
         if candidate is not None:
             self.rejected['inconsistent_start'] += 1
@@ -272,7 +267,7 @@ class ErrorStateEkf:
         dt = stamp - before
         if not 0 < dt <= GAP:
             return False
-        node = track.newest
+        node = track.nodes[-1]
         step = position - from_position - dt * node.velocity
         was, now = (rotations.multiply(q, self._model.marker_to_base)
                     for q in (from_quaternion, quaternion))

@@ -1,7 +1,7 @@
 """Checks of the filter's inputs (finite, plausible, new, in time), and the MoCap's noise."""
 
 from collections import Counter, deque
-from math import inf, isfinite, sqrt
+from math import hypot, inf, isfinite, sqrt
 
 import numpy as np
 
@@ -61,8 +61,7 @@ class InputGuard:
         values = (*force.tolist(), *rate.tolist())
         if not all(map(isfinite, (stamp, *values))):
             return self._refuse('not_finite')
-        if (_squared_norm(*values[:3]) > FORCE_LIMIT ** 2
-                or _squared_norm(*values[3:]) > RATE_LIMIT ** 2):
+        if hypot(*values[:3]) > FORCE_LIMIT or hypot(*values[3:]) > RATE_LIMIT:
             return self._refuse('out_of_range')
         if self._last_reading is not None:
             step = stamp - self._last_reading
@@ -101,7 +100,8 @@ class InputGuard:
             return self._refuse('not_finite')
         if max(map(abs, values[:3])) > PLACES:
             return self._refuse('out_of_range')
-        norm = sqrt(_squared_norm(*values[3:]))
+        x, y, z, w = values[3:]
+        norm = sqrt(x * x + y * y + z * z + w * w)
         if not abs(norm - 1) <= UNIT:
             return self._refuse('quaternion_norm')
         if self._last_reading is None:
@@ -122,11 +122,6 @@ class InputGuard:
         """Count a refusal; return the result of the caller."""
         self.rejected[reason] += 1
         return None
-
-
-def _squared_norm(x, y, z, w=0.0) -> float:
-    """Sum of squares in plain floats, which become infinite without a warning."""
-    return x * x + y * y + z * z + w * w
 
 
 class NoiseMonitor:

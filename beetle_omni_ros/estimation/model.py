@@ -72,7 +72,6 @@ class ErrorStateModel:
         self._period = 1 / imu.rate
         self._doubt = np.diag([*np.repeat(np.square(DOUBT), 3), *np.zeros(4)])
 
-        self._axes = rotations.matrix(rotations.exp(imu.rotation))
         # vector from the navigated point (the IMU) to the marker body, in base_link axes
         self._lever = mocap.position - imu.position
         self.marker_to_base = rotations.conjugate(rotations.exp(mocap.rotation))
@@ -218,12 +217,6 @@ class ErrorStateModel:
                         max(-LARGEST_OFFSET, prior.time_offset + float(error[TIME_OFFSET]))),
                     0.5 * (covariance + covariance.T))
 
-    def aligned(self, force: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Specific force and rate (3,) minus their known biases, in base_link axes."""
-        imu = self.parameters.imu
-        return (self._axes.dot(force - imu.accelerometer_bias),
-                self._axes.dot(rate - imu.gyroscope_bias))
-
     def estimate(self, node: Node, readings: Sequence = ()) -> Estimate:
         """
         State of base_link at the stamp of the newest node, with its covariance.
@@ -233,7 +226,7 @@ class ErrorStateModel:
         age = node.time_offset
         late = age > SIGNIFICANT * self.time_deviation(node)
         position, velocity, quaternion, measured_rate = (
-            self._extrapolated(node, age, self.trend(readings)) if late else
+            self._extrapolated(node, age, readings) if late else
             (node.position, node.velocity, node.quaternion, node.rate))
         rate = measured_rate - node.gyroscope_bias
         rotation, arm = rotations.matrix(quaternion), self.parameters.imu.position
@@ -247,24 +240,22 @@ class ErrorStateModel:
                         velocity - rotation.dot(rotations.cross(rate, arm)), quaternion, rate,
                         node.accelerometer_bias, node.gyroscope_bias, covariance)
 
-    def trend(self, readings) -> np.ndarray:
-        """(3,) angular acceleration [rad/s^2], by least squares through the last readings."""
-        if len(readings) < TREND:
-            return np.zeros(3)
-        stamps, _, rates = zip(*(readings[k] for k in range(-TREND, 0)))
-        times = np.array(stamps)
-        times -= np.add.reduce(times) / TREND
-        return times.dot(rates) / times.dot(times)
-
-    def _extrapolated(self, node, age, trend) -> tuple[np.ndarray, ...]:
+    def _extrapolated(self, node, age, readings) -> tuple[np.ndarray, ...]:
         """
         Extrapolate position, velocity, quaternion and rate over the latency in the IMU's stamps.
 
         A stamp on arrival can be late but not early. IMU stamps later than the MoCap's therefore
         mean a delayed reading. In the opposite case the MoCap's stamps are late and the reading is
         not delayed. The acceleration is constant over these few milliseconds, and the rate
-        continues its trend. Without the trend, 25 ms are a phase lag of 18 deg at 2 Hz.
+        continues its trend, by least squares through the last readings. Without the trend, 25 ms
+        are a phase lag of 18 deg at 2 Hz.
         """
+        trend = np.zeros(3)     # angular acceleration [rad/s^2]
+        if len(readings) >= TREND:
+            stamps, _, rates = zip(*(readings[k] for k in range(-TREND, 0)))
+            times = np.array(stamps)
+            times -= np.add.reduce(times) / TREND
+            trend = times.dot(rates) / times.dot(times)
         turn = age * (node.rate - node.gyroscope_bias + 0.5 * age * trend)
         acceleration = node.rotation.dot(node.force - node.accelerometer_bias)
         acceleration[2] -= self.gravity

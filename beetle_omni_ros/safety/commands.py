@@ -3,6 +3,8 @@
 from collections import Counter
 from math import isfinite
 
+import numpy as np
+
 from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.robot.allocation import clipped
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -86,7 +88,7 @@ class CommandStream:
     def forget(self) -> None:
         """Accept any stamp, after a step of the clock."""
         self.accepted = self._offered = None
-        self.silence.forget()
+        self.silence = Silence(TIMEOUT)
 
     def _check(self, command, now):
         """Reason of a refusal and, without one, a copy within the limits."""
@@ -100,16 +102,17 @@ class CommandStream:
             return 'stamp in the future', None
         if self.accepted is not None and stamp <= self.accepted.stamp:
             return 'repeated or older stamp', None
-        beyond = _farthest(tilt, clean.tilt), _farthest(thrust, clean.thrust)
+        beyond = np.abs(tilt - clean.tilt).max(), np.abs(thrust - clean.thrust).max()
         if beyond[0] > OVERSTEP * self._robot.joints.position_limit:
             return 'tilt out of range', None
         if beyond[1] > OVERSTEP * self._robot.rotors.thrust_max:
             return 'thrust out of range', None
-        self.clipped += max(beyond) > 0
+        self.clipped += bool(max(beyond) > 0)
         before, self._offered = self._offered, clean
         if before is None:
             return '', clean
-        steps = _farthest(clean.tilt, before.tilt), _farthest(clean.thrust, before.thrust)
+        steps = (np.abs(clean.tilt - before.tilt).max(),
+                 np.abs(clean.thrust - before.thrust).max())
         self._same = 0 if max(steps) > 0 else self._same + 1
         if self._same >= SAME:
             return FROZEN, None
@@ -129,6 +132,3 @@ def within_limits(command: Command, robot: RobotParameters) -> Command | None:
     return Command(command.stamp, clipped(command.tilt, -limit, limit),
                    clipped(command.thrust, 0.0, robot.rotors.thrust_max))
 
-
-def _farthest(a, b):
-    return max(map(abs, (a - b).tolist()))

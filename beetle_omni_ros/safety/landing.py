@@ -69,7 +69,15 @@ class Takeoff:
         if self._ramp is None:
             return self._align(state, dt)
         self._climbed_for += dt
-        self._judge(state, self._climbed_for - self._ramp.duration)
+        over = self._climbed_for - self._ramp.duration
+        if over >= 0 and np.linalg.norm(state.position - self._end) < NEAR \
+                and np.linalg.norm(state.velocity) < SLOW:
+            self.done = True
+        elif over > PATIENCE:
+            # In the air, off target: the hand-over follows. On the ground: abort.
+            self.done = self.airborne
+            if not self.airborne:
+                self.failure = f'still on the ground {PATIENCE:g} s after the climb'
         self._hover.observe(state, free=self.airborne)
         # The ramp runs by counted time, which a step of the clock does not change.
         return self._hover.step(state, self._ramp.at(self._climbed_for))
@@ -90,18 +98,6 @@ class Takeoff:
             self.failure = f'gimbal{k + 1} is {error[k]:.2f} rad from its place after ' \
                            f'{ALIGN_PATIENCE:g} s (joint_bridge_node)'
         return Command(state.stamp, self._tilt, np.zeros(4))
-
-    def _judge(self, state, over):
-        if over < 0:
-            return
-        if np.linalg.norm(state.position - self._end) < NEAR \
-                and np.linalg.norm(state.velocity) < SLOW:
-            self.done = True
-        elif over > PATIENCE:
-            # In the air, off target: the hand-over follows. On the ground: abort.
-            self.done = self.airborne
-            if not self.airborne:
-                self.failure = f'still on the ground {PATIENCE:g} s after the climb'
 
 
 class Landing:

@@ -36,6 +36,7 @@ class SpeedWatch:
     seconds the thrusts then differ from the model, and no rotor is suspected.
 
     Attributes:
+        commands: stamps [s] and commanded thrusts (4,) [N], the newest last.
         lost: the rotor (0 to 3) that turns too slowly, or None.
         deaf: the rotor (0 to 3) that gives more than commanded, or None.
         thrust: (4,) computed from the speeds [N], nan where unknown.
@@ -47,12 +48,8 @@ class SpeedWatch:
         allowed = Responses.of(robot)
         self._responses = [(lag, DELAY + delay)
                            for lag, delay in zip(allowed.rotor_lag, allowed.rotor_delay)]
-        self.reset()
-
-    def reset(self) -> None:
-        """Reset all learnt factors."""
         self._stamp, self._interval, self._settled_at = -inf, 0.0, -inf
-        self._commands: deque = deque(maxlen=KEPT)
+        self.commands: deque = deque(maxlen=KEPT)
         self._modelled = np.zeros((2, ROTORS))      # with the shortest and with the longest lag
         self._learnt_for, self._mean_thrust, self._mean_square = np.zeros((3, ROTORS))
         self.thrust = np.full(ROTORS, np.nan)
@@ -64,10 +61,6 @@ class SpeedWatch:
         self._slow_for, self._more_for = np.zeros((2, ROTORS))
         self.lost: int | None = None
         self.deaf: int | None = None
-
-    def on_command(self, stamp: float, thrust: np.ndarray) -> None:
-        """Receive the commanded thrusts (4,) [N] of the time ``stamp`` [s]."""
-        self._commands.append((stamp, thrust))
 
     def on_speeds(self, stamp: float, speed: np.ndarray) -> None:
         """Receive a report of the time ``stamp`` [s]: (4,) [rad/s], nan where offline."""
@@ -85,7 +78,7 @@ class SpeedWatch:
 
     def _follow(self, start, end):
         """Thrusts that the commands build up between two times [s]."""
-        commands = self._commands
+        commands = self.commands
         while len(commands) > 1 and commands[1][0] + self._responses[-1][1] <= start:
             commands.popleft()
         for modelled, (lag, delay) in zip(self._modelled, self._responses):

@@ -172,10 +172,6 @@ class ContactWatch:
 
     def __init__(self, gravity: float):
         self._gravity = gravity
-        self.reset()
-
-    def reset(self) -> None:
-        """Begin anew."""
         self._for, self.reason, self._usual, self._since_hit = 0.0, '', 0.0, np.inf
 
     def update(self, dt: float, height: float | None, wrench: WrenchWatch) -> None:
