@@ -2,8 +2,8 @@
 Error-state EKF: IMU prediction and MoCap correction at capture time.
 
 The guard checks the inputs, and a track is one hypothesis of the motion. The first track, or a new
-one when the state is lost, is a candidate until enough poses agree with it and the IMU. This
-includes gravity: an IMU with wrong axes or units predicts a motion that the poses contradict.
+one after a long dropout or a lasting jump, is a candidate until enough poses agree with it and the
+IMU. This includes gravity: an IMU with wrong axes or units predicts another motion.
 """
 
 from bisect import bisect_right
@@ -32,6 +32,8 @@ DEAD_RECKONING, LOST = 0.1, 20.0    # [s] without an accepted pose until these s
 LOST_POSITION_STD = 5.0     # [m] of the position, each axis, above which the state is lost
 ALIGNED = 0.8   # least cosine between residuals of one cause; 3 % of random pairs in 6-D reach it
 START_POSES = 20    # in a row that must agree with the IMU before the first fix, and when lost
+JUMP_POSES = 100    # that must agree with the IMU and each other before a jump is followed
+JUMP_ATTITUDE = 0.35    # [rad] largest jump that is followed; the gyroscope rules out larger ones
 # Poses that contradict the IMU, and not each other: number of the first, and the time [s] in which
 # one suffices afterwards. Further steps from the last good pose are jumps of the MoCap: distance
 # [m] and angle [rad], and their increase for each second since [m/s], [rad/s].
@@ -62,7 +64,7 @@ class Track:
         self._model = model
         self.nodes = [first]
         self.last_fix = first.stamp
-        self.fixes = 1
+        self.fixes, self.reckons = 1, False
 
     def predict(self, stamp: float, force: np.ndarray, rate: np.ndarray) -> None:
         """Append the state at the next reading."""
@@ -71,6 +73,9 @@ class Track:
         while nodes[1].stamp < stamp - DELAY_LIMIT:
             del nodes[0]
             self._model.covariance(nodes[0])    # otherwise it would keep its predecessors
+        if not self.reckons and stamp - self.last_fix > 2 * DEAD_RECKONING:     # 10 Hz of MoCap
+            self.reckons = True
+            nodes[-1] = self._model.without_marker_error(nodes[-1])
 
     def correct(self, stamp: float, position: np.ndarray, quaternion: np.ndarray,
                 doubt_span: float = 0.0) -> bool:
@@ -109,7 +114,7 @@ class Track:
             replayed.append(propagate(replayed[-1], node.stamp, node.force, node.rate,
                                       self._model.gravity))
         self.nodes = replayed
-        self.last_fix = stamp
+        self.last_fix, self.reckons = stamp, False
         return True
 
 
@@ -205,7 +210,7 @@ class ErrorStateEkf:
             return False
         self._noise.add(*checked)
         # to the clock of the IMU, by the estimate of the leading track
-        leader = self._candidate or self._track
+        leader = self._valid or self._candidate or self._track
         offset = leader.nodes[-1].time_offset if leader is not None else 0.0
         stamp = max(checked[0] + offset, self._readings[0][0])
         if stamp > self._readings[-1][0] + SAME_INSTANT:
@@ -213,28 +218,35 @@ class ErrorStateEkf:
             return True
         return self._apply(stamp, *checked[1:])
 
+    @property
+    def _valid(self) -> Track | None:
+        return self._track if self.status in ('tracking', 'dead_reckoning') else None
+
     def _apply(self, stamp, position, quaternion) -> bool:
         self._estimate = None
         self._model.scale_noise(*self._noise.scale)
-        if self._track is not None and self.status != 'lost':
-            if self._track.correct(stamp, position, quaternion) \
-                    or self._corrected_with_doubt(self._track, stamp, position, quaternion):
-                self._contradictions = 0
+        track, candidate = self._valid, self._candidate
+        if track is not None:
+            if track.correct(stamp, position, quaternion) \
+                    or self._corrected_with_doubt(track, stamp, position, quaternion):
+                self._candidate, self._contradictions = None, 0
                 self._good_pose = stamp, position, quaternion
                 return True
             self.rejected['outlier'] += 1
-            return False
-        candidate = self._candidate
         if candidate is not None and candidate.correct(stamp, position, quaternion):
-            if candidate.fixes >= START_POSES:
-                self._track, self._candidate = candidate, None
-            return True
+            if candidate.fixes >= (START_POSES if track is None else JUMP_POSES):
+                before = (track or candidate).nodes[-1].quaternion
+                if geodesic_angle(before, candidate.nodes[-1].quaternion) > JUMP_ATTITUDE:
+                    self.rejected['attitude_jump'] += 1
+                else:
+                    self._track, self._candidate = candidate, None
+            return track is None
         # The known biases are used once; if they contradict the poses, start without them.
         known = self._track.nodes[-1] if candidate is None and self._track is not None else None
         self._candidate = self._started(stamp, position, quaternion, known)
-        if candidate is not None:
+        if track is None and candidate is not None:
             self.rejected['inconsistent_start'] += 1
-        return candidate is None
+        return track is None and candidate is None
 
     def _corrected_with_doubt(self, track: Track, stamp, position, quaternion) -> bool:
         """

@@ -32,6 +32,9 @@ MEASUREMENTS = 6  # position in world, rotation vector in base_link
 GATE = 0.99999          # share of good poses that passes the chi-square gate
 FIRST_SPEED = 5.0       # [m/s] standard deviation of the velocity before the second pose
 ACCELEROMETER_BIAS_STD, GYROSCOPE_BIAS_STD = 0.2, 0.05  # [m/s^2], [rad/s] at the start
+# For dead reckoning: standard deviations of the accelerometer's true bias [m/s^2] and of the
+# markers' attitude error [rad], each axis.
+TRUE_BIAS_STD, MARKER_STD = 0.03, 0.006
 # The offset between the clocks: largest [s], random walk [s/sqrt(s)], and the speed [m/s] and rate
 # [rad/s] below which it is not estimated, because both are then mostly noise.
 LARGEST_OFFSET, OFFSET_WALK, LEAST_SPEED, LEAST_RATE = 0.05, 1e-5, 0.1, 0.2
@@ -148,6 +151,30 @@ class ErrorStateModel:
         change[GYROSCOPE_BIAS], change[ATTITUDE] = np.eye(3), -span * np.eye(3)
         covariance += DOUBT_RATE ** 2 * change @ change.T
         return replace(node, covariance=covariance)
+
+    def without_marker_error(self, node: Node) -> Node:
+        """
+        Correct attitude and bias of a state, for the time after the last pose.
+
+        An attitude error of the markers appears as an accelerometer bias perpendicular to gravity,
+        which is wrong as soon as the robot turns. In one attitude only the sum of both errors is
+        known, and their priors divide it. Beyond three standard deviations it is another error.
+        """
+        up, markers = node.rotation[2], (self.gravity * MARKER_STD) ** 2
+        both = TRUE_BIAS_STD ** 2 + markers
+        share = markers / both
+        turn = share / self.gravity * rotations.cross(up, node.accelerometer_bias)
+        if turn.dot(turn) > (3 * share / self.gravity) ** 2 * both:
+            return node
+        quaternion = rotations.normalized(rotations.multiply(
+            node.quaternion, rotations.exp(-turn)))
+        change = np.zeros((STATES, 3))      # with it, poses that return correct both again
+        change[ATTITUDE] = np.eye(3)
+        change[ACCELEROMETER_BIAS] = -self.gravity * rotations.skew(up)
+        return replace(
+            node, quaternion=quaternion, rotation=rotations.matrix(quaternion), before=None,
+            accelerometer_bias=node.accelerometer_bias + self.gravity * rotations.cross(up, turn),
+            covariance=self.covariance(node) + MARKER_STD ** 2 * change @ change.T)
 
     def covariance(self, node: Node) -> np.ndarray:
         """Covariance (16, 16) of a node, predicted now if it is pending."""
