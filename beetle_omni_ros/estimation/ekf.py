@@ -29,6 +29,7 @@ from beetle_omni_ros.robot.rotations import geodesic_angle
 __all__ = ['EkfParameters', 'ErrorStateEkf', 'Estimate', 'ImuReading', 'PoseReading']
 
 DEAD_RECKONING, LOST = 0.1, 20.0    # [s] without an accepted pose until these states
+WITHOUT_POSES = 0.15        # [s] until markers do not define the attitude; a MoCap has 10 Hz
 LOST_POSITION_STD = 5.0     # [m] of the position, each axis, above which the state is lost
 ALIGNED = 0.8   # least cosine between residuals of one cause; 3 % of random pairs in 6-D reach it
 START_POSES = 20    # in a row that must agree with the IMU before the first fix, and when lost
@@ -73,9 +74,16 @@ class Track:
         while nodes[1].stamp < stamp - DELAY_LIMIT:
             del nodes[0]
             self._model.covariance(nodes[0])    # otherwise it would keep its predecessors
-        if not self.reckons and stamp - self.last_fix > 2 * DEAD_RECKONING:     # 10 Hz of MoCap
+        if not self.reckons and stamp - self.last_fix > WITHOUT_POSES:
             self.reckons = True
-            nodes[-1] = self._model.without_marker_error(nodes[-1])
+            self._replay(self._model.without_marker_error(nodes[0]), nodes[1:])
+
+    def _replay(self, first: Node, later: list[Node]) -> None:
+        """Begin the history anew with a node, and predict it through the later readings."""
+        self.nodes = [first]
+        for node in later:
+            self.nodes.append(propagate(self.nodes[-1], node.stamp, node.force, node.rate,
+                                        self._model.gravity))
 
     def correct(self, stamp: float, position: np.ndarray, quaternion: np.ndarray,
                 doubt_span: float = 0.0) -> bool:
@@ -109,11 +117,7 @@ class Track:
         self.fixes += 1
         if self.fixes == VELOCITY_KNOWN:
             self._model.add_time_uncertainty(posterior, self._time_deviation)
-        replayed = [posterior]
-        for node in nodes[index + 1:]:
-            replayed.append(propagate(replayed[-1], node.stamp, node.force, node.rate,
-                                      self._model.gravity))
-        self.nodes = replayed
+        self._replay(posterior, nodes[index + 1:])
         self.last_fix, self.reckons = stamp, False
         return True
 

@@ -154,7 +154,7 @@ class ErrorStateModel:
 
     def without_marker_error(self, node: Node) -> Node:
         """
-        Correct attitude and bias of a state, for the time after the last pose.
+        Correct attitude and bias of the state at the last pose, for the time after it.
 
         An attitude error of the markers appears as an accelerometer bias perpendicular to gravity,
         which is wrong as soon as the robot turns. In one attitude only the sum of both errors is

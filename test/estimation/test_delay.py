@@ -9,7 +9,7 @@ import pytest
 from beetle_omni_ros.estimation.ekf import EkfParameters, ErrorStateEkf, PoseReading
 
 
-@pytest.mark.parametrize(('delay', 'capture'), [(0.037, 0.0), (0.15, 0.0017)])
+@pytest.mark.parametrize(('delay', 'capture'), [(0.037, 0.0), (0.13, 0.0017)])
 def test_replay_equals_processing_in_order(delay, capture):
     """For any latency of poses and any phase relative to the IMU samples."""
     flight = fly(1, 1.5)
