@@ -33,7 +33,7 @@ from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.log import LogRecorder
 from beetle_omni_ros.runs.tasks import make_task
 
-TARGETS = {'median_ms': 0.1, 'p99_ms': 0.2}  # of inference with its observation
+TARGETS = {'median': 0.1, 'p99': 0.2}   # [ms] of inference with its observation
 
 
 class TimedPolicy(PolicyController):
@@ -89,17 +89,17 @@ def main():
                'rl: inference': inference}
     for name, numbers in results.items():
         table.add_row(name, f"{numbers['count']:.0f}", *(
-            f'{numbers[key]:.3f}' for key in ('median_ms', 'p99_ms', 'max_ms')))
+            f'{numbers[key]:.3f}' for key in ('median', 'p99', 'max')))
     Console(width=120).print(table)
     poses = [compute_summary(list(part), policy.period)
              for part in np.array_split(policy.times, given.poses)]
-    quietest = min(poses, key=lambda numbers: numbers['p99_ms'])
+    quietest = min(poses, key=lambda numbers: numbers['p99'])
     met = within(inference)
     print('target of inference: '
-          + ', '.join(f'{key} {limit:g}' for key, limit in TARGETS.items())
+          + ', '.join(f'{key} {limit:g} ms' for key, limit in TARGETS.items())
           + (': met' if met else ': missed') + f' by all steps, met by those of '
           f'{sum(map(within, poses))} of {given.poses} poses; the quietest pose: '
-          f'median {quietest["median_ms"]:.3f}, p99 {quietest["p99_ms"]:.3f} ms')
+          f'median {quietest["median"]:.3f}, p99 {quietest["p99"]:.3f} ms')
     if given.json:
         inference['poses'] = poses
         given.json.write_text(json.dumps(results, indent=1) + '\n')

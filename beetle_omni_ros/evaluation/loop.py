@@ -33,7 +33,7 @@ from beetle_omni_ros.messages.values import Diagnostic, Odom, Wrench
 from beetle_omni_ros.robot.allocation import ALL_HEALTHY
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError, RunError
-from beetle_omni_ros.runs.log import COMPUTE_STATUS, Recorder
+from beetle_omni_ros.runs.log import COMPUTE_KEYS, COMPUTE_STATUS, Recorder
 from beetle_omni_ros.runs.targets import TargetChecks
 from beetle_omni_ros.runs.tasks import Task, TaskPlayer
 from beetle_omni_ros.safety.parameters import SupervisorParameters
@@ -76,10 +76,10 @@ def timed(times: list[float], function: Callable, *arguments):
 
 
 def compute_summary(times: Sequence[float], period: float) -> dict[str, float | int]:
-    """Values of the status '<name>_node: compute', from ``times`` and ``period`` [s]."""
+    """Median, 99th percentile, maximum [ms], misses of ``period`` and number of ``times`` [s]."""
     used = 1e3 * np.array(times or [0.0])
-    return {'median_ms': float(np.median(used)), 'p99_ms': float(np.percentile(used, 99)),
-            'max_ms': float(used.max()), 'deadline_misses': int(np.sum(used > 1e3 * period)),
+    return {'median': float(np.median(used)), 'p99': float(np.percentile(used, 99)),
+            'max': float(used.max()), 'deadline_misses': int(np.sum(used > 1e3 * period)),
             'count': len(times)}
 
 
@@ -210,11 +210,11 @@ class FlightLoop:
                     self.step()
                 if over or simulator.time - reported >= COMPUTE_REPORT:
                     reported += COMPUTE_REPORT
-                    for name, times in self._times.items():
-                        summary = compute_summary(times, self._hosts[name].controller.period)
+                    for controller, times in self._times.items():
+                        summary = compute_summary(times, self._hosts[controller].controller.period)
                         self._recorder.write('diagnostics', [Diagnostic(
-                            simulator.time, f'{name}_node: {COMPUTE_STATUS}', 0, '',
-                            {key: str(value) for key, value in summary.items()})])
+                            simulator.time, f'{controller}_node: {COMPUTE_STATUS}', 0, '',
+                            {key: str(summary[name]) for key, name in COMPUTE_KEYS.items()})])
                     if progress:
                         progress(completed=(simulator.time - began) / task.duration)
                 if over:
@@ -283,7 +283,9 @@ class FlightLoop:
             self._estimated = estimate.stamp    # each estimate is sent once
             for state in processes.schedule.through('estimate', State.join(
                     estimate, self._joints, self._command), 0.0):
-                processes.send('on_state', state, self._estimator.status)
+                if self._estimator.status == 'lost':
+                    continue
+                processes.send('on_state', state)
                 commands = self._control(state)
                 recorder.write('odom', Odom.of(state, *(
                     (pose_covariance(estimate), twist_covariance(estimate, self._gyroscope_noise))
