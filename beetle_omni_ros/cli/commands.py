@@ -314,11 +314,7 @@ def train(output: Annotated[Path | None, Option(metavar='DIR', help=(
               'End the training after this time.'))] = None,
           robot: TheRobotOption = None,
           json_path: JsonOption = None):
-    """
-    Train a policy and export it to ONNX; needs the extra 'train' and a GPU.
-
-    Several GPUs: torchrun --nproc-per-node N -m beetle_omni_ros.cli train --output DIR
-    """
+    """Train a policy and export it to ONNX; needs the extra 'train' and a GPU."""
     from beetle_omni_ros.train.command import parse_changes, run_train
     run_train(output=output, config=config, robot=robot, device=device, resume=resume,
               changes=parse_changes(changes, seed=seed, memory=memory),

@@ -209,8 +209,7 @@ def _folded(size):
 
 
 def export_policy(actor: FeatureModel, path: Path, robot: RobotParameters,
-                  parameters: TrainParameters, training: dict | None = None,
-                  metrics: dict | None = None) -> float:
+                  parameters: TrainParameters, training: dict) -> float:
     """
     Write an actor as ONNX with further facts of its training, and compare the file with it.
 
@@ -232,8 +231,8 @@ def export_policy(actor: FeatureModel, path: Path, robot: RobotParameters,
     written = program.model_proto
     contract = PolicyContract.default(robot, parameters.memory)
     contract = replace(
-        contract, training={**parameters.plain(), **(training or {})}, metrics=metrics or {},
-        commit=_commit(), version=__version__,
+        contract, training={**parameters.plain(), **training}, commit=_commit(),
+        version=__version__,
         created=datetime.now(timezone.utc).isoformat(timespec='seconds'))
     _strip_paths(written)
     for key, value in contract.to_metadata().items():
