@@ -73,9 +73,6 @@ class Draw:
     def uniform(self, size: int, low: float = 0.0, high: float = 1.0) -> torch.Tensor:
         """(N, size) uniform in [low, high)."""
         first, self._used = self._used, self._used + size
-        if self._used > self._numbers.shape[1]:
-            raise ValueError(f'{self._used} random numbers needed, {self._numbers.shape[1]} '
-                             'drawn')
         return low + (high - low) * self._numbers[:, first:self._used]
 
     def around(self, half_width: float, size: int) -> torch.Tensor:

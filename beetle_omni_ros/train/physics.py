@@ -163,17 +163,14 @@ def _load_kernel(source: str):
 
 
 class Physics:
-    """Control periods [s] of a batch of robots; ``kernel`` None: the Triton one if it can run."""
+    """Control periods [s] of a batch of robots, with the Triton kernel on a GPU."""
 
     def __init__(self, robot: RobotParameters, period: float, substeps: int,
-                 device: torch.device | str, kernel: bool | None = None):
+                 device: torch.device | str):
         self._period, self._substeps = period, substeps
         function = model.substep(robot, period / substeps)
-        if kernel is None:
-            kernel = torch.device(device).type == 'cuda' \
-                and importlib.util.find_spec('triton') is not None
-        self.has_kernel = kernel
-        if kernel:
+        self.has_kernel = torch.device(device).type == 'cuda'
+        if self.has_kernel:
             self._kernel = _load_kernel(_kernel_source(function))
         self._substep = torch_function(function)
 

@@ -121,7 +121,6 @@ def test_an_interrupted_run_keeps_its_state(tmp_path, capsys, monkeypatch):
     ('--output OUT --set iterations', 'expected key=value'),
     ('--output OUT --set iterations=[1', 'not valid YAML'),
     ('--output OUT --set iterations=many', 'expected an integer'),
-    ('--output OUT --set episode.target_time=[8,3]', "'target_time'"),
     ('--output OUT --seed -1', '--seed'), ('--output OUT --stop-after -1', '--stop-after'),
     ('--output OUT --config none.yaml', 'none.yaml'),
     ('--output OUT --robot none.yaml', 'none.yaml'),
