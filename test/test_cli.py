@@ -35,7 +35,7 @@ def refused(capsys, *arguments):
 
 @pytest.mark.parametrize('command', [
     [], ['fly'], ['evaluate'], ['compare'], ['faults'], ['report'], ['train'],
-    ['identify'], ['check'], ['controllers'], ['drive'], ['view']])
+    ['identify'], ['check'], ['drive'], ['view']])
 def test_every_command_has_help(capsys, command):
     assert cli.main([*command, '--help']) == 0
     assert 'Usage' in capsys.readouterr().out
@@ -48,15 +48,6 @@ def test_help_needs_neither_ros_nor_any_heavy_module():
     done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True,
                           env={**os.environ, 'PYTHONPATH': str(ROOT)}, check=False)
     assert done.returncode == 0, done.stderr
-
-
-def test_controllers_are_listed_with_their_properties(capsys, tmp_path):
-    file = tmp_path / 'controllers.json'
-    assert cli.main(['controllers', '--json', str(file)]) == 0
-    listed = json.loads(file.read_text())
-    assert list(listed)[:2] == ['nmpc', 'rl'] and 'rl_memory' in capsys.readouterr().out
-    assert listed['rl']['policy_file'] == 'policies/rl.onnx' and listed['rl']['rate_hz'] == 100
-    assert listed['nmpc']['guidance'] == 'none' and listed['nmpc']['flies_degraded']
 
 
 @pytest.mark.parametrize('command', ['report', 'view', 'gap'])

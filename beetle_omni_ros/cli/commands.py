@@ -40,7 +40,6 @@ from beetle_omni_ros.cli.options import (
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.registry import ControllerOptions, DEFAULT, owner
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.files import write_json
 
 HELP = {'help_option_names': ['-h', '--help']}
 
@@ -104,9 +103,6 @@ def evaluate(controllers: Annotated[str, Option(callback=several, metavar='NAME,
              nmpc: NmpcOption = None,
              policy: PolicyOption = None,
              allow_other_robot: OtherRobotOption = False,
-             without: Annotated[str, Option(metavar='LAYER,...', help=(
-                 'Layers of the guidance that are off: unwinding, routing, trimming, or '
-                 'all.'))] = '',
              bag: Annotated[Path | None, Option(metavar='DIR', help=(
                  'New folder for the bag; with several controllers it contains one bag for '
                  'each.'))] = None,
@@ -119,12 +115,7 @@ def evaluate(controllers: Annotated[str, Option(callback=several, metavar='NAME,
     Plant, sensors, estimator, controllers and actuators are those of the ROS graph.
     Example: beetle_omni evaluate --controllers nmpc --task random100 --json result.json
     """
-    guided = [name for name in controllers if registry.find(name).guidance != 'none']
-    if without and not guided:
-        raise ParameterError(f'--without {without}: no controller with guidance among '
-                             f"{', '.join(controllers)}")
-    options = {name: ControllerOptions(allow_other_robot=allow_other_robot,
-                                       without=without if name in guided else '')
+    options = {name: ControllerOptions(allow_other_robot=allow_other_robot)
                for name in controllers}
     for option, file, key in (('--nmpc', nmpc, 'parameters'), ('--policy', policy, 'policy')):
         name = owner(option)
@@ -372,37 +363,6 @@ def drive(source: Annotated[str, Argument(metavar='keyboard|joystick|terminal', 
     given = dict(locals())
     from beetle_omni_ros.nodes.driver import run_drive
     return run_drive(**given)
-
-
-@app.command()
-def controllers(json_path: JsonOption = None):
-    """
-    List the registered controllers.
-
-    Others fly as FILE.py:Class or package.module:Class, see docs/how-to/own_controller.md.
-    Example: beetle_omni controllers --json controllers.json
-    """
-    from beetle_omni_ros.pages.page import Grid, print_grids, Terminal
-    found = {name: _known(name) for name in registry.names()}
-    header = ['name', 'description', 'rate [Hz]', 'parameters', 'policy', 'actuators lost',
-              'guidance']
-    rows = [[name, known['error'], *[''] * 5] if 'error' in known else
-            [name, known['description'], f"{known['rate_hz']:g}", known['parameters_file'] or '–',
-             known['policy_file'] or '–', 'flies' if known['flies_degraded'] else '–',
-             known['guidance']] for name, known in found.items()]
-    print_grids([Grid('', header, rows)], Terminal())
-    write_json(json_path, found)
-
-
-def _known(name):
-    """Properties of a controller, or the error of its import."""
-    try:
-        entry = registry.find(name)
-    except ParameterError as error:
-        return {'error': str(error)}
-    return {'description': entry.description, 'rate_hz': 1 / entry.period,
-            **{key: getattr(entry, key) for key in (
-                'parameters_file', 'policy_file', 'flies_degraded', 'guidance', 'stands_by')}}
 
 
 @identify.command()

@@ -100,7 +100,7 @@ class ControllerNode(FlightNode):
         more = {} if is_own else {'controller': parameter(
             entry.reference, doc='controller that this node runs', read_only=True)}
         super().__init__(f'{entry.name}_node', entry.parameter_class, entry.parameters_file,
-                         entry.file_key, robot_file=file_parameter(), **more)
+                         f'{entry.name}_file', robot_file=file_parameter(), **more)
         self._entry = entry
         robot = RobotParameters.load(self.parameters.robot_file or None)
         controller = entry.make(

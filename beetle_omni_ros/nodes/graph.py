@@ -212,7 +212,7 @@ def controller_nodes(controller: str, robot: dict, *, standby: bool = True, nmpc
         values = {**({} if node in NODES else {'controller': entry.reference}), **robot}
         if nmpc and entry.option == '--nmpc' and entry.parameter_class:
             schema.load(entry.parameter_class, nmpc)    # an error here, not in another process
-            values[entry.file_key] = nmpc
+            values[f'{entry.name}_file'] = nmpc
         if entry.policy_file:
             given = policy if entry.name == registry.owner('--policy') else ''
             values |= {'policy': str(Path(given).absolute())} if given else {}
