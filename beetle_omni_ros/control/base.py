@@ -356,24 +356,13 @@ class ControllerHost:
             if method != 'step':
                 return function(*arguments)
             result = self._timed(function, *arguments)
-            text = flaw(result)
+            if isinstance(result, Command) and all(
+                    getattr(part, 'shape', None) == (ROTORS,)
+                    for part in (result.tilt, result.thrust)):
+                return result
+            text = f'returned {str(result)[:100]}, expected a Command with two arrays of {ROTORS}'
         except Exception as error:
             text = f'raised {error_text(error)}'
-        if not text:
-            return result
         self.errors, self.error = self.errors + 1, f"controller '{self._name}': {method} {text}"
         self._report(self.error)
         return None
-
-
-def flaw(command: object) -> str:
-    """Why the result of a controller's ``step`` is no command, or ''."""
-    if not isinstance(command, Command):
-        return f'returned {type(command).__name__}, expected control.base.Command'
-    for part in ('tilt', 'thrust'):
-        shape = getattr(getattr(command, part), 'shape', None)
-        if shape != (ROTORS,):
-            return (f'returned a command whose {part} is '
-                    f"{f'of shape {shape}' if shape is not None else 'no array'}, expected a "
-                    f'numpy array of {ROTORS}')
-    return ''

@@ -26,7 +26,6 @@ from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.schema import ParameterError, quoted
 
 LAYERS = 'unwinding', 'routing', 'trimming'
-ALL = 'all'             # in place of the names of all layers
 # Unwinding
 ATTEMPTS = 2            # to unwind, for one target
 WOUND = 2.4             # [rad] a joint beyond is wound; hover with a force or payload needs less
@@ -67,27 +66,23 @@ class Guidance:
 
     def __init__(self, axes: np.ndarray, without: str = ''):
         off = {name.strip() for name in without.split(',')} - {''}
-        if unknown := off - {*LAYERS, ALL}:
-            raise ParameterError(f"key 'without': expected {', '.join(LAYERS)} or {ALL}, found "
-                                 f'{quoted(", ".join(sorted(unknown)))}')
-        self._on = [name for name in LAYERS if not off & {name, ALL}]
+        if off - {*LAYERS, 'all'}:
+            raise ParameterError(f"key 'without': expected {', '.join(LAYERS)} or all, found "
+                                 + quoted(without))
+        self._on = [name for name in LAYERS if not off & {name, 'all'}]
         self.text = ', '.join(self._on) or 'none'
-        self._axes, self._trimming = axes, Trimming()
+        self._axes = axes
         self.reset()
 
     def reset(self) -> None:
         """Reset the memory of the target and of all parts."""
-        self._trimming.reset()
+        self._trimming = Trimming()
         self._unwound = self._routed = 0        # counts
         self._given: PoseTarget | None = None
         self._looked: np.ndarray | None = None  # attitude of the target of the last search
         # Attitudes on the way: smallest height, distance and tilt at which each is reached.
         self._way: list[tuple[np.ndarray, float, float, float]] = []
         self._until = 0.0
-        self._start()
-
-    def _start(self):
-        """Begin with a new target."""
         self._failed: list[np.ndarray] = []     # tilts at the begin of each unwinding
         self._watch(-inf)
 
@@ -110,7 +105,7 @@ class Guidance:
         if not self._way:
             return self._trimming.target(state, given, in_charge) if 'trimming' in self._on \
                 else given
-        self._trimming.reset()      # the joints may be wound differently afterwards
+        self._trimming = Trimming()     # the joints may be wound differently afterwards
         attitude, height, _, _ = self._way[0]
         position = given.position
         if position[2] < height:
@@ -124,7 +119,8 @@ class Guidance:
     def _take(self, state, given):
         """Begin with another target; search a route if its attitude differs from the last."""
         if self._given is None or not given.same_pose(self._given):
-            self._start()
+            self._failed = []
+            self._watch(-inf)
         self._given = given
         if self._looked is None \
                 or rotations.geodesic_angle(given.quaternion, self._looked) >= ANOTHER:
@@ -189,11 +185,7 @@ class Trimming:
     """
 
     def __init__(self):
-        self.reset()
-
-    def reset(self) -> None:
-        """Reset the integral."""
-        self.position, self.rotation = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
+        self.position, self.rotation = [0.0] * 3, [0.0] * 3
         self._given: PoseTarget | None = None
         self._seen = -inf
 
@@ -210,23 +202,19 @@ class Trimming:
         """
         if given is not self._given:
             if self._given is not None and not _near(*_between(self._given, given)):
-                self.reset()
+                self.position, self.rotation, self._seen = [0.0] * 3, [0.0] * 3, -inf
             self._given = given
         elapsed, self._seen = state.stamp - self._seen, state.stamp
-        if learn and 0.0 < elapsed <= LONGEST_STEP:
-            self._add(elapsed, state, given)
-        x, y, z = (0.5 * angle for angle in self.rotation)
-        turned = rotations.multiply(given.quaternion,
-                                    (x, y, z, sqrt(1.0 - (x * x + y * y + z * z))))
-        return PoseTarget(given.position + self.position, turned, given.stamp)
-
-    def _add(self, elapsed, state, given):
-        if hypot(*state.velocity.tolist()) <= SLOW \
+        if learn and 0.0 < elapsed <= LONGEST_STEP and hypot(*state.velocity.tolist()) <= SLOW \
                 and hypot(*state.angular_velocity.tolist()) <= SLOW_TURN:
             way, turn = _between(state, given)
             if _near(way, turn):
                 self.position = _added(self.position, TRIM_RATE * elapsed, way, TRIM_DISTANCE)
                 self.rotation = _added(self.rotation, TRIM_RATE * elapsed, turn, TRIM_ANGLE)
+        x, y, z = (0.5 * angle for angle in self.rotation)
+        turned = rotations.multiply(given.quaternion,
+                                    (x, y, z, sqrt(1.0 - (x * x + y * y + z * z))))
+        return PoseTarget(given.position + self.position, turned, given.stamp)
 
 
 # Plain floats, which are faster; turns are small, half an angle is its sine.

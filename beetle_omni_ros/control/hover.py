@@ -184,12 +184,13 @@ class HoverController:
         attitude_error = rotations.log(rotations.multiply(to_body, reference.quaternion))
         relative = rotations.matrix(rotations.multiply(to_body, reference.quaternion))
         p = self.parameters
-        acceleration = _pd(p.position_kp, p.position_kd, POSITION_LIMITS,
-                           reference.position - state.position,
-                           reference.velocity - state.velocity) - self._disturbance[:3]
-        angular = _pd(p.attitude_kp, p.attitude_kd, ATTITUDE_LIMITS, attitude_error,
-                      relative @ reference.angular_velocity - state.angular_velocity) \
-            - self._disturbance[3:]
+        rate_error = relative @ reference.angular_velocity - state.angular_velocity
+        acceleration = \
+            p.position_kp * _shortened(reference.position - state.position, POSITION_LIMITS[0]) \
+            + p.position_kd * _shortened(reference.velocity - state.velocity, POSITION_LIMITS[1]) \
+            - self._disturbance[:3]
+        angular = p.attitude_kp * _shortened(attitude_error, ATTITUDE_LIMITS[0]) \
+            + p.attitude_kd * _shortened(rate_error, ATTITUDE_LIMITS[1]) - self._disturbance[3:]
         inertia, rate = self._robot.inertia, state.angular_velocity
         gyroscopic = rotations.cross(rate, inertia * rate)
         return self._allocator.mass * acceleration, inertia * angular + gyroscopic
@@ -239,10 +240,6 @@ class HoverController:
             if held is not None:
                 low[i] = high[i] = held
         return bounded_step(now, wrench, np.full(4, DAMPING), helpful, low, high)
-
-
-def _pd(kp, kd, limits, error, rate_error):
-    return kp * _shortened(error, limits[0]) + kd * _shortened(rate_error, limits[1])
 
 
 def _shortened(vector, limit):

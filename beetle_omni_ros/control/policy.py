@@ -6,10 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, PoseTarget, Reference, State, Target
-from beetle_omni_ros.control.disturbance import DisturbanceEstimator, DisturbanceParameters
 from beetle_omni_ros.control.guidance import Guidance
 from beetle_omni_ros.control.policy_file import PolicyNetwork
-from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import parameter, ParameterFile
 
@@ -64,9 +62,12 @@ class PolicyController:
         tilt, rotors = robot.joints.position_limit, robot.rotors
         self._limits = [(-tilt, tilt)] * 4 + [(rotors.thrust_min, rotors.thrust_max)] * 4
         self._hover = [robot.hover_thrust] * 4
-        self._estimator = DisturbanceEstimator(
-            robot, DisturbanceParameters(), COMMAND_DELAY,
-            model.integrator(robot)) if contract.memory else None
+        self._estimator = None
+        if contract.memory:
+            from beetle_omni_ros.control import disturbance
+            from beetle_omni_ros.robot.dynamics import integrator
+            self._estimator = disturbance.DisturbanceEstimator(
+                robot, disturbance.DisturbanceParameters(), COMMAND_DELAY, integrator(robot))
         self._guidance = Guidance(robot.tilt_axes, p.without)
         self.guidance = self._guidance.text
         self.reset()
@@ -129,8 +130,8 @@ class PolicyController:
             **self._guidance.diagnostics()}
         if self._estimator:
             d = self._estimator.disturbance
-            values['force_estimate_N'] = float(np.linalg.norm(d[model.FORCE]))
-            values['torque_estimate_Nm'] = float(np.linalg.norm(d[model.TORQUE]))
+            values['force_estimate_N'] = float(np.linalg.norm(d[:3]))
+            values['torque_estimate_Nm'] = float(np.linalg.norm(d[3:6]))
         return values
 
 
