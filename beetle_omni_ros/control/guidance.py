@@ -1,18 +1,9 @@
 """
-Guidance: functions that modify the pose targets of a controller.
+Guidance: functions that modify the pose targets of a controller without prediction or memory.
 
-A controller that is a function of the present state, like a policy, needs it for wound joints and
-for steady errors. Guidance is optional: a controller may contain a :class:`Guidance`.
-
-- Unwinding: from a joint's stop through a level attitude back to the target. A level attitude
-  unwinds all joints, and from there the target is reached as after a take-off. If the turn back is
-  long, the attitude half way follows, because a policy may choose either direction for nearly half
-  a turn, and the wrong one winds the joints differently.
-- Routing: through an intermediate attitude if the shortest turn needs more than the travel of a
-  joint.
-- Trimming: an integral against the steady error.
-
-docs/explanation/policy.md has the reasons.
+Unwinding leads from a joint's stop through a level attitude back to the target, routing through an
+intermediate attitude if the shortest turn needs more than the travel of a joint. Trimming is an
+integral against the steady error. docs/explanation/policy.md has the reasons.
 """
 
 from dataclasses import replace
@@ -54,13 +45,7 @@ class Guidance:
 
     Args:
         axes: (4, 3) unit tilt axes in base_link.
-        without: layers that are off: names with commas, or 'all'.
-
-    Attributes:
-        text: lists the active layers.
-
-    Raises:
-        ParameterError: an unknown layer.
+        without: layers that are off: names with commas, or 'all'; ``text`` lists the others.
 
     """
 
@@ -172,11 +157,9 @@ class Guidance:
 
 class Trimming:
     """
-    Integral action: shifts pose targets against the steady error.
+    Integral of the steady error, which is added to the target.
 
-    Biased encoders, a shifted centre of mass or a payload cause a steady error of some millimetres
-    and degrees. The integral of this error is added to the target. It is slow compared with the
-    policy, bounded, and only active near the target.
+    Biased encoders, a shifted centre of mass or a payload cause some millimetres and degrees.
 
     Attributes:
         position: (3,) shift of the target, in world [m].
@@ -191,14 +174,9 @@ class Trimming:
 
     def target(self, state: State, given: PoseTarget, learn: bool = True) -> PoseTarget:
         """
-        The modified target for the policy.
+        The modified target; ``learn``: whether this controller is active and flies towards it.
 
-        Args:
-            state: of the robot.
-            given: the target. If it is not near the last target, the integral is reset, because
-                the steady error is different there.
-            learn: whether this policy is active and flies towards the target.
-
+        A target that is not near the last one resets the integral: another steady error is there.
         """
         if given is not self._given:
             if self._given is not None and not _near(*_between(self._given, given)):

@@ -35,20 +35,10 @@ class PolicyParameters(ParameterFile, file='rl.yaml'):
 
 class PolicyController:
     """
-    The learnt controller.
+    The learnt controller; ParameterError if its file is missing, broken, or does not fit.
 
     Its previous action is the executed command, of any controller, so that it can take over from
-    another controller. Targets are clipped to the limits of the actuators, as in training. An
-    output that is not finite or extremely large is returned unchanged, so that the supervisor
-    refuses it. :mod:`control.guidance` modifies pose targets.
-
-    Args:
-        robot: the controller's model of the robot.
-        parameters: policy file and guidance.
-
-    Raises:
-        ParameterError: the file is missing, broken, or does not fit; one line.
-
+    another controller. :mod:`control.guidance` modifies pose targets.
     """
 
     Parameters = PolicyParameters
@@ -96,13 +86,7 @@ class PolicyController:
             and command.tilt.tolist() + command.thrust.tolist() in self._latest
 
     def infer(self, state: State, reference: Reference) -> list[float]:
-        """
-        Compute observation and action, and clip the targets to the limits of the actuators.
-
-        Returns:
-            Tilt targets (4) [rad] and thrust targets (4) [N].
-
-        """
+        """Tilt targets (4) [rad] and thrust targets (4) [N], clipped to the actuators' limits."""
         command = state.command     # before the first: the measured tilts and hover thrust
         before = state.tilt.tolist() + self._hover if command is None else \
             command.tilt.tolist() + command.thrust.tolist()

@@ -1,11 +1,9 @@
 """
 A policy file: its contract, its checksum and its network; read without torch and onnx.
 
-A policy is only valid with the names, order, scales, rate and robot of its training. The metadata
-contain all of these. The loader compares them with the inputs and outputs of this version, and
-refuses a file that differs. A flipped bit in a weight changes the policy, but the file still
-loads; the checksum therefore covers every byte of the file except its own entry.
-``python -m beetle_omni_ros.control.policy_file FILE`` adds it. See docs/reference/policy_file.md.
+A policy is only valid with the names, order, scales, rate and robot of its training, which are in
+its metadata. With a flipped bit in a weight the file still loads; the checksum therefore covers
+every byte of the file except its own entry. See docs/reference/policy_file.md.
 """
 
 from __future__ import annotations
@@ -118,13 +116,10 @@ class PolicyContract:
 
     def check(self, robot: RobotParameters, allow_other_robot: bool = False) -> str:
         """
-        Compare with the description of this version for ``robot``.
+        Compare with this version for ``robot``; ParameterError names the first difference.
 
         Returns:
             A warning, one line, when another robot was allowed; else ''.
-
-        Raises:
-            ParameterError: naming the first thing that differs.
 
         """
         # Effects of sensors are corrected by the estimator and do not concern the policy.
@@ -203,14 +198,7 @@ def session(data: bytes):
 
 class PolicyNetwork:
     """
-    One policy, ready to be called.
-
-    Runs on the calling thread alone, with fixed buffers for input and output.
-
-    Args:
-        path: ONNX file with the metadata of :class:`PolicyContract`.
-        robot: the robot that it flies.
-        allow_other_robot: accept one that was trained for other robot parameters.
+    One policy, on the calling thread alone, with fixed buffers for input and output.
 
     Raises:
         ParameterError: one line with the file and what is missing, broken or different.

@@ -78,13 +78,7 @@ class ControllerEntry:
         return getattr(self.builder, 'Parameters', None)
 
     def load_parameters(self, options: ControllerOptions = ControllerOptions()):
-        """
-        Parameters from a file and the options; None for a controller without parameters.
-
-        Raises:
-            ParameterError: an unusable file.
-
-        """
+        """Parameters from a file and the options; None for a controller without parameters."""
         kind, file = self.parameter_class, options.parameters
         if kind is None:
             return None
@@ -99,13 +93,7 @@ class ControllerEntry:
 
     def make(self, robot: RobotParameters, options: ControllerOptions = ControllerOptions(),
              parameters: Any = None) -> Controller:
-        """
-        Build the controller; ``parameters`` replace those of files and options.
-
-        Raises:
-            ParameterError: what is wrong with its class or its files, in one line.
-
-        """
+        """Build the controller; ``parameters`` replace those of files and options."""
         builder, at = self.builder, f"controller '{self.reference}': "
         parameters = parameters or self.load_parameters(options)
         try:
@@ -191,15 +179,9 @@ def names() -> list[str]:
 
 def entry_of(found: Any, spec: str) -> ControllerEntry:
     """
-    Make an entry from a class, or a function that builds a controller.
+    Make an entry from a class, or a function that builds a controller; or a ParameterError.
 
-    Args:
-        found: a class may have ``name``, ``Parameters``, ``parameters_file`` and ``policy_file``.
-        spec: reference by which other processes find it.
-
-    Raises:
-        ParameterError: it cannot be used.
-
+    A class may have ``name``, ``Parameters``, ``parameters_file`` and ``policy_file``.
     """
     if not callable(found):
         raise ParameterError(f"controller '{spec}': a {type(found).__name__}, expected a class "
@@ -233,10 +215,7 @@ def add(found: Any) -> ControllerEntry:
 
 def find(reference: str) -> ControllerEntry:
     """
-    Look a controller up.
-
-    Args:
-        reference: a registered name, ``package.module:Class`` or ``path/to/file.py:Class``.
+    Find a registered name, ``package.module:Class`` or ``path/to/file.py:Class``.
 
     Raises:
         ParameterError: there is none, or it cannot be loaded; one line.
