@@ -38,7 +38,7 @@ from beetle_omni_ros.cli.options import (
     writable,
 )
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.control.registry import ControllerOptions, DEFAULT, owner
+from beetle_omni_ros.control.registry import ControllerOptions, DEFAULT, OWNER
 from beetle_omni_ros.robot.schema import ParameterError
 
 HELP = {'help_option_names': ['-h', '--help']}
@@ -118,7 +118,7 @@ def evaluate(controllers: Annotated[str, Option(callback=several, metavar='NAME,
     options = {name: ControllerOptions(allow_other_robot=allow_other_robot)
                for name in controllers}
     for option, file, key in (('--nmpc', nmpc, 'parameters'), ('--policy', policy, 'policy')):
-        name = owner(option)
+        name = OWNER[option]
         if file and name not in controllers:
             raise ParameterError(f"{option} {file}: for the controller '{name}', which is not "
                                  f"among {', '.join(controllers)}")
@@ -134,7 +134,7 @@ def evaluate(controllers: Annotated[str, Option(callback=several, metavar='NAME,
 
 @app.command()
 def compare(controllers: Annotated[str | None, Option(callback=several, metavar='NAME,...', help=(
-                f"Controllers: {KNOWN}. Default: {', '.join(registry.compared())}; a missing "
+                f"Controllers: {KNOWN}. Default: {', '.join(registry.COMPARED)}; a missing "
                 'policy is left out.'))] = None,
             tasks: Annotated[str | None, Option(callback=several, metavar='TASK,...', help=(
                 'Names or pose files. Default: those of the publication.'))] = None,

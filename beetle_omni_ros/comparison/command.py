@@ -57,7 +57,7 @@ def run_compare(*, output: Path, controllers: list[str] | None = None,
 
     """
     console = console or Terminal()
-    names = controllers or registry.compared()
+    names = controllers or registry.COMPARED
     arguments = (names, tasks or TASKS, conditions or CONDITIONS, seeds)
     check_backend(backend)
     if readme:
@@ -102,7 +102,7 @@ def _available(names, policy, refuse):
     other one. With ``refuse`` the first reason is raised instead.
     """
     robot, available, skipped = RobotParameters.load(), {}, {}
-    learnt = registry.owner('--policy')
+    learnt = registry.OWNER['--policy']
     for entry in registry.find_all(names):
         try:
             available[entry] = guidance_of(entry.make(robot, ControllerOptions(

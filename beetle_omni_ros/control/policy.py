@@ -73,38 +73,27 @@ class PolicyController:
     def step(self, state: State, target: Target) -> Command:
         """One command for one state."""
         self._steps += 1
-        if isinstance(target, PoseTarget):
-            target = self._guidance.target(state, target, self._in_charge(state))
-        values = self.infer(state, target.at(state.stamp))
-        self._latest.append(values)
-        return Command(state.stamp, np.array(values[:4]), np.array(values[4:]))
-
-    def _in_charge(self, state):
-        """Whether the executed command is one of the latest commands."""
         command = state.command
-        return command is not None \
-            and command.tilt.tolist() + command.thrust.tolist() in self._latest
-
-    def infer(self, state: State, reference: Reference) -> list[float]:
-        """Tilt targets (4) [rad] and thrust targets (4) [N], clipped to the actuators' limits."""
-        command = state.command     # before the first: the measured tilts and hover thrust
-        before = state.tilt.tolist() + self._hover if command is None else \
-            command.tilt.tolist() + command.thrust.tolist()
-        observation = observed(state, reference, [
+        executed = command and command.tilt.tolist() + command.thrust.tolist()
+        if isinstance(target, PoseTarget):      # in charge: the executed command is a latest one
+            target = self._guidance.target(state, target, executed in self._latest)
+        before = executed or state.tilt.tolist() + self._hover
+        observation = observed(state, target.at(state.stamp), [
             (v - o) / s for v, o, s in zip(before, self._offset, self._scale)])
         if self._estimator:
             self._estimator.observe(state)
             observation += disturbed(state, self._estimator.disturbance)
         action = self.network(observation)
         values = [s * a + o for a, o, s in zip(action, self._offset, self._scale)]
-        # also false for NaN
-        if not all(-ACTION_LIMIT <= a <= ACTION_LIMIT for a in action):
+        if all(-ACTION_LIMIT <= a <= ACTION_LIMIT for a in action):     # false for NaN
+            cut = [low if v < low else high if v > high else v
+                   for v, (low, high) in zip(values, self._limits)]
+            self._cut += cut != values
+            values = cut
+        else:
             self._faults += 1
-            return values
-        cut = [low if v < low else high if v > high else v
-               for v, (low, high) in zip(values, self._limits)]
-        self._cut += cut != values
-        return cut
+        self._latest.append(values)
+        return Command(state.stamp, np.array(values[:4]), np.array(values[4:]))
 
     def diagnostics(self) -> dict[str, float | int | str]:
         """Counts since reset, and the disturbance estimates of a policy with memory."""

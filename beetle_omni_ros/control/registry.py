@@ -169,6 +169,11 @@ SHIPPED: Mapping[str, ControllerEntry] = {entry.name: entry for entry in (
         parameters_file='params/hover.yaml', flies_degraded=True,
         line=('#5b6770', (0, (1, 1.2)))))}
 DEFAULT = next(iter(SHIPPED))       # the default controller
+STANDING_BY = tuple(name for name, entry in SHIPPED.items() if entry.stands_by)
+COMPARED = sorted((name for name, entry in SHIPPED.items() if entry.compared),
+                  key=lambda name: not SHIPPED[name].policy_file)      # policies first
+# Option of the command line -> controller whose file it replaces.
+OWNER = {entry.option: name for name, entry in SHIPPED.items() if entry.option}
 _ADDED: dict[str, ControllerEntry] = {}     # of this process alone
 
 
@@ -292,19 +297,3 @@ def pilot(among: Iterable[str] | None = None) -> str:
     there = set(SHIPPED if among is None else among)
     return next((name for name, entry in SHIPPED.items()
                  if entry.flies_degraded and name in there), '')
-
-
-def standing_by() -> list[str]:
-    """Names of the controllers that run on standby in the ROS graph."""
-    return [name for name, entry in SHIPPED.items() if entry.stands_by]
-
-
-def compared() -> list[str]:
-    """Names that are compared by default; policies first."""
-    return sorted((name for name, entry in SHIPPED.items() if entry.compared),
-                  key=lambda name: not SHIPPED[name].policy_file)
-
-
-def owner(option: str) -> str:
-    """Name of the controller whose file an option of the command line replaces."""
-    return next(name for name, entry in SHIPPED.items() if entry.option == option)

@@ -206,7 +206,7 @@ class SupervisorNode(FlightNode):
 
     def __init__(self):
         controllers = parameter(
-            tuple(registry.standing_by()), read_only=True,
+            registry.STANDING_BY, read_only=True,
             doc='controllers that may be active: registered names, or FILE.py:Class')
         super().__init__('supervisor_node', SupervisorParameters, 'params/supervisor.yaml',
                          'supervisor_file', self._changed, changeable=('controller',),
