@@ -19,13 +19,10 @@ PARAMETER_FILE, POLICY_FILE = 'train.yaml', 'policy.onnx'
 SMOKE = {'iterations': 3, 'log_every': 1, 'save_every': 2, 'ppo.robots': 32, 'ppo.steps': 8,
          'ppo.epochs': 2, 'ppo.minibatches': 2, 'network.hidden': [32, 16, 16],
          'network.critic': [32, 16, 16]}
-COLUMNS = (('iteration', 'iteration', '{:.0f}'), ('seconds', 'time s', '{:.0f}'),
-           ('samples_per_second', 'samples/s', '{:.2e}'), ('reward', 'reward', '{:+.4f}'),
-           ('success_rate', 'reached', '{:.1%}'), ('position_error_m', 'error m', '{:.3f}'),
-           ('attitude_error_deg', 'error deg', '{:.1f}'), ('deaths', 'lost', '{:.0f}'),
-           ('tilt_std', 'std tilt', '{:.2f}'), ('thrust_std', 'std thrust', '{:.2f}'),
-           ('learning_rate', 'rate', '{:.0e}'))
-OF_TARGETS = ('success_rate', 'position_error_m', 'attitude_error_deg')  # averages over targets
+PROGRESS = ('iteration {iteration}, {seconds:.0f} s, {samples_per_second:.2e} samples/s: reward '
+            '{reward:+.4f}, reached {success_rate:.1%} of {targets:.0f} targets, error '
+            '{position_error_m:.3f} m and {attitude_error_deg:.1f} deg, lost {deaths:.0f}, std '
+            '{tilt_std:.2f} and {thrust_std:.2f}, rate {learning_rate:.0e}')
 
 
 def choose_device(name: str) -> str:
@@ -48,10 +45,9 @@ def run_train(*, output: Path | None, config: Path | None = None, robot: Path | 
               smoke: bool = False, stop_after: float | None = None,
               json_path: Path | None = None) -> None:
     """
-    Train and export a policy.
+    Train and export a policy, with the options of `beetle_omni train`.
 
-    Arguments are the options of `beetle_omni train`; ``changes`` maps dotted parameter names to
-    values that override the file.
+    ``changes`` maps dotted parameter names to values that override the file.
 
     Raises:
         ParameterError: unusable input.
@@ -90,7 +86,8 @@ def run_train(*, output: Path | None, config: Path | None = None, robot: Path | 
                   f'{runner.iteration} to {parameters.iterations}; all files are in {output}',
                   soft_wrap=True)
     try:
-        runner.train(_progress_table(console), stop_after)
+        runner.train(lambda row: console.print(PROGRESS.format(**row), soft_wrap=True,
+                                               highlight=False), stop_after)
     except KeyboardInterrupt:
         path = runner.checkpoint()
         console.print(f'interrupted; continue with: beetle_omni train --resume {path.parent}',
@@ -105,20 +102,6 @@ def run_train(*, output: Path | None, config: Path | None = None, robot: Path | 
                   f'evaluate --controllers rl --policy {path} --task random100', soft_wrap=True)
     write_json(json_path, {'policy': str(path), 'iterations': done,
                            'seconds': runner.trained_seconds, 'onnx_difference': difference})
-
-
-def _progress_table(console):
-    """Printer of rows of progress under a header."""
-    widths = [max(len(title), 9) for _, title, _ in COLUMNS]
-    console.print(' '.join(title.rjust(width) for (_, title, _), width in zip(COLUMNS, widths)),
-                  style='bold', soft_wrap=True)
-
-    def show(row):
-        cells = ['–' if key in OF_TARGETS and not row['targets'] else pattern.format(row[key])
-                 for key, _, pattern in COLUMNS]
-        console.print(' '.join(map(str.rjust, cells, widths)), soft_wrap=True, highlight=False)
-
-    return show
 
 
 def _checkpoints(folder):

@@ -35,13 +35,7 @@ REACHED_POSITION, REACHED_ATTITUDE = 0.10, 0.17453    # [m], [rad] limits of the
 
 class TiltableQuadrotorEnv:
     """
-    N robots in one tensor program.
-
-    Args:
-        parameters: training parameters (params/train.yaml).
-        robot: nominal robot; ParameterError if it has an effect that training refuses.
-        device: torch device.
-        compiled: whether to compile the step; by default on a GPU only.
+    N robots in one tensor program; its step is compiled on a GPU, or as ``compiled`` says.
 
     Attributes:
         state: name -> (N, ...) tensor, all quantities that persist between steps.

@@ -38,8 +38,7 @@ def _statements(function: ca.Function) -> list[str]:
     """
     Translate a scalar function with dense inputs to assignments.
 
-    Inputs are read from ``NAME_K`` and outputs assigned to ``NAME_K``, with the function's own
-    names of inputs and outputs and the index K of the entry.
+    Inputs and outputs are ``NAME_K``, with the function's own names and the index of the entry.
     """
     lines = []
     for k in range(function.n_instructions()):

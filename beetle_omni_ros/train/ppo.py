@@ -2,9 +2,8 @@
 rsl-rl's PPO, with update and rollout as CUDA graphs.
 
 rsl-rl's loop launches about ten thousand small kernels in an iteration and waits for the device
-after each minibatch, so that the GPU is mostly idle. This module implements the arithmetic of
-rsl-rl's ``PPO.update`` without a wait, with the adaptation of the learning rate on the device. The
-update and the rollout are compiled and captured. On other devices the same code runs uncaptured.
+after each minibatch, so that the GPU is mostly idle. Here nothing waits, and the learning rate
+adapts on the device. On other devices the same code runs uncaptured.
 """
 
 from collections.abc import Callable

@@ -28,13 +28,12 @@ class Runner:
     Args:
         parameters: training parameters.
         robot: nominal robot.
-        folder: folder of checkpoints and TensorBoard log; None: nothing is written.
+        folder: of checkpoints and TensorBoard log; None: nothing is written.
         device: torch device.
         graphs: whether to capture CUDA graphs and compile; None: on a GPU.
 
     Attributes:
-        iteration: number of iterations so far.
-        trained_seconds: their duration, including those before a resume.
+        iteration: number of iterations so far; ``trained_seconds`` is their duration.
 
     """
 
