@@ -4,8 +4,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from beetle_omni_ros.control.base import Command, State, Target
+from beetle_omni_ros.control.base import Command, PoseTarget, State, Target
 from beetle_omni_ros.control.disturbance import DisturbanceEstimator, DisturbanceParameters
+from beetle_omni_ros.control.guidance import Guidance
 from beetle_omni_ros.control.ocp import Rti, WEIGHTS
 from beetle_omni_ros.control.references import ReferencePlanner
 from beetle_omni_ros.robot import dynamics as model
@@ -107,6 +108,7 @@ class NmpcParameters(ParameterFile, file='nmpc.yaml'):
         4.0, doc='tilt references are within +-pi, unless the nearest legal turn is closer to '
         'the present tilt by more than this; 0: always nearest, 6.3: always within +-pi',
         unit='rad', low=0, high=6.3)
+    without: str = parameter('', doc="'unwinding' or 'all': no guidance", read_only=True)
     reach: float = parameter(10.0, doc='a target farther from the robot is refused', unit='m',
                              low=0.5, high=1000, read_only=True)
 
@@ -130,7 +132,9 @@ class NmpcController:
 
     Each step estimates disturbances, predicts the state at the time at which the command will act,
     shifts the stored horizon, and solves one QP. If a QP is not solved, the shifted previous plan
-    is used; after several in a row the horizon is initialised again.
+    is used; after several in a row the horizon is initialised again. Between poses whose joints
+    are wound differently, the plan may end in a local minimum; :mod:`control.guidance` leads out
+    of it through the level attitude.
     """
 
     name, Parameters = 'nmpc', NmpcParameters
@@ -162,6 +166,9 @@ class NmpcController:
                              # lead of a held target at which the lag has the rate limit
                              tilt_rate * p.horizon / -np.expm1(-p.horizon / servo_lag)]
         self._health, self._bounds = ALL_HEALTHY, self._all_bounds
+        # Plan and disturbance estimate do what routing and trimming do.
+        self._guidance = Guidance(robot.tilt_axes, f'{p.without},routing,trimming')
+        self.guidance = self._guidance.text
         self.reset()
 
     def set_health(self, health: ActuatorHealth) -> None:
@@ -190,12 +197,15 @@ class NmpcController:
     def reset(self) -> None:
         """Reset estimates and horizon."""
         self._estimator.reset()
+        self._guidance.reset()
         self._started, self._failures, self._iterate = False, 0, 0
         self._above = False     # whether the robot was above the smallest height
         self._steps = self._unsolved = self._iterations = 0
 
     def step(self, state: State, target: Target) -> Command:
         """One command for one state; see the class."""
+        if isinstance(target, PoseTarget) and self._health.healthy:
+            target = self._guidance.target(state, target)
         full = self._estimator.update(state)
         x0 = np.concatenate([full[:13], full[model.TILT], full[model.THRUST]])[:self._state_size]
         start = state.stamp + self._estimator.delay
@@ -237,6 +247,7 @@ class NmpcController:
         """Solver health and estimated disturbances."""
         d = self._estimator.disturbance
         return {'steps': self._steps, 'unsolved': self._unsolved, 'iterations': self._iterations,
+                **self._guidance.diagnostics(),
                 'force_estimate_N': float(np.linalg.norm(d[model.FORCE])),
                 'torque_estimate_Nm': float(np.linalg.norm(d[model.TORQUE])),
                 'servo_offset_rad': float(np.max(np.abs(d[model.TILT_OFFSET])))}

@@ -9,6 +9,7 @@ import pytest
 from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
 from beetle_omni_ros.control.nmpc import NmpcController, NmpcParameters
 from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.allocation import ALL_HEALTHY
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
 
@@ -60,6 +61,22 @@ def test_servo_offsets_and_torque_are_estimated(controller):
     assert body.errors(target)[-1] == pytest.approx((0, 0), abs=9e-4)
     assert np.allclose(controller._estimator.disturbance[6:], disturbance[6:], atol=2e-3)
     assert np.allclose(controller._estimator.disturbance[3:6], disturbance[3:6], atol=1e-2)
+
+
+@pytest.mark.parametrize('without, broken, unwound', [
+    ('', ALL_HEALTHY, 1), ('unwinding', ALL_HEALTHY, 0),
+    ('', replace(ALL_HEALTHY, stuck=(0.7, None, None, None)), 0)],
+    ids=['healthy', 'without', 'a stuck joint'])
+def test_a_plan_stuck_with_wound_joints_is_led_through_the_level_attitude(
+        without, broken, unwound):
+    controller = NmpcController(ROBOT, replace(NmpcParameters.load(), without=without))
+    controller.set_health(broken)
+    attitude = rotations.from_rpy(*np.radians([165, 10, -160]))
+    state = Body((0.0, 0.0, 1.2), attitude, np.array([0.7, 2.7, -1.5, 3.1])).state()
+    target = PoseTarget(state.position, rotations.from_rpy(*np.radians([43, -51, -64])))
+    for k in range(150):    # 1.5 s without motion
+        controller.step(replace(state, stamp=0.01 * k), target)
+    assert controller.diagnostics()['unwound'] == unwound
 
 
 def test_a_moving_reference_is_tracked_with_preview(controller):
