@@ -194,9 +194,9 @@ def entry_of(found: Any, spec: str) -> ControllerEntry:
     snake = re.sub(r'(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])', '_', found.__name__).lower()
     name = vars(found).get('name') or snake     # an inherited one would be another controller's
     if not re.fullmatch(r'[a-z][a-z0-9_]*', name) or name in (*SHIPPED, *RESERVED):
-        raise ParameterError(f"controller '{spec or name}': not usable as a name: '{name}'; "
-                             "expected small letters, digits and _ (the class's attribute "
-                             f"'name'), and none of {', '.join((*SHIPPED, *RESERVED))}")
+        raise ParameterError(f"controller '{spec or name}': '{name}' is no usable name; expected "
+                             "small letters, digits and _ (the class's attribute 'name'), and "
+                             f"none of {', '.join((*SHIPPED, *RESERVED))}")
     file = getattr(found, 'parameters_file', '')
     beside = Path(getattr(sys.modules.get(found.__module__), '__file__', None) or '').parent / file
     return ControllerEntry(
