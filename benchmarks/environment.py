@@ -12,9 +12,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from contextlib import redirect_stdout
 from dataclasses import replace
-import io
 import json
 from pathlib import Path
 import statistics
@@ -96,8 +94,7 @@ def environment_rate(robots: int, device: str) -> float:
 
 def made_runner(robots: int, device: str, graphs: bool) -> Runner:
     """Make a training without output files."""
-    with redirect_stdout(io.StringIO()):    # rsl-rl prints its models
-        runner = Runner(with_robots(robots), ROBOT, None, device, graphs=graphs)
+    runner = Runner(with_robots(robots), ROBOT, None, device, graphs=graphs)
     runner.apply_schedule(0.0)
     return runner
 
@@ -119,8 +116,10 @@ def rsl_rls(robots: int, device: str) -> dict[str, float]:
         seen = env.get_observations()
         with torch.inference_mode():
             for _ in range(runner.parameters.ppo.steps):
-                seen, reward, done, extras = env.step(alg.act(seen))
-                alg.process_env_step(seen, reward, done, extras)
+                env.advance(alg.act(seen.clone()))
+                seen = env.get_observations()
+                alg.process_env_step(seen, env.reward, env.done,
+                                     {'time_outs': env.timeout.float()})
             alg.compute_returns(seen)
 
     return {'rollout': seconds(rollout, device, 2),

@@ -35,11 +35,11 @@ from beetle_omni_ros.control.policy_file import find, PolicyNetwork, session
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.tasks import pose_target, random_poses
-from beetle_omni_ros.train.assess import conditions
 from beetle_omni_ros.train.environment import TiltableQuadrotorEnv
-from beetle_omni_ros.train.parameters import StartParameters, TrainParameters
+from beetle_omni_ros.train.parameters import RandomParameters, StartParameters, TrainParameters
 
 SEGMENT, AT_TARGET, ON_THE_WAY = 750, (700, 750), (100, 700)    # steps of 10 ms
 DEPTHS, HEIGHT = (0.15, 0.25, 0.4), 0.3      # [m] counted: below start and target; above ground
@@ -79,6 +79,18 @@ class Batched:
 
     def _call(self, session, observations):
         return session.run(['action'], {'observation': observations})[0]
+
+
+def conditions(name: str, random: RandomParameters) -> RandomParameters:
+    """Randomisation of the published training, or latencies of the simulated robot alone."""
+    if name == 'published':
+        published = TrainParameters.load(share_path('params/train_published.yaml')).random
+        return replace(published, carried_share=1.0)
+    zero = {entry.name: 0.0 for entry in fields(RandomParameters)
+            if isinstance(getattr(random, entry.name), float)}
+    return replace(random, **{**zero, 'push_period': 1.0, 'thrust_sag': random.thrust_sag},
+                   command_latency=[0.01, 0.01], velocity_latency=[0.0, 0.0],
+                   tilt_latency=[0.01, 0.01], actuator_spread=[0.0, 0.0])
 
 
 def environment(robots: int, name: str, memory: bool, robot: RobotParameters):

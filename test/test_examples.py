@@ -117,7 +117,7 @@ def test_a_class_flies_under_its_own_name_and_may_be_defined_again():
     again = type('Still', (Still,), {})
     assert beetle_omni_ros.evaluate(again, [[0, 0, 1, 0, 0, 0]], quiet=True)['still']['poses']
     assert registry.find('still').controller is again
-    with pytest.raises(ParameterError, match="'nmpc' is a registered"):
+    with pytest.raises(ParameterError, match="'nmpc' is no usable name"):
         beetle_omni_ros.simulate(type('X', (Still,), {'name': 'nmpc'}))
 
 

@@ -1,4 +1,4 @@
-"""`python -m beetle_omni_ros.cli`, as torchrun starts it."""
+"""`python -m beetle_omni_ros.cli`."""
 
 from beetle_omni_ros.cli import run
 

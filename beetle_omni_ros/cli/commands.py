@@ -38,7 +38,7 @@ from beetle_omni_ros.cli.options import (
     writable,
 )
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.control.registry import ControllerOptions, DEFAULT, owner
+from beetle_omni_ros.control.registry import ControllerOptions, DEFAULT, OWNER
 from beetle_omni_ros.robot.schema import ParameterError
 
 HELP = {'help_option_names': ['-h', '--help']}
@@ -102,9 +102,6 @@ def evaluate(controllers: Annotated[str, Option(callback=several, metavar='NAME,
              nmpc: NmpcOption = None,
              policy: PolicyOption = None,
              allow_other_robot: OtherRobotOption = False,
-             without: Annotated[str, Option(metavar='LAYER,...', help=(
-                 'Layers of the guidance that are off: unwinding, routing, trimming, or '
-                 'all.'))] = '',
              bag: Annotated[Path | None, Option(metavar='DIR', help=(
                  'New folder for the bag; with several controllers it contains one bag for '
                  'each.'))] = None,
@@ -116,15 +113,10 @@ def evaluate(controllers: Annotated[str, Option(callback=several, metavar='NAME,
     Plant, sensors, estimator, controllers and actuators are those of the ROS graph.
     Example: beetle_omni evaluate --controllers nmpc --task random100 --json result.json
     """
-    guided = [name for name in controllers if registry.find(name).guidance != 'none']
-    if without and not guided:
-        raise ParameterError(f'--without {without}: no controller with guidance among '
-                             f"{', '.join(controllers)}")
-    options = {name: ControllerOptions(allow_other_robot=allow_other_robot,
-                                       without=without if name in guided else '')
+    options = {name: ControllerOptions(allow_other_robot=allow_other_robot)
                for name in controllers}
     for option, file, key in (('--nmpc', nmpc, 'parameters'), ('--policy', policy, 'policy')):
-        name = owner(option)
+        name = OWNER[option]
         if file and name not in controllers:
             raise ParameterError(f"{option} {file}: for the controller '{name}', which is not "
                                  f"among {', '.join(controllers)}")
@@ -140,7 +132,7 @@ def evaluate(controllers: Annotated[str, Option(callback=several, metavar='NAME,
 
 @app.command()
 def compare(controllers: Annotated[str | None, Option(callback=several, metavar='NAME,...', help=(
-                f"Controllers: {KNOWN}. Default: {', '.join(registry.compared())}; a missing "
+                f"Controllers: {KNOWN}. Default: {', '.join(registry.COMPARED)}; a missing "
                 'policy is left out.'))] = None,
             tasks: Annotated[str | None, Option(callback=several, metavar='TASK,...', help=(
                 'Names or pose files. Default: those of the publication.'))] = None,
@@ -309,11 +301,7 @@ def train(output: Annotated[Path | None, Option(metavar='DIR', help=(
               'End the training after this time.'))] = None,
           robot: TheRobotOption = None,
           json_path: JsonOption = None):
-    """
-    Train a policy and export it to ONNX; needs the extra 'train' and a GPU.
-
-    Several GPUs: torchrun --nproc-per-node N -m beetle_omni_ros.cli train --output DIR
-    """
+    """Train a policy and export it to ONNX; needs the extra 'train' and a GPU."""
     from beetle_omni_ros.train.command import parse_changes, run_train
     run_train(output=output, config=config, robot=robot, device=device, resume=resume,
               changes=parse_changes(changes, seed=seed, memory=memory),

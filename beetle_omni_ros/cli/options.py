@@ -71,11 +71,11 @@ PlantOption = Annotated[Path | None, Option(metavar='FILE', help=(
     'Default: as --robot.'))]
 NmpcOption = Annotated[Path | None, Option(
     exists=True, dir_okay=False, metavar='FILE', help=(
-        f"Parameters of the controller '{registry.owner('--nmpc')}'. Default: the shipped "
+        f"Parameters of the controller '{registry.OWNER['--nmpc']}'. Default: the shipped "
         'params/nmpc.yaml.'))]
 PolicyOption = Annotated[Path | None, Option(
     exists=True, dir_okay=False, metavar='FILE', help=(
-        f"Policy (ONNX) for the controller '{registry.owner('--policy')}'. Default: the shipped "
+        f"Policy (ONNX) for the controller '{registry.OWNER['--policy']}'. Default: the shipped "
         'one.'))]
 OtherRobotOption = Annotated[bool, Option('--allow-other-robot', help=(
     'Fly a policy although it was trained for other robot parameters.'))]

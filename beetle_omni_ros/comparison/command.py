@@ -54,7 +54,7 @@ def run_compare(*, output: Path, controllers: list[str] | None = None,
     """
     console = console or Terminal()
     RobotParameters.load(plant)     # refuses an unusable file before any work
-    available, skipped = _available(controllers or registry.compared(), policy,
+    available, skipped = _available(controllers or registry.COMPARED, policy,
                                     refuse=controllers is not None)
     for name, reason in skipped.items():
         print(f'beetle_omni: {name} is left out: {reason}', file=sys.stderr)
@@ -90,7 +90,7 @@ def _available(names, policy, refuse):
     other one. With ``refuse`` the first reason is raised instead.
     """
     robot, available, skipped = RobotParameters.load(), {}, {}
-    learnt = registry.owner('--policy')
+    learnt = registry.OWNER['--policy']
     for entry in registry.find_all(names):
         try:
             available[entry] = guidance_of(entry.make(robot, ControllerOptions(

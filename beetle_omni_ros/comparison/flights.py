@@ -85,7 +85,7 @@ def plan(controllers: Sequence[str], tasks: Sequence[str] = TASKS,
     for entry in conditions:
         if entry not in CONDITIONS:
             raise ParameterError(f"--conditions '{entry}': expected {' or '.join(CONDITIONS)}")
-    other = {registry.owner('--policy'): str(policy)} if policy else {}
+    other = {registry.OWNER['--policy']: str(policy)} if policy else {}
     entries, flights = registry.find_all(controllers), []
     for task in tasks:
         duration = make_task(task).duration

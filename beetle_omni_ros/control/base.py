@@ -155,8 +155,8 @@ class TrajectoryTarget:
         """
         References at (M,) times, each field with M rows.
 
-        Positions and rates are interpolated linearly, quaternions linearly and
-        normalised, which at the spacing of a trajectory's samples is a slerp to 1e-6 rad.
+        Normalised linear interpolation of quaternions is, at the spacing of the samples of a
+        trajectory, a slerp to 1e-6 rad.
         """
         own = self.times
         k = np.clip(np.searchsorted(own, times, side='right') - 1, 0, len(own) - 2)
@@ -248,22 +248,14 @@ class ControllerHost:
     Steps one controller for the supervisor.
 
     Before the first target it holds the pose at which the controller became active. A controller
-    that is not active is stepped too, so that it can take over without a jump. An exception of the
-    controller means no command for this state, and the supervisor falls back.
-
-    Args:
-        name: name of the controller.
-        controller: the controller.
-        timed: called with ``step`` and its arguments; returns the result.
-        report: called with the text of each error.
+    that is not active is stepped too, so that it can take over without a jump. ``timed`` calls
+    ``step`` with its arguments, ``report`` gets the text of each error.
 
     Attributes:
-        controller: the argument.
         target: target of the operator or the task, or None.
         override: target of the supervisor, which replaces it, or None.
         mode: state of the supervisor, 'flying:NAME' while the controller NAME is active.
-        errors: number of exceptions.
-        error: the last one in one line, or ''.
+        errors: number of exceptions; ``error`` is the last one in one line.
 
     """
 
@@ -331,11 +323,7 @@ class ControllerHost:
                                          f'{reach:g} m: the reach of the controller')
 
     def step(self, state: State, target: Target | None = None) -> Command | None:
-        """
-        Command for a state, to ``target`` or the target in force.
-
-        None after an exception, and for a state that is not finite.
-        """
+        """Command to ``target`` or the target in force; None for a state that is not finite."""
         if not isfinite(sum(sum(part.tolist()) for part in (
                 state.position, state.velocity, state.quaternion, state.angular_velocity,
                 state.tilt, state.tilt_velocity))):
@@ -344,10 +332,9 @@ class ControllerHost:
 
     def call(self, method: str, *arguments: Any) -> Any:
         """
-        Call the controller's ``method`` if it has one; returns its result.
+        Call the controller's ``method`` if it has one; returns its result, None after an error.
 
-        In a process with other nodes, an exception would end the supervisor, too. It is reported,
-        and None is returned, like for a step without a command.
+        In a process with other nodes, an exception would end the supervisor, too.
         """
         function = getattr(self.controller, method, None)
         if function is None:
@@ -356,24 +343,13 @@ class ControllerHost:
             if method != 'step':
                 return function(*arguments)
             result = self._timed(function, *arguments)
-            text = flaw(result)
+            if isinstance(result, Command) and all(
+                    getattr(part, 'shape', None) == (ROTORS,)
+                    for part in (result.tilt, result.thrust)):
+                return result
+            text = f'returned {str(result)[:100]}, expected a Command with two arrays of {ROTORS}'
         except Exception as error:
             text = f'raised {error_text(error)}'
-        if not text:
-            return result
         self.errors, self.error = self.errors + 1, f"controller '{self._name}': {method} {text}"
         self._report(self.error)
         return None
-
-
-def flaw(command: object) -> str:
-    """Why the result of a controller's ``step`` is no command, or ''."""
-    if not isinstance(command, Command):
-        return f'returned {type(command).__name__}, expected control.base.Command'
-    for part in ('tilt', 'thrust'):
-        shape = getattr(getattr(command, part), 'shape', None)
-        if shape != (ROTORS,):
-            return (f'returned a command whose {part} is '
-                    f"{f'of shape {shape}' if shape is not None else 'no array'}, expected a "
-                    f'numpy array of {ROTORS}')
-    return ''

@@ -2,10 +2,8 @@
 Disturbance estimates for offset-free control.
 
 Three slow estimates integrate the prediction error of the model: an external force in world, an
-external torque in body and an offset of each servo's resting angle. A controller that predicts
-with them has no steady error. The module also predicts quantities that no sensor reports: the
-rotors' thrust, and the present tilts. For a robot file with ``joint_friction`` it models the play
-of each servo, and the targets overcome it. docs/explanation/nmpc.md has the reasons.
+external torque in body and an offset of each servo's resting angle. For a robot file with
+``joint_friction`` the targets overcome it. docs/explanation/nmpc.md has the reasons.
 """
 
 from collections import deque
@@ -48,7 +46,7 @@ class DisturbanceEstimator:
 
     Args:
         robot: nominal robot.
-        parameters: bandwidths and limits.
+        parameters: bandwidths.
         command_delay: from a command to the actuators without the robot file's effects [s].
         advance: :func:`dynamics.integrator` of the robot.
 
@@ -102,16 +100,8 @@ class DisturbanceEstimator:
                 self._state[model.TILT], self._state[model.THRUST])
 
     def update(self, state: State) -> np.ndarray:
-        """
-        Update with one state estimate.
-
-        Returns:
-            (25,) full state predicted to the time at which a command computed from ``state``
-            reaches the actuators; slices as in :mod:`robot.dynamics`.
-
-        """
-        present = self.observe(state)
-        return self._flown(present, state.stamp, self.delay)
+        """Observe, and predict the state (25,) at which a command for ``state`` acts."""
+        return self._flown(self.observe(state), state.stamp, self.delay)
 
     def observe(self, state: State) -> np.ndarray:
         """Update with one state estimate; returns the (25,) full state at its stamp."""

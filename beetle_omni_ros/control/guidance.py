@@ -1,18 +1,9 @@
 """
-Guidance: functions that modify the pose targets of a controller.
+Guidance: functions that modify the pose targets of a controller without prediction or memory.
 
-A controller that is a function of the present state, like a policy, needs it for wound joints and
-for steady errors. Guidance is optional: a controller may contain a :class:`Guidance`.
-
-- Unwinding: from a joint's stop through a level attitude back to the target. A level attitude
-  unwinds all joints, and from there the target is reached as after a take-off. If the turn back is
-  long, the attitude half way follows, because a policy may choose either direction for nearly half
-  a turn, and the wrong one winds the joints differently.
-- Routing: through an intermediate attitude if the shortest turn needs more than the travel of a
-  joint.
-- Trimming: an integral against the steady error.
-
-docs/explanation/policy.md has the reasons.
+Unwinding leads from a joint's stop through a level attitude back to the target, routing through an
+intermediate attitude if the shortest turn needs more than the travel of a joint. Trimming is an
+integral against the steady error. docs/explanation/policy.md has the reasons.
 """
 
 from dataclasses import replace
@@ -26,7 +17,6 @@ from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.schema import ParameterError, quoted
 
 LAYERS = 'unwinding', 'routing', 'trimming'
-ALL = 'all'             # in place of the names of all layers
 # Unwinding
 ATTEMPTS = 2            # to unwind, for one target
 WOUND = 2.4             # [rad] a joint beyond is wound; hover with a force or payload needs less
@@ -55,39 +45,29 @@ class Guidance:
 
     Args:
         axes: (4, 3) unit tilt axes in base_link.
-        without: layers that are off: names with commas, or 'all'.
-
-    Attributes:
-        text: lists the active layers.
-
-    Raises:
-        ParameterError: an unknown layer.
+        without: layers that are off: names with commas, or 'all'; ``text`` lists the others.
 
     """
 
     def __init__(self, axes: np.ndarray, without: str = ''):
         off = {name.strip() for name in without.split(',')} - {''}
-        if unknown := off - {*LAYERS, ALL}:
-            raise ParameterError(f"key 'without': expected {', '.join(LAYERS)} or {ALL}, found "
-                                 f'{quoted(", ".join(sorted(unknown)))}')
-        self._on = [name for name in LAYERS if not off & {name, ALL}]
+        if off - {*LAYERS, 'all'}:
+            raise ParameterError(f"key 'without': expected {', '.join(LAYERS)} or all, found "
+                                 + quoted(without))
+        self._on = [name for name in LAYERS if not off & {name, 'all'}]
         self.text = ', '.join(self._on) or 'none'
-        self._axes, self._trimming = axes, Trimming()
+        self._axes = axes
         self.reset()
 
     def reset(self) -> None:
         """Reset the memory of the target and of all parts."""
-        self._trimming.reset()
+        self._trimming = Trimming()
         self._unwound = self._routed = 0        # counts
         self._given: PoseTarget | None = None
         self._looked: np.ndarray | None = None  # attitude of the target of the last search
         # Attitudes on the way: smallest height, distance and tilt at which each is reached.
         self._way: list[tuple[np.ndarray, float, float, float]] = []
         self._until = 0.0
-        self._start()
-
-    def _start(self):
-        """Begin with a new target."""
         self._failed: list[np.ndarray] = []     # tilts at the begin of each unwinding
         self._watch(-inf)
 
@@ -110,7 +90,7 @@ class Guidance:
         if not self._way:
             return self._trimming.target(state, given, in_charge) if 'trimming' in self._on \
                 else given
-        self._trimming.reset()      # the joints may be wound differently afterwards
+        self._trimming = Trimming()     # the joints may be wound differently afterwards
         attitude, height, _, _ = self._way[0]
         position = given.position
         if position[2] < height:
@@ -124,7 +104,8 @@ class Guidance:
     def _take(self, state, given):
         """Begin with another target; search a route if its attitude differs from the last."""
         if self._given is None or not given.same_pose(self._given):
-            self._start()
+            self._failed = []
+            self._watch(-inf)
         self._given = given
         if self._looked is None \
                 or rotations.geodesic_angle(given.quaternion, self._looked) >= ANOTHER:
@@ -176,11 +157,9 @@ class Guidance:
 
 class Trimming:
     """
-    Integral action: shifts pose targets against the steady error.
+    Integral of the steady error, which is added to the target.
 
-    Biased encoders, a shifted centre of mass or a payload cause a steady error of some millimetres
-    and degrees. The integral of this error is added to the target. It is slow compared with the
-    policy, bounded, and only active near the target.
+    Biased encoders, a shifted centre of mass or a payload cause some millimetres and degrees.
 
     Attributes:
         position: (3,) shift of the target, in world [m].
@@ -189,44 +168,31 @@ class Trimming:
     """
 
     def __init__(self):
-        self.reset()
-
-    def reset(self) -> None:
-        """Reset the integral."""
-        self.position, self.rotation = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
+        self.position, self.rotation = [0.0] * 3, [0.0] * 3
         self._given: PoseTarget | None = None
         self._seen = -inf
 
     def target(self, state: State, given: PoseTarget, learn: bool = True) -> PoseTarget:
         """
-        The modified target for the policy.
+        The modified target; ``learn``: whether this controller is active and flies towards it.
 
-        Args:
-            state: of the robot.
-            given: the target. If it is not near the last target, the integral is reset, because
-                the steady error is different there.
-            learn: whether this policy is active and flies towards the target.
-
+        A target that is not near the last one resets the integral: another steady error is there.
         """
         if given is not self._given:
             if self._given is not None and not _near(*_between(self._given, given)):
-                self.reset()
+                self.position, self.rotation, self._seen = [0.0] * 3, [0.0] * 3, -inf
             self._given = given
         elapsed, self._seen = state.stamp - self._seen, state.stamp
-        if learn and 0.0 < elapsed <= LONGEST_STEP:
-            self._add(elapsed, state, given)
-        x, y, z = (0.5 * angle for angle in self.rotation)
-        turned = rotations.multiply(given.quaternion,
-                                    (x, y, z, sqrt(1.0 - (x * x + y * y + z * z))))
-        return PoseTarget(given.position + self.position, turned, given.stamp)
-
-    def _add(self, elapsed, state, given):
-        if hypot(*state.velocity.tolist()) <= SLOW \
+        if learn and 0.0 < elapsed <= LONGEST_STEP and hypot(*state.velocity.tolist()) <= SLOW \
                 and hypot(*state.angular_velocity.tolist()) <= SLOW_TURN:
             way, turn = _between(state, given)
             if _near(way, turn):
                 self.position = _added(self.position, TRIM_RATE * elapsed, way, TRIM_DISTANCE)
                 self.rotation = _added(self.rotation, TRIM_RATE * elapsed, turn, TRIM_ANGLE)
+        x, y, z = (0.5 * angle for angle in self.rotation)
+        turned = rotations.multiply(given.quaternion,
+                                    (x, y, z, sqrt(1.0 - (x * x + y * y + z * z))))
+        return PoseTarget(given.position + self.position, turned, given.stamp)
 
 
 # Plain floats, which are faster; turns are small, half an angle is its sine.

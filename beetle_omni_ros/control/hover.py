@@ -1,20 +1,12 @@
 """
-Hover: PD on the pose with a disturbance observer, then allocation.
-
-The simplest controller for comparisons, and the fallback of the supervisor. It is stable from any
-attitude, because translation and rotation do not couple on this robot.
+Hover: PD on the pose with a disturbance observer, then allocation; the supervisor's fallback.
 
     acceleration = Kp e_p + Kd e_v - d           (world)
     angular acceleration = Kp e_R + Kd e_w - d   (base_link)
 
-with e_R the geodesic attitude error and d the acceleration that the commands do not explain: a
-wrong mass, an offset of the centre of gravity, wind. d is the low-passed difference between the
-measured acceleration and that of the present thrusts. It does not depend on errors or targets, and
-it is valid when this controller takes over from another. A lead filter compensates the rotors'
-slow thrust response. The tilt targets move at a limited rate from the executed command. A rotor
-whose joint is still turning gives only the thrust that is useful in its present direction. A joint
-at its stop waits there for the end of a transient, because the same thrust direction on the other
-side of its travel is a full turn away.
+with d the low-passed acceleration that the commands do not explain: a wrong mass, wind. It does
+not depend on errors or targets, and is valid when this controller takes over from another. A rotor
+whose joint is still turning gives only the thrust that is useful in its present direction.
 """
 
 from dataclasses import dataclass
@@ -38,8 +30,6 @@ THRUST_RATE = 300.0     # [N/s] 3 N a period: no step at a take-over
 TILT_RATE_SHARE = 0.9   # of the servos' velocity limit, so that they can follow
 FULL_THRUST = 1.0       # [N] below it a joint turns more slowly: its direction is mostly noise
 STOP_OVERLAP = 0.3      # [rad] beyond the stop: the rotor keeps 95 % of its useful thrust
-
-
 # Errors and rate errors of position [m], [m/s] and attitude [rad], [rad/s] are shortened to these.
 POSITION_LIMITS, ATTITUDE_LIMITS = (0.6, 3.0), (0.6, 6.0)
 # Largest compensated acceleration [m/s^2] and angular acceleration [rad/s^2]: 2 N m, the hover
@@ -62,14 +52,7 @@ class HoverParameters(ParameterFile, file='hover.yaml'):
 
 
 class HoverController:
-    """
-    Holds a pose, see the docstring of the module.
-
-    Args:
-        robot: the controller's model of the robot.
-        parameters: tuning; default the shipped file.
-
-    """
+    """Holds a pose, from any attitude: translation and rotation do not couple on this robot."""
 
     name, Parameters = 'hover', HoverParameters
     period = 0.01   # [s]
@@ -96,12 +79,7 @@ class HoverController:
         self._thrust = np.zeros(4)          # modelled [N]
 
     def step(self, state: State, target: Any) -> Command:
-        """
-        One command for one state.
-
-        The time since the previous step is taken from the stamps, so the controller may be
-        called at any rate; a repeated stamp repeats the command.
-        """
+        """One command for one state, at any rate; a repeated stamp repeats the command."""
         last = self._command
         if last is not None and state.stamp <= last.stamp:
             return last
@@ -124,10 +102,7 @@ class HoverController:
         """
         Update the disturbance with one state; :meth:`step` does the same.
 
-        Args:
-            state: with the executed command, of any controller.
-            free: False while something else carries the robot; the estimate then does not change.
-
+        It does not change while something else carries the robot, which is not ``free``.
         """
         before = self._before
         if before is not None and state.stamp <= before.stamp:
@@ -184,12 +159,13 @@ class HoverController:
         attitude_error = rotations.log(rotations.multiply(to_body, reference.quaternion))
         relative = rotations.matrix(rotations.multiply(to_body, reference.quaternion))
         p = self.parameters
-        acceleration = _pd(p.position_kp, p.position_kd, POSITION_LIMITS,
-                           reference.position - state.position,
-                           reference.velocity - state.velocity) - self._disturbance[:3]
-        angular = _pd(p.attitude_kp, p.attitude_kd, ATTITUDE_LIMITS, attitude_error,
-                      relative @ reference.angular_velocity - state.angular_velocity) \
-            - self._disturbance[3:]
+        rate_error = relative @ reference.angular_velocity - state.angular_velocity
+        acceleration = \
+            p.position_kp * _shortened(reference.position - state.position, POSITION_LIMITS[0]) \
+            + p.position_kd * _shortened(reference.velocity - state.velocity, POSITION_LIMITS[1]) \
+            - self._disturbance[:3]
+        angular = p.attitude_kp * _shortened(attitude_error, ATTITUDE_LIMITS[0]) \
+            + p.attitude_kd * _shortened(rate_error, ATTITUDE_LIMITS[1]) - self._disturbance[3:]
         inertia, rate = self._robot.inertia, state.angular_velocity
         gyroscopic = rotations.cross(rate, inertia * rate)
         return self._allocator.mass * acceleration, inertia * angular + gyroscopic
@@ -225,9 +201,8 @@ class HoverController:
         """
         Thrusts along the present rotor directions that are nearest to the desired wrench.
 
-        Least squares in linear and angular acceleration within the thrust range: a rotor that
-        points in a wrong direction is throttled, and also the rotors whose torque it should
-        balance.
+        Least squares of accelerations: a rotor that points in a wrong direction is throttled, and
+        also the rotors whose torque it should balance.
         """
         rotors, matrix = self._robot.rotors, self._scaled
         now = matrix[:, 0::2] * np.cos(tilt) + matrix[:, 1::2] * np.sin(tilt)
@@ -239,10 +214,6 @@ class HoverController:
             if held is not None:
                 low[i] = high[i] = held
         return bounded_step(now, wrench, np.full(4, DAMPING), helpful, low, high)
-
-
-def _pd(kp, kd, limits, error, rate_error):
-    return kp * _shortened(error, limits[0]) + kd * _shortened(rate_error, limits[1])
 
 
 def _shortened(vector, limit):

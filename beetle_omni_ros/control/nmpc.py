@@ -116,10 +116,8 @@ class NmpcParameters(ParameterFile, file='nmpc.yaml'):
         """
         Actuators of the problem: of the robot file, unless this file overrides them.
 
-        Returns:
-            Time constant of the first-order servo model [s], largest tilt target to each side
-            [rad], largest tilt rate [rad/s], largest thrust [N].
-
+        Time constant of the first-order servo model [s], largest tilt target to each side [rad],
+        largest tilt rate [rad/s], largest thrust [N].
         """
         limits, joints = self.limits, robot.joints
         return (self.model.servo_lag or joints.time_constant,
@@ -137,21 +135,13 @@ class NmpcController:
     is used; after several in a row the horizon is initialised again. Between poses whose joints
     are wound differently, the plan may end in a local minimum; :mod:`control.guidance` leads out
     of it through the level attitude.
-
-    Args:
-        robot: the controller's model of the robot.
-        parameters: weights, limits, horizon.
-
-    Raises:
-        ParameterError: there is no usable compiler.
-
     """
 
     name, Parameters = 'nmpc', NmpcParameters
     period = 0.01  # [s] 100 Hz, as published
 
     def __init__(self, robot: RobotParameters, parameters: NmpcParameters | None = None):
-        """Build or load the solver; the first time takes some seconds of compilation."""
+        """Build or load the solver; ParameterError if there is no usable compiler."""
         p = parameters or NmpcParameters.load()
         servo_lag, tilt, tilt_rate, thrust_max = p.actuators(robot)
         self._parameters, self.reach = p, p.reach

@@ -3,11 +3,8 @@ The NMPC's optimal control problem as stage functions, generated from the robot'
 
 The rigid body is integrated by Runge-Kutta 4, the first-order lags of servos and rotors in closed
 form at the start, middle and end of an interval, which may therefore be much longer than a servo's
-time constant. docs/explanation/nmpc.md has the cost.
-
-:class:`Rti` iterates: one Gauss-Newton QP a cycle around a stored, shifted trajectory. The
-iteration is in rti.c and compiled together with the stage functions. The QP is solved by HPIPM,
-which the casadi wheel contains with BLASFEO and the headers of both.
+time constant. docs/explanation/nmpc.md has the cost. HPIPM, which the casadi wheel contains with
+BLASFEO and the headers of both, solves the QP.
 """
 
 import ctypes
@@ -44,7 +41,7 @@ def stage_functions(robot: RobotParameters, servo_lag: float, rotor_lag: bool
     Write the stage functions for a robot.
 
     Args:
-        robot: parameters, with the effects that apply.
+        robot: with the effects that apply.
         servo_lag: time constant of the servos' first-order reduction [s].
         rotor_lag: whether thrust is a state with the robot's rotor time constant
             (21 states) or follows its command at once (17 states).
@@ -141,7 +138,7 @@ def _residual(rotor_lag, x, u, d, reference, weights, change):
 
 class Rti:
     """
-    The compiled iteration; a call costs a fraction of a millisecond.
+    One Gauss-Newton QP a cycle around a stored, shifted trajectory, compiled with rti.c.
 
     Args:
         robot, servo_lag, rotor_lag: of :func:`stage_functions`.
@@ -151,10 +148,6 @@ class Rti:
         tolerance: residual at which the QP counts as solved.
         max_iterations: of the QP.
         reaches: number of intervals after the first in which the lead of tilt targets is bounded.
-
-    Raises:
-        RunError: there is no usable compiler.
-        ParameterError: more than MAX_STAGES intervals.
 
     """
 
@@ -200,19 +193,16 @@ class Rti:
 
     def step(self, x0, references, disturbance, weights, bounds) -> tuple[bool, int]:
         """
-        One iteration; the result is in ``states`` and ``inputs``.
+        One iteration, with the result in ``states`` and ``inputs``; if solved, and iterations.
 
         Args:
             x0: (nx,) present state.
             references: (N + 1, 29).
             disturbance: (10,) force in world, torque in body, tilt offsets.
-            weights: (11,) in the order of ``ocp.WEIGHTS``.
+            weights: (11,) in the order of ``WEIGHTS``.
             bounds: (18 + 2 N,) lower and upper input bounds, limits of |v| and |w|, for each
                 interval the largest lead of a tilt target, and for each of the nodes 1 to N the
                 smallest height.
-
-        Returns:
-            Whether the QP was solved, and iterations.
 
         """
         status = self._library.rti_step(

@@ -6,10 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, PoseTarget, Reference, State, Target
-from beetle_omni_ros.control.disturbance import DisturbanceEstimator, DisturbanceParameters
 from beetle_omni_ros.control.guidance import Guidance
 from beetle_omni_ros.control.policy_file import PolicyNetwork
-from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import parameter, ParameterFile
 
@@ -37,20 +35,10 @@ class PolicyParameters(ParameterFile, file='rl.yaml'):
 
 class PolicyController:
     """
-    The learnt controller.
+    The learnt controller; ParameterError if its file is missing, broken, or does not fit.
 
     Its previous action is the executed command, of any controller, so that it can take over from
-    another controller. Targets are clipped to the limits of the actuators, as in training. An
-    output that is not finite or extremely large is returned unchanged, so that the supervisor
-    refuses it. :mod:`control.guidance` modifies pose targets.
-
-    Args:
-        robot: the controller's model of the robot.
-        parameters: policy file and guidance.
-
-    Raises:
-        ParameterError: the file is missing, broken, or does not fit; one line.
-
+    another controller. :mod:`control.guidance` modifies pose targets.
     """
 
     Parameters = PolicyParameters
@@ -64,9 +52,12 @@ class PolicyController:
         tilt, rotors = robot.joints.position_limit, robot.rotors
         self._limits = [(-tilt, tilt)] * 4 + [(rotors.thrust_min, rotors.thrust_max)] * 4
         self._hover = [robot.hover_thrust] * 4
-        self._estimator = DisturbanceEstimator(
-            robot, DisturbanceParameters(), COMMAND_DELAY,
-            model.integrator(robot)) if contract.memory else None
+        self._estimator = None
+        if contract.memory:
+            from beetle_omni_ros.control import disturbance
+            from beetle_omni_ros.robot.dynamics import integrator
+            self._estimator = disturbance.DisturbanceEstimator(
+                robot, disturbance.DisturbanceParameters(), COMMAND_DELAY, integrator(robot))
         self._guidance = Guidance(robot.tilt_axes, p.without)
         self.guidance = self._guidance.text
         self.reset()
@@ -82,44 +73,27 @@ class PolicyController:
     def step(self, state: State, target: Target) -> Command:
         """One command for one state."""
         self._steps += 1
-        if isinstance(target, PoseTarget):
-            target = self._guidance.target(state, target, self._in_charge(state))
-        values = self.infer(state, target.at(state.stamp))
-        self._latest.append(values)
-        return Command(state.stamp, np.array(values[:4]), np.array(values[4:]))
-
-    def _in_charge(self, state):
-        """Whether the executed command is one of the latest commands."""
         command = state.command
-        return command is not None \
-            and command.tilt.tolist() + command.thrust.tolist() in self._latest
-
-    def infer(self, state: State, reference: Reference) -> list[float]:
-        """
-        Compute observation and action, and clip the targets to the limits of the actuators.
-
-        Returns:
-            Tilt targets (4) [rad] and thrust targets (4) [N].
-
-        """
-        command = state.command     # before the first: the measured tilts and hover thrust
-        before = state.tilt.tolist() + self._hover if command is None else \
-            command.tilt.tolist() + command.thrust.tolist()
-        observation = observed(state, reference, [
+        executed = command and command.tilt.tolist() + command.thrust.tolist()
+        if isinstance(target, PoseTarget):      # in charge: the executed command is a latest one
+            target = self._guidance.target(state, target, executed in self._latest)
+        before = executed or state.tilt.tolist() + self._hover
+        observation = observed(state, target.at(state.stamp), [
             (v - o) / s for v, o, s in zip(before, self._offset, self._scale)])
         if self._estimator:
             self._estimator.observe(state)
             observation += disturbed(state, self._estimator.disturbance)
         action = self.network(observation)
         values = [s * a + o for a, o, s in zip(action, self._offset, self._scale)]
-        # also false for NaN
-        if not all(-ACTION_LIMIT <= a <= ACTION_LIMIT for a in action):
+        if all(-ACTION_LIMIT <= a <= ACTION_LIMIT for a in action):     # false for NaN
+            cut = [low if v < low else high if v > high else v
+                   for v, (low, high) in zip(values, self._limits)]
+            self._cut += cut != values
+            values = cut
+        else:
             self._faults += 1
-            return values
-        cut = [low if v < low else high if v > high else v
-               for v, (low, high) in zip(values, self._limits)]
-        self._cut += cut != values
-        return cut
+        self._latest.append(values)
+        return Command(state.stamp, np.array(values[:4]), np.array(values[4:]))
 
     def diagnostics(self) -> dict[str, float | int | str]:
         """Counts since reset, and the disturbance estimates of a policy with memory."""
@@ -129,8 +103,8 @@ class PolicyController:
             **self._guidance.diagnostics()}
         if self._estimator:
             d = self._estimator.disturbance
-            values['force_estimate_N'] = float(np.linalg.norm(d[model.FORCE]))
-            values['torque_estimate_Nm'] = float(np.linalg.norm(d[model.TORQUE]))
+            values['force_estimate_N'] = float(np.linalg.norm(d[:3]))
+            values['torque_estimate_Nm'] = float(np.linalg.norm(d[3:6]))
         return values
 
 

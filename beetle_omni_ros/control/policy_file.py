@@ -1,21 +1,19 @@
 """
 A policy file: its contract, its checksum and its network; read without torch and onnx.
 
-A policy is only valid with the names, order, scales, rate and robot of its training. The metadata
-contain all of these. The loader compares them with the inputs and outputs of this version, and
-refuses a file that differs. A flipped bit in a weight changes the policy, but the file still
-loads; the checksum therefore covers every byte of the file except its own entry.
-``python -m beetle_omni_ros.control.policy_file FILE`` adds it. See docs/reference/policy_file.md.
+A policy is only valid with the names, order, scales, rate and robot of its training, which are in
+its metadata. With a flipped bit in a weight the file still loads; the checksum therefore covers
+every byte of the file except its own entry. See docs/reference/policy_file.md.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-import hashlib
+from hashlib import sha256
 from itertools import zip_longest
 import json
 import logging
-from math import isclose, isfinite
+from math import isfinite
 import os
 from pathlib import Path
 import sys
@@ -36,31 +34,25 @@ RATE_HZ = 100
 LONGEST = 500           # characters of differences in a message: metadata may hold anything
 WARM_UP = 20            # calls at start, because the first calls are slow
 FATAL_ONLY = 4          # onnxruntime's log level: errors are raised, and reported by this module
-LEVEL = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0)   # x and z axis of a level body
 # The checksum as ONNX's protobuf stores it; DIGITS hexadecimal digits follow.
 ENTRY, DIGITS = b'rS\n\x08checksum\x12Gsha256:', 64
 
 
-def _blocks(*rows):
-    """Named parts of the observation: values, SI unit ('1': none), and what they belong to."""
-    return [dict(zip(('name', 'size', 'unit', 'frame'), row, strict=True)) for row in rows]
-
-
-OBSERVATIONS = _blocks(
+# Blocks of the observation: SI unit ('1': none), and what the values belong to; the last two are
+# those of a policy with memory.
+OBSERVATIONS = [dict(zip(('name', 'size', 'unit', 'frame'), row)) for row in (
     ('velocity', 3, 'm/s', 'base_link'),                 # R^T (v - v_ref)
     ('angular_velocity', 3, 'rad/s', 'base_link'),       # w - R^T R_ref w_ref
     ('target_position', 3, 'm', 'base_link'),            # R^T (p_ref - p)
     ('attitude', 6, '1', 'world'),                       # x and z axis of base_link
     ('target_attitude', 6, '1', 'world'),                # x and z axis of the reference
     ('tilt', 4, 'rad', 'joint'),                         # measured
-    ('previous_action', 8, '1', 'action'))               # the command in force
-DISTURBANCES = _blocks(
+    ('previous_action', 8, '1', 'action'),               # the command in force
     ('disturbance_force', 3, 'N', 'base_link'),          # estimated external force
-    ('disturbance_torque', 3, 'N m', 'base_link'))       # estimated external torque
-# Entries of the metadata in JSON; the others are plain text. Entries that a file need not have.
+    ('disturbance_torque', 3, 'N m', 'base_link'))]      # estimated external torque
+# Entries of the metadata in JSON; the others are plain text. A file need not have the last two.
 JSON = ('observations', 'actions', 'action_scale', 'action_offset', 'rate_hz', 'robot_values',
-        'training', 'metrics')
-DEFAULTS = dict.fromkeys(('robot_values', 'training', 'metrics'), '{}')
+        'training')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,7 +69,6 @@ class PolicyContract:
     robot_values: dict              # :meth:`RobotParameters.as_dict`; {} in an old file
     name: str
     training: dict = field(default_factory=dict)
-    metrics: dict = field(default_factory=dict)
     commit: str = ''
     version: str = ''
     created: str = ''
@@ -85,7 +76,7 @@ class PolicyContract:
     @classmethod
     def default(cls, robot: RobotParameters, memory: bool = False) -> PolicyContract:
         """Describe a policy that this version can fly on ``robot``."""
-        return cls(observations=OBSERVATIONS + DISTURBANCES if memory else OBSERVATIONS,
+        return cls(observations=OBSERVATIONS if memory else OBSERVATIONS[:-2],
                    actions=[*JOINT_NAMES, *ROTOR_NAMES],
                    action_scale=[TILT_SCALE] * 4 + [THRUST_SCALE] * 4,
                    action_offset=[0.0] * 4 + [robot.hover_thrust] * 4, rate_hz=RATE_HZ,
@@ -95,7 +86,7 @@ class PolicyContract:
     @property
     def memory(self) -> bool:
         """Whether the estimated disturbance is an input."""
-        return len(self.observations) > len(OBSERVATIONS)
+        return len(self.observations) == len(OBSERVATIONS)
 
     @property
     def observation_size(self) -> int:
@@ -115,58 +106,46 @@ class PolicyContract:
             raise ParameterError(f"metadata 'format': expected {FORMAT!r}, found {quoted(found)}")
         values: dict[str, Any] = {}
         for key in cls.__dataclass_fields__:
-            text: Any = metadata.get(key, DEFAULTS.get(key))
+            text = metadata.get(key, '{}' if key in JSON[-2:] else '')
             try:
-                values[key] = json.loads(text) if key in JSON else text or ''
-            except (RecursionError, TypeError, ValueError):
+                values[key] = json.loads(text) if key in JSON else text
+            except (RecursionError, ValueError):
                 raise ParameterError(f"metadata '{key}': missing or unusable, found "
                                      f'{quoted(text)}') from None
         return cls(**values)
 
     def check(self, robot: RobotParameters, allow_other_robot: bool = False) -> str:
         """
-        Compare with the description of this version for ``robot``.
+        Compare with this version for ``robot``; ParameterError names the first difference.
 
         Returns:
             A warning, one line, when another robot was allowed; else ''.
 
-        Raises:
-            ParameterError: naming the first thing that differs.
-
         """
-        expected = PolicyContract.default(robot, self.memory)
-        warning = self._other_robot(robot)
+        # Effects of sensors are corrected by the estimator and do not concern the policy.
+        flown = replace(robot, effects={name: values for name, values in robot.effects.items()
+                                        if CATALOGUE[name].kind != 'sensor'})
+        expected, warning = PolicyContract.default(flown, self.memory), ''
+        if self.robot_hash != expected.robot_hash:
+            known, shipped = self.robot_values, RobotParameters.load()
+            if not known and shipped.hash() == self.robot_hash:
+                known = shipped.as_dict()
+            found = list(_differences(expected.robot_values, known or expected.robot_values)) or [
+                f'robot_hash {self.robot_hash} in training, {expected.robot_hash} here']
+            warning = f"trained for other robot parameters: {shortened('; '.join(found), LONGEST)}"
         for key in ('observations', 'actions', 'action_scale', 'rate_hz',
                     *([] if warning else ['action_offset'])):
-            for ours, theirs in zip_longest(_rows(getattr(expected, key)),
-                                            _rows(getattr(self, key))):
-                close = isinstance(ours, float) and isinstance(theirs, (float, int)) \
-                    and isclose(ours, theirs)
-                if not close and ours != theirs:
-                    raise ParameterError(f'{key}: expected {ours}, found {theirs}')
+            ours, theirs = getattr(expected, key), getattr(self, key)
+            if isinstance(ours, list) and isinstance(theirs, list):     # the first that differs
+                ours, theirs = next((pair for pair in zip_longest(ours, theirs)
+                                     if pair[0] != pair[1]), (None, None))
+            if ours != theirs:
+                raise ParameterError(f'{key}: expected {ours}, found {theirs}')
         if warning and not allow_other_robot:
             raise ParameterError(f'{warning}; train a policy for this robot, or fly this policy '
                                  'with --allow-other-robot (evaluate and fly; '
                                  'allow_other_robot:=true of launch file and nodes)')
         return warning
-
-    def _other_robot(self, robot):
-        """'' when trained for ``robot``, else what differs."""
-        # Effects of sensors are corrected by the estimator and do not concern the policy.
-        flown = replace(robot, effects={name: values for name, values in robot.effects.items()
-                                        if CATALOGUE[name].kind != 'sensor'})
-        if self.robot_hash == flown.hash():
-            return ''
-        known, shipped = self.robot_values, RobotParameters.load()
-        if not known and shipped.hash() == self.robot_hash:
-            known = shipped.as_dict()
-        found = list(_differences(flown.as_dict(), known)) if known else []
-        found = found or [f'robot_hash {self.robot_hash} in training, {flown.hash()} here']
-        return f"trained for other robot parameters: {shortened('; '.join(found), LONGEST)}"
-
-
-def _rows(value):
-    return value if isinstance(value, list) else [value]
 
 
 def _differences(flown, trained, prefix=''):
@@ -187,7 +166,7 @@ def verify(data: bytes) -> None:
         raise ParameterError("metadata 'checksum' is missing: truncated, or no policy; python -m "
                              'beetle_omni_ros.control.policy_file FILE adds it to a policy that '
                              'you trust')
-    if after[:DIGITS] != _digest(before + after[DIGITS:]):
+    if after[:DIGITS] != sha256(before + after[DIGITS:]).hexdigest().encode():
         raise ParameterError('weights, graph or metadata are not those that were exported: their '
                              "checksum differs from the metadata's 'checksum'; take an undamaged "
                              'copy')
@@ -201,12 +180,8 @@ def add_checksum(path: str | Path) -> None:
     if entry:
         data = before + after[DIGITS:]
     part = path.with_name(f'{path.name}.part')
-    part.write_bytes(data + ENTRY + _digest(data))
+    part.write_bytes(data + ENTRY + sha256(data).hexdigest().encode())
     part.replace(path)
-
-
-def _digest(data):
-    return hashlib.sha256(data).hexdigest().encode()
 
 
 def session(data: bytes):
@@ -215,24 +190,15 @@ def session(data: bytes):
     os.environ.setdefault('ORT_DISABLE_TELEMETRY', '1')
     import onnxruntime
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
+    options.intra_op_num_threads = 1
     options.add_session_config_entry('session.intra_op.allow_spinning', '0')
-    options.add_session_config_entry('session.inter_op.allow_spinning', '0')
     options.log_severity_level = FATAL_ONLY
     return onnxruntime.InferenceSession(data, options, providers=['CPUExecutionProvider'])
 
 
 class PolicyNetwork:
     """
-    One policy, ready to be called.
-
-    Runs on the calling thread alone, with fixed buffers for input and output.
-
-    Args:
-        path: ONNX file with the metadata of :class:`PolicyContract`.
-        robot: the robot that it flies.
-        allow_other_robot: accept one that was trained for other robot parameters.
+    One policy, on the calling thread alone, with fixed buffers for input and output.
 
     Raises:
         ParameterError: one line with the file and what is missing, broken or different.
@@ -243,14 +209,7 @@ class PolicyNetwork:
                  allow_other_robot: bool = False):
         path = find(path)
         try:
-            data = path.read_bytes()
-            verify(data)
-            self._session = session(data)
-            self.contract = PolicyContract.from_metadata(
-                self._session.get_modelmeta().custom_metadata_map)
-            warning = self.contract.check(robot, allow_other_robot)
-            self._bind(self.contract.observation_size)
-            self._warm_up()
+            warning = self._open(path.read_bytes(), robot, allow_other_robot)
         except ParameterError as error:
             raise ParameterError(f'policy {path}: {shortened(str(error), 2 * LONGEST)}') from None
         except Exception as error:      # onnxruntime's exceptions have no common base class
@@ -267,8 +226,14 @@ class PolicyNetwork:
         self._session.run_with_iobinding(self._binding)
         return self._output[0].tolist()
 
-    def _bind(self, size):
-        """Let the session read and write the same two arrays at every call."""
+    def _open(self, data, robot, allow_other_robot):
+        """Check contract and tensors, let the session use two arrays at every call, warm up."""
+        verify(data)
+        self._session = session(data)
+        self.contract = PolicyContract.from_metadata(
+            self._session.get_modelmeta().custom_metadata_map)
+        warning = self.contract.check(robot, allow_other_robot)
+        size = self.contract.observation_size
         self._input = np.zeros((1, size), np.float32)
         self._output = np.zeros((1, len(self.contract.actions)), np.float32)
         binding = self._binding = self._session.io_binding()
@@ -280,16 +245,11 @@ class PolicyNetwork:
             if tensors != expected:
                 raise ParameterError(f'expected {expected}, found {tensors}')
             bind(name, 'cpu', 0, np.float32, array.shape, array.ctypes.data)
-
-    def _warm_up(self):
-        """Call as in level flight; refuse a network whose output is not finite."""
-        rest: list[float] = []
-        for block in self.contract.observations:
-            rest += LEVEL if 'attitude' in block['name'] else [0.0] * block['size']
         for _ in range(WARM_UP):
-            action = self(rest)
+            action = self([0.1] * size)
         if not all(map(isfinite, action)):
-            raise ParameterError('the action for a robot at rest is not finite')
+            raise ParameterError('the action for an observation of 0.1 is not finite')
+        return warning
 
 
 def find(path: str | Path) -> Path:

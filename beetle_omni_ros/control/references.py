@@ -24,11 +24,9 @@ class ReferencePlanner:
     Poses, rates, tilts and thrusts over the horizon.
 
     Tilts and thrusts hold the target pose (or follow the trajectory) and cancel the estimated
-    disturbances. Each tilt is the legal angle nearest to the present angle, unless the angle
-    within +-pi is not much farther. A joint near its stop would have to turn far for the next
-    pose, during which the robot falls. For moving tilts, a command that is held over an interval h
-    must lead: a first-order lag reaches the next node's value if the command exceeds the first
-    value by the change / (1 - exp(-h / lag)).
+    disturbances. A moving command that is held over an interval h must lead: a first-order lag
+    reaches the next node's value if the command exceeds the first value by the
+    change / (1 - exp(-h / lag)).
 
     Args:
         robot: the controller's model of the robot.
@@ -62,13 +60,8 @@ class ReferencePlanner:
         """
         Reference (N + 1, 29): position, velocity, quaternion, rates, tilts, thrusts, leads.
 
-        Args:
-            target: pose or trajectory.
-            start: time of the horizon's first node [s].
-            quaternion: (4,) present attitude.
-            tilt: (4,) present tilts [rad].
-            disturbance: (10,) as in :mod:`robot.dynamics`.
-
+        From the time ``start`` [s], the present attitude (4,) and tilts (4,) [rad], and the
+        estimated disturbance (10,) of :mod:`robot.dynamics`.
         """
         references = np.zeros((len(self._times), REFERENCE_SIZE))
         if isinstance(target, PoseTarget):
@@ -112,7 +105,11 @@ class ReferencePlanner:
         return np.where(nearer & legal & self._movable, other, tilt)
 
     def _unwound(self, tilt, present):
-        """Choose the tilts within +-pi unless the joint would have to travel much farther."""
+        """
+        Choose the tilts within +-pi unless the joint would have to travel much farther.
+
+        A joint near its stop would have to turn far for the next pose: the robot would fall.
+        """
         if max(map(abs, tilt.tolist())) <= np.pi:
             return tilt
         other = tilt - 2 * np.pi * np.sign(tilt)
@@ -142,10 +139,7 @@ class ReferencePlanner:
 
 def effect_wrench(robot: RobotParameters, allocator: Allocator, nodes: int) -> ca.Function | None:
     """
-    Model less allocation, at the nodes of a reference.
-
-    Without this correction, tilts and thrusts of the reference would not hold its pose in the
-    model, and the plan would have a steady error.
+    Model less allocation, without which the plan would have a steady error.
 
     Returns:
         (pose with velocity, tilt, thrust) -> force in world [N] and torque in base_link [N m],

@@ -1,10 +1,8 @@
 """
 The table of controllers, for all programs that accept a controller's name.
 
-Shipped controllers are in :data:`SHIPPED`. Any installed package may add others by entry points of
-the group ``beetle_omni_ros.controllers``. ``package.module:Class`` and ``path/to/file.py:Class``
-refer to a class that is not registered. A controller is imported when it is built, because the
-large libraries that it needs take seconds.
+Others are given as ``path/to/file.py:Class`` or ``package.module:Class``. A controller is imported
+when it is built, because the large libraries that it needs take seconds.
 """
 
 from __future__ import annotations
@@ -12,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
-from importlib import import_module, metadata
+from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
 import inspect
 from pathlib import Path
@@ -28,12 +26,9 @@ from beetle_omni_ros.robot.schema import ParameterError
 if TYPE_CHECKING:       # imports CasADi, which a list of names does not need
     from beetle_omni_ros.robot.parameters import RobotParameters
 
-GROUP = 'beetle_omni_ros.controllers'
-PERIOD = 0.01               # [s] of a controller whose class has no period
 LONGEST_PERIOD = 1.0        # [s]
 METHODS = {'step': ('state', 'target'), 'reset': ()}     # and their arguments
 CLASS = 'FILE.py:Class or package.module:Class'    # reference to an unregistered controller
-NAME = re.compile(r'[a-z][a-z0-9_]*')
 # Names whose `<name>_node` or `<name>/command` exists, and words of results and states.
 RESERVED = ('controller', 'ekf', 'joint_bridge', 'meta', 'none', 'operator', 'recorder',
             'reference', 'rotor_bridge', 'sim', 'supervisor', 'viewer')
@@ -41,12 +36,11 @@ RESERVED = ('controller', 'ekf', 'joint_bridge', 'meta', 'none', 'operator', 're
 
 @dataclass(frozen=True, kw_only=True)
 class ControllerOptions:
-    """Files of parameters and network that replace a controller's own ones, and switches."""
+    """Files of parameters and network that replace a controller's own ones, and a switch."""
 
     parameters: Path | None = None
     policy: Path | None = None
     allow_other_robot: bool = False     # fly a policy trained for other robot parameters
-    without: str = ''                   # layers of the guidance that are off
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -55,37 +49,23 @@ class ControllerEntry:
 
     name: str               # of its results, its topic '<name>/command' and node '<name>_node'
     # Class or function, or 'package.module:Class', called with the robot and, where its signature
-    # has them, `parameters` and `options`. Its `Parameters` is the class of its parameters.
+    # has them, `parameters`. Its `Parameters` is the class of its parameters.
     controller: str | Callable[..., Controller]
     spec: str = ''          # reference by which another process finds it; '': its name
     label: str = ''         # short, for headings of figures
     description: str = ''
-    period: float = PERIOD      # [s] between its commands
     parameters_file: str = ''   # shipped file of them; in the package's share, or any path
     policy_file: str = ''       # its network
     option: str = ''        # of the command line, replaces the file of this controller only
-    guidance: str = 'none'  # names the functions that modify its targets
     flies_degraded: bool = False    # with failed actuators
     stands_by: bool = False     # in the ROS graph
     compared: bool = False  # by default
     line: tuple[str, str | tuple] = ('', '-')       # colour and dashes in figures
 
-    def __post_init__(self):
-        """Refuse an invalid name."""
-        if not NAME.fullmatch(self.name) or self.name in RESERVED:
-            raise ParameterError(
-                f"controller '{self.name}': not usable as a name; expected small letters, digits "
-                f"and _, and none of {', '.join(RESERVED)}")
-
     @property
     def reference(self) -> str:
         """Reference by which another process finds it: its name, or the path of its class."""
         return self.spec or self.name
-
-    @property
-    def file_key(self) -> str:
-        """Parameter of its node that names another parameter file."""
-        return f'{self.name}_file'
 
     @property
     def builder(self) -> Callable[..., Controller]:
@@ -98,64 +78,34 @@ class ControllerEntry:
         return getattr(self.builder, 'Parameters', None)
 
     def load_parameters(self, options: ControllerOptions = ControllerOptions()):
-        """
-        Parameters from a file and the options; None for a controller without parameters.
-
-        Raises:
-            ParameterError: an unusable file, or an option that the controller lacks.
-
-        """
+        """Parameters from a file and the options; None for a controller without parameters."""
         kind, file = self.parameter_class, options.parameters
-        if kind is None and file:
-            raise ParameterError(f"controller '{self.reference}': reads no parameter file, "
-                                 f'given {file}')
+        if kind is None:
+            return None
         if not file and self.parameters_file:
             file = Path(self.parameters_file)
             file = file if file.is_file() else share_path(self.parameters_file)
-        parameters = kind and schema.bind(kind, schema.load_yaml(file) if file else {},
-                                          str(file or ''))
-        if options.without and not hasattr(parameters, 'without'):
-            raise ParameterError(f"--without {options.without}: controller '{self.reference}' has "
-                                 'no layers of guidance')
-        given = {'policy': str(options.policy or ''), 'without': options.without,
+        parameters = schema.bind(kind, schema.load_yaml(file) if file else {}, str(file or ''))
+        given = {'policy': str(options.policy or ''),
                  'allow_other_robot': options.allow_other_robot}
-        return parameters and replace(parameters, **{
-            key: value for key, value in given.items() if value and hasattr(parameters, key)})
+        return replace(parameters, **{key: value for key, value in given.items()
+                                      if value and hasattr(parameters, key)})
 
     def make(self, robot: RobotParameters, options: ControllerOptions = ControllerOptions(),
              parameters: Any = None) -> Controller:
-        """
-        Build the controller; ``parameters`` replace those of files and options.
-
-        Raises:
-            ParameterError: what is wrong with its class or its files, in one line.
-
-        """
-        builder = self.builder
-        given = {'parameters': parameters or self.load_parameters(options), 'options': options}
+        """Build the controller; ``parameters`` replace those of files and options."""
+        builder, at = self.builder, f"controller '{self.reference}': "
+        parameters = parameters or self.load_parameters(options)
         try:
             # Plain arguments: those of Protocol's own constructor, (*args, **kwargs), do not count
-            names = [name for name, each in inspect.signature(builder).parameters.items()
-                     if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)]
-            controller = builder(*[robot][:len(set(names) - set(given))], **{
-                key: value for key, value in given.items()
-                if key in names and value is not None})
+            names = {name for name, each in inspect.signature(builder).parameters.items()
+                     if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)}
+            controller = builder(*[robot][:len(names - {'parameters'})], **(
+                {'parameters': parameters} if 'parameters' in names else {}))
         except ParameterError:
             raise
         except Exception as error:
-            raise ParameterError(f"controller '{self.reference}': building it raised "
-                                 f'{error_text(error)}') from error
-        self._check(controller)
-        return controller
-
-    def reach(self, robot: RobotParameters) -> float:
-        """Largest distance to a target [m], from its parameters: building may take seconds."""
-        parameters = self.load_parameters()
-        return reach_of(parameters if hasattr(parameters, 'reach') else self.make(robot))
-
-    def _check(self, controller):
-        """Refuse a result that is no controller."""
-        at = f"controller '{self.reference}': "
+            raise ParameterError(f'{at}building it raised {error_text(error)}') from error
         for method, expected in METHODS.items():
             call: Any = getattr(controller, method, None)
             try:
@@ -167,6 +117,12 @@ class ControllerEntry:
         if not isinstance(period, (int, float)) or not 0 < period <= LONGEST_PERIOD:
             raise ParameterError(f'{at}period is {period!r}, expected the time between two steps, '
                                  f'above 0 and at most {LONGEST_PERIOD:g} s')
+        return controller
+
+    def reach(self, robot: RobotParameters) -> float:
+        """Largest distance to a target [m], from its parameters: building may take seconds."""
+        parameters = self.load_parameters()
+        return reach_of(parameters if hasattr(parameters, 'reach') else self.make(robot))
 
 
 # Line styles: blue for RL and red for NMPC as in the publication. The variants are lighter and
@@ -176,14 +132,12 @@ _POLICY = 'beetle_omni_ros.control.policy:PolicyController'
 SHIPPED: Mapping[str, ControllerEntry] = {entry.name: entry for entry in (
     ControllerEntry(
         name='nmpc', label='NMPC', description='offset-free, params/nmpc.yaml', controller=_NMPC,
-        parameters_file='params/nmpc.yaml', option='--nmpc', guidance='unwinding',
-        flies_degraded=True, stands_by=True,
+        parameters_file='params/nmpc.yaml', option='--nmpc', flies_degraded=True, stands_by=True,
         compared=True, line=('#c8281e', '-')),
     ControllerEntry(
         name='rl', label='RL', description='the learned policy, 33 observations',
         controller=_POLICY, parameters_file='params/rl.yaml', policy_file='policies/rl.onnx',
-        option='--policy', guidance='unwinding, routing, trimming', stands_by=True,
-        compared=True, line=('#1b5fb4', '-')),
+        option='--policy', stands_by=True, compared=True, line=('#1b5fb4', '-')),
     ControllerEntry(
         name='rl_bare', label='RL, bare', description='the learned policy without guidance',
         controller=_POLICY, parameters_file='params/rl_bare.yaml', policy_file='policies/rl.onnx',
@@ -192,8 +146,7 @@ SHIPPED: Mapping[str, ControllerEntry] = {entry.name: entry for entry in (
         name='rl_memory', label='RL, memory',
         description='the learned policy with the estimated disturbance as input',
         controller=_POLICY, parameters_file='params/rl_memory.yaml',
-        policy_file='policies/rl_memory.onnx',
-        guidance='unwinding, routing, trimming', line=('#58b4e8', (0, (5, 1.6)))),
+        policy_file='policies/rl_memory.onnx', line=('#58b4e8', (0, (5, 1.6)))),
     ControllerEntry(
         name='rl_published', label='RL, published training',
         description='params/train_published.yaml, without guidance', controller=_POLICY,
@@ -216,49 +169,42 @@ SHIPPED: Mapping[str, ControllerEntry] = {entry.name: entry for entry in (
         parameters_file='params/hover.yaml', flies_degraded=True,
         line=('#5b6770', (0, (1, 1.2)))))}
 DEFAULT = next(iter(SHIPPED))       # the default controller
+STANDING_BY = tuple(name for name, entry in SHIPPED.items() if entry.stands_by)
+COMPARED = sorted((name for name, entry in SHIPPED.items() if entry.compared),
+                  key=lambda name: not SHIPPED[name].policy_file)      # policies first
+# Option of the command line -> controller whose file it replaces.
+OWNER = {entry.option: name for name, entry in SHIPPED.items() if entry.option}
 _ADDED: dict[str, ControllerEntry] = {}     # of this process alone
-
-
-@cache
-def _points() -> dict[str, metadata.EntryPoint]:
-    """Entry points of other packages by name; the shipped names stay the package's own."""
-    return {point.name: point for point in sorted(metadata.entry_points(group=GROUP))
-            if point.name not in SHIPPED}
 
 
 def names() -> list[str]:
     """Every registered name, the shipped ones first."""
-    return list(dict.fromkeys((*SHIPPED, *_points(), *_ADDED)))
+    return [*SHIPPED, *_ADDED]
 
 
-def entry_of(found: Any, spec: str, name: str = '') -> ControllerEntry:
+def entry_of(found: Any, spec: str) -> ControllerEntry:
     """
-    Make an entry from a class, or a function that builds a controller.
+    Make an entry from a class, or a function that builds a controller; or a ParameterError.
 
-    Args:
-        found: a class may have ``name``, ``Parameters``, ``parameters_file``, ``policy_file`` and
-            ``guidance``.
-        spec: reference by which other processes find it.
-        name: under which it is registered; '' uses its own name.
-
-    Raises:
-        ParameterError: it cannot be registered.
-
+    A class may have ``name``, ``Parameters``, ``parameters_file`` and ``policy_file``.
     """
     if not callable(found):
         raise ParameterError(f"controller '{spec}': a {type(found).__name__}, expected a class "
                              'with step(state, target), reset() and period')
     snake = re.sub(r'(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])', '_', found.__name__).lower()
+    name = vars(found).get('name') or snake     # an inherited one would be another controller's
+    if not re.fullmatch(r'[a-z][a-z0-9_]*', name) or name in (*SHIPPED, *RESERVED):
+        raise ParameterError(f"controller '{spec or name}': '{name}' is no usable name; expected "
+                             "small letters, digits and _ (the class's attribute 'name'), and "
+                             f"none of {', '.join((*SHIPPED, *RESERVED))}")
     file = getattr(found, 'parameters_file', '')
     beside = Path(getattr(sys.modules.get(found.__module__), '__file__', None) or '').parent / file
-    own = {key: value for key in ('period', 'policy_file', 'guidance')
-           if (value := getattr(found, key, None)) and not isinstance(value, property)}
     return ControllerEntry(
-        # an inherited name would be that of another controller
-        name=name or vars(found).get('name') or snake, controller=found, spec=spec,
+        name=name, controller=found, spec=spec,
         description=(found.__doc__ or '').strip().partition('\n')[0],
         parameters_file=str(beside) if file and beside.is_file() else file,
-        flies_degraded=hasattr(found, 'set_health'), **own)
+        policy_file=getattr(found, 'policy_file', ''),
+        flies_degraded=hasattr(found, 'set_health'))
 
 
 def add(found: Any) -> ControllerEntry:
@@ -267,34 +213,31 @@ def add(found: Any) -> ControllerEntry:
 
     It replaces one of the same name, for example when a notebook cell runs again.
     """
-    entry = _untaken(entry_of(found, ''))
+    entry = entry_of(found, '')
     _ADDED[entry.name] = entry
     return entry
 
 
 def find(reference: str) -> ControllerEntry:
     """
-    Look a controller up.
-
-    Args:
-        reference: a registered name, ``package.module:Class`` or ``path/to/file.py:Class``.
+    Find a registered name, ``package.module:Class`` or ``path/to/file.py:Class``.
 
     Raises:
         ParameterError: there is none, or it cannot be loaded; one line.
 
     """
-    if reference in SHIPPED:
-        return SHIPPED[reference]
-    module, _, name = reference.rpartition(':')
-    if module or reference.endswith('.py'):
-        return _named(f'{Path(module).absolute()}:{name}' if module.endswith('.py')
-                      else reference)
-    if reference in _ADDED:
-        return _ADDED[reference]
-    if reference in _points():
-        return _registered(reference)
+    place, _, name = reference.rpartition(':')
+    if place or reference.endswith('.py'):
+        return _named(f'{Path(place).absolute()}:{name}' if place.endswith('.py') else reference)
+    if entry := SHIPPED.get(reference) or _ADDED.get(reference):
+        return entry
     raise ParameterError(f"controller '{reference}': expected one of {', '.join(names())}, or "
                          + CLASS)
+
+
+@cache
+def _named(spec: str) -> ControllerEntry:
+    return entry_of(loaded(spec), spec)
 
 
 def find_all(references: Iterable[str]) -> list[ControllerEntry]:
@@ -308,24 +251,6 @@ def find_all(references: Iterable[str]) -> list[ControllerEntry]:
                                  "different names (a class's attribute 'name')")
         entries[entry.name] = entry
     return list(entries.values())
-
-
-@cache
-def _named(spec: str) -> ControllerEntry:
-    return _untaken(entry_of(loaded(spec), spec))
-
-
-@cache
-def _registered(name: str) -> ControllerEntry:
-    return entry_of(loaded(_points()[name].value.replace(' ', '')), '', name)
-
-
-def _untaken(entry):
-    if entry.name in SHIPPED or entry.name in _points():
-        raise ParameterError(f"controller '{entry.reference}': '{entry.name}' is a registered "
-                             "controller's name; expected another one (the class's attribute "
-                             "'name')")
-    return entry
 
 
 def loaded(reference: str) -> Any:
@@ -372,19 +297,3 @@ def pilot(among: Iterable[str] | None = None) -> str:
     there = set(SHIPPED if among is None else among)
     return next((name for name, entry in SHIPPED.items()
                  if entry.flies_degraded and name in there), '')
-
-
-def standing_by() -> list[str]:
-    """Names of the controllers that run on standby in the ROS graph."""
-    return [name for name, entry in SHIPPED.items() if entry.stands_by]
-
-
-def compared() -> list[str]:
-    """Names that are compared by default; policies first."""
-    return sorted((name for name, entry in SHIPPED.items() if entry.compared),
-                  key=lambda name: not SHIPPED[name].policy_file)
-
-
-def owner(option: str) -> str:
-    """Name of the controller whose file an option of the command line replaces."""
-    return next(name for name, entry in SHIPPED.items() if entry.option == option)

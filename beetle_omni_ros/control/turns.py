@@ -26,15 +26,10 @@ LEAST_USE = 0.2         # smallest used share of an arm's thrust that can carry 
 def level_between(start: np.ndarray, end: np.ndarray, axes: np.ndarray,
                   failed: Sequence[np.ndarray] = ()) -> np.ndarray:
     """
-    Choose the level attitude between two attitudes of the least :func:`turning_cost`.
+    Level attitude (4,) between two attitudes (4,) of the least :func:`turning_cost`.
 
-    Args:
-        start: (4,) attitude, xyzw.
-        end: (4,) the same.
-        axes: (4, 3) unit tilt axes in base_link.
-        failed: (4,) tilts [rad] with which the end was not held; headings that lead to other tilts
-            are preferred.
-
+    ``axes`` (4, 3) are the unit tilt axes in base_link. Headings that lead to other tilts than the
+    ``failed`` ones (4,) [rad], with which the end was not held, are preferred.
     """
     begin, goal = Rotation.from_quat(start), Rotation.from_quat(end)
     heading = np.linspace(0.0, 2 * np.pi, HEADINGS, endpoint=False)
@@ -51,17 +46,10 @@ def level_between(start: np.ndarray, end: np.ndarray, axes: np.ndarray,
 def route(start: np.ndarray, end: np.ndarray, tilt: np.ndarray, axes: np.ndarray
           ) -> np.ndarray | None:
     """
-    Intermediate attitude with which the joints are wound less.
+    Intermediate attitude (4,) between two attitudes (4,) with which the joints are wound less.
 
-    Args:
-        start: (4,) attitude, xyzw.
-        end: (4,) the same.
-        tilt: (4,) tilts at the start [rad].
-        axes: (4, 3) unit tilt axes in base_link.
-
-    Returns:
-        (4,) an attitude, xyzw, or None if the shortest turn is as good.
-
+    ``tilt`` (4,) [rad] are the tilts at the start, ``axes`` (4, 3) the unit tilt axes in
+    base_link. None if the shortest turn is as good.
     """
     begin, goal = Rotation.from_quat(start), Rotation.from_quat(end)
     angle, up = turned(begin, goal)
@@ -74,9 +62,9 @@ def route(start: np.ndarray, end: np.ndarray, tilt: np.ndarray, axes: np.ndarray
     there, up_there = turned(begin, middle)
     on, up_on = turned(middle, goal)
     wound = _wound(np.concatenate([up_there, up_on[:, 1:]], axis=1), tilt, axes)
-    cost = there + on + _excess(wound)
+    cost = there + on + EXCESS * np.maximum(0.0, wound - AIM)
     best = int(np.argmin(cost))
-    if cost[best] > angle[0] + _excess(direct)[0] - SHORTER:
+    if cost[best] > angle[0] + EXCESS * np.maximum(0.0, direct[0] - AIM) - SHORTER:
         return None
     return middle[best].as_quat()
 
@@ -85,10 +73,6 @@ def _wound(up, tilt, axes):
     """(n,) largest tilt along n turns that begin with ``tilt``."""
     along = tilts_along(up, axes)
     return np.abs(tilt + along - along[:, :1]).max(axis=(1, 2))
-
-
-def _excess(wound):
-    return EXCESS * np.maximum(0.0, wound - AIM)
 
 
 def turning_cost(start: Rotation, end: Rotation, axes: np.ndarray) -> np.ndarray:
@@ -107,23 +91,14 @@ def tilts_along(up: np.ndarray, axes: np.ndarray) -> np.ndarray:
     """
     Tilts (n, P, 4) [rad] that keep all thrusts upward, those at the beginning within +-pi.
 
-    Args:
-        up: (n, P, 3) world's z in the body at points of n ways.
-        axes: (4, 3) unit tilt axes in base_link.
-
+    ``up`` (n, P, 3) is world's z in the body at points of n ways.
     """
     across = np.cross(axes, STRAIGHT_UP)        # direction of a thrust at a tilt of pi / 2
     return np.unwrap(np.arctan2(up @ across.T, up[..., 2:]), axis=1)
 
 
 def turned(start: Rotation, end: Rotation) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Follow the shortest turns between attitudes, one or n of them at each end.
-
-    Returns:
-        (n,) their angles [rad], and (n, POINTS, 3) world's z in the turning body.
-
-    """
+    """Angles (n,) [rad] of the shortest turns, and world's z (n, POINTS, 3) in the body."""
     turn = np.atleast_2d((start.inv() * end).as_rotvec())
     angle = np.linalg.norm(turn, axis=1)
     axis = (turn / np.maximum(angle, 1e-9)[:, None])[:, None]               # (n, 1, 3)

@@ -130,7 +130,7 @@ TABLE = (
     Topic('target_trajectory', c.TRAJECTORY, LATCHED, TrajectoryTarget, c.read_trajectory,
           c.write_trajectory,
           'time-parameterised reference; `reference_node` or a user publishes it'),
-    *map(command_topic, registry.standing_by()),      # topic_of() makes those of other controllers
+    *map(command_topic, registry.STANDING_BY),      # topic_of() makes those of other controllers
     _command('command', 'selected and checked command, which the actuators execute', True),
     _text('supervisor/identity',
           'identity of the supervisor; the actuators execute commands with this identity only'),

@@ -100,7 +100,7 @@ class ControllerNode(FlightNode):
         more = {} if is_own else {'controller': parameter(
             entry.reference, doc='controller that this node runs', read_only=True)}
         super().__init__(f'{entry.name}_node', entry.parameter_class, entry.parameters_file,
-                         entry.file_key, robot_file=file_parameter(), **more)
+                         f'{entry.name}_file', robot_file=file_parameter(), **more)
         self._entry = entry
         robot = RobotParameters.load(self.parameters.robot_file or None)
         controller = entry.make(
@@ -206,7 +206,7 @@ class SupervisorNode(FlightNode):
 
     def __init__(self):
         controllers = parameter(
-            tuple(registry.standing_by()), read_only=True,
+            registry.STANDING_BY, read_only=True,
             doc='controllers that may be active: registered names, or FILE.py:Class')
         super().__init__('supervisor_node', SupervisorParameters, 'params/supervisor.yaml',
                          'supervisor_file', self._changed, changeable=('controller',),

@@ -104,7 +104,7 @@ class Driver(Operator):
             accepted, answer = self.call(name)
             return f"{name}: {answer or ('done' if accepted else 'refused')}"
         if name == 'controller':
-            names, now = list(registry.standing_by()), self.state.partition(':')[2]
+            names, now = list(registry.STANDING_BY), self.state.partition(':')[2]
             other = names[(names.index(now) + 1) % len(names)] if now in names else names[0]
             wanted = values[0] if values else other
             wanted = values[0] if values else other

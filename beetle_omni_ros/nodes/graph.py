@@ -147,8 +147,8 @@ def plan(controller: str = registry.DEFAULT, *, standby: bool = True, nmpc: str 
         allow_other_robot=allow_other_robot)
     active = registry.find(controller).name
     # The default of these nodes is the list of standby controllers.
-    others = {} if active in registry.standing_by() else {
-        'controllers': [active, *registry.standing_by()]}
+    others = {} if active in registry.STANDING_BY else {
+        'controllers': [active, *registry.STANDING_BY]}
     bridges = bridge_parameters(Path(ports), robot) if emulated else {}
     table = (
         ('recorder_node', bag, {'bag': bag, **others}),
@@ -198,10 +198,10 @@ def controller_nodes(controller: str, robot: dict, *, standby: bool = True, nmpc
     first, robot_file = registry.find(controller), robot.get('robot_file')
     if first.reference not in registry.SHIPPED:     # in one line here, not in another process
         first.make(RobotParameters.load(robot_file))
-    entries = [first, *(registry.find(name) for name in registry.standing_by()
+    entries = [first, *(registry.find(name) for name in registry.STANDING_BY
                         if standby and name != first.name)]
     if nmpc and not any(entry.option == '--nmpc' for entry in entries):
-        raise ParameterError(f"--nmpc {nmpc}: for the controller '{registry.owner('--nmpc')}', "
+        raise ParameterError(f"--nmpc {nmpc}: for the controller '{registry.OWNER['--nmpc']}', "
                              'which does not run')
     nodes, left_out = {}, {}
     for entry in entries:
@@ -209,9 +209,9 @@ def controller_nodes(controller: str, robot: dict, *, standby: bool = True, nmpc
         values = {**({} if node in NODES else {'controller': entry.reference}), **robot}
         if nmpc and entry.option == '--nmpc' and entry.parameter_class:
             entry.parameter_class.load(nmpc)    # an error here, not in another process
-            values[entry.file_key] = nmpc
+            values[f'{entry.name}_file'] = nmpc
         if entry.policy_file:
-            given = policy if entry.name == registry.owner('--policy') else ''
+            given = policy if entry.name == registry.OWNER['--policy'] else ''
             values |= {'policy': str(Path(given).absolute())} if given else {}
             values |= {'allow_other_robot': True} if allow_other_robot else {}
             if reason := unfit(given or entry.policy_file, robot_file, allow_other_robot):

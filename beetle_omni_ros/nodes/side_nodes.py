@@ -136,7 +136,7 @@ class RecorderNode(FlightNode):
         super().__init__(
             'recorder_node',
             bag=parameter(doc='folder to create for the bag', read_only=True),
-            controllers=parameter(tuple(registry.standing_by()), read_only=True,
+            controllers=parameter(registry.STANDING_BY, read_only=True,
                                   doc='registered controllers whose commands are recorded'))
         topics = topics_with(self.parameters.controllers)
         self._bag = None

@@ -60,7 +60,7 @@ class Supervisor(Inputs):
 
     def __init__(self, parameters: SupervisorParameters, robot: RobotParameters,
                  fallback: Fallback, controllers: Sequence[str] | None = None):
-        controllers = tuple(registry.standing_by() if controllers is None else controllers)
+        controllers = tuple(registry.STANDING_BY if controllers is None else controllers)
         super().__init__(parameters, robot, controllers)
         self._pilot = registry.pilot(controllers)
         self._hover = fallback

@@ -57,14 +57,9 @@ def transpose_product(rotation: torch.Tensor, other: torch.Tensor) -> torch.Tens
 
 class Draw:
     """
-    Source of random numbers, columns of one tensor of uniform numbers.
+    Source of random numbers, the columns of a tensor (N, K) of uniform numbers in [0, 1).
 
-    The numbers are drawn in advance and used in order. A step then needs one random kernel, and
-    a captured step gets new numbers.
-
-    Args:
-        numbers: (N, K) uniform in [0, 1).
-
+    A step then needs one random kernel, and a captured step gets new numbers.
     """
 
     def __init__(self, numbers: torch.Tensor):
@@ -73,9 +68,6 @@ class Draw:
     def uniform(self, size: int, low: float = 0.0, high: float = 1.0) -> torch.Tensor:
         """(N, size) uniform in [low, high)."""
         first, self._used = self._used, self._used + size
-        if self._used > self._numbers.shape[1]:
-            raise ValueError(f'{self._used} random numbers needed, {self._numbers.shape[1]} '
-                             'drawn')
         return low + (high - low) * self._numbers[:, first:self._used]
 
     def around(self, half_width: float, size: int) -> torch.Tensor:
@@ -133,12 +125,9 @@ def sensed(random, s, draw):
 
 def delayed(history: torch.Tensor, delay: torch.Tensor) -> torch.Tensor:
     """
-    Value before ``delay``, interpolated linearly between the entries of a history.
+    Value before ``delay`` (N, 1) [s], interpolated linearly between the entries of a history.
 
-    Args:
-        history: (N, H, K), newest first, one control period apart.
-        delay: (N, 1) [s], at most (H - 1) periods.
-
+    These (N, H, K) are one control period apart, newest first.
     """
     back = delay / PERIOD
     weights = (1 - (back - torch.arange(history.shape[1], device=history.device)).abs()).clamp(0)
@@ -151,12 +140,6 @@ def extrapolated(history: torch.Tensor, delay: torch.Tensor, ahead: torch.Tensor
 
     The estimator extrapolates delayed rates likewise (:class:`estimation.mounting.Mounting`),
     but with a line through three readings within 10 ms.
-
-    Args:
-        history: (N, H, K), newest first, one control period apart.
-        delay: (N, 1) [s], at most (H - 2) periods.
-        ahead: (N, 1) [s].
-
     """
     value = delayed(history, delay)
     return value + ahead / PERIOD * (value - delayed(history, delay + PERIOD))

@@ -1,8 +1,5 @@
 """`beetle_omni train`: trains a policy from a parameter file and exports it to ONNX."""
 
-from contextlib import redirect_stdout
-import io
-import os
 from pathlib import Path
 import re
 
@@ -13,24 +10,19 @@ import yaml
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import nest, ParameterError, parse_yaml, quoted
 from beetle_omni_ros.runs.files import check_writable, write_json
-from beetle_omni_ros.train.assess import assess
 from beetle_omni_ros.train.network import export_policy
 from beetle_omni_ros.train.parameters import read_parameters
-from beetle_omni_ros.train.runner import is_rank_zero, Runner
+from beetle_omni_ros.train.runner import Runner
 
 PARAMETER_FILE, POLICY_FILE = 'train.yaml', 'policy.onnx'
 # A run of less than a minute on a CPU that executes every part; the policy learns nothing.
 SMOKE = {'iterations': 3, 'log_every': 1, 'save_every': 2, 'ppo.robots': 32, 'ppo.steps': 8,
          'ppo.epochs': 2, 'ppo.minibatches': 2, 'network.hidden': [32, 16, 16],
          'network.critic': [32, 16, 16]}
-ROBOTS, CPU_ROBOTS = 8192, 64            # robots of the final assessment
-COLUMNS = (('iteration', 'iteration', '{:.0f}'), ('seconds', 'time s', '{:.0f}'),
-           ('samples_per_second', 'samples/s', '{:.2e}'), ('reward', 'reward', '{:+.4f}'),
-           ('success_rate', 'reached', '{:.1%}'), ('position_error_m', 'error m', '{:.3f}'),
-           ('attitude_error_deg', 'error deg', '{:.1f}'), ('deaths', 'lost', '{:.0f}'),
-           ('tilt_std', 'std tilt', '{:.2f}'), ('thrust_std', 'std thrust', '{:.2f}'),
-           ('learning_rate', 'rate', '{:.0e}'))
-OF_TARGETS = ('success_rate', 'position_error_m', 'attitude_error_deg')  # averages over targets
+PROGRESS = ('iteration {iteration}, {seconds:.0f} s, {samples_per_second:.2e} samples/s: reward '
+            '{reward:+.4f}, reached {success_rate:.1%} of {targets:.0f} targets, error '
+            '{position_error_m:.3f} m and {attitude_error_deg:.1f} deg, lost {deaths:.0f}, std '
+            '{tilt_std:.2f} and {thrust_std:.2f}, rate {learning_rate:.0e}')
 
 
 def choose_device(name: str) -> str:
@@ -40,7 +32,7 @@ def choose_device(name: str) -> str:
         return 'cpu'
     if name != 'auto' and not re.fullmatch(r'cuda(:\d+)?', name):
         raise ParameterError(f"--device '{name}': expected auto, cpu, cuda or cuda:N")
-    index = int(os.environ.get('LOCAL_RANK') or name.partition(':')[2] or 0)
+    index = int(name.partition(':')[2] or 0)
     if index >= count:
         raise ParameterError(f"--device '{name}': this machine has {count or 'no'} CUDA "
                              f'device{"s" if count > 1 else ""} that torch {torch.__version__}'
@@ -53,10 +45,9 @@ def run_train(*, output: Path | None, config: Path | None = None, robot: Path | 
               smoke: bool = False, stop_after: float | None = None,
               json_path: Path | None = None) -> None:
     """
-    Train, assess and export a policy.
+    Train and export a policy, with the options of `beetle_omni train`.
 
-    Arguments are the options of `beetle_omni train`; ``changes`` maps dotted parameter names to
-    values that override the file.
+    ``changes`` maps dotted parameter names to values that override the file.
 
     Raises:
         ParameterError: unusable input.
@@ -64,7 +55,7 @@ def run_train(*, output: Path | None, config: Path | None = None, robot: Path | 
         KeyboardInterrupt: raised again after a checkpoint.
 
     """
-    console = Console(quiet=not is_rank_zero())
+    console = Console()
     check_writable(json_path)
     if output is None and resume is None:
         raise ParameterError('--output: missing; expected a folder for the training')
@@ -86,68 +77,31 @@ def run_train(*, output: Path | None, config: Path | None = None, robot: Path | 
     torch.set_float32_matmul_precision('high')
     if smoke:
         torch.set_num_threads(1)    # on a loaded machine several threads wait for each other
-    with redirect_stdout(io.StringIO()):     # rsl-rl prints its models
-        runner = Runner(parameters, nominal, output, where)
+    runner = Runner(parameters, nominal, output, where)
     if checkpoint:
         runner.resume(checkpoint)
-    if is_rank_zero():
-        _make_folder(output, checkpoint)
-        (output / PARAMETER_FILE).write_text(
-            yaml.safe_dump(nest(parameters.plain()), sort_keys=False))
-    processes = f'{runner.gpu_world_size} x ' if runner.is_distributed else ''
-    console.print(f'{processes}{parameters.ppo.robots} robots on {where}, seed '
-                  f'{parameters.seed}, iterations {runner.current_learning_iteration} to '
-                  f'{parameters.iterations}; all files are in {output}', soft_wrap=True)
+    _make_folder(output, checkpoint)
+    (output / PARAMETER_FILE).write_text(yaml.safe_dump(nest(parameters.plain()), sort_keys=False))
+    console.print(f'{parameters.ppo.robots} robots on {where}, seed {parameters.seed}, iterations '
+                  f'{runner.iteration} to {parameters.iterations}; all files are in {output}',
+                  soft_wrap=True)
     try:
-        runner.train(_progress_table(console), stop_after)
-        if runner.is_distributed:
-            torch.distributed.destroy_process_group()
-        if is_rank_zero():
-            _finish(runner, nominal, output, where, smoke, json_path, console)
+        runner.train(lambda row: console.print(PROGRESS.format(**row), soft_wrap=True,
+                                               highlight=False), stop_after)
     except KeyboardInterrupt:
-        if is_rank_zero():
-            path = runner.checkpoint()
-            console.print(f'interrupted; continue with: beetle_omni train --resume {path.parent}',
-                          soft_wrap=True)
+        path = runner.checkpoint()
+        console.print(f'interrupted; continue with: beetle_omni train --resume {path.parent}',
+                      soft_wrap=True)
         raise
-
-
-def _finish(runner, robot, output, device, smoke, json_path, console):
-    """Assess, export, report."""
-    parameters, actor = runner.parameters, runner.alg.actor
-    robots, segments = (ROBOTS, 2) if device.startswith('cuda') else (CPU_ROBOTS, 1)
-    metrics = {name: assess(actor.mean, parameters, robot, device, name, robots, segments)
-               for name in ('nominal', 'published', 'measured')} if not smoke else {}
-    path = output / POLICY_FILE
-    training = {'iterations_done': runner.current_learning_iteration,
-                'samples': runner.current_learning_iteration * parameters.ppo.steps
-                * parameters.ppo.robots * runner.gpu_world_size,
-                'seconds': round(runner.trained_seconds, 1), 'processes': runner.gpu_world_size,
-                'device': torch.cuda.get_device_name(device) if device.startswith('cuda')
-                else 'cpu'}
-    difference = export_policy(actor, path, robot, parameters, training, metrics)
-    for name, values in metrics.items():
-        console.print(f'{name}, training environment: ' + ', '.join(
-            f'{key} {value:.4g}' for key, value in values.items()), soft_wrap=True)
+    done, path = runner.iteration, output / POLICY_FILE
+    difference = export_policy(runner.alg.actor, path, nominal, parameters, {
+        'iterations_done': done, 'samples': done * parameters.ppo.steps * parameters.ppo.robots,
+        'seconds': round(runner.trained_seconds, 1),
+        'device': torch.cuda.get_device_name(where) if where.startswith('cuda') else 'cpu'})
     console.print(f'{path}: agrees with torch to {difference:.1e}; fly it with beetle_omni '
                   f'evaluate --controllers rl --policy {path} --task random100', soft_wrap=True)
-    write_json(json_path, {
-        'policy': str(path), 'iterations': runner.current_learning_iteration,
-        'seconds': runner.trained_seconds, 'metrics': metrics, 'onnx_difference': difference})
-
-
-def _progress_table(console):
-    """Printer of rows of progress under a header."""
-    widths = [max(len(title), 9) for _, title, _ in COLUMNS]
-    console.print(' '.join(title.rjust(width) for (_, title, _), width in zip(COLUMNS, widths)),
-                  style='bold', soft_wrap=True)
-
-    def show(row):
-        cells = ['–' if key in OF_TARGETS and not row['targets'] else pattern.format(row[key])
-                 for key, _, pattern in COLUMNS]
-        console.print(' '.join(map(str.rjust, cells, widths)), soft_wrap=True, highlight=False)
-
-    return show
+    write_json(json_path, {'policy': str(path), 'iterations': done,
+                           'seconds': runner.trained_seconds, 'onnx_difference': difference})
 
 
 def _checkpoints(folder):

@@ -7,7 +7,6 @@ with the host, so that a whole rollout can be captured as one CUDA graph.
 """
 
 import numpy as np
-from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 import torch
 
@@ -34,15 +33,9 @@ NUMBERS = 169       # random numbers for each robot and step
 REACHED_POSITION, REACHED_ATTITUDE = 0.10, 0.17453    # [m], [rad] limits of the task metrics
 
 
-class TiltableQuadrotorEnv(VecEnv):
+class TiltableQuadrotorEnv:
     """
-    N robots in one tensor program.
-
-    Args:
-        parameters: training parameters (params/train.yaml).
-        robot: nominal robot; ParameterError if it has an effect that training refuses.
-        device: torch device.
-        compiled: whether to compile the step; by default on a GPU only.
+    N robots in one tensor program; its step is compiled on a GPU, or as ``compiled`` says.
 
     Attributes:
         state: name -> (N, ...) tensor, all quantities that persist between steps.
@@ -57,7 +50,6 @@ class TiltableQuadrotorEnv(VecEnv):
         self.cfg, self.robot, self.device = parameters, robot, torch.device(device)
         self.num_envs, self.num_actions = parameters.ppo.robots, model.INPUT_SIZE
         self.max_episode_length = round(parameters.episode.duration / batch.PERIOD)
-        self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.long, device=device)
         self.physics = Physics(robot, batch.PERIOD, SUBSTEPS, device)
         contract = PolicyContract.default(robot, parameters.memory)
         self.scale = self._tensor(contract.action_scale)
@@ -104,15 +96,8 @@ class TiltableQuadrotorEnv(VecEnv):
         return TensorDict({'actor': self.observation, 'critic': self.critic},
                           batch_size=[self.num_envs], device=self.device)
 
-    def step(self, actions: torch.Tensor):
-        """One period of all robots; see :class:`rsl_rl.env.VecEnv`."""
-        self.advance(actions)
-        self.episode_length_buf = self.state['age'].long()
-        return self.get_observations(), self.reward.clone(), self.done.clone(), \
-            {'time_outs': self.timeout.float()}
-
     def advance(self, actions: torch.Tensor) -> None:
-        """:meth:`step` in place: sets observation, critic, reward, done, timeout."""
+        """One period of all robots; sets observation, critic, reward, done, timeout."""
         requested = self.offset + self.scale * actions
         command = torch.clamp(requested, self._low, self._high)
         s = self.state

@@ -1,11 +1,10 @@
 """
 Model of the robot in the training environment, as one CasADi function.
 
-Rigid-body equations, rotor lag and effects come from :mod:`robot.dynamics`. This module adds the
-integration over a short substep, the limits of the servos and the quantities that differ between
-robots: mass, inertia, centre of mass, servos and rotor lag. With a multibody section in the robot
-file, the model includes the reaction of the tilting modules and their shift of the centre of mass.
-Without these a policy does not hold level attitudes on the multibody plant.
+To :mod:`robot.dynamics` it adds the integration over a short substep, the limits of the servos and
+the quantities that differ between robots. With a multibody section in the robot file it includes
+the reaction of the tilting modules and their shift of the centre of mass, without which a policy
+does not hold level attitudes on the multibody plant.
 """
 
 from dataclasses import replace
@@ -30,13 +29,7 @@ WRENCH_SIZE = 6    # external force in world [N], torque in body [N m]
 
 
 def module_reaction(robot: RobotParameters) -> dict[str, float]:
-    """
-    Parameters of the effect ``module_reaction`` from the multibody section.
-
-    Returns:
-        module_inertia [kg m^2] about the joint axis, and mass_moment [kg m] of a module.
-
-    """
+    """Parameters of the effect ``module_reaction`` from the multibody section [kg m^2], [kg m]."""
     module = robot.multibody.module
     depth = -float(module.centre_of_mass[2])
     return {'module_inertia': float(module.inertia[0] + module.mass * depth ** 2),
@@ -95,19 +88,11 @@ def _behind_play(gap, tilt, rate):
 
 def substep(robot: RobotParameters, duration: float) -> ca.Function:
     """
-    One integration step of the full state.
+    One integration step of ``duration`` [s]: x (25), u (8), wrench (6), body (28) -> x_next (25).
 
     The servos take shorter steps within rate limit and stops. The rotor lag is exact. The body
-    uses the acceleration at the mean thrust and the new tilt.
-
-    Args:
-        robot: parameters and effects.
-        duration: duration of the step [s].
-
-    Returns:
-        substep(x (25), u (8), wrench (6), body (28)) -> x_next (25), in the slices of
-        :mod:`robot.dynamics` and of this module.
-
+    uses the acceleration at the mean thrust and the new tilt. The slices are those of
+    :mod:`robot.dynamics` and of this module.
     """
     x, u = ca.SX.sym('x', model.STATE_SIZE), ca.SX.sym('u', model.INPUT_SIZE)
     wrench, body = ca.SX.sym('wrench', WRENCH_SIZE), ca.SX.sym('body', BODY_SIZE)

@@ -1,10 +1,9 @@
 """
 Actor and critic, rsl-rl's MLP models on features of the raw observation, and their ONNX file.
 
-The features are functions of the 33 (or 39) observed numbers and part of the exported graph. The
-interface is therefore the raw observation. The features are the target attitude in the body
-frame, gravity in both frames, sines and cosines of the tilts, and errors on scales of metres and
-centimetres. They do not depend on the heading of the world frame.
+The features are the target attitude in the body frame, gravity in both frames, sines and cosines
+of the tilts, and errors on scales of metres and centimetres. They do not depend on the heading of
+the world frame, and are part of the exported graph.
 """
 
 import copy
@@ -98,8 +97,8 @@ class FeatureModel(MLPModel):
     """
     Actor or critic of rsl-rl, on features of its observation.
 
-    The mean action is output_scale * mlp(features) + carry * previous action; the value of the
-    critic is mlp(features). ``stds`` are initial standard deviations of the actions.
+    The mean action is output_scale * mlp(features) + carry * previous action, the value of the
+    critic mlp(features). ``stds`` are initial standard deviations of the actions.
     """
 
     def __init__(self, obs, obs_groups, obs_set, output_dim, *, output_scale=1.0, carry=0.0,
@@ -132,12 +131,11 @@ class FeatureModel(MLPModel):
 
 class ExportedPolicy(torch.nn.Module):
     """
-    Network of the ONNX file, from the raw observation to the mean action in few operations.
+    :meth:`FeatureModel.mean` in few operations, whose number determines the time on one CPU core.
 
-    The function is that of :meth:`FeatureModel.mean`, written for a single observation on one CPU
-    core, where the number of operations determines the time. Axes and products of axes are
-    appended to the observation by two stages of products. All features are then one linear
-    function of these numbers, except that errors are normalised and angles become sines.
+    Axes and products of axes are appended to the observation by two stages of products. All
+    features are then one linear function of these numbers, except that errors are normalised and
+    angles become sines.
     """
 
     def __init__(self, actor: FeatureModel):
@@ -209,16 +207,13 @@ def _folded(size):
 
 
 def export_policy(actor: FeatureModel, path: Path, robot: RobotParameters,
-                  parameters: TrainParameters, training: dict | None = None,
-                  metrics: dict | None = None) -> float:
+                  parameters: TrainParameters, training: dict) -> float:
     """
-    Write an actor as ONNX with further facts of its training, and compare the file with it.
+    Write an actor as ONNX with further facts of its training.
 
     Returns:
-        largest difference of torch and onnxruntime, relative to the largest action.
-
-    Raises:
-        RunError: the difference exceeds ``AGREEMENT``.
+        largest difference of torch and onnxruntime, relative to the largest action; RunError if it
+        exceeds ``AGREEMENT``.
 
     """
     actor = copy.deepcopy(actor).cpu().eval()
@@ -232,8 +227,8 @@ def export_policy(actor: FeatureModel, path: Path, robot: RobotParameters,
     written = program.model_proto
     contract = PolicyContract.default(robot, parameters.memory)
     contract = replace(
-        contract, training={**parameters.plain(), **(training or {})}, metrics=metrics or {},
-        commit=_commit(), version=__version__,
+        contract, training={**parameters.plain(), **training}, commit=_commit(),
+        version=__version__,
         created=datetime.now(timezone.utc).isoformat(timespec='seconds'))
     _strip_paths(written)
     for key, value in contract.to_metadata().items():

@@ -12,20 +12,11 @@ from beetle_omni_ros.robot.schema import (
     group,
     nest,
     parameter,
-    ParameterError,
     ParameterFile,
     unknown,
 )
 
 STRATA = ('wound_back', 'level', 'wound', 'mixed', 'hover', 'hold', 'moving')
-
-
-def _check_ranges(parameters, *names):
-    for name in names:
-        low, high = getattr(parameters, name)
-        if low > high:
-            raise ParameterError(f"key '{name}': expected [lowest, highest], found "
-                                 f'[{low:g}, {high:g}]')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,9 +45,6 @@ class EpisodeParameters:
     replay_share: float = parameter(
         0.3, doc='largest fraction of the episodes that begin with an earlier miss',
         low=0, high=0.9)
-
-    def __post_init__(self):
-        _check_ranges(self, 'target_time')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,10 +131,6 @@ class RandomParameters:
                                      unit='m/s', low=0, high=10)
     push_rate: float = parameter(4.5, doc='change of body rate, standard deviation of an axis',
                                  unit='rad/s', low=0, high=30)
-
-    def __post_init__(self):
-        _check_ranges(self, 'velocity_latency', 'tilt_latency', 'command_latency',
-                      'actuator_spread', 'thrust_limit')
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -38,8 +38,7 @@ def _statements(function: ca.Function) -> list[str]:
     """
     Translate a scalar function with dense inputs to assignments.
 
-    Inputs are read from ``NAME_K`` and outputs assigned to ``NAME_K``, with the function's own
-    names of inputs and outputs and the index K of the entry.
+    Inputs and outputs are ``NAME_K``, with the function's own names and the index of the entry.
     """
     lines = []
     for k in range(function.n_instructions()):
@@ -163,17 +162,14 @@ def _load_kernel(source: str):
 
 
 class Physics:
-    """Control periods [s] of a batch of robots; ``kernel`` None: the Triton one if it can run."""
+    """Control periods [s] of a batch of robots, with the Triton kernel on a GPU."""
 
     def __init__(self, robot: RobotParameters, period: float, substeps: int,
-                 device: torch.device | str, kernel: bool | None = None):
+                 device: torch.device | str):
         self._period, self._substeps = period, substeps
         function = model.substep(robot, period / substeps)
-        if kernel is None:
-            kernel = torch.device(device).type == 'cuda' \
-                and importlib.util.find_spec('triton') is not None
-        self.has_kernel = kernel
-        if kernel:
+        self.has_kernel = torch.device(device).type == 'cuda'
+        if self.has_kernel:
             self._kernel = _load_kernel(_kernel_source(function))
         self._substep = torch_function(function)
 

@@ -2,17 +2,21 @@
 rsl-rl's PPO, with update and rollout as CUDA graphs.
 
 rsl-rl's loop launches about ten thousand small kernels in an iteration and waits for the device
-after each minibatch, so that the GPU is mostly idle. This module implements the arithmetic of
-rsl-rl's ``PPO.update`` without a wait, with the adaptation of the learning rate on the device. The
-update and the rollout are compiled and captured. On other devices the same code runs uncaptured.
+after each minibatch, so that the GPU is mostly idle. Here nothing waits, and the learning rate
+adapts on the device. On other devices the same code runs uncaptured.
 """
 
 from collections.abc import Callable
 from math import log, pi
 
 from rsl_rl.algorithms import PPO
+from rsl_rl.storage import RolloutStorage
 import torch
 from torch import nn
+
+from beetle_omni_ros.train.environment import TiltableQuadrotorEnv
+from beetle_omni_ros.train.network import FeatureModel
+from beetle_omni_ros.train.parameters import TrainParameters
 
 LEARNING_RATE_STEP = 1.5     # factor of rsl-rl's adaptation
 ADAM_EPSILON = 1e-8          # published
@@ -28,24 +32,35 @@ class GraphPpo(PPO):
 
     """
 
-    def prepare(self, env, learning_rate_limits, graphs: bool) -> None:
-        """Prepare buffers and optimiser, and graphs and compiled functions if ``graphs``."""
+    def __init__(self, env: TiltableQuadrotorEnv, parameters: TrainParameters, graphs: bool):
+        network, p = parameters.network, parameters.ppo
+        groups, seen = {'actor': ['actor'], 'critic': ['critic']}, env.get_observations()
+        actor = FeatureModel(
+            seen, groups, 'actor', env.num_actions, output_scale=network.output_scale,
+            carry=network.carry, last_gain=network.last_gain,
+            stds=[network.tilt_std] * 4 + [network.thrust_std] * 4,
+            hidden_dims=[int(size) for size in network.hidden],
+            distribution_cfg={'class_name': 'GaussianDistribution', 'std_type': 'log'})
+        critic = FeatureModel(seen, groups, 'critic', 1,
+                              hidden_dims=[int(size) for size in network.critic])
+        storage = RolloutStorage('rl', env.num_envs, p.steps, seen, [env.num_actions], env.device)
+        super().__init__(     # the numbers are published
+            actor, critic, storage, num_learning_epochs=p.epochs, num_mini_batches=p.minibatches,
+            clip_param=0.2, gamma=p.discount, lam=0.95, value_loss_coef=1.0, max_grad_norm=1.0,
+            learning_rate=p.learning_rate, use_clipped_value_loss=False, device=env.device)
         self.env, self._graphs = env, graphs
-        self._limits = tuple(float(limit) for limit in learning_rate_limits)
-        self.rate = torch.tensor(float(self.learning_rate), device=self.device)
+        self._limits = tuple(float(limit) for limit in p.learning_rate_limits)
+        self.rate = torch.tensor(p.learning_rate, device=self.device)
         self.optimizer = torch.optim.Adam(
             [*self.actor.parameters(), *self.critic.parameters()],
-            lr=self.rate if graphs else float(self.learning_rate), eps=ADAM_EPSILON,
+            lr=self.rate if graphs else p.learning_rate, eps=ADAM_EPSILON,
             capturable=graphs, fused=graphs or None)
-        self.scheduled = torch.tensor([self.desired_kl, self.entropy_coef, 10.0, 10.0],
-                                      device=self.device)
+        self.scheduled = torch.zeros(4, device=self.device)
         self._loss, self._mean = (torch.compile(function, dynamic=False) if graphs else function
                                   for function in (self._losses, self.actor.mean))
-        s = self.storage
-        shape = (s.num_transitions_per_env, s.num_envs)
-        width = self.actor.distribution.output_dim
-        s.distribution_params = tuple(torch.zeros(*shape, width, device=self.device)
-                                      for _ in range(2))
+        shape = (p.steps, env.num_envs)
+        storage.distribution_params = tuple(
+            torch.zeros(*shape, env.num_actions, device=self.device) for _ in range(2))
         self.losses = torch.zeros(4, device=self.device)
         self._order = torch.arange(shape[0] * shape[1], device=self.device)
         self._replay: dict[str, Callable] = {}
@@ -65,23 +80,8 @@ class GraphPpo(PPO):
         self._order.copy_(torch.randperm(count, device=self.device))
         self._run('learn', self._learn)
 
-    def update(self) -> dict[str, float]:
-        """Run rsl-rl's own update with the schedule, which averages over several processes."""
-        self.desired_kl, self.entropy_coef = self.scheduled[:2].tolist()
-        losses = super().update()
-        self._bound()
-        low, high = self._limits
-        self.set_rate(min(max(self.learning_rate, low), high))
-        with torch.no_grad():    # release the last minibatch, whose graph cannot be copied
-            self.actor.distribution.update(torch.zeros_like(self.std))
-        # rsl-rl does not return the divergence
-        self.losses.copy_(torch.tensor([losses['value'], losses['surrogate'], losses['entropy'],
-                                        0.0]))
-        return losses
-
     def set_rate(self, rate: float) -> None:
         """Set the learning rate."""
-        self.learning_rate = rate
         self.rate.fill_(rate)
         self.optimizer.param_groups[0]['lr'] = self.rate if self._graphs else rate
 
@@ -149,14 +149,10 @@ class GraphPpo(PPO):
             for k in range(self.num_mini_batches):
                 self._step([column[k * size:(k + 1) * size] for column in shuffled], old_std)
         self.losses.div_(self.num_learning_epochs * self.num_mini_batches)
-        self._bound()
-
-    @torch.no_grad()
-    def _bound(self):
-        """Limit the standard deviations as scheduled, which rsl-rl does not."""
-        log_std = self.actor.distribution.log_std_param
-        limits = self.scheduled[2:].repeat_interleave(4)
-        log_std.copy_(torch.minimum(log_std, torch.log(limits)))
+        with torch.no_grad():       # limit the standard deviations, which rsl-rl does not
+            log_std = self.actor.distribution.log_std_param
+            limits = self.scheduled[2:].repeat_interleave(4)
+            log_std.copy_(torch.minimum(log_std, torch.log(limits)))
 
     def _step(self, batch, old_std):
         self.optimizer.zero_grad(set_to_none=True)

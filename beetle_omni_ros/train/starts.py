@@ -1,11 +1,10 @@
 """
 Random initial states, targets and differences between robots, and replay of missed targets.
 
-A trained policy misses about one target in a thousand. Such situations are too rare in training to
-improve the policy. The environment therefore keeps, for every robot, the state at the start of its
-present target. If the target is missed, this state is stored. A fraction of the next episodes
-begin with stored states, until these are flown well. This is prioritised sampling of initial
-states, similar to that of steps in T. Schaul et al., Prioritized experience replay (2016).
+A trained policy misses about one target in a thousand, too few to improve it. A fraction of the
+episodes therefore begins with the state at the start of a missed target, until it is flown well:
+prioritised sampling of initial states, similar to that of steps in T. Schaul et al., Prioritized
+experience replay (2016).
 """
 
 import numpy as np
@@ -231,7 +230,7 @@ class Replays:
             fresh: new robots.
             ends: (N,) bool 'due' (time of the target is over), 'done' (end of the episode),
                 'missed' (target or robot lost, if this can be judged).
-            draw: source of random numbers, three for each robot.
+            draw: three random numbers for each robot.
 
         """
         over, replayed = ends['due'] | ends['done'], s['source'] >= 0

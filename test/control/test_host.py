@@ -125,13 +125,11 @@ def test_an_exception_of_any_method_is_counted_and_reported(method):
         f"controller 'own': {method} raised ValueError: bad (test_host.py:")
 
 
-@pytest.mark.parametrize('wrong, message', [
-    (None, 'returned NoneType'), ((0, 1), 'returned tuple'),
-    (Command(0.0, [0] * 4, np.ones(4)), 'tilt is no array'),
-    (Command(0.0, np.zeros(4), np.ones(3)), 'thrust is of shape (3,)')], ids=str)
-def test_a_return_value_of_step_that_is_no_command_is_an_error(wrong, message):
+@pytest.mark.parametrize('wrong', [None, Command(0.0, [0] * 4, np.ones(4)),
+                                   Command(0.0, np.zeros(4), np.ones(3))], ids=str)
+def test_a_return_value_of_step_that_is_no_command_is_an_error(wrong):
     host = ControllerHost('own', Own())
     host.controller.step = lambda state, target: wrong
     host.on_estimate(state())
     assert host.step(state()) is None and host.errors == 1
-    assert host.error.startswith("controller 'own': step returned ") and message in host.error
+    assert host.error.startswith(f"controller 'own': step returned {wrong}, expected a Command")

@@ -138,7 +138,7 @@ def test_an_active_controller_outside_the_supervisors_list_is_refused(make):
 
 def test_the_plan_of_a_graph_with_another_controller():
     nodes, _ = graph.plan(OWN, actuators='direct', bag='/b', task='hover')
-    known = ['pose_controller', *registry.standing_by()]
+    known = ['pose_controller', *registry.STANDING_BY]
     assert nodes['pose_controller_node'] == {'controller': OWN}
     assert nodes['supervisor_node']['controller'] == 'pose_controller'
     for name in ('supervisor_node', 'recorder_node'):

@@ -39,7 +39,7 @@ def observations(memory, count=64):
 def test_torch_and_onnxruntime_agree(tmp_path, memory, carry):
     network, parameters = actor(memory, carry)
     path = tmp_path / 'policy.onnx'
-    difference = export_policy(network, path, ROBOT, parameters)
+    difference = export_policy(network, path, ROBOT, parameters, {})
     assert 0 <= difference <= 1e-5
     session = onnxruntime.InferenceSession(path, providers=['CPUExecutionProvider'])
     seen = observations(memory)
@@ -54,15 +54,13 @@ def test_torch_and_onnxruntime_agree(tmp_path, memory, carry):
 def test_the_file_is_complete_accepted_on_board_and_contains_no_local_path(tmp_path):
     network, parameters = actor(memory=True)
     path = tmp_path / 'policy.onnx'
-    metrics = {'nominal': {'reached': 1.0, 'U_position_m': 0.013}}
-    export_policy(network, path, ROBOT, parameters, {'seconds': 12.5}, metrics)
+    export_policy(network, path, ROBOT, parameters, {'seconds': 12.5})
     entries = {entry.key: entry.value for entry in onnx.load(path).metadata_props}
     assert set(entries) == {*PolicyContract.default(ROBOT).to_metadata(), 'checksum'}
     verify(path.read_bytes())
     contract = PolicyContract.from_metadata(entries)
     assert contract.check(ROBOT) == ''
     assert contract.memory and contract.observation_size == 39
-    assert contract.metrics == metrics
     assert contract.version == beetle_omni_ros.__version__ and contract.created
     assert contract.training['seconds'] == 12.5
     assert contract.training['random.mass_scale'] == parameters.random.mass_scale
@@ -83,5 +81,5 @@ def test_a_wrong_export_is_detected_and_removed(tmp_path, monkeypatch):
     monkeypatch.setattr(module, 'ExportedPolicy', lambda _: ExportedPolicy(wrong))
     (tmp_path / 'policy.onnx').write_text('the one before')
     with pytest.raises(RunError, match=r'policy.onnx: torch and onnxruntime differ by'):
-        export_policy(network, tmp_path / 'policy.onnx', ROBOT, parameters)
+        export_policy(network, tmp_path / 'policy.onnx', ROBOT, parameters, {})
     assert [path.read_text() for path in tmp_path.iterdir()] == ['the one before']

@@ -75,7 +75,7 @@ def test_every_operation_of_the_tables_is_correct_with_constants_too():
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason='triton compiles for a GPU')
 def test_the_kernel_agrees_with_torch():
-    made = physics.Physics(EVERYTHING, 0.01, 4, 'cuda', kernel=True)
+    made = physics.Physics(EVERYTHING, 0.01, 4, 'cuda')
     x, _, wrench, body = (value.cuda() for value in states(1000, 3, torch.float32))
     commands = [states(1000, seed, torch.float32)[1].cuda() for seed in (4, 5, 6)]
     delays = uniform(torch.Generator().manual_seed(7), 0.0, 0.02, 1000, 2).cuda()

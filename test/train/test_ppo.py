@@ -27,11 +27,14 @@ def randomised(made, seed=0):
 
 def rollout_of_rsl_rl(made):
     """Collect samples like OnPolicyRunner.learn."""
-    alg, observations = made.alg, made.env.get_observations()
+    alg, env = made.alg, made.env
+    observations = env.get_observations()
     with torch.inference_mode():
         for _ in range(made.parameters.ppo.steps):
-            observations, rewards, dones, extras = made.env.step(alg.act(observations.clone()))
-            alg.process_env_step(observations, rewards, dones, extras)
+            env.advance(alg.act(observations.clone()))
+            observations = env.get_observations()
+            alg.process_env_step(observations, env.reward, env.done,
+                                 {'time_outs': env.timeout.float()})
         alg.compute_returns(observations)
     return alg.storage
 
@@ -69,11 +72,11 @@ def test_one_update_equals_that_of_rsl_rl():
         alg.scheduled[2:] = 100.0       # no bound, which rsl-rl lacks
         torch.manual_seed(7)
         if own:
+            alg.desired_kl, alg.entropy_coef = alg.scheduled[:2].tolist()
             losses = PPO.update(alg)
             found = [losses['value'], losses['surrogate'], losses['entropy']]
             rate = alg.learning_rate
         else:
-            alg.desired_kl, alg.entropy_coef = alg.scheduled[:2].tolist()
             alg.learn_batch()
             found, rate = alg.losses[:3].tolist(), alg.optimizer.param_groups[0]['lr']
         results.append((found, rate, [p.detach().clone() for p in (

@@ -100,7 +100,7 @@ def test_a_resumed_training_has_the_state_of_the_interrupted_one(tmp_path):
     assert path.name == 'model_2.pt'
     other = runner(tmp_path, iterations=4, seed=9)
     other.resume(path)
-    assert other.current_learning_iteration == 2
+    assert other.iteration == 2
     assert other.trained_seconds == made.trained_seconds > 0
     assert_same_state(made, other)
     rows = []
@@ -121,7 +121,7 @@ def test_a_checkpoint_of_a_captured_training_continues_without_capture(tmp_path)
     other = runner(iterations=2)
     other.resume(path)
     other.train()
-    assert other.current_learning_iteration == 2
+    assert other.iteration == 2
     group = other.alg.optimizer.param_groups[0]
     assert isinstance(group['lr'], float) and not group['capturable'] and not group['fused']
 
@@ -152,7 +152,7 @@ def test_a_loss_that_is_not_finite_stops_the_training_before_it_is_saved(tmp_pat
 
     def poisoned():
         learn()
-        if made.current_learning_iteration == 4:
+        if made.iteration == 4:
             made.alg.losses.fill_(torch.nan)
             made.alg.learn_batch = lambda: None
 

@@ -1,6 +1,5 @@
 """`beetle_omni train`: a smoke run, resume, one-line refusals."""
 
-from dataclasses import fields
 import json
 from pathlib import Path
 import re
@@ -13,12 +12,10 @@ import pytest
 from beetle_omni_ros import cli
 from beetle_omni_ros.control.base import PoseTarget, State
 from beetle_omni_ros.control.policy import PolicyController, PolicyParameters
-from beetle_omni_ros.control.policy_file import PolicyNetwork
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import flatten
 from beetle_omni_ros.train import command
-from beetle_omni_ros.train.assess import conditions
 from beetle_omni_ros.train.command import parse_changes
 from beetle_omni_ros.train.parameters import read_parameters, TrainParameters
 from beetle_omni_ros.train.ppo import GraphPpo
@@ -73,11 +70,6 @@ def test_the_published_training_has_the_published_values_and_no_own_term():
         elif doc.startswith('own: '):
             assert value == 0 or name == 'reward.termination', name
     assert documented == 20
-    for entry in fields(published.random):      # but velocities are old, with no estimator
-        if entry.name != 'carried_share':
-            np.testing.assert_array_equal(
-                getattr(published.random, entry.name),
-                getattr(conditions('published', published.random), entry.name), entry.name)
 
 
 def test_the_policy_of_a_run_flies(run):
@@ -91,9 +83,7 @@ def test_the_policy_of_a_run_flies(run):
     assert np.isfinite(given.tilt).all() and np.isfinite(given.thrust).all()
 
 
-def test_a_run_continues_from_its_last_checkpoint(run, tmp_path, capsys, monkeypatch):
-    asked, figures = [], {'reached': 0.5, 'U_position_m': 0.25}
-    monkeypatch.setattr(command, 'assess', lambda *given: asked.append(given[4]) or figures)
+def test_a_run_continues_from_its_last_checkpoint(run, tmp_path, capsys):
     shutil.copytree(run, tmp_path / 'run')
     (tmp_path / 'run' / 'policy.onnx').unlink()
     assert cli.main(['train', '--resume', str(tmp_path / 'run'), '--device', 'cpu', '--set',
@@ -103,10 +93,6 @@ def test_a_run_continues_from_its_last_checkpoint(run, tmp_path, capsys, monkeyp
     assert (tmp_path / 'run' / 'model_4.pt').is_file()
     assert (tmp_path / 'run' / 'policy.onnx').is_file()
     assert TrainParameters.load(tmp_path / 'run' / 'train.yaml').iterations == 4
-    contract = PolicyNetwork(tmp_path / 'run' / 'policy.onnx', ROBOT).contract
-    assert asked == ['nominal', 'published', 'measured']
-    assert contract.metrics == dict.fromkeys(asked, figures)
-    assert 'nominal, training environment: reached 0.5, U_position_m 0.25' in printed
 
 
 def test_an_interrupted_run_keeps_its_state(tmp_path, capsys, monkeypatch):
@@ -135,7 +121,6 @@ def test_an_interrupted_run_keeps_its_state(tmp_path, capsys, monkeypatch):
     ('--output OUT --set iterations', 'expected key=value'),
     ('--output OUT --set iterations=[1', 'not valid YAML'),
     ('--output OUT --set iterations=many', 'expected an integer'),
-    ('--output OUT --set episode.target_time=[8,3]', "'target_time'"),
     ('--output OUT --seed -1', '--seed'), ('--output OUT --stop-after -1', '--stop-after'),
     ('--output OUT --config none.yaml', 'none.yaml'),
     ('--output OUT --robot none.yaml', 'none.yaml'),

@@ -25,7 +25,7 @@ def check_own_controller(folder):
     assert results['mine']['compute_ms']['median'] > 0
     log = read_bag(folder / 'flown')
     assert 'flying:mine' in log.states and not log.warnings
-    assert set(log.requests) == {'mine', *registry.standing_by()}
+    assert set(log.requests) == {'mine', *registry.STANDING_BY}
 
     assert log.meta['faults'][1] == 'mocap_lost at=3 duration=0.3'
     begin = log.targets[0].stamp
