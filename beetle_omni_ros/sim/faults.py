@@ -31,7 +31,14 @@ import numpy as np
 
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import bind, load, parameter, ParameterError, quoted, unknown
+from beetle_omni_ros.robot.schema import (
+    bind,
+    load_yaml,
+    parameter,
+    ParameterError,
+    quoted,
+    unknown,
+)
 
 ROUNDING = 1e-9     # [s] bound of the rounding error of sums of ticks
 READINGS = 'imu', 'mocap', 'joints', 'rotors', 'battery'        # attributes of a Frame
@@ -437,7 +444,8 @@ class Case:
 
 def _content(path, kind):
     """Value of the key 'faults', the only one of a file."""
-    return load(make_dataclass('File', [('faults', kind, parameter(doc=''))]), path).faults
+    kind = make_dataclass('File', [('faults', kind, parameter(doc=''))])
+    return bind(kind, load_yaml(path), str(path)).faults
 
 
 def load_cases(path: str | Path | None = None) -> dict[str, Case]:
