@@ -78,7 +78,7 @@ def test_every_executable_has_its_function(setup_arguments):
         program, = getattr(import_module(module), function).args
         if program == start.TOOL:
             assert callable(start.load(program)), script
-        elif HAS_ROS:
+        elif HAS_ROS and program != 'composed':     # which names its nodes
             assert callable(import_module(f'{PACKAGE}.nodes.runner').maker(program)), script
 
 

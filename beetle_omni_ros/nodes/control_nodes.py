@@ -6,7 +6,6 @@ import math
 import secrets
 
 import numpy as np
-from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from beetle_omni_ros.control import registry
@@ -24,7 +23,7 @@ from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.estimation.state import pose_covariance, twist_covariance
 from beetle_omni_ros.messages.topics import TARGETS
 from beetle_omni_ros.messages.values import MessageError, Odom
-from beetle_omni_ros.nodes.graph import GENERIC, NODES
+from beetle_omni_ros.nodes.graph import NODES
 from beetle_omni_ros.nodes.node import ERROR, FlightNode, IDENTITY, OK, WARN
 from beetle_omni_ros.nodes.parameters import file_parameter
 from beetle_omni_ros.robot.allocation import ALL_HEALTHY
@@ -86,18 +85,12 @@ class ControllerNode(FlightNode):
     """
     Steps a controller once a period, triggered by the estimate; see ControllerHost.
 
-    An exception of the controller is logged and reported in diagnostics.
+    Commands go to '<name>/command'. An exception of the controller is logged and reported in
+    diagnostics.
     """
 
-    def __init__(self, entry: ControllerEntry | None = None):
-        """
-        Build the controller and subscribe its inputs; commands go to '<name>/command'.
-
-        Without ``entry``, the node's parameter ``controller`` names it.
-        """
-        is_own = entry and f'{entry.name}_node' in NODES    # of an executable of this name
-        entry = entry or registry.find(_requested_controller())
-        more = {} if is_own else {'controller': parameter(
+    def __init__(self, entry: ControllerEntry):
+        more = {} if f'{entry.name}_node' in NODES else {'controller': parameter(
             entry.reference, doc='controller that this node runs', read_only=True)}
         super().__init__(f'{entry.name}_node', entry.parameter_class, entry.parameters_file,
                          entry.file_key, robot_file=file_parameter(), **more)
@@ -181,17 +174,6 @@ class ControllerNode(FlightNode):
         if new:
             return ERROR, host.error, values
         return OK, getattr(controller, 'name', self._entry.name), values
-
-
-def _requested_controller() -> str:
-    """Read the parameter ``controller`` by a temporary node, before the real one is made."""
-    probe = Node(GENERIC, start_parameter_services=False, enable_rosout=False)
-    given = probe._parameter_overrides.get('controller')
-    probe.destroy_node()
-    if given is None:
-        raise ParameterError("key 'controller': missing; expected a registered controller "
-                             f"({', '.join(registry.names())}) or {registry.CLASS}")
-    return str(given.value)
 
 
 # --- supervisor ---------------------------------------------------------------------------------

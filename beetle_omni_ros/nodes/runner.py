@@ -24,7 +24,7 @@ from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
 
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.nodes.graph import COMPOSED, confine, GENERIC, NODES
+from beetle_omni_ros.nodes.graph import COMPOSED, confine, CONTROLLER, NODES
 from beetle_omni_ros.robot.schema import load_yaml, ParameterError
 
 OK, FAILED, UNUSABLE = 0, 1, 2
@@ -61,11 +61,12 @@ def main(name: str) -> None:
 
 def maker(name: str) -> Callable:
     """Import what makes the node of an executable, or of a controller by name or reference."""
-    module, _, kind = NODES.get(name, NODES[GENERIC]).partition(':')
+    place = NODES.get(name, CONTROLLER)
+    module, _, kind = place.partition(':')
     made = getattr(import_module(f'{__package__}.{module}'), kind)
-    if name == GENERIC or NODES.get(name) not in (None, NODES[GENERIC]):
-        return made
-    return partial(made, registry.find(name.removesuffix('_node')))
+    if place == CONTROLLER:
+        return partial(made, registry.find(name.removesuffix('_node')))
+    return made
 
 
 def run(names: Sequence[str], argv: Sequence[str], name: str) -> int:

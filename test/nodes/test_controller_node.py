@@ -15,6 +15,7 @@ from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes import graph
 from beetle_omni_ros.nodes import node as base
 from beetle_omni_ros.nodes.control_nodes import ControllerNode, SupervisorNode
+from beetle_omni_ros.nodes.runner import maker
 from beetle_omni_ros.robot.allocation import ActuatorHealth
 from beetle_omni_ros.robot.readings import JointReading
 from beetle_omni_ros.robot.schema import ParameterError
@@ -104,7 +105,7 @@ def test_an_exception_of_step_is_logged_and_reported_and_publishes_no_command(
         make, tmp_path, capfd):
     own = tmp_path / 'bad.py'
     own.write_text(FAILING)
-    node = make(ControllerNode, f'controller:={own}:Failing')
+    node = make(maker(f'{own}:Failing'))
     node._publisher = Sent('nmpc/command')
     node._on_joints(JointReading(1.0, np.zeros(4), np.zeros(4)))
     fly(node, [1.0, 2.0, 2.1])
