@@ -36,7 +36,6 @@ ARGUMENTS = {
     'policy': ('', None, 'policy (ONNX) for rl_node; empty: the shipped one'),
     'task': ('', None, 'task for reference_node; empty: targets come from elsewhere'),
     'record': ('', None, 'folder for a bag; empty: no recording'),
-    'compression': ('none', ['none', 'zstd'], 'of the chunks in the bag'),
     'allow_other_robot': ('false', ['true', 'false'],
                           'fly a policy that was trained for other robot parameters'),
     'namespace': ('', None, 'namespace of every node and topic'),
@@ -66,8 +65,7 @@ def options(given):
         bag=given['record'], seed=int(given['seed']),
         **{key: given[key] == 'true' for key in ('standby', 'allow_other_robot', 'viewer')},
         **{key: given[key] for key in (
-            'clock', 'compression', 'conditions', 'controller', 'plant_file', 'policy',
-            'robot_file', 'task')})
+            'clock', 'conditions', 'controller', 'plant_file', 'policy', 'robot_file', 'task')})
 
 
 def state_publisher(namespace):

@@ -84,8 +84,7 @@ CASES = {
     EVALUATE: [
         ('--plant unknown.yaml', 'masss'),
         ('--conditions windy', "--conditions 'windy': expected nominal or"),
-        ('--compression rar', "compression 'rar': expected none or zstd"), ('--sed 1', '--sed'),
-        ('--seed', '--seed'), ('extra', 'extra'),
+        ('--sed 1', '--sed'), ('--seed', '--seed'), ('extra', 'extra'),
         ('--bag folder', 'folder: exists already; a bag needs a new folder'),
         ('--bag notes.txt/bag', 'is not a folder')],
     FLY: [

@@ -10,7 +10,6 @@ from typing import Annotated
 from typer import Argument, echo, Option, Typer
 
 from beetle_omni_ros.cli.options import (
-    CompressionOption,
     CONDITIONS,
     ConditionsOption,
     ControllerOption,
@@ -55,7 +54,6 @@ def fly(controller: ControllerOption = DEFAULT,
         task: TaskOption = 'waypoints',
         bag: Annotated[Path | None, Option(metavar='DIR', help=(
             'New folder for the recorded bag. Default: runs_out/fly_DATE.'))] = None,
-        compression: CompressionOption = 'none',
         conditions: ConditionsOption = 'nominal',
         seed: SeedOption = 0,
         actuators: Annotated[str | None, Option(metavar='emulated|direct', help=(
@@ -110,7 +108,6 @@ def evaluate(controllers: Annotated[str, Option(callback=several, metavar='NAME,
              bag: Annotated[Path | None, Option(metavar='DIR', help=(
                  'New folder for the bag; with several controllers it contains one bag for '
                  'each.'))] = None,
-             compression: CompressionOption = 'none',
              faults: FaultsOption = None,
              json_path: JsonOption = None):
     """
@@ -136,8 +133,8 @@ def evaluate(controllers: Annotated[str, Option(callback=several, metavar='NAME,
     from beetle_omni_ros.evaluation.command import run_evaluate
     from beetle_omni_ros.runs.metrics import failed
     results = run_evaluate(controllers=controllers, task=task, conditions=conditions, robot=robot,
-                           plant=plant, seed=seed, bag=bag, compression=compression,
-                           json_path=json_path, faults=faults, options=options)
+                           plant=plant, seed=seed, bag=bag, json_path=json_path, faults=faults,
+                           options=options)
     return FAILED if any(map(failed, results.values())) else 0
 
 

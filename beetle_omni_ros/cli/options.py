@@ -88,8 +88,6 @@ DomainOption = Annotated[int | None, Option(
     min=0, max=101, help='ROS domain. Default: ROS_DOMAIN_ID; of fly, a free one.')]
 NamespaceOption = Annotated[str, Option(
     metavar='NAME', help="Namespace of the robot's topics in a running graph.")]
-CompressionOption = Annotated[str, Option(
-    callback=one_of, metavar='none|zstd', help='Compression of the chunks in the bag.')]
 FaultsOption = Annotated[Path | None, Option(callback=existing, metavar='FILE', help=(
     'Faults with times and durations (YAML, see docs/faults.md).'))]
 JobsOption = Annotated[int | None, Option(

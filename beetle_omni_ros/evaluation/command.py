@@ -31,7 +31,7 @@ from beetle_omni_ros.sim.faults import Fault
 def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotParameters,
         conditions: str = 'nominal', seed: int = 0,
         options: Mapping[str, ControllerOptions] = MappingProxyType({}),
-        built: Controller | None = None, bag: Path | None = None, compression: str = 'none',
+        built: Controller | None = None, bag: Path | None = None,
         meta: dict | None = None, faults: Sequence[Fault] = (),
         progress=lambda part: None) -> FlightLog:
     """
@@ -61,8 +61,8 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
         recorder: Recorder = memory
         if bag is not None:
             recorder = Recorder(memory, stack.enter_context(BagWriter(
-                bag, meta=meta, topics=tuple(topics_with([entry.name])), compression=compression,
-                frames=True, epoch=int(time()))))
+                bag, meta=meta, topics=tuple(topics_with([entry.name])), frames=True,
+                epoch=int(time()))))
         loop = FlightLoop(robot, plant, aboard, recorder, conditions=conditions, seed=seed,
                           faults=faults)
         stayed, truth = loop.fly(task, progress), loop.simulator.truth
@@ -77,7 +77,6 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
 def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 'nominal',
                  robot: Path | None = None, plant: Path | None = None, seed: int = 0,
                  bag: Path | None = None, json_path: Path | None = None,
-                 compression: str = 'none',
                  options: Mapping[str, ControllerOptions] = MappingProxyType({}),
                  faults: Path | None = None, console: Console | None = None) -> dict:
     """
@@ -91,7 +90,6 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
         plant: robot file of the simulated plant; default ``robot``.
         seed: seed of the task's poses and of the simulation.
         bag: folder of a bag; with several controllers it contains one bag for each.
-        compression: compression of the bags, 'none' or 'zstd'.
         json_path: file for the results.
         options: controller -> files in place of its own.
         faults: file of faults with times since the task's start and durations.
@@ -132,8 +130,8 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
             bar = bars.add_task(f'{name}: {task.name}, {conditions}', total=1.0)
             log = fly(entry.reference, task, robot=believed, plant=true, conditions=conditions,
                       seed=seed, options=options, built=controller,
-                      bag=bag / name if bag and len(built) > 1 else bag, compression=compression,
-                      meta=meta, faults=injected,
+                      bag=bag / name if bag and len(built) > 1 else bag, meta=meta,
+                      faults=injected,
                       progress=lambda part, bar=bar: bars.update(bar, completed=part))
             results[name] = metrics(log, task)
             if not console.is_terminal:     # which shows no progress bar

@@ -180,7 +180,6 @@ def write_battery(value: BatteryReading) -> Any:
     message.power_supply_status = message.POWER_SUPPLY_STATUS_DISCHARGING
     message.power_supply_technology = message.POWER_SUPPLY_TECHNOLOGY_LIPO
     message.present = True
-    message.cell_voltage = np.full(value.cells, np.nan, dtype=np.float32)
     return message
 
 

@@ -1,7 +1,6 @@
 """ROS lifecycle nodes between the topics and the actuators: tilt servos and motor board."""
 
 from collections import Counter
-from dataclasses import replace
 from functools import partial, partialmethod
 import math
 import time
@@ -286,7 +285,6 @@ class RotorBridgeNode(BridgeNode):
                          'motor_board_file', autostart='activate')
         given = self.parameters
         robot = RobotParameters.load(given.robot_file or None)
-        self._cells = robot.battery.cells
         self._period = 1 / given.target_rate
         self._board = MotorBoard(given, robot, clock=self.now)
         self._arming = Arming(self._board)
@@ -391,7 +389,7 @@ class RotorBridgeNode(BridgeNode):
         battery, rotors, events = self._board.poll()
         if battery is not None:
             self._battery = battery
-            self._batteries.publish(replace(battery, cells=self._cells))
+            self._batteries.publish(battery)
         if rotors is not None:
             self._speeds = rotors
             self._rotors.publish(RotorReading(rotors.stamp, RPM * rotors.rpm))

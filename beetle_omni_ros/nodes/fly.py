@@ -51,12 +51,10 @@ PACING = 'sim_node: pacing'
 
 
 def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
-            bag: Path | None = None, compression: str = 'none',
-            seed: int = 0, conditions: str = 'nominal',
-            actuators: str | None = None,
-            clock: str = 'system', robot: Path | None = None, plant: Path | None = None,
-            nmpc: Path | None = None, policy: Path | None = None,
-            allow_other_robot: bool = False, standby: bool = True,
+            bag: Path | None = None, seed: int = 0, conditions: str = 'nominal',
+            actuators: str | None = None, clock: str = 'system',
+            robot: Path | None = None, plant: Path | None = None, nmpc: Path | None = None,
+            policy: Path | None = None, allow_other_robot: bool = False, standby: bool = True,
             faults: Path | None = None, json_path: Path | None = None,
             domain_id: int | None = None, view: bool = False,
             console: Console | None = None) -> int:
@@ -89,7 +87,7 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
                 plant_file=_absolute(plant and find_robot(plant)),
                 conditions=conditions, seed=int(seed),
                 task=_absolute(task) if Path(task).is_file() else str(task), bag=str(bag),
-                compression=compression, ports=str(folder), clock=clock,
+                ports=str(folder), clock=clock,
                 actuators='bridges' if actuators == 'emulated' else 'direct')
             for name, reason in left_out.items():
                 _print(console, f'{name} does not stand by: {reason}')

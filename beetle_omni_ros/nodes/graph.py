@@ -105,8 +105,7 @@ def plan(controller: str = registry.DEFAULT, *, standby: bool = True, nmpc: str 
          policy: str = '', allow_other_robot: bool = False, simulated: bool = True,
          actuators: str = 'bridges', ports: str = '', robot_file: str = '', plant_file: str = '',
          conditions: str = 'nominal', seed: int = 0, task: str = '', bag: str = '',
-         compression: str = 'none', viewer: bool = False, clock: str = 'system'
-         ) -> tuple[Parameters, dict[str, str]]:
+         viewer: bool = False, clock: str = 'system') -> tuple[Parameters, dict[str, str]]:
     """
     List the nodes of a graph; a file '' is the shipped one.
 
@@ -126,7 +125,6 @@ def plan(controller: str = registry.DEFAULT, *, standby: bool = True, nmpc: str 
         seed: of the simulation and the task.
         task: task of reference_node; '': targets from elsewhere.
         bag: folder of the bag, '' for no recording.
-        compression: of the bag, 'none' or 'zstd'.
         viewer: whether viewer_node runs.
         clock: 'system', or 'simulated': time on /clock that waits for nodes that are late.
 
@@ -150,10 +148,9 @@ def plan(controller: str = registry.DEFAULT, *, standby: bool = True, nmpc: str 
     # The default of these nodes is the list of standby controllers.
     others = {} if active in registry.standing_by() else {
         'controllers': [active, *registry.standing_by()]}
-    packed = {} if compression == 'none' else {'compression': compression}
     bridges = bridge_parameters(Path(ports), robot) if emulated else {}
     table = (
-        ('recorder_node', bag, {'bag': bag, **packed, **others}),
+        ('recorder_node', bag, {'bag': bag, **others}),
         ('ekf_node', True, robot),
         *((name, True, values) for name, values in controllers.items()),
         ('supervisor_node', True, {**robot, 'controller': active, **others}),

@@ -25,7 +25,7 @@ from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.node import ERROR, FlightNode, OK, WARN
 from beetle_omni_ros.robot.schema import parameter, ParameterError
 from beetle_omni_ros.runs.bag import BagError
-from beetle_omni_ros.runs.bag_writer import BagWriter, COMPRESSIONS
+from beetle_omni_ros.runs.bag_writer import BagWriter
 from beetle_omni_ros.runs.tasks import make_task, TaskPlayer, WITH_WRENCHES
 
 PERIOD = 0.02           # s between updates of the task
@@ -134,16 +134,12 @@ class RecorderNode(FlightNode):
             'recorder_node',
             bag=parameter(doc='folder to create for the bag', read_only=True),
             controllers=parameter(tuple(registry.standing_by()), read_only=True,
-                                  doc='registered controllers whose commands are recorded'),
-            compression=parameter('none', choices=COMPRESSIONS, read_only=True,
-                                  doc='compression of the chunks in the MCAP file'))
+                                  doc='registered controllers whose commands are recorded'))
         topics = topics_with(self.parameters.controllers)
         self._bag = None
         try:
             self._bag = BagWriter(self.parameters.bag, namespace=self.get_namespace(),
-                                  topics=tuple(topics),
-                                  compression=self.parameters.compression,
-                                  frames=True)
+                                  topics=tuple(topics), frames=True)
         except BagError as error:
             raise ParameterError(f"key 'bag': {error}") from None
         self._written = self._lost = self._writes = 0

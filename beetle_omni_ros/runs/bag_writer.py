@@ -14,7 +14,6 @@ from typing import Any
 
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
 from rosbags.rosbag2.storage_mcap import McapWriter, write_channel, write_string
 from rosbags.serde import SerdeError
 import yaml
@@ -30,9 +29,6 @@ from beetle_omni_ros.runs.log import Recorder, RUN_STATUS
 
 VERSION = 9     # of metadata.yaml
 DISTRIBUTION = 'jazzy'
-# Compression of the chunks in the MCAP file, which every reader supports; 'zstd' is like the
-# preset `zstd_fast` of rosbag2.
-COMPRESSIONS = ('none', 'zstd')
 TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 TEXT = 'std_msgs/msg/String'
 PERIOD = 0.02       # [s] between transforms
@@ -131,8 +127,8 @@ class BagWriter(Recorder):
     keeps_covariances = True
 
     def __init__(self, path: str | Path, meta: dict | None = None, *, namespace: str = '',
-                 topics: Sequence[str] = tuple(TOPICS), compression: str = 'none',
-                 frames: bool = False, epoch: int = 0):
+                 topics: Sequence[str] = tuple(TOPICS), frames: bool = False,
+                 epoch: int = 0):
         """
         Create the folder and the bag in it.
 
@@ -141,7 +137,6 @@ class BagWriter(Recorder):
             meta: metadata of the flight: task, conditions, seed, robot, version.
             namespace: namespace of the topics, '' or e.g. '/robot1'.
             topics: names to declare, see :func:`~beetle_omni_ros.messages.topics.topic_of`.
-            compression: compression of the chunks in the file, 'none' or 'zstd'.
             frames: whether the description and the frames of the robot are recorded.
             epoch: UNIX time of time 0 [s], so that a flight that begins at 0 s gets a real date.
 
@@ -158,8 +153,6 @@ class BagWriter(Recorder):
         self._writer: Writer | None = Writer(self.path, version=VERSION,
                                              storage_plugin=StoragePlugin.MCAP)
         self._writer.STORAGE_PLUGINS = {StoragePlugin.MCAP: JazzyStorage}
-        if compression == 'zstd':
-            self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
         with self._disk():
             self._writer.open()
         for name in topics:

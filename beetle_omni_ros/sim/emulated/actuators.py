@@ -61,21 +61,17 @@ class EmulatedActuators:
 
     def set_faults(self, servo: ServoFaults, board: BoardFaults) -> None:
         """
-        Switch faults on and off, and trigger the events that are set.
+        Switch faults on and off.
 
         A ParameterError reports an unknown servo, without any change.
         """
         ids = [one['ID'] for one in self.bus.servos]
-        for name in ('silent', 'overload', 'reboot'):
-            for wanted in np.ravel(getattr(servo, name)):
-                if wanted not in (*ids, *[0] * (name == 'reboot')):
+        for name in ('silent', 'overload'):
+            for wanted in getattr(servo, name):
+                if wanted not in ids:
                     raise ParameterError(f'servo_faults.{name}: no servo has the id {wanted:g}; '
                                          f'ids are {ids}')
         self._faults = self.bus.faults, self.board.faults = servo, board
-        if servo.reboot:
-            self.bus.reboot(ids.index(servo.reboot))
-        if board.reboot:
-            self.board.reboot()
 
     @property
     def faults(self) -> list[str]:

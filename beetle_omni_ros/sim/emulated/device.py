@@ -28,7 +28,7 @@ DELAY = {'unit': 's', 'low': 0, 'high': 10}
 
 @dataclass(kw_only=True)
 class ServoFaults:
-    """Faults of the servo bus. Levels may be changed at any time, ``reboot`` happens once."""
+    """Faults of the servo bus, which may be changed at any time."""
 
     bad_crc: float = parameter(0.0, doc='share of answers with a flipped bit', **SHARE)
     dropped: float = parameter(0.0, doc='share of lost answers', **SHARE)
@@ -38,7 +38,6 @@ class ServoFaults:
     overload: np.ndarray = parameter([], doc='IDs with a permanent overload', **LISTED)
     supply_voltage: float = parameter(12.0, doc='supply voltage of the servos', unit='V', low=0,
                                       high=30)
-    reboot: int = parameter(0, doc='ID to restart once', low=0, high=252)
 
 
 @dataclass(kw_only=True)
@@ -54,21 +53,19 @@ class BoardFaults:
     delay_out: float = parameter(0.0, doc='delay of packets of the board', **DELAY)
     delay_in: float = parameter(0.0, doc='delay of packets to the board', **DELAY)
     failed_escs: np.ndarray = parameter([], doc='rotors (1 to 4) that do not turn', low=1, high=4)
-    reboot: bool = parameter(False, doc='reset once')
 
 
-def switched_on(faults: ServoFaults | BoardFaults, event: bool = False) -> list[str]:
-    """Levels, and the event if asked, that differ from their defaults, such as 'silent [2]'."""
+def switched_on(faults: ServoFaults | BoardFaults) -> list[str]:
+    """Levels that differ from their defaults, such as 'silent [2]'."""
     healthy, found = type(faults)(), []
     for name in (entry.name for entry in fields(faults)):
         value = getattr(faults, name)
-        if name == 'delay' or name == 'reboot' and not event \
-                or np.array_equal(value, getattr(healthy, name)):
+        if name == 'delay' or np.array_equal(value, getattr(healthy, name)):
             continue
         if isinstance(value, np.ndarray):
             found.append(f'{name} {sorted({int(one) for one in value})}')
         else:
-            found.append(name if value is True else f'{name} {value:g}')
+            found.append(f'{name} {value:g}')
     return found
 
 
