@@ -11,7 +11,6 @@ import tempfile
 
 from launch.actions import DeclareLaunchArgument, ExecuteProcess, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
-from launch_ros.actions import Node
 
 from launch import LaunchDescription
 
@@ -68,17 +67,6 @@ def options(given):
             'clock', 'conditions', 'controller', 'plant_file', 'policy', 'robot_file', 'task')})
 
 
-def state_publisher(namespace):
-    """The node that publishes description and frames of the links."""
-    from launch_ros.parameter_descriptions import ParameterValue
-
-    from beetle_omni_ros.robot.urdf import description
-    return Node(package='robot_state_publisher', executable='robot_state_publisher',
-                namespace=namespace, output='screen', parameters=[{
-                    'robot_description': ParameterValue(description(), value_type=str),
-                    'publish_frequency': 50.0}])
-
-
 def composed(arguments, nodes, namespace):
     """One process that runs ``nodes``."""
     overrides = [argument for node, values in nodes.items() for key, value in values.items()
@@ -97,10 +85,9 @@ def actions(context):
     nodes, left_out = graph.plan(**options(given))
     for name, reason in left_out.items():
         print(f'{name} does not stand by: {reason}', file=sys.stderr)
-    return [*([state_publisher(given['namespace'])] if 'viewer_node' in nodes else []),
-            *(composed(graph.arguments(nodes, names), {name: nodes[name] for name in names},
-                       given['namespace'].strip('/'))
-              for names in graph.processes(nodes).values())]
+    return [composed(graph.arguments(nodes, names), {name: nodes[name] for name in names},
+                     given['namespace'].strip('/'))
+            for names in graph.processes(nodes).values()]
 
 
 def generate_launch_description():

@@ -52,7 +52,7 @@ def third_party_imports():
 
 def is_ros(module):
     """Whether a module is part of ROS."""
-    return module in ('rclpy', 'launch', 'launch_ros', 'ament_index_python',
+    return module in ('rclpy', 'launch', 'ament_index_python',
                       'builtin_interfaces') or module.endswith(('_msgs', '_srvs', '_interfaces'))
 
 

@@ -3,17 +3,14 @@
 from functools import partial
 import sys
 
-from geometry_msgs.msg import TransformStamped
 import numpy as np
 from rcl_interfaces.srv import SetParameters
 from rclpy.event_handler import SubscriptionEventCallbacks
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
-from beetle_omni_ros.messages.conversions import BODY, set_parts, set_time, WORLD
 from beetle_omni_ros.messages.topics import (
     ALL,
-    EVENT,
     LATCHED_LOG,
     LOG,
     SENSOR,
@@ -25,7 +22,7 @@ from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.node import ERROR, FlightNode, OK, WARN
 from beetle_omni_ros.robot.schema import parameter, ParameterError
 from beetle_omni_ros.runs.bag import BagError
-from beetle_omni_ros.runs.bag_writer import BagWriter
+from beetle_omni_ros.runs.bag_writer import BagWriter, FRAMES, FrameWriter
 from beetle_omni_ros.runs.tasks import make_task, TaskPlayer, WITH_WRENCHES
 
 PERIOD = 0.02           # s between updates of the task
@@ -36,7 +33,6 @@ WINDOW, WINDOW_PERIOD, WINDOW_SAMPLE = 3.0, 1.5, 0.05   # s
 WRITE_PERIOD = 0.02     # s between writes of the received messages, so that no callback waits
 FLUSH_WRITES = 20       # writes between flushes; a crash loses only messages after the last one
 HELD = 1000             # messages at most that wait for the first simulated time
-FRAME_PERIOD = 0.02     # s between two transforms
 
 
 # --- targets ------------------------------------------------------------------------------------
@@ -202,23 +198,17 @@ class RecorderNode(FlightNode):
 # --- viewers ------------------------------------------------------------------------------------
 
 class ViewerNode(FlightNode):
-    """Publishes the transform from world to base_link for RViz and Foxglove."""
+    """Publishes description and frames of the robot for RViz and Foxglove, like those of a bag."""
 
     def __init__(self):
         super().__init__('viewer_node')
-        self._message = wire.message_class('tf2_msgs/msg/TFMessage')    # not on PyPI
-        self._transforms = self.create_publisher(self._message, '/tf', wire.profile(EVENT))
-        self._moved = 0.0       # stamp of the estimate that the frame shows
-        self.listen('odom', self._on_odom, qos=SENSOR)
+        self._outputs = {     # tf2_msgs is not on PyPI
+            name: self.create_publisher(wire.message_class(kind), name, wire.profile(qos))
+            for name, (kind, qos) in FRAMES.items()}
+        frames = FrameWriter(self._write, '')
+        for topic in ('odom', 'joint_states'):
+            wire.subscribe_raw(self, topic, lambda data, topic=topic: frames.take(
+                topic, data, self.now()), SENSOR)
 
-    def _on_odom(self, odom):
-        if not self._transforms.get_subscription_count() \
-                or 0 <= odom.stamp - self._moved < FRAME_PERIOD:
-            return
-        self._moved = odom.stamp
-        frame = TransformStamped(child_frame_id=BODY)
-        set_time(frame.header.stamp, odom.stamp)
-        frame.header.frame_id = WORLD
-        set_parts(frame.transform.translation, odom.position)
-        set_parts(frame.transform.rotation, odom.quaternion)
-        self._transforms.publish(self._message(transforms=[frame]))
+    def _write(self, topic, kind, data, t):
+        self._outputs[topic].publish(bytes(data))

@@ -25,9 +25,7 @@ def bringup(monkeypatch):
     """Load the launch file against stand-ins for the modules of launch."""
     classes = {'launch': ['LaunchDescription'],
                'launch.actions': ['DeclareLaunchArgument', 'ExecuteProcess', 'OpaqueFunction'],
-               'launch.substitutions': ['LaunchConfiguration'],
-               'launch_ros': [], 'launch_ros.actions': ['Node'],
-               'launch_ros.parameter_descriptions': ['ParameterValue']}
+               'launch.substitutions': ['LaunchConfiguration']}
     for name, members in classes.items():
         module = ModuleType(name)
         for member in members:
