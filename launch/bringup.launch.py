@@ -5,6 +5,7 @@ The robot stays on the ground until ``supervisor_node/arm`` is called.
 """
 
 import atexit
+from pathlib import Path
 import shutil
 import sys
 import tempfile
@@ -14,7 +15,6 @@ from launch.substitutions import LaunchConfiguration
 
 from launch import LaunchDescription
 
-PACKAGE = 'beetle_omni_ros'
 ARGUMENTS = {
     # name: (default, choices or None, description)
     'backend': ('sim', ['sim', 'none'],
@@ -46,48 +46,33 @@ ARGUMENTS = {
 }
 
 
-def ports():
-    """Make a private folder of this launch, so that the ports of two simulations do not meet."""
-    made = tempfile.mkdtemp(prefix='beetle_omni_ports_')
-    atexit.register(shutil.rmtree, made, ignore_errors=True)
-    return made
-
-
-def options(given):
+def options(given, folder):
     """Put the arguments into the terms of the graph's plan."""
-    simulated = given['backend'] == 'sim'
     actuators = given['actuators'] or (
         'direct' if given['clock'] == 'simulated' else 'bridges')
-    emulated = simulated and actuators == 'bridges'
     return dict(
-        simulated=simulated, actuators=actuators, ports=ports() if emulated else '',
+        simulated=given['backend'] == 'sim', actuators=actuators, ports=folder,
         bag=given['record'], seed=int(given['seed']),
         **{key: given[key] == 'true' for key in ('standby', 'allow_other_robot', 'viewer')},
         **{key: given[key] for key in (
             'clock', 'conditions', 'controller', 'plant_file', 'policy', 'robot_file', 'task')})
 
 
-def composed(arguments, nodes, namespace):
-    """One process that runs ``nodes``."""
-    overrides = [argument for node, values in nodes.items() for key, value in values.items()
-                 for argument in ('-p', f'{node}:{key}:={value}')]
-    if namespace:
-        overrides += ['-r', f'__ns:=/{namespace}']
-    return ExecuteProcess(cmd=[sys.executable, '-m', f'{PACKAGE}.start', 'composed', *arguments,
-                               '--ros-args', *overrides], output='screen')
-
-
 def actions(context):
     """Turn the arguments into processes."""
     from beetle_omni_ros.nodes import graph
     given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
+    # Private to this launch, so that the ports of two simulations do not meet.
+    folder = tempfile.mkdtemp(prefix='beetle_omni_')
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
     graph.confine()
-    nodes, left_out = graph.plan(**options(given))
+    nodes, left_out = graph.plan(**options(given, folder))
     for name, reason in left_out.items():
         print(f'{name} does not stand by: {reason}', file=sys.stderr)
-    return [composed(graph.arguments(nodes, names), {name: nodes[name] for name in names},
-                     given['namespace'].strip('/'))
-            for names in graph.processes(nodes).values()]
+    namespace = given['namespace'].strip('/')
+    remapped = ['-r', f'__ns:=/{namespace}'] if namespace else []
+    return [ExecuteProcess(cmd=[*command, *remapped], output='screen')
+            for command in graph.commands(nodes, Path(folder)).values()]
 
 
 def generate_launch_description():

@@ -6,7 +6,7 @@ Nodes of a ROS graph as data, and their processes on this computer; imports no R
 in the same network would publish on the same topics.
 """
 
-from collections.abc import Iterable, MutableMapping
+from collections.abc import MutableMapping
 from contextlib import contextmanager
 from copy import deepcopy
 from itertools import count
@@ -109,24 +109,10 @@ def plan(controller: str = registry.DEFAULT, *, standby: bool = True, nmpc: str 
     """
     List the nodes of a graph; a file '' is the shipped one.
 
-    Args:
-        controller: active controller: a name, or a reference to a class.
-        standby: whether the standby controllers run too, so that they can be selected in flight.
-        nmpc: file of the controller that has the option `--nmpc`.
-        policy: file of the controller that has the option `--policy`.
-        allow_other_robot: whether a policy trained for other robot parameters may fly.
-        simulated: whether sim_node provides sensors and actuators. Otherwise nodes started
-            elsewhere do; on the robot deploy/install.sh starts the bridges.
-        actuators: 'bridges' to emulated devices, or 'direct': from the topic to the simulator.
-        ports: folder of the names of the emulated devices' ports.
-        robot_file: robot file of estimator and controllers.
-        plant_file: robot file of the simulation; '': the same.
-        conditions: of the simulation.
-        seed: of the simulation and the task.
-        task: task of reference_node; '': targets from elsewhere.
-        bag: folder of the bag, '' for no recording.
-        viewer: whether viewer_node runs.
-        clock: 'system', or 'simulated': time on /clock that waits for nodes that are late.
+    The arguments are options of `beetle_omni fly` and arguments of the launch file. Without
+    ``simulated`` sensors and actuators are nodes started elsewhere; on the robot deploy/install.sh
+    starts the bridges. ``actuators`` are 'bridges' to emulated devices, with ports in the folder
+    ``ports``, or 'direct': from the topic to the simulator.
 
     Returns:
         Node name -> parameters; omitted standby controller -> reason.
@@ -232,40 +218,39 @@ def unfit(policy: str, robot_file: str | None, allow_other_robot: bool) -> str:
     return ''
 
 
-def arguments(nodes: Parameters, names: Iterable[str]) -> list[str]:
-    """Return the arguments of `composed`: executables, and references of other controllers."""
-    return [name if name in NODES else nodes[name]['controller'] for name in names]
-
-
-def processes(nodes: Parameters) -> dict[str, list[str]]:
-    """Return process -> its nodes; the bridges, which block on their ports, have their own."""
-    groups = {COMPOSED: [name for name in nodes if name not in BRIDGES],
-              BRIDGES_COMPOSED: [name for name in nodes if name in BRIDGES]}
-    return {name: names for name, names in groups.items() if names}
-
-
 # --- processes --------------------------------------------------------------------------------
+
+def commands(nodes: Parameters, folder: Path, groups: dict[str, list[str]] | None = None
+             ) -> dict[str, list[str]]:
+    """
+    Return process -> its command; ``folder`` receives the parameter file.
+
+    ``groups`` are process -> its nodes. By default the bridges, which block on their ports, have
+    their own.
+    """
+    groups = groups or {COMPOSED: [name for name in nodes if name not in BRIDGES],
+                        BRIDGES_COMPOSED: [name for name in nodes if name in BRIDGES]}
+    file = folder / 'parameters.yaml'
+    file.write_text(yaml.safe_dump({f'/**/{node}': {'ros__parameters': values}
+                                    for node, values in nodes.items()}))
+    return {process: [sys.executable, '-m', 'beetle_omni_ros.start', COMPOSED,
+                      # A controller without an executable is named by its reference.
+                      *(name if name in NODES else nodes[name]['controller'] for name in names),
+                      '--ros-args', '--params-file', str(file)]
+            for process, names in groups.items() if names}
+
 
 class Graph:
     """
-    Processes that run nodes.
+    Processes that run nodes; the other arguments are those of :func:`commands`.
 
-    ``folder`` receives the parameter file and the output of the processes. ``groups`` are process
-    -> its nodes, by default those of :func:`processes`.
+    ``folder`` also receives the output of the processes.
     """
 
     def __init__(self, nodes: Parameters, folder: Path, domain: int,
                  groups: dict[str, list[str]] | None = None):
         self.folder, self.domain, self.nodes = Path(folder), domain, list(nodes)
-        groups = groups or processes(nodes)
-        self._bridges = [name for name, group in groups.items() if set(group) <= set(BRIDGES)]
-        self._file = self.folder / 'parameters.yaml'
-        self._file.write_text(yaml.safe_dump(
-            {f'/**/{node}': {'ros__parameters': values} for node, values in nodes.items()
-             if values} or {'/**': {'ros__parameters': {}}}))
-        self._commands = {name: [COMPOSED, *arguments(nodes, group), '--ros-args',
-                                 '--params-file', str(self._file)]
-                          for name, group in groups.items()}
+        self._commands = commands(nodes, self.folder, groups)
         self.processes: dict[str, subprocess.Popen] = {}
 
     def start(self) -> None:
@@ -277,9 +262,9 @@ class Graph:
         """Start one process, or start it again."""
         with open(self.log(name), 'a') as log:
             self.processes[name] = subprocess.Popen(
-                [sys.executable, '-m', 'beetle_omni_ros.start', *self._commands[name]],
-                env=child_environment(self.domain), stdin=subprocess.DEVNULL, stdout=log,
-                stderr=log, start_new_session=True)     # Ctrl-C reaches this process only
+                self._commands[name], env=child_environment(self.domain),
+                stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+                start_new_session=True)     # Ctrl-C reaches this process only
 
     def log(self, name: str) -> Path:
         """Return the file with the output of a process."""
@@ -301,9 +286,8 @@ class Graph:
 
         Bridges stop first, because they switch off the actuators, which the simulator emulates.
         """
-        others = [name for name in self.processes if name not in self._bridges]
-        return self._end([name for name in self.processes if name in self._bridges]) \
-            + self._end(others)
+        bridges = {BRIDGES_COMPOSED, *BRIDGES} & set(self.processes)
+        return self._end(bridges) + self._end(set(self.processes) - bridges)
 
     def _end(self, names):
         """Send SIGINT every second: a process that still imports may lose the first one."""
