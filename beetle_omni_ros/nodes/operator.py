@@ -11,6 +11,7 @@ import numpy as np
 from rcl_interfaces.srv import SetParameters
 import rclpy
 from rclpy.exceptions import NameValidationException
+from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
@@ -66,7 +67,7 @@ class Client:
             context.try_shutdown()
             raise ParameterError(f"--namespace '{namespace}': "
                                  f'{str(error).splitlines()[0]}') from None
-        self._executor = runner.make_executor(context)
+        self._executor = EventsExecutor(context=context)
         self._executor.add_node(self._node)
 
     def spin_steadily(self, seconds: float) -> None:

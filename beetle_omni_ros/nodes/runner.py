@@ -19,6 +19,7 @@ import threading
 
 import rclpy
 from rclpy.executors import ExternalShutdownException
+from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
@@ -84,7 +85,7 @@ def run(names: Sequence[str], argv: Sequence[str], name: str) -> int:
         confine()
         # rclpy's handlers would end the context while a callback still publishes.
         rclpy.init(args=list(argv), signal_handler_options=SignalHandlerOptions.NO)
-        executor = make_executor()
+        executor = EventsExecutor()
         for name in names:
             node = maker(name)()
             nodes.append(node)
@@ -130,16 +131,6 @@ def _own_arguments():
         if 'ROSArgs' not in type(error).__name__:
             raise
         raise ParameterError(str(error)) from None
-
-
-def make_executor(context=None):
-    """Make an events executor, or a single-threaded one if the distribution lacks it."""
-    try:
-        from rclpy.experimental.events_executor import EventsExecutor
-    except ImportError:
-        from rclpy.executors import SingleThreadedExecutor
-        return SingleThreadedExecutor(context=context)
-    return EventsExecutor(context=context)
 
 
 def _stop_on_signal() -> Future:

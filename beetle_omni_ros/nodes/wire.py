@@ -111,9 +111,7 @@ def subscribe_any(node: Node, topic: str, callback: Callable[[bytes, float], Non
     """
     seen: deque[float] = deque(maxlen=COPIES)
 
-    def take(*given):
-        # The single-threaded executor passes two arguments, the events executor of Jazzy one
-        # tuple of both.
+    def take(*given):   # the events executor of rclpy 7.1 passes one tuple of both arguments
         data, info = given if len(given) == 2 else given[0]
         stamp = info.get('source_timestamp')
         publication = stamp * 1e-9 if stamp and stamp > 0 else math.nan

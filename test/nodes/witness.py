@@ -8,10 +8,11 @@ import time
 import numpy as np
 import pytest
 import rclpy
+from rclpy.experimental.events_executor import EventsExecutor
 
 from beetle_omni_ros.messages import conversions
 from beetle_omni_ros.messages.topics import EVENT, SENSOR, topic_of
-from beetle_omni_ros.nodes import runner, wire
+from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.graph import COMPOSED, Graph
 from beetle_omni_ros.nodes.operator import Operator
 
@@ -107,7 +108,7 @@ class Bench:
         arguments = [a for override in overrides for a in ('-p', override)]
         rclpy.init(args=['--ros-args', *arguments], domain_id=domain)
         self.user = rclpy.create_node(user)
-        self.executor = runner.make_executor()
+        self.executor = EventsExecutor()
         self.executor.add_node(self.user)
         self.nodes = [self.user]
 
