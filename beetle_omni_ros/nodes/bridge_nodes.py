@@ -15,7 +15,7 @@ from beetle_omni_ros.drivers.serial_port import SerialPortError
 from beetle_omni_ros.drivers.servo_bus import ServoBus
 from beetle_omni_ros.drivers.servo_link import ServoBusError
 from beetle_omni_ros.drivers.servo_loop import ServoLoop
-from beetle_omni_ros.nodes import parameters
+from beetle_omni_ros.nodes import parameters, wire
 from beetle_omni_ros.nodes.graph import AUTOSTART
 from beetle_omni_ros.nodes.node import Distribution, ERROR, FlightNode, OK, WARN
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters
@@ -302,7 +302,7 @@ class RotorBridgeNode(BridgeNode):
         for k in range(4):
             self.report(f'rotor{k + 1}', partial(self._rotor_status, k))
         self.listen('command', self._on_command, max_age=given.stamp_age_limit, stale_after=None)
-        self.follow('supervisor/state', self._on_supervisor)
+        wire.subscribe(self, 'supervisor/state', self._on_supervisor)
         self._timer = self.create_timer(self._period, self._on_timer, clock=self.steady_clock)
         self.start_by_itself()
         if given.autostart != 'none':

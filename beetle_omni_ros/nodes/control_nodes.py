@@ -23,6 +23,7 @@ from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.estimation.state import pose_covariance, twist_covariance
 from beetle_omni_ros.messages.topics import TARGETS
 from beetle_omni_ros.messages.values import MessageError, Odom
+from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.graph import NODES
 from beetle_omni_ros.nodes.node import ERROR, FlightNode, IDENTITY, OK, WARN
 from beetle_omni_ros.nodes.parameters import file_parameter
@@ -110,9 +111,9 @@ class ControllerNode(FlightNode):
         self.listen('command', partial(setattr, self, '_command'), stale_after=None)
         for topic in TARGETS:
             self.listen(topic, self._on_target, stale_after=None)
-        self.follow('supervisor/state', self._on_mode)
-        self.follow('supervisor/target', partial(setattr, self._host, 'override'))
-        self.follow('supervisor/actuators', self._host.on_health)
+        wire.subscribe(self, 'supervisor/state', self._on_mode)
+        wire.subscribe(self, 'supervisor/target', partial(setattr, self._host, 'override'))
+        wire.subscribe(self, 'supervisor/actuators', self._host.on_health)
         self.track_compute(controller.period)
         self.report('controller', self._controller_status)
 
@@ -227,7 +228,7 @@ class SupervisorNode(FlightNode):
         for name in self._controllers:
             self.listen(f'{name}/command', partial(self._on_command, name), stale_after=None)
         for name in ('joint', 'rotor'):
-            self.follow(f'{name}_bridge/state', partial(self._on_bridge, name))
+            wire.subscribe(self, f'{name}_bridge/state', partial(self._on_bridge, name))
         for name in ('arm', 'disarm', 'land', 'emergency_stop'):
             self.create_service(Trigger, f'~/{name}', partial(self._on_request, name))
         self.report('supervisor', self._supervisor_status)

@@ -6,13 +6,12 @@ from dataclasses import dataclass, field
 from functools import partial
 import math
 import time
-from typing import Any
 
 import numpy as np
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
-from beetle_omni_ros.messages.topics import Qos, TARGETS, topic_of
+from beetle_omni_ros.messages.topics import Qos, topic_of
 from beetle_omni_ros.messages.values import Diagnostic, MessageError
 from beetle_omni_ros.nodes import parameters, wire
 from beetle_omni_ros.nodes.graph import claim
@@ -147,10 +146,6 @@ class FlightNode(Node):
         """Make the publisher of a topic."""
         return wire.Publisher(self, topic)
 
-    def follow(self, topic: str, handle: Callable[[Any], None]) -> None:
-        """Pass the values of a latched topic to ``handle``, without checks of age."""
-        wire.subscribe(self, topic, handle)
-
     def listen(self, topic: str, handle: Callable, *, qos: Qos | None = None,
                max_age: float | None = None, stale_after: float | None = 0.5) -> None:
         """
@@ -163,7 +158,7 @@ class FlightNode(Node):
             topic: relative name in the table of topics.
             handle: called with each value, and for targets with the time of publication [s,
                 system time, or nan]; may raise MessageError to refuse it.
-            qos: quality of service; default: the table's, any for targets.
+            qos: quality of service; default: the table's.
             max_age: limit of a stamp's age [s], also refuses future stamps; None: no check.
             stale_after: silence after a message that is an error [s]; None: never.
 
@@ -171,7 +166,7 @@ class FlightNode(Node):
         entry, counts = topic_of(topic), Input(stale_after)
         self.inputs[topic] = counts
         if topic == 'command':
-            self.follow(IDENTITY, partial(setattr, self, '_supervisor_identity'))
+            wire.subscribe(self, IDENTITY, partial(setattr, self, '_supervisor_identity'))
 
         def callback(data, *publication):
             try:
@@ -189,10 +184,7 @@ class FlightNode(Node):
             counts.received += 1
             counts.age, counts.seen = age, self.elapsed()
 
-        if topic in TARGETS:
-            wire.subscribe_any(self, topic, callback)
-        else:
-            wire.subscribe_raw(self, topic, callback, qos)
+        wire.subscribe_raw(self, topic, callback, qos)
 
     def _check_source(self, source):
         identity = self._supervisor_identity

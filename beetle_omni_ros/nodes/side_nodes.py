@@ -5,7 +5,6 @@ import sys
 
 import numpy as np
 from rcl_interfaces.srv import SetParameters
-from rclpy.event_handler import SubscriptionEventCallbacks
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
@@ -14,7 +13,6 @@ from beetle_omni_ros.messages.topics import (
     LATCHED_LOG,
     LOG,
     SENSOR,
-    TARGETS,
     topics_with,
 )
 from beetle_omni_ros.messages.values import Wrench
@@ -60,7 +58,7 @@ class ReferenceNode(FlightNode):
         self._states = self.publisher('reference/state')
         self._payload = self.create_client(SetParameters, 'sim_node/set_parameters')
         self._set_state('waiting')
-        self.follow('supervisor/state', self._on_supervisor)
+        wire.subscribe(self, 'supervisor/state', self._on_supervisor)
         disturbed = self._task.kind in WITH_WRENCHES
         if disturbed:       # the loss of control ends tasks with rising levels
             self.listen('odom', partial(setattr, self, '_odom'), qos=SENSOR)
@@ -143,18 +141,12 @@ class RecorderNode(FlightNode):
         self._received = []     # (topic, type, CDR, time of receipt [s]) not yet written
         prefix = self.get_namespace().rstrip('/') + '/'
         for name, topic in {**ALL, **topics}.items():
-            keep = partial(self._keep, prefix + name, topic.type)
-            if name in TARGETS:
-                wire.subscribe_any(self, name, keep, depth=50, on_lost=self._on_lost)
-            else:
-                wire.subscribe_raw(
-                    self, name, lambda data, keep=keep: keep(data),
-                    LATCHED_LOG if topic.qos.latched else LOG,
-                    event_callbacks=SubscriptionEventCallbacks(message_lost=self._on_lost))
+            wire.subscribe_raw(self, name, partial(self._keep, prefix + name, topic.type),
+                               LATCHED_LOG if topic.qos.latched else LOG, self._on_lost)
         self.report('bag', self._bag_status)
         self.create_timer(WRITE_PERIOD, self._write, clock=self.steady_clock)
 
-    def _keep(self, topic, message_type, data, _=None):
+    def _keep(self, topic, message_type, data, *_):
         self._received.append((topic, message_type, data, self.now()))
 
     def _write(self):
