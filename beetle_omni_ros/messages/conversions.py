@@ -191,15 +191,6 @@ def read_odom(message: Any) -> Odom:
                    np.einsum('ijn,nj->ni', rotations.matrix(tuple(q.T)), velocity))
 
 
-def take_odom(message: Any) -> Odom:
-    """Read pose and velocity for flight."""
-    odom = read_odom(message)
-    for name in ('position', 'velocity', 'quaternion', 'angular_velocity'):
-        finite(getattr(odom, name), name)
-    unit(odom.quaternion)
-    return odom
-
-
 def write_odom(value: Odom) -> Any:
     """Write pose in world, twist in base_link, and covariances."""
     message = _write_odom(value)
@@ -213,7 +204,6 @@ def write_odom(value: Odom) -> Any:
 
 
 def read_pose_target(message: Any) -> PoseTarget:
-    """Read a pose target; MessageError if it is not finite or in another frame than world."""
     target = _read_target(message)
     finite(target.position, 'position')
     _check_frame(message)
@@ -246,7 +236,6 @@ def _joint_state(stamp, names, **fields):
 
 
 def read_joints(message: Any) -> JointReading:
-    """Read the four tilt joints, in any order of names."""
     return JointReading(
         seconds(message.header.stamp), _of(message, 'position', JOINTS),
         _of(message, 'velocity', JOINTS) if len(message.velocity) else None,
@@ -266,23 +255,19 @@ def take_joints(message: Any) -> JointReading:
 
 
 def write_joints(value: JointReading) -> Any:
-    """Write the joints that the value names."""
     return _joint_state(value.stamp, value.names, position=value.position,
                         velocity=value.velocity, effort=value.effort)
 
 
 def read_rotors(message: Any) -> RotorReading:
-    """Read the speeds measured by the ESCs."""
     return RotorReading(seconds(message.header.stamp), _of(message, 'velocity', ROTORS))
 
 
 def write_rotors(value: RotorReading) -> Any:
-    """Write the speeds."""
     return _joint_state(value.stamp, ROTORS, velocity=value.speed)
 
 
 def read_command(message: Any) -> Command:
-    """Read four tilts and four thrusts."""
     return Command(seconds(message.header.stamp), _of(message, 'position', JOINTS),
                    _of(message, 'effort', ROTORS))
 
@@ -342,7 +327,6 @@ def read_override(message: Any) -> TrajectoryTarget | None:
 
 
 def write_override(target: TrajectoryTarget | None) -> Any:
-    """Write the supervisor's target; a message without points for None."""
     return new(TRAJECTORY) if target is None else write_trajectory(target)
 
 
@@ -352,14 +336,12 @@ read_text: Callable[[Any], str] = attrgetter('data')
 
 
 def write_text(value: str) -> Any:
-    """Write a text."""
     message = new('std_msgs/msg/String')
     message.data = value
     return message
 
 
 def read_health(message: Any) -> ActuatorHealth:
-    """Read the health of the actuators."""
     try:
         health = ActuatorHealth(**{name: tuple(value) if isinstance(value, list) else value
                                    for name, value in json.loads(message.data).items()})
@@ -373,7 +355,6 @@ def read_health(message: Any) -> ActuatorHealth:
 
 
 def write_health(health: ActuatorHealth) -> Any:
-    """Write the health of the actuators as JSON."""
     return write_text(json.dumps(asdict(health)))
 
 
