@@ -10,7 +10,7 @@ from rclpy.lifecycle import LifecycleNodeMixin, TransitionCallbackReturn
 from std_srvs.srv import Trigger
 
 from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters, ServoBusParameters
-from beetle_omni_ros.drivers.motor_board import Arming, FLIES, LOST, MotorBoard, RECONNECT
+from beetle_omni_ros.drivers.motor_board import Arming, FLIES, LOST, MotorBoard
 from beetle_omni_ros.drivers.serial_port import SerialPortError
 from beetle_omni_ros.drivers.servo_bus import ServoBus
 from beetle_omni_ros.drivers.servo_link import ServoBusError
@@ -69,6 +69,8 @@ class BridgeNode(LifecycleNodeMixin, FlightNode):
         if AUTOSTART[self.parameters.autostart]:
             self._start_timer = self.create_timer(RETRY, self.try_to_start,
                                                   clock=self.steady_clock)
+            self.try_to_start()
+        self.changed()
 
     def changed(self) -> None:
         """Publish and log the state if it changed."""
@@ -154,7 +156,6 @@ class JointBridgeNode(BridgeNode):
         self.create_service(Trigger, '~/reboot', self._on_reboot)
         self.create_timer(CHECK_PERIOD, self._on_timer, clock=self.steady_clock)
         self.start_by_itself()
-        self.changed()
 
     def configure(self):
         """Open the port, check and write the servos' settings, and start to read angles."""
@@ -290,9 +291,7 @@ class RotorBridgeNode(BridgeNode):
         self._arming = Arming(self._board)
         self._arming.inhibit('not configured')
         self._command = self._battery = self._speeds = None
-        # _port_error: why the port is closed, '' if not yet known; None: open, or not configured.
-        self._port_error = None
-        self._updated = self._next_try = time.monotonic()
+        self._updated = time.monotonic()
         self._cycle, self._sent_at = 0, 0.0
         self._unsent = Counter()
         self._saturated, self._saturated_reported = np.zeros((2, 4), dtype=int)
@@ -305,12 +304,10 @@ class RotorBridgeNode(BridgeNode):
         wire.subscribe(self, 'supervisor/state', self._on_supervisor)
         self._timer = self.create_timer(self._period, self._on_timer, clock=self.steady_clock)
         self.start_by_itself()
-        if given.autostart != 'none':
-            self.try_to_start()     # at once; nothing is refused here
 
     def configure(self):
-        """Open the port, now or as soon as it exists; then battery and rotors are published."""
-        self._port_error, self._next_try = '', time.monotonic()
+        """Open the port; from then on battery and rotors are published."""
+        self._board.open()
         self._arming.inhibit('not activated')
 
     def activate(self):
@@ -324,7 +321,6 @@ class RotorBridgeNode(BridgeNode):
     def release(self):
         """Disarm and close the port."""
         self._arming.inhibit('not configured')
-        self._port_error = None
         self._board.close()
 
     def close(self):
@@ -345,7 +341,6 @@ class RotorBridgeNode(BridgeNode):
 
     def _on_timer(self):
         now = time.monotonic()
-        self._open(now)
         self._arming.update(now - self._updated)
         self._updated = now
         if now - self._sent_at < self._period / 2:
@@ -358,18 +353,6 @@ class RotorBridgeNode(BridgeNode):
         if self._cycle % POLL_CYCLES == 0:
             self._poll()
         self.changed()
-
-    def _open(self, now):
-        """Try to open the port; afterwards the driver itself reconnects."""
-        if self._port_error is None or now < self._next_try:
-            return
-        self._next_try = now + RECONNECT
-        try:
-            self._board.open()
-        except SerialPortError as error:
-            self._port_error = str(error)
-        else:
-            self._port_error = None
 
     def _send(self):
         """Send the newest thrusts while flying; return whether they were sent."""
@@ -399,8 +382,7 @@ class RotorBridgeNode(BridgeNode):
     def state_text(self):
         """Return the state of the board, or why its port is closed."""
         text = self._arming.text
-        return f'waiting: {self._port_error}' if self._port_error and text.startswith('waiting') \
-            else text
+        return f'waiting: {self.refusal}' if self.refusal and text.startswith('waiting') else text
 
     def _board_status(self):
         arming, text = self._arming, self._arming.text

@@ -136,9 +136,10 @@ def test_without_autostart_it_arms_only_while_activated_and_disarms_at_its_end(t
     with bench(tmp_path, autostart='none', port=str(port)) as made:
         board, operator = made.board, made.operator
         operator.reaches('waiting: not configured')
-        assert operator.change('configure')
+        assert not operator.change('configure')
         operator.reaches(f'waiting: {port}: cannot be opened (no such port')
         os.symlink(board.port, port)
+        assert operator.change('configure')
         operator.reaches('waiting: not activated')
         operator.until(lambda: operator.batteries)                  # received, but not armed
         operator.supervise('takeoff')
