@@ -32,7 +32,6 @@ HEADER = 4          # bytes of encapsulation before the payload, from which alig
 SIZES = {'bool': '?', 'byte': 'u1', 'octet': 'u1', 'char': 'u1', 'int8': 'i1', 'uint8': 'u1',
          'int16': 'i2', 'uint16': 'u2', 'int32': 'i4', 'uint32': 'u4', 'int64': 'i8',
          'uint64': 'u8', 'float32': 'f4', 'float64': 'f8'}
-LAYOUTS = 32        # layouts of one length, after which messages are read one by one
 EMPTY: dict[str, Any] = {'bool': False, 'string': '', 'float32': 0.0, 'float64': 0.0}
 
 
@@ -141,15 +140,12 @@ def _alike(name, messages, refused) -> Iterator[tuple[np.ndarray, SimpleNamespac
     for length, rows in lengths.items():
         block = np.frombuffer(b''.join(messages[row] for row in rows), np.uint8)
         block, rows = block.reshape(len(rows), length), np.array(rows)
-        tried = 0
         while len(rows):
-            tried += 1
             alike = np.zeros(len(rows), dtype=bool)
             alike[0] = True
             try:
                 columns, fixed = _layout(name, block[0].tobytes())
-                if tried < LAYOUTS:
-                    alike = (block[:, fixed] == block[0, fixed]).all(axis=1)
+                alike = (block[:, fixed] == block[0, fixed]).all(axis=1)
                 yield rows[alike], columns(block[alike])
             except Exception as error:      # broken bytes raise anything
                 refused[str(error) or type(error).__name__] += int(alike.sum())

@@ -107,8 +107,6 @@ class Driver(Operator):
             names, now = list(registry.standing_by()), self.state.partition(':')[2]
             other = names[(names.index(now) + 1) % len(names)] if now in names else names[0]
             wanted = values[0] if values else other
-            wanted = values[0] if values else other
-            wanted = values[0] if values else other
             accepted, answer = self.set('supervisor_node', 'controller', wanted)
             return f'controller {wanted}' + ('' if accepted else f': {answer}')
         if name == 'where':
