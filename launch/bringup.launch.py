@@ -20,10 +20,10 @@ ARGUMENTS = {
     'backend': ('sim', ['sim', 'none'],
                 'who provides sensors and actuators: the simulator, or nodes started elsewhere, '
                 'as the service of deploy/install.sh, which runs the bridges of the robot'),
-    'actuators': ('', ['', 'bridges', 'direct'],
+    'actuators': ('', ['', 'emulated', 'direct'],
                   'how commands reach the simulated actuators: through joint_bridge_node and '
                   'rotor_bridge_node to emulated devices, or straight into the plant; empty: '
-                  'bridges, direct with clock simulated'),
+                  'emulated, direct with clock simulated'),
     'clock': ('system', ['system', 'simulated'],
               'real time, or simulated time on /clock, which waits for nodes that are late: for a '
               'computer that is too slow'),
@@ -48,14 +48,13 @@ ARGUMENTS = {
 
 def options(given, folder):
     """Put the arguments into the terms of the graph's plan."""
-    actuators = given['actuators'] or (
-        'direct' if given['clock'] == 'simulated' else 'bridges')
     return dict(
-        simulated=given['backend'] == 'sim', actuators=actuators, ports=folder,
-        bag=given['record'], seed=int(given['seed']),
+        simulated=given['backend'] == 'sim', ports=folder, bag=given['record'],
+        seed=int(given['seed']),
         **{key: given[key] == 'true' for key in ('standby', 'allow_other_robot', 'viewer')},
         **{key: given[key] for key in (
-            'clock', 'conditions', 'controller', 'plant_file', 'policy', 'robot_file', 'task')})
+            'actuators', 'clock', 'conditions', 'controller', 'plant_file', 'policy',
+            'robot_file', 'task')})
 
 
 def actions(context):

@@ -21,6 +21,7 @@ from beetle_omni_ros.cli.options import (
     KNOWN,
     NamespaceOption,
     NmpcOption,
+    one_of,
     OtherRobotOption,
     OutputOption,
     PageOption,
@@ -56,11 +57,11 @@ def fly(controller: ControllerOption = DEFAULT,
             'New folder for the recorded bag. Default: runs_out/fly_DATE.'))] = None,
         conditions: ConditionsOption = 'nominal',
         seed: SeedOption = 0,
-        actuators: Annotated[str | None, Option(metavar='emulated|direct', help=(
+        actuators: Annotated[str | None, Option(callback=one_of, metavar='emulated|direct', help=(
             'emulated (default): commands go through joint_bridge_node, rotor_bridge_node, serial '
             'ports and emulated devices; direct: they go straight to the simulated '
             'plant.'))] = None,
-        clock: Annotated[str, Option(metavar='system|simulated', help=(
+        clock: Annotated[str, Option(callback=one_of, metavar='system|simulated', help=(
             'system: real time; simulated: simulated time on /clock, which waits for late nodes, '
             'with direct actuators, for a computer that is too slow for real '
             'time.'))] = 'system',

@@ -26,13 +26,12 @@ from beetle_omni_ros.robot.schema import ParameterError, RunError
 from beetle_omni_ros.runs import table
 from beetle_omni_ros.runs.bag import read_bag
 from beetle_omni_ros.runs.bag_writer import add_meta, check_new
-from beetle_omni_ros.runs.files import check_writable, write_json
+from beetle_omni_ros.runs.files import write_json
 from beetle_omni_ros.runs.metrics import failed, metrics
 from beetle_omni_ros.runs.tasks import make_task, Task
 from beetle_omni_ros.sim import fault_lists as listed
 
 INTERRUPTED = 130
-ACTUATORS, CLOCKS = ('emulated', 'direct'), ('system', 'simulated')
 READY_TIMEOUT = 300.0   # s; the first start compiles the controller
 BRIDGES_TIMEOUT = 20.0  # s; the simulator makes their devices at its start
 ARM_TIMEOUT = 10.0      # s
@@ -41,7 +40,6 @@ TAKEOFF_ATTEMPTS = 3
 SETTLE_TIME = 1.0       # s before arming, in which start-up work ends
 LANDING_TIMEOUT = 30.0  # s
 SPARE_TIME = 10.0       # s beyond the task's duration before a flight counts as stuck
-CHECK_PERIOD = 0.1      # s between checks of processes and progress
 ON_GROUND = ('disarmed', 'emergency_stop')
 
 # s lost by the simulator above which a failure is attributed to the slow computer: the actuators
@@ -74,12 +72,10 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix='beetle_omni_')))
             bag = Path(bag).absolute() if bag else folder / 'bag'
             check_new(bag)
-            check_writable(json_path)
             flown_task = make_task(task, seed, registry.find(controller).reach(
                 RobotParameters.load(robot)))
             RobotParameters.load(plant or robot)
             injected = listed.load_faults(faults) if faults else []
-            actuators = _actuators(injected, actuators, clock)
             nodes, left_out = plan(
                 controller, nmpc=_absolute(nmpc), policy=str(policy or ''),
                 standby=standby, allow_other_robot=allow_other_robot,
@@ -87,8 +83,7 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
                 plant_file=_absolute(plant and find_robot(plant)),
                 conditions=conditions, seed=int(seed),
                 task=_absolute(task) if Path(task).is_file() else str(task), bag=str(bag),
-                ports=str(folder), clock=clock,
-                actuators='bridges' if actuators == 'emulated' else 'direct')
+                ports=str(folder), clock=clock, actuators=_checked(injected, actuators))
             for name, reason in left_out.items():
                 _print(console, f'{name} does not stand by: {reason}')
             controller = registry.find(controller).name
@@ -98,7 +93,8 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             meta = {'task': task, 'conditions': conditions, 'seed': seed,
                     'robot': str(robot) if robot else 'params/robot.yaml',
                     'plant': str(plant) if plant else None, 'version': __version__,
-                    'controller': controller, 'clock': clock, 'actuators': actuators}
+                    'controller': controller, 'clock': clock,
+                    'actuators': nodes['sim_node'].get('actuators', 'direct')}
             if injected:
                 meta['faults'] = [str(fault) for fault in injected]
             graph = Graph(nodes, folder, number)
@@ -120,12 +116,8 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
         return INTERRUPTED
 
 
-def _actuators(faults, actuators, clock):
-    """Choose the actuators if the user left them open: devices need real time and no faults."""
-    for key, value, known in (('actuators', actuators, (None, *ACTUATORS)),
-                              ('clock', clock, CLOCKS)):
-        if value not in known:
-            raise ParameterError(f"{key} '{value}': expected {' or '.join(filter(None, known))}")
+def _checked(faults, actuators):
+    """Refuse faults that a flight cannot have; those of devices need direct actuators."""
     for fault in faults:
         if fault.is_process:
             raise ParameterError(f"--faults: '{fault.kind}' affects a process; expected a fault "
@@ -135,7 +127,7 @@ def _actuators(faults, actuators, clock):
                 raise ParameterError(f"--faults: '{fault.kind}' affects a device; expected "
                                      '--actuators direct')
             actuators = 'direct'
-    return actuators or ('direct' if clock == 'simulated' else 'emulated')
+    return actuators
 
 
 def _absolute(path):
@@ -193,7 +185,7 @@ class Flight(Operator):
 
     def __init__(self, graph: Graph, controller: str, task: Task, show: Callable[[str], None]):
         super().__init__(graph.domain, controller)
-        self._graph, self._task, self._show = graph, task, show
+        self._graph, self._task, self._show, self._lands = graph, task, show, False
         self._bridges = [node for node in graph.nodes if node in BRIDGES]
 
     def fly(self, faults: str) -> None:
@@ -226,7 +218,7 @@ class Flight(Operator):
         """Arm and take off; repeat if the supervisor disarms on the ground."""
         answers = []
         for _ in range(TAKEOFF_ATTEMPTS):
-            self._spin(SETTLE_TIME)
+            self.spin(SETTLE_TIME)
             self._await('arming', lambda: answers.append(self.call('arm')) or answers[-1][0],
                         ARM_TIMEOUT, lambda: f'; supervisor_node: {answers[-1][1]}')
             self.states.clear()
@@ -257,6 +249,7 @@ class Flight(Operator):
 
     def land(self) -> None:
         """Land if the robot flies, and wait for the motors to stop."""
+        self._lands = True
         if self.state in ('', *ON_GROUND):
             return
         self._show('landing')
@@ -269,17 +262,16 @@ class Flight(Operator):
 
     def _await(self, text, condition, timeout, why=lambda: ''):
         self._show(text)
-        left = self.countdown(timeout)
-        while not condition():
-            self._spin()
-            if next(left, None) is None:
-                waits = self.waits_for(self._bridges)
-                raise RunError(f'{text}: nothing after {timeout:g} s, supervisor in '
-                               f"'{self.state}'{why()}" + (waits and f'; {waits}'))
+        if not self.wait(condition, timeout):
+            waits = self.waits_for(self._bridges)
+            raise RunError(f'{text}: nothing after {timeout:g} s, supervisor in '
+                           f"'{self.state}'{why()}" + (waits and f'; {waits}'))
 
-    def _spin(self, seconds=CHECK_PERIOD):
-        """Process messages; an ended process and a failing controller end the flight."""
-        self.spin(seconds)
+    def spin(self, seconds: float) -> None:
+        """Process messages; before landing, an ended process and a failing controller raise."""
+        super().spin(seconds)
+        if self._lands:
+            return
         if dead := self._graph.dead():
             raise RunError('; '.join(f'{name} died ({how})' for name, how in dead.items()))
         status = self.diagnostics.get(f'{self.controller}_node: controller')

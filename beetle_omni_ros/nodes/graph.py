@@ -103,7 +103,7 @@ def _ports_are_free(domain):
 
 def plan(controller: str = registry.DEFAULT, *, standby: bool = True, nmpc: str = '',
          policy: str = '', allow_other_robot: bool = False, simulated: bool = True,
-         actuators: str = 'bridges', ports: str = '', robot_file: str = '', plant_file: str = '',
+         actuators: str | None = None, ports: str = '', robot_file: str = '', plant_file: str = '',
          conditions: str = 'nominal', seed: int = 0, task: str = '', bag: str = '',
          viewer: bool = False, clock: str = 'system') -> tuple[Parameters, dict[str, str]]:
     """
@@ -111,8 +111,8 @@ def plan(controller: str = registry.DEFAULT, *, standby: bool = True, nmpc: str 
 
     The arguments are options of `beetle_omni fly` and arguments of the launch file. Without
     ``simulated`` sensors and actuators are nodes started elsewhere; on the robot deploy/install.sh
-    starts the bridges. ``actuators`` are 'bridges' to emulated devices, with ports in the folder
-    ``ports``, or 'direct': from the topic to the simulator.
+    starts the bridges. ``actuators`` are 'emulated' devices behind the bridges, with ports in the
+    folder ``ports``, or 'direct': from the topic to the simulator.
 
     Returns:
         Node name -> parameters; omitted standby controller -> reason.
@@ -121,7 +121,8 @@ def plan(controller: str = registry.DEFAULT, *, standby: bool = True, nmpc: str 
         ParameterError: the active controller is unusable, or the clock does not fit the actuators.
 
     """
-    emulated = simulated and actuators == 'bridges'
+    actuators = actuators or ('direct' if clock == 'simulated' else 'emulated')
+    emulated = simulated and actuators == 'emulated'
     if clock == 'simulated' and (emulated or not simulated):
         raise ParameterError("clock 'simulated': serial devices keep real time; expected the "
                              'simulator, with direct actuators')
