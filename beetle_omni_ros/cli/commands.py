@@ -357,7 +357,8 @@ def check(servo_port: Annotated[str | None, Option(metavar='PORT', help=(
 
 
 @app.command()
-def drive(source: Annotated[str, Argument(metavar='keyboard|joystick|terminal', help=(
+def drive(source: Annotated[str, Argument(
+              callback=one_of, metavar='keyboard|joystick|terminal', help=(
               'Input: keys of this terminal, the topic joy, or typed commands.'))] = 'keyboard',
           parameters: Annotated[Path | None, Option('--params', metavar='FILE', help=(
               'Limits, axes, buttons and named poses. Default: the shipped '

@@ -10,7 +10,6 @@ import termios
 import tty
 
 import numpy as np
-from rich.console import Console
 from sensor_msgs.msg import Joy
 
 from beetle_omni_ros import drive
@@ -45,7 +44,7 @@ class Driver(Operator):
 
     """
 
-    def __init__(self, domain: int, parameters: DriveParameters, robot: RobotParameters):
+    def __init__(self, domain: int | None, parameters: DriveParameters, robot: RobotParameters):
         super().__init__(domain)
         self._p, self._checks = parameters, TargetChecks(robot)
         self.odom: Odom | None = None
@@ -137,8 +136,7 @@ class Driver(Operator):
 
 
 def run_drive(source: str, *, parameters: Path | None = None, poses: Path | None = None,
-              robot: Path | None = None, domain_id: int | None = None,
-              console: Console | None = None) -> int:
+              robot: Path | None = None, domain_id: int | None = None) -> int:
     """
     Drive until the user quits; arguments as of `beetle_omni drive`.
 
@@ -149,29 +147,25 @@ def run_drive(source: str, *, parameters: Path | None = None, poses: Path | None
         ParameterError: unusable input.
 
     """
-    if source not in SOURCES:
-        raise ParameterError(f"source '{source}': expected {' or '.join(SOURCES)}")
     p = DriveParameters.load(parameters)
     named = {**p.poses, **(read_named_poses(poses) if poses else {})}
     robot_parameters = RobotParameters.load(robot)
     if source == 'keyboard' and not sys.stdin.isatty():
         raise ParameterError('keyboard: standard input is no terminal; expected one, or the '
                              "source 'terminal', which reads lines")
-    console = console or Console()
-    domain = int(os.environ.get('ROS_DOMAIN_ID') or 0) if domain_id is None else domain_id
     with ExitStack() as stack:
         stack.enter_context(sigterm_as_interrupt())
-        driver = Driver(domain, p, robot_parameters)
+        driver = Driver(domain_id, p, robot_parameters)
         stack.callback(driver.close)
 
         def say(text):
             if text:
-                console.print(text, markup=False, emoji=False, highlight=False)
+                print(text, flush=True)
 
         if not driver.wait(lambda: driver.answers and driver.state and driver.odom is not None,
                            SUPERVISOR_TIMEOUT):
             missing = 'odom' if driver.answers and driver.state else 'supervisor_node'
-            print(f'beetle_omni drive: error: {missing}: not seen in ROS domain {domain}; '
+            print(f'beetle_omni drive: error: {missing}: not seen in ROS domain {driver.domain}; '
                   'expected a running graph (bringup.launch.py, or beetle_omni fly)',
                   file=sys.stderr)
             return FAILED

@@ -1,11 +1,10 @@
 """ROS clients outside the flight: operator, listener of `check`, live graph of `view`."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
 import os
 import time
-from typing import Any
 
 import numpy as np
 from rcl_interfaces.srv import SetParameters
@@ -67,6 +66,7 @@ class Client:
             context.try_shutdown()
             raise ParameterError(f"--namespace '{namespace}': "
                                  f'{str(error).splitlines()[0]}') from None
+        self.domain: int = context.get_domain_id()
         self._executor = EventsExecutor(context=context)
         self._executor.add_node(self._node)
 
@@ -95,14 +95,15 @@ class Operator(Client):
 
     """
 
-    def __init__(self, domain: int, controller: str = registry.DEFAULT):
+    def __init__(self, domain: int | None, controller: str = registry.DEFAULT):
         super().__init__('operator', domain)
         self.controller = controller
         self.state = self.progress = ''
         self.states: list[str] = []
         self.bridges: dict[str, str] = {}
         self.diagnostics: dict[str, Diagnostic] = {}
-        self._simulated: float | None = None
+        self._offset: float | None = None   # s from /clock to time(), which goes on steadily
+        self._clock = 0.0
         node = self._node
         node.create_subscription(Clock, '/clock', self._on_clock, wire.profile(SENSOR))
         wire.subscribe(node, 'supervisor/state', self._on_state)
@@ -116,7 +117,9 @@ class Operator(Client):
                          for name in SERVICES}
 
     def _on_clock(self, message):
-        self._simulated = seconds_of(message.clock)
+        self._clock = seconds_of(message.clock)
+        if self._offset is None:
+            self._offset = time.monotonic() - self._clock
 
     def _on_state(self, text):
         state = text.partition(':')[0]
@@ -124,8 +127,8 @@ class Operator(Client):
         self.states.append(text)
 
     def time(self) -> float:
-        """Return simulated time if it is used, else steady time [s]."""
-        return time.monotonic() if self._simulated is None else self._simulated
+        """Return a time that passes like that of the flight, simulated or steady [s]."""
+        return time.monotonic() if self._offset is None else self._clock + self._offset
 
     @property
     def answers(self) -> bool:
@@ -150,24 +153,18 @@ class Operator(Client):
 
     def countdown(self, seconds: float) -> Iterator[float]:
         """Yield the remaining time [s], steady or simulated, until it is over."""
-        simulated, start = self._simulated is not None, self.time()
-        steady = time.monotonic()
-        while True:
-            if simulated != (self._simulated is not None):      # the clock has just appeared
-                simulated, start, steady = True, self.time(), time.monotonic()
-            left = start + seconds - self.time()
-            if left <= 0 or time.monotonic() - steady > SLOWEST * seconds + 1.0:
-                return
+        start, steady = self.time(), time.monotonic()
+        while (left := start + seconds - self.time()) > 0 \
+                and time.monotonic() - steady < SLOWEST * seconds + 1.0:
             yield left
 
     def wait(self, condition, timeout: float) -> bool:
         """Process messages until ``condition()`` holds; False after ``timeout`` [s]."""
-        left = self.countdown(timeout)
-        while not condition():
-            if next(left, None) is None:
-                return False
+        for _ in self.countdown(timeout):
+            if condition():
+                return True
             self.spin(0.05)
-        return True
+        return bool(condition())
 
     def call(self, name: str, timeout: float = 2.0) -> tuple[bool, str]:
         """Call a service of the supervisor; return (accepted, answer)."""
@@ -199,7 +196,7 @@ def listen(seconds: float, namespace: str = '') -> findings.ObservedGraph:
     client = Client('check', namespace=namespace)
     node = client._node
     try:
-        graph = findings.ObservedGraph(node.context.get_domain_id(), seconds,
+        graph = findings.ObservedGraph(client.domain, seconds,
                                        {topic: findings.Stream() for topic in SENSORS})
         for topic in SENSORS:
             wire.subscribe_raw(node, topic, partial(
@@ -241,17 +238,15 @@ class LiveGraph(Client):
 
     def __init__(self, namespace: str = '', domain: int | None = None):
         super().__init__('view', domain, namespace)
-        self._write: Callable[[str, Any], None] = lambda topic, value: None
+        self._newest = None
         for topic in (*SHOWN, *EVENTS, *TARGETS):
-            wire.subscribe(self._node, topic, partial(self._take, topic),
-                           NEWEST if topic in SHOWN else None)
-
-    def _take(self, topic, value):
-        self._write(topic, value)
+            wire.subscribe(
+                self._node, topic, lambda value, topic=topic: self._newest.write(topic, value),
+                NEWEST if topic in SHOWN else None)
 
     def take(self, newest) -> None:
         """Write the messages since the last call to a view.live.Newest."""
-        self._write = newest.write
+        self._newest = newest
         self.spin_steadily(SPIN)
 
 

@@ -52,7 +52,7 @@ def switches(witness):
 
 
 def loses_one_node_after_another(graph, witness, bag):
-    killed_at = witness.time()
+    killed_at = witness.truth.stamp
     graph.kill('recorder_node')
     assert witness.stays_in_the_air(0.5)
     log = read_bag(bag)
