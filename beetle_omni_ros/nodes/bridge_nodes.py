@@ -47,7 +47,7 @@ class BridgeNode(LifecycleNodeMixin, FlightNode):
                 autostart, choices=tuple(AUTOSTART), read_only=True,
                 doc='transition at the start, repeated until it succeeds'), **kwargs)
         LifecycleNodeMixin.__init__(self)
-        self._states = self.publisher(f"{name.removesuffix('_node')}/state")
+        self._states = wire.Publisher(self, f"{name.removesuffix('_node')}/state")
         self.state = ''         # the published one
         self.latency = Distribution()
         self.report('latency', lambda: self.latency.status(
@@ -148,7 +148,7 @@ class JointBridgeNode(BridgeNode):
         self._travel = RobotParameters.load(self.parameters.robot_file or None).joints
         self._bus = self._loop = None
         self._lost_reason = ''
-        self._joints = self.publisher('joint_states')
+        self._joints = wire.Publisher(self, 'joint_states')
         self.listen('command', self._on_command, max_age=COMMAND_AGE, stale_after=None)
         self.report('bus', self._bus_status)
         for k, name in enumerate(JOINT_NAMES):
@@ -295,8 +295,8 @@ class RotorBridgeNode(BridgeNode):
         self._cycle, self._sent_at = 0, 0.0
         self._unsent = Counter()
         self._saturated, self._saturated_reported = np.zeros((2, 4), dtype=int)
-        self._batteries = self.publisher('battery_state')
-        self._rotors = self.publisher('rotor_states')
+        self._batteries = wire.Publisher(self, 'battery_state')
+        self._rotors = wire.Publisher(self, 'rotor_states')
         self.report('board', self._board_status)
         for k in range(4):
             self.report(f'rotor{k + 1}', partial(self._rotor_status, k))

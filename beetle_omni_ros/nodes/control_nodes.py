@@ -55,7 +55,7 @@ class EkfNode(FlightNode):
         robot = RobotParameters.load(self.parameters.robot_file or None)
         self._ekf = ErrorStateEkf(self.parameters.of_robot(robot), robot.gravity)
         self._status = self._ekf.status
-        self._publisher = self.publisher('odom')
+        self._publisher = wire.Publisher(self, 'odom')
         self.listen('imu/data_raw', self._on_imu, max_age=SENSOR_AGE)
         self.listen('mocap/pose', partial(self.timed, self._ekf.pose), max_age=SENSOR_AGE)
         self.track_compute(1 / self.parameters.imu.rate)
@@ -105,7 +105,7 @@ class ControllerNode(FlightNode):
         self._joints = self._command = None
         self._last_step = 0.0
         self._reported_errors = 0
-        self._publisher = self.publisher(f'{entry.name}/command')
+        self._publisher = wire.Publisher(self, f'{entry.name}/command')
         self.listen('odom', self._on_odom, max_age=ODOM_AGE)
         self.listen('joint_states', self._on_joints, max_age=JOINT_AGE)
         self.listen('command', partial(setattr, self, '_command'), stale_after=None)
@@ -207,13 +207,13 @@ class SupervisorNode(FlightNode):
         self._joints = None
         self._sent = (None, '')     # stamp and source of the last command
         self._state = ''
-        self._publisher = self.publisher('command')
+        self._publisher = wire.Publisher(self, 'command')
         self._identity = f'supervisor_node:{secrets.token_hex(4)}'      # of this run of the node
-        self._identities = self.publisher(IDENTITY)
+        self._identities = wire.Publisher(self, IDENTITY)
         self._identities.publish(self._identity)
-        self._states = self.publisher('supervisor/state')
-        self._targets = self.publisher('supervisor/target')
-        self._actuators = self.publisher('supervisor/actuators')
+        self._states = wire.Publisher(self, 'supervisor/state')
+        self._targets = wire.Publisher(self, 'supervisor/target')
+        self._actuators = wire.Publisher(self, 'supervisor/actuators')
         self._override, self._health = None, ALL_HEALTHY
         supervisor = self._supervisor
         self.listen('odom', self._on_odom)

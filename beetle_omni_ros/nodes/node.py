@@ -116,7 +116,7 @@ class FlightNode(Node):
             on_change, changeable)
         self.inputs: dict[str, Input] = {}
         self._supervisor_identity = ''
-        self._diagnostics = self.publisher('diagnostics')
+        self._diagnostics = wire.Publisher(self, 'diagnostics')
         self._reports = [('inputs', self._input_status)]
         self._compute, self._deadline, self._misses = Distribution(), math.inf, 0
         self._reported_at = self.elapsed()
@@ -141,10 +141,6 @@ class FlightNode(Node):
             logger.warning(text)
         else:
             logger.info(text)
-
-    def publisher(self, topic: str) -> wire.Publisher:
-        """Make the publisher of a topic."""
-        return wire.Publisher(self, topic)
 
     def listen(self, topic: str, handle: Callable, *, qos: Qos | None = None,
                max_age: float | None = None, stale_after: float | None = 0.5) -> None:

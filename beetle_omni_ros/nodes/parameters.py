@@ -7,8 +7,6 @@ of the parameter files refuse both at the start of the node, in one line that na
 
 from collections.abc import Callable
 from dataclasses import make_dataclass, MISSING
-import types
-from typing import get_args, get_origin, Union
 
 import numpy as np
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
@@ -74,8 +72,7 @@ def declare(node: Node, cls: type, file: str | None = None, file_key: str | None
         if isinstance(value, (dict, tuple)) and hint != NAMES:
             continue    # structured values live in files only
         fixed = on_change is None or changeable is not None and name not in changeable
-        node.declare_parameter(name, _plain(value, hint),
-                               _descriptor(entry, hint, fixed),
+        node.declare_parameter(name, _plain(value), _descriptor(entry, hint, fixed),
                                ignore_override=True)
     if on_change:
         _validate_changes(node, cls, instance, on_change)
@@ -90,20 +87,12 @@ def _put(mapping, name, value):
     mapping[leaf] = value
 
 
-def _plain(value, hint):
+def _plain(value):
     if isinstance(value, np.ndarray):
-        return [float(v) for v in value.ravel()]
-    if hint == NAMES:
-        return list(value)
-    if value is None:       # an optional value that is not set
-        return '' if _kind(hint) is str else float('nan')
-    return _kind(hint)(value) if _kind(hint) in (int, float, bool, str) else value
-
-
-def _kind(hint):
-    if get_origin(hint) in (Union, types.UnionType):
-        return next(a for a in get_args(hint) if a is not type(None))
-    return hint
+        return value.ravel().astype(float).tolist()
+    if value is None:       # an optional number that is not set
+        return float('nan')
+    return list(value) if isinstance(value, tuple) else value
 
 
 def _descriptor(entry, hint, fixed) -> ParameterDescriptor:

@@ -52,10 +52,10 @@ class ReferenceNode(FlightNode):
         self._player = self._odom = self._trajectory = None
         self._window_end = 0.0
         self._state = ''
-        self._poses = self.publisher('target_pose')
-        self._trajectories = self.publisher('target_trajectory')
-        self._wrenches = self.publisher('disturbance')
-        self._states = self.publisher('reference/state')
+        self._poses = wire.Publisher(self, 'target_pose')
+        self._trajectories = wire.Publisher(self, 'target_trajectory')
+        self._wrenches = wire.Publisher(self, 'disturbance')
+        self._states = wire.Publisher(self, 'reference/state')
         self._payload = self.create_client(SetParameters, 'sim_node/set_parameters')
         self._set_state('waiting')
         wire.subscribe(self, 'supervisor/state', self._on_supervisor)

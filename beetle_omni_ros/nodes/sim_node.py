@@ -163,8 +163,8 @@ class SimNode(FlightNode):
             self.report('latency', lambda: self._latency.status(
                 'stamp of the answered IMU sample to the arrival of its command'))
         self._changed(given)
-        self._publish_to = {name: self.publisher(topic) for name, topic in topics.items()}
-        self._truth = self.publisher('ground_truth/odom')
+        self._publish_to = {name: wire.Publisher(self, topic) for name, topic in topics.items()}
+        self._truth = wire.Publisher(self, 'ground_truth/odom')
         self.listen('disturbance', lambda wrench: self._simulator.set_wrench(
             wrench.force, wrench.torque), stale_after=None)
         self.track_compute(self._simulator.tick)
