@@ -44,7 +44,7 @@ class BridgeNode(LifecycleNodeMixin, FlightNode):
     def __init__(self, name, *args, autostart, **kwargs):
         FlightNode.__init__(
             self, name, *args, robot_file=parameters.file_parameter(), autostart=parameter(
-                autostart, choices=tuple(AUTOSTART), read_only=True,
+                autostart, choices=tuple(AUTOSTART),
                 doc='transition at the start, repeated until it succeeds'), **kwargs)
         LifecycleNodeMixin.__init__(self)
         self._states = wire.Publisher(self, f"{name.removesuffix('_node')}/state")

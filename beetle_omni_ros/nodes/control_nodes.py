@@ -92,7 +92,7 @@ class ControllerNode(FlightNode):
 
     def __init__(self, entry: ControllerEntry):
         more = {} if f'{entry.name}_node' in NODES else {'controller': parameter(
-            entry.reference, doc='controller that this node runs', read_only=True)}
+            entry.reference, doc='controller that this node runs')}
         super().__init__(f'{entry.name}_node', entry.parameter_class, entry.parameters_file,
                          entry.file_key, robot_file=file_parameter(), **more)
         self._entry = entry
@@ -189,7 +189,7 @@ class SupervisorNode(FlightNode):
 
     def __init__(self):
         controllers = parameter(
-            tuple(registry.standing_by()), read_only=True,
+            tuple(registry.standing_by()),
             doc='controllers that may be active: registered names, or FILE.py:Class')
         super().__init__('supervisor_node', SupervisorParameters, 'params/supervisor.yaml',
                          'supervisor_file', self._changed, changeable=('controller',),

@@ -88,7 +88,7 @@ class FlightNode(Node):
 
     def __init__(self, name: str, base: type | None = None, file: str | None = None,
                  file_key: str | None = None, on_change: Callable | None = None,
-                 changeable: tuple[str, ...] | None = None, **more):
+                 changeable: tuple[str, ...] = (), **more):
         """
         Claim the name, read the parameters, start diagnostics.
 

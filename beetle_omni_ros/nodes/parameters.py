@@ -24,7 +24,7 @@ ROS_OWN_PREFIX = 'qos_overrides.'
 
 def file_parameter(what: str = 'robot file'):
     """Make the parameter of a node that names a file."""
-    return schema.parameter('', doc=f'{what}; empty: the shipped one', read_only=True)
+    return schema.parameter('', doc=f'{what}; empty: the shipped one')
 
 
 def extended(name: str, base: type | None, fields: dict) -> type:
@@ -38,7 +38,7 @@ def extended(name: str, base: type | None, fields: dict) -> type:
 
 
 def declare(node: Node, cls: type, file: str | None = None, file_key: str | None = None,
-            on_change: Callable | None = None, changeable: tuple[str, ...] | None = None):
+            on_change: Callable | None = None, changeable: tuple[str, ...] = ()):
     """
     Declare every leaf of the parameter dataclass ``cls`` on ``node``.
 
@@ -51,8 +51,8 @@ def declare(node: Node, cls: type, file: str | None = None, file_key: str | None
         file: shipped parameter file, such as ``params/ekf.yaml``.
         file_key: parameter that names another file.
         on_change: called with the new instance when parameters are set in flight; may raise
-            ParameterError to refuse. Without it every parameter is read-only.
-        changeable: names that may be set in flight; None: all that are not read-only.
+            ParameterError to refuse.
+        changeable: begins of the names that may be set in flight.
 
     Returns:
         The validated instance of ``cls``.
@@ -71,9 +71,8 @@ def declare(node: Node, cls: type, file: str | None = None, file_key: str | None
     for name, entry, hint, value in schema.flatten(instance):
         if isinstance(value, (dict, tuple)) and hint != NAMES:
             continue    # structured values live in files only
-        fixed = on_change is None or changeable is not None and name not in changeable
-        node.declare_parameter(name, _plain(value), _descriptor(entry, hint, fixed),
-                               ignore_override=True)
+        node.declare_parameter(name, _plain(value), _descriptor(
+            entry, hint, not name.startswith(changeable)), ignore_override=True)
     if on_change:
         _validate_changes(node, cls, instance, on_change)
     return instance
@@ -102,7 +101,7 @@ def _descriptor(entry, hint, fixed) -> ParameterDescriptor:
         description=meta.get('doc', '') + unit,
         # ROS gives an empty list another type, and [2] is a list of integers.
         dynamic_typing=hint is np.ndarray and meta.get('shape') is None or hint == NAMES,
-        read_only=fixed or bool(meta.get('read_only')),
+        read_only=fixed,
         additional_constraints=f"one of {', '.join(meta['choices'])}" if meta.get('choices')
         else ' to '.join(f'{meta[end]:g}' for end in ('low', 'high')
                          if meta.get(end) is not None))

@@ -46,8 +46,8 @@ class ReferenceNode(FlightNode):
     def __init__(self):
         super().__init__(
             'reference_node',
-            task=parameter('hover', doc='name of a task, or a CSV file of poses', read_only=True),
-            seed=parameter(0, doc='seed of random poses', low=0, high=2**31 - 1, read_only=True))
+            task=parameter('hover', doc='name of a task, or a CSV file of poses'),
+            seed=parameter(0, doc='seed of random poses', low=0, high=2**31 - 1))
         self._task = make_task(self.parameters.task, self.parameters.seed)
         self._player = self._odom = self._trajectory = None
         self._window_end = 0.0
@@ -126,8 +126,8 @@ class RecorderNode(FlightNode):
     def __init__(self):
         super().__init__(
             'recorder_node',
-            bag=parameter(doc='folder to create for the bag', read_only=True),
-            controllers=parameter(tuple(registry.standing_by()), read_only=True,
+            bag=parameter(doc='folder to create for the bag'),
+            controllers=parameter(tuple(registry.standing_by()),
                                   doc='registered controllers whose commands are recorded'))
         topics = topics_with(self.parameters.controllers)
         self._bag = None

@@ -111,19 +111,18 @@ class SimNodeParameters:
 
     robot_file: str = file_parameter('robot file of the simulated robot')
     simulator_file: str = file_parameter('simulator file')
-    conditions: str = parameter('nominal', choices=('nominal', 'published'), read_only=True,
+    conditions: str = parameter('nominal', choices=('nominal', 'published'),
                                 doc='randomisation of plant and sensors')
-    seed: int = parameter(0, doc='seed of all random numbers', low=0, high=2**31 - 1,
-                          read_only=True)
-    actuators: str = parameter('direct', choices=('direct', 'emulated'), read_only=True,
+    seed: int = parameter(0, doc='seed of all random numbers', low=0, high=2**31 - 1)
+    actuators: str = parameter('direct', choices=('direct', 'emulated'),
                                doc='how commands reach the plant: from the topic, or through '
                                'emulated devices on serial ports')
     servo_port: str = parameter('', doc="path of the emulated servos' port; empty: a temporary "
-                                'one', read_only=True)
+                                'one')
     board_port: str = parameter('', doc="path of the emulated motor board's port; empty: a "
-                                'temporary one', read_only=True)
+                                'temporary one')
     servo_bus_file: str = file_parameter('ids, signs and zeros of the emulated servos')
-    clock: str = parameter('system', choices=('system', 'simulated'), read_only=True,
+    clock: str = parameter('system', choices=('system', 'simulated'),
                            doc='real time, or simulated time on /clock, which waits for late '
                            'nodes; all other nodes then need use_sim_time')
     payload: float = parameter(0.0, doc='mass attached below the body', unit='kg', low=0, high=2)
@@ -144,7 +143,8 @@ class SimNode(FlightNode):
     def __init__(self):
         self._devices: EmulatedActuators | None = None
         self._clock_publisher = None
-        super().__init__('sim_node', SimNodeParameters, on_change=self._changed)
+        super().__init__('sim_node', SimNodeParameters, on_change=self._changed, changeable=(
+            'payload', 'faults', 'servo_faults.', 'board_faults.'))
         given = self.parameters
         robot = RobotParameters.load(given.robot_file or None)
         self._simulator = Simulator(

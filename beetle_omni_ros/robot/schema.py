@@ -56,7 +56,7 @@ def shortened(text: str, length: int = QUOTED) -> str:
 
 def parameter(default: Any = MISSING, *, doc: str, unit: str = '', low: float | None = None,
               high: float | None = None, shape: tuple[int, ...] | None = None,
-              choices: tuple[str, ...] | None = None, read_only: bool = False):
+              choices: tuple[str, ...] | None = None):
     """
     Declare one dataclass field as a parameter.
 
@@ -68,11 +68,10 @@ def parameter(default: Any = MISSING, *, doc: str, unit: str = '', low: float | 
         high: largest legal value, inclusive.
         shape: shape of an array parameter.
         choices: legal strings.
-        read_only: whether it can change only at start.
 
     """
     metadata = {'doc': doc, 'unit': unit, 'low': low, 'high': high, 'shape': shape,
-                'choices': choices, 'read_only': read_only}
+                'choices': choices}
     if isinstance(default, (list, np.ndarray)):
         default = np.array(default, dtype=float)
     if isinstance(default, (dict, np.ndarray)):
