@@ -140,15 +140,6 @@ def test_a_length_beyond_the_message_is_refused():
     assert not len(rows) and found is None and refused.total() == 1
 
 
-def test_big_endian_messages_are_read_too():
-    from beetle_omni_ros.messages.bag_types import TYPESTORE
-    sent = value('imu/data_raw')
-    data = bytes(TYPESTORE.serialize_cdr(ALL['imu/data_raw'].write(sent),
-                                         ALL['imu/data_raw'].type, little_endian=False))
-    _, back, _ = read_all(ALL['imu/data_raw'], [data, cdr('imu/data_raw', sent)])
-    assert np.array_equal(back.specific_force, [sent.specific_force] * 2)
-
-
 @pytest.mark.parametrize('topic', [name for name in SERIES if name != 'rotor_states'])
 def test_non_finite_values_are_read_but_refused_in_flight(topic):
     entry, sent = ALL[topic], value(topic)
