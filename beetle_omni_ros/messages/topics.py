@@ -176,13 +176,7 @@ def controller_of(name: str) -> str:
 
 
 def topic_of(name: str) -> Topic:
-    """
-    Return the topic of a name without namespace.
-
-    Raises:
-        KeyError: unknown name.
-
-    """
+    """Return the topic of a name without namespace; KeyError for an unknown one."""
     controller = controller_of(name)
     return command_topic(controller) if controller and name not in ALL else ALL[name]
 

@@ -163,7 +163,8 @@ class JointBridgeNode(BridgeNode):
         self._bus.open()
         self._bus.configure()
         self._lost_reason = ''
-        self._loop = ServoLoop(self._bus, self._joints.publish, self._on_written)
+        self._loop = ServoLoop(self._bus, self._joints.publish,
+                               lambda stamp: self.latency.add(self.now() - stamp))
         self._loop.start()
 
     def activate(self):
@@ -220,9 +221,6 @@ class JointBridgeNode(BridgeNode):
         if self._loop is not None:
             left = COMMAND_AGE - max(0.0, self.now() - command.stamp)
             self._loop.offer(command.tilt, command.stamp, time.monotonic() + left)
-
-    def _on_written(self, stamp):
-        self.latency.add(self.now() - stamp)
 
     def _on_timer(self):
         if self._loop is not None:

@@ -90,15 +90,10 @@ class FlightNode(Node):
                  file_key: str | None = None, on_change: Callable | None = None,
                  changeable: tuple[str, ...] = (), **more):
         """
-        Claim the name, read the parameters, start diagnostics.
+        Claim the name (OSError if such a node runs), read the parameters, start diagnostics.
 
         The parameters are those of the class ``base``, ``file_key`` and ``more`` (name -> field).
         The arguments from ``file`` on are those of :func:`parameters.declare`.
-
-        Raises:
-            ParameterError: unusable parameters.
-            OSError: a node of this name runs already.
-
         """
         super().__init__(name)
         domain, name = self.context.get_domain_id(), self.get_fully_qualified_name()
@@ -148,16 +143,10 @@ class FlightNode(Node):
         Subscribe ``topic``; pass valid values to ``handle`` and count refused messages.
 
         Until a supervisor publishes its identity, every message of `command` is accepted. After
-        that, only those whose frame_id is the newest identity are accepted.
-
-        Args:
-            topic: relative name in the table of topics.
-            handle: called with each value, and for targets with the time of publication [s,
-                system time, or nan]; may raise MessageError to refuse it.
-            qos: quality of service; default: the table's.
-            max_age: limit of a stamp's age [s], also refuses future stamps; None: no check.
-            stale_after: silence after a message that is an error [s]; None: never.
-
+        that, only those whose frame_id is the newest identity are accepted. For targets ``handle``
+        also gets the time of publication [s, system time, or nan]; it may raise MessageError.
+        ``max_age`` is the limit of a stamp's age [s], which also refuses future stamps. Silence of
+        ``stale_after`` [s] after a message is an error.
         """
         entry, counts = topic_of(topic), Input(stale_after)
         self.inputs[topic] = counts

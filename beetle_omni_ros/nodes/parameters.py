@@ -40,22 +40,12 @@ def extended(name: str, base: type | None, fields: dict) -> type:
 def declare(node: Node, cls: type, file: str | None = None, file_key: str | None = None,
             on_change: Callable | None = None, changeable: tuple[str, ...] = ()):
     """
-    Declare every leaf of the parameter dataclass ``cls`` on ``node``.
+    Declare every leaf of the parameter dataclass ``cls``; return its validated instance.
 
     Overrides of the command line (``--params-file``, ``-p``) precede the values of the file, and
-    these precede the defaults of the class.
-
-    Args:
-        node: node with automatically_declare_parameters_from_overrides off.
-        cls: dataclass of :func:`schema.parameter` and :func:`schema.group` fields.
-        file: shipped parameter file, such as ``params/ekf.yaml``.
-        file_key: parameter that names another file.
-        on_change: called with the new instance when parameters are set in flight; may raise
-            ParameterError to refuse.
-        changeable: begins of the names that may be set in flight.
-
-    Returns:
-        The validated instance of ``cls``.
+    these precede the defaults of the class. ``file`` is the shipped one, the parameter
+    ``file_key`` names another. Names that begin with one of ``changeable`` may be set in flight;
+    ``on_change`` gets the new instance, and may raise ParameterError to refuse it.
 
     Raises:
         ParameterError: unusable value; names file, key and expectation.

@@ -97,14 +97,9 @@ def subscribe_raw(node: Node, topic: str, callback: Callable, qos: Qos | None = 
     `ros2 topic pub`; a volatile subscription misses messages latched earlier. So targets have
     both. A message that both receive is passed on once, by its time of publication.
 
-    Args:
-        node: node that subscribes.
-        topic: relative name in the table of topics.
-        callback: called with the bytes, and for targets with the time of publication [s, system
-            time, set by the middleware of the publisher; nan if unknown].
-        qos: replaces that of the table.
-        on_lost: gets rclpy's event of lost messages.
-
+    ``callback`` gets the bytes, and for targets the time of publication [s, system time, set by
+    the middleware of the publisher; nan if unknown], ``on_lost`` rclpy's event of lost messages.
+    ``qos`` replaces that of the table.
     """
     qos, seen = qos or topic_of(topic).qos, deque(maxlen=COPIES)
 
