@@ -48,7 +48,6 @@ class BridgeNode(LifecycleNodeMixin, FlightNode):
                 doc='transition at the start, repeated until it succeeds'), **kwargs)
         LifecycleNodeMixin.__init__(self)
         self._states = wire.Publisher(self, f"{name.removesuffix('_node')}/state")
-        self.state = ''         # the published one
         self.latency = Distribution()
         self.report('latency', lambda: self.latency.status(
             'stamp of the answered IMU sample to the last byte of its command'))
@@ -75,11 +74,9 @@ class BridgeNode(LifecycleNodeMixin, FlightNode):
     def changed(self) -> None:
         """Publish and log the state if it changed."""
         text = self.state_text()
-        if text != self.state:
-            self.state = text
+        if self._states.update(text):
             self.log_line('error' if text.startswith('lost') and self.stage == ACTIVE else 'info',
                           text)
-            self._states.publish(text)
 
     def try_to_start(self) -> None:
         """Make the next transitions of the automatic start."""
@@ -244,7 +241,7 @@ class JointBridgeNode(BridgeNode):
             else 'waiting: not configured'
 
     def _bus_status(self):
-        loop, bus, text = self._loop, self._bus, self.state
+        loop, bus, text = self._loop, self._bus, self._states.value
         if loop is None:
             return WARN if self.stage == ACTIVE else OK, text, {'stage': self.stage}
         level = ERROR if text.startswith('lost') else OK if bus.link.is_open else WARN

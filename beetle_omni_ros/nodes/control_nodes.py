@@ -27,7 +27,6 @@ from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.graph import NODES
 from beetle_omni_ros.nodes.node import ERROR, FlightNode, IDENTITY, OK, WARN
 from beetle_omni_ros.nodes.parameters import file_parameter
-from beetle_omni_ros.robot.allocation import ALL_HEALTHY
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import parameter, ParameterError
 from beetle_omni_ros.runs.targets import TargetChecks
@@ -206,7 +205,6 @@ class SupervisorNode(FlightNode):
                                       self._controllers)
         self._joints = None
         self._sent = (None, '')     # stamp and source of the last command
-        self._state = ''
         self._publisher = wire.Publisher(self, 'command')
         self._identity = f'supervisor_node:{secrets.token_hex(4)}'      # of this run of the node
         self._identities = wire.Publisher(self, IDENTITY)
@@ -214,7 +212,6 @@ class SupervisorNode(FlightNode):
         self._states = wire.Publisher(self, 'supervisor/state')
         self._targets = wire.Publisher(self, 'supervisor/target')
         self._actuators = wire.Publisher(self, 'supervisor/actuators')
-        self._override, self._health = None, ALL_HEALTHY
         supervisor = self._supervisor
         self.listen('odom', self._on_odom)
         self.listen('joint_states', self._on_joints, max_age=SENSOR_AGE)
@@ -281,16 +278,9 @@ class SupervisorNode(FlightNode):
 
     def _publish_states(self):
         supervisor = self._supervisor
-        state = supervisor.reported_state
-        if state != self._state:
-            self._state = state
-            self._states.publish(state)
-        if supervisor.target_override is not self._override:
-            self._override = supervisor.target_override
-            self._targets.publish(self._override)
-        if supervisor.health is not self._health:
-            self._health = supervisor.health
-            self._actuators.publish(self._health)
+        self._states.update(supervisor.reported_state)
+        self._targets.update(supervisor.target_override)
+        self._actuators.update(supervisor.health)
         for event in supervisor.events:
             self.log_line(event.severity, event.text)
         supervisor.events.clear()
@@ -303,4 +293,5 @@ class SupervisorNode(FlightNode):
         level = {FALLBACK: WARN, STOPPED: ERROR}.get(
             supervisor.state, WARN if supervisor.faults else OK)
         named = ', '.join(supervisor.faults)
-        return level, f'{self._state}; faults: {named}' if named else self._state, values
+        state = self._states.value
+        return level, f'{state}; faults: {named}' if named else state, values

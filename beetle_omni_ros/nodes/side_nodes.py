@@ -19,7 +19,6 @@ from beetle_omni_ros.messages.values import Wrench
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.node import ERROR, FlightNode, OK, WARN
 from beetle_omni_ros.robot.schema import parameter, ParameterError
-from beetle_omni_ros.runs.bag import BagError
 from beetle_omni_ros.runs.bag_writer import BagWriter, FRAMES, FrameWriter
 from beetle_omni_ros.runs.tasks import make_task, TaskPlayer, WITH_WRENCHES
 
@@ -51,34 +50,28 @@ class ReferenceNode(FlightNode):
         self._task = make_task(self.parameters.task, self.parameters.seed)
         self._player = self._odom = self._trajectory = None
         self._window_end = 0.0
-        self._state = ''
         self._poses = wire.Publisher(self, 'target_pose')
         self._trajectories = wire.Publisher(self, 'target_trajectory')
         self._wrenches = wire.Publisher(self, 'disturbance')
         self._states = wire.Publisher(self, 'reference/state')
         self._payload = self.create_client(SetParameters, 'sim_node/set_parameters')
-        self._set_state('waiting')
+        self._states.update('waiting')
         wire.subscribe(self, 'supervisor/state', self._on_supervisor)
         disturbed = self._task.kind in WITH_WRENCHES
         if disturbed:       # the loss of control ends tasks with rising levels
             self.listen('odom', partial(setattr, self, '_odom'), qos=SENSOR)
-        self.report('task', lambda: (OK, self._state, {'task': self._task.name}))
+        self.report('task', lambda: (OK, self._states.value, {'task': self._task.name}))
         self.create_timer(IMPULSE_PERIOD if disturbed else PERIOD, self._on_timer,
                           clock=self.flight_clock)
 
-    def _set_state(self, state):
-        if state != self._state:
-            self._state = state
-            self._states.publish(state)
-
     def _on_supervisor(self, state):
-        if self._state == 'waiting' and state.startswith('flying'):
+        if self._states.value == 'waiting' and state.startswith('flying'):
             self._player = TaskPlayer(self._task, self.now())
             self.get_logger().info(f"task '{self._task.name}', {self._task.ends[-1]:g} s")
         elif self._player and state.partition(':')[0] in (
                 'landing', 'disarmed', 'emergency_stop'):
             self._player = None
-            self._set_state('aborted')
+            self._states.update('aborted')
 
     def _on_timer(self):
         if self._player is None:
@@ -100,10 +93,11 @@ class ReferenceNode(FlightNode):
         if moment.finished:
             lost = f': control lost at level {self._player.lost_level:g}' if moment.lost else ''
             self._player = self._trajectory = None
-            self._set_state(f'done{lost}')
+            self._states.update(f'done{lost}')
         else:
-            current = 1 + int(np.searchsorted(self._task.ends, now - self._player.start, 'right'))
-            self._set_state(f'flying {min(current, len(self._task.ends))}/{len(self._task.ends)}')
+            ends = self._task.ends
+            current = 1 + int(np.searchsorted(ends, now - self._player.start, 'right'))
+            self._states.update(f'flying {min(current, len(ends))}/{len(ends)}')
 
     def _publish_window(self, now):
         path = self._trajectory
@@ -130,12 +124,8 @@ class RecorderNode(FlightNode):
             controllers=parameter(tuple(registry.standing_by()),
                                   doc='registered controllers whose commands are recorded'))
         topics = topics_with(self.parameters.controllers)
-        self._bag = None
-        try:
-            self._bag = BagWriter(self.parameters.bag, namespace=self.get_namespace(),
-                                  topics=tuple(topics), frames=True)
-        except BagError as error:
-            raise ParameterError(f"key 'bag': {error}") from None
+        self._bag = BagWriter(self.parameters.bag, namespace=self.get_namespace(),
+                              topics=tuple(topics), frames=True)
         self._written = self._lost = self._writes = 0
         self._failure = None
         self._received = []     # (topic, type, CDR, time of receipt [s]) not yet written
@@ -161,7 +151,7 @@ class RecorderNode(FlightNode):
             self._writes += 1
             if self._writes % FLUSH_WRITES == 0:
                 self._bag.flush()
-        except BagError as error:
+        except ParameterError as error:
             # A full disk ends the recording but not the process, which is shared with other nodes.
             self._failure = str(error)
             self.get_logger().error(f'recording ended: {error}')
@@ -182,7 +172,7 @@ class RecorderNode(FlightNode):
             if self._bag:
                 self._write()
                 self._bag.close()
-        except BagError as error:
+        except ParameterError as error:
             print(f'recorder_node: error: {error}', file=sys.stderr)
         self._bag = None
 

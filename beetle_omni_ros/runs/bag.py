@@ -25,7 +25,7 @@ from beetle_omni_ros.messages.topics import (
 from beetle_omni_ros.robot.schema import ParameterError, quoted, read_yaml
 from beetle_omni_ros.runs.log import FlightLog, LogRecorder, motion, SERIES_OF
 
-BagError = ParameterError   # its name in identify and nodes
+BagError = ParameterError   # its name in identify
 AT_ONCE = 4096      # messages that are read together
 META_KEY = 'beetle_omni'  # under custom_data of metadata.yaml
 # Entries of the metadata that readers of a log rely on; a task may be the name of a file.

@@ -27,10 +27,13 @@ class Sent(list):
 
     def __init__(self, topic):
         super().__init__()
-        self._topic = topic
+        self._topic, self.value = topic, None
 
     def publish(self, value):
+        self.value = value
         self.append(topic_of(self._topic).write(value))
+
+    update = wire.Publisher.update
 
     def stamps(self):
         return np.array([conversions.seconds(message.header.stamp) for message in self])
