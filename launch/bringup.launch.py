@@ -46,17 +46,6 @@ ARGUMENTS = {
 }
 
 
-def options(given, folder):
-    """Put the arguments into the terms of the graph's plan."""
-    return dict(
-        simulated=given['backend'] == 'sim', ports=folder, bag=given['record'],
-        seed=int(given['seed']),
-        **{key: given[key] == 'true' for key in ('standby', 'allow_other_robot', 'viewer')},
-        **{key: given[key] for key in (
-            'actuators', 'clock', 'conditions', 'controller', 'plant_file', 'policy',
-            'robot_file', 'task')})
-
-
 def actions(context):
     """Turn the arguments into processes."""
     from beetle_omni_ros.nodes import graph
@@ -65,7 +54,12 @@ def actions(context):
     folder = tempfile.mkdtemp(prefix='beetle_omni_')
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     graph.confine()
-    nodes, left_out = graph.plan(**options(given, folder))
+    nodes, left_out = graph.plan(
+        simulated=given['backend'] == 'sim', ports=folder, bag=given['record'],
+        seed=int(given['seed']),
+        **{key: given[key] == 'true' for key in ('standby', 'allow_other_robot', 'viewer')},
+        **{key: given[key] for key in ('actuators', 'clock', 'conditions', 'controller',
+                                       'plant_file', 'policy', 'robot_file', 'task')})
     for name, reason in left_out.items():
         print(f'{name} does not stand by: {reason}', file=sys.stderr)
     namespace = given['namespace'].strip('/')

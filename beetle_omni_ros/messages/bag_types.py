@@ -2,11 +2,8 @@
 Messages of nodes and bags: classes, CDR, vectorised reading, by rosbags' type store for Jazzy.
 
 It decodes an odometry five times faster than rclpy, which makes each nested message twice.
-
-Messages with equal texts and array lengths have the same layout. :func:`read_all` finds the layout
-from one of them field by field; each number is then a column of the bytes of all. The result has
-the attributes of a message, so that ``read_*`` of :mod:`~beetle_omni_ros.messages.conversions`
-reads it.
+:func:`read_all` reads each number of all messages with equal texts and array lengths as one column
+of their bytes.
 """
 
 from __future__ import annotations

@@ -1,10 +1,8 @@
 """
 Conversion between messages and values, by attribute access only.
 
-``read_*`` converts a message of :mod:`~.bag_types`, also one of ``read_all``, whose numbers are
-arrays over N messages, so vectors have the shape (N, 3). ``take_*`` converts one message for use
-in flight, where :class:`~.topics.Topic` does not. Both raise MessageError. ``write_*`` makes a
-message.
+``read_*`` also converts messages of ``read_all``, whose numbers are arrays over N messages, so
+vectors have the shape (N, 3). ``take_joints`` converts one message for use in flight.
 """
 
 from collections.abc import Callable, Sequence
@@ -361,8 +359,7 @@ def write_health(health: ActuatorHealth) -> Any:
 def read_diagnostics(message: Any) -> list[Diagnostic]:
     """Read all statuses; each gets the message's stamp."""
     t = seconds(message.header.stamp)
-    return [Diagnostic(t, status.name, ord(status.level) if isinstance(status.level, bytes)
-                       else int(status.level), status.message,
+    return [Diagnostic(t, status.name, status.level, status.message,
                        {pair.key: pair.value for pair in status.values})
             for status in message.status]
 

@@ -14,24 +14,22 @@ from sensor_msgs.msg import Joy
 
 from beetle_omni_ros import drive
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.control.base import PoseTarget
+from beetle_omni_ros.control.base import MOTORS_OFF, PoseTarget
 from beetle_omni_ros.drive import Action, DriveParameters, read_named_poses, Steering
 from beetle_omni_ros.messages.topics import SENSOR
 from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.operator import Operator
-from beetle_omni_ros.nodes.runner import sigterm_as_interrupt
+from beetle_omni_ros.nodes.runner import FAILED, OK, sigterm_as_interrupt
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.targets import TargetChecks
 
-OK, FAILED = 0, 1
 PERIOD = 0.05           # s between two targets
 SUPERVISOR_TIMEOUT = 10.0   # s until the supervisor and the estimate must have appeared
 SETTLE_TIME = 0.5       # s that `wait` takes at least, so that the motion has begun
 NEAR, ALIGNED = 0.1, np.radians(10)     # [m], [rad] within which the robot is at its target
-RESTING = ('disarmed', 'emergency_stop')
 
 
 class Driver(Operator):
@@ -68,7 +66,7 @@ class Driver(Operator):
     def at_goal(self) -> bool:
         """Whether the robot is at its goal; if no controller flies, whether it is at rest."""
         if not self.flies:
-            return self.state in RESTING
+            return self.state in MOTORS_OFF
         steering = self.steering
         return steering is not None and steering.arrived and self.odom is not None and bool(
             np.linalg.norm(self.odom.position - steering.position) < NEAR) and \

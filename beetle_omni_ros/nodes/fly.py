@@ -11,6 +11,7 @@ from rich.console import Console
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.control import registry
+from beetle_omni_ros.control.base import MOTORS_OFF
 from beetle_omni_ros.nodes import runner
 from beetle_omni_ros.nodes.graph import (
     BRIDGES,
@@ -40,7 +41,6 @@ TAKEOFF_ATTEMPTS = 3
 SETTLE_TIME = 1.0       # s before arming, in which start-up work ends
 LANDING_TIMEOUT = 30.0  # s
 SPARE_TIME = 10.0       # s beyond the task's duration before a flight counts as stuck
-ON_GROUND = ('disarmed', 'emergency_stop')
 
 # s lost by the simulator above which a failure is attributed to the slow computer: the actuators
 # stop after so long without a command.
@@ -240,7 +240,7 @@ class Flight(Operator):
         def is_done():
             self._show(f'{name}: {self.progress}, {self.time() - start:.0f} of '
                        f'{self._task.duration:.0f} s ({self.state})')
-            if self.state in ON_GROUND:
+            if self.state in MOTORS_OFF:
                 raise RunError(f"the flight ended early, supervisor in '{self.state}'")
             return self.progress.startswith('done')
 
@@ -250,14 +250,14 @@ class Flight(Operator):
     def land(self) -> None:
         """Land if the robot flies, and wait for the motors to stop."""
         self._lands = True
-        if self.state in ('', *ON_GROUND):
+        if self.state in ('', *MOTORS_OFF):
             return
         self._show('landing')
         accepted, answer = self.call('land')
         if not accepted:
             _complain(f'no landing: {answer}')
         else:
-            self.wait(lambda: self.state in ON_GROUND, LANDING_TIMEOUT)
+            self.wait(lambda: self.state in MOTORS_OFF, LANDING_TIMEOUT)
             self.spin(1.1)      # the last diagnostics
 
     def _await(self, text, condition, timeout, why=lambda: ''):

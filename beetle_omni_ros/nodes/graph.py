@@ -1,9 +1,8 @@
 """
 Nodes of a ROS graph as data, and their processes on this computer; imports no ROS.
 
-:func:`plan` lists the nodes of `beetle_omni fly` and of the launch file, :class:`Graph` runs them,
-:func:`confine` limits their discovery, by default to this computer: a second robot or simulation
-in the same network would publish on the same topics.
+Discovery is limited to this computer by default: a second robot or simulation in the same network
+would publish on the same topics.
 """
 
 from collections.abc import MutableMapping

@@ -1,9 +1,4 @@
-"""
-Runs nodes in one process: start, spin, stop; errors are one line and an exit status.
-
-``python -m beetle_omni_ros.start composed NODE...`` runs several nodes. NODE is an executable, a
-registered controller name, or the reference of a controller's class.
-"""
+"""Runs nodes in one process: start, spin, stop; errors are one line and an exit status."""
 
 from collections.abc import Callable
 from contextlib import contextmanager

@@ -7,7 +7,7 @@ import numpy as np
 from rcl_interfaces.srv import SetParameters
 
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
+from beetle_omni_ros.control.base import MOTORS_OFF, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.messages.topics import (
     ALL,
     LATCHED_LOG,
@@ -68,8 +68,7 @@ class ReferenceNode(FlightNode):
         if self._states.value == 'waiting' and state.startswith('flying'):
             self._player = TaskPlayer(self._task, self.now())
             self.get_logger().info(f"task '{self._task.name}', {self._task.ends[-1]:g} s")
-        elif self._player and state.partition(':')[0] in (
-                'landing', 'disarmed', 'emergency_stop'):
+        elif self._player and state.partition(':')[0] in ('landing', *MOTORS_OFF):
             self._player = None
             self._states.update('aborted')
 
