@@ -374,7 +374,7 @@ def drive(source: Annotated[str, Argument(
     """
     given = dict(locals())
     from beetle_omni_ros.nodes.driver import run_drive
-    return run_drive(**given)
+    run_drive(**given)
 
 
 @app.command()

@@ -36,8 +36,6 @@ from beetle_omni_ros.safety.supervisor import DISARMED, FALLBACK, FLYING, STOPPE
 SENSOR_AGE = 0.2        # s, an older sample is of a stuck driver or another clock
 ODOM_AGE = 0.05         # s, no command answers an older estimate
 JOINT_AGE = 0.1         # s
-# s between a target's stamp and simulated time above which the stamp is of another clock
-OTHER_CLOCK = 3600.0
 STEP_TOLERANCE = 0.0025     # s, half of the smallest interval between estimates
 REPEAT = 1.0            # s between two log lines about a controller
 WATCH_PERIOD = 0.01     # s between checks for silent inputs
@@ -122,12 +120,8 @@ class ControllerNode(FlightNode):
 
     def _check_target(self, target, published):
         # The age counts at publication: a latched target stays valid for a node that starts
-        # later. Publication times are system time. In simulated time, only a stamp that is very
-        # far off is refused, once the clock is known.
-        then = None if math.isnan(published) else published
-        if self.simulated:
-            now = self.now()
-            then = now if now and abs(now - target.stamp) > OTHER_CLOCK else None
+        # later. Publication times are system time, so simulated stamps have no age.
+        then = None if self.simulated or math.isnan(published) else published
         reason = self._checks.why_not(target, then) or (
             self._host.too_far(target, self.now()) if self._host.active else '')
         if reason:

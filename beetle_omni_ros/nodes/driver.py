@@ -20,10 +20,10 @@ from beetle_omni_ros.messages.topics import SENSOR
 from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.operator import Operator
-from beetle_omni_ros.nodes.runner import FAILED, OK, sigterm_as_interrupt
+from beetle_omni_ros.nodes.runner import sigterm_as_interrupt
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.schema import ParameterError, RunError
 from beetle_omni_ros.runs.targets import TargetChecks
 
 PERIOD = 0.05           # s between two targets
@@ -134,15 +134,13 @@ class Driver(Operator):
 
 
 def run_drive(source: str, *, parameters: Path | None = None, poses: Path | None = None,
-              robot: Path | None = None, domain_id: int | None = None) -> int:
+              robot: Path | None = None, domain_id: int | None = None) -> None:
     """
     Drive until the user quits; arguments as of `beetle_omni drive`.
 
-    Returns:
-        Exit status: 0 ended by the user, 1 no supervisor or estimate found.
-
     Raises:
         ParameterError: unusable input.
+        RunError: no supervisor or estimate found.
 
     """
     p = DriveParameters.load(parameters)
@@ -163,10 +161,8 @@ def run_drive(source: str, *, parameters: Path | None = None, poses: Path | None
         if not driver.wait(lambda: driver.answers and driver.state and driver.odom is not None,
                            SUPERVISOR_TIMEOUT):
             missing = 'odom' if driver.answers and driver.state else 'supervisor_node'
-            print(f'beetle_omni drive: error: {missing}: not seen in ROS domain {driver.domain}; '
-                  'expected a running graph (bringup.launch.py, or beetle_omni fly)',
-                  file=sys.stderr)
-            return FAILED
+            raise RunError(f'{missing}: not seen in ROS domain {driver.domain}; expected a '
+                           'running graph (bringup.launch.py, or beetle_omni fly)')
         say(driver.where())
         before = driver.time()
         try:
@@ -179,7 +175,6 @@ def run_drive(source: str, *, parameters: Path | None = None, poses: Path | None
                 driver.spin(PERIOD)
         finally:    # also at Ctrl-C
             say('left; the robot holds its last target')
-    return OK
 
 
 # Each source is a generator of the actions since its last step; it ends when the user leaves.

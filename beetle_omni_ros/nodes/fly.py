@@ -32,7 +32,6 @@ from beetle_omni_ros.runs.metrics import failed, metrics
 from beetle_omni_ros.runs.tasks import make_task, Task
 from beetle_omni_ros.sim import fault_lists as listed
 
-INTERRUPTED = 130
 READY_TIMEOUT = 300.0   # s; the first start compiles the controller
 BRIDGES_TIMEOUT = 20.0  # s; the simulator makes their devices at its start
 ARM_TIMEOUT = 10.0      # s
@@ -62,58 +61,55 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
     Arguments are the options of `beetle_omni fly`; without ``bag`` the bag is deleted.
 
     Returns:
-        Exit status: 0 flown to the end, 1 not, 2 unusable input, 130 interrupted.
+        Exit status: 0 flown to the end, 1 not.
+
+    Raises:
+        ParameterError: unusable input.
 
     """
     console = console or table.Terminal()
-    try:
-        with ExitStack() as stack:
-            stack.enter_context(runner.sigterm_as_interrupt())
-            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix='beetle_omni_')))
-            bag = Path(bag).absolute() if bag else folder / 'bag'
-            check_new(bag)
-            flown_task = make_task(task, seed, registry.find(controller).reach(
-                RobotParameters.load(robot)))
-            RobotParameters.load(plant or robot)
-            injected = listed.load_faults(faults) if faults else []
-            nodes, left_out = plan(
-                controller, nmpc=_absolute(nmpc), policy=str(policy or ''),
-                standby=standby, allow_other_robot=allow_other_robot,
-                robot_file=_absolute(robot and find_robot(robot)),
-                plant_file=_absolute(plant and find_robot(plant)),
-                conditions=conditions, seed=int(seed),
-                task=_absolute(task) if Path(task).is_file() else str(task), bag=str(bag),
-                ports=str(folder), clock=clock, actuators=_checked(injected, actuators))
-            for name, reason in left_out.items():
-                _print(console, f'{name} does not stand by: {reason}')
-            controller = registry.find(controller).name
-            number = stack.enter_context(reserved_domain()) if domain_id is None else domain_id
-            if view:
-                stack.enter_context(viewer_process(number, console))
-            meta = {'task': task, 'conditions': conditions, 'seed': seed,
-                    'robot': str(robot) if robot else 'params/robot.yaml',
-                    'plant': str(plant) if plant else None, 'version': __version__,
-                    'controller': controller, 'clock': clock,
-                    'actuators': nodes['sim_node'].get('actuators', 'direct')}
-            if injected:
-                meta['faults'] = [str(fault) for fault in injected]
-            graph = Graph(nodes, folder, number)
-            try:
-                status = _fly(graph, controller, flown_task, console,
-                              '; '.join(map(str, injected)))
-            except KeyboardInterrupt:
-                if (bag / 'metadata.yaml').exists():
-                    add_meta(bag, {**meta, 'interrupted': True})
-                raise
-            if not bag.exists():
-                return status or runner.FAILED
-            return max(status, _report(bag, controller, flown_task, meta, json_path, console))
-    except (ParameterError, OSError) as error:
-        _complain(error)
-        return runner.UNUSABLE
-    except KeyboardInterrupt:
-        print('beetle_omni fly: interrupted; everything is stopped', file=sys.stderr)
-        return INTERRUPTED
+    with ExitStack() as stack:
+        stack.enter_context(runner.sigterm_as_interrupt())
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix='beetle_omni_')))
+        bag = Path(bag).absolute() if bag else folder / 'bag'
+        check_new(bag)
+        flown_task = make_task(task, seed, registry.find(controller).reach(
+            RobotParameters.load(robot)))
+        RobotParameters.load(plant or robot)
+        injected = listed.load_faults(faults) if faults else []
+        nodes, left_out = plan(
+            controller, nmpc=_absolute(nmpc), policy=str(policy or ''),
+            standby=standby, allow_other_robot=allow_other_robot,
+            robot_file=_absolute(robot and find_robot(robot)),
+            plant_file=_absolute(plant and find_robot(plant)),
+            conditions=conditions, seed=int(seed),
+            task=_absolute(task) if Path(task).is_file() else str(task), bag=str(bag),
+            ports=str(folder), clock=clock, actuators=_checked(injected, actuators))
+        for name, reason in left_out.items():
+            _print(console, f'{name} does not stand by: {reason}')
+        controller = registry.find(controller).name
+        number = stack.enter_context(reserved_domain()) if domain_id is None else domain_id
+        if view:
+            stack.enter_context(viewer_process(number, console))
+        meta = {'task': task, 'conditions': conditions, 'seed': seed,
+                'robot': str(robot) if robot else 'params/robot.yaml',
+                'plant': str(plant) if plant else None, 'version': __version__,
+                'controller': controller, 'clock': clock,
+                'actuators': nodes['sim_node'].get('actuators', 'direct')}
+        if injected:
+            meta['faults'] = [str(fault) for fault in injected]
+        graph = Graph(nodes, folder, number)
+        try:
+            status = _fly(graph, controller, flown_task, console,
+                          '; '.join(map(str, injected)))
+        except KeyboardInterrupt:
+            _complain('interrupted; everything is stopped')
+            if (bag / 'metadata.yaml').exists():
+                add_meta(bag, {**meta, 'interrupted': True})
+            raise
+        if not bag.exists():
+            return status or runner.FAILED
+        return max(status, _report(bag, controller, flown_task, meta, json_path, console))
 
 
 def _checked(faults, actuators):

@@ -23,7 +23,7 @@ import beetle_omni_ros
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.schema import ParameterError, RunError
 
 BRIDGES = ('joint_bridge_node', 'rotor_bridge_node')
 READY = 'ready'         # begin of a bridge's state
@@ -74,7 +74,7 @@ def claim(name: str) -> socket.socket | None:
 
 @contextmanager
 def reserved_domain():
-    """Yield the number of a free ROS domain, reserved while the context lasts; else OSError."""
+    """Yield the number of a free ROS domain, reserved while the context lasts; else RunError."""
     # Each call begins at another number: participants that are shutting down may still send
     # discovery data to new ones in the same domain.
     first = next(_starts) % len(DOMAINS)
@@ -85,7 +85,7 @@ def reserved_domain():
                 if _ports_are_free(number):
                     yield number
                     return
-    raise OSError('no free ROS domain between 1 and 101')
+    raise RunError('no free ROS domain between 1 and 101')
 
 
 def _ports_are_free(domain):

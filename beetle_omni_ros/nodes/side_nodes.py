@@ -29,7 +29,6 @@ IMPULSE_PERIOD = 0.005  # s, the same for tasks with impulses of 50 ms
 WINDOW, WINDOW_PERIOD, WINDOW_SAMPLE = 3.0, 1.5, 0.05   # s
 WRITE_PERIOD = 0.02     # s between writes of the received messages, so that no callback waits
 FLUSH_WRITES = 20       # writes between flushes; a crash loses only messages after the last one
-HELD = 1000             # messages at most that wait for the first simulated time
 
 
 # --- targets ------------------------------------------------------------------------------------
@@ -140,7 +139,7 @@ class RecorderNode(FlightNode):
 
     def _write(self):
         # Before the first /clock the time is 0: a bag that begins in 1970 cannot be viewed.
-        if self._failure or not self._bag or not self.now() and len(self._received) < HELD:
+        if self._failure or not self._bag or not self.now():
             return
         received, self._received = self._received, []
         try:

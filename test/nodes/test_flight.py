@@ -120,7 +120,7 @@ def test_sigterm_ends_a_flight_cleanly_and_the_bag_is_complete(tmp_path):
             process.send_signal(signal.SIGTERM)
             time.sleep(0.1)
         _, error = process.communicate(timeout=60)
-    assert error.strip() == 'beetle_omni fly: interrupted; everything is stopped'
+    assert error.startswith('beetle_omni fly: error: interrupted; everything is stopped\n')
     assert process.returncode == 130
     log = read_bag(bag)
     assert not log.warnings and 'flying:nmpc' in log.states and log.meta['interrupted']

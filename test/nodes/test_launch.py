@@ -1,4 +1,4 @@
-"""Processes of the launch file by its arguments; launch itself is replaced."""
+"""Processes of the launch file by its arguments, with launch replaced; their discovery."""
 
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
@@ -84,3 +84,18 @@ def test_simulator_and_bridges_meet_at_the_same_ports_in_a_private_folder(bringu
     assert 'actuators' not in direct['sim_node']
     assert [direct[name]['robot_file'] for name in ('sim_node', 'ekf_node')] == [
         'b.yaml', 'a.yaml']
+
+
+@pytest.mark.parametrize('given, holds', [
+    ({}, 'LOCALHOST'), ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}, 'SUBNET'),
+    ({'ROS_STATIC_PEERS': '192.168.1.2'}, None), ({'ROS_LOCALHOST_ONLY': '0'}, None)])
+def test_the_users_setting_has_precedence(given, holds):
+    graph.confine(given)
+    assert given.get('ROS_AUTOMATIC_DISCOVERY_RANGE') == holds
+
+
+def test_two_reserved_domains_differ(monkeypatch):
+    with graph.reserved_domain() as first:
+        monkeypatch.setattr(graph, '_starts', iter([graph.DOMAINS.index(first)]))
+        with graph.reserved_domain() as second:
+            assert second != first
