@@ -21,7 +21,7 @@ from beetle_omni_ros.nodes.graph import (
     reserved_domain,
 )
 from beetle_omni_ros.nodes.node import ERROR
-from beetle_omni_ros.nodes.operator import Operator
+from beetle_omni_ros.nodes.operator import Operator, TAKEOFF_TIMEOUT
 from beetle_omni_ros.robot.parameters import find_robot, RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError, RunError
 from beetle_omni_ros.runs import table
@@ -34,10 +34,6 @@ from beetle_omni_ros.sim import fault_lists as listed
 
 READY_TIMEOUT = 300.0   # s; the first start compiles the controller
 BRIDGES_TIMEOUT = 20.0  # s; the simulator makes their devices at its start
-ARM_TIMEOUT = 10.0      # s
-TAKEOFF_TIMEOUT = 30.0  # s
-TAKEOFF_ATTEMPTS = 3
-SETTLE_TIME = 1.0       # s before arming, in which start-up work ends
 LANDING_TIMEOUT = 30.0  # s
 SPARE_TIME = 10.0       # s beyond the task's duration before a flight counts as stuck
 
@@ -181,8 +177,8 @@ class Flight(Operator):
 
     def __init__(self, graph: Graph, controller: str, task: Task, show: Callable[[str], None]):
         super().__init__(graph.domain, controller)
-        self._graph, self._task, self._show, self._lands = graph, task, show, False
-        self._bridges = [node for node in graph.nodes if node in BRIDGES]
+        self._graph, self._task, self.show, self._lands = graph, task, show, False
+        self.required = [node for node in graph.nodes if node in BRIDGES]
 
     def fly(self, faults: str) -> None:
         """
@@ -192,13 +188,13 @@ class Flight(Operator):
             RunError: a failure; the text states whether the computer was too slow.
 
         """
-        self._await('starting (the first time compiles the controller)',
+        self.expect('starting (the first time compiles the controller)',
                     lambda: self.ready and self.progress, READY_TIMEOUT)
-        self._await('actuators and simulator', lambda: not self.waits_for(self._bridges)
+        self.expect('actuators and simulator', lambda: not self.waits_for(self.required)
                     and PACING in self.diagnostics, BRIDGES_TIMEOUT)
         lost = self._lost_time()
         try:
-            self._take_off()
+            self.take_off()
             self._fly_task(faults)
         except RunError as error:
             if (late := self._lost_time() - lost) < SLOW_TIME:
@@ -210,37 +206,22 @@ class Flight(Operator):
         """Return the time that the simulator skipped because it was late [s]."""
         return float(self.values(PACING).get('lost_s', 0.0))
 
-    def _take_off(self):
-        """Arm and take off; repeat if the supervisor disarms on the ground."""
-        answers = []
-        for _ in range(TAKEOFF_ATTEMPTS):
-            self.spin(SETTLE_TIME)
-            self._await('arming', lambda: answers.append(self.call('arm')) or answers[-1][0],
-                        ARM_TIMEOUT, lambda: f'; supervisor_node: {answers[-1][1]}')
-            self.states.clear()
-            # The state may name a fault: disarmed:joint1_astray.
-            self._await('taking off', lambda: self.state.startswith('flying') or any(
-                state.startswith('disarmed') for state in self.states), TAKEOFF_TIMEOUT)
-            if self.state.startswith('flying'):
-                return
-        raise RunError(f'no take-off in {TAKEOFF_ATTEMPTS} attempts; see the warnings below')
-
     def _fly_task(self, faults):
         name, start = self._task.name, self.time()
         if faults:      # as the task begins, so that their times count from there
-            self._await(name, lambda: self.progress.startswith('flying'), TAKEOFF_TIMEOUT)
+            self.expect(name, lambda: self.progress.startswith('flying'), TAKEOFF_TIMEOUT)
             accepted, answer = self.set('sim_node', 'faults', faults)
             if not accepted:
                 raise RunError(f'sim_node refuses the faults: {answer}')
 
         def is_done():
-            self._show(f'{name}: {self.progress}, {self.time() - start:.0f} of '
+            self.show(f'{name}: {self.progress}, {self.time() - start:.0f} of '
                        f'{self._task.duration:.0f} s ({self.state})')
             if self.state in MOTORS_OFF:
                 raise RunError(f"the flight ended early, supervisor in '{self.state}'")
             return self.progress.startswith('done')
 
-        self._await(name, is_done, self._task.duration + SPARE_TIME,
+        self.expect(name, is_done, self._task.duration + SPARE_TIME,
                     lambda: f"; the task does not continue at '{self.progress}'")
 
     def land(self) -> None:
@@ -248,20 +229,13 @@ class Flight(Operator):
         self._lands = True
         if self.state in ('', *MOTORS_OFF):
             return
-        self._show('landing')
+        self.show('landing')
         accepted, answer = self.call('land')
         if not accepted:
             _complain(f'no landing: {answer}')
         else:
             self.wait(lambda: self.state in MOTORS_OFF, LANDING_TIMEOUT)
             self.spin(1.1)      # the last diagnostics
-
-    def _await(self, text, condition, timeout, why=lambda: ''):
-        self._show(text)
-        if not self.wait(condition, timeout):
-            waits = self.waits_for(self._bridges)
-            raise RunError(f'{text}: nothing after {timeout:g} s, supervisor in '
-                           f"'{self.state}'{why()}" + (waits and f'; {waits}'))
 
     def spin(self, seconds: float) -> None:
         """Process messages; before landing, an ended process and a failing controller raise."""

@@ -1,6 +1,6 @@
 """ROS clients outside the flight: operator, listener of `check`, live graph of `view`."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
 import os
@@ -28,11 +28,15 @@ from beetle_omni_ros.messages.topics import (
 from beetle_omni_ros.messages.values import Diagnostic, MessageError
 from beetle_omni_ros.nodes import runner, wire
 from beetle_omni_ros.nodes.graph import BRIDGES, confine, READY
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.schema import ParameterError, RunError
 
 # Simulated time may be slow, or stop if the simulator dies: waiting ends after this much steady
 # time for each second of the timeout.
 SLOWEST = 20.0
+ARM_TIMEOUT = 10.0      # s
+TAKEOFF_TIMEOUT = 30.0  # s
+TAKEOFF_ATTEMPTS = 3
+SETTLE_TIME = 1.0       # s before arming, in which start-up work ends
 SERVICES = ('arm', 'disarm', 'land', 'emergency_stop')
 SUPERVISOR = 'supervisor_node'
 # Topic -> attribute of its values that changes with every sample of a working sensor.
@@ -92,8 +96,13 @@ class Operator(Client):
         bridges: bridge node -> its newest state.
         controller: name of the watched controller.
         diagnostics: status name -> newest :class:`Diagnostic`.
+        required: bridges whose states belong to the text of an error.
+        show: called with what the operator waits for.
 
     """
+
+    required: Sequence[str] = ()
+    show: Callable[[str], None] = staticmethod(lambda text: None)
 
     def __init__(self, domain: int | None, controller: str = registry.DEFAULT):
         super().__init__('operator', domain)
@@ -165,6 +174,29 @@ class Operator(Client):
                 return True
             self.spin(0.05)
         return bool(condition())
+
+    def expect(self, text: str, condition, timeout: float, why=lambda: '') -> None:
+        """Wait as :meth:`wait`; a timeout raises RunError with ``text`` and ``why()``."""
+        self.show(text)
+        if not self.wait(condition, timeout):
+            waits = self.waits_for(self.required)
+            raise RunError(f'{text}: nothing after {timeout:g} s, supervisor in '
+                           f"'{self.state}'{why()}" + (waits and f'; {waits}'))
+
+    def take_off(self) -> None:
+        """Arm and take off, or raise RunError; repeat if the supervisor disarms on the ground."""
+        answers = []
+        for _ in range(TAKEOFF_ATTEMPTS):
+            self.spin(SETTLE_TIME)
+            self.expect('arming', lambda: answers.append(self.call('arm')) or answers[-1][0],
+                        ARM_TIMEOUT, lambda: f'; supervisor_node: {answers[-1][1]}')
+            self.states.clear()
+            # The state may name a fault: disarmed:joint1_astray.
+            self.expect('taking off', lambda: self.state.startswith('flying') or any(
+                state.startswith('disarmed') for state in self.states), TAKEOFF_TIMEOUT)
+            if self.state.startswith('flying'):
+                return
+        raise RunError(f'no take-off in {TAKEOFF_ATTEMPTS} attempts; see the warnings below')
 
     def call(self, name: str, timeout: float = 2.0) -> tuple[bool, str]:
         """Call a service of the supervisor; return (accepted, answer)."""

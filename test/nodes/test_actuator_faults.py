@@ -32,7 +32,7 @@ class FaultOperator(Witness):
     def start(self):
         """Arm as soon as the bridges are ready, and wait until the controller flies."""
         assert self.wait(lambda: not self.waits_for(BRIDGES), 20), self.waits_for(BRIDGES)
-        self.take_off(lambda: self.state == 'flying:nmpc')
+        self.take_off()
 
     def ask(self, service):
         client = self._node.create_client(Trigger, f'joint_bridge_node/{service}')

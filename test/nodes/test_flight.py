@@ -33,7 +33,7 @@ def test_switches_and_the_loss_of_recorder_reference_controller_and_estimator(ro
     with running_graph(in_simulated_time(parameters), tmp_path, ros_domain,
                        groups={name: [name] for name in parameters},
                        ready=lambda one: one.ready and one.progress) as (graph, witness):
-        witness.take_off(lambda: witness.progress.startswith('flying'))
+        witness.take_off()
         switches(witness)
         loses_one_node_after_another(graph, witness, bag)
 

@@ -17,7 +17,6 @@ from beetle_omni_ros.nodes.graph import COMPOSED, Graph
 from beetle_omni_ros.nodes.operator import Operator
 
 HEADER = 'x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg\n'
-TAKEOFF_ATTEMPTS = 3
 BUSY = 0.85         # share of a core above which tests are not valid
 READY = 240     # s; without a cache the controller is compiled first
 
@@ -74,16 +73,6 @@ class Witness(Operator):
         used = cpu_seconds(graph.processes[COMPOSED].pid) - before
         if (busy := used / (time.monotonic() - begin)) > BUSY:
             pytest.skip(f'too slow for a flight in real time: the nodes use {busy:.0%} of a core')
-
-    def take_off(self, flies):
-        """Arm and climb until ``flies()``; repeated on a busy computer."""
-        for _ in range(TAKEOFF_ATTEMPTS):
-            assert self.wait(lambda: self.call('arm')[0], 15), self.call('arm')
-            self.states.clear()
-            self.wait(lambda: flies() or 'disarmed' in self.states, 30)
-            if flies():
-                return
-        raise AssertionError(f'no take-off: {self.states}')
 
 
 @contextmanager
