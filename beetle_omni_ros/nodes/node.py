@@ -224,8 +224,7 @@ class FlightNode(Node):
         """Close, leave the graph, release the name."""
         self.close()
         super().destroy_node()
-        if self._claim:
-            self._claim.close()
+        self._claim.close()
 
     def _publish_diagnostics(self):
         found = []

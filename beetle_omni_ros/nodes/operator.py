@@ -5,6 +5,7 @@ from contextlib import ExitStack, suppress
 from functools import partial
 import os
 import time
+from typing import Any
 
 import numpy as np
 from rcl_interfaces.srv import SetParameters
@@ -205,15 +206,21 @@ class Operator(Client):
             return False, f'{SUPERVISOR} does not answer to {name}'
         return future.result().success, future.result().message
 
+    def request(self, service: str, kind: type, request: Any, timeout: float) -> Any:
+        """Call any service; return its response, None without an answer."""
+        client = self._node.create_client(kind, service)
+        if not self.wait(client.service_is_ready, timeout):
+            return None
+        future = client.call_async(request)
+        return future.result() if self.wait(future.done, timeout) else None
+
     def set(self, node: str, name: str, value, timeout: float = 5.0) -> tuple[bool, str]:
         """Set a parameter of a node; return (accepted, answer)."""
-        client = self._node.create_client(SetParameters, f'{node}/set_parameters')
-        if not self.wait(client.service_is_ready, timeout):
-            return False, f'{node} is not there'
-        future = client.call_async(wire.parameter_request(name, value))
-        if not self.wait(future.done, timeout):
+        answer = self.request(f'{node}/set_parameters', SetParameters,
+                              wire.parameter_request(name, value), timeout)
+        if answer is None:
             return False, f'{node} does not answer'
-        return future.result().results[0].successful, future.result().results[0].reason
+        return answer.results[0].successful, answer.results[0].reason
 
     def values(self, status: str) -> dict[str, str]:
         """Return the values of a diagnostic status, empty before the first message."""

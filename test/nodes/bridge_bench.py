@@ -62,11 +62,9 @@ class BridgeOperator(Operator):
         self._supervisor.publish(state)
 
     def ask(self, name, kind=Trigger, request=None):
-        client = self._node.create_client(kind, f'{self.bridge}/{name}')
-        self.until(client.service_is_ready, f'no service {name}')
-        future = client.call_async(request or kind.Request())
-        self.until(future.done, f'{name}: no answer')
-        return future.result()
+        answer = self.request(f'{self.bridge}/{name}', kind, request or kind.Request(), WITHIN)
+        assert answer, f'{name}: no answer'
+        return answer
 
     def change(self, name):
         """Request a lifecycle transition such as 'configure'; return whether it succeeded."""
