@@ -105,11 +105,7 @@ class Bench:
         self.nodes = [self.user]
 
     def add(self, node):
-        """Spin this node too; log lines of its refusals are kept in ``node.refusals``."""
-        node.refusals = []
-        before = node.reject
-        node.reject = lambda topic, reason, kind: (
-            node.refusals.append(f'{topic}: {reason}'), before(topic, reason, kind))
+        """Spin this node too."""
         self.executor.add_node(node)
         self.nodes.append(node)
         return node
