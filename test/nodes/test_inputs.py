@@ -33,13 +33,11 @@ LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 SOON = 10       # s; a busy test machine must not cause a fault
 
 
-class StillNode(ControllerNode):
-    """The controller node without a solver."""
-
-    def __init__(self):
-        super().__init__(ControllerEntry(name='nmpc', controller=lambda: SimpleNamespace(
-            period=0.01, step=lambda state, target: None, reset=lambda: None,
-            set_health=lambda health: None)))
+def still():
+    """Make the controller node without a solver."""
+    return ControllerNode(ControllerEntry(name='nmpc', controller=lambda: SimpleNamespace(
+        period=0.01, step=lambda state, target: None, reset=lambda: None,
+        set_health=lambda health: None)))
 
 
 def pose(height=1.0, stamp=0.0, frame='world', x=0.0):
@@ -47,7 +45,7 @@ def pose(height=1.0, stamp=0.0, frame='world', x=0.0):
 
 
 def test_a_bad_target_pose_is_refused_with_its_reason_and_the_old_one_stays(bench):
-    node = bench.add(StillNode())
+    node = bench.add(still())
     poses = bench.publisher(PoseStamped, 'target_pose')
     poses.publish(pose())
     assert bench.wait(lambda: node._host.target is not None)
