@@ -146,7 +146,7 @@ class JointBridgeNode(BridgeNode):
         self._bus = self._loop = None
         self._lost_reason = ''
         self._joints = wire.Publisher(self, 'joint_states')
-        self.listen('command', self._on_command, max_age=COMMAND_AGE, stale_after=None)
+        self.listen('command', self._on_command, max_age=COMMAND_AGE, expected=False)
         self.report('bus', self._bus_status)
         for k, name in enumerate(JOINT_NAMES):
             self.report(name, partial(self._servo_status, k))
@@ -295,7 +295,7 @@ class RotorBridgeNode(BridgeNode):
         self.report('board', self._board_status)
         for k in range(4):
             self.report(f'rotor{k + 1}', partial(self._rotor_status, k))
-        self.listen('command', self._on_command, max_age=given.stamp_age_limit, stale_after=None)
+        self.listen('command', self._on_command, max_age=given.stamp_age_limit, expected=False)
         wire.subscribe(self, 'supervisor/state', self._on_supervisor)
         self._timer = self.create_timer(self._period, self._on_timer, clock=self.steady_clock)
         self.start_by_itself()

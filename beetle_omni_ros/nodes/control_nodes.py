@@ -105,9 +105,9 @@ class ControllerNode(FlightNode):
         self._publisher = wire.Publisher(self, f'{entry.name}/command')
         self.listen('odom', self._on_odom, max_age=ODOM_AGE)
         self.listen('joint_states', self._on_joints, max_age=JOINT_AGE)
-        self.listen('command', partial(setattr, self, '_command'), stale_after=None)
+        self.listen('command', partial(setattr, self, '_command'), expected=False)
         for topic in TARGETS:
-            self.listen(topic, self._on_target, stale_after=None)
+            self.listen(topic, self._on_target, expected=False)
         wire.subscribe(self, 'supervisor/state', self._on_mode)
         wire.subscribe(self, 'supervisor/target', partial(setattr, self._host, 'override'))
         wire.subscribe(self, 'supervisor/actuators', self._host.on_health)
@@ -214,10 +214,10 @@ class SupervisorNode(FlightNode):
         self.listen('mocap/pose', lambda s: supervisor.on_mocap(
             s.stamp, s.position, s.quaternion), max_age=SENSOR_AGE)
         self.listen('rotor_states', lambda r: supervisor.on_rotors(r.stamp, r.speed),
-                    stale_after=None)
+                    expected=False)
         self.listen('battery_state', lambda battery: supervisor.on_battery(battery.voltage))
         for name in self._controllers:
-            self.listen(f'{name}/command', partial(self._on_command, name), stale_after=None)
+            self.listen(f'{name}/command', partial(self._on_command, name), expected=False)
         for name in ('joint', 'rotor'):
             wire.subscribe(self, f'{name}_bridge/state', partial(self._on_bridge, name))
         for name in ('arm', 'disarm', 'land', 'emergency_stop'):

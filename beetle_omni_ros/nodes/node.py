@@ -19,6 +19,7 @@ from beetle_omni_ros.nodes.graph import claim
 
 OK, WARN, ERROR = range(3)      # of diagnostic_msgs/DiagnosticStatus
 PERIOD = 1.0            # s between two diagnostics
+SILENCE = 0.5           # s without a message after which an expected topic has ended
 FUTURE = 0.05           # s ahead of the clock above which a stamp is refused
 IDENTITY = 'supervisor/identity'
 TEXT_LIMIT = 40         # characters of a foreign frame_id in an error message
@@ -55,9 +56,9 @@ class Distribution:
 
 @dataclass
 class Input:
-    """Counts of one subscribed topic; silence of ``stale_after`` [s] is an error, None never."""
+    """Counts of one subscribed topic; if messages are ``expected``, their end is an error."""
 
-    stale_after: float | None
+    expected: bool
     received: int = 0
     reported: int = 0
     age: float = float('nan')
@@ -69,7 +70,7 @@ class Input:
     @property
     def is_missing(self) -> bool:
         """Whether a message is expected and none has come yet."""
-        return self.seen is None and self.stale_after is not None
+        return self.seen is None and self.expected
 
 
 class FlightNode(Node):
@@ -138,17 +139,16 @@ class FlightNode(Node):
             logger.info(text)
 
     def listen(self, topic: str, handle: Callable, *, qos: Qos | None = None,
-               max_age: float | None = None, stale_after: float | None = 0.5) -> None:
+               max_age: float | None = None, expected: bool = True) -> None:
         """
         Subscribe ``topic``; pass valid values to ``handle`` and count refused messages.
 
         Until a supervisor publishes its identity, every message of `command` is accepted. After
         that, only those whose frame_id is the newest identity are accepted. For targets ``handle``
         also gets the time of publication [s, system time, or nan]; it may raise MessageError.
-        ``max_age`` is the limit of a stamp's age [s], which also refuses future stamps. Silence of
-        ``stale_after`` [s] after a message is an error.
+        ``max_age`` is the limit of a stamp's age [s], which also refuses future stamps.
         """
-        entry, counts = topic_of(topic), Input(stale_after)
+        entry, counts = topic_of(topic), Input(expected)
         self.inputs[topic] = counts
         if topic == 'command':
             wire.subscribe(self, IDENTITY, partial(setattr, self, '_supervisor_identity'))
@@ -245,8 +245,7 @@ class FlightNode(Node):
                        f'{topic} age_ms': 1e3 * entry.age, f'{topic} received': entry.received,
                        f'{topic} rejected': count,
                        **{f'{topic} rejected: {why}': n for why, n in entry.rejected.items()}}
-            if entry.seen is not None and entry.stale_after is not None \
-                    and now - entry.seen > entry.stale_after:
+            if entry.expected and entry.seen is not None and now - entry.seen > SILENCE:
                 level = ERROR
                 faults.append(f'{topic} silent for {now - entry.seen:.1f} s')
             if count > entry.rejected_reported:

@@ -166,7 +166,7 @@ class SimNode(FlightNode):
         self._publish_to = {name: wire.Publisher(self, topic) for name, topic in topics.items()}
         self._truth = wire.Publisher(self, 'ground_truth/odom')
         self.listen('disturbance', lambda wrench: self._simulator.set_wrench(
-            wrench.force, wrench.torque), stale_after=None)
+            wrench.force, wrench.torque), expected=False)
         self.track_compute(self._simulator.tick)
         self.report('pacing', self._pacing_status)
         self.report('robot', self._robot_status)
