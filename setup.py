@@ -12,7 +12,7 @@ import re
 from setuptools import find_packages, setup
 
 PACKAGE = 'beetle_omni_ros'
-NODES = ('sim_node', 'ekf_node', 'nmpc_node', 'rl_node', 'controller_node', 'supervisor_node',
+NODES = ('sim_node', 'ekf_node', 'nmpc_node', 'rl_node', 'supervisor_node',
          'joint_bridge_node', 'rotor_bridge_node', 'reference_node', 'recorder_node',
          'viewer_node')
 
@@ -141,7 +141,7 @@ setup(
     },
     entry_points={
         'console_scripts': [
-            *(f'{name} = {PACKAGE}.start:{name}' for name in ('beetle_omni', *NODES)),
+            *(f'{name} = {PACKAGE}.start:{name}' for name in ('beetle_omni', 'composed', *NODES)),
         ],
     },
 )

@@ -44,7 +44,7 @@ WARM_UP = 0.2           # share of the flight before the fit, at least:
 WARM_UP_LEAST = 180.0   # s; buffers and caches fill in the first minutes
 LIMIT = 5.0             # MB an hour
 CAPACITY = 1000.0       # Ah
-READY, TAKE_OFF, LANDING = 300.0, 30.0, 30.0    # s
+READY, LANDING = 300.0, 30.0     # s
 MEGA = 1 / 1024         # of a kB of /proc
 
 
@@ -106,15 +106,10 @@ def make_graph(folder: Path, number: int, minutes: float) -> Graph:
 
 
 def take_off(operator: Operator, bridges: list[str]) -> None:
-    """Arm and wait for the start of the task; exit on failure."""
-    if not operator.wait(lambda: operator.ready and not operator.waits_for(bridges), READY):
-        sys.exit(f'the graph is not ready: {operator.waits_for(bridges) or operator.state}')
-    operator.spin(2.0)
-    for _ in range(3):
-        answer = operator.call('arm')
-        if answer[0] and operator.wait(lambda: operator.state.startswith('flying'), TAKE_OFF):
-            return
-    sys.exit(f'no take-off: {answer[1]}')
+    """Take off as soon as the graph is ready; RunError on failure."""
+    operator.required = bridges
+    operator.expect('starting', lambda: operator.ready and not operator.waits_for(bridges), READY)
+    operator.take_off()
 
 
 def watch(graph: Graph, operator: Operator, seconds: float, say: Callable[[str], None]

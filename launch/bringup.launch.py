@@ -5,26 +5,25 @@ The robot stays on the ground until ``supervisor_node/arm`` is called.
 """
 
 import atexit
+from pathlib import Path
 import shutil
 import sys
 import tempfile
 
 from launch.actions import DeclareLaunchArgument, ExecuteProcess, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
-from launch_ros.actions import Node
 
 from launch import LaunchDescription
 
-PACKAGE = 'beetle_omni_ros'
 ARGUMENTS = {
     # name: (default, choices or None, description)
     'backend': ('sim', ['sim', 'none'],
                 'who provides sensors and actuators: the simulator, or nodes started elsewhere, '
                 'as the service of deploy/install.sh, which runs the bridges of the robot'),
-    'actuators': ('', ['', 'bridges', 'direct'],
+    'actuators': ('', ['', 'emulated', 'direct'],
                   'how commands reach the simulated actuators: through joint_bridge_node and '
                   'rotor_bridge_node to emulated devices, or straight into the plant; empty: '
-                  'bridges, direct with clock simulated'),
+                  'emulated, direct with clock simulated'),
     'clock': ('system', ['system', 'simulated'],
               'real time, or simulated time on /clock, which waits for nodes that are late: for a '
               'computer that is too slow'),
@@ -47,61 +46,26 @@ ARGUMENTS = {
 }
 
 
-def ports():
-    """Make a private folder of this launch, so that the ports of two simulations do not meet."""
-    made = tempfile.mkdtemp(prefix='beetle_omni_ports_')
-    atexit.register(shutil.rmtree, made, ignore_errors=True)
-    return made
-
-
-def options(given):
-    """Put the arguments into the terms of the graph's plan."""
-    simulated = given['backend'] == 'sim'
-    actuators = given['actuators'] or (
-        'direct' if given['clock'] == 'simulated' else 'bridges')
-    emulated = simulated and actuators == 'bridges'
-    return dict(
-        simulated=simulated, actuators=actuators, ports=ports() if emulated else '',
-        bag=given['record'], seed=int(given['seed']),
-        **{key: given[key] == 'true' for key in ('standby', 'allow_other_robot', 'viewer')},
-        **{key: given[key] for key in (
-            'clock', 'conditions', 'controller', 'plant_file', 'policy', 'robot_file',
-            'task')})
-
-
-def state_publisher(namespace):
-    """The node that publishes description and frames of the links."""
-    from launch_ros.parameter_descriptions import ParameterValue
-
-    from beetle_omni_ros.robot.urdf import description
-    return Node(package='robot_state_publisher', executable='robot_state_publisher',
-                namespace=namespace, output='screen', parameters=[{
-                    'robot_description': ParameterValue(description(), value_type=str),
-                    'publish_frequency': 50.0}])
-
-
-def composed(arguments, nodes, namespace):
-    """One process that runs ``nodes``."""
-    overrides = [argument for node, values in nodes.items() for key, value in values.items()
-                 for argument in ('-p', f'{node}:{key}:={value}')]
-    if namespace:
-        overrides += ['-r', f'__ns:=/{namespace}']
-    return ExecuteProcess(cmd=[sys.executable, '-m', f'{PACKAGE}.start', 'composed', *arguments,
-                               '--ros-args', *overrides], output='screen')
-
-
 def actions(context):
     """Turn the arguments into processes."""
     from beetle_omni_ros.nodes import graph
     given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
+    # Private to this launch, so that the ports of two simulations do not meet.
+    folder = tempfile.mkdtemp(prefix='beetle_omni_')
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
     graph.confine()
-    nodes, left_out = graph.plan(**options(given))
+    nodes, left_out = graph.plan(
+        simulated=given['backend'] == 'sim', ports=folder, bag=given['record'],
+        seed=int(given['seed']),
+        **{key: given[key] == 'true' for key in ('standby', 'allow_other_robot', 'viewer')},
+        **{key: given[key] for key in ('actuators', 'clock', 'conditions', 'controller',
+                                       'plant_file', 'policy', 'robot_file', 'task')})
     for name, reason in left_out.items():
         print(f'{name} does not stand by: {reason}', file=sys.stderr)
-    return [*([state_publisher(given['namespace'])] if 'viewer_node' in nodes else []),
-            *(composed(graph.arguments(nodes, names), {name: nodes[name] for name in names},
-                       given['namespace'].strip('/'))
-              for names in graph.processes(nodes).values())]
+    namespace = given['namespace'].strip('/')
+    remapped = ['-r', f'__ns:=/{namespace}'] if namespace else []
+    return [ExecuteProcess(cmd=[*command, *remapped], output='screen')
+            for command in graph.commands(nodes, Path(folder)).values()]
 
 
 def generate_launch_description():

@@ -1,5 +1,6 @@
 """Unusable input of each subcommand: one line with the error, its place and the expectation."""
 
+from io import StringIO
 from pathlib import Path
 import shlex
 
@@ -137,6 +138,10 @@ CASES = {
         ('--seconds 0', "'--seconds': Input"), ('--skip legs', "--skip 'legs': expected"),
         ('--servo-bus baud.yaml', 'baud_rate'), ('--motor-board port.yaml', "'prt': unknown"),
         ('--robot unknown.yaml', 'masss'), ('--json no/x.json', 'there is no folder')],
+    'drive': [
+        ('wheel', "source 'wheel': expected keyboard or joystick or terminal"),
+        ('keyboard', 'standard input is no terminal'),
+        ('terminal --params none.yaml', 'none.yaml'), ('terminal --domain-id 300', 'Input')],
     '': [('frobnicate', 'frobnicate'), ('--nonsense', '--nonsense')]}
 ROWS = [(f'{before} {value}', fragment) for before, cases in CASES.items()
         for value, fragment in cases]
@@ -163,8 +168,9 @@ def inputs(tmp_path_factory):
 def test_unusable_input_is_one_line_and_writes_nothing(arguments, fragment, inputs, monkeypatch,
                                                        capsys):
     arguments = shlex.split(arguments)
-    if arguments[0] in ('fly', 'check'):
-        pytest.importorskip({'fly': 'rclpy', 'check': 'serial'}[arguments[0]])
+    if arguments[0] in ('fly', 'drive', 'check'):
+        pytest.importorskip('serial' if arguments[0] == 'check' else 'rclpy')
+    monkeypatch.setattr('sys.stdin', StringIO())
     monkeypatch.chdir(inputs)
     before = sorted(Path().rglob('*'))
     status = cli.main(arguments)

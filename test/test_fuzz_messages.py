@@ -59,7 +59,7 @@ def test_hostile_messages_are_accepted_or_refused():
               'odom': Odom(1.0, zero, zero, LEVEL, zero),
               'command': Command(1.0, np.zeros(4), np.ones(4)),
               'joint_states': JointReading(1.0, np.zeros(4), np.zeros(4)),
-              'battery_state': BatteryReading(1.0, 24.0, -9.0, 6),
+              'battery_state': BatteryReading(1.0, 24.0, -9.0),
               'target_pose': PoseTarget(zero + 1, LEVEL, 1.0),
               'target_trajectory': TrajectoryTarget(
                   np.arange(3.0), np.ones((3, 3)), np.tile(LEVEL, (3, 1)), np.zeros((3, 3)),

@@ -56,11 +56,11 @@ def fly(controller: ControllerOption = DEFAULT,
             'New folder for the recorded bag. Default: runs_out/fly_DATE.'))] = None,
         conditions: ConditionsOption = 'nominal',
         seed: SeedOption = 0,
-        actuators: Annotated[str | None, Option(metavar='emulated|direct', help=(
+        actuators: Annotated[str | None, Option(callback=one_of, metavar='emulated|direct', help=(
             'emulated (default): commands go through joint_bridge_node, rotor_bridge_node, serial '
             'ports and emulated devices; direct: they go straight to the simulated '
             'plant.'))] = None,
-        clock: Annotated[str, Option(metavar='system|simulated', help=(
+        clock: Annotated[str, Option(callback=one_of, metavar='system|simulated', help=(
             'system: real time; simulated: simulated time on /clock, which waits for late nodes, '
             'with direct actuators, for a computer that is too slow for real '
             'time.'))] = 'system',
@@ -342,7 +342,8 @@ def check(servo_port: Annotated[str | None, Option(metavar='PORT', help=(
 
 
 @app.command()
-def drive(source: Annotated[str, Argument(metavar='keyboard|joystick|terminal', help=(
+def drive(source: Annotated[str, Argument(
+              callback=one_of, metavar='keyboard|joystick|terminal', help=(
               'Input: keys of this terminal, the topic joy, or typed commands.'))] = 'keyboard',
           parameters: Annotated[Path | None, Option('--params', metavar='FILE', help=(
               'Limits, axes, buttons and named poses. Default: the shipped '
@@ -356,7 +357,7 @@ def drive(source: Annotated[str, Argument(metavar='keyboard|joystick|terminal', 
     """
     given = dict(locals())
     from beetle_omni_ros.nodes.driver import run_drive
-    return run_drive(**given)
+    run_drive(**given)
 
 
 @identify.command()

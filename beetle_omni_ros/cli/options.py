@@ -16,10 +16,10 @@ KNOWN = f"{', '.join(registry.SHIPPED)}, any registered one, {registry.CLASS}"
 DEFAULT_ROBOT = 'Default: the shipped params/robot.yaml.'
 
 
-def one_of(param: CallbackParam, value: str) -> str:
+def one_of(param: CallbackParam, value: str | None) -> str | None:
     """Refuse another value than those of the option's metavar."""
     known = param.metavar.split('|')
-    if value not in known:
+    if value is not None and value not in known:
         raise ParameterError(f"--{param.name} '{value}': expected {' or '.join(known)}")
     return value
 

@@ -33,9 +33,9 @@ class ModelParameters:
 
     servo_lag: float | None = parameter(
         None, doc="time constant of the first-order servo model; absent: the robot's", unit='s',
-        low=0.002, high=0.5, read_only=True)
+        low=0.002, high=0.5)
     rotor_lag: bool = parameter(True, doc='thrust as a state with the rotor time constant '
-                                '(21 states) instead of a direct input (17)', read_only=True)
+                                '(21 states) instead of a direct input (17)')
     command_delay: float = parameter(
         0.01, doc='delay from the state stamp to the actuators, which is predicted', unit='s',
         low=0, high=0.1)
@@ -54,13 +54,13 @@ class LimitParameters:
         unit='rad', low=0.1, high=20)
     tilt_rate_intervals: int = parameter(
         5, doc='number of first intervals in which the lead of tilt targets is bounded by the '
-        'rate of the servos; 0: none', low=0, high=60, read_only=True)
+        'rate of the servos; 0: none', low=0, high=60)
     thrust_max: float | None = parameter(
         None, doc="largest thrust inside the optimisation; absent: the robot's", unit='N', low=0.1,
         high=200)
     soft: bool = parameter(
         True, doc='limits of velocity, rate and height may be exceeded at a cost, which keeps the '
-        'QP feasible', read_only=True)
+        'QP feasible')
     height: float = parameter(
         0.5, doc='smallest height of base_link in world, unless the target is lower; inactive '
         'until the robot was above it; -1000: none',
@@ -99,7 +99,7 @@ class NmpcParameters(ParameterFile, file='nmpc.yaml'):
 
     horizon: np.ndarray = parameter(
         [0.02, 0.03, 0.04, 0.06, 0.08, 0.1, 0.12, 0.15, 0.2, 0.2], unit='s', doc='lengths of the '
-        'shooting intervals, first to last', low=0.005, high=0.5, read_only=True)
+        'shooting intervals, first to last', low=0.005, high=0.5)
     model: ModelParameters = group(ModelParameters, 'prediction')
     limits: LimitParameters = group(LimitParameters, 'constraints')
     weights: NmpcWeights = group(NmpcWeights, 'cost')
@@ -108,9 +108,9 @@ class NmpcParameters(ParameterFile, file='nmpc.yaml'):
         4.0, doc='tilt references are within +-pi, unless the nearest legal turn is closer to '
         'the present tilt by more than this; 0: always nearest, 6.3: always within +-pi',
         unit='rad', low=0, high=6.3)
-    without: str = parameter('', doc="'unwinding' or 'all': no guidance", read_only=True)
+    without: str = parameter('', doc="'unwinding' or 'all': no guidance")
     reach: float = parameter(10.0, doc='a target farther from the robot is refused', unit='m',
-                             low=0.5, high=1000, read_only=True)
+                             low=0.5, high=1000)
 
     def actuators(self, robot: RobotParameters) -> tuple[float, float, float, float]:
         """

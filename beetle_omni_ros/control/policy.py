@@ -23,14 +23,13 @@ ACTION_LIMIT = 100.0
 class PolicyParameters(ParameterFile, file='rl.yaml'):
     """Policy file and guidance."""
 
-    policy: str = parameter(DEFAULT, doc="ONNX file, in the package's share or any path",
-                            read_only=True)
+    policy: str = parameter(DEFAULT, doc="ONNX file, in the package's share or any path")
     allow_other_robot: bool = parameter(
-        False, doc='fly a policy that was trained for other robot parameters', read_only=True)
+        False, doc='fly a policy that was trained for other robot parameters')
     reach: float = parameter(6.5, doc='a target farther from the robot is refused', unit='m',
-                             low=0.5, high=1000, read_only=True)
+                             low=0.5, high=1000)
     without: str = parameter('', doc="layers of the guidance that are off: names with commas, or "
-                             "'all'", read_only=True)
+                             "'all'")
 
 
 class PolicyController:

@@ -1,10 +1,8 @@
 """
 Conversion between messages and values, by attribute access only.
 
-``read_*`` converts a message of :mod:`~.bag_types`, also one of ``read_all``, whose numbers are
-arrays over N messages, so vectors have the shape (N, 3). ``take_*`` converts one message for use
-in flight, where :class:`~.topics.Topic` does not. Both raise MessageError. ``write_*`` makes a
-message.
+``read_*`` also converts messages of ``read_all``, whose numbers are arrays over N messages, so
+vectors have the shape (N, 3). ``take_joints`` converts one message for use in flight.
 """
 
 from collections.abc import Callable, Sequence
@@ -180,7 +178,6 @@ def write_battery(value: BatteryReading) -> Any:
     message.power_supply_status = message.POWER_SUPPLY_STATUS_DISCHARGING
     message.power_supply_technology = message.POWER_SUPPLY_TECHNOLOGY_LIPO
     message.present = True
-    message.cell_voltage = np.full(value.cells, np.nan, dtype=np.float32)
     return message
 
 
@@ -190,15 +187,6 @@ def read_odom(message: Any) -> Odom:
     q, velocity = odom.quaternion, odom.velocity
     return replace(odom, velocity=rotations.matrix(q) @ velocity if velocity.ndim == 1 else
                    np.einsum('ijn,nj->ni', rotations.matrix(tuple(q.T)), velocity))
-
-
-def take_odom(message: Any) -> Odom:
-    """Read pose and velocity for flight."""
-    odom = read_odom(message)
-    for name in ('position', 'velocity', 'quaternion', 'angular_velocity'):
-        finite(getattr(odom, name), name)
-    unit(odom.quaternion)
-    return odom
 
 
 def write_odom(value: Odom) -> Any:
@@ -214,7 +202,6 @@ def write_odom(value: Odom) -> Any:
 
 
 def read_pose_target(message: Any) -> PoseTarget:
-    """Read a pose target; MessageError if it is not finite or in another frame than world."""
     target = _read_target(message)
     finite(target.position, 'position')
     _check_frame(message)
@@ -247,7 +234,6 @@ def _joint_state(stamp, names, **fields):
 
 
 def read_joints(message: Any) -> JointReading:
-    """Read the four tilt joints, in any order of names."""
     return JointReading(
         seconds(message.header.stamp), _of(message, 'position', JOINTS),
         _of(message, 'velocity', JOINTS) if len(message.velocity) else None,
@@ -267,23 +253,19 @@ def take_joints(message: Any) -> JointReading:
 
 
 def write_joints(value: JointReading) -> Any:
-    """Write the joints that the value names."""
     return _joint_state(value.stamp, value.names, position=value.position,
                         velocity=value.velocity, effort=value.effort)
 
 
 def read_rotors(message: Any) -> RotorReading:
-    """Read the speeds measured by the ESCs."""
     return RotorReading(seconds(message.header.stamp), _of(message, 'velocity', ROTORS))
 
 
 def write_rotors(value: RotorReading) -> Any:
-    """Write the speeds."""
     return _joint_state(value.stamp, ROTORS, velocity=value.speed)
 
 
 def read_command(message: Any) -> Command:
-    """Read four tilts and four thrusts."""
     return Command(seconds(message.header.stamp), _of(message, 'position', JOINTS),
                    _of(message, 'effort', ROTORS))
 
@@ -343,7 +325,6 @@ def read_override(message: Any) -> TrajectoryTarget | None:
 
 
 def write_override(target: TrajectoryTarget | None) -> Any:
-    """Write the supervisor's target; a message without points for None."""
     return new(TRAJECTORY) if target is None else write_trajectory(target)
 
 
@@ -353,14 +334,12 @@ read_text: Callable[[Any], str] = attrgetter('data')
 
 
 def write_text(value: str) -> Any:
-    """Write a text."""
     message = new('std_msgs/msg/String')
     message.data = value
     return message
 
 
 def read_health(message: Any) -> ActuatorHealth:
-    """Read the health of the actuators."""
     try:
         health = ActuatorHealth(**{name: tuple(value) if isinstance(value, list) else value
                                    for name, value in json.loads(message.data).items()})
@@ -374,15 +353,13 @@ def read_health(message: Any) -> ActuatorHealth:
 
 
 def write_health(health: ActuatorHealth) -> Any:
-    """Write the health of the actuators as JSON."""
     return write_text(json.dumps(asdict(health)))
 
 
 def read_diagnostics(message: Any) -> list[Diagnostic]:
     """Read all statuses; each gets the message's stamp."""
     t = seconds(message.header.stamp)
-    return [Diagnostic(t, status.name, ord(status.level) if isinstance(status.level, bytes)
-                       else int(status.level), status.message,
+    return [Diagnostic(t, status.name, status.level, status.message,
                        {pair.key: pair.value for pair in status.values})
             for status in message.status]
 

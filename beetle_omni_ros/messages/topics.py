@@ -58,9 +58,9 @@ class Topic:
         read: message -> value; MessageError for another layout.
         write: value -> message.
         meaning: description for the reference page.
-        finite: attributes that must be finite in flight.
+        finite: attributes that must be finite in flight; `quaternion` must have length 1.
         take: message -> value for use in flight; MessageError for unusable values. Default: read,
-            with the check of ``finite``.
+            with these checks.
         required: whether a bag without it gets a warning.
         in_flight: whether every bag declares it.
 
@@ -87,6 +87,8 @@ def _checked(read, names, message):
     value = read(message)
     for name in names:
         c.finite(getattr(value, name), name)
+    if 'quaternion' in names:
+        c.unit(value.quaternion)
     return value
 
 
@@ -102,7 +104,7 @@ def _command(name, meaning, required=False):
 
 def _odom(name, meaning, required=False):
     return Topic(name, 'nav_msgs/msg/Odometry', ESTIMATE, Odom, c.read_odom, c.write_odom, meaning,
-                 take=c.take_odom, required=required)
+                 ('position', 'velocity', 'quaternion', 'angular_velocity'), required=required)
 
 
 def command_topic(controller: str) -> Topic:
@@ -174,13 +176,7 @@ def controller_of(name: str) -> str:
 
 
 def topic_of(name: str) -> Topic:
-    """
-    Return the topic of a name without namespace.
-
-    Raises:
-        KeyError: unknown name.
-
-    """
+    """Return the topic of a name without namespace; KeyError for an unknown one."""
     controller = controller_of(name)
     return command_topic(controller) if controller and name not in ALL else ALL[name]
 

@@ -1,7 +1,6 @@
 """ROS lifecycle nodes between the topics and the actuators: tilt servos and motor board."""
 
 from collections import Counter
-from dataclasses import replace
 from functools import partial, partialmethod
 import math
 import time
@@ -11,12 +10,12 @@ from rclpy.lifecycle import LifecycleNodeMixin, TransitionCallbackReturn
 from std_srvs.srv import Trigger
 
 from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters, ServoBusParameters
-from beetle_omni_ros.drivers.motor_board import Arming, FLIES, LOST, MotorBoard, RECONNECT
+from beetle_omni_ros.drivers.motor_board import Arming, FLIES, LOST, MotorBoard
 from beetle_omni_ros.drivers.serial_port import SerialPortError
 from beetle_omni_ros.drivers.servo_bus import ServoBus
 from beetle_omni_ros.drivers.servo_link import ServoBusError
 from beetle_omni_ros.drivers.servo_loop import ServoLoop
-from beetle_omni_ros.nodes import parameters
+from beetle_omni_ros.nodes import parameters, wire
 from beetle_omni_ros.nodes.graph import AUTOSTART
 from beetle_omni_ros.nodes.node import Distribution, ERROR, FlightNode, OK, WARN
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters
@@ -46,11 +45,10 @@ class BridgeNode(LifecycleNodeMixin, FlightNode):
     def __init__(self, name, *args, autostart, **kwargs):
         FlightNode.__init__(
             self, name, *args, robot_file=parameters.file_parameter(), autostart=parameter(
-                autostart, choices=tuple(AUTOSTART), read_only=True,
+                autostart, choices=tuple(AUTOSTART),
                 doc='transition at the start, repeated until it succeeds'), **kwargs)
         LifecycleNodeMixin.__init__(self)
-        self._states = self.publisher(f"{name.removesuffix('_node')}/state")
-        self.state = ''         # the published one
+        self._states = wire.Publisher(self, f"{name.removesuffix('_node')}/state")
         self.latency = Distribution()
         self.report('latency', lambda: self.latency.status(
             'stamp of the answered IMU sample to the last byte of its command'))
@@ -71,15 +69,15 @@ class BridgeNode(LifecycleNodeMixin, FlightNode):
         if AUTOSTART[self.parameters.autostart]:
             self._start_timer = self.create_timer(RETRY, self.try_to_start,
                                                   clock=self.steady_clock)
+            self.try_to_start()
+        self.changed()
 
     def changed(self) -> None:
         """Publish and log the state if it changed."""
         text = self.state_text()
-        if text != self.state:
-            self.state = text
+        if self._states.update(text):
             self.log_line('error' if text.startswith('lost') and self.stage == ACTIVE else 'info',
                           text)
-            self._states.publish(text)
 
     def try_to_start(self) -> None:
         """Make the next transitions of the automatic start."""
@@ -148,15 +146,14 @@ class JointBridgeNode(BridgeNode):
         self._travel = RobotParameters.load(self.parameters.robot_file or None).joints
         self._bus = self._loop = None
         self._lost_reason = ''
-        self._joints = self.publisher('joint_states')
-        self.listen('command', self._on_command, max_age=COMMAND_AGE, stale_after=None)
+        self._joints = wire.Publisher(self, 'joint_states')
+        self.listen('command', self._on_command, max_age=COMMAND_AGE, expected=False)
         self.report('bus', self._bus_status)
         for k, name in enumerate(JOINT_NAMES):
             self.report(name, partial(self._servo_status, k))
         self.create_service(Trigger, '~/reboot', self._on_reboot)
         self.create_timer(CHECK_PERIOD, self._on_timer, clock=self.steady_clock)
         self.start_by_itself()
-        self.changed()
 
     def configure(self):
         """Open the port, check and write the servos' settings, and start to read angles."""
@@ -164,7 +161,8 @@ class JointBridgeNode(BridgeNode):
         self._bus.open()
         self._bus.configure()
         self._lost_reason = ''
-        self._loop = ServoLoop(self._bus, self._joints.publish, self._on_written)
+        self._loop = ServoLoop(self._bus, self._joints.publish,
+                               lambda stamp: self.latency.add(self.now() - stamp))
         self._loop.start()
 
     def activate(self):
@@ -222,9 +220,6 @@ class JointBridgeNode(BridgeNode):
             left = COMMAND_AGE - max(0.0, self.now() - command.stamp)
             self._loop.offer(command.tilt, command.stamp, time.monotonic() + left)
 
-    def _on_written(self, stamp):
-        self.latency.add(self.now() - stamp)
-
     def _on_timer(self):
         if self._loop is not None:
             self._log(self._bus)
@@ -247,7 +242,7 @@ class JointBridgeNode(BridgeNode):
             else 'waiting: not configured'
 
     def _bus_status(self):
-        loop, bus, text = self._loop, self._bus, self.state
+        loop, bus, text = self._loop, self._bus, self._states.value
         if loop is None:
             return WARN if self.stage == ACTIVE else OK, text, {'stage': self.stage}
         level = ERROR if text.startswith('lost') else OK if bus.link.is_open else WARN
@@ -287,32 +282,27 @@ class RotorBridgeNode(BridgeNode):
                          'motor_board_file', autostart='activate')
         given = self.parameters
         robot = RobotParameters.load(given.robot_file or None)
-        self._cells = robot.battery.cells
         self._board = MotorBoard(given, robot, clock=self.now)
         self._arming = Arming(self._board)
         self._arming.inhibit('not configured')
         self._command = self._battery = self._speeds = None
-        # _port_error: why the port is closed, '' if not yet known; None: open, or not configured.
-        self._port_error = None
-        self._updated = self._next_try = time.monotonic()
+        self._updated = time.monotonic()
         self._cycle, self._sent_at = 0, 0.0
         self._unsent = Counter()
         self._saturated, self._saturated_reported = np.zeros((2, 4), dtype=int)
-        self._batteries = self.publisher('battery_state')
-        self._rotors = self.publisher('rotor_states')
+        self._batteries = wire.Publisher(self, 'battery_state')
+        self._rotors = wire.Publisher(self, 'rotor_states')
         self.report('board', self._board_status)
         for k in range(4):
             self.report(f'rotor{k + 1}', partial(self._rotor_status, k))
-        self.listen('command', self._on_command, max_age=COMMAND_AGE, stale_after=None)
-        self.follow('supervisor/state', self._on_supervisor)
+        self.listen('command', self._on_command, max_age=COMMAND_AGE, expected=False)
+        wire.subscribe(self, 'supervisor/state', self._on_supervisor)
         self._timer = self.create_timer(TARGET_PERIOD, self._on_timer, clock=self.steady_clock)
         self.start_by_itself()
-        if given.autostart != 'none':
-            self.try_to_start()     # at once; nothing is refused here
 
     def configure(self):
-        """Open the port, now or as soon as it exists; then battery and rotors are published."""
-        self._port_error, self._next_try = '', time.monotonic()
+        """Open the port; from then on battery and rotors are published."""
+        self._board.open()
         self._arming.inhibit('not activated')
 
     def activate(self):
@@ -326,7 +316,6 @@ class RotorBridgeNode(BridgeNode):
     def release(self):
         """Disarm and close the port."""
         self._arming.inhibit('not configured')
-        self._port_error = None
         self._board.close()
 
     def close(self):
@@ -347,7 +336,6 @@ class RotorBridgeNode(BridgeNode):
 
     def _on_timer(self):
         now = time.monotonic()
-        self._open(now)
         self._arming.update(now - self._updated)
         self._updated = now
         if now - self._sent_at < TARGET_PERIOD / 2:
@@ -360,18 +348,6 @@ class RotorBridgeNode(BridgeNode):
         if self._cycle % POLL_CYCLES == 0:
             self._poll()
         self.changed()
-
-    def _open(self, now):
-        """Try to open the port; afterwards the driver itself reconnects."""
-        if self._port_error is None or now < self._next_try:
-            return
-        self._next_try = now + RECONNECT
-        try:
-            self._board.open()
-        except SerialPortError as error:
-            self._port_error = str(error)
-        else:
-            self._port_error = None
 
     def _send(self):
         """Send the newest thrusts while flying; return whether they were sent."""
@@ -391,7 +367,7 @@ class RotorBridgeNode(BridgeNode):
         battery, rotors = self._board.poll()
         if battery is not None:
             self._battery = battery
-            self._batteries.publish(replace(battery, cells=self._cells))
+            self._batteries.publish(battery)
         if rotors is not None:
             self._speeds = rotors
             self._rotors.publish(RotorReading(rotors.stamp, RPM * rotors.rpm))
@@ -399,8 +375,7 @@ class RotorBridgeNode(BridgeNode):
     def state_text(self):
         """Return the state of the board, or why its port is closed."""
         text = self._arming.text
-        return f'waiting: {self._port_error}' if self._port_error and text.startswith('waiting') \
-            else text
+        return f'waiting: {self.refusal}' if self.refusal and text.startswith('waiting') else text
 
     def _board_status(self):
         arming, text = self._arming, self._arming.text

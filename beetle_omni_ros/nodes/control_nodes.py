@@ -6,7 +6,6 @@ import math
 import secrets
 
 import numpy as np
-from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from beetle_omni_ros.control import registry
@@ -24,10 +23,10 @@ from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.estimation.state import pose_covariance, twist_covariance
 from beetle_omni_ros.messages.topics import TARGETS
 from beetle_omni_ros.messages.values import MessageError, Odom
-from beetle_omni_ros.nodes.graph import GENERIC, NODES
+from beetle_omni_ros.nodes import wire
+from beetle_omni_ros.nodes.graph import NODES
 from beetle_omni_ros.nodes.node import ERROR, FlightNode, IDENTITY, OK, WARN
 from beetle_omni_ros.nodes.parameters import file_parameter
-from beetle_omni_ros.robot.allocation import ALL_HEALTHY
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import parameter, ParameterError
 from beetle_omni_ros.runs.targets import TargetChecks
@@ -37,8 +36,6 @@ from beetle_omni_ros.safety.supervisor import DISARMED, FALLBACK, FLYING, STOPPE
 SENSOR_AGE = 0.2        # s, an older sample is of a stuck driver or another clock
 ODOM_AGE = 0.05         # s, no command answers an older estimate
 JOINT_AGE = 0.1         # s
-# s between a target's stamp and simulated time above which the stamp is of another clock
-OTHER_CLOCK = 3600.0
 STEP_TOLERANCE = 0.0025     # s, half of the smallest interval between estimates
 REPEAT = 1.0            # s between two log lines about a controller
 WATCH_PERIOD = 0.01     # s between checks for silent inputs
@@ -55,7 +52,7 @@ class EkfNode(FlightNode):
         robot = RobotParameters.load(self.parameters.robot_file or None)
         self._ekf = ErrorStateEkf(self.parameters.of_robot(robot), robot.gravity)
         self._status = self._ekf.status
-        self._publisher = self.publisher('odom')
+        self._publisher = wire.Publisher(self, 'odom')
         self.listen('imu/data_raw', self._on_imu, max_age=SENSOR_AGE)
         self.listen('mocap/pose', partial(self.timed, self._ekf.pose), max_age=SENSOR_AGE)
         self.track_compute(1 / self.parameters.imu.rate)
@@ -86,19 +83,13 @@ class ControllerNode(FlightNode):
     """
     Steps a controller once a period, triggered by the estimate; see ControllerHost.
 
-    An exception of the controller is logged and reported in diagnostics.
+    Commands go to '<name>/command'. An exception of the controller is logged and reported in
+    diagnostics.
     """
 
-    def __init__(self, entry: ControllerEntry | None = None):
-        """
-        Build the controller and subscribe its inputs; commands go to '<name>/command'.
-
-        Without ``entry``, the node's parameter ``controller`` names it.
-        """
-        is_own = entry and f'{entry.name}_node' in NODES    # of an executable of this name
-        entry = entry or registry.find(_requested_controller())
-        more = {} if is_own else {'controller': parameter(
-            entry.reference, doc='controller that this node runs', read_only=True)}
+    def __init__(self, entry: ControllerEntry):
+        more = {} if f'{entry.name}_node' in NODES else {'controller': parameter(
+            entry.reference, doc='controller that this node runs')}
         super().__init__(f'{entry.name}_node', entry.parameter_class, entry.parameters_file,
                          f'{entry.name}_file', robot_file=file_parameter(), **more)
         self._entry = entry
@@ -111,15 +102,15 @@ class ControllerNode(FlightNode):
         self._joints = self._command = None
         self._last_step = 0.0
         self._reported_errors = 0
-        self._publisher = self.publisher(f'{entry.name}/command')
+        self._publisher = wire.Publisher(self, f'{entry.name}/command')
         self.listen('odom', self._on_odom, max_age=ODOM_AGE)
         self.listen('joint_states', self._on_joints, max_age=JOINT_AGE)
-        self.listen('command', partial(setattr, self, '_command'), stale_after=None)
+        self.listen('command', partial(setattr, self, '_command'), expected=False)
         for topic in TARGETS:
-            self.listen(topic, self._on_target, stale_after=None)
-        self.follow('supervisor/state', self._on_mode)
-        self.follow('supervisor/target', partial(setattr, self._host, 'override'))
-        self.follow('supervisor/actuators', self._host.on_health)
+            self.listen(topic, self._on_target, expected=False)
+        wire.subscribe(self, 'supervisor/state', self._on_mode)
+        wire.subscribe(self, 'supervisor/target', partial(setattr, self._host, 'override'))
+        wire.subscribe(self, 'supervisor/actuators', self._host.on_health)
         self.track_compute(controller.period)
         self.report('controller', self._controller_status)
 
@@ -129,12 +120,8 @@ class ControllerNode(FlightNode):
 
     def _check_target(self, target, published):
         # The age counts at publication: a latched target stays valid for a node that starts
-        # later. Publication times are system time. In simulated time, only a stamp that is very
-        # far off is refused, once the clock is known.
-        then = None if math.isnan(published) else published
-        if self.simulated:
-            now = self.now()
-            then = now if now and abs(now - target.stamp) > OTHER_CLOCK else None
+        # later. Publication times are system time, so simulated stamps have no age.
+        then = None if self.simulated or math.isnan(published) else published
         reason = self._checks.why_not(target, then) or (
             self._host.too_far(target, self.now()) if self._host.active else '')
         if reason:
@@ -183,17 +170,6 @@ class ControllerNode(FlightNode):
         return OK, getattr(controller, 'name', self._entry.name), values
 
 
-def _requested_controller() -> str:
-    """Read the parameter ``controller`` by a temporary node, before the real one is made."""
-    probe = Node(GENERIC, start_parameter_services=False, enable_rosout=False)
-    given = probe._parameter_overrides.get('controller')
-    probe.destroy_node()
-    if given is None:
-        raise ParameterError("key 'controller': missing; expected a registered controller "
-                             f"({', '.join(registry.names())}) or {registry.CLASS}")
-    return str(given.value)
-
-
 # --- supervisor ---------------------------------------------------------------------------------
 
 class SupervisorNode(FlightNode):
@@ -206,7 +182,7 @@ class SupervisorNode(FlightNode):
 
     def __init__(self):
         controllers = parameter(
-            registry.STANDING_BY, read_only=True,
+            registry.STANDING_BY,
             doc='controllers that may be active: registered names, or FILE.py:Class')
         super().__init__('supervisor_node', SupervisorParameters, 'params/supervisor.yaml',
                          'supervisor_file', self._changed, changeable=('controller',),
@@ -223,15 +199,13 @@ class SupervisorNode(FlightNode):
                                       self._controllers)
         self._joints = None
         self._sent = (None, '')     # stamp and source of the last command
-        self._state = ''
-        self._publisher = self.publisher('command')
+        self._publisher = wire.Publisher(self, 'command')
         self._identity = f'supervisor_node:{secrets.token_hex(4)}'      # of this run of the node
-        self._identities = self.publisher(IDENTITY)
+        self._identities = wire.Publisher(self, IDENTITY)
         self._identities.publish(self._identity)
-        self._states = self.publisher('supervisor/state')
-        self._targets = self.publisher('supervisor/target')
-        self._actuators = self.publisher('supervisor/actuators')
-        self._override, self._health = None, ALL_HEALTHY
+        self._states = wire.Publisher(self, 'supervisor/state')
+        self._targets = wire.Publisher(self, 'supervisor/target')
+        self._actuators = wire.Publisher(self, 'supervisor/actuators')
         supervisor = self._supervisor
         self.listen('odom', self._on_odom)
         self.listen('joint_states', self._on_joints, max_age=SENSOR_AGE)
@@ -240,12 +214,12 @@ class SupervisorNode(FlightNode):
         self.listen('mocap/pose', lambda s: supervisor.on_mocap(
             s.stamp, s.position, s.quaternion), max_age=SENSOR_AGE)
         self.listen('rotor_states', lambda r: supervisor.on_rotors(r.stamp, r.speed),
-                    stale_after=None)
+                    expected=False)
         self.listen('battery_state', lambda battery: supervisor.on_battery(battery.voltage))
         for name in self._controllers:
-            self.listen(f'{name}/command', partial(self._on_command, name), stale_after=None)
+            self.listen(f'{name}/command', partial(self._on_command, name), expected=False)
         for name in ('joint', 'rotor'):
-            self.follow(f'{name}_bridge/state', partial(self._on_bridge, name))
+            wire.subscribe(self, f'{name}_bridge/state', partial(self._on_bridge, name))
         for name in ('arm', 'disarm', 'land', 'emergency_stop'):
             self.create_service(Trigger, f'~/{name}', partial(self._on_request, name))
         self.report('supervisor', self._supervisor_status)
@@ -298,16 +272,9 @@ class SupervisorNode(FlightNode):
 
     def _publish_states(self):
         supervisor = self._supervisor
-        state = supervisor.reported_state
-        if state != self._state:
-            self._state = state
-            self._states.publish(state)
-        if supervisor.target_override is not self._override:
-            self._override = supervisor.target_override
-            self._targets.publish(self._override)
-        if supervisor.health is not self._health:
-            self._health = supervisor.health
-            self._actuators.publish(self._health)
+        self._states.update(supervisor.reported_state)
+        self._targets.update(supervisor.target_override)
+        self._actuators.update(supervisor.health)
         for event in supervisor.events:
             self.log_line(event.severity, event.text)
         supervisor.events.clear()
@@ -320,4 +287,5 @@ class SupervisorNode(FlightNode):
         level = {FALLBACK: WARN, STOPPED: ERROR}.get(
             supervisor.state, WARN if supervisor.faults else OK)
         named = ', '.join(supervisor.faults)
-        return level, f'{self._state}; faults: {named}' if named else self._state, values
+        state = self._states.value
+        return level, f'{state}; faults: {named}' if named else state, values

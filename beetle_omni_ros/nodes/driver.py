@@ -10,12 +10,11 @@ import termios
 import tty
 
 import numpy as np
-from rich.console import Console
 from sensor_msgs.msg import Joy
 
 from beetle_omni_ros import drive
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.control.base import PoseTarget
+from beetle_omni_ros.control.base import MOTORS_OFF, PoseTarget
 from beetle_omni_ros.drive import Action, DriveParameters, Steering
 from beetle_omni_ros.messages.topics import SENSOR
 from beetle_omni_ros.messages.values import Odom
@@ -24,15 +23,13 @@ from beetle_omni_ros.nodes.operator import Operator
 from beetle_omni_ros.nodes.runner import sigterm_as_interrupt
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.schema import ParameterError, RunError
 from beetle_omni_ros.runs.targets import TargetChecks
 
-OK, FAILED = 0, 1
 PERIOD = 0.05           # s between two targets
 SUPERVISOR_TIMEOUT = 10.0   # s until the supervisor and the estimate must have appeared
 SETTLE_TIME = 0.5       # s that `wait` takes at least, so that the motion has begun
 NEAR, ALIGNED = 0.1, np.radians(10)     # [m], [rad] within which the robot is at its target
-RESTING = ('disarmed', 'emergency_stop')
 
 
 class Driver(Operator):
@@ -45,7 +42,7 @@ class Driver(Operator):
 
     """
 
-    def __init__(self, domain: int, parameters: DriveParameters, robot: RobotParameters):
+    def __init__(self, domain: int | None, parameters: DriveParameters, robot: RobotParameters):
         super().__init__(domain)
         self._p, self._checks = parameters, TargetChecks(robot)
         self.odom: Odom | None = None
@@ -69,7 +66,7 @@ class Driver(Operator):
     def at_goal(self) -> bool:
         """Whether the robot is at its goal; if no controller flies, whether it is at rest."""
         if not self.flies:
-            return self.state in RESTING
+            return self.state in MOTORS_OFF
         steering = self.steering
         return steering is not None and steering.arrived and self.odom is not None and bool(
             np.linalg.norm(self.odom.position - steering.position) < NEAR) and \
@@ -107,8 +104,6 @@ class Driver(Operator):
             names, now = list(registry.STANDING_BY), self.state.partition(':')[2]
             other = names[(names.index(now) + 1) % len(names)] if now in names else names[0]
             wanted = values[0] if values else other
-            wanted = values[0] if values else other
-            wanted = values[0] if values else other
             accepted, answer = self.set('supervisor_node', 'controller', wanted)
             return f'controller {wanted}' + ('' if accepted else f': {answer}')
         if name == 'where':
@@ -139,42 +134,34 @@ class Driver(Operator):
 
 
 def run_drive(source: str, *, parameters: Path | None = None, robot: Path | None = None,
-              domain_id: int | None = None, console: Console | None = None) -> int:
+              domain_id: int | None = None) -> None:
     """
     Drive until the user quits; arguments as of `beetle_omni drive`.
 
-    Returns:
-        Exit status: 0 ended by the user, 1 no supervisor or estimate found.
-
     Raises:
         ParameterError: unusable input.
+        RunError: no supervisor or estimate found.
 
     """
-    if source not in SOURCES:
-        raise ParameterError(f"source '{source}': expected {' or '.join(SOURCES)}")
     p = DriveParameters.load(parameters)
     robot_parameters = RobotParameters.load(robot)
     if source == 'keyboard' and not sys.stdin.isatty():
         raise ParameterError('keyboard: standard input is no terminal; expected one, or the '
                              "source 'terminal', which reads lines")
-    console = console or Console()
-    domain = int(os.environ.get('ROS_DOMAIN_ID') or 0) if domain_id is None else domain_id
     with ExitStack() as stack:
         stack.enter_context(sigterm_as_interrupt())
-        driver = Driver(domain, p, robot_parameters)
+        driver = Driver(domain_id, p, robot_parameters)
         stack.callback(driver.close)
 
         def say(text):
             if text:
-                console.print(text, markup=False, emoji=False, highlight=False)
+                print(text, flush=True)
 
         if not driver.wait(lambda: driver.answers and driver.state and driver.odom is not None,
                            SUPERVISOR_TIMEOUT):
             missing = 'odom' if driver.answers and driver.state else 'supervisor_node'
-            print(f'beetle_omni drive: error: {missing}: not seen in ROS domain {domain}; '
-                  'expected a running graph (bringup.launch.py, or beetle_omni fly)',
-                  file=sys.stderr)
-            return FAILED
+            raise RunError(f'{missing}: not seen in ROS domain {driver.domain}; expected a '
+                           'running graph (bringup.launch.py, or beetle_omni fly)')
         say(driver.where())
         before = driver.time()
         try:
@@ -187,7 +174,6 @@ def run_drive(source: str, *, parameters: Path | None = None, robot: Path | None
                 driver.spin(PERIOD)
         finally:    # also at Ctrl-C
             say('left; the robot holds its last target')
-    return OK
 
 
 # Each source is a generator of the actions since its last step; it ends when the user leaves.

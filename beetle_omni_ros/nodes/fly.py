@@ -11,6 +11,7 @@ from rich.console import Console
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.control import registry
+from beetle_omni_ros.control.base import MOTORS_OFF
 from beetle_omni_ros.nodes import runner
 from beetle_omni_ros.nodes.graph import (
     BRIDGES,
@@ -20,29 +21,21 @@ from beetle_omni_ros.nodes.graph import (
     reserved_domain,
 )
 from beetle_omni_ros.nodes.node import ERROR
-from beetle_omni_ros.nodes.operator import Operator
+from beetle_omni_ros.nodes.operator import Operator, TAKEOFF_TIMEOUT
 from beetle_omni_ros.robot.parameters import find_robot, RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError, RunError
 from beetle_omni_ros.runs import table
 from beetle_omni_ros.runs.bag import read_bag
 from beetle_omni_ros.runs.bag_writer import add_meta, check_new
-from beetle_omni_ros.runs.files import check_writable, write_json
+from beetle_omni_ros.runs.files import write_json
 from beetle_omni_ros.runs.metrics import failed, metrics
 from beetle_omni_ros.runs.tasks import make_task, Task
 from beetle_omni_ros.sim import faults as listed
 
-INTERRUPTED = 130
-ACTUATORS, CLOCKS = ('emulated', 'direct'), ('system', 'simulated')
 READY_TIMEOUT = 300.0   # s; the first start compiles the controller
 BRIDGES_TIMEOUT = 20.0  # s; the simulator makes their devices at its start
-ARM_TIMEOUT = 10.0      # s
-TAKEOFF_TIMEOUT = 30.0  # s
-TAKEOFF_ATTEMPTS = 3
-SETTLE_TIME = 1.0       # s before arming, in which start-up work ends
 LANDING_TIMEOUT = 30.0  # s
 SPARE_TIME = 10.0       # s beyond the task's duration before a flight counts as stuck
-CHECK_PERIOD = 0.1      # s between checks of processes and progress
-ON_GROUND = ('disarmed', 'emergency_stop')
 
 # s lost by the simulator above which a failure is attributed to the slow computer: the actuators
 # stop after so long without a command.
@@ -52,10 +45,9 @@ PACING = 'sim_node: pacing'
 
 def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             bag: Path | None = None, seed: int = 0, conditions: str = 'nominal',
-            actuators: str | None = None,
-            clock: str = 'system', robot: Path | None = None, plant: Path | None = None,
-            nmpc: Path | None = None, policy: Path | None = None,
-            allow_other_robot: bool = False, standby: bool = True,
+            actuators: str | None = None, clock: str = 'system',
+            robot: Path | None = None, plant: Path | None = None, nmpc: Path | None = None,
+            policy: Path | None = None, allow_other_robot: bool = False, standby: bool = True,
             faults: Path | None = None, json_path: Path | None = None,
             domain_id: int | None = None, view: bool = False,
             console: Console | None = None) -> int:
@@ -65,68 +57,59 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
     Arguments are the options of `beetle_omni fly`; without ``bag`` the bag is deleted.
 
     Returns:
-        Exit status: 0 flown to the end, 1 not, 2 unusable input, 130 interrupted.
+        Exit status: 0 flown to the end, 1 not.
+
+    Raises:
+        ParameterError: unusable input.
 
     """
     console = console or table.Terminal()
-    try:
-        with ExitStack() as stack:
-            stack.enter_context(runner.sigterm_as_interrupt())
-            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix='beetle_omni_')))
-            bag = Path(bag).absolute() if bag else folder / 'bag'
-            check_new(bag)
-            check_writable(json_path)
-            flown_task = make_task(task, seed, registry.find(controller).reach(
-                RobotParameters.load(robot)))
-            RobotParameters.load(plant or robot)
-            injected = listed.load_faults(faults) if faults else []
-            actuators = _actuators(injected, actuators, clock)
-            nodes, left_out = plan(
-                controller, nmpc=_absolute(nmpc), policy=str(policy or ''),
-                standby=standby, allow_other_robot=allow_other_robot,
-                robot_file=_absolute(robot and find_robot(robot)),
-                plant_file=_absolute(plant and find_robot(plant)),
-                conditions=conditions, seed=int(seed),
-                task=_absolute(task) if Path(task).is_file() else str(task), bag=str(bag),
-                ports=str(folder), clock=clock,
-                actuators='bridges' if actuators == 'emulated' else 'direct')
-            for name, reason in left_out.items():
-                _print(console, f'{name} does not stand by: {reason}')
-            controller = registry.find(controller).name
-            number = stack.enter_context(reserved_domain()) if domain_id is None else domain_id
-            if view:
-                stack.enter_context(viewer_process(number, console))
-            meta = {'task': task, 'conditions': conditions, 'seed': seed,
-                    'robot': str(robot) if robot else 'params/robot.yaml',
-                    'plant': str(plant) if plant else None, 'version': __version__,
-                    'controller': controller, 'clock': clock, 'actuators': actuators}
-            if injected:
-                meta['faults'] = [str(fault) for fault in injected]
-            graph = Graph(nodes, folder, number)
-            try:
-                status = _fly(graph, controller, flown_task, console,
-                              '; '.join(map(str, injected)))
-            except KeyboardInterrupt:
-                if (bag / 'metadata.yaml').exists():
-                    add_meta(bag, {**meta, 'interrupted': True})
-                raise
-            if not bag.exists():
-                return status or runner.FAILED
-            return max(status, _report(bag, controller, flown_task, meta, json_path, console))
-    except (ParameterError, OSError) as error:
-        _complain(error)
-        return runner.UNUSABLE
-    except KeyboardInterrupt:
-        print('beetle_omni fly: interrupted; everything is stopped', file=sys.stderr)
-        return INTERRUPTED
+    with ExitStack() as stack:
+        stack.enter_context(runner.sigterm_as_interrupt())
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix='beetle_omni_')))
+        bag = Path(bag).absolute() if bag else folder / 'bag'
+        check_new(bag)
+        flown_task = make_task(task, seed, registry.find(controller).reach(
+            RobotParameters.load(robot)))
+        RobotParameters.load(plant or robot)
+        injected = listed.load_faults(faults) if faults else []
+        nodes, left_out = plan(
+            controller, nmpc=_absolute(nmpc), policy=str(policy or ''),
+            standby=standby, allow_other_robot=allow_other_robot,
+            robot_file=_absolute(robot and find_robot(robot)),
+            plant_file=_absolute(plant and find_robot(plant)),
+            conditions=conditions, seed=int(seed),
+            task=_absolute(task) if Path(task).is_file() else str(task), bag=str(bag),
+            ports=str(folder), clock=clock, actuators=_checked(injected, actuators))
+        for name, reason in left_out.items():
+            _print(console, f'{name} does not stand by: {reason}')
+        controller = registry.find(controller).name
+        number = stack.enter_context(reserved_domain()) if domain_id is None else domain_id
+        if view:
+            stack.enter_context(viewer_process(number, console))
+        meta = {'task': task, 'conditions': conditions, 'seed': seed,
+                'robot': str(robot) if robot else 'params/robot.yaml',
+                'plant': str(plant) if plant else None, 'version': __version__,
+                'controller': controller, 'clock': clock,
+                'actuators': nodes['sim_node'].get('actuators', 'direct')}
+        if injected:
+            meta['faults'] = [str(fault) for fault in injected]
+        graph = Graph(nodes, folder, number)
+        try:
+            status = _fly(graph, controller, flown_task, console,
+                          '; '.join(map(str, injected)))
+        except KeyboardInterrupt:
+            _complain('interrupted; everything is stopped')
+            if (bag / 'metadata.yaml').exists():
+                add_meta(bag, {**meta, 'interrupted': True})
+            raise
+        if not bag.exists():
+            return status or runner.FAILED
+        return max(status, _report(bag, controller, flown_task, meta, json_path, console))
 
 
-def _actuators(faults, actuators, clock):
-    """Choose the actuators if the user left them open: devices need real time and no faults."""
-    for key, value, known in (('actuators', actuators, (None, *ACTUATORS)),
-                              ('clock', clock, CLOCKS)):
-        if value not in known:
-            raise ParameterError(f"{key} '{value}': expected {' or '.join(filter(None, known))}")
+def _checked(faults, actuators):
+    """Refuse faults that a flight cannot have; those of devices need direct actuators."""
     for fault in faults:
         if fault.is_process:
             raise ParameterError(f"--faults: '{fault.kind}' affects a process; expected a fault "
@@ -136,7 +119,7 @@ def _actuators(faults, actuators, clock):
                 raise ParameterError(f"--faults: '{fault.kind}' affects a device; expected "
                                      '--actuators direct')
             actuators = 'direct'
-    return actuators or ('direct' if clock == 'simulated' else 'emulated')
+    return actuators
 
 
 def _absolute(path):
@@ -194,8 +177,8 @@ class Flight(Operator):
 
     def __init__(self, graph: Graph, controller: str, task: Task, show: Callable[[str], None]):
         super().__init__(graph.domain, controller)
-        self._graph, self._task, self._show = graph, task, show
-        self._bridges = [node for node in graph.nodes if node in BRIDGES]
+        self._graph, self._task, self.show, self._lands = graph, task, show, False
+        self.required = [node for node in graph.nodes if node in BRIDGES]
 
     def fly(self, faults: str) -> None:
         """
@@ -205,13 +188,13 @@ class Flight(Operator):
             RunError: a failure; the text states whether the computer was too slow.
 
         """
-        self._await('starting (the first time compiles the controller)',
+        self.expect('starting (the first time compiles the controller)',
                     lambda: self.ready and self.progress, READY_TIMEOUT)
-        self._await('actuators and simulator', lambda: not self.waits_for(self._bridges)
+        self.expect('actuators and simulator', lambda: not self.waits_for(self.required)
                     and PACING in self.diagnostics, BRIDGES_TIMEOUT)
         lost = self._lost_time()
         try:
-            self._take_off()
+            self.take_off()
             self._fly_task(faults)
         except RunError as error:
             if (late := self._lost_time() - lost) < SLOW_TIME:
@@ -223,64 +206,42 @@ class Flight(Operator):
         """Return the time that the simulator skipped because it was late [s]."""
         return float(self.values(PACING).get('lost_s', 0.0))
 
-    def _take_off(self):
-        """Arm and take off; repeat if the supervisor disarms on the ground."""
-        answers = []
-        for _ in range(TAKEOFF_ATTEMPTS):
-            self._spin(SETTLE_TIME)
-            self._await('arming', lambda: answers.append(self.call('arm')) or answers[-1][0],
-                        ARM_TIMEOUT, lambda: f'; supervisor_node: {answers[-1][1]}')
-            self.states.clear()
-            # The state may name a fault: disarmed:joint1_astray.
-            self._await('taking off', lambda: self.state.startswith('flying') or any(
-                state.startswith('disarmed') for state in self.states), TAKEOFF_TIMEOUT)
-            if self.state.startswith('flying'):
-                return
-        raise RunError(f'no take-off in {TAKEOFF_ATTEMPTS} attempts; see the warnings below')
-
     def _fly_task(self, faults):
         name, start = self._task.name, self.time()
         if faults:      # as the task begins, so that their times count from there
-            self._await(name, lambda: self.progress.startswith('flying'), TAKEOFF_TIMEOUT)
+            self.expect(name, lambda: self.progress.startswith('flying'), TAKEOFF_TIMEOUT)
             accepted, answer = self.set('sim_node', 'faults', faults)
             if not accepted:
                 raise RunError(f'sim_node refuses the faults: {answer}')
 
         def is_done():
-            self._show(f'{name}: {self.progress}, {self.time() - start:.0f} of '
+            self.show(f'{name}: {self.progress}, {self.time() - start:.0f} of '
                        f'{self._task.duration:.0f} s ({self.state})')
-            if self.state in ON_GROUND:
+            if self.state in MOTORS_OFF:
                 raise RunError(f"the flight ended early, supervisor in '{self.state}'")
             return self.progress.startswith('done')
 
-        self._await(name, is_done, self._task.duration + SPARE_TIME,
+        self.expect(name, is_done, self._task.duration + SPARE_TIME,
                     lambda: f"; the task does not continue at '{self.progress}'")
 
     def land(self) -> None:
         """Land if the robot flies, and wait for the motors to stop."""
-        if self.state in ('', *ON_GROUND):
+        self._lands = True
+        if self.state in ('', *MOTORS_OFF):
             return
-        self._show('landing')
+        self.show('landing')
         accepted, answer = self.call('land')
         if not accepted:
             _complain(f'no landing: {answer}')
         else:
-            self.wait(lambda: self.state in ON_GROUND, LANDING_TIMEOUT)
+            self.wait(lambda: self.state in MOTORS_OFF, LANDING_TIMEOUT)
             self.spin(1.1)      # the last diagnostics
 
-    def _await(self, text, condition, timeout, why=lambda: ''):
-        self._show(text)
-        left = self.countdown(timeout)
-        while not condition():
-            self._spin()
-            if next(left, None) is None:
-                waits = self.waits_for(self._bridges)
-                raise RunError(f'{text}: nothing after {timeout:g} s, supervisor in '
-                               f"'{self.state}'{why()}" + (waits and f'; {waits}'))
-
-    def _spin(self, seconds=CHECK_PERIOD):
-        """Process messages; an ended process and a failing controller end the flight."""
-        self.spin(seconds)
+    def spin(self, seconds: float) -> None:
+        """Process messages; before landing, an ended process and a failing controller raise."""
+        super().spin(seconds)
+        if self._lands:
+            return
         if dead := self._graph.dead():
             raise RunError('; '.join(f'{name} died ({how})' for name, how in dead.items()))
         status = self.diagnostics.get(f'{self.controller}_node: controller')

@@ -1,12 +1,11 @@
 """
 Nodes of a ROS graph as data, and their processes on this computer; imports no ROS.
 
-:func:`plan` lists the nodes of `beetle_omni fly` and of the launch file, :class:`Graph` runs them,
-:func:`confine` limits their discovery, by default to this computer: a second robot or simulation
-in the same network would publish on the same topics.
+Discovery is limited to this computer by default: a second robot or simulation in the same network
+would publish on the same topics.
 """
 
-from collections.abc import Iterable, MutableMapping
+from collections.abc import MutableMapping
 from contextlib import contextmanager
 from copy import deepcopy
 from itertools import count
@@ -23,20 +22,19 @@ import yaml
 import beetle_omni_ros
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.schema import ParameterError, RunError
 
 BRIDGES = ('joint_bridge_node', 'rotor_bridge_node')
 READY = 'ready'         # begin of a bridge's state
+CONTROLLER = 'control_nodes:ControllerNode'
 # Executable -> module of this folder and class.
 NODES = {'sim_node': 'sim_node:SimNode', 'ekf_node': 'control_nodes:EkfNode',
-         **dict.fromkeys(('nmpc_node', 'rl_node', 'controller_node'),
-                         'control_nodes:ControllerNode'),
+         'nmpc_node': CONTROLLER, 'rl_node': CONTROLLER,
          'supervisor_node': 'control_nodes:SupervisorNode',
          'joint_bridge_node': 'bridge_nodes:JointBridgeNode',
          'rotor_bridge_node': 'bridge_nodes:RotorBridgeNode',
          'reference_node': 'side_nodes:ReferenceNode', 'recorder_node': 'side_nodes:RecorderNode',
          'viewer_node': 'side_nodes:ViewerNode'}
-GENERIC = 'controller_node'
 # Parameter autostart of a bridge -> lifecycle state to reach.
 AUTOSTART = {'none': '', 'configure': 'inactive', 'activate': 'active'}
 COMPOSED, BRIDGES_COMPOSED = 'composed', 'bridges'      # processes
@@ -75,7 +73,7 @@ def claim(name: str) -> socket.socket | None:
 
 @contextmanager
 def reserved_domain():
-    """Yield the number of a free ROS domain, reserved while the context lasts; else OSError."""
+    """Yield the number of a free ROS domain, reserved while the context lasts; else RunError."""
     # Each call begins at another number: participants that are shutting down may still send
     # discovery data to new ones in the same domain.
     first = next(_starts) % len(DOMAINS)
@@ -86,7 +84,7 @@ def reserved_domain():
                 if _ports_are_free(number):
                     yield number
                     return
-    raise OSError('no free ROS domain between 1 and 101')
+    raise RunError('no free ROS domain between 1 and 101')
 
 
 def _ports_are_free(domain):
@@ -103,31 +101,16 @@ def _ports_are_free(domain):
 
 def plan(controller: str = registry.DEFAULT, *, standby: bool = True, nmpc: str = '',
          policy: str = '', allow_other_robot: bool = False, simulated: bool = True,
-         actuators: str = 'bridges', ports: str = '', robot_file: str = '', plant_file: str = '',
+         actuators: str | None = None, ports: str = '', robot_file: str = '', plant_file: str = '',
          conditions: str = 'nominal', seed: int = 0, task: str = '', bag: str = '',
-         viewer: bool = False, clock: str = 'system'
-         ) -> tuple[Parameters, dict[str, str]]:
+         viewer: bool = False, clock: str = 'system') -> tuple[Parameters, dict[str, str]]:
     """
     List the nodes of a graph; a file '' is the shipped one.
 
-    Args:
-        controller: active controller: a name, or a reference to a class.
-        standby: whether the standby controllers run too, so that they can be selected in flight.
-        nmpc: file of the controller that has the option `--nmpc`.
-        policy: file of the controller that has the option `--policy`.
-        allow_other_robot: whether a policy trained for other robot parameters may fly.
-        simulated: whether sim_node provides sensors and actuators. Otherwise nodes started
-            elsewhere do; on the robot deploy/install.sh starts the bridges.
-        actuators: 'bridges' to emulated devices, or 'direct': from the topic to the simulator.
-        ports: folder of the names of the emulated devices' ports.
-        robot_file: robot file of estimator and controllers.
-        plant_file: robot file of the simulation; '': the same.
-        conditions: of the simulation.
-        seed: of the simulation and the task.
-        task: task of reference_node; '': targets from elsewhere.
-        bag: folder of the bag, '' for no recording.
-        viewer: whether viewer_node runs.
-        clock: 'system', or 'simulated': time on /clock that waits for nodes that are late.
+    The arguments are options of `beetle_omni fly` and arguments of the launch file. Without
+    ``simulated`` sensors and actuators are nodes started elsewhere; on the robot deploy/install.sh
+    starts the bridges. ``actuators`` are 'emulated' devices behind the bridges, with ports in the
+    folder ``ports``, or 'direct': from the topic to the simulator.
 
     Returns:
         Node name -> parameters; omitted standby controller -> reason.
@@ -136,7 +119,8 @@ def plan(controller: str = registry.DEFAULT, *, standby: bool = True, nmpc: str 
         ParameterError: the active controller is unusable, or the clock does not fit the actuators.
 
     """
-    emulated = simulated and actuators == 'bridges'
+    actuators = actuators or ('direct' if clock == 'simulated' else 'emulated')
+    emulated = simulated and actuators == 'emulated'
     if clock == 'simulated' and (emulated or not simulated):
         raise ParameterError("clock 'simulated': serial devices keep real time; expected the "
                              'simulator, with direct actuators')
@@ -233,40 +217,39 @@ def unfit(policy: str, robot_file: str | None, allow_other_robot: bool) -> str:
     return ''
 
 
-def arguments(nodes: Parameters, names: Iterable[str]) -> list[str]:
-    """Return the arguments of `composed`: executables, and references of other controllers."""
-    return [name if name in NODES else nodes[name]['controller'] for name in names]
-
-
-def processes(nodes: Parameters) -> dict[str, list[str]]:
-    """Return process -> its nodes; the bridges, which block on their ports, have their own."""
-    groups = {COMPOSED: [name for name in nodes if name not in BRIDGES],
-              BRIDGES_COMPOSED: [name for name in nodes if name in BRIDGES]}
-    return {name: names for name, names in groups.items() if names}
-
-
 # --- processes --------------------------------------------------------------------------------
+
+def commands(nodes: Parameters, folder: Path, groups: dict[str, list[str]] | None = None
+             ) -> dict[str, list[str]]:
+    """
+    Return process -> its command; ``folder`` receives the parameter file.
+
+    ``groups`` are process -> its nodes. By default the bridges, which block on their ports, have
+    their own.
+    """
+    groups = groups or {COMPOSED: [name for name in nodes if name not in BRIDGES],
+                        BRIDGES_COMPOSED: [name for name in nodes if name in BRIDGES]}
+    file = folder / 'parameters.yaml'
+    file.write_text(yaml.safe_dump({f'/**/{node}': {'ros__parameters': values}
+                                    for node, values in nodes.items()}))
+    return {process: [sys.executable, '-m', 'beetle_omni_ros.start', COMPOSED,
+                      # A controller without an executable is named by its reference.
+                      *(name if name in NODES else nodes[name]['controller'] for name in names),
+                      '--ros-args', '--params-file', str(file)]
+            for process, names in groups.items() if names}
+
 
 class Graph:
     """
-    Processes that run nodes.
+    Processes that run nodes; the other arguments are those of :func:`commands`.
 
-    ``folder`` receives the parameter file and the output of the processes. ``groups`` are process
-    -> its nodes, by default those of :func:`processes`.
+    ``folder`` also receives the output of the processes.
     """
 
     def __init__(self, nodes: Parameters, folder: Path, domain: int,
                  groups: dict[str, list[str]] | None = None):
         self.folder, self.domain, self.nodes = Path(folder), domain, list(nodes)
-        groups = groups or processes(nodes)
-        self._bridges = [name for name, group in groups.items() if set(group) <= set(BRIDGES)]
-        self._file = self.folder / 'parameters.yaml'
-        self._file.write_text(yaml.safe_dump(
-            {f'/**/{node}': {'ros__parameters': values} for node, values in nodes.items()
-             if values} or {'/**': {'ros__parameters': {}}}))
-        self._commands = {name: [COMPOSED, *arguments(nodes, group), '--ros-args',
-                                 '--params-file', str(self._file)]
-                          for name, group in groups.items()}
+        self._commands = commands(nodes, self.folder, groups)
         self.processes: dict[str, subprocess.Popen] = {}
 
     def start(self) -> None:
@@ -278,9 +261,9 @@ class Graph:
         """Start one process, or start it again."""
         with open(self.log(name), 'a') as log:
             self.processes[name] = subprocess.Popen(
-                [sys.executable, '-m', 'beetle_omni_ros.start', *self._commands[name]],
-                env=child_environment(self.domain), stdin=subprocess.DEVNULL, stdout=log,
-                stderr=log, start_new_session=True)     # Ctrl-C reaches this process only
+                self._commands[name], env=child_environment(self.domain),
+                stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+                start_new_session=True)     # Ctrl-C reaches this process only
 
     def log(self, name: str) -> Path:
         """Return the file with the output of a process."""
@@ -302,9 +285,8 @@ class Graph:
 
         Bridges stop first, because they switch off the actuators, which the simulator emulates.
         """
-        others = [name for name in self.processes if name not in self._bridges]
-        return self._end([name for name in self.processes if name in self._bridges]) \
-            + self._end(others)
+        bridges = {BRIDGES_COMPOSED, *BRIDGES} & set(self.processes)
+        return self._end(bridges) + self._end(set(self.processes) - bridges)
 
     def _end(self, names):
         """Send SIGINT every second: a process that still imports may lose the first one."""

@@ -1,24 +1,25 @@
 """Base class of the package's nodes: parameters, checked inputs, commands, diagnostics."""
 
+from bisect import bisect
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 import math
 import time
-from typing import Any
 
 import numpy as np
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
-from beetle_omni_ros.messages.topics import Qos, TARGETS, topic_of
+from beetle_omni_ros.messages.topics import Qos, topic_of
 from beetle_omni_ros.messages.values import Diagnostic, MessageError
 from beetle_omni_ros.nodes import parameters, wire
 from beetle_omni_ros.nodes.graph import claim
 
 OK, WARN, ERROR = range(3)      # of diagnostic_msgs/DiagnosticStatus
 PERIOD = 1.0            # s between two diagnostics
+SILENCE = 0.5           # s without a message after which an expected topic has ended
 FUTURE = 0.05           # s ahead of the clock above which a stamp is refused
 IDENTITY = 'supervisor/identity'
 TEXT_LIMIT = 40         # characters of a foreign frame_id in an error message
@@ -27,25 +28,24 @@ TEXT_LIMIT = 40         # characters of a foreign frame_id in an error message
 class Distribution:
     """Quantiles of durations in constant memory: a histogram with 2 % wide bins."""
 
-    LOW, RATIO, BINS = 1e-6, 1.02, 1000     # 1 us to 400 s
+    EDGES = tuple(1e-6 * 1.02 ** k for k in range(1000))    # [s], up to 400 s
 
     def __init__(self):
-        self.counts = np.zeros(self.BINS, dtype=np.int64)
+        self.counts = np.zeros(len(self.EDGES) + 1, dtype=np.int64)
         self.count, self.max = 0, 0.0
 
     def add(self, seconds: float) -> None:
         """Count one duration [s]."""
-        k = int(math.log(max(seconds, self.LOW) / self.LOW) / math.log(self.RATIO))
-        self.counts[min(k, self.BINS - 1)] += 1
+        self.counts[bisect(self.EDGES, seconds)] += 1
         self.count += 1
         self.max = max(self.max, seconds)
 
     def quantile(self, fraction: float) -> float:
-        """Return a quantile [s], accurate to 1 %; NaN if nothing was counted."""
+        """Return a quantile [s], up to 2 % too large; NaN if nothing was counted."""
         if not self.count:
             return float('nan')
         k = int(np.searchsorted(np.cumsum(self.counts), fraction * self.count))
-        return min(self.LOW * self.RATIO ** (k + 0.5), self.max)
+        return min((*self.EDGES, self.max)[k], self.max)
 
     def status(self, text: str, level: int = OK, **more: float) -> tuple[int, str, dict]:
         """Return median, 99th percentile, maximum [ms] and number as a diagnostic status."""
@@ -56,9 +56,9 @@ class Distribution:
 
 @dataclass
 class Input:
-    """Counts of one subscribed topic; silence of ``stale_after`` [s] is an error, None never."""
+    """Counts of one subscribed topic; if messages are ``expected``, their end is an error."""
 
-    stale_after: float | None
+    expected: bool
     received: int = 0
     reported: int = 0
     age: float = float('nan')
@@ -70,7 +70,7 @@ class Input:
     @property
     def is_missing(self) -> bool:
         """Whether a message is expected and none has come yet."""
-        return self.seen is None and self.stale_after is not None
+        return self.seen is None and self.expected
 
 
 class FlightNode(Node):
@@ -89,17 +89,12 @@ class FlightNode(Node):
 
     def __init__(self, name: str, base: type | None = None, file: str | None = None,
                  file_key: str | None = None, on_change: Callable | None = None,
-                 changeable: tuple[str, ...] | None = None, **more):
+                 changeable: tuple[str, ...] = (), **more):
         """
-        Claim the name, read the parameters, start diagnostics.
+        Claim the name (OSError if such a node runs), read the parameters, start diagnostics.
 
         The parameters are those of the class ``base``, ``file_key`` and ``more`` (name -> field).
         The arguments from ``file`` on are those of :func:`parameters.declare`.
-
-        Raises:
-            ParameterError: unusable parameters.
-            OSError: a node of this name runs already.
-
         """
         super().__init__(name)
         domain, name = self.context.get_domain_id(), self.get_fully_qualified_name()
@@ -117,7 +112,7 @@ class FlightNode(Node):
             on_change, changeable)
         self.inputs: dict[str, Input] = {}
         self._supervisor_identity = ''
-        self._diagnostics = self.publisher('diagnostics')
+        self._diagnostics = wire.Publisher(self, 'diagnostics')
         self._reports = [('inputs', self._input_status)]
         self._compute, self._deadline, self._misses = Distribution(), math.inf, 0
         self._reported_at = self.elapsed()
@@ -143,35 +138,20 @@ class FlightNode(Node):
         else:
             logger.info(text)
 
-    def publisher(self, topic: str) -> wire.Publisher:
-        """Make the publisher of a topic."""
-        return wire.Publisher(self, topic)
-
-    def follow(self, topic: str, handle: Callable[[Any], None]) -> None:
-        """Pass the values of a latched topic to ``handle``, without checks of age."""
-        wire.subscribe(self, topic, handle)
-
     def listen(self, topic: str, handle: Callable, *, qos: Qos | None = None,
-               max_age: float | None = None, stale_after: float | None = 0.5) -> None:
+               max_age: float | None = None, expected: bool = True) -> None:
         """
         Subscribe ``topic``; pass valid values to ``handle`` and count refused messages.
 
         Until a supervisor publishes its identity, every message of `command` is accepted. After
-        that, only those whose frame_id is the newest identity are accepted.
-
-        Args:
-            topic: relative name in the table of topics.
-            handle: called with each value, and for targets with the time of publication [s,
-                system time, or nan]; may raise MessageError to refuse it.
-            qos: quality of service; default: the table's, any for targets.
-            max_age: limit of a stamp's age [s], also refuses future stamps; None: no check.
-            stale_after: silence after a message that is an error [s]; None: never.
-
+        that, only those whose frame_id is the newest identity are accepted. For targets ``handle``
+        also gets the time of publication [s, system time, or nan]; it may raise MessageError.
+        ``max_age`` is the limit of a stamp's age [s], which also refuses future stamps.
         """
-        entry, counts = topic_of(topic), Input(stale_after)
+        entry, counts = topic_of(topic), Input(expected)
         self.inputs[topic] = counts
         if topic == 'command':
-            self.follow(IDENTITY, partial(setattr, self, '_supervisor_identity'))
+            wire.subscribe(self, IDENTITY, partial(setattr, self, '_supervisor_identity'))
 
         def callback(data, *publication):
             try:
@@ -189,10 +169,7 @@ class FlightNode(Node):
             counts.received += 1
             counts.age, counts.seen = age, self.elapsed()
 
-        if topic in TARGETS:
-            wire.subscribe_any(self, topic, callback)
-        else:
-            wire.subscribe_raw(self, topic, callback, qos)
+        wire.subscribe_raw(self, topic, callback, qos)
 
     def _check_source(self, source):
         identity = self._supervisor_identity
@@ -247,8 +224,7 @@ class FlightNode(Node):
         """Close, leave the graph, release the name."""
         self.close()
         super().destroy_node()
-        if self._claim:
-            self._claim.close()
+        self._claim.close()
 
     def _publish_diagnostics(self):
         found = []
@@ -269,8 +245,7 @@ class FlightNode(Node):
                        f'{topic} age_ms': 1e3 * entry.age, f'{topic} received': entry.received,
                        f'{topic} rejected': count,
                        **{f'{topic} rejected: {why}': n for why, n in entry.rejected.items()}}
-            if entry.seen is not None and entry.stale_after is not None \
-                    and now - entry.seen > entry.stale_after:
+            if entry.expected and entry.seen is not None and now - entry.seen > SILENCE:
                 level = ERROR
                 faults.append(f'{topic} silent for {now - entry.seen:.1f} s')
             if count > entry.rejected_reported:

@@ -11,6 +11,7 @@ import numpy as np
 from rcl_interfaces.srv import SetParameters
 import rclpy
 from rclpy.exceptions import NameValidationException
+from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
@@ -28,11 +29,15 @@ from beetle_omni_ros.messages.topics import (
 from beetle_omni_ros.messages.values import Diagnostic, MessageError
 from beetle_omni_ros.nodes import runner, wire
 from beetle_omni_ros.nodes.graph import BRIDGES, confine, READY
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.schema import ParameterError, RunError
 
 # Simulated time may be slow, or stop if the simulator dies: waiting ends after this much steady
 # time for each second of the timeout.
 SLOWEST = 20.0
+ARM_TIMEOUT = 10.0      # s
+TAKEOFF_TIMEOUT = 30.0  # s
+TAKEOFF_ATTEMPTS = 3
+SETTLE_TIME = 1.0       # s before arming, in which start-up work ends
 SERVICES = ('arm', 'disarm', 'land', 'emergency_stop')
 SUPERVISOR = 'supervisor_node'
 # Topic -> attribute of its values that changes with every sample of a working sensor.
@@ -66,7 +71,8 @@ class Client:
             context.try_shutdown()
             raise ParameterError(f"--namespace '{namespace}': "
                                  f'{str(error).splitlines()[0]}') from None
-        self._executor = runner.make_executor(context)
+        self.domain: int = context.get_domain_id()
+        self._executor = EventsExecutor(context=context)
         self._executor.add_node(self._node)
 
     def spin_steadily(self, seconds: float) -> None:
@@ -91,17 +97,23 @@ class Operator(Client):
         bridges: bridge node -> its newest state.
         controller: name of the watched controller.
         diagnostics: status name -> newest :class:`Diagnostic`.
+        required: bridges whose states belong to the text of an error.
+        show: called with what the operator waits for.
 
     """
 
-    def __init__(self, domain: int, controller: str = registry.DEFAULT):
+    required: Sequence[str] = ()
+    show: Callable[[str], None] = staticmethod(lambda text: None)
+
+    def __init__(self, domain: int | None, controller: str = registry.DEFAULT):
         super().__init__('operator', domain)
         self.controller = controller
         self.state = self.progress = ''
         self.states: list[str] = []
         self.bridges: dict[str, str] = {}
         self.diagnostics: dict[str, Diagnostic] = {}
-        self._simulated: float | None = None
+        self._offset: float | None = None   # s from /clock to time(), which goes on steadily
+        self._clock = 0.0
         node = self._node
         node.create_subscription(Clock, '/clock', self._on_clock, wire.profile(SENSOR))
         wire.subscribe(node, 'supervisor/state', self._on_state)
@@ -115,7 +127,9 @@ class Operator(Client):
                          for name in SERVICES}
 
     def _on_clock(self, message):
-        self._simulated = seconds_of(message.clock)
+        self._clock = seconds_of(message.clock)
+        if self._offset is None:
+            self._offset = time.monotonic() - self._clock
 
     def _on_state(self, text):
         state = text.partition(':')[0]
@@ -123,8 +137,8 @@ class Operator(Client):
         self.states.append(text)
 
     def time(self) -> float:
-        """Return simulated time if it is used, else steady time [s]."""
-        return time.monotonic() if self._simulated is None else self._simulated
+        """Return a time that passes like that of the flight, simulated or steady [s]."""
+        return time.monotonic() if self._offset is None else self._clock + self._offset
 
     @property
     def answers(self) -> bool:
@@ -149,24 +163,41 @@ class Operator(Client):
 
     def countdown(self, seconds: float) -> Iterator[float]:
         """Yield the remaining time [s], steady or simulated, until it is over."""
-        simulated, start = self._simulated is not None, self.time()
-        steady = time.monotonic()
-        while True:
-            if simulated != (self._simulated is not None):      # the clock has just appeared
-                simulated, start, steady = True, self.time(), time.monotonic()
-            left = start + seconds - self.time()
-            if left <= 0 or time.monotonic() - steady > SLOWEST * seconds + 1.0:
-                return
+        start, steady = self.time(), time.monotonic()
+        while (left := start + seconds - self.time()) > 0 \
+                and time.monotonic() - steady < SLOWEST * seconds + 1.0:
             yield left
 
     def wait(self, condition, timeout: float) -> bool:
         """Process messages until ``condition()`` holds; False after ``timeout`` [s]."""
-        left = self.countdown(timeout)
-        while not condition():
-            if next(left, None) is None:
-                return False
+        for _ in self.countdown(timeout):
+            if condition():
+                return True
             self.spin(0.05)
-        return True
+        return bool(condition())
+
+    def expect(self, text: str, condition, timeout: float, why=lambda: '') -> None:
+        """Wait as :meth:`wait`; a timeout raises RunError with ``text`` and ``why()``."""
+        self.show(text)
+        if not self.wait(condition, timeout):
+            waits = self.waits_for(self.required)
+            raise RunError(f'{text}: nothing after {timeout:g} s, supervisor in '
+                           f"'{self.state}'{why()}" + (waits and f'; {waits}'))
+
+    def take_off(self) -> None:
+        """Arm and take off, or raise RunError; repeat if the supervisor disarms on the ground."""
+        answers = []
+        for _ in range(TAKEOFF_ATTEMPTS):
+            self.spin(SETTLE_TIME)
+            self.expect('arming', lambda: answers.append(self.call('arm')) or answers[-1][0],
+                        ARM_TIMEOUT, lambda: f'; supervisor_node: {answers[-1][1]}')
+            self.states.clear()
+            # The state may name a fault: disarmed:joint1_astray.
+            self.expect('taking off', lambda: self.state.startswith('flying') or any(
+                state.startswith('disarmed') for state in self.states), TAKEOFF_TIMEOUT)
+            if self.state.startswith('flying'):
+                return
+        raise RunError(f'no take-off in {TAKEOFF_ATTEMPTS} attempts; see the warnings below')
 
     def call(self, name: str, timeout: float = 2.0) -> tuple[bool, str]:
         """Call a service of the supervisor; return (accepted, answer)."""
@@ -175,15 +206,21 @@ class Operator(Client):
             return False, f'{SUPERVISOR} does not answer to {name}'
         return future.result().success, future.result().message
 
+    def request(self, service: str, kind: type, request: Any, timeout: float) -> Any:
+        """Call any service; return its response, None without an answer."""
+        client = self._node.create_client(kind, service)
+        if not self.wait(client.service_is_ready, timeout):
+            return None
+        future = client.call_async(request)
+        return future.result() if self.wait(future.done, timeout) else None
+
     def set(self, node: str, name: str, value, timeout: float = 5.0) -> tuple[bool, str]:
         """Set a parameter of a node; return (accepted, answer)."""
-        client = self._node.create_client(SetParameters, f'{node}/set_parameters')
-        if not self.wait(client.service_is_ready, timeout):
-            return False, f'{node} is not there'
-        future = client.call_async(wire.parameter_request(name, value))
-        if not self.wait(future.done, timeout):
+        answer = self.request(f'{node}/set_parameters', SetParameters,
+                              wire.parameter_request(name, value), timeout)
+        if answer is None:
             return False, f'{node} does not answer'
-        return future.result().results[0].successful, future.result().results[0].reason
+        return answer.results[0].successful, answer.results[0].reason
 
     def values(self, status: str) -> dict[str, str]:
         """Return the values of a diagnostic status, empty before the first message."""
@@ -198,7 +235,7 @@ def listen(seconds: float, namespace: str = '') -> findings.ObservedGraph:
     client = Client('check', namespace=namespace)
     node = client._node
     try:
-        graph = findings.ObservedGraph(node.context.get_domain_id(), seconds,
+        graph = findings.ObservedGraph(client.domain, seconds,
                                        {topic: findings.Stream() for topic in SENSORS})
         for topic in SENSORS:
             wire.subscribe_raw(node, topic, partial(
@@ -240,17 +277,15 @@ class LiveGraph(Client):
 
     def __init__(self, namespace: str = '', domain: int | None = None):
         super().__init__('view', domain, namespace)
-        self._write: Callable[[str, Any], None] = lambda topic, value: None
+        self._newest = None
         for topic in (*SHOWN, *EVENTS, *TARGETS):
-            wire.subscribe(self._node, topic, partial(self._take, topic),
-                           NEWEST if topic in SHOWN else None)
-
-    def _take(self, topic, value):
-        self._write(topic, value)
+            wire.subscribe(
+                self._node, topic, lambda value, topic=topic: self._newest.write(topic, value),
+                NEWEST if topic in SHOWN else None)
 
     def take(self, newest) -> None:
         """Write the messages since the last call to a view.live.Newest."""
-        self._write = newest.write
+        self._newest = newest
         self.spin_steadily(SPIN)
 
 

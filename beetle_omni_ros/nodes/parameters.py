@@ -7,8 +7,6 @@ of the parameter files refuse both at the start of the node, in one line that na
 
 from collections.abc import Callable
 from dataclasses import make_dataclass, MISSING
-import types
-from typing import get_args, get_origin, Union
 
 import numpy as np
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
@@ -26,7 +24,7 @@ ROS_OWN_PREFIX = 'qos_overrides.'
 
 def file_parameter(what: str = 'robot file'):
     """Make the parameter of a node that names a file."""
-    return schema.parameter('', doc=f'{what}; empty: the shipped one', read_only=True)
+    return schema.parameter('', doc=f'{what}; empty: the shipped one')
 
 
 def extended(name: str, base: type | None, fields: dict) -> type:
@@ -40,24 +38,14 @@ def extended(name: str, base: type | None, fields: dict) -> type:
 
 
 def declare(node: Node, cls: type, file: str | None = None, file_key: str | None = None,
-            on_change: Callable | None = None, changeable: tuple[str, ...] | None = None):
+            on_change: Callable | None = None, changeable: tuple[str, ...] = ()):
     """
-    Declare every leaf of the parameter dataclass ``cls`` on ``node``.
+    Declare every leaf of the parameter dataclass ``cls``; return its validated instance.
 
     Overrides of the command line (``--params-file``, ``-p``) precede the values of the file, and
-    these precede the defaults of the class.
-
-    Args:
-        node: node with automatically_declare_parameters_from_overrides off.
-        cls: dataclass of :func:`schema.parameter` and :func:`schema.group` fields.
-        file: shipped parameter file, such as ``params/ekf.yaml``.
-        file_key: parameter that names another file.
-        on_change: called with the new instance when parameters are set in flight; may raise
-            ParameterError to refuse. Without it every parameter is read-only.
-        changeable: names that may be set in flight; None: all that are not read-only.
-
-    Returns:
-        The validated instance of ``cls``.
+    these precede the defaults of the class. ``file`` is the shipped one, the parameter
+    ``file_key`` names another. Names that begin with one of ``changeable`` may be set in flight;
+    ``on_change`` gets the new instance, and may raise ParameterError to refuse it.
 
     Raises:
         ParameterError: unusable value; names file, key and expectation.
@@ -73,10 +61,8 @@ def declare(node: Node, cls: type, file: str | None = None, file_key: str | None
     for name, entry, hint, value in schema.flatten(instance):
         if isinstance(value, (dict, tuple)) and hint != NAMES:
             continue    # structured values live in files only
-        fixed = on_change is None or changeable is not None and name not in changeable
-        node.declare_parameter(name, _plain(value, hint),
-                               _descriptor(entry, hint, fixed),
-                               ignore_override=True)
+        node.declare_parameter(name, _plain(value), _descriptor(
+            entry, hint, not name.startswith(changeable)), ignore_override=True)
     if on_change:
         _validate_changes(node, cls, instance, on_change)
     return instance
@@ -90,20 +76,12 @@ def _put(mapping, name, value):
     mapping[leaf] = value
 
 
-def _plain(value, hint):
+def _plain(value):
     if isinstance(value, np.ndarray):
-        return [float(v) for v in value.ravel()]
-    if hint == NAMES:
-        return list(value)
-    if value is None:       # an optional value that is not set
-        return '' if _kind(hint) is str else float('nan')
-    return _kind(hint)(value) if _kind(hint) in (int, float, bool, str) else value
-
-
-def _kind(hint):
-    if get_origin(hint) in (Union, types.UnionType):
-        return next(a for a in get_args(hint) if a is not type(None))
-    return hint
+        return value.ravel().astype(float).tolist()
+    if value is None:       # an optional number that is not set
+        return float('nan')
+    return list(value) if isinstance(value, tuple) else value
 
 
 def _descriptor(entry, hint, fixed) -> ParameterDescriptor:
@@ -113,7 +91,7 @@ def _descriptor(entry, hint, fixed) -> ParameterDescriptor:
         description=meta.get('doc', '') + unit,
         # ROS gives an empty list another type, and [2] is a list of integers.
         dynamic_typing=hint is np.ndarray and meta.get('shape') is None or hint == NAMES,
-        read_only=fixed or bool(meta.get('read_only')),
+        read_only=fixed,
         additional_constraints=f"one of {', '.join(meta['choices'])}" if meta.get('choices')
         else ' to '.join(f'{meta[end]:g}' for end in ('low', 'high')
                          if meta.get(end) is not None))

@@ -1,11 +1,6 @@
-"""
-Runs nodes in one process: start, spin, stop; errors are one line and an exit status.
+"""Runs nodes in one process: start, spin, stop; errors are one line and an exit status."""
 
-``python -m beetle_omni_ros.start composed NODE...`` runs several nodes. NODE is an executable, a
-registered controller name, or the reference of a controller's class.
-"""
-
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import contextmanager
 import ctypes
 from functools import partial
@@ -19,12 +14,13 @@ import threading
 
 import rclpy
 from rclpy.executors import ExternalShutdownException
+from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
 
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.nodes.graph import COMPOSED, confine, GENERIC, NODES
+from beetle_omni_ros.nodes.graph import COMPOSED, confine, CONTROLLER, NODES
 from beetle_omni_ros.robot.schema import load_yaml, ParameterError
 
 OK, FAILED, UNUSABLE = 0, 1, 2
@@ -37,40 +33,19 @@ PR_SET_PDEATHSIG = 1    # of linux/prctl.h
 ENDING = (signal.SIGINT, signal.SIGTERM)
 
 
-def main(name: str) -> None:
-    """Entry point of an executable: of one node, or of `composed`."""
-    usage = f'usage: {name} [--ros-args -p KEY:=VALUE --params-file FILE ...]'
-    if name == COMPOSED:
-        usage = (f"usage: {name} NODE... [--ros-args -p NODE:KEY:=VALUE ...]; NODE: "
-                 f"{', '.join(NODES)}, a controller's name, {registry.CLASS}")
-    try:
-        rest = _own_arguments()
-        if rest and rest[0] in ('-h', '--help'):
-            print(usage)
-            sys.exit(OK)
-        names, unknown = (rest, []) if name == COMPOSED else ([name], rest)
-        unknown += [each for each in names if each not in NODES and ':' not in each
-                    and each not in registry.names()]
-        if unknown or not names or len(set(names)) < len(names):
-            raise ParameterError((f"unknown '{unknown[0]}'" if unknown else
-                                  'each node once, at least one') + f'; {usage}')
-    except ParameterError as error:
-        sys.exit(_fail(name, error, UNUSABLE))
-    sys.exit(run(names, [each for each in sys.argv if each not in names], name))
-
-
 def maker(name: str) -> Callable:
     """Import what makes the node of an executable, or of a controller by name or reference."""
-    module, _, kind = NODES.get(name, NODES[GENERIC]).partition(':')
+    place = NODES.get(name, CONTROLLER)
+    module, _, kind = place.partition(':')
     made = getattr(import_module(f'{__package__}.{module}'), kind)
-    if name == GENERIC or NODES.get(name) not in (None, NODES[GENERIC]):
-        return made
-    return partial(made, registry.find(name.removesuffix('_node')))
+    if place == CONTROLLER:
+        return partial(made, registry.find(name.removesuffix('_node')))
+    return made
 
 
-def run(names: Sequence[str], argv: Sequence[str], name: str) -> int:
+def main(name: str) -> int:
     """
-    Run nodes on one events executor until a signal or a fatal error.
+    Run an executable, one node or `composed`, until a signal or a fatal error.
 
     Returns:
         Exit status: 0 stopped by a signal, 1 failed, 2 unusable parameters.
@@ -81,9 +56,11 @@ def run(names: Sequence[str], argv: Sequence[str], name: str) -> int:
     end_with_parent()
     try:
         confine()
+        names = _names(name)
         # rclpy's handlers would end the context while a callback still publishes.
-        rclpy.init(args=list(argv), signal_handler_options=SignalHandlerOptions.NO)
-        executor = make_executor()
+        rclpy.init(args=[each for each in sys.argv if each not in names],
+                   signal_handler_options=SignalHandlerOptions.NO)
+        executor = EventsExecutor()
         for name in names:
             node = maker(name)()
             nodes.append(node)
@@ -118,27 +95,29 @@ def run(names: Sequence[str], argv: Sequence[str], name: str) -> int:
     return status
 
 
-def _own_arguments():
-    """Return the arguments that are not for ROS."""
+def _names(name):
+    """Return the names of the nodes to run; the option --help ends the process."""
+    usage = f'usage: {name} [--ros-args -p KEY:=VALUE --params-file FILE ...]'
+    if name == COMPOSED:
+        usage = (f"usage: {name} NODE... [--ros-args -p NODE:KEY:=VALUE ...]; NODE: "
+                 f"{', '.join(NODES)}, a controller's name, {registry.CLASS}")
     for flag, path in zip(sys.argv, sys.argv[1:]):
         if flag == '--params-file':     # by file and line; ROS would print a traceback
             load_yaml(path)
     try:
-        return remove_ros_args(list(sys.argv))[1:]
+        given = remove_ros_args(list(sys.argv))[1:]
     except Exception as error:      # rclpy does not export the class
         if 'ROSArgs' not in type(error).__name__:
             raise
         raise ParameterError(str(error)) from None
-
-
-def make_executor(context=None):
-    """Make an events executor, or a single-threaded one if the distribution lacks it."""
-    try:
-        from rclpy.experimental.events_executor import EventsExecutor
-    except ImportError:
-        from rclpy.executors import SingleThreadedExecutor
-        return SingleThreadedExecutor(context=context)
-    return EventsExecutor(context=context)
+    if given[:1] in (['-h'], ['--help']):
+        print(usage)
+        sys.exit(OK)
+    unknown = [each for each in given if name != COMPOSED
+               or ':' not in each and each not in (*NODES, *registry.names())]
+    if unknown or name == COMPOSED and not given:
+        raise ParameterError(f"unknown '{unknown[0]}'; {usage}" if unknown else usage)
+    return given or [name]
 
 
 def _stop_on_signal() -> Future:
@@ -198,9 +177,6 @@ def sigterm_as_interrupt():
             signal.signal(each, signal.SIG_IGN)
         raise KeyboardInterrupt
 
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
     before = {number: signal.signal(number, interrupt) for number in ENDING}
     try:
         yield

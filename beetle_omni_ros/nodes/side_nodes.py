@@ -3,29 +3,23 @@
 from functools import partial
 import sys
 
-from geometry_msgs.msg import TransformStamped
 import numpy as np
 from rcl_interfaces.srv import SetParameters
-from rclpy.event_handler import SubscriptionEventCallbacks
 
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
-from beetle_omni_ros.messages.conversions import BODY, set_parts, set_time, WORLD
+from beetle_omni_ros.control.base import MOTORS_OFF, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.messages.topics import (
     ALL,
-    EVENT,
     LATCHED_LOG,
     LOG,
     SENSOR,
-    TARGETS,
     topics_with,
 )
 from beetle_omni_ros.messages.values import Wrench
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.node import ERROR, FlightNode, OK, WARN
 from beetle_omni_ros.robot.schema import parameter, ParameterError
-from beetle_omni_ros.runs.bag import BagError
-from beetle_omni_ros.runs.bag_writer import BagWriter
+from beetle_omni_ros.runs.bag_writer import BagWriter, FRAMES, FrameWriter
 from beetle_omni_ros.runs.tasks import make_task, TaskPlayer, WITH_WRENCHES
 
 PERIOD = 0.02           # s between updates of the task
@@ -35,8 +29,6 @@ IMPULSE_PERIOD = 0.005  # s, the same for tasks with impulses of 50 ms
 WINDOW, WINDOW_PERIOD, WINDOW_SAMPLE = 3.0, 1.5, 0.05   # s
 WRITE_PERIOD = 0.02     # s between writes of the received messages, so that no callback waits
 FLUSH_WRITES = 20       # writes between flushes; a crash loses only messages after the last one
-HELD = 1000             # messages at most that wait for the first simulated time
-FRAME_PERIOD = 0.02     # s between two transforms
 
 
 # --- targets ------------------------------------------------------------------------------------
@@ -52,39 +44,32 @@ class ReferenceNode(FlightNode):
     def __init__(self):
         super().__init__(
             'reference_node',
-            task=parameter('hover', doc='name of a task, or a CSV file of poses', read_only=True),
-            seed=parameter(0, doc='seed of random poses', low=0, high=2**31 - 1, read_only=True))
+            task=parameter('hover', doc='name of a task, or a CSV file of poses'),
+            seed=parameter(0, doc='seed of random poses', low=0, high=2**31 - 1))
         self._task = make_task(self.parameters.task, self.parameters.seed)
         self._player = self._odom = self._trajectory = None
         self._window_end = 0.0
-        self._state = ''
-        self._poses = self.publisher('target_pose')
-        self._trajectories = self.publisher('target_trajectory')
-        self._wrenches = self.publisher('disturbance')
-        self._states = self.publisher('reference/state')
+        self._poses = wire.Publisher(self, 'target_pose')
+        self._trajectories = wire.Publisher(self, 'target_trajectory')
+        self._wrenches = wire.Publisher(self, 'disturbance')
+        self._states = wire.Publisher(self, 'reference/state')
         self._payload = self.create_client(SetParameters, 'sim_node/set_parameters')
-        self._set_state('waiting')
-        self.follow('supervisor/state', self._on_supervisor)
+        self._states.update('waiting')
+        wire.subscribe(self, 'supervisor/state', self._on_supervisor)
         disturbed = self._task.kind in WITH_WRENCHES
         if disturbed:       # the loss of control ends tasks with rising levels
             self.listen('odom', partial(setattr, self, '_odom'), qos=SENSOR)
-        self.report('task', lambda: (OK, self._state, {'task': self._task.name}))
+        self.report('task', lambda: (OK, self._states.value, {'task': self._task.name}))
         self.create_timer(IMPULSE_PERIOD if disturbed else PERIOD, self._on_timer,
                           clock=self.flight_clock)
 
-    def _set_state(self, state):
-        if state != self._state:
-            self._state = state
-            self._states.publish(state)
-
     def _on_supervisor(self, state):
-        if self._state == 'waiting' and state.startswith('flying'):
+        if self._states.value == 'waiting' and state.startswith('flying'):
             self._player = TaskPlayer(self._task, self.now())
             self.get_logger().info(f"task '{self._task.name}', {self._task.ends[-1]:g} s")
-        elif self._player and state.partition(':')[0] in (
-                'landing', 'disarmed', 'emergency_stop'):
+        elif self._player and state.partition(':')[0] in ('landing', *MOTORS_OFF):
             self._player = None
-            self._set_state('aborted')
+            self._states.update('aborted')
 
     def _on_timer(self):
         if self._player is None:
@@ -109,10 +94,11 @@ class ReferenceNode(FlightNode):
             level = self._player.lost_level
             lost = '' if level is None else f': control lost at level {level:g}'
             self._player = self._trajectory = None
-            self._set_state(f'done{lost}')
+            self._states.update(f'done{lost}')
         else:
-            current = 1 + int(np.searchsorted(self._task.ends, now - self._player.start, 'right'))
-            self._set_state(f'flying {min(current, len(self._task.ends))}/{len(self._task.ends)}')
+            ends = self._task.ends
+            current = 1 + int(np.searchsorted(ends, now - self._player.start, 'right'))
+            self._states.update(f'flying {min(current, len(ends))}/{len(ends)}')
 
     def _publish_window(self, now):
         path = self._trajectory
@@ -135,38 +121,28 @@ class RecorderNode(FlightNode):
     def __init__(self):
         super().__init__(
             'recorder_node',
-            bag=parameter(doc='folder to create for the bag', read_only=True),
-            controllers=parameter(registry.STANDING_BY, read_only=True,
+            bag=parameter(doc='folder to create for the bag'),
+            controllers=parameter(registry.STANDING_BY,
                                   doc='registered controllers whose commands are recorded'))
         topics = topics_with(self.parameters.controllers)
-        self._bag = None
-        try:
-            self._bag = BagWriter(self.parameters.bag, namespace=self.get_namespace(),
-                                  topics=tuple(topics), frames=True)
-        except BagError as error:
-            raise ParameterError(f"key 'bag': {error}") from None
+        self._bag = BagWriter(self.parameters.bag, namespace=self.get_namespace(),
+                              topics=tuple(topics), frames=True)
         self._written = self._lost = self._writes = 0
         self._failure = None
         self._received = []     # (topic, type, CDR, time of receipt [s]) not yet written
         prefix = self.get_namespace().rstrip('/') + '/'
         for name, topic in {**ALL, **topics}.items():
-            keep = partial(self._keep, prefix + name, topic.type)
-            if name in TARGETS:
-                wire.subscribe_any(self, name, keep, depth=50, on_lost=self._on_lost)
-            else:
-                wire.subscribe_raw(
-                    self, name, lambda data, keep=keep: keep(data),
-                    LATCHED_LOG if topic.qos.latched else LOG,
-                    event_callbacks=SubscriptionEventCallbacks(message_lost=self._on_lost))
+            wire.subscribe_raw(self, name, partial(self._keep, prefix + name, topic.type),
+                               LATCHED_LOG if topic.qos.latched else LOG, self._on_lost)
         self.report('bag', self._bag_status)
         self.create_timer(WRITE_PERIOD, self._write, clock=self.steady_clock)
 
-    def _keep(self, topic, message_type, data, _=None):
+    def _keep(self, topic, message_type, data, *_):
         self._received.append((topic, message_type, data, self.now()))
 
     def _write(self):
         # Before the first /clock the time is 0: a bag that begins in 1970 cannot be viewed.
-        if self._failure or not self._bag or not self.now() and len(self._received) < HELD:
+        if self._failure or not self._bag or not self.now():
             return
         received, self._received = self._received, []
         try:
@@ -176,7 +152,7 @@ class RecorderNode(FlightNode):
             self._writes += 1
             if self._writes % FLUSH_WRITES == 0:
                 self._bag.flush()
-        except BagError as error:
+        except ParameterError as error:
             # A full disk ends the recording but not the process, which is shared with other nodes.
             self._failure = str(error)
             self.get_logger().error(f'recording ended: {error}')
@@ -197,7 +173,7 @@ class RecorderNode(FlightNode):
             if self._bag:
                 self._write()
                 self._bag.close()
-        except BagError as error:
+        except ParameterError as error:
             print(f'recorder_node: error: {error}', file=sys.stderr)
         self._bag = None
 
@@ -205,23 +181,17 @@ class RecorderNode(FlightNode):
 # --- viewers ------------------------------------------------------------------------------------
 
 class ViewerNode(FlightNode):
-    """Publishes the transform from world to base_link for RViz and Foxglove."""
+    """Publishes description and frames of the robot for RViz and Foxglove, like those of a bag."""
 
     def __init__(self):
         super().__init__('viewer_node')
-        self._message = wire.message_class('tf2_msgs/msg/TFMessage')    # not on PyPI
-        self._transforms = self.create_publisher(self._message, '/tf', wire.profile(EVENT))
-        self._moved = 0.0       # stamp of the estimate that the frame shows
-        self.listen('odom', self._on_odom, qos=SENSOR)
+        self._outputs = {     # tf2_msgs is not on PyPI
+            name: self.create_publisher(wire.message_class(kind), name, wire.profile(qos))
+            for name, (kind, qos) in FRAMES.items()}
+        frames = FrameWriter(self._write, '')
+        for topic in ('odom', 'joint_states'):
+            wire.subscribe_raw(self, topic, lambda data, topic=topic: frames.take(
+                topic, data, self.now()), SENSOR)
 
-    def _on_odom(self, odom):
-        if not self._transforms.get_subscription_count() \
-                or 0 <= odom.stamp - self._moved < FRAME_PERIOD:
-            return
-        self._moved = odom.stamp
-        frame = TransformStamped(child_frame_id=BODY)
-        set_time(frame.header.stamp, odom.stamp)
-        frame.header.frame_id = WORLD
-        set_parts(frame.transform.translation, odom.position)
-        set_parts(frame.transform.rotation, odom.quaternion)
-        self._transforms.publish(self._message(transforms=[frame]))
+    def _write(self, topic, kind, data, t):
+        self._outputs[topic].publish(bytes(data))

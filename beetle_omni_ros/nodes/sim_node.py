@@ -83,11 +83,9 @@ class SimulatedTimePacing:
     lost_ticks = 0
 
     def __init__(self, tick: float, epoch: float, steady: Callable[[], float] = time.monotonic):
-        self._tick, self._steady, self.epoch = tick, steady, epoch
-        self.sent = float('-inf')
+        self._tick, self.epoch, self._steady = tick, epoch, steady
+        self.sent, self.ticks = float('-inf'), 0
         self._answers: dict[str, tuple[float, float]] = {}
-        self._last = steady()
-        self.ticks = 0
 
     @property
     def now(self) -> float:
@@ -101,11 +99,9 @@ class SimulatedTimePacing:
     def due(self) -> int:
         """Return the number of ticks that are due now: 1 or 0."""
         now = self._steady()
-        late = any(self.sent - stamp > LAG and now - arrived < PATIENCE
-                   for stamp, arrived in self._answers.values())
-        if late and now - self._last < PATIENCE:
+        if any(self.sent - stamp > LAG and now - arrived < PATIENCE
+               for stamp, arrived in self._answers.values()):
             return 0
-        self._last = now
         self.ticks += 1
         return 1
 
@@ -116,19 +112,18 @@ class SimNodeParameters:
 
     robot_file: str = file_parameter('robot file of the simulated robot')
     simulator_file: str = file_parameter('simulator file')
-    conditions: str = parameter('nominal', choices=('nominal', 'published'), read_only=True,
+    conditions: str = parameter('nominal', choices=('nominal', 'published'),
                                 doc='randomisation of plant and sensors')
-    seed: int = parameter(0, doc='seed of all random numbers', low=0, high=2**31 - 1,
-                          read_only=True)
-    actuators: str = parameter('direct', choices=('direct', 'emulated'), read_only=True,
+    seed: int = parameter(0, doc='seed of all random numbers', low=0, high=2**31 - 1)
+    actuators: str = parameter('direct', choices=('direct', 'emulated'),
                                doc='how commands reach the plant: from the topic, or through '
                                'emulated devices on serial ports')
     servo_port: str = parameter('', doc="path of the emulated servos' port; empty: a temporary "
-                                'one', read_only=True)
+                                'one')
     board_port: str = parameter('', doc="path of the emulated motor board's port; empty: a "
-                                'temporary one', read_only=True)
+                                'temporary one')
     servo_bus_file: str = file_parameter('ids, signs and zeros of the emulated servos')
-    clock: str = parameter('system', choices=('system', 'simulated'), read_only=True,
+    clock: str = parameter('system', choices=('system', 'simulated'),
                            doc='real time, or simulated time on /clock, which waits for late '
                            'nodes; all other nodes then need use_sim_time')
     payload: float = parameter(0.0, doc='mass attached below the body', unit='kg', low=0, high=2)
@@ -149,27 +144,32 @@ class SimNode(FlightNode):
     def __init__(self):
         self._devices: EmulatedActuators | None = None
         self._clock_publisher = None
-        super().__init__('sim_node', SimNodeParameters, on_change=self._changed)
+        super().__init__('sim_node', SimNodeParameters, on_change=self._changed, changeable=(
+            'payload', 'faults', 'servo_faults.', 'board_faults.'))
         given = self.parameters
-        self._robot = RobotParameters.load(given.robot_file or None)
+        robot = RobotParameters.load(given.robot_file or None)
         self._simulator = Simulator(
-            self._robot, SimulatorParameters.load(given.simulator_file or None),
+            robot, SimulatorParameters.load(given.simulator_file or None),
             conditions=given.conditions, seed=given.seed)
-        self._simulator.payload = given.payload
-        self._set_faults(given)
         self._pacing = self._make_pacing(given)
         self._latency = Distribution()
-        self._publish_to = {
-            'mocap': self.publisher('mocap/pose'), 'imu': self.publisher('imu/data_raw')}
-        self._truth = self.publisher('ground_truth/odom')
-        self.listen('disturbance', self._on_disturbance, stale_after=None)
+        topics = {'mocap': 'mocap/pose', 'imu': 'imu/data_raw'}
+        if given.actuators == 'emulated':
+            self._devices = self._make_devices(given, robot)
+            self.report('devices', self._devices_status)
+        else:
+            topics |= {'joints': 'joint_states', 'rotors': 'rotor_states',
+                       'battery': 'battery_state'}
+            self.listen('command', self._on_command, max_age=COMMAND_AGE)
+            self.report('latency', lambda: self._latency.status(
+                'stamp of the answered IMU sample to the arrival of its command'))
+        self._changed(given)
+        self._publish_to = {name: wire.Publisher(self, topic) for name, topic in topics.items()}
+        self._truth = wire.Publisher(self, 'ground_truth/odom')
+        self.listen('disturbance', self._on_disturbance, expected=False)
         self.track_compute(self._simulator.tick)
         self.report('pacing', self._pacing_status)
         self.report('robot', self._robot_status)
-        if given.actuators == 'emulated':
-            self._make_devices()
-        else:
-            self._take_commands()
         self.create_timer(self._simulator.tick, self._on_timer, clock=self.steady_clock)
 
     def _make_pacing(self, given):
@@ -187,76 +187,48 @@ class SimNode(FlightNode):
         """Return ROS time [s]; this node is the source of simulated time."""
         return super().now() if self._clock_publisher is None else self._pacing.now
 
-    def _take_commands(self):
-        """Apply the topic `command` to the plant, and publish the measurements of the devices."""
-        self._refuse_faults(self.parameters)
-        self._step = self._simulator.step
-        self._publish_to['joints'] = self.publisher('joint_states')
-        self._publish_to['battery'] = self.publisher('battery_state')
-        self._publish_to['rotors'] = self.publisher('rotor_states')
-        self.listen('command', self._on_command, max_age=COMMAND_AGE)
-        self.report('latency', lambda: self._latency.status(
-            'stamp of the answered IMU sample to the arrival of its command'))
-
-    def _make_devices(self):
+    def _make_devices(self, given, robot):
         """Connect emulated devices to the plant, for the drivers of the bridges."""
         from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard  # has pymavlink
         from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
-        given = self.parameters
         servos = ServoBusParameters.load(given.servo_bus_file or None)
         bus = EmulatedServoBus(
             servos.ids.astype(int).tolist(), port=given.servo_port or None,
             signs=servos.signs.astype(int).tolist(), zeros=servos.zeros.astype(int).tolist(),
             seed=given.seed)
-        board = EmulatedMotorBoard(self._robot, seed=given.seed, port=given.board_port or None)
-        self._devices = EmulatedActuators(self._simulator, bus, board)
-        self._step = self._devices.step
-        self.report('devices', self._devices_status)
+        board = EmulatedMotorBoard(robot, seed=given.seed, port=given.board_port or None)
         self.get_logger().info(f'servos at {bus.port}, motor board at {board.port}')
-        self._devices.set_faults(given.servo_faults, given.board_faults)
+        return EmulatedActuators(self._simulator, bus, board)
 
     def close(self) -> None:
         """Switch the emulated devices off."""
         if self._devices is not None:
             self._devices.close()
 
-    def _set_faults(self, given):
-        """Set the active faults of robot and sensors; unchanged ones continue."""
-        faults = parse_faults(given.faults)
+    def _changed(self, new):
+        """Set faults and payload; unchanged faults continue."""
+        faults, devices = parse_faults(new.faults), self._devices
         for fault in faults:
-            if given.actuators == 'emulated' and fault.changes(*DEVICES):
+            if devices is not None and fault.changes(*DEVICES):
                 raise ParameterError(f"faults: '{fault.kind}': the emulated devices handle this "
                                      'signal; use servo_faults and board_faults, or '
                                      'actuators:=direct')
+        of_devices = [*switched_on(new.servo_faults), *switched_on(new.board_faults)]
+        if devices is not None:
+            devices.set_faults(new.servo_faults, new.board_faults)
+        elif of_devices:
+            raise ParameterError(f'servo_faults, board_faults: {of_devices[0]}: there are no '
+                                 'devices with actuators direct; start with actuators:=emulated')
         self._simulator.set_faults(faults)
-
-    def _changed(self, new):
-        if new.faults != self.parameters.faults:
-            self._set_faults(new)
-            self.get_logger().info(f"faults: {new.faults or 'none'}")
-        if self._devices is None:
-            self._refuse_faults(new)
-        else:
-            before = self._devices.faults
-            self._devices.set_faults(new.servo_faults, new.board_faults)
-            if self._devices.faults != before:
-                self.get_logger().info('faults: ' + (', '.join(self._devices.faults) or 'none'))
-        if new.payload != self.parameters.payload:
-            self._simulator.payload = new.payload
-            self.get_logger().info(f'payload {new.payload:g} kg')
-        self.parameters = new
-
-    @staticmethod
-    def _refuse_faults(given):
-        """Refuse faults of emulated devices if there are none."""
-        for group_name in ('servo_faults', 'board_faults'):
-            if wanted := switched_on(getattr(given, group_name)):
-                raise ParameterError(f'{group_name}: {wanted[0]}: there are no devices with '
-                                     'actuators direct; start with actuators:=emulated')
+        self._simulator.payload = new.payload
+        if new is not self.parameters:
+            active = '; '.join(filter(None, (new.faults, *of_devices)))
+            self.get_logger().info(f"faults: {active or 'none'}, payload {new.payload:g} kg")
 
     def _on_timer(self):
+        step = (self._devices or self._simulator).step
         for _ in range(self._pacing.due()):
-            frame = self.timed(self._step)
+            frame = self.timed(step)
             if self._clock_publisher is not None:
                 message = Clock()
                 set_time(message.clock, self._pacing.now)
@@ -266,13 +238,12 @@ class SimNode(FlightNode):
             self._publish(frame)
 
     def _publish(self, frame):
-        epoch, publish_to = self._pacing.epoch, self._publish_to
+        epoch = self._pacing.epoch
         # Delayed readings first: the IMU sample triggers the estimate, which should include them.
         for name in ('mocap', 'joints', 'imu', 'rotors', 'battery'):
             reading = getattr(frame, name)
-            if reading is not None and name in publish_to:
-                more = {'cells': self._robot.battery.cells} if name == 'battery' else {}
-                publish_to[name].publish(replace(reading, stamp=epoch + reading.stamp, **more))
+            if reading is not None and name in self._publish_to:
+                self._publish_to[name].publish(replace(reading, stamp=epoch + reading.stamp))
         self._truth.publish(Odom.of(frame.truth, stamp=epoch + frame.truth.stamp))
 
     def _on_command(self, command):

@@ -19,6 +19,7 @@ from beetle_omni_ros.messages.topics import Qos, TARGETS, Topic, topic_of
 from beetle_omni_ros.messages.values import MessageError
 
 COPIES = 64             # newest messages that are compared to detect a copy
+TARGET_DEPTH = 10       # messages of a target at least that wait for a slow reader
 TWO_ARGUMENTS = inspect.Signature([
     inspect.Parameter(name, inspect.Parameter.POSITIONAL_ONLY) for name in ('message', 'info')])
 
@@ -61,59 +62,56 @@ def parameter_request(name: str, value: Any) -> SetParameters.Request:
 
 
 class Publisher:
-    """Publishes the values of a topic."""
+    """Publishes the values of a topic; ``value`` is the newest one."""
 
     def __init__(self, node: Node, topic: str):
-        entry, self._topic = topic_of(topic), topic
+        entry, self._topic, self.value = topic_of(topic), topic, None
         self._publisher = node.create_publisher(message_class(entry.type), topic,
                                                 profile(entry.qos))
 
     def publish(self, value: Any, frame: str | None = None) -> None:
         """Publish one value, see :func:`serialized`."""
+        self.value = value
         self._publisher.publish(serialized(self._topic, value, frame))
+
+    def update(self, value: Any) -> bool:
+        """Publish another text or object than the newest one; return whether it is another."""
+        if value is self.value or isinstance(value, str) and value == self.value:
+            return False
+        self.publish(value)
+        return True
 
 
 def subscribe(node: Node, topic: str, handle: Callable[[Any], None],
               qos: Qos | None = None) -> None:
-    """Subscribe without checks of age; ``qos`` replaces that of the table, or any of targets."""
+    """Pass the values of a topic to ``handle``, without checks of age."""
     entry = topic_of(topic)
 
-    def callback(data, _=None):
+    def callback(data, *_):
         try:
             handle(entry.take(message(entry, data)))
         except MessageError as error:
             node.get_logger().warning(f'{topic}: message refused, {error}')
 
-    if topic in TARGETS and qos is None:
-        subscribe_any(node, topic, callback)
-    else:
-        subscribe_raw(node, topic, lambda data: callback(data), qos)
+    subscribe_raw(node, topic, callback, qos)
 
 
-def subscribe_raw(node: Node, topic: str, callback: Callable[[bytes], None],
-                  qos: Qos | None = None, **more) -> None:
-    """Pass the CDR messages of a topic; ``qos`` replaces that of the table."""
-    entry = topic_of(topic)
-    node.create_subscription(message_class(entry.type), topic, callback,
-                             profile(qos or entry.qos), raw=True, **more)
-
-
-def subscribe_any(node: Node, topic: str, callback: Callable[[bytes, float], None], *,
-                  depth: int = 10, on_lost: Callable | None = None) -> None:
+def subscribe_raw(node: Node, topic: str, callback: Callable, qos: Qos | None = None,
+                  on_lost: Callable | None = None) -> None:
     """
-    Receive the messages of publishers with any quality of service, each message once.
+    Pass the CDR messages of a topic; those of targets with any quality of service, each once.
 
     A subscription of latched messages is incompatible with a volatile publisher, such as
-    `ros2 topic pub`; a volatile subscription misses messages latched earlier. So there are both.
-    A message that both receive is passed on once, by its time of publication [s, system time, set
-    by the middleware of the publisher; nan if unknown]. ``on_lost`` gets rclpy's event of lost
-    messages.
-    """
-    seen: deque[float] = deque(maxlen=COPIES)
+    `ros2 topic pub`; a volatile subscription misses messages latched earlier. So targets have
+    both. A message that both receive is passed on once, by its time of publication.
 
-    def take(*given):
-        # The single-threaded executor passes two arguments, the events executor of Jazzy one
-        # tuple of both.
+    ``callback`` gets the bytes, and for targets the time of publication [s, system time, set by
+    the middleware of the publisher; nan if unknown], ``on_lost`` rclpy's event of lost messages.
+    ``qos`` replaces that of the table.
+    """
+    qos, seen = qos or topic_of(topic).qos, deque(maxlen=COPIES)
+
+    def take(*given):   # the events executor of rclpy 7.1 passes one tuple of both arguments
         data, info = given if len(given) == 2 else given[0]
         stamp = info.get('source_timestamp')
         publication = stamp * 1e-9 if stamp and stamp > 0 else math.nan
@@ -122,7 +120,11 @@ def subscribe_any(node: Node, topic: str, callback: Callable[[bytes, float], Non
             callback(data, publication)
 
     take.__signature__ = TWO_ARGUMENTS      # rclpy passes the info of the message by this
-    for is_latched in (False, True):
-        subscribe_raw(node, topic, take, Qos(depth, reliable=is_latched, latched=is_latched),
-                      event_callbacks=SubscriptionEventCallbacks(
-                          incompatible_qos=lambda event: None, message_lost=on_lost))
+    is_target = topic in TARGETS
+    for one in [Qos(max(qos.depth, TARGET_DEPTH), reliable=latched, latched=latched)
+                for latched in (False, True)] if is_target else [qos]:
+        node.create_subscription(
+            message_class(topic_of(topic).type), topic, take if is_target else callback,
+            profile(one), raw=True, event_callbacks=SubscriptionEventCallbacks(
+                incompatible_qos=(lambda event: None) if is_target else None,
+                message_lost=on_lost))

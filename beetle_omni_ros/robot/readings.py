@@ -48,12 +48,11 @@ class JointReading:
 
 @dataclass(frozen=True, slots=True)
 class BatteryReading:
-    """Pack voltage under load [V], current [A], negative in discharge, and cells (0: unknown)."""
+    """Pack voltage under load [V] and current [A], negative in discharge."""
 
     stamp: float
     voltage: float
     current: float
-    cells: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -59,16 +59,15 @@ def shortened(text: str, length: int = QUOTED) -> str:
 
 def parameter(default: Any = MISSING, *, doc: str, unit: str = '', low: float | None = None,
               high: float | None = None, shape: tuple[int, ...] | None = None,
-              choices: tuple[str, ...] | None = None, read_only: bool = False):
+              choices: tuple[str, ...] | None = None):
     """
     Declare one dataclass field as a parameter.
 
     ``default`` is the value if the file omits it, ``doc`` the meaning in one phrase, ``low`` and
     ``high`` are the smallest and largest legal value of a number or of each element of an array.
-    A ``read_only`` parameter of a node can change only at its start.
     """
     metadata = {'doc': doc, 'unit': unit, 'low': low, 'high': high, 'shape': shape,
-                'choices': choices, 'read_only': read_only}
+                'choices': choices}
     if isinstance(default, (list, np.ndarray)):
         default = np.array(default, dtype=float)
     if isinstance(default, (dict, np.ndarray)):

@@ -25,7 +25,7 @@ from beetle_omni_ros.messages.topics import (
 from beetle_omni_ros.robot.schema import ParameterError, read_yaml
 from beetle_omni_ros.runs.log import FlightLog, LogRecorder, META_KEY, motion, SERIES_OF
 
-BagError = ParameterError   # its name in identify and nodes
+BagError = ParameterError   # its name in identify
 AT_ONCE = 4096      # messages that are read together
 
 

@@ -27,6 +27,9 @@ from beetle_omni_ros.runs.log import META_KEY, Recorder
 VERSION = 9     # of metadata.yaml
 TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 TEXT = 'std_msgs/msg/String'
+# Topic -> type and quality of service of what FrameWriter writes.
+FRAMES = {'/tf': (TRANSFORMS, EVENT), '/tf_static': (TRANSFORMS, LATCHED),
+          'robot_description': (TEXT, LATCHED)}
 PERIOD = 0.02       # [s] between transforms
 
 
@@ -129,9 +132,8 @@ class BagWriter(Recorder):
         self._frames = None
         if frames:
             self._frames = FrameWriter(self.write_raw, self._prefix)
-            self._declare('/tf', TRANSFORMS, EVENT)
-            self._declare('/tf_static', TRANSFORMS, LATCHED)
-            self._declare(f'{self._prefix}robot_description', TEXT, LATCHED)
+            for name, kind in FRAMES.items():
+                self._declare(name if name.startswith('/') else self._prefix + name, *kind)
 
     def __enter__(self) -> BagWriter:
         return self

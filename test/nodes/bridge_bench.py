@@ -8,10 +8,11 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 import numpy as np
 from std_srvs.srv import Trigger
+from witness import running_graph
 
 from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.nodes import wire
-from beetle_omni_ros.nodes.graph import Graph, reserved_domain
+from beetle_omni_ros.nodes.graph import reserved_domain
 from beetle_omni_ros.nodes.operator import Operator
 
 JOINT, ROTOR = 'joint_bridge_node', 'rotor_bridge_node'
@@ -41,7 +42,7 @@ class BridgeOperator(Operator):
         self.period, self.age = 0.01, 0.0
         self._supervisor = wire.Publisher(node, 'supervisor/state')
         self._commands = wire.Publisher(node, 'command')
-        self._clients_of_bridge = {}
+        self._supervisor.publish('disarmed')
         wire.subscribe(node, f'{bridge.removesuffix("_node")}/state', self.bridge_states.append)
         wire.subscribe(node, 'battery_state', self.batteries.append)
         wire.subscribe(node, 'joint_states', self.joints.append)
@@ -61,13 +62,9 @@ class BridgeOperator(Operator):
         self._supervisor.publish(state)
 
     def ask(self, name, kind=Trigger, request=None):
-        if name not in self._clients_of_bridge:
-            self._clients_of_bridge[name] = self._node.create_client(kind, f'{self.bridge}/{name}')
-        client = self._clients_of_bridge[name]
-        self.until(client.service_is_ready, f'no service {name}')
-        future = client.call_async(request or kind.Request())
-        self.until(future.done, f'{name}: no answer')
-        return future.result()
+        answer = self.request(f'{self.bridge}/{name}', kind, request or kind.Request(), WITHIN)
+        assert answer, f'{name}: no answer'
+        return answer
 
     def change(self, name):
         """Request a lifecycle transition such as 'configure'; return whether it succeeded."""
@@ -118,18 +115,8 @@ class BridgeOperator(Operator):
 @contextmanager
 def running_bridge(folder, bridge, others=(), **parameters):
     """Run a bridge in a separate process, or composed with others; yield graph and operator."""
-    with reserved_domain() as number:
-        nodes = {bridge: {**PATIENT[bridge], **parameters}, **{name: {} for name in others}}
-        graph = Graph(nodes, folder, number, {bridge: list(nodes)})
-        operator = None
-        try:
-            graph.start()
-            operator = BridgeOperator(number, bridge)
-            operator.supervise('disarmed')
-            operator.until(lambda: operator.bridge_states, 'no state')
-            yield graph, operator
-        finally:
-            stubborn = graph.stop()
-            if operator:
-                operator.close()
-        assert not stubborn
+    nodes = {bridge: {**PATIENT[bridge], **parameters}, **{name: {} for name in others}}
+    with reserved_domain() as number, running_graph(
+            nodes, folder, number, operator=lambda domain: BridgeOperator(domain, bridge),
+            ready=lambda one: one.bridge_states, groups={bridge: list(nodes)}) as made:
+        yield made

@@ -32,14 +32,7 @@ class FaultOperator(Witness):
     def start(self):
         """Arm as soon as the bridges are ready, and wait until the controller flies."""
         assert self.wait(lambda: not self.waits_for(BRIDGES), 20), self.waits_for(BRIDGES)
-        self.take_off(lambda: self.state == 'flying:nmpc')
-
-    def ask(self, service):
-        client = self._node.create_client(Trigger, f'joint_bridge_node/{service}')
-        assert self.wait(client.service_is_ready, 5)
-        future = client.call_async(Trigger.Request())
-        assert self.wait(future.done, 5)
-        return future.result().success
+        self.take_off()
 
 
 # fault, value without fault; state of the bridge; whether it needs a reboot
@@ -82,4 +75,4 @@ def lands(operator, name, value, mended, text, reboot):
     assert operator.wait(lambda: operator.device('armed') == 'False', 5), name
     operator.set(name, mended)
     if reboot:
-        assert operator.ask('reboot')
+        assert operator.request('joint_bridge_node/reboot', Trigger, Trigger.Request(), 5).success

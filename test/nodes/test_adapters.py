@@ -20,7 +20,7 @@ def test_the_supervisor_refuses_to_arm_with_the_reason_of_bridges_or_estimator(m
 
     def refusal():
         answer = node._on_request('arm', None, SimpleNamespace())
-        assert not answer.success and node._state == 'disarmed'
+        assert not answer.success and node._states.value == 'disarmed'
         return answer.message
 
     assert 'ekf_node' in refusal()
@@ -41,6 +41,7 @@ def reference(make, monkeypatch):
         monkeypatch.setattr(node, 'now', lambda: clock.now)
         node._poses, node._states = Sent('target_pose'), Sent('reference/state')
         node._trajectories = Sent('target_trajectory')
+        node._states.publish('waiting')
         return node, clock
     return build
 
@@ -54,16 +55,16 @@ def test_the_reference_node_starts_the_task_in_flight_and_a_landing_aborts_it(re
         node._on_timer()
         clock.now += 0.02
     assert np.allclose(node._poses.stamps(), 2000 + 8 * np.arange(15))
-    assert node._states[0].data == 'flying 1/15'
+    assert node._states[1].data == 'flying 1/15'
     node._on_supervisor('landing')
-    assert node._state == 'aborted'
+    assert node._states.value == 'aborted'
 
 
 def test_trajectory_windows_join_without_a_gap_and_keep_to_the_path(reference):
     node, clock = reference('lemniscate')
     node._on_supervisor('flying:nmpc')
     path = node._task.segments[-1].target(2008.0)
-    while node._state != 'done':
+    while node._states.value != 'done':
         node._on_timer()
         clock.now += 0.02
         assert clock.now < 2200

@@ -1,5 +1,6 @@
 """Nodes of registered controllers: by name, by class, when they step, what they log."""
 
+from functools import partial
 from itertools import count
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes import graph
 from beetle_omni_ros.nodes import node as base
 from beetle_omni_ros.nodes.control_nodes import ControllerNode, SupervisorNode
+from beetle_omni_ros.nodes.runner import maker
 from beetle_omni_ros.robot.allocation import ActuatorHealth
 from beetle_omni_ros.robot.readings import JointReading
 from beetle_omni_ros.robot.schema import ParameterError
@@ -48,15 +50,6 @@ class Follower:
         return Command(state.stamp, np.zeros(4), np.full(4, 7.5))
 
 
-class FollowerNode(ControllerNode):
-    """The controller node with a controller without solver."""
-
-    def __init__(self):
-        super().__init__(ControllerEntry(name='nmpc', controller=Follower))
-        self._publisher = Sent('nmpc/command')
-        self.follower = self._host.controller
-
-
 def fly(node, stamps):
     for stamp in np.atleast_1d(stamps):
         node._on_odom(Odom(stamp, np.array([0, 0, 1.0]), np.zeros(3), LEVEL, np.zeros(3)))
@@ -64,7 +57,8 @@ def fly(node, stamps):
 
 @pytest.fixture
 def follower(make):
-    node = make(FollowerNode)
+    node = make(partial(ControllerNode, ControllerEntry(name='nmpc', controller=Follower)))
+    node._publisher = Sent('nmpc/command')
     fly(node, 99.9 + 0.005 * np.arange(20))
     assert not node._publisher          # no joint angles yet
     node._on_joints(JointReading(100.0, np.zeros(4), np.zeros(4)))
@@ -77,7 +71,8 @@ def test_the_controller_steps_once_a_period_and_stamps_with_the_state(follower):
     stamps = 101 + 0.005 * np.arange(200)
     fly(follower, stamps)
     assert np.allclose(follower._publisher.stamps(), stamps[::2])
-    assert follower.follower.received[-1][0].tilt == pytest.approx(health.true(np.zeros(4)))
+    state, _ = follower._host.controller.received[-1]
+    assert state.tilt == pytest.approx(health.true(np.zeros(4)))
     fly(follower, [95.0, 95.005, 95.01])    # the clock was set back, and the new time is used
     assert len(follower._publisher) == 102
 
@@ -87,7 +82,7 @@ def test_the_newest_target_is_used_an_unset_stamp_means_now_and_a_landing_resets
 
     def target():
         fly(follower, next(stamps))
-        return follower.follower.received[-1][1]
+        return follower._host.controller.received[-1][1]
 
     for stamp, x in ((50.0, 1.0), (60.0, 2.0), (50.0, 3.0)):
         follower._on_target(PoseTarget(np.array([x, 0, 1.0]), LEVEL, stamp), np.nan)
@@ -97,14 +92,14 @@ def test_the_newest_target_is_used_an_unset_stamp_means_now_and_a_landing_resets
     assert target().stamp == pytest.approx(follower.now(), abs=5)
     for mode in ('flying:nmpc', 'disarmed'):
         follower._on_mode(mode)
-    assert follower.follower.resets == 1
+    assert follower._host.controller.resets == 1
 
 
 def test_an_exception_of_step_is_logged_and_reported_and_publishes_no_command(
         make, tmp_path, capfd):
     own = tmp_path / 'bad.py'
     own.write_text(FAILING)
-    node = make(ControllerNode, f'controller:={own}:Failing')
+    node = make(maker(f'{own}:Failing'))
     node._publisher = Sent('nmpc/command')
     node._on_joints(JointReading(1.0, np.zeros(4), np.zeros(4)))
     fly(node, [1.0, 2.0, 2.1])
@@ -136,13 +131,14 @@ def test_an_active_controller_outside_the_supervisors_list_is_refused(make):
         make(SupervisorNode, 'controller:=x')
 
 
-def test_the_plan_of_a_graph_with_another_controller():
+def test_the_plan_of_a_graph_with_another_controller(tmp_path):
     nodes, _ = graph.plan(OWN, actuators='direct', bag='/b', task='hover')
     known = ['pose_controller', *registry.STANDING_BY]
     assert nodes['pose_controller_node'] == {'controller': OWN}
     assert nodes['supervisor_node']['controller'] == 'pose_controller'
     for name in ('supervisor_node', 'recorder_node'):
         assert nodes[name]['controllers'] == known
-    assert graph.arguments(nodes, ['ekf_node', 'pose_controller_node']) == ['ekf_node', OWN]
+    command = graph.commands(nodes, tmp_path)[graph.COMPOSED]
+    assert OWN in command and 'ekf_node' in command
     alone, _ = graph.plan(OWN, actuators='direct', standby=False)
     assert list(alone) == ['ekf_node', 'pose_controller_node', 'supervisor_node', 'sim_node']

@@ -1,4 +1,4 @@
-"""Manual driving through ROS: keys, lines of text, a joystick, and refusals."""
+"""Manual driving through ROS: keys, lines of text, a joystick."""
 
 from contextlib import closing, suppress
 import os
@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from witness import running_graph
 
-from beetle_omni_ros import cli
 from beetle_omni_ros.drive import DriveParameters
 from beetle_omni_ros.nodes import driver, wire
 from beetle_omni_ros.nodes.graph import in_simulated_time, reserved_domain
@@ -118,15 +117,3 @@ def test_sticks_and_buttons_are_actions_until_the_joystick_is_silent():
     assert len(next(actions)) == 1      # the button is still pressed
     pilot.time = lambda: 5.2 + 2 * p.joystick_timeout
     assert next(actions) == []
-
-
-@pytest.mark.parametrize(('arguments', 'expected'), [
-    (['wheel'], "source 'wheel': expected keyboard or joystick or terminal"),
-    (['keyboard'], 'standard input is no terminal'),
-    (['terminal', '--params', 'none.yaml'], 'none.yaml'),
-    (['terminal', '--domain-id', '300'], "'--domain-id': Input should be")])
-def test_an_unusable_source_is_refused_in_one_line(capsys, monkeypatch, arguments, expected):
-    monkeypatch.setattr(sys, 'stdin', open(os.devnull))
-    assert cli.main(['drive', *arguments]) == 2
-    line, = capsys.readouterr().err.splitlines()
-    assert expected in line

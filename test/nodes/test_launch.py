@@ -1,4 +1,4 @@
-"""Processes of the launch file by its arguments; launch itself is replaced."""
+"""Processes of the launch file by its arguments, with launch replaced; their discovery."""
 
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
@@ -7,6 +7,7 @@ import sys
 from types import ModuleType
 
 import pytest
+import yaml
 
 from beetle_omni_ros.nodes import graph
 from beetle_omni_ros.nodes.graph import BRIDGES
@@ -25,9 +26,7 @@ def bringup(monkeypatch):
     """Load the launch file against stand-ins for the modules of launch."""
     classes = {'launch': ['LaunchDescription'],
                'launch.actions': ['DeclareLaunchArgument', 'ExecuteProcess', 'OpaqueFunction'],
-               'launch.substitutions': ['LaunchConfiguration'],
-               'launch_ros': [], 'launch_ros.actions': ['Node'],
-               'launch_ros.parameter_descriptions': ['ParameterValue']}
+               'launch.substitutions': ['LaunchConfiguration']}
     for name, members in classes.items():
         module = ModuleType(name)
         for member in members:
@@ -52,37 +51,51 @@ def bringup(monkeypatch):
     return module
 
 
-def test_the_bridges_have_their_own_process(bringup):
-    process, bridges = (one.kwargs['cmd'] for one in bringup.start(seed='7', namespace='/robot1'))
-    assert bridges[4:6] == list(BRIDGES) and bridges[-2:] == ['-r', '__ns:=/robot1']
-    assert process[4:process.index('--ros-args')] == [
-        'ekf_node', 'nmpc_node', 'rl_node', 'supervisor_node', 'sim_node']
-    assert 'sim_node:seed:=7' in process
-
-
 def given_to(processes):
-    """Name -> parameters of the nodes of all processes, as texts."""
-    found = {}
+    """Name -> parameters of the nodes of each process."""
+    found = []
     for process in processes:
         words = process.kwargs['cmd']
         names = words[4:words.index('--ros-args')]
-        found |= {name: {} for name in names}
-        for word in (after for flag, after in zip(words, words[1:]) if flag == '-p'):
-            node, key, value = word.replace(':=', ':', 1).split(':', 2)
-            found[node][key] = value
+        stored = yaml.safe_load(Path(words[words.index('--params-file') + 1]).read_text())
+        found.append({name: stored[f'/**/{name}']['ros__parameters'] for name in names})
     return found
 
 
+def test_the_bridges_have_their_own_process(bringup):
+    processes = bringup.start(seed='7', namespace='/robot1')
+    assert all(one.kwargs['cmd'][-2:] == ['-r', '__ns:=/robot1'] for one in processes)
+    nodes, bridges = given_to(processes)
+    assert list(bridges) == list(BRIDGES) and nodes['sim_node']['seed'] == 7
+    assert list(nodes) == ['ekf_node', 'nmpc_node', 'rl_node', 'supervisor_node', 'sim_node']
+
+
 def test_simulator_and_bridges_meet_at_the_same_ports_in_a_private_folder(bringup):
-    nodes = given_to(bringup.start())
+    nodes, bridges = given_to(bringup.start())
+    nodes |= bridges
     assert nodes['sim_node']['actuators'] == 'emulated'
     assert nodes['sim_node']['servo_port'] == nodes['joint_bridge_node']['port']
     assert nodes['sim_node']['board_port'] == nodes['rotor_bridge_node']['port']
     assert nodes['joint_bridge_node']['autostart'] == 'activate'
     folder = Path(nodes['sim_node']['servo_port']).parent
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
-    direct = given_to(bringup.start(actuators='direct', robot_file='a.yaml',
-                                    plant_file='b.yaml'))
-    assert not set(BRIDGES) & set(direct) and 'actuators' not in direct['sim_node']
+    direct, = given_to(bringup.start(actuators='direct', robot_file='a.yaml',
+                                     plant_file='b.yaml'))
+    assert 'actuators' not in direct['sim_node']
     assert [direct[name]['robot_file'] for name in ('sim_node', 'ekf_node')] == [
         'b.yaml', 'a.yaml']
+
+
+@pytest.mark.parametrize('given, holds', [
+    ({}, 'LOCALHOST'), ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}, 'SUBNET'),
+    ({'ROS_STATIC_PEERS': '192.168.1.2'}, None), ({'ROS_LOCALHOST_ONLY': '0'}, None)])
+def test_the_users_setting_has_precedence(given, holds):
+    graph.confine(given)
+    assert given.get('ROS_AUTOMATIC_DISCOVERY_RANGE') == holds
+
+
+def test_two_reserved_domains_differ(monkeypatch):
+    with graph.reserved_domain() as first:
+        monkeypatch.setattr(graph, '_starts', iter([graph.DOMAINS.index(first)]))
+        with graph.reserved_domain() as second:
+            assert second != first

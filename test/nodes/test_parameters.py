@@ -29,7 +29,7 @@ class Example:
     mode: str = parameter('slow', doc='speed', choices=('slow', 'fast'))
     count: int = parameter(3, doc='number', low=1, high=5)
     active: bool = parameter(True, doc='switch')
-    seed: int = parameter(0, doc='seed', read_only=True)
+    seed: int = parameter(0, doc='seed')
 
 
 @pytest.fixture
@@ -62,7 +62,7 @@ def test_file_and_overrides_arrive_in_the_dataclass(make_node, tmp_path):
 
 def test_changes_in_flight_are_validated(make_node):
     node, seen = make_node(), []
-    parameters.declare(node, Example, on_change=seen.append)
+    parameters.declare(node, Example, on_change=seen.append, changeable=('gains.', 'mode'))
 
     def set_to(name, value):
         return node.set_parameters([Parameter(name, value=value)])[0]

@@ -49,51 +49,28 @@ def bench(folder, **parameters):
         yield Bench(board, graph, operator)
 
 
-@pytest.fixture(scope='module')
-def shared(tmp_path_factory):
-    """One process for all tests that do not end it."""
-    with bench(tmp_path_factory.mktemp('bridge')) as made:
-        yield made
+def test_the_bridge_arms_at_takeoff_follows_thrusts_and_disarms_with_the_supervisor(tmp_path):
+    with bench(tmp_path) as made:
+        board, operator = made.board, made.operator
+        operator.thrust = np.zeros(4)
+        operator.reaches('ready')
+        operator.spin(0.2)
+        assert not board.armed and not board.refused      # nothing is sent before it is armed
+        made.take_off()
+        for state, thrust in (('flying:nmpc', [3.0, 12.0, 0.5, 20.0]), ('landing', [9, 9, 1, 0])):
+            operator.supervise(state)
+            made.follow(thrust)
+        repeats_commands_until_they_are_old(made)
+        operator.bridge_states.clear()
+        operator.supervise('disarmed')
+        made.stops()
+        operator.until(lambda: 'waiting: throttle not low' in operator.bridge_states
+                       and operator.now == 'ready')
+        assert not any(text.startswith('lost') for text in operator.bridge_states)
+        assert not made.graph.dead()
 
 
-@pytest.fixture
-def bridge(shared):
-    shared.operator.reaches('ready')
-    shared.operator.bridge_states[:-1] = []
-    yield shared
-    board, operator = shared.board, shared.operator
-    board.faults, board.on_target = type(board.faults)(), None
-    operator.tilt = operator.thrust = None
-    operator.period, operator.age = 0.01, 0.0
-    operator.supervise('disarmed')
-    shared.stops()
-    operator.spin(0.5)      # the 'ready' of the flight is not yet that of the ground
-    assert not shared.graph.dead()
-
-
-@pytest.fixture
-def flying(bridge):
-    bridge.take_off()
-    return bridge
-
-
-def test_the_bridge_arms_at_takeoff_follows_thrusts_and_disarms_with_the_supervisor(bridge):
-    board, operator = bridge.board, bridge.operator
-    operator.thrust = np.zeros(4)
-    operator.spin(0.2)
-    assert not board.armed and not board.firmware.refused      # nothing is sent before it is armed
-    bridge.take_off()
-    for state, thrust in (('flying:nmpc', [3.0, 12.0, 0.5, 20.0]), ('landing', [9, 9, 1, 0])):
-        operator.supervise(state)
-        bridge.follow(thrust)
-    operator.supervise('disarmed')
-    bridge.stops()
-    operator.until(lambda: 'waiting: throttle not low' in operator.bridge_states
-                   and operator.now == 'ready')
-    assert not any(text.startswith('lost') for text in operator.bridge_states)
-
-
-def test_commands_are_repeated_and_the_rotors_stop_with_the_stream_or_with_old_commands(flying):
+def repeats_commands_until_they_are_old(flying):
     board, operator, arrivals = flying.board, flying.operator, []
     operator.period = 0.06
     board.on_target = lambda now, stamp: arrivals.append((now, stamp))
@@ -109,6 +86,8 @@ def test_commands_are_repeated_and_the_rotors_stop_with_the_stream_or_with_old_c
     operator.age = 0.2
     operator.until(lambda: not board.commands.any())
     operator.counts('inputs', 'command rejected: stale stamp', above=5)
+    operator.age = 0.0
+    flying.follow(HOVER)
 
 
 def test_after_a_killed_bridge_no_rotor_turns_and_a_new_one_does_not_arm(tmp_path):
@@ -136,9 +115,10 @@ def test_without_autostart_it_arms_only_while_activated_and_disarms_at_its_end(t
     with bench(tmp_path, autostart='none', port=str(port)) as made:
         board, operator = made.board, made.operator
         operator.reaches('waiting: not configured')
-        assert operator.change('configure')
+        assert not operator.change('configure')
         operator.reaches(f'waiting: {port}: cannot be opened (no such port')
         os.symlink(board.port, port)
+        assert operator.change('configure')
         operator.reaches('waiting: not activated')
         operator.until(lambda: operator.batteries)                  # received, but not armed
         operator.supervise('takeoff')

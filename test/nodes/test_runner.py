@@ -43,16 +43,16 @@ def wait_until_it_spins(process):
     ('ekf_node', ['-p', 'imu.rat:=100.0'], "'imu.rat': unknown key; did you mean 'rate'"),
     ('ekf_node', ['--params-file', 'broken.yaml'], 'line 3'),
     ('reference_node', ['-p', 'task:=somersault'], "task 'somersault': expected"),
-    ('controller_node', ['-p', 'controller:=absent.module:My'], "no module 'absent'")])
+    ('composed absent.module:My', [], "no module 'absent'")])
 def test_unusable_parameters_end_in_one_line_and_status_2(ros_domain, tmp_path, node, arguments,
                                                           named):
     (tmp_path / 'broken.yaml').write_text(
         '/**/ekf_node:\n  ros__parameters:\n    imu: {rate: [}\n')
-    status, error = finish(start(node, '--ros-args', *arguments, cwd=tmp_path,
+    status, error = finish(start(*node.split(), '--ros-args', *arguments, cwd=tmp_path,
                                  env={**os.environ, 'PYTHONPATH': str(ROOT)}))
     assert status == 2
     line, = error.strip().splitlines()
-    assert line.startswith(f'{node}: error: ') and named in line
+    assert line.startswith(f'{node.split()[-1]}: error: ') and named in line
 
 
 def test_a_node_names_missing_inputs_is_unique_and_ends_cleanly(ros_domain):

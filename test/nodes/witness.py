@@ -8,15 +8,15 @@ import time
 import numpy as np
 import pytest
 import rclpy
+from rclpy.experimental.events_executor import EventsExecutor
 
 from beetle_omni_ros.messages import conversions
 from beetle_omni_ros.messages.topics import EVENT, SENSOR, topic_of
-from beetle_omni_ros.nodes import runner, wire
+from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.graph import COMPOSED, Graph
 from beetle_omni_ros.nodes.operator import Operator
 
 HEADER = 'x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg\n'
-TAKEOFF_ATTEMPTS = 3
 BUSY = 0.85         # share of a core above which tests are not valid
 READY = 240     # s; without a cache the controller is compiled first
 
@@ -26,10 +26,13 @@ class Sent(list):
 
     def __init__(self, topic):
         super().__init__()
-        self._topic = topic
+        self._topic, self.value = topic, None
 
     def publish(self, value):
+        self.value = value
         self.append(topic_of(self._topic).write(value))
+
+    update = wire.Publisher.update
 
     def stamps(self):
         return np.array([conversions.seconds(message.header.stamp) for message in self])
@@ -71,16 +74,6 @@ class Witness(Operator):
         if (busy := used / (time.monotonic() - begin)) > BUSY:
             pytest.skip(f'too slow for a flight in real time: the nodes use {busy:.0%} of a core')
 
-    def take_off(self, flies):
-        """Arm and climb until ``flies()``; repeated on a busy computer."""
-        for _ in range(TAKEOFF_ATTEMPTS):
-            assert self.wait(lambda: self.call('arm')[0], 15), self.call('arm')
-            self.states.clear()
-            self.wait(lambda: flies() or 'disarmed' in self.states, 30)
-            if flies():
-                return
-        raise AssertionError(f'no take-off: {self.states}')
-
 
 @contextmanager
 def running_graph(nodes, folder, domain, *, operator=Witness, ready=lambda one: one.ready,
@@ -107,16 +100,12 @@ class Bench:
         arguments = [a for override in overrides for a in ('-p', override)]
         rclpy.init(args=['--ros-args', *arguments], domain_id=domain)
         self.user = rclpy.create_node(user)
-        self.executor = runner.make_executor()
+        self.executor = EventsExecutor()
         self.executor.add_node(self.user)
         self.nodes = [self.user]
 
     def add(self, node):
-        """Spin this node too; log lines of its refusals are kept in ``node.refusals``."""
-        node.refusals = []
-        before = node.reject
-        node.reject = lambda topic, reason, kind: (
-            node.refusals.append(f'{topic}: {reason}'), before(topic, reason, kind))
+        """Spin this node too."""
         self.executor.add_node(node)
         self.nodes.append(node)
         return node
