@@ -1,4 +1,4 @@
-"""The report: flights without targets or with an early end, and lines of charts."""
+"""The report of flights without targets or with an early end."""
 
 import io
 
@@ -9,8 +9,6 @@ from synthetic_flights import write_odom, write_state, write_truth
 from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.runs.bag import read_bag
 from beetle_omni_ros.runs.bag_writer import BagWriter
-from beetle_omni_ros.runs.log import FlightLog
-from beetle_omni_ros.view.charts import POINTS, Run
 from beetle_omni_ros.view.report import run_report
 
 LEVEL = np.array([0, 0, 0, 1.0])
@@ -70,15 +68,3 @@ def test_the_outcome_and_faults_are_on_the_page_and_in_the_table(tmp_path):
                      'injected: rotor_stops at=5 rotor=2', 'plant used.yaml'):
         assert expected in text, expected
     assert 'landing: rotor2_lost at 1.5 s' in text and 'rotor2_lost at' in printed.getvalue()
-
-
-def test_a_line_has_few_points_and_keeps_extremes_and_gaps():
-    t = np.arange(0, 100, 0.005)
-    t = t[(t < 40) | (t > 45)]
-    values = np.random.default_rng(0).normal(size=len(t))
-    values[7001], values[9001] = 50.0, -60.0
-    line = Run('a', '#123456', FlightLog(), {}).line(t, values)
-    assert len(line.x) < 1.6 * POINTS and np.all(np.diff(line.x) >= 0)
-    assert np.nanmax(line.y) == 50 and np.nanmin(line.y) == -60
-    missing = line.x[np.isnan(line.y)]
-    assert len(missing) and np.all((missing >= 39.9) & (missing <= 45.1))
