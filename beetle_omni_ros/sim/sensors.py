@@ -157,7 +157,7 @@ class Sensors:
         motion[:3] = acceleration.dot(rotations.matrix(middle))
         motion[3:] = rate = turn / dt
         if (arm := self._lever_arm) is not None:
-            turning = (after.angular_velocity - before.angular_velocity) / dt
+            turning = (after.angular_velocity - before.angular_velocity) / self._tick
             motion[:3] += np.cross(turning, arm) + np.cross(rate, np.cross(rate, arm))
         return self._to_imu.T @ motion
 

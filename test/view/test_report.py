@@ -1,4 +1,4 @@
-"""The report: flights without targets or with an early end, and lines of charts."""
+"""The report of flights without targets or with an early end."""
 
 import io
 
