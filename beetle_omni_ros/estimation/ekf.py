@@ -1,22 +1,27 @@
 """
 Error-state EKF: IMU prediction and MoCap correction at capture time.
 
-The guard checks the inputs, a track is one hypothesis of the motion, and the filter here selects
-the valid hypothesis. The first track, or a new one after a long dropout or a persistent jump, is a
-candidate until enough poses agree with it and the IMU. This includes agreement of the IMU with
-gravity: an IMU with wrong axes or units predicts a motion that the poses contradict.
+The guard checks the inputs, and a track is one hypothesis of the motion. The first track, or a new
+one after a long dropout or a lasting jump, is a candidate until enough poses agree with it and the
+IMU. This includes gravity: an IMU with wrong axes or units predicts another motion.
 """
 
 from bisect import bisect_right
-from collections import Counter, deque
-from math import sqrt
+from collections import deque
+from operator import attrgetter
 
 import numpy as np
 
 from beetle_omni_ros.estimation.inputs import DELAY_LIMIT, GAP, InputGuard, NoiseMonitor
 from beetle_omni_ros.estimation.model import ErrorStateModel, MEASUREMENTS
 from beetle_omni_ros.estimation.parameters import EkfParameters
-from beetle_omni_ros.estimation.state import ATTITUDE, Estimate, Node, POSITION, SAME_INSTANT
+from beetle_omni_ros.estimation.state import (
+    Estimate,
+    Node,
+    POSITION,
+    propagate,
+    SAME_INSTANT,
+)
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.readings import ImuReading, PoseReading
 from beetle_omni_ros.robot.rotations import geodesic_angle
@@ -24,9 +29,9 @@ from beetle_omni_ros.robot.rotations import geodesic_angle
 __all__ = ['EkfParameters', 'ErrorStateEkf', 'Estimate', 'ImuReading', 'PoseReading']
 
 DEAD_RECKONING, LOST = 0.1, 20.0    # [s] without an accepted pose until these states
+WITHOUT_POSES = 0.15        # [s] until markers do not define the attitude; a MoCap has 10 Hz
 LOST_POSITION_STD = 5.0     # [m] of the position, each axis, above which the state is lost
 ALIGNED = 0.8   # least cosine between residuals of one cause; 3 % of random pairs in 6-D reach it
-SURE = 5.0      # standard deviations of the attitude that noise does not reach
 START_POSES = 20    # in a row that must agree with the IMU before the first fix, and when lost
 JUMP_POSES = 100    # that must agree with the IMU and each other before a jump is followed
 JUMP_ATTITUDE = 0.35    # [rad] largest jump that is followed; the gyroscope rules out larger ones
@@ -35,6 +40,7 @@ JUMP_ATTITUDE = 0.35    # [rad] largest jump that is followed; the gyroscope rul
 # [m] and angle [rad], and their increase for each second since [m/s], [rad/s].
 DOUBT_POSES, DOUBT_TIME = 3, 1.0
 DISTANCE, ANGLE, SPEED, RATE = 0.05, 0.05, 2.0, 8.0
+STAMP = attrgetter('stamp')
 VELOCITY_KNOWN = 5  # poses after which the velocity is known, so that the time can be uncertain
 
 
@@ -54,49 +60,30 @@ class Track:
     """
 
     def __init__(self, model: ErrorStateModel, first: Node, time_deviation: float):
-        """
-        Start with one state.
-
-        Args:
-            model: prediction and correction.
-            first: state with its covariance.
-            time_deviation: standard deviation of the first state's time offset [s].
-
-        """
+        """Start with one state, whose time offset has a standard deviation [s]."""
         self._time_deviation = time_deviation
         self._model = model
         self.nodes = [first]
         self.last_fix = first.stamp
-        self._waits_since: float | None = None     # first reading after a pose was used
-        self._aligned: tuple[float, np.ndarray] | None = None   # stamp and turn of expect_poses
-        self.fixes = 1
+        self.fixes, self.reckons = 1, False
 
-    @property
-    def newest(self) -> Node:
-        """State at the newest reading."""
-        return self.nodes[-1]
-
-    def at(self, stamp: float) -> Node:
-        """Last state not after ``stamp`` [s], or the oldest one."""
-        return self.nodes[max(0, bisect_right(self.nodes, stamp + SAME_INSTANT, key=_stamp) - 1)]
-
-    def predict(self, stamp: float, force: np.ndarray, rate: np.ndarray,
-                after_impact: bool) -> None:
+    def predict(self, stamp: float, force: np.ndarray, rate: np.ndarray) -> None:
         """Append the state at the next reading."""
         nodes = self.nodes
-        nodes.append(self._model.predict(nodes[-1], stamp, force, rate, after_impact))
+        nodes.append(propagate(nodes[-1], stamp, force, rate, self._model.gravity))
         while nodes[1].stamp < stamp - DELAY_LIMIT:
             del nodes[0]
             self._model.covariance(nodes[0])    # otherwise it would keep its predecessors
+        if not self.reckons and stamp - self.last_fix > WITHOUT_POSES:
+            self.reckons = True
+            self._replay(self._model.without_marker_error(nodes[0]), nodes[1:])
 
-    def expect_poses(self) -> None:
-        """Prepare the newest state for dead reckoning if no pose was used for some time."""
-        if self._waits_since is None:
-            self._waits_since = self.newest.stamp
-        if self.newest.stamp - self._waits_since > DEAD_RECKONING:
-            self._waits_since = np.inf      # once after each pose
-            self.nodes[-1], turn = self._model.without_marker_error(self.newest)
-            self._aligned = self.newest.stamp, turn
+    def _replay(self, first: Node, later: list[Node]) -> None:
+        """Begin the history anew with a node, and predict it through the later readings."""
+        self.nodes = [first]
+        for node in later:
+            self.nodes.append(propagate(self.nodes[-1], node.stamp, node.force, node.rate,
+                                        self._model.gravity))
 
     def correct(self, stamp: float, position: np.ndarray, quaternion: np.ndarray,
                 doubt_span: float = 0.0) -> bool:
@@ -115,17 +102,13 @@ class Track:
         """
         nodes = self.nodes
         stamp = max(stamp, nodes[0].stamp)
-        index = bisect_right(nodes, stamp + SAME_INSTANT, key=_stamp) - 1
+        index = bisect_right(nodes, stamp + SAME_INSTANT, key=STAMP) - 1
         prior = nodes[index]
-        since, turn = self._aligned or (np.inf, None)
-        aligned = prior.stamp >= since
         if stamp - prior.stamp > SAME_INSTANT:
             after = nodes[index + 1]
-            prior = self._model.predict(prior, stamp, *interpolate(
+            prior = propagate(prior, stamp, *interpolate(
                 stamp, (prior.stamp, prior.force, prior.rate),
-                (after.stamp, after.force, after.rate)), after.after_impact)
-        if turn is not None and aligned:    # poses refer to the markers
-            prior = self._model.turned(prior, turn)
+                (after.stamp, after.force, after.rate)), self._model.gravity)
         if doubt_span:
             prior = self._model.doubt(prior, doubt_span)
         posterior = self._model.correct(prior, position, quaternion)
@@ -134,43 +117,29 @@ class Track:
         self.fixes += 1
         if self.fixes == VELOCITY_KNOWN:
             self._model.add_time_uncertainty(posterior, self._time_deviation)
-        replayed = [posterior]
-        for node in nodes[index + 1:]:
-            replayed.append(self._model.predict(replayed[-1], node.stamp, node.force, node.rate,
-                                                node.after_impact))
-        self.nodes = replayed
-        self.last_fix = stamp
-        self._waits_since = self._aligned = None
+        self._replay(posterior, nodes[index + 1:])
+        self.last_fix, self.reckons = stamp, False
         return True
-
-
-def _stamp(node):
-    return node.stamp
 
 
 class ErrorStateEkf:
     """Position, velocity, attitude and IMU biases of base_link, at any attitude."""
 
     def __init__(self, parameters: EkfParameters, gravity: float):
-        """
-        Construct the filter without a state.
-
-        Args:
-            parameters: noise, extrinsics, gates and times.
-            gravity: magnitude along world -z [m/s^2].
-
-        """
+        """Construct the filter without a state; ``gravity`` [m/s^2] along world -z."""
         self._parameters = parameters
         self._model = ErrorStateModel(parameters, gravity)
+        imu = parameters.imu
+        self._axes = rotations.matrix(rotations.exp(imu.rotation))
+        self._known_biases = imu.accelerometer_bias, imu.gyroscope_bias
         self.reset()
 
     def reset(self) -> None:
         """Return to the state before the first sample."""
         self._guard = InputGuard(self._parameters)
+        self.rejected = self._guard.rejected    # reason -> number of inputs refused for it
         self._noise = NoiseMonitor(self._parameters.mocap)
-        self._noise_scale = self._noise.scale
-        self._model.scale_noise(*self._noise_scale)
-        self._readings: deque = deque()  # (stamp, force, rate, after_impact), base_link axes
+        self._readings: deque = deque()     # (stamp, force, rate), base_link axes
         self._early: deque = deque()     # poses captured after the newest IMU sample
         self._track: Track | None = None
         self._candidate: Track | None = None
@@ -180,16 +149,11 @@ class ErrorStateEkf:
         self._residual = np.zeros(MEASUREMENTS)     # of the last refused pose, in deviations
 
     @property
-    def rejected(self) -> Counter:
-        """Reason -> number of inputs refused for it since :meth:`reset`."""
-        return self._guard.rejected
-
-    @property
     def status(self) -> str:
         """'uninitialised', 'tracking', 'dead_reckoning' or 'lost' at the newest IMU sample."""
         if self._track is None:
             return 'uninitialised'
-        newest = self._track.newest
+        newest = self._track.nodes[-1]
         age = newest.stamp - self._track.last_fix
         if age <= DEAD_RECKONING:
             return 'tracking'
@@ -202,7 +166,7 @@ class ErrorStateEkf:
     def estimate(self) -> Estimate | None:
         """State at the newest IMU sample; None while uninitialised."""
         if self._estimate is None and self._track is not None:
-            self._estimate = self._model.estimate(self._track.newest, self._readings)
+            self._estimate = self._model.estimate(self._track.nodes[-1], self._readings)
         return self._estimate
 
     def imu(self, sample: ImuReading) -> bool:
@@ -222,7 +186,8 @@ class ErrorStateEkf:
         if checked is None:
             return False
         stamp = checked[0]
-        reading = (stamp, *self._model.aligned(*checked[1:3]), self._guard.after_impact)
+        reading = (stamp, *(self._axes.dot(measured - bias)
+                            for measured, bias in zip(checked[1:], self._known_biases)))
         self._estimate = None
         self._readings.append(reading)
         while self._readings[0][0] < stamp - DELAY_LIMIT:
@@ -232,8 +197,6 @@ class ErrorStateEkf:
                 track.predict(*reading)
         while self._early and self._early[0][0] <= stamp + SAME_INSTANT:
             self._apply(*self._early.popleft())
-        if self._track is not None:
-            self._track.expect_poses()
         return True
 
     def pose(self, sample: PoseReading) -> bool:
@@ -250,27 +213,23 @@ class ErrorStateEkf:
         if checked is None:
             return False
         self._noise.add(*checked)
-        stamp = max(checked[0] + self._time_offset(), self._readings[0][0])
+        # to the clock of the IMU, by the estimate of the leading track
+        leader = self._valid or self._candidate or self._track
+        offset = leader.nodes[-1].time_offset if leader is not None else 0.0
+        stamp = max(checked[0] + offset, self._readings[0][0])
         if stamp > self._readings[-1][0] + SAME_INSTANT:
             self._early.append((stamp, *checked[1:]))
             return True
         return self._apply(stamp, *checked[1:])
 
-    def _time_offset(self) -> float:
-        """Offset from a pose's stamp to the IMU's clock, estimated by the leading track."""
-        leader = self._track if self._valid or self._candidate is None else self._candidate
-        return leader.newest.time_offset if leader is not None else 0.0
-
     @property
-    def _valid(self) -> bool:
-        return self.status in ('tracking', 'dead_reckoning')
+    def _valid(self) -> Track | None:
+        return self._track if self.status in ('tracking', 'dead_reckoning') else None
 
     def _apply(self, stamp, position, quaternion) -> bool:
         self._estimate = None
-        if self._noise.scale != self._noise_scale:
-            self._noise_scale = self._noise.scale
-            self._model.scale_noise(*self._noise_scale)
-        track = self._track if self._valid else None
+        self._model.scale_noise(*self._noise.scale)
+        track, candidate = self._valid, self._candidate
         if track is not None:
             if track.correct(stamp, position, quaternion) \
                     or self._corrected_with_doubt(track, stamp, position, quaternion):
@@ -278,10 +237,20 @@ class ErrorStateEkf:
                 self._good_pose = stamp, position, quaternion
                 return True
             self.rejected['outlier'] += 1
-        agrees = self._update_candidate(track, stamp, position, quaternion)
-        if not agrees and track is None:
+        if candidate is not None and candidate.correct(stamp, position, quaternion):
+            if candidate.fixes >= (START_POSES if track is None else JUMP_POSES):
+                before = (track or candidate).nodes[-1].quaternion
+                if geodesic_angle(before, candidate.nodes[-1].quaternion) > JUMP_ATTITUDE:
+                    self.rejected['attitude_jump'] += 1
+                else:
+                    self._track, self._candidate = candidate, None
+            return track is None
+        # The known biases are used once; if they contradict the poses, start without them.
+        known = self._track.nodes[-1] if candidate is None and self._track is not None else None
+        self._candidate = self._started(stamp, position, quaternion, known)
+        if track is None and candidate is not None:
             self.rejected['inconsistent_start'] += 1
-        return agrees and track is None
+        return track is None and candidate is None
 
     def _corrected_with_doubt(self, track: Track, stamp, position, quaternion) -> bool:
         """
@@ -312,47 +281,15 @@ class ErrorStateEkf:
             return False
         before, from_position, from_quaternion = self._good_pose
         dt = stamp - before
-        repeats = np.array_equal(position, from_position) \
-            and np.array_equal(quaternion, from_quaternion)
-        if repeats or not 0 < dt <= GAP:
+        if not 0 < dt <= GAP:
             return False
-        node = track.at(stamp)
+        node = track.nodes[-1]
         step = position - from_position - dt * node.velocity
         was, now = (rotations.multiply(q, self._model.marker_to_base)
                     for q in (from_quaternion, quaternion))
         turned = rotations.multiply(was, rotations.exp(dt * (node.rate - node.gyroscope_bias)))
         return float(np.linalg.norm(step)) < DISTANCE + SPEED * dt \
             and geodesic_angle(turned, now) < ANGLE + RATE * dt
-
-    def _update_candidate(self, valid: Track | None, stamp, position, quaternion) -> bool:
-        """
-        Update the candidate with a pose that the track cannot use, and accept it if confirmed.
-
-        Returns:
-            False if the pose contradicts the candidate, which then restarts from this pose.
-
-        """
-        candidate = self._candidate
-        agrees = candidate is None
-        if candidate is not None:
-            agrees = candidate.correct(stamp, position, quaternion)
-            if agrees:
-                if candidate.fixes >= (START_POSES if valid is None else JUMP_POSES):
-                    if valid is not None and self._attitude_jumped(valid, candidate):
-                        self.rejected['attitude_jump'] += 1
-                        return True
-                    self._track, self._candidate = candidate, None
-                return True
-        # The known biases are used once; if they contradict the poses, start without them.
-        known = self._track.newest if agrees and self._track is not None else None
-        self._candidate = self._started(stamp, position, quaternion, known)
-        return agrees
-
-    def _attitude_jumped(self, track: Track, candidate: Track) -> bool:
-        """Whether the gyroscope rules out the candidate's attitude."""
-        deviation = sqrt(np.trace(self._model.covariance(track.newest)[ATTITUDE, ATTITUDE]))
-        return geodesic_angle(track.newest.quaternion, candidate.newest.quaternion) \
-            > JUMP_ATTITUDE + SURE * deviation
 
     def _started(self, stamp, position, quaternion, known) -> Track:
         """Start a track at a pose, with the biases of ``known``, and predict it to now."""

@@ -1,7 +1,7 @@
 """Checks of the filter's inputs (finite, plausible, new, in time), and the MoCap's noise."""
 
 from collections import Counter, deque
-from math import inf, isfinite, sqrt
+from math import hypot, inf, isfinite, sqrt
 
 import numpy as np
 
@@ -12,9 +12,7 @@ from beetle_omni_ros.robot.readings import SpikeFilter
 Checked = tuple[float, np.ndarray, np.ndarray]   # stamp and two vectors of a sample
 GAP = 0.1           # [s] longest bridged time between two IMU samples
 RESYNC = 20         # refused consistent stamps in a row after which the clock itself has jumped
-# Samples equal to the last digit while the other sensor moves come from a frozen driver; noise
-# never repeats exactly.
-FROZEN_READINGS, FROZEN_POSES = 10, 5
+FROZEN_READINGS = 10    # equal to the last digit, of a frozen driver; noise never repeats
 # [m/s^2] change of the specific force between two samples that is an impact of unknown impulse
 IMPACT = 30.0
 # [rad/s] a larger change of the rate in one reading is a fault; full thrust turns the body by 0.5
@@ -41,40 +39,29 @@ class InputGuard:
     Attributes:
         rejected: reason -> count.
         clock_jumped: whether enough refused stamps of the IMU continue each other.
-        after_impact: whether readings just before it were beyond the sensor's range.
 
     """
 
     def __init__(self, parameters: EkfParameters):
         self._offset = parameters.mocap.time_offset
         self.rejected: Counter = Counter()
-        self.after_impact = self._out_of_range = False
         self._last_reading: float | None = None
         self._last_pose = -inf
         self._pose_values: tuple[float, ...] | None = None
         self._reading_values: tuple[float, ...] | None = None
-        self._same_pose = self._same_reading = 0
-        self._pose_moved = self._moved = False
+        self._same_reading = 0
         self._spikes = SpikeFilter(IMPACT, SPIKE)
         self._refused: list[float] = []  # consecutive refused stamps at regular distances
 
     def reading(self, sample) -> Checked | None:
-        """
-        Check an IMU sample.
-
-        Returns:
-            (stamp, specific force, angular rate) in copies, or None if it is refused.
-
-        """
+        """Copies of stamp, specific force and rate of an IMU sample, None if it is refused."""
         stamp = float(sample.stamp)
         force = np.array(sample.specific_force, dtype=float)
         rate = np.array(sample.angular_velocity, dtype=float)
         values = (*force.tolist(), *rate.tolist())
         if not all(map(isfinite, (stamp, *values))):
             return self._refuse('not_finite')
-        if (_squared_norm(*values[:3]) > FORCE_LIMIT ** 2
-                or _squared_norm(*values[3:]) > RATE_LIMIT ** 2):
-            self._out_of_range = True
+        if hypot(*values[:3]) > FORCE_LIMIT or hypot(*values[3:]) > RATE_LIMIT:
             return self._refuse('out_of_range')
         if self._last_reading is not None:
             step = stamp - self._last_reading
@@ -84,18 +71,14 @@ class InputGuard:
                 self._refused.append(stamp)
                 return self._refuse('duplicate' if step == 0 else
                                     'backwards' if step < 0 else 'forward_gap')
-        same = values == self._reading_values
-        self._moved |= self._reading_values is not None and not same
+        self._same_reading = self._same_reading + 1 if values == self._reading_values else 0
         self._reading_values = values
-        self._same_reading = self._same_reading + 1 if same else 0
-        self._pose_moved &= same
-        if self._same_reading >= FROZEN_READINGS and self._pose_moved:
+        if self._same_reading >= FROZEN_READINGS:
             return self._refuse('frozen')
         if not self._spikes.passes(force, rate):
             return self._refuse('spike')
         self._last_reading = stamp
         self._refused.clear()
-        self.after_impact, self._out_of_range = self._out_of_range or self._spikes.lasted, False
         return stamp, force, rate
 
     @property
@@ -105,15 +88,9 @@ class InputGuard:
 
     def pose(self, sample, oldest: float) -> Checked | None:
         """
-        Check a MoCap pose.
+        Stamp on the IMU's clock, position and unit quaternion of a pose, None if it is refused.
 
-        Args:
-            sample: stamp, position and quaternion.
-            oldest: stamp of the oldest stored IMU reading [s].
-
-        Returns:
-            (stamp on the IMU's clock, position, unit quaternion), or None if it is refused.
-
+        ``oldest`` is the stamp of the oldest stored IMU reading [s].
         """
         stamp = float(sample.stamp) + self._offset
         position = np.array(sample.position, dtype=float)
@@ -123,36 +100,28 @@ class InputGuard:
             return self._refuse('not_finite')
         if max(map(abs, values[:3])) > PLACES:
             return self._refuse('out_of_range')
-        norm = sqrt(_squared_norm(*values[3:]))
+        x, y, z, w = values[3:]
+        norm = sqrt(x * x + y * y + z * z + w * w)
         if not abs(norm - 1) <= UNIT:
             return self._refuse('quaternion_norm')
         if self._last_reading is None:
             return self._refuse('no_imu')
         if stamp <= self._last_pose:
             return self._refuse('duplicate' if stamp == self._last_pose else 'backwards')
-        if stamp < oldest or stamp < self._last_reading - DELAY_LIMIT:
+        if stamp < oldest:
             return self._refuse('too_old')
         if stamp > self._last_reading + GAP:
             return self._refuse('future')
         self._last_pose = stamp
-        same = values == self._pose_values
-        self._pose_moved |= self._pose_values is not None and not same
-        self._pose_values = values
-        self._same_pose = self._same_pose + 1 if same and self._moved else 0
-        self._moved = False
-        if self._same_pose >= FROZEN_POSES:
+        if values == self._pose_values:     # a measured pose never repeats to the last digit
             return self._refuse('frozen')
+        self._pose_values = values
         return stamp, position, quaternion / norm
 
     def _refuse(self, reason: str) -> Checked | None:
         """Count a refusal; return the result of the caller."""
         self.rejected[reason] += 1
         return None
-
-
-def _squared_norm(x, y, z, w=0.0) -> float:
-    """Sum of squares in plain floats, which become infinite without a warning."""
-    return x * x + y * y + z * z + w * w
 
 
 class NoiseMonitor:

@@ -1,10 +1,7 @@
 """
-The error-state model: inputs of filterpy's Kalman filter at each step.
+The error-state model: a rigid body for filterpy, which computes covariance and gain.
 
-filterpy keeps the error state and computes its covariance and gain. This module adds the parts of
-a rigid body: propagation and residual on SO(3), and the injection of the estimated error into the
-state. The filter estimates the motion of the IMU at the IMU's stamps. The output is that of
-base_link now.
+The filter estimates the motion of the IMU at the IMU's stamps; the output is that of base_link.
 """
 
 from collections.abc import Sequence
@@ -15,7 +12,6 @@ from filterpy.kalman import KalmanFilter
 import numpy as np
 from scipy.special import gammaincinv
 
-from beetle_omni_ros.estimation.inputs import FORCE_LIMIT, IMPACT, RATE_LIMIT
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.estimation.state import (
     ACCELEROMETER_BIAS,
@@ -25,7 +21,6 @@ from beetle_omni_ros.estimation.state import (
     GYROSCOPE_BIAS,
     Node,
     POSITION,
-    propagate,
     STATES,
     TIME_OFFSET,
     transition,
@@ -56,7 +51,7 @@ DOUBT_RATE = 3.0
 
 class ErrorStateModel:
     """
-    Prediction and correction of one node; contains constants and buffers, no state.
+    Covariance and correction of one node; contains constants and buffers, no state.
 
     Attributes:
         marker_to_base: (4,) quaternion from base_link's axes to those of the marker body.
@@ -64,14 +59,6 @@ class ErrorStateModel:
     """
 
     def __init__(self, parameters: EkfParameters, gravity: float):
-        """
-        Compute the constant matrices.
-
-        Args:
-            parameters: noise and extrinsics.
-            gravity: magnitude along world -z [m/s^2].
-
-        """
         imu, mocap = parameters.imu, parameters.mocap
         self.gravity = gravity
         self.parameters = parameters
@@ -86,13 +73,8 @@ class ErrorStateModel:
         density[TIME_OFFSET] = OFFSET_WALK ** 2
         self._process = np.diag(density)
         self._period = 1 / imu.rate
-        # a missing reading was at the limit of the sensor's range or beyond, in any direction
-        self._shock = np.zeros(STATES)
-        self._shock[VELOCITY] = FORCE_LIMIT ** 2
-        self._shock[ATTITUDE] = RATE_LIMIT ** 2
         self._doubt = np.diag([*np.repeat(np.square(DOUBT), 3), *np.zeros(4)])
 
-        self._axes = rotations.matrix(rotations.exp(imu.rotation))
         # vector from the navigated point (the IMU) to the marker body, in base_link axes
         self._lever = mocap.position - imu.position
         self.marker_to_base = rotations.conjugate(rotations.exp(mocap.rotation))
@@ -146,12 +128,8 @@ class ErrorStateModel:
         Make the time offset uncertain in a node that was estimated with an exact offset.
 
         With another offset the same poses would have given the state of another instant. The
-        errors of the states are therefore the error of the offset times their rates.
-
-        Args:
-            node: node with known velocity; its covariance is replaced.
-            deviation: standard deviation of the offset [s].
-
+        errors of the states are therefore the error of the offset times their rates. ``deviation``
+        [s] is that of the offset; the velocity of the node is known.
         """
         acceleration = node.rotation @ (node.force - node.accelerometer_bias)
         acceleration[2] -= self.gravity
@@ -174,59 +152,40 @@ class ErrorStateModel:
         covariance += DOUBT_RATE ** 2 * change @ change.T
         return replace(node, covariance=covariance)
 
-    def turned(self, node: Node, turn: np.ndarray) -> Node:
+    def without_marker_error(self, node: Node) -> Node:
         """
-        Give a state the attitude error of the markers, and the bias that has the same effect.
-
-        Args:
-            node: state without this error.
-            turn: (3,) the error, a rotation vector in base_link [rad].
-
-        """
-        quaternion = rotations.normalized(rotations.multiply(
-            node.quaternion, rotations.exp(turn)))
-        bias = node.accelerometer_bias - self.gravity * rotations.cross(node.rotation[2], turn)
-        return replace(node, quaternion=quaternion, rotation=rotations.matrix(quaternion),
-                       accelerometer_bias=bias, covariance=self.covariance(node), before=None)
-
-    def without_marker_error(self, node: Node) -> tuple[Node, np.ndarray]:
-        """
-        Correct attitude and bias of a state, for the time after the last pose.
+        Correct attitude and bias of the state at the last pose, for the time after it.
 
         An attitude error of the markers appears as an accelerometer bias perpendicular to gravity,
         which is wrong as soon as the robot turns. In one attitude only the sum of both errors is
-        known, and their priors divide it.
-
-        Returns:
-            the state, and the error of the markers (3,), a rotation vector in base_link [rad]; it
-            is zero if the bias is beyond three standard deviations of both: then it is another
-            error.
-
+        known, and their priors divide it. Beyond three standard deviations it is another error.
         """
         up, markers = node.rotation[2], (self.gravity * MARKER_STD) ** 2
         both = TRUE_BIAS_STD ** 2 + markers
         share = markers / both
         turn = share / self.gravity * rotations.cross(up, node.accelerometer_bias)
         if turn.dot(turn) > (3 * share / self.gravity) ** 2 * both:
-            return node, np.zeros(3)
-        corrected = self.turned(node, -turn)
-        change = np.zeros((STATES, 3))
+            return node
+        quaternion = rotations.normalized(rotations.multiply(
+            node.quaternion, rotations.exp(-turn)))
+        change = np.zeros((STATES, 3))      # with it, poses that return correct both again
         change[ATTITUDE] = np.eye(3)
         change[ACCELEROMETER_BIAS] = -self.gravity * rotations.skew(up)
-        corrected.covariance = corrected.covariance \
-            + (1 - share) * MARKER_STD ** 2 * change @ change.T
-        return corrected, turn
-
-    def predict(self, node: Node, stamp: float, force: np.ndarray, rate: np.ndarray,
-                after_impact: bool = False) -> Node:
-        """Predict ``node`` to the next IMU reading, its covariance only on demand."""
-        return propagate(node, stamp, force, rate, self.gravity, after_impact)
+        return replace(
+            node, quaternion=quaternion, rotation=rotations.matrix(quaternion), before=None,
+            accelerometer_bias=node.accelerometer_bias + self.gravity * rotations.cross(up, turn),
+            covariance=self.covariance(node) + MARKER_STD ** 2 * change @ change.T)
 
     def covariance(self, node: Node) -> np.ndarray:
         """Covariance (16, 16) of a node, predicted now if it is pending."""
+        kalman = self.filter
         for before, after in node.pending():
-            after.covariance = self._predicted_covariance(before, after)
-            after.before = None
+            dt = after.stamp - before.stamp
+            kalman.x, kalman.P = self._no_error, before.covariance
+            # Missing samples are interpolated, and the error grows with each of them.
+            kalman.predict(F=transition(before, after, self._transition),
+                           Q=self._process * (dt * max(1.0, dt / self._period) ** 3))
+            after.covariance, after.before = kalman.P, None
         return node.covariance
 
     def time_deviation(self, node: Node) -> float:
@@ -235,65 +194,35 @@ class ErrorStateModel:
         known = steps[0][0] if steps else node
         return sqrt(known.covariance[TIME_OFFSET, TIME_OFFSET])
 
-    def _predicted_covariance(self, before: Node, after: Node) -> np.ndarray:
-        """Covariance (16, 16) after one step of :func:`propagate`."""
-        dt, kalman = after.stamp - before.stamp, self.filter
-        kalman.x = self._no_error
-        kalman.P = before.covariance
-        # Missing samples are interpolated, and the error grows with each of them.
-        kalman.predict(F=transition(before, after, self._transition),
-                       Q=self._process * (dt * max(1.0, dt / self._period) ** 3))
-        change = after.force - before.force
-        squared_change = float(change.dot(change))
-        if not (after.after_impact or squared_change > IMPACT ** 2):
-            return kalman.P
-        # an impulse, after missing readings also of the attitude
-        density = self._shock.copy() if after.after_impact else np.zeros(STATES)
-        density[VELOCITY] += squared_change
-        return kalman.P + np.diag(density * dt ** 2)
-
     def correct(self, prior: Node, position: np.ndarray, quaternion: np.ndarray) -> Node | None:
         """
-        Correct a node with a pose that was captured at its stamp.
-
-        Args:
-            prior: predicted node.
-            position: (3,) of the marker body in world [m].
-            quaternion: (4,) marker body to world, unit, either sign.
+        Correct a node with a pose of the marker body in world, captured at its stamp.
 
         Returns:
-            The corrected node, or None if the pose fails the chi-square gate.
+            the corrected node, or None if the pose fails the chi-square gate.
 
         """
-        kalman = self.filter
+        kalman, jacobian = self.filter, self.filter.H
         residual = np.empty(MEASUREMENTS)
         residual[:3] = position - prior.position
         x, y, z, w = prior.quaternion.tolist()
         measured = rotations.product(*quaternion.tolist(), *self.marker_to_base.tolist())
         residual[3:] = rotations.log(rotations.product(-x, -y, -z, w, *measured))
         residual[:3] -= prior.rotation @ self._lever
-        kalman.H[0:3, ATTITUDE] = -prior.rotation @ rotations.skew(self._lever)
-        self._linearise_time(prior)
-        kalman.P = self.covariance(prior)
-        kalman.x = self._no_error
-        kalman.update(residual, H=kalman.H)
-        # The innovation is filterpy's y with inverse covariance SI; not <= also catches NaN.
-        if not kalman.y.dot(kalman.SI).dot(kalman.y) <= self.gate:
-            return None
-        return self._inject(prior, kalman.x, kalman.P)
-
-    def _linearise_time(self, prior) -> None:
-        """
-        Set the columns of the time offset: a moving pose is displaced by motion times offset.
-
-        At rest they are zero. The estimated velocity and rate are then mostly noise, which is
-        correlated with the residual and would bias the offset.
-        """
-        jacobian = self.filter.H
+        jacobian[0:3, ATTITUDE] = -prior.rotation @ rotations.skew(self._lever)
+        # A moving pose is displaced by motion times clock offset. Near rest velocity and rate are
+        # mostly noise, which is correlated with the residual and would bias the offset.
         rate = prior.rate - prior.gyroscope_bias
         velocity = prior.velocity + prior.rotation @ rotations.cross(rate, self._lever)
         jacobian[0:3, TIME_OFFSET] = velocity if velocity.dot(velocity) > LEAST_SPEED ** 2 else 0.0
         jacobian[3:6, TIME_OFFSET] = rate if rate.dot(rate) > LEAST_RATE ** 2 else 0.0
+        kalman.P = self.covariance(prior)
+        kalman.x = self._no_error
+        kalman.update(residual, H=jacobian)
+        # The innovation is filterpy's y with inverse covariance SI; not <= also catches NaN.
+        if not kalman.y.dot(kalman.SI).dot(kalman.y) <= self.gate:
+            return None
+        return self._inject(prior, kalman.x, kalman.P)
 
     def _inject(self, prior: Node, error: np.ndarray, covariance: np.ndarray) -> Node:
         """Add the estimated error to the state; the remaining error has mean zero."""
@@ -313,27 +242,18 @@ class ErrorStateModel:
                     prior.gyroscope_bias + error[GYROSCOPE_BIAS],
                     min(LARGEST_OFFSET,
                         max(-LARGEST_OFFSET, prior.time_offset + float(error[TIME_OFFSET]))),
-                    prior.after_impact, 0.5 * (covariance + covariance.T))
-
-    def aligned(self, force: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Specific force and rate (3,) minus their known biases, in base_link axes."""
-        imu = self.parameters.imu
-        return (self._axes.dot(force - imu.accelerometer_bias),
-                self._axes.dot(rate - imu.gyroscope_bias))
+                    0.5 * (covariance + covariance.T))
 
     def estimate(self, node: Node, readings: Sequence = ()) -> Estimate:
         """
-        Convert a node to the state of base_link at its stamp, with its covariance.
+        State of base_link at the stamp of the newest node, with its covariance.
 
-        Args:
-            node: newest state of the filter.
-            readings: IMU readings (stamp, specific force, rate, after impact) up to the node's.
-
+        ``readings`` (stamp, specific force, rate) end with the node's.
         """
         age = node.time_offset
         late = age > SIGNIFICANT * self.time_deviation(node)
         position, velocity, quaternion, measured_rate = (
-            self._extrapolated(node, age, self.trend(readings)) if late else
+            self._extrapolated(node, age, readings) if late else
             (node.position, node.velocity, node.quaternion, node.rate))
         rate = measured_rate - node.gyroscope_bias
         rotation, arm = rotations.matrix(quaternion), self.parameters.imu.position
@@ -347,46 +267,35 @@ class ErrorStateModel:
                         velocity - rotation.dot(rotations.cross(rate, arm)), quaternion, rate,
                         node.accelerometer_bias, node.gyroscope_bias, covariance)
 
-    def trend(self, readings) -> np.ndarray:
-        """(3,) angular acceleration [rad/s^2], by least squares through the last readings."""
-        last = [readings[i] for i in range(max(0, len(readings) - TREND), len(readings))]
-        if len(last) < max(TREND, 2):
-            return np.zeros(3)
-        stamps, _, rates, after_impact = zip(*last)
-        if any(after_impact):
-            return np.zeros(3)
-        times = np.array(stamps)
-        times -= np.add.reduce(times) / len(last)
-        return times.dot(rates) / times.dot(times)
-
-    def _extrapolated(self, node, age, trend) -> tuple[np.ndarray, ...]:
+    def _extrapolated(self, node, age, readings) -> tuple[np.ndarray, ...]:
         """
         Extrapolate position, velocity, quaternion and rate over the latency in the IMU's stamps.
 
         A stamp on arrival can be late but not early. IMU stamps later than the MoCap's therefore
         mean a delayed reading. In the opposite case the MoCap's stamps are late and the reading is
         not delayed. The acceleration is constant over these few milliseconds, and the rate
-        continues its trend. Without the trend, 25 ms are a phase lag of 18 deg at 2 Hz.
+        continues its trend, by least squares through the last readings. Without the trend, 25 ms
+        are a phase lag of 18 deg at 2 Hz.
         """
-        velocity0, rate0, slopes = node.velocity.tolist(), node.rate.tolist(), trend.tolist()
-        turn = [age * (w - bias + 0.5 * age * slope)
-                for w, bias, slope in zip(rate0, node.gyroscope_bias.tolist(), slopes)]
-        quaternion = np.array(rotations.product(*node.quaternion.tolist(),
-                                                *rotations.exp_parts(*turn)))
-        acceleration = node.rotation.dot(node.force - node.accelerometer_bias).tolist()
+        trend = np.zeros(3)     # angular acceleration [rad/s^2]
+        if len(readings) >= TREND:
+            stamps, _, rates = zip(*(readings[k] for k in range(-TREND, 0)))
+            times = np.array(stamps)
+            times -= np.add.reduce(times) / TREND
+            trend = times.dot(rates) / times.dot(times)
+        turn = age * (node.rate - node.gyroscope_bias + 0.5 * age * trend)
+        acceleration = node.rotation.dot(node.force - node.accelerometer_bias)
         acceleration[2] -= self.gravity
-        position = [p + age * v + 0.5 * age ** 2 * a
-                    for p, v, a in zip(node.position.tolist(), velocity0, acceleration)]
-        velocity = [v + age * a for v, a in zip(velocity0, acceleration)]
-        rate = [w + age * slope for w, slope in zip(rate0, slopes)]
-        return np.array(position), np.array(velocity), quaternion, np.array(rate)
+        return (node.position + age * node.velocity + 0.5 * age ** 2 * acceleration,
+                node.velocity + age * acceleration,
+                rotations.multiply(node.quaternion, rotations.exp(turn)),
+                node.rate + age * trend)
 
     def _covariance_at_base(self, rotation, rate, covariance, lever: np.ndarray) -> np.ndarray:
         """
-        Transform a state's covariance (15, 15) from the IMU to base_link's origin.
+        Transform a covariance (15, 15) from the IMU: p = p_imu - R r, v = v_imu - R (w x r).
 
-        With arm r and rate w, p = p_imu - R r and v = v_imu - R (w x r). The noise of the rate
-        sample affects the velocity through the arm.
+        The noise of the rate w affects the velocity through the arm r.
         """
         swing = rotations.cross(rate, lever)
         arm = rotation @ rotations.skew(lever)

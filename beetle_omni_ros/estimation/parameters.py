@@ -78,16 +78,13 @@ class EkfParameters(ParameterFile, file='ekf.yaml'):
         as a latency that is estimated in flight.
         """
         e, imu, mocap = robot.sensors, self.imu, self.mocap
-
-        def mounted(own, effect):
-            return np.array(effect) if any(effect) else own
-
         return replace(
             self, imu=replace(
-                imu, rotation=mounted(imu.rotation, e.imu_rotation),
-                position=mounted(imu.position, e.imu_position),
+                imu, rotation=np.array(e.imu_rotation) if any(e.imu_rotation) else imu.rotation,
+                position=np.array(e.imu_position) if any(e.imu_position) else imu.position,
                 accelerometer_bias=imu.accelerometer_bias + np.array(e.accelerometer_bias),
                 gyroscope_bias=imu.gyroscope_bias + np.array(e.gyroscope_bias),
                 delay=imu.delay + e.imu_delay),
-            mocap=replace(mocap, rotation=mounted(mocap.rotation, e.mocap_rotation),
-                          time_offset=mocap.time_offset - e.mocap_delay))
+            mocap=replace(
+                mocap, rotation=np.array(e.mocap_rotation) if any(e.mocap_rotation)
+                else mocap.rotation, time_offset=mocap.time_offset - e.mocap_delay))

@@ -1,10 +1,9 @@
 """
 State of the filter, its propagation between two IMU samples, and the output.
 
-The measured signals are linear between two samples. The attitude uses the mean rate and the first
-commutator (Magnus) term, so that coning motion does not drift. Velocity and position use the
-trapezoidal rule in world, which needs no midpoint. The navigated point is the IMU. Its
-accelerometer then needs no correction by the angular acceleration, which is not measured.
+The signals are linear between two samples. The attitude uses the mean rate and the first
+commutator (Magnus) term, so that coning motion does not drift, velocity and position the
+trapezoidal rule in world. The navigated point is the IMU: no angular acceleration is measured.
 """
 
 from __future__ import annotations
@@ -53,7 +52,6 @@ class Node:
     accelerometer_bias: np.ndarray  # (3,) base_link axes [m/s^2]
     gyroscope_bias: np.ndarray      # (3,) base_link axes [rad/s]
     time_offset: float              # stamps of the IMU minus those of the MoCap [s]
-    after_impact: bool = False      # readings just before were beyond the sensor's range
     # (16, 16) of the error states and the time offset; NaN while pending
     covariance: np.ndarray = field(default_factory=lambda: UNKNOWN)
     before: Node | None = None      # from which a pending covariance is predicted
@@ -68,19 +66,8 @@ class Node:
 
 
 def propagate(node: Node, stamp: float, force: np.ndarray, rate: np.ndarray,
-              gravity: float, after_impact: bool = False) -> Node:
-    """
-    Propagate the state, without its covariance, to the next IMU reading.
-
-    Args:
-        node: initial state.
-        stamp: stamp of the next reading [s].
-        force: (3,) specific force of the next reading, base_link axes [m/s^2].
-        rate: (3,) angular rate of the next reading, base_link axes [rad/s].
-        gravity: magnitude along world -z [m/s^2].
-        after_impact: whether readings just before the next one were beyond the sensor's range.
-
-    """
+              gravity: float) -> Node:
+    """Propagate the state, without its covariance, to the next IMU reading, in base_link axes."""
     dt = stamp - node.stamp
     ax, ay, az = (node.rate - node.gyroscope_bias).tolist()
     bx, by, bz = (rate - node.gyroscope_bias).tolist()
@@ -94,29 +81,22 @@ def propagate(node: Node, stamp: float, force: np.ndarray, rate: np.ndarray,
     rotation = rotations.matrix(unit)
 
     # ndarray.dot takes a third of the time of @ at this size
-    acceleration0 = node.rotation.dot(node.force - node.accelerometer_bias).tolist()
-    acceleration1 = rotation.dot(force - node.accelerometer_bias).tolist()
-    velocity0, sixth = node.velocity.tolist(), dt * dt / 6
-    velocity = [v + h * (a0 + a1)
-                for v, a0, a1 in zip(velocity0, acceleration0, acceleration1)]
+    acceleration0 = node.rotation.dot(node.force - node.accelerometer_bias)
+    acceleration1 = rotation.dot(force - node.accelerometer_bias)
+    velocity = node.velocity + h * (acceleration0 + acceleration1)
     velocity[2] -= gravity * dt
-    position = [p + dt * v + sixth * (a0 + a0 + a1) for p, v, a0, a1 in zip(
-        node.position.tolist(), velocity0, acceleration0, acceleration1)]
+    position = node.position + dt * node.velocity \
+        + dt * dt / 6 * (acceleration0 + acceleration0 + acceleration1)
     position[2] -= 0.5 * gravity * dt * dt
-    return Node(stamp, force, rate, np.array(position), np.array(velocity), np.array(unit),
-                rotation, node.accelerometer_bias, node.gyroscope_bias, node.time_offset,
-                after_impact, UNKNOWN, before=node)
+    return Node(stamp, force, rate, position, velocity, np.array(unit), rotation,
+                node.accelerometer_bias, node.gyroscope_bias, node.time_offset, before=node)
 
 
 def transition(before: Node, after: Node, out: np.ndarray) -> np.ndarray:
     """
     Linearise :func:`propagate`: error after = ``out`` @ error before.
 
-    Args:
-        before: initial node of the step.
-        after: result of :func:`propagate`.
-        out: (16, 16) buffer, identity in all unwritten blocks.
-
+    ``out`` is a (16, 16) buffer, identity in all unwritten blocks.
     """
     dt = after.stamp - before.stamp
     r0, r1 = before.rotation, after.rotation
@@ -177,10 +157,7 @@ def twist_covariance(estimate: Estimate, gyroscope_noise: float) -> np.ndarray:
     """
     Covariance (6, 6) of linear [m/s] and angular [rad/s] velocity in base_link.
 
-    Args:
-        estimate: output of the filter.
-        gyroscope_noise: standard deviation of one angular-rate sample, each axis [rad/s].
-
+    ``gyroscope_noise`` is the standard deviation of one angular-rate sample, each axis [rad/s].
     """
     to_body = rotations.matrix(estimate.quaternion).T
     jacobian = np.zeros((6, ERROR_STATES))

@@ -47,7 +47,8 @@ BAD_POSE = [
     ('not_finite', {'quaternion': vector(INF, 4)}), ('out_of_range', {'position': vector(-HUGE)}),
     ('quaternion_norm', {'quaternion': np.zeros(4)}),
     ('quaternion_norm', {'quaternion': np.array([0, 0, 0, 1.1])}),
-    ('duplicate', {'ahead': 0.0}), ('backwards', {'ahead': -0.02}), ('future', {'ahead': 5.0})]
+    ('duplicate', {'ahead': 0.0}), ('backwards', {'ahead': -0.02}), ('future', {'ahead': 5.0}),
+    ('frozen', {})]
 
 
 def refused(ekf, sample, reason):

@@ -92,10 +92,10 @@ def test_the_estimator_publishes_only_valid_estimates(make):
     node = make(EkfNode)
     node._publisher = Sent('odom')
     for k in range(400):
-        stamp = 100 + 0.005 * k
+        stamp, noise = 100 + 0.005 * k, 1e-6 * np.sin(k)
         if k % 2:
-            node._ekf.pose(PoseReading(stamp - 0.01, np.array([0, 0, 0.3]), LEVEL))
-        node._on_imu(ImuReading(stamp, np.array([0, 0, 9.80665]), np.zeros(3)))
+            node._ekf.pose(PoseReading(stamp - 0.01, np.array([noise, 0, 0.3]), LEVEL))
+        node._on_imu(ImuReading(stamp, np.array([noise, 0, 9.80665]), np.zeros(3)))
         if k == 3:
             assert not node._publisher      # too few poses for an estimate
     message = node._publisher[-1]
