@@ -334,8 +334,8 @@ class FlightLoop:
         if new and self._joints is not None:
             self._estimated = estimate.stamp    # each estimate is sent once
             state = processes.estimate(State.join(estimate, self._joints, self._command))
-            if state is not None:
-                processes.send('on_state', state, self._estimator.status)
+            if state is not None and self._estimator.status != 'lost':
+                processes.send('on_state', state)
                 self._control(state, now)
                 self._recorder.write('odom', Odom.of(state, *(
                     (pose_covariance(estimate), twist_covariance(estimate, self._gyroscope_noise))

@@ -28,13 +28,9 @@ LARGEST_ERROR = 0.2     # [m or rad] larger MoCap corrections are limited to thi
 
 class BackupEstimator:
     """
-    Complementary filter on raw IMU and MoCap; all inputs are finite.
-
-    Args:
-        gravity: [m/s^2].
+    Complementary filter on raw IMU and MoCap.
 
     Attributes:
-        specific_force_up: latest specific force along world up [m/s^2], None without IMU.
         imu_alive: set by the caller; without it rates come from MoCap.
         sample: latest IMU sample: stamp [s], specific force (3,), rate (3,) in base_link, or None.
         poses: latest MoCap poses: stamp [s], position (3,), quaternion (4,).
@@ -48,7 +44,6 @@ class BackupEstimator:
         self.imu_alive = True
         self.poses: deque = deque(maxlen=KEPT_POSES)
         self.running = False    # whether it is used; set to False by the caller
-        self.specific_force_up: float | None = None
         self.forget()
 
     def forget(self, by: float = 0.0) -> None:
@@ -110,7 +105,6 @@ class BackupEstimator:
         if dt > 0:
             self._rate = self._rate + min(dt, LONGEST_STEP) * turning
             self._advance(now, force)
-        self.specific_force_up = None
 
     def state(self, now: float, other: State) -> State:
         """The estimate at ``now``, extrapolated by at most the longest step; joints of another."""
@@ -122,9 +116,7 @@ class BackupEstimator:
 
     def _advance(self, stamp, force):
         dt = min(stamp - self._stamp, LONGEST_STEP)
-        in_world = rotations.matrix(self._quaternion).dot(force)
-        self.specific_force_up = float(in_world[2])
-        acceleration = in_world + self._gravity
+        acceleration = rotations.matrix(self._quaternion).dot(force) + self._gravity
         self._position = self._position + dt * self._velocity + 0.5 * dt * dt * acceleration
         self._velocity = self._velocity + dt * acceleration
         self._quaternion = rotations.normalized(rotations.multiply(

@@ -3,6 +3,8 @@
 from collections import Counter
 from math import isfinite
 
+import numpy as np
+
 from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.robot.allocation import clipped
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -26,9 +28,6 @@ class CommandStream:
     """
     Commands of one controller: the last accepted one, and refusals with reasons.
 
-    Args:
-        robot: thrust and tilt ranges.
-
     Attributes:
         accepted: the last valid command, clipped to the ranges, or None.
         clipped: number of accepted commands that were clipped.
@@ -39,8 +38,7 @@ class CommandStream:
     """
 
     def __init__(self, robot: RobotParameters):
-        self._tilt_limit = robot.joints.position_limit
-        self._low, self._high = robot.rotors.thrust_min, robot.rotors.thrust_max
+        self._robot = robot
         self.accepted: Command | None = None
         self.clipped, self.refused = 0, Counter[str]()
         self._last_refusal = ''
@@ -68,13 +66,7 @@ class CommandStream:
         return f'good for only {self.good_for:.2f} s of {RETURN_AFTER:g} s'
 
     def offer(self, command: Command, now: float) -> str:
-        """
-        Check one command; store a copy of a valid command.
-
-        Returns:
-            '' when accepted, else the reason.
-
-        """
+        """Check one command; '' when a copy is stored, else the reason of the refusal."""
         reason, clean = self._check(command, now)
         if reason:
             self.refused[reason] += 1
@@ -96,12 +88,13 @@ class CommandStream:
     def forget(self) -> None:
         """Accept any stamp, after a step of the clock."""
         self.accepted = self._offered = None
-        self.silence.forget()
+        self.silence = Silence(TIMEOUT)
 
     def _check(self, command, now):
         """Reason of a refusal and, without one, a copy within the limits."""
         stamp, tilt, thrust = command.stamp, command.tilt, command.thrust
-        if not all(map(isfinite, [stamp, *tilt.tolist(), *thrust.tolist()])):
+        clean = within_limits(command, self._robot)
+        if clean is None or not isfinite(stamp):
             return NOT_FINITE, None
         if now - stamp > STALE_AFTER:
             return 'stale stamp', None
@@ -109,18 +102,17 @@ class CommandStream:
             return 'stamp in the future', None
         if self.accepted is not None and stamp <= self.accepted.stamp:
             return 'repeated or older stamp', None
-        clean = Command(stamp, clipped(tilt, -self._tilt_limit, self._tilt_limit),
-                        clipped(thrust, self._low, self._high))
-        beyond = _farthest(tilt, clean.tilt), _farthest(thrust, clean.thrust)
-        if beyond[0] > OVERSTEP * self._tilt_limit:
+        beyond = np.abs(tilt - clean.tilt).max(), np.abs(thrust - clean.thrust).max()
+        if beyond[0] > OVERSTEP * self._robot.joints.position_limit:
             return 'tilt out of range', None
-        if beyond[1] > OVERSTEP * (self._high - self._low):
+        if beyond[1] > OVERSTEP * self._robot.rotors.thrust_max:
             return 'thrust out of range', None
-        self.clipped += max(beyond) > 0
+        self.clipped += bool(max(beyond) > 0)
         before, self._offered = self._offered, clean
         if before is None:
             return '', clean
-        steps = _farthest(clean.tilt, before.tilt), _farthest(clean.thrust, before.thrust)
+        steps = (np.abs(clean.tilt - before.tilt).max(),
+                 np.abs(clean.thrust - before.thrust).max())
         self._same = 0 if max(steps) > 0 else self._same + 1
         if self._same >= SAME:
             return FROZEN, None
@@ -140,6 +132,3 @@ def within_limits(command: Command, robot: RobotParameters) -> Command | None:
     return Command(command.stamp, clipped(command.tilt, -limit, limit),
                    clipped(command.thrust, 0.0, robot.rotors.thrust_max))
 
-
-def _farthest(a, b):
-    return max(map(abs, (a - b).tolist()))

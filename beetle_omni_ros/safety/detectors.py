@@ -30,7 +30,6 @@ MOVED = 0.02            # [rad] the same for the angle of a stuck joint
 # Of the pack
 DIRECTIONS = 200        # of up in the body, with a computed hover load, 14 deg apart
 STEPS = 500             # between no and full thrust, for the thrust of all rotors together
-LEAST = 1.0             # [V] a smaller reading is that of a disconnected sensor
 TIME = 0.2              # [s] three readings; full thrust in a manoeuvre is shorter
 
 
@@ -41,10 +40,6 @@ class FaultWatch:
     A detected fault stays until :meth:`reset`: an actuator that has failed once is not used again
     in the same flight.
 
-    Args:
-        robot: nominal robot.
-        allocator: of the robot.
-
     Attributes:
         faults: name -> time of detection [s].
         health: which actuators work, and the zeros of encoders that jumped.
@@ -53,32 +48,29 @@ class FaultWatch:
     """
 
     def __init__(self, robot: RobotParameters, allocator: Allocator):
+        self._robot, self._allocator = robot, allocator
         self._limit = robot.joints.position_limit
         self._thrust_max = self._limit_now = robot.rotors.thrust_max
-        self._wrench = WrenchWatch(robot, allocator)
-        self.contact = ContactWatch(robot.gravity)
-        self._joints = JointWatch(robot)
-        self._speeds = SpeedWatch(robot)
-        self._mocap = MocapWatch()
         self._map = ThrustMap(robot.rotors) if len(robot.rotors.map) > 1 else None
-        self._pack = None if self._map is None else PackWatch(robot, allocator, self._map)
         self.faults: dict[str, float] = {}
         self.reset()
 
     def reset(self) -> None:
-        """Reset for a new flight without faults."""
+        """Reset for a new flight without faults, perhaps with another pack."""
         self.faults.clear()
         self.health: ActuatorHealth = ALL_HEALTHY
         self.news: list[str] = []
-        if self._pack is not None:
-            self._pack.reset()
+        self._pack = None if self._map is None else PackWatch(self._robot, self._allocator,
+                                                              self._map)
         self.restart()
 
     def restart(self) -> None:
         """Restart the detectors after a pause or a step of the clock; detected faults stay."""
         self._stamp = -np.inf
-        for watch in (self._wrench, self.contact, self._joints, self._speeds, self._mocap):
-            watch.reset()
+        self._wrench = WrenchWatch(self._robot, self._allocator)
+        self.contact = ContactWatch(self._robot.gravity)
+        self._joints, self._speeds = JointWatch(self._robot), SpeedWatch(self._robot)
+        self._mocap = MocapWatch()
 
     def name(self, name: str, stamp: float, text: str = '') -> bool:
         """Add a fault; False if it is already known."""
@@ -92,8 +84,8 @@ class FaultWatch:
     def on_command(self, command: Command) -> None:
         """Receive the executed command."""
         thrust = clipped(command.thrust, 0.0, self._limit_now)
-        self._joints.on_command(command.stamp, command.tilt)
-        self._speeds.on_command(command.stamp, thrust)
+        self._joints.commands.append((command.stamp, command.tilt))
+        self._speeds.commands.append((command.stamp, thrust))
 
     def on_imu(self, stamp: float, force: np.ndarray, rate: np.ndarray, tilt: np.ndarray | None,
                command: Command | None, height: float | None) -> None:
@@ -196,11 +188,6 @@ class PackWatch:
     drop * load / V`` with the load being the sum of those powers. With the highest voltage of the
     flight as ``rest``, a reading gives ``drop``, and this the thrust of all rotors together.
 
-    Args:
-        robot: nominal robot.
-        allocator: of the robot.
-        rotor_map: thrust limits by voltage.
-
     Attributes:
         limit: thrust that all rotors can give at the same time [N], None while the pack is strong
             enough; it only falls.
@@ -211,18 +198,12 @@ class PackWatch:
         self._map, self._thrust_max = rotor_map, robot.rotors.thrust_max
         _, thrusts = allocator.upright(sphere(DIRECTIONS))
         self._need = min(float(thrusts.max()), self._thrust_max)
-        self.reset()
-
-    def reset(self) -> None:
-        """Reset for a new flight, perhaps with another pack."""
         self.limit: float | None = None
         self._rest, self._read_at, self._weak_for = 0.0, -np.inf, 0.0
 
     def on_voltage(self, stamp: float, voltage: float, thrust: np.ndarray) -> None:
         """Receive a reading [V] under modelled thrusts (4,) [N]."""
         since, self._read_at = min(stamp - self._read_at, 1.0), stamp
-        if since <= 0 or voltage < LEAST:
-            return
         self._rest = max(self._rest, voltage)
         allowed, load = float(self._map.thrust_limit_below(voltage)), float((thrust ** 1.5).sum())
         self._weak_for = self._weak_for + since if allowed < self._need else 0.0

@@ -42,10 +42,6 @@ class Silence:
 
     def __init__(self, limit: float):
         self.limit = limit
-        self.forget()
-
-    def forget(self) -> None:
-        """As if no message had arrived yet."""
         self.elapsed, self.silent, self.lost, self._fresh = inf, True, False, False
 
     def reset(self) -> None:

@@ -20,8 +20,6 @@ from beetle_omni_ros.safety.events import Event, INFO, Silence, WARNING
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.way import inclination
 
-NODES = {'joint': 'joint_bridge_node', 'rotor': 'rotor_bridge_node'}
-TRACKING = ('tracking', 'dead_reckoning')   # statuses with a usable estimate
 TICK_LIMIT = 0.02       # [s] a longer pause of the supervisor counts as this for the sources
 ESTIMATE_TIMEOUT = 0.05     # [s] 10 periods of 200 Hz
 STALE_AFTER = 0.05      # [s] older estimates are refused
@@ -29,7 +27,7 @@ JOINT_TIMEOUT = 0.2     # [s]
 IMU_TIMEOUT = 0.05      # [s]
 MOCAP_TIMEOUT = 0.2     # [s]
 ABSURD = 1e4            # [m, m/s, m/s^2, rad/s] beyond any robot and sensor; no overflow
-VOLTAGE_END = 1000.0    # [V] from which a reading is refused
+VOLTAGES = 1.0, 1000.0  # [V] plausible readings; that of a disconnected sensor is smaller
 UNIT_TOLERANCE = 0.02   # of a quaternion's squared length
 JUMP_POSITION, JUMP_ATTITUDE = 1.0, 1.0     # [m], [rad] a single larger jump of the estimate is
                         # refused, a lasting one is accepted with the next. 20 m/s and 20 rad/s
@@ -59,10 +57,9 @@ class Inputs:
         events: what happened, oldest first.
         faults: of this flight: name -> time of detection [s].
         active: name of the selected controller.
-        estimate: the last valid one; status: of the estimator at that time.
+        estimate: the last valid one; before the first at the origin, of an infinite age.
         bridges: bridge 'joint' or 'rotor' -> its reported state; a bridge that never reported has
             no influence, because without bridges the simulator gets the commands directly.
-        unready: bridge -> '' while it is ready or never reported, else its node and state.
         battery_low, battery_empty, lost: pack below its voltages, robot tumbling or falling, for
             long enough.
         refused: 'estimate: stale stamp' and the like -> count.
@@ -84,18 +81,18 @@ class Inputs:
         self.active = parameters.controller if parameters.controller in controllers \
             else controllers[0]
         self.backup = BackupEstimator(robot.gravity)
-        self.estimate: State | None = None
-        self.status = self.last_refusal = ''
+        self.estimate = State(-np.inf, np.zeros(3), np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]),
+                              np.zeros(3), np.zeros(4), np.zeros(4), -np.inf)
+        self._offered = self.estimate       # the one before, accepted or not
+        self.last_refusal = ''
         self.refused = Counter[str]()
         self.ekf, self.joints = Silence(ESTIMATE_TIMEOUT), Silence(JOINT_TIMEOUT)
         self.imu, self.mocap = Silence(IMU_TIMEOUT), Silence(MOCAP_TIMEOUT)
         self.tilt, self.tilt_velocity, self.tilt_stamp = np.zeros(4), np.zeros(4), -np.inf
         self.voltage: float | None = None
         self.bridges: dict[str, str] = {}
-        self.unready = dict.fromkeys(NODES, '')
         self.battery_low = self.battery_empty = self.lost = False
         self._low_for = self._empty_for = self._lost_for = 0.0
-        self._offered: State | None = None      # the estimate before, accepted or not
         self._same = self._same_samples = 0     # equal estimates and IMU samples in a row
         self._sample: list[float] = []
         self._spikes = SpikeFilter(FORCE_SPIKE, RATE_SPIKE)
@@ -106,23 +103,21 @@ class Inputs:
 
     # Messages ---------------------------------------------------------------------------------
 
-    def on_state(self, state: State, status: str = 'tracking') -> bool:
-        """Receive the estimator's state and status; False when it is refused."""
+    def on_state(self, state: State) -> bool:
+        """Receive the estimator's state; False when it is refused."""
         true = corrected(state, self.watch.health)
-        reason = self._why_not(true, status)
+        reason = self._why_not(true)
         if reason:
             self.refused[f'estimate: {reason}'] += 1
             self.last_refusal = reason
             self.say(WARNING, f'ekf_node: estimate refused: {reason}', reason)
             return False
-        if status not in (self.status, 'tracking'):
-            self.say(WARNING, f"ekf_node reports '{status}'")
-        self.estimate, self.status, self.last_refusal = true, status, ''
+        self.estimate, self.last_refusal = true, ''
         self.ekf.reset()
         self.on_joints(state.tilt_stamp, state.tilt, state.tilt_velocity)
         return True
 
-    def _why_not(self, state, status):
+    def _why_not(self, state):
         now = self._now
         if not (isfinite(state.stamp) and plausible(
                 state.position, state.velocity, state.quaternion, state.angular_velocity)):
@@ -133,16 +128,13 @@ class Inputs:
             return 'stale stamp'
         if self._ahead(state.stamp):
             return 'stamp in the future'
-        if self.estimate is not None and state.stamp <= self.estimate.stamp:
+        if state.stamp <= self.estimate.stamp:
             return 'repeated or older stamp'
-        if status not in TRACKING:
-            return f"status '{status}'"
         before, self._offered = self._offered, state
-        self._same = self._same + 1 if before is not None and np.array_equal(
-            before.position, state.position) else 0
+        self._same = self._same + 1 if np.array_equal(before.position, state.position) else 0
         if self._same >= SAME and self.airborne:
             return FROZEN
-        jumped = before is not None and 0 < state.stamp - before.stamp <= ESTIMATE_TIMEOUT and (
+        jumped = 0 < state.stamp - before.stamp <= ESTIMATE_TIMEOUT and (
             dist(before.position, state.position) > JUMP_POSITION
             or rotations.geodesic_angle(before.quaternion, state.quaternion) > JUMP_ATTITUDE)
         return JUMP if jumped else ''
@@ -213,34 +205,29 @@ class Inputs:
         quaternion = rotations.normalized(quaternion)
         poses.append((stamp, position, quaternion))
         if self.airborne:
-            state = self.best if self.estimate is not None else None
-            near = state is not None and abs(state.stamp - stamp) < POSE_AGE
+            state = self.best
+            near = abs(state.stamp - stamp) < POSE_AGE
             good = self.watch.on_mocap(stamp, position, quaternion, state if near else None)
             if not good and 'estimator_wrong' not in self.watch.faults:
                 return
         self.backup.correct(stamp, position, quaternion)
         if self.airborne and self.imu.silent:
-            self.watch.contact.on_pose(stamp, position, quaternion, self.height)
+            self.watch.contact.on_pose(quaternion, self.height)
         self.mocap.reset()
 
     def on_battery(self, voltage: float) -> None:
-        """Receive the pack voltage under load [V]; ignored if not finite, negative or absurd."""
-        if self._now is not None and 0 <= voltage < VOLTAGE_END:
+        """Receive the pack voltage under load [V]; ignored if not finite or not plausible."""
+        if self._now is not None and VOLTAGES[0] <= voltage < VOLTAGES[1]:
             self.voltage = float(voltage)
             self.watch.on_voltage(self._now, self.voltage)
 
     def on_actuators(self, name: str, text: str, now: float) -> None:
         """
-        Receive the reported state of an actuator bridge; the next update acts on it.
+        Receive the state of the bridge 'joint' or 'rotor'; the next update acts on it.
 
-        Args:
-            name: 'joint' or 'rotor'.
-            text: 'ready', 'waiting: WHY', 'silent: WHY' or 'lost: WHY'.
-            now: time [s].
-
+        It is 'ready', 'waiting: WHY', 'silent: WHY' or 'lost: WHY'.
         """
         self.bridges[name] = text
-        self.unready[name] = '' if text == 'ready' else f'{NODES[name]} {text}'
 
     # What is known ----------------------------------------------------------------------------
 
@@ -249,53 +236,54 @@ class Inputs:
         """Health of the actuators by the detectors."""
         return self.watch.health
 
-    @property
-    def known(self) -> State:
-        """The last valid estimate, a condition for take-off."""
-        if self.estimate is None:
-            raise RuntimeError('no estimate received yet')
-        return self.estimate
+    def unready(self, bridge: str) -> str:
+        """'' while 'joint' or 'rotor' is ready or never reported, else its node and state."""
+        text = self.bridges.get(bridge, 'ready')
+        return '' if text == 'ready' else f'{bridge}_bridge_node {text}'
 
     @property
     def best(self) -> State:
         """The estimate, or the backup estimate while it is used."""
-        return self.known if not self.backup.running or self._now is None else \
-            self.backup.state(self._now, self.known)
+        return self.estimate if not self.backup.running or self._now is None else \
+            self.backup.state(self._now, self.estimate)
+
+    @property
+    def blind(self) -> bool:
+        """Whether position and velocity are dead reckoning."""
+        return self.mocap.silent if self.backup.running else self.mocap.lost
 
     @property
     def height(self) -> float | None:
         """Height of base_link above its height on the ground [m]; None if unknown."""
-        blind = self.mocap.silent if self.backup.running else self.mocap.lost
-        return None if self.estimate is None or blind else \
-            float(self.best.position[2]) - self.floor
+        return None if self.blind else float(self.best.position[2]) - self.floor
 
     @property
     def seen(self) -> State:
         """The best state, for the hover controller; silent joints are where they were asked to."""
-        state, tilt, velocity, in_force = self.best, self.tilt, self.tilt_velocity, self._in_force
+        tilt, velocity, in_force = self.tilt, self.tilt_velocity, self._in_force
         # Joints of a bridge that lost them keep their last angles.
         if self.joints.silent and in_force is not None and not self.bridges.get(
                 'joint', '').startswith('lost:'):
             tilt, velocity = in_force.tilt, np.zeros(4)
-        return State(state.stamp, state.position, state.velocity, state.quaternion,
-                     state.angular_velocity, tilt, velocity, self.tilt_stamp, in_force)
+        return replace(self.best, tilt=tilt, tilt_velocity=velocity, tilt_stamp=self.tilt_stamp,
+                       command=in_force)
 
     @property
     def specific_force_up(self) -> float | None:
-        """Latest specific force along world up by the estimator's attitude [m/s^2]."""
-        if self.backup.sample is None or self.estimate is None or self.imu.silent:
+        """Latest specific force along world up [m/s^2], None without IMU."""
+        if self.backup.sample is None or self.imu.silent:
             return None
-        return float(rotations.up(self.estimate.quaternion).dot(self.backup.sample[1]))
+        return float(rotations.up(self.best.quaternion).dot(self.backup.sample[1]))
 
     def why_not_arm(self) -> str:
         """'' when the motors may start, else the missing condition."""
         state = self.estimate
-        if any(self.unready.values()):
-            return '; '.join(filter(None, self.unready.values()))
-        if state is None or self.ekf.silent:
+        if unready := '; '.join(filter(None, map(self.unready, ('joint', 'rotor')))):
+            return unready
+        if self.ekf.silent:
             return f'no fresh state estimate (ekf_node {self.ekf.text})'
-        if self.status != 'tracking':
-            return f"the estimator reports '{self.status}', not 'tracking'"
+        if self.mocap.silent:
+            return f'no fresh pose (MoCap {self.mocap.text})'
         if self.joints.silent:
             return f'no fresh joint angles (joint_bridge_node {self.joints.text})'
         angle = np.degrees(inclination(state.quaternion))
@@ -344,18 +332,16 @@ class Inputs:
         self._empty_for = self._empty_for + dt if cell < limits.battery_land else 0.0
         self.battery_low, self.battery_empty = self._low_for >= LOW_TIME, \
             self._empty_for >= LOW_TIME
-        if self.estimate is not None:
-            state = self.best
-            lost = state.angular_velocity.dot(state.angular_velocity) > TUMBLING**2 \
-                or state.velocity[2] < -FALLING
-            self._lost_for = self._lost_for + dt if lost else 0.0
-            self.lost = self._lost_for >= LOST_TIME
+        state = self.best
+        lost = state.angular_velocity.dot(state.angular_velocity) > TUMBLING**2 \
+            or state.velocity[2] < -FALLING
+        self._lost_for = self._lost_for + dt if lost else 0.0
+        self.lost = self._lost_for >= LOST_TIME
         return dt
 
     def _forget_stamps(self, now: float, by: float) -> None:
         """Accept new stamps after the clock was set back by ``by`` [s]."""
-        if self.estimate is not None:
-            self.estimate = replace(self.estimate, stamp=min(self.estimate.stamp, now))
+        self.estimate = replace(self.estimate, stamp=min(self.estimate.stamp, now))
         self.tilt_stamp = min(self.tilt_stamp, now)
         self.backup.forget(by)
         self.watch.restart()

@@ -69,7 +69,15 @@ class Takeoff:
         if self._ramp is None:
             return self._align(state, dt)
         self._climbed_for += dt
-        self._judge(state, self._climbed_for - self._ramp.duration)
+        over = self._climbed_for - self._ramp.duration
+        if over >= 0 and np.linalg.norm(state.position - self._end) < NEAR \
+                and np.linalg.norm(state.velocity) < SLOW:
+            self.done = True
+        elif over > PATIENCE:
+            # In the air, off target: the hand-over follows. On the ground: abort.
+            self.done = self.airborne
+            if not self.airborne:
+                self.failure = f'still on the ground {PATIENCE:g} s after the climb'
         self._hover.observe(state, free=self.airborne)
         # The ramp runs by counted time, which a step of the clock does not change.
         return self._hover.step(state, self._ramp.at(self._climbed_for))
@@ -91,18 +99,6 @@ class Takeoff:
                            f'{ALIGN_PATIENCE:g} s (joint_bridge_node)'
         return Command(state.stamp, self._tilt, np.zeros(4))
 
-    def _judge(self, state, over):
-        if over < 0:
-            return
-        if np.linalg.norm(state.position - self._end) < NEAR \
-                and np.linalg.norm(state.velocity) < SLOW:
-            self.done = True
-        elif over > PATIENCE:
-            # In the air, off target: the hand-over follows. On the ground: abort.
-            self.done = self.airborne
-            if not self.airborne:
-                self.failure = f'still on the ground {PATIENCE:g} s after the climb'
-
 
 class Landing:
     """
@@ -120,7 +116,7 @@ class Landing:
         self._standing_for = self._still_for = self._blind_for = 0.0
         self._support = 0.0     # share of the weight that the rotors do not carry, filtered
         if 'estimator_wrong' in inputs.faults or inputs.ekf.silent:
-            inputs.backup.start(inputs.known)
+            inputs.backup.start(inputs.estimate)
         self.set_out()
 
     @property
@@ -139,11 +135,10 @@ class Landing:
         inputs, backup = self._inputs, self._inputs.backup
         if not backup.running and inputs.ekf.silent:
             inputs.say(ERROR, f'ekf_node {inputs.ekf.text}: descent goes on with raw sensors')
-            backup.start(inputs.known)
+            backup.start(inputs.estimate)
             self.set_out()
         if not backup.running:
-            return self._follow(inputs.seen, dt, inputs.specific_force_up
-                                if inputs.mocap.lost else None)
+            return self._follow(inputs.seen, dt)
         for source, name in ((inputs.mocap, 'MoCap'), (inputs.imu, 'IMU')):
             if source.silent:
                 inputs.say(ERROR, f'{name} is gone too: descent without it', f'no {name}')
@@ -154,7 +149,7 @@ class Landing:
         if no_imu:
             force, torque = inputs.allocator.wrench(inputs.seen.tilt, inputs.thrusts)
             backup.predict(now, force / inputs.allocator.mass, torque / inputs.robot.inertia)
-        return self._follow(inputs.seen, dt, backup.specific_force_up if no_mocap else None)
+        return self._follow(inputs.seen, dt)
 
     # The plan ---------------------------------------------------------------------------------
 
@@ -184,30 +179,28 @@ class Landing:
 
     # The descent ------------------------------------------------------------------------------
 
-    def _follow(self, state, dt, specific_force_up):
-        """
-        Follow the ramp, whose target waits for the robot.
-
-        ``specific_force_up`` [m/s^2] is given only if motion is not measured: otherwise an upward
-        wind would be interpreted as the ground.
-        """
+    def _follow(self, state, dt):
+        """Follow the ramp, whose target waits for the robot."""
         reference = self._ramp.at(state.stamp)
         height = max(reference.position[2], state.position[2] - TARGET_LEAD)
         reference = replace(reference, position=np.array([*reference.position[:2], height]))
-        self._feel_ground(state, dt, specific_force_up, reference.velocity[2])
+        self._feel_ground(state, dt, reference.velocity[2])
         # Rates from MoCap only are late and noisy: no update of the disturbance.
         self._hover.observe(state, free=self._inputs.backup.imu_alive)
         return self._hover.step(state, reference)
 
-    def _feel_ground(self, state, dt, specific_force_up, speed):
+    def _feel_ground(self, state, dt, speed):
         """The rotors carry clearly less than the weight, but the robot does not fall."""
+        inputs = self._inputs
         # Without IMU the velocity comes from the rotor model, which does not include the floor.
-        backup = self._inputs.backup
-        blind = backup.running and not backup.imu_alive
-        by_poses = backup.velocity_by_poses if blind else None
+        backup = inputs.backup
+        no_imu = backup.running and not backup.imu_alive
+        by_poses = backup.velocity_by_poses if no_imu else None
         still = abs(state.velocity[2] if by_poses is None else by_poses[2]) < STILL_SPEED
-        model, gravity = self._inputs.allocator, self._inputs.robot.gravity
-        force, _ = model.wrench(state.tilt, self._inputs.thrusts)
+        # Used only if motion is not measured: an upward wind would seem to be the ground.
+        specific_force_up = inputs.specific_force_up if inputs.blind else None
+        model, gravity = inputs.allocator, inputs.robot.gravity
+        force, _ = model.wrench(state.tilt, inputs.thrusts)
         lift = float(rotations.up(state.quaternion).dot(force)) / model.mass
         felt = gravity if specific_force_up is None else specific_force_up
         # The accelerometer jitters on the floor, by more than the weight with idle rotors.
@@ -215,5 +208,5 @@ class Landing:
         sinking = speed < -0.5 * SPEED
         stands = sinking and self._support > CARRIED and (still or specific_force_up is not None)
         self._standing_for = self._standing_for + dt if stands else 0.0
-        self._still_for = self._still_for + dt if blind and sinking and still else 0.0
+        self._still_for = self._still_for + dt if no_imu and sinking and still else 0.0
         self.grounded = self._standing_for >= GROUND_TIME - 1e-9 or self._still_for >= STILL_TIME

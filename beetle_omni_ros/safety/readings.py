@@ -36,10 +36,8 @@ class JointWatch:
     Both follow the commands with a first-order lag, at a limited rate and after a delay. A joint
     between them, or within the noise and its friction beside them, follows its commands.
 
-    Args:
-        robot: nominal robot.
-
     Attributes:
+        commands: stamps [s] and joint targets (4,) [rad], the newest last.
         astray: joints (4,) bool that do not follow their command.
         jump: (4,) [rad] jump of the last reading relative to the motion before it, if it is larger
             than a joint can turn, else 0.
@@ -53,18 +51,10 @@ class JointWatch:
         self._lags, (low, high) = allowed.servo_lag, allowed.servo_delay
         self._delays = max(0.0, DELAY - SPREAD + low), DELAY + SPREAD + high
         self._error = ERROR + allowed.friction
-        self.reset()
-
-    def reset(self) -> None:
-        """Start again at the next reading."""
-        self._commands: deque = deque(maxlen=KEPT)
+        self.commands: deque = deque(maxlen=KEPT)
         self._stamp, self._tilt, self._models = -np.inf, np.zeros(ROTORS), np.zeros((2, ROTORS))
         self._change, self._for = np.zeros(ROTORS), np.zeros(ROTORS)
         self.astray, self.jump, self.suspects = np.zeros(ROTORS, dtype=bool), NO_JUMP, False
-
-    def on_command(self, stamp: float, tilt: np.ndarray) -> None:
-        """Receive the joint targets (4,) [rad] of the time ``stamp`` [s]."""
-        self._commands.append((stamp, tilt))
 
     def on_joints(self, stamp: float, tilt: np.ndarray) -> None:
         """Receive a complete reading (4,) [rad] of the time ``stamp`` [s]."""
@@ -75,7 +65,7 @@ class JointWatch:
             return
         reach = self._rate_limit * dt
         for model, delay, lag in zip(models, self._delays, self._lags):
-            target = next((asked for at, asked in reversed(self._commands) if at <= stamp - delay),
+            target = next((asked for at, asked in reversed(self.commands) if at <= stamp - delay),
                           tilt)
             model += clipped(-expm1(-dt / lag) * (target - model), -reach, reach)
         jumped = np.abs(change) > reach + JUMP
@@ -101,26 +91,13 @@ class MocapWatch:
     """
 
     def __init__(self):
-        self.reset()
-
-    def reset(self) -> None:
-        """Reset the detector."""
         self._before: tuple[float, np.ndarray, np.ndarray] | None = None
         self.good = self.frozen = self.jumped = self.contradicts = False
         self._same = self._off = 0
 
     def on_pose(self, stamp: float, position: np.ndarray, quaternion: np.ndarray,
                 state: State | None) -> None:
-        """
-        Receive a pose.
-
-        Args:
-            stamp: of its capture [s].
-            position: (3,) in world [m].
-            quaternion: (4,) xyzw, unit.
-            state: estimate of about that time, None: there is none.
-
-        """
+        """Receive a pose and the estimate of about that time, None: there is none."""
         before, self._before = self._before, (stamp, position, quaternion)
         turning = 0.0 if state is None else sqrt(state.angular_velocity.dot(
             state.angular_velocity))

@@ -12,7 +12,6 @@ from beetle_omni_ros.robot.servo import Responses
 LEARNT = 1.0            # [s] time constant of the learnt factor between speed and thrust
 DELAY = 0.01            # [s] from a command's stamp until it acts
 KEPT = 64               # commands, 0.3 s at 200 Hz
-LONGEST = 0.2           # [s] longest time between two reports of one sequence
 STALLED, SHORTEST = 2.5, 0.05   # [intervals], [s]: a longer pause of the reports is a stall
 SETTLED = 0.3           # [s] after a stall, three time constants of a rotor
 SHARE = 0.5             # [-] missing share of the thrust of a lost rotor
@@ -36,10 +35,8 @@ class SpeedWatch:
     If the reports of the motor board pause, its commands were probably late, too. For SETTLED
     seconds the thrusts then differ from the model, and no rotor is suspected.
 
-    Args:
-        robot: nominal robot.
-
     Attributes:
+        commands: stamps [s] and commanded thrusts (4,) [N], the newest last.
         lost: the rotor (0 to 3) that turns too slowly, or None.
         deaf: the rotor (0 to 3) that gives more than commanded, or None.
         thrust: (4,) computed from the speeds [N], nan where unknown.
@@ -51,12 +48,8 @@ class SpeedWatch:
         allowed = Responses.of(robot)
         self._responses = [(lag, DELAY + delay)
                            for lag, delay in zip(allowed.rotor_lag, allowed.rotor_delay)]
-        self.reset()
-
-    def reset(self) -> None:
-        """Reset all learnt factors."""
-        self._stamp, self._interval, self._settled_at = -inf, inf, -inf
-        self._commands: deque = deque(maxlen=KEPT)
+        self._stamp, self._interval, self._settled_at = -inf, 0.0, -inf
+        self.commands: deque = deque(maxlen=KEPT)
         self._modelled = np.zeros((2, ROTORS))      # with the shortest and with the longest lag
         self._learnt_for, self._mean_thrust, self._mean_square = np.zeros((3, ROTORS))
         self.thrust = np.full(ROTORS, np.nan)
@@ -69,19 +62,8 @@ class SpeedWatch:
         self.lost: int | None = None
         self.deaf: int | None = None
 
-    def on_command(self, stamp: float, thrust: np.ndarray) -> None:
-        """Receive the commanded thrusts (4,) [N] of the time ``stamp`` [s]."""
-        self._commands.append((stamp, thrust))
-
     def on_speeds(self, stamp: float, speed: np.ndarray) -> None:
-        """
-        Receive a report.
-
-        Args:
-            stamp: [s].
-            speed: (4,) [rad/s], nan where the ESC is offline.
-
-        """
+        """Receive a report of the time ``stamp`` [s]: (4,) [rad/s], nan where offline."""
         dt, before = stamp - self._stamp, self._stamp
         if dt <= 0:
             return
@@ -89,10 +71,6 @@ class SpeedWatch:
         if dt > max(SHORTEST, STALLED * self._interval):
             self._settled_at = stamp + SETTLED
         self._interval = dt
-        if dt > LONGEST:
-            if self._commands:
-                self._modelled[:] = self._commands[-1][1]
-            return self.forget()
         self._follow(before, stamp)
         if stamp < self._settled_at:
             return self.forget()
@@ -100,7 +78,7 @@ class SpeedWatch:
 
     def _follow(self, start, end):
         """Thrusts that the commands build up between two times [s]."""
-        commands = self._commands
+        commands = self.commands
         while len(commands) > 1 and commands[1][0] + self._responses[-1][1] <= start:
             commands.popleft()
         for modelled, (lag, delay) in zip(self._modelled, self._responses):

@@ -48,11 +48,8 @@ class Supervisor(Inputs):
     """
     Arms, selects, checks, falls back, lands.
 
-    Args:
-        parameters: thresholds.
-        robot: the model of the robot.
-        fallback: for takeoff, fallback and landing; a HoverController or similar.
-        controllers: names of the controllers that may be active; None: those on standby.
+    ``fallback`` flies takeoff, fallback and landing. ``controllers`` may be active; None: those on
+    standby.
 
     Attributes:
         state: 'disarmed', 'takeoff', 'flying', 'fallback', 'landing' or 'emergency_stop'.
@@ -89,7 +86,7 @@ class Supervisor(Inputs):
         self._in_force = None
         self._takeoff = Takeoff(self._parameters.takeoff_height, self.allocator, self._hover,
                                 self.seen)
-        self.floor = float(self.known.position[2])
+        self.floor = float(self.estimate.position[2])
         self.watch.reset()
         self._acted_on = ALL_HEALTHY
         self._hover.set_health(ALL_HEALTHY)
@@ -141,11 +138,9 @@ class Supervisor(Inputs):
 
     def update(self, now: float) -> Command | None:
         """
-        Select the command of the actuators; call it at least every 10 ms.
+        A finite command within limits, or None: nothing is sent.
 
-        Returns:
-            a finite command within limits, or None: nothing is sent.
-
+        Call it at least every 10 ms.
         """
         dt = self._tick(now)
         self._in_state += dt
@@ -232,7 +227,7 @@ class Supervisor(Inputs):
         """Faults that end or change a flight with any controller, the most urgent first."""
         if self.battery_low:
             self.say(WARNING, f'battery low: {self.voltage:.1f} V', 'battery')
-        no_rotors, no_joints = self.unready['rotor'], self.unready['joint']
+        no_rotors = self.unready('rotor')
         if no_rotors and not self.bridges['rotor'].startswith('silent:'):
             if not self.airborne:
                 self._enter(DISARMED, ERROR, f'{no_rotors}; still on the ground: motors off')
@@ -241,7 +236,7 @@ class Supervisor(Inputs):
                 self.emergency_stop(now, no_rotors)
         elif self.state == LANDING:
             self._limit_landing(now)
-        elif reason := self._why_land(no_rotors, no_joints):
+        elif reason := self._why_land(no_rotors):
             name, text = reason
             self._land(now, ERROR, text, name)
         elif self.lost and self.state == FLYING:
@@ -249,7 +244,7 @@ class Supervisor(Inputs):
             self._fall_back(now, ERROR, f'tumbling or falling under {self.active}_node: fallback '
                                         'to hover')
 
-    def _why_land(self, no_rotors, no_joints):
+    def _why_land(self, no_rotors):
         """Name of the fault ('' for a detected one) and text of the most urgent reason."""
         if self.state == FALLBACK and self._in_state > FALLBACK_TIME:
             return 'controller_lost', f'{self.active}_node not good for {self._in_state:.0f} s: ' \
@@ -266,7 +261,7 @@ class Supervisor(Inputs):
             return '', 'MoCap jumped: landing'
         if self.mocap.lost and self.mocap.elapsed > MOCAP_PATIENCE:
             return 'mocap_lost', f'MoCap {self.mocap.text}: landing by dead reckoning'
-        if no_joints:
+        if no_joints := self.unready('joint'):
             return 'joint_bridge_lost', f'{no_joints}: landing with the joints as they are'
         if self.joints.silent:
             return 'joints_lost', f'joint_bridge_node {self.joints.text}: landing with the ' \
@@ -379,9 +374,9 @@ class Supervisor(Inputs):
 
     def _fall_back(self, now, severity, text):
         """Hover at the present position, in the attitude in which the present turn ends."""
-        turn = rotations.exp(TURN_TIME * self.known.angular_velocity)
-        self._target = PoseTarget(self.known.position, rotations.multiply(
-            self.known.quaternion, turn), now)
+        turn = rotations.exp(TURN_TIME * self.estimate.angular_velocity)
+        self._target = PoseTarget(self.estimate.position, rotations.multiply(
+            self.estimate.quaternion, turn), now)
         self._enter(FALLBACK, severity, text)
 
     def _land(self, now, severity, text, name=''):
@@ -422,7 +417,6 @@ class Supervisor(Inputs):
         """State, sources and refusals, flat, for operators and logs."""
         values: dict[str, float | int | str] = {
             'state': self.state, 'controller': self.active, 'source': self.source,
-            'estimator': self.status or 'no message yet',
             'on_backup_estimator': int(self.backup.running)}
         values.update({f'fault.{name}': at for name, at in self.faults.items()})
         values.update({f'{name}_bridge_node': state for name, state in self.bridges.items()})

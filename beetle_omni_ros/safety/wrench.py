@@ -1,6 +1,5 @@
 """Detection of a lost rotor or contact by unexplained forces and torques."""
 
-from collections import deque
 from math import exp, expm1, sqrt
 
 import numpy as np
@@ -40,10 +39,7 @@ AFTER_HIT = 1.0         # [s] after an impact, in which a push at any height is 
 SUPPORT = 0.35          # [-] of the weight; healthy flights near the ground stay below 0.2
 SUPPORT_TIME = 0.15     # [s]
 USUAL = 1.0             # [s] time constant of the learnt steady push in the air
-# Without IMU: change of the velocity that is an impact, three deviations of published MoCap noise
-BUMP = 1.2              # [m/s]
 TIPPED, LOW = 0.5, 0.12     # [rad], [m] above the standing height: it touches the floor
-SPAN, LONGEST_TRACK = 3, 0.12   # poses of either velocity; [s] of both
 
 
 class WrenchWatch:
@@ -56,10 +52,6 @@ class WrenchWatch:
     of healthy flights, it is fitted by another thrust vector of each rotor, one at a time. A
     vector near zero is a lost rotor. A second, slower filter finds a smaller loss that lasts, as
     of a broken propeller: averaged over a manoeuvre the residual of a healthy robot is small.
-
-    Args:
-        robot: nominal robot.
-        allocator: of the robot.
 
     Attributes:
         lost: the rotor (0 to 3) that is missing, or None.
@@ -176,25 +168,11 @@ class WrenchWatch:
 
 
 class ContactWatch:
-    """
-    Ground contact and crash, near the ground.
-
-    Args:
-        gravity: [m/s^2].
-
-    Attributes:
-        reason: '' or the reason why the robot is treated as on the ground.
-
-    """
+    """Ground contact and crash: ``reason`` is '' until the robot is treated as on the ground."""
 
     def __init__(self, gravity: float):
         self._gravity = gravity
-        self.reset()
-
-    def reset(self) -> None:
-        """Begin anew."""
         self._for, self.reason, self._usual, self._since_hit = 0.0, '', 0.0, np.inf
-        self._track: deque = deque(maxlen=2 * SPAN + 1)
 
     def update(self, dt: float, height: float | None, wrench: WrenchWatch) -> None:
         """
@@ -219,17 +197,7 @@ class ContactWatch:
         if self._for >= SUPPORT_TIME and not self.reason:
             self.reason = f'{push:.1f} of the weight are carried by something else'
 
-    def on_pose(self, stamp: float, position: np.ndarray, quaternion: np.ndarray,
-                height: float | None) -> None:
+    def on_pose(self, quaternion: np.ndarray, height: float | None) -> None:
         """Detect a crash by MoCap alone, if there is no IMU; ``height`` as in :meth:`update`."""
         if height is not None and height < LOW and inclination(quaternion) > TIPPED:
             self.reason = 'tipped over at the floor'
-        self._track.append((stamp, position))
-        (t, a), (u, b), (v, c) = self._track[0], self._track[len(self._track) // 2], \
-            self._track[-1]
-        if len(self._track) <= 2 * SPAN or v - t > LONGEST_TRACK or height is None \
-                or height > NEAR_GROUND:
-            return
-        change = (c - b) / (v - u) - (b - a) / (u - t)
-        if (size := sqrt(change.dot(change))) > BUMP:
-            self.reason = f'velocity changed by {size:.1f} m/s at once'

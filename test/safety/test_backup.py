@@ -1,6 +1,7 @@
 """The estimator of the descent against motions in closed form."""
 
 import numpy as np
+import pytest
 
 from beetle_omni_ros.control.base import State
 from beetle_omni_ros.robot import rotations
@@ -24,50 +25,30 @@ def state(t):
     return State(t, position, velocity, attitude, RATE, np.zeros(4), np.zeros(4), t)
 
 
-def sample(t, force_bias=0.0, rate_bias=0.0):
+def sample(t):
+    """An IMU sample with constant biases."""
     _, _, acceleration, attitude = truth(t)
     force = (acceleration + [0, 0, GRAVITY]) @ rotations.matrix(attitude)
-    return t, force + force_bias, RATE + rate_bias
+    return t, force + 0.1, RATE + 0.01
 
 
-def follow(estimator, begin, end, imu=True, mocap=True, force_bias=0.0, rate_bias=0.0,
-           noise=None):
-    """Feed 200 Hz of IMU and 100 Hz of MoCap, 10 ms late."""
-    for k in range(round(begin * 200) + 1, round(end * 200) + 1):
-        t = k / 200
+@pytest.mark.parametrize('imu, most', [(True, (0.01, 0.06, 0.01)), (False, (0.03, 0.15, 0.02))])
+def test_follows_a_motion_with_late_noisy_mocap_and_a_biased_imu_or_none(imu, most):
+    estimator, random, end = BackupEstimator(GRAVITY), np.random.default_rng(0), 6.0
+    estimator.start(state(0.0))
+    estimator.imu_alive = imu
+    for t in np.arange(1, round(200 * end) + 1) / 200:
         if imu:
-            estimator.add(*sample(t, force_bias, rate_bias))
-        if mocap and k % 2 == 0:
+            estimator.add(*sample(t))
+        if round(200 * t) % 2 == 0:
             position, _, _, attitude = truth(t - 0.01)
-            if noise is not None:
-                position = position + 0.001 * noise.normal(size=3)
-                attitude = rotations.multiply(attitude, rotations.exp(
-                    0.002 * noise.normal(size=3)))
-            estimator.correct(t - 0.01, position, attitude)
+            estimator.correct(t - 0.01, position + 0.001 * random.normal(size=3),
+                              rotations.multiply(attitude, rotations.exp(
+                                  0.002 * random.normal(size=3))))
         if not imu:
             hover = [0, 0, GRAVITY] @ rotations.matrix(truth(t)[3])     # without acceleration
             estimator.predict(t, hover, np.zeros(3))
-
-
-def errors(estimator, t):
-    got = estimator.state(t, state(t))
-    position, velocity, _, attitude = truth(t)
-    return (np.linalg.norm(got.position - position), np.linalg.norm(got.velocity - velocity),
-            rotations.geodesic_angle(got.quaternion, attitude))
-
-
-def test_follows_a_motion_with_late_noisy_mocap_and_a_biased_imu():
-    estimator = BackupEstimator(GRAVITY)
-    estimator.start(state(0.0))
-    follow(estimator, 0.0, 6.0, force_bias=0.1, rate_bias=0.01, noise=np.random.default_rng(0))
-    position, velocity, attitude = errors(estimator, 6.0)
-    assert position < 0.01 and velocity < 0.06 and attitude < 0.01
-
-
-def test_follows_mocap_alone_without_imu():
-    estimator = BackupEstimator(GRAVITY)
-    estimator.start(state(0.0))
-    estimator.imu_alive = False
-    follow(estimator, 0.0, 5.0, imu=False)
-    position, velocity, attitude = errors(estimator, 5.0)
-    assert position < 0.03 and velocity < 0.15 and attitude < 0.02
+    got, (position, velocity, _, attitude) = estimator.state(end, state(end)), truth(end)
+    assert np.linalg.norm(got.position - position) < most[0]
+    assert np.linalg.norm(got.velocity - velocity) < most[1]
+    assert rotations.geodesic_angle(got.quaternion, attitude) < most[2]

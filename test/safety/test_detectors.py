@@ -124,7 +124,7 @@ def test_contact_is_detected_by_impact_or_by_a_push_near_the_ground():
     assert not contact.reason
     contact.update(TICK, 0.1, watch)
     assert 'impact' in contact.reason
-    contact.reset()
+    contact = ContactWatch(ROBOT.gravity)
     watch.impact, watch.unexplained = 0.0, np.array([0, 0, 0.6 * ROBOT.gravity])
     for height, named in ((1.0, False), (None, False), (0.1, True)):
         for _ in range(round(2 * wrench.SUPPORT_TIME / TICK)):
@@ -150,7 +150,7 @@ def follow(watch, asked, follows, delay, robot):
     servo = Step(NUMPY, Servo.of(robot.joints, **{
         name: np.array(value) for name, value in friction.items()}), TICK)
     for t in TICK * np.arange(round(8.0 / TICK)):
-        watch.on_command(t, asked(t))
+        watch.commands.append((t, asked(t)))
         tilt, rate = servo(asked(t - delay), tilt, rate)
         watch.on_joints(t, follows(tilt) + 0.005 * random.uniform(-1, 1, 4))
         if (watch.astray | (watch.jump != 0)).any():
@@ -189,7 +189,7 @@ def esc(lag, asked, works, noise=0.0, seed=0):
         t = TICK * k
         share = works if t > 4.0 else np.ones(4)
         thrust = thrust - np.expm1(-TICK / lag) * (share * asked[max(0, k - 2)] - thrust)
-        watch.on_command(t, command)
+        watch.commands.append((t, command))
         if k % 4 == 0:
             watch.on_speeds(t, 300.0 * np.sqrt(thrust) * random.normal(1.0, noise, 4))
             if noticed is None and watch.slow.any():
@@ -220,7 +220,7 @@ def test_no_rotor_is_suspected_after_a_stall_of_the_motor_board(stall):
         if not stalled:
             asked = wanted
         thrust = thrust - np.expm1(-0.005 / LAG) * (asked - thrust)
-        watch.on_command(t, wanted)
+        watch.commands.append((t, wanted))
         if n % 4 == 0 and not stalled:
             watch.on_speeds(t, 300.0 * np.sqrt(np.maximum(thrust, 0.0)))
             assert watch.lost is None and watch.deaf is None
@@ -262,13 +262,9 @@ def test_a_rotor_that_gives_more_thrust_than_asked_is_deaf_and_not_lost(sticks):
     assert watch.health.held[2] == (pytest.approx(7.0, abs=1.5) if sticks else None)
 
 
-@pytest.mark.parametrize(('speed', 'height', 'roll', 'crashed'), [
-    (2.0, 0.1, 0.0, True), (0.4, 0.1, 0.2, False), (2.0, 1.0, 0.0, False), (0.4, 0.1, 1.0, True)])
-def test_without_imu_a_fall_or_a_tipped_robot_at_the_floor_is_a_crash(
-        speed, height, roll, crashed):
-    """A landing ends at 0.3 m/s."""
+@pytest.mark.parametrize(('height', 'roll', 'crashed'), [
+    (0.1, 0.2, False), (1.0, 1.0, False), (0.1, 1.0, True)])
+def test_without_imu_a_tipped_robot_at_the_floor_is_a_crash(height, roll, crashed):
     contact = ContactWatch(ROBOT.gravity)
-    for n in range(20):
-        z = height + speed * 0.01 * max(10 - n, 0)
-        contact.on_pose(0.01 * n, np.array([0.0, 0.0, z]), rotations.from_rpy(roll, 0, 0), height)
+    contact.on_pose(rotations.from_rpy(roll, 0, 0), height)
     assert bool(contact.reason) == crashed

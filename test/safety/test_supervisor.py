@@ -15,8 +15,7 @@ from beetle_omni_ros.safety.supervisor import STOP_TIME
 
 @pytest.mark.parametrize('spoil, text', [
     (lambda p: p.alive.discard('estimate'), 'ekf_node silent since the start'),
-    (lambda p: setattr(p, 'status', 'dead_reckoning'), "'dead_reckoning', not 'tracking'"),
-    (lambda p: setattr(p, 'status', 'lost'), 'no fresh state estimate'),
+    (lambda p: p.alive.discard('mocap'), 'no fresh pose (MoCap silent since the start)'),
     (lambda p: p.alive.discard('joints'), 'joint_bridge_node silent since the start'),
     (lambda p: setattr(p, 'quaternion', rotations.from_rpy(1.0, 0, 0)), 'inclined by 57 deg'),
     (lambda p: setattr(p, 'velocity', np.array([0.5, 0, 0])), 'moving at 0.50 m/s'),

@@ -35,7 +35,7 @@ class VehicleRig:
         self.alive = set(ALL)
         self.position, self.velocity = np.array([0.3, -0.2, 0.16]), np.zeros(3)
         self.quaternion, self.rate = LEVEL, np.zeros(3)
-        self.status, self.voltage = 'tracking', 24.0
+        self.voltage = 24.0
         self.lifts = True           # whether takeoff moves it
         self.command = None
         self.thrust = np.zeros(4)
@@ -87,14 +87,14 @@ class VehicleRig:
         if 'mocap' in alive:
             noise = 1e-6 * np.array([round(self.now / TICK) % 2, 0, 0])
             supervisor.on_mocap(self.now - 0.01, self.position + noise, self.quaternion)
-        joints = (self.now - 0.01, tilt) if 'joints' in alive else (np.nan, np.full(4, np.nan))
+        stamp = self.now - 0.01 if 'joints' in alive else np.nan
         if 'joints' in alive:
-            supervisor.on_joints(joints[0], tilt, np.zeros(4))
+            supervisor.on_joints(stamp, tilt, np.zeros(4))
         if 'estimate' in alive:
             noise = 1e-9 * np.sin(1e3 * self.now + np.arange(3))    # no two estimates are equal
             supervisor.on_state(State(
                 self.now, self.position + noise, self.velocity, self.quaternion, self.rate,
-                joints[1], np.zeros(4), joints[0]), self.status)
+                tilt, np.zeros(4), stamp))
         supervisor.on_battery(self.voltage)
         for name in ('nmpc', 'rl'):
             if name in alive:
