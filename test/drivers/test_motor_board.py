@@ -88,4 +88,4 @@ def test_a_step_of_the_computers_clock_does_not_stop_the_rotors():
             assert not board.send(HOVER, time.time() + shift[0])
             time.sleep(0.005)
             assert k < 10 or emulated.commands.all()
-        assert sum(emulated.refused.values()) <= 2
+        assert sum(emulated.firmware.refused.values()) <= 2
