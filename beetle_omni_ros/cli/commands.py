@@ -102,6 +102,9 @@ def evaluate(controllers: Annotated[str, Option(callback=several, metavar='NAME,
              nmpc: NmpcOption = None,
              policy: PolicyOption = None,
              allow_other_robot: OtherRobotOption = False,
+             without: Annotated[str, Option(metavar='LAYER,...', help=(
+                 'Layers of the guidance that are off: unwinding, routing, trimming, or '
+                 'all.'))] = '',
              bag: Annotated[Path | None, Option(metavar='DIR', help=(
                  'New folder for the bag; with several controllers it contains one bag for '
                  'each.'))] = None,
@@ -113,7 +116,11 @@ def evaluate(controllers: Annotated[str, Option(callback=several, metavar='NAME,
     Plant, sensors, estimator, controllers and actuators are those of the ROS graph.
     Example: beetle_omni evaluate --controllers nmpc --task random100 --json result.json
     """
-    options = {name: ControllerOptions(allow_other_robot=allow_other_robot)
+    if without and not any(hasattr(registry.find(name).parameter_class, 'without')
+                           for name in controllers):
+        raise ParameterError(f'--without {without}: no controller with guidance among '
+                             f"{', '.join(controllers)}")
+    options = {name: ControllerOptions(allow_other_robot=allow_other_robot, without=without)
                for name in controllers}
     for option, file, key in (('--nmpc', nmpc, 'parameters'), ('--policy', policy, 'policy')):
         name = OWNER[option]

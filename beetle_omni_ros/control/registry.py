@@ -36,11 +36,12 @@ RESERVED = ('controller', 'ekf', 'joint_bridge', 'meta', 'none', 'operator', 're
 
 @dataclass(frozen=True, kw_only=True)
 class ControllerOptions:
-    """Files of parameters and network that replace a controller's own ones, and a switch."""
+    """Files of parameters and network that replace a controller's own ones, and switches."""
 
     parameters: Path | None = None
     policy: Path | None = None
     allow_other_robot: bool = False     # fly a policy trained for other robot parameters
+    without: str = ''                   # layers of the guidance that are off
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -86,7 +87,7 @@ class ControllerEntry:
             file = Path(self.parameters_file)
             file = file if file.is_file() else share_path(self.parameters_file)
         parameters = schema.bind(kind, schema.load_yaml(file) if file else {}, str(file or ''))
-        given = {'policy': str(options.policy or ''),
+        given = {'policy': str(options.policy or ''), 'without': options.without,
                  'allow_other_robot': options.allow_other_robot}
         return replace(parameters, **{key: value for key, value in given.items()
                                       if value and hasattr(parameters, key)})

@@ -55,7 +55,7 @@ def test_the_bridge_arms_at_takeoff_follows_thrusts_and_disarms_with_the_supervi
         operator.thrust = np.zeros(4)
         operator.reaches('ready')
         operator.spin(0.2)
-        assert not board.armed and not board.firmware.refused      # nothing is sent before it is armed
+        assert not board.armed and not board.firmware.refused  # not before it is armed
         made.take_off()
         for state, thrust in (('flying:nmpc', [3.0, 12.0, 0.5, 20.0]), ('landing', [9, 9, 1, 0])):
             operator.supervise(state)

@@ -235,7 +235,7 @@ def test_a_soft_touchdown_breaks_nothing(monkeypatch):
 
 @pytest.mark.parametrize(('numbers', 'named'), [
     ({'rotor': 5}, '1 to 4'), ({'rotor': 1.5}, 'an integer'),
-    ({'rotor': 1, 'servo': 1}, "'servo': unknown key"), ({'x' * 9000: 1}, "xxx...': unknown")])
+    ({'rotor': 1, 'servo': 1}, "'servo': unknown key")])
 def test_numbers_are_checked_by_name(numbers, named):
     with pytest.raises(ParameterError, match=named):
         Fault('rotor_stops', **numbers)

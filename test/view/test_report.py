@@ -4,19 +4,11 @@ import io
 
 import numpy as np
 from rich.console import Console
-from synthetic_flights import (
-    write_diagnostic,
-    write_odom,
-    write_state,
-    write_target,
-    write_truth,
-)
+from synthetic_flights import write_odom, write_state, write_truth
 
 from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.runs.bag import read_bag
 from beetle_omni_ros.runs.bag_writer import BagWriter
-from beetle_omni_ros.runs.log import LogRecorder
-from beetle_omni_ros.view.charts import POINTS, Run
 from beetle_omni_ros.view.report import run_report
 
 LEVEL = np.array([0, 0, 0, 1.0])
@@ -31,8 +23,8 @@ def record(folder, *, task, body='truth', targets=0):
             write(writer, t, np.zeros(3), LEVEL, np.zeros(3), np.zeros(3))
             write_state(writer, t, 'flying:nmpc')
         for k in range(targets):
-            write_target(writer, PoseTarget(position=np.array([0, 0, 1.0]), quaternion=LEVEL,
-                                            stamp=10.5 + k))
+            writer.write_target(PoseTarget(position=np.array([0, 0, 1.0]), quaternion=LEVEL,
+                                           stamp=10.5 + k))
     return folder
 
 
@@ -58,8 +50,8 @@ def test_the_outcome_and_faults_are_on_the_page_and_in_the_table(tmp_path):
             write_truth(writer, t, np.array([0, 0, 1.0]), LEVEL, np.zeros(3), np.zeros(3))
             write_state(writer, t, 'flying:nmpc' if k < 30 else 'fallback:joint1_astray' if k < 40
                         else 'landing:rotor2_lost' if k < 70 else 'disarmed:<b>')
-        write_target(writer, PoseTarget(np.array([0, 0, 1.0]), LEVEL, 10.5))
-        write_diagnostic(writer, 13.0, 'supervisor_node: supervisor', {
+        writer.write_target(PoseTarget(np.array([0, 0, 1.0]), LEVEL, 10.5))
+        writer.write_diagnostic(13.0, 'supervisor_node: supervisor', {
             'fault.joint3_slipped': '12.5', 'nmpc.refused.stale stamp': '7'}, 1, 'landing')
     log = read_bag(tmp_path / 'bag')
     assert log.controllers() == ['nmpc']        # a fallback counts for the replaced controller
@@ -76,15 +68,3 @@ def test_the_outcome_and_faults_are_on_the_page_and_in_the_table(tmp_path):
                      'injected: rotor_stops at=5 rotor=2', 'plant used.yaml'):
         assert expected in text, expected
     assert 'landing: rotor2_lost at 1.5 s' in text and 'rotor2_lost at' in printed.getvalue()
-
-
-def test_a_line_has_few_points_and_keeps_extremes_and_gaps():
-    t = np.arange(0, 100, 0.005)
-    t = t[(t < 40) | (t > 45)]
-    values = np.random.default_rng(0).normal(size=len(t))
-    values[7001], values[9001] = 50.0, -60.0
-    line = Run('a', '#123456', LogRecorder().log(), {}).line(t, values)
-    assert len(line.x) < 1.6 * POINTS and np.all(np.diff(line.x) >= 0)
-    assert np.nanmax(line.y) == 50 and np.nanmin(line.y) == -60
-    missing = line.x[np.isnan(line.y)]
-    assert len(missing) and np.all((missing >= 39.9) & (missing <= 45.1))
