@@ -23,13 +23,15 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import parameter, ParameterFile
 
 LONGEST_STEP = 0.1   # [s] between two states from which an acceleration is computed
+PAUSE = 0.05         # [s] between two steps, after which the first is as long as one period
 DAMPING = 1e-2   # [(1/kg)^2] keeps the thrusts near the plain projection where directions agree
 DISTURBANCE_TIME = 0.3  # [s] of the observer: slower than the loop (0.1 s), faster than levelling
 THRUST_RESPONSE = 0.04  # [s] time constant of the thrust with the lead
 THRUST_RATE = 300.0     # [N/s] 3 N a period: no step at a take-over
 TILT_RATE_SHARE = 0.9   # of the servos' velocity limit, so that they can follow
 FULL_THRUST = 1.0       # [N] below it a joint turns more slowly: its direction is mostly noise
-STOP_OVERLAP = 0.3      # [rad] beyond the stop: the rotor keeps 95 % of its useful thrust
+STOP_OVERLAP = 0.3      # [rad] beside the stop: the rotor keeps 95 % of its useful thrust
+FAR = 0.6               # [rad] from its goal a joint needs 0.1 s: the wrench is not met meanwhile
 # Errors and rate errors of position [m], [m/s] and attitude [rad], [rad/s] are shortened to these.
 POSITION_LIMITS, ATTITUDE_LIMITS = (0.6, 3.0), (0.6, 6.0)
 # Largest compensated acceleration [m/s^2] and angular acceleration [rad/s^2]: 2 N m, the hover
@@ -70,6 +72,8 @@ class HoverController:
         self._thrust_max = health.limited(self._robot.rotors.thrust_max)
         self._scaled = self._allocator.matrix / np.concatenate(
             [np.full(3, self._allocator.mass), self._robot.inertia])[:, None]
+        arm = np.linalg.norm(self._robot.rotors.positions[0])
+        self._arms = np.repeat([1.0, arm], 3)[:, None]
 
     def reset(self) -> None:
         """Reset disturbances and thrust model; the next step starts from state.command."""
@@ -83,8 +87,9 @@ class HoverController:
         last = self._command
         if last is not None and state.stamp <= last.stamp:
             return last
-        gap = self.period if last is None else state.stamp - last.stamp
-        dt = min(gap, 5 * self.period)   # after a pause: no single long step
+        dt = self.period if last is None else state.stamp - last.stamp
+        if dt > PAUSE:      # another controller flew: one period from its command
+            dt = self.period
         in_force = state.command
         self.observe(state)
         force, torque = self._wrench(state, target)
@@ -140,7 +145,9 @@ class HoverController:
             return goal
         steady = nearest_turn(self._allocator.hover(quaternion, present).tilt, present)
         limit = self._allocator.tilt_limit
-        waits = over & (np.abs(steady) <= limit + STOP_OVERLAP)
+        # From farther away it would turn back and forth while the attitude changes.
+        near = np.abs(present) >= limit - STOP_OVERLAP
+        waits = over & near & (np.abs(steady) <= limit + STOP_OVERLAP)
         return np.where(waits, np.copysign(limit, present), goal)
 
     def _near(self, degraded: DegradedAllocator, state, target, present, force, torque):
@@ -202,9 +209,13 @@ class HoverController:
         Thrusts along the present rotor directions that are nearest to the desired wrench.
 
         Least squares of accelerations: a rotor that points in a wrong direction is throttled, and
-        also the rotors whose torque it should balance.
+        also the rotors whose torque it should balance. If a joint is far from its goal, the wrench
+        cannot be met. An angular acceleration then counts as that of a rotor: otherwise all rotors
+        would stop for the sake of the torque.
         """
         rotors, matrix = self._robot.rotors, self._scaled
+        if np.abs(goal.tilt - tilt).max() > FAR:
+            matrix = matrix * self._arms
         now = matrix[:, 0::2] * np.cos(tilt) + matrix[:, 1::2] * np.sin(tilt)
         wrench = matrix[:, 0::2] @ (goal.thrust * np.cos(goal.tilt)) \
             + matrix[:, 1::2] @ (goal.thrust * np.sin(goal.tilt))

@@ -10,7 +10,7 @@ from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.degraded import FLYING_MARGIN, Holding
 from beetle_omni_ros.safety.events import ERROR
 from beetle_omni_ros.safety.inputs import Inputs
-from beetle_omni_ros.safety.way import climb, inclination, plan, Ramp, Way
+from beetle_omni_ros.safety.way import climb, coasted, halting, inclination, plan, Ramp, Way
 
 ESCAPE_TIME = 1.5       # [s] of the attitude of an escape, before the turn to level
 ACCELERATION = 0.5      # [m/s^2] of climb and descent
@@ -27,8 +27,6 @@ PATIENCE = 4.0          # [s] after the climb
 # Levelling
 LEVEL_RATE = 0.8        # [rad/s] from upside down to level in 4 s
 LEVEL_FIRST = 0.3       # [rad] a larger inclination is levelled before the descent
-COAST = 0.3             # [s] of the horizontal velocity, in which a fast robot brakes; without it
-                        # braking costs a robot with a weak pack its height
 BLIND_LIMIT = 0.3       # [s] without any sensor the attitude is then unknown: motors off
 # The ground
 SPEED = 0.3             # [m/s] of the descent, harmless for the legs
@@ -118,6 +116,7 @@ class Landing:
         if 'estimator_wrong' in inputs.faults or inputs.ekf.silent:
             inputs.backup.start(inputs.estimate)
         self.set_out()
+        self._halting = inputs.health.healthy
 
     @property
     def way(self) -> TrajectoryTarget:
@@ -156,15 +155,15 @@ class Landing:
     def set_out(self) -> None:
         """Plan the way down from the present pose, with the actuators that work."""
         inputs, state = self._inputs, self._inputs.seen
+        self._halting = False
         if inputs.health.healthy:
             way = plan(state.quaternion, state.tilt, inputs.allocator, LEVEL_RATE)
         else:
             way = self._escape(state)
         slanted = inclination(state.quaternion) > LEVEL_FIRST or not inputs.health.healthy
         begin = way.duration if slanted else 0.0
-        self._ramp = Ramp(state.stamp, state.position + COAST * np.array(
-            [*state.velocity[:2], 0.0]), way, [
-                (0.0, 0.0), (begin + 1e-9, 0.0), (begin + SPEED / ACCELERATION, -SPEED)])
+        self._ramp = Ramp(state.stamp, coasted(state), way, [
+            (0.0, 0.0), (begin + 1e-9, 0.0), (begin + SPEED / ACCELERATION, -SPEED)])
 
     def _escape(self, state):
         """First to the attitude where control is regained soonest, then towards level."""
@@ -181,7 +180,10 @@ class Landing:
 
     def _follow(self, state, dt):
         """Follow the ramp, whose target waits for the robot."""
-        reference = self._ramp.at(state.stamp)
+        halt = halting(state, self._ramp.position[2]) if self._halting else None
+        if self._halting and halt is None:
+            self.set_out()
+        reference = halt or self._ramp.at(state.stamp)
         height = max(reference.position[2], state.position[2] - TARGET_LEAD)
         reference = replace(reference, position=np.array([*reference.position[:2], height]))
         self._feel_ground(state, dt, reference.velocity[2])

@@ -13,7 +13,6 @@ import numpy as np
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import Command, Fallback, PoseTarget, Target
-from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import ALL_HEALTHY, NO_ZEROS, ROTORS
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.commands import within_limits
@@ -21,7 +20,7 @@ from beetle_omni_ros.safety.events import Answer, ERROR, INFO, WARNING
 from beetle_omni_ros.safety.inputs import ARM_TILT, Inputs
 from beetle_omni_ros.safety.landing import Landing, Takeoff
 from beetle_omni_ros.safety.parameters import SupervisorParameters
-from beetle_omni_ros.safety.way import inclination
+from beetle_omni_ros.safety.way import coasted, halting, inclination
 from beetle_omni_ros.safety.wrench import NEAR_GROUND
 
 DISARMED, TAKEOFF, FLYING = 'disarmed', 'takeoff', 'flying'
@@ -32,7 +31,6 @@ STOP_TIME = 0.3         # [s] zero thrust is sent for this time, then nothing
 HANDOVER_TIME = 0.3     # [s] longest duration: half a turn of a joint
 TILT_RATE = 9.0         # [rad/s] as in hover.yaml: below the servos' 10
 THRUST_RATE = 300.0     # [N/s] as in hover.yaml: 3 N a period
-TURN_TIME = 0.2         # [s] of the present turn until it ends
 LOOK = 0.02             # [s] after a pause without a command: two periods of MoCap, because the
                         # robot may lie on the floor
 RESUMING = 0.1          # [s] after a pause until every source has sent a message again
@@ -70,7 +68,8 @@ class Supervisor(Inputs):
         # Objects of the present state, created when it is entered.
         self._takeoff: Takeoff
         self._landing: Landing
-        self._target: PoseTarget
+        self._target: PoseTarget | None     # of the fallback; None until the turn has ended
+        self._height: float
         self._in_state = 0.0    # time since the last change of the state [s]
         self._acted_on = ALL_HEALTHY    # health to which landing and hover are adapted
         self._before = np.inf       # time of the update before [s]
@@ -351,8 +350,13 @@ class Supervisor(Inputs):
         if self.streams[self.active].good and not self.lost and self._in_state >= RESUMING:
             self._enter(FLYING, INFO, f'{self.active}_node good again: it flies')
             return self._fly(now, dt)
-        self.source = 'hover'
-        return self._hover.step(self.seen, self._target)
+        self.source, state = 'hover', self.seen
+        if self._target is None:
+            reference = halting(state, self._height)
+            if reference is not None:
+                return self._hover.step(state, reference)
+            self._target = PoseTarget(coasted(state), state.quaternion, now)
+        return self._hover.step(state, self._target)
 
     def _descend(self, now, dt):
         self.source = 'hover'
@@ -373,10 +377,8 @@ class Supervisor(Inputs):
     # Changes of state -------------------------------------------------------------------------
 
     def _fall_back(self, now, severity, text):
-        """Hover at the present position, in the attitude in which the present turn ends."""
-        turn = rotations.exp(TURN_TIME * self.estimate.angular_velocity)
-        self._target = PoseTarget(self.estimate.position, rotations.multiply(
-            self.estimate.quaternion, turn), now)
+        """Hover at the present height, in the attitude in which the present turn ends."""
+        self._target, self._height = None, float(self.estimate.position[2])
         self._enter(FALLBACK, severity, text)
 
     def _land(self, now, severity, text, name=''):

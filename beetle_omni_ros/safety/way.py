@@ -19,7 +19,7 @@ from math import sqrt
 
 import numpy as np
 
-from beetle_omni_ros.control.base import Reference
+from beetle_omni_ros.control.base import Reference, State
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import Allocator, nearest_turn, ROTORS
 
@@ -32,6 +32,9 @@ MARGIN = 0.1            # [rad] from the joints' stops, for the servos' sag and 
 TURNED_OVER = 1.0       # [rad] in one step: the thrust points in a wrong direction meanwhile
 UNLOADED = 0.3          # [-] of its hover thrust is the loss if a rotor without load turns over,
                         # because its small thrust controls the attitude
+HALTED = 1.0            # [rad/s] a slower turn ends by itself within 0.2 rad
+COAST = 0.3             # [s] of the horizontal velocity, in which a fast robot brakes; without it
+                        # braking costs a robot with a weak pack its height
 MISSING_THRUST = 20.0   # [s] of one second without one hover thrust of lift, as time: turning a
                         # joint over under load costs more than any detour
 
@@ -39,6 +42,26 @@ MISSING_THRUST = 20.0   # [s] of one second without one hover thrust of lift, as
 def inclination(quaternion: np.ndarray) -> float:
     """Angle between the body's z axis and up [rad]."""
     return float(np.arccos(np.clip(rotations.matrix(quaternion)[2, 2], -1.0, 1.0)))
+
+
+def halting(state: State, height: float) -> Reference | None:
+    """
+    Reference of a robot that turns fast, until the turn has ended, then None.
+
+    The turn is braked and the height [m] held. An attitude to return to, or a horizontal velocity
+    to brake, would need thrust directions that the joints reach too late.
+    """
+    rate = state.angular_velocity
+    if rate.dot(rate) < HALTED**2:
+        return None
+    (x, y, z), (u, v, w) = state.position, state.velocity
+    return Reference(np.array([x, y, max(z, height)]), state.quaternion,
+                     np.array([u, v, max(w, 0.0)]), np.zeros(3))
+
+
+def coasted(state: State) -> np.ndarray:
+    """Position (3,) in world at which a robot in motion comes to rest [m]."""
+    return state.position + COAST * np.array([*state.velocity[:2], 0.0])
 
 
 class Way:

@@ -15,6 +15,7 @@ from beetle_omni_ros.control.hover import (
 )
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import Allocator
+from beetle_omni_ros.safety.way import coasted, halting
 
 TILT_RATE = TILT_RATE_SHARE * ROBOT.joints.velocity_limit
 HOME = np.array([0.0, 0.0, 1.0])
@@ -46,11 +47,10 @@ def test_recovers_from_one_metre_and_sixty_degrees(seed, mass_scale):
 def test_takes_over_without_a_jump_from_any_command_in_force():
     rng = np.random.default_rng(5)
     controller, state = HoverController(ROBOT), Body().state()
-    for _ in range(20):
+    for stamp in range(20):     # another controller flew in between
         in_force = Command(0.0, rng.uniform(-3.9, 3.9, 4), rng.uniform(0, 20, 4))
-        controller.reset()
-        command = controller.step(replace(state, quaternion=unit(rng, 4), command=in_force),
-                                  PoseTarget(HOME, unit(rng, 4)))
+        command = controller.step(replace(state, stamp=stamp, quaternion=unit(rng, 4),
+                                          command=in_force), PoseTarget(HOME, unit(rng, 4)))
         assert np.abs(command.tilt - in_force.tilt).max() <= TILT_RATE * PERIOD + 1e-9
         assert np.abs(command.thrust - in_force.thrust).max() \
             <= THRUST_RATE * PERIOD + 1e-9
@@ -64,6 +64,24 @@ def test_the_disturbance_estimate_converges_while_another_controller_is_active()
         body.advance(flying.step(body.state(), PoseTarget(HOME, LEVEL)))
     body.trace, target = [], PoseTarget(body.x[:3], LEVEL)
     assert body.fly(standby, target, 1.0).errors(target)[:, 0].max() < 0.01
+
+
+@pytest.mark.parametrize('seed', range(8))
+def test_a_fast_turn_is_stopped_without_loss_of_height(seed):
+    """At 5 rad/s and 2 m/s, with joints up to 0.6 rad beside those of hovering."""
+    rng = np.random.default_rng(seed)
+    body, hover, target = Body(HOME, unit(rng, 4)), HoverController(ROBOT), None
+    body.x[3:5], body.x[10:13] = 2 * unit(rng, 2), 5 * unit(rng)
+    body.x[13:17] += rng.uniform(-0.6, 0.6, 4)
+    body.command = replace(body.command, tilt=body.x[13:17].copy())
+    for _ in range(100):
+        state = body.state()
+        reference = target or halting(state, HOME[2])
+        if reference is None:
+            reference = target = PoseTarget(coasted(state), state.quaternion)
+        body.advance(hover.step(state, reference))
+    assert min(x[2] for _, x, _ in body.trace) > HOME[2] - 0.3
+    assert target is not None
 
 
 STOP = ROBOT.joints.position_limit
@@ -82,6 +100,19 @@ def test_a_joint_waits_at_its_stop_for_the_end_of_a_transient(seed):
     farthest = max(np.abs(command.tilt - wound).max() for _, _, command in body.trace)
     assert farthest < 1.5                                   # not to the other side
     assert position < 0.05 and turn < 0.1
+
+
+def test_a_joint_far_from_its_stop_turns_to_its_goal_at_once():
+    rng, hover, state, back = np.random.default_rng(0), HoverController(ROBOT), Body().state(), 0
+    for stamp in range(1, 300):
+        attitude, tilt = unit(rng, 4), rng.uniform(-1, 1, 4) * (STOP - STOP_OVERLAP)
+        goal = Allocator(ROBOT).hover(attitude, tilt)
+        command = hover.step(replace(
+            state, stamp=stamp, quaternion=attitude, tilt=tilt, angular_velocity=np.zeros(3),
+            command=Command(0.0, tilt, goal.thrust)), PoseTarget(state.position, attitude))
+        assert ((command.tilt - tilt) * (goal.tilt - tilt) >= 0).all()
+        back += (np.abs(goal.tilt - tilt) > np.pi).sum()
+    assert back > 10            # to the other side
 
 
 def test_a_joint_leaves_its_stop_if_the_weight_needs_the_other_side():

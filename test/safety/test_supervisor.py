@@ -7,6 +7,7 @@ import pytest
 from vehicle_rig import flown, PARAMETERS, ROBOT, TICK, VehicleRig
 
 from beetle_omni_ros.control.base import Command
+from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.safety.commands import RETURN_AFTER, TIMEOUT
 from beetle_omni_ros.safety.inputs import ESTIMATE_TIMEOUT, JOINT_TIMEOUT, LOST_TIME, LOW_TIME
@@ -49,6 +50,23 @@ def test_silent_controller_falls_back_to_hover_without_a_jump_and_gets_control_b
     assert rig.supervisor.state == 'fallback'
     rig.run(4 * TICK)
     assert rig.supervisor.state == 'flying' and rig.supervisor.source == 'nmpc'
+
+
+@pytest.mark.parametrize('begin', [lambda rig: rig.alive.discard('nmpc'),
+                                   lambda rig: rig.supervisor.land(rig.now)])
+def test_fallback_and_landing_stop_a_turn_before_they_aim_at_a_pose(begin, monkeypatch):
+    rig, seen, step = flown(), [], HoverController.step
+    monkeypatch.setattr(HoverController, 'step', lambda own, state, target: seen.append(
+        target.at(state.stamp)) or step(own, state, target))
+    rig.rate, rig.velocity = np.array([0.0, 0.0, 3.0]), np.array([1.0, 0.0, 0.0])
+    rig.run(TICK)
+    begin(rig)
+    rig.run(TIMEOUT + TICK)
+    assert np.array_equal(seen[-1].velocity, rig.velocity) and not seen[-1].angular_velocity.any()
+    rig.rate = np.zeros(3)
+    rig.run(3 * TICK)
+    assert not seen[-1].velocity[:2].any()      # to rest, ahead
+    assert 0.1 < seen[-1].position[0] - rig.position[0] < 1.0
 
 
 def test_a_controller_whose_commands_are_not_finite_loses_control_at_once_with_the_reason():
