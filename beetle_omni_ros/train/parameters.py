@@ -115,21 +115,21 @@ class RandomParameters:
                                    high=1)
     force: float = parameter(4.0, doc='largest constant force, each axis', unit='N', low=0,
                              high=50)
-    strong_share: float = parameter(0.08, doc='fraction of robots with a strong constant force',
+    strong_share: float = parameter(0.12, doc='fraction of robots with a strong constant force',
                                     low=0, high=1)
-    strong_force: float = parameter(35.0, doc='largest strong force, each axis', unit='N', low=0,
+    strong_force: float = parameter(60.0, doc='largest strong force, each axis', unit='N', low=0,
                                     high=200)
     payload_share: float = parameter(0.2, doc='fraction of robots with a payload', low=0, high=1)
     payload: float = parameter(1.1, doc='largest mass of a payload', unit='kg', low=0, high=10)
     torque: float = parameter(0.1, doc='largest constant torque with a constant force, each axis',
                               unit='N m', low=0, high=5)
-    push_share: float = parameter(0.25, doc='fraction of robots with random pushes', low=0,
+    push_share: float = parameter(0.3, doc='fraction of robots with random pushes', low=0,
                                   high=1)
     push_period: float = parameter(3.0, doc='mean time between pushes', unit='s', low=0.1,
                                    high=1000)
     push_velocity: float = parameter(0.6, doc='change of velocity, standard deviation of an axis',
                                      unit='m/s', low=0, high=10)
-    push_rate: float = parameter(4.5, doc='change of body rate, standard deviation of an axis',
+    push_rate: float = parameter(6.5, doc='change of body rate, standard deviation of an axis',
                                  unit='rad/s', low=0, high=30)
 
 
@@ -137,12 +137,12 @@ class RandomParameters:
 class RewardWeights:
     """Weights of the terms in :mod:`train.rewards`, with the terms' names."""
 
-    position: float = parameter(-2.5, doc='published -1')
+    position: float = parameter(-3.5, doc='published -1')
     pose: float = parameter(2.0, doc='published')
     reach_position: float = parameter(1.0, doc='published')
     reach_pose: float = parameter(0.75, doc='published')
-    linear_velocity: float = parameter(-0.015, doc='published -0.03')
-    angular_velocity: float = parameter(-0.05, doc='published')
+    linear_velocity: float = parameter(-0.0075, doc='published -0.03')
+    angular_velocity: float = parameter(-0.035, doc='published -0.05')
     joint_limit: float = parameter(-0.02, doc='published')
     thrust_limit: float = parameter(-0.01, doc='published')
     joint_action_rate: float = parameter(-0.1, doc='published -5e-4')
@@ -151,7 +151,7 @@ class RewardWeights:
     joint_acceleration: float = parameter(-1.5e-5, doc='published')
     z_axis_align: float = parameter(-0.1, doc='published')
     thrust_allocation: float = parameter(-1e-5, doc='published')
-    attitude: float = parameter(-2.5, doc='own: slope far from the target')
+    attitude: float = parameter(-4.0, doc='own: slope far from the target')
     near_position: float = parameter(3.5, doc='own: slope close to the target')
     near_attitude: float = parameter(2.5, doc='own: slope close to the target')
     near_pose: float = parameter(1.5, doc='own: slope close to the target')
@@ -221,7 +221,7 @@ class TrainParameters(ParameterFile, file='train.yaml'):
     """All parameters of a training; each run saves them beside its checkpoints."""
 
     seed: int = parameter(0, doc='random seed', low=0, high=2**31 - 1)
-    iterations: int = parameter(6400, doc='PPO iterations', low=1, high=10**7)
+    iterations: int = parameter(11050, doc='PPO iterations', low=1, high=10**7)
     memory: bool = parameter(False, doc='whether the policy observes the disturbance estimate')
     log_every: int = parameter(50, doc='iterations between two rows of progress', low=1,
                                high=10**6)
