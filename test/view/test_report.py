@@ -4,7 +4,13 @@ import io
 
 import numpy as np
 from rich.console import Console
-from synthetic_flights import write_odom, write_state, write_truth
+from synthetic_flights import (
+    write_diagnostic,
+    write_odom,
+    write_state,
+    write_target,
+    write_truth,
+)
 
 from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.runs.bag import read_bag
@@ -23,8 +29,7 @@ def record(folder, *, task, body='truth', targets=0):
             write(writer, t, np.zeros(3), LEVEL, np.zeros(3), np.zeros(3))
             write_state(writer, t, 'flying:nmpc')
         for k in range(targets):
-            writer.write_target(PoseTarget(position=np.array([0, 0, 1.0]), quaternion=LEVEL,
-                                           stamp=10.5 + k))
+            write_target(writer, PoseTarget(np.array([0, 0, 1.0]), LEVEL, 10.5 + k))
     return folder
 
 
@@ -50,8 +55,8 @@ def test_the_outcome_and_faults_are_on_the_page_and_in_the_table(tmp_path):
             write_truth(writer, t, np.array([0, 0, 1.0]), LEVEL, np.zeros(3), np.zeros(3))
             write_state(writer, t, 'flying:nmpc' if k < 30 else 'fallback:joint1_astray' if k < 40
                         else 'landing:rotor2_lost' if k < 70 else 'disarmed:<b>')
-        writer.write_target(PoseTarget(np.array([0, 0, 1.0]), LEVEL, 10.5))
-        writer.write_diagnostic(13.0, 'supervisor_node: supervisor', {
+        write_target(writer, PoseTarget(np.array([0, 0, 1.0]), LEVEL, 10.5))
+        write_diagnostic(writer, 13.0, 'supervisor_node: supervisor', {
             'fault.joint3_slipped': '12.5', 'nmpc.refused.stale stamp': '7'}, 1, 'landing')
     log = read_bag(tmp_path / 'bag')
     assert log.controllers() == ['nmpc']        # a fallback counts for the replaced controller
