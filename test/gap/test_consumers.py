@@ -142,7 +142,7 @@ def gap(name):
     """Whether a key of the effect changes the residual."""
     made = flight_model()
     limit = CATALOGUE[name].limit     # beyond this calm flight
-    theta = {key.name: np.log(0.05 if limit else 1 - key.typical) if key.relative
+    theta = {key.name: np.log(1e-5 if limit else 1 - key.typical) if key.relative
              else key.typical for key in KEYS.values() if key.effect == name and not key.form}
     before, after = made.residual({}), made.residual(theta)
     return any(not np.array_equal(before[group], after[group]) for group in before)
