@@ -65,9 +65,13 @@ class CommandStream:
             return self.silence.text + last
         return f'good for only {self.good_for:.2f} s of {RETURN_AFTER:g} s'
 
-    def offer(self, command: Command, now: float) -> str:
-        """Check one command; '' when a copy is stored, else the reason of the refusal."""
-        reason, clean = self._check(command, now)
+    def offer(self, command: Command, now: float, doubted: float = -np.inf) -> str:
+        """
+        Check one command; '' when a copy is stored, else the reason of the refusal.
+
+        ``doubted`` is the stamp of a refused estimate, which controllers also received [s].
+        """
+        reason, clean = self._check(command, now, doubted)
         if reason:
             self.refused[reason] += 1
             self._last_refusal = reason
@@ -90,12 +94,14 @@ class CommandStream:
         self.accepted = self._offered = None
         self.silence = Silence(TIMEOUT)
 
-    def _check(self, command, now):
+    def _check(self, command, now, doubted):
         """Reason of a refusal and, without one, a copy within the limits."""
         stamp, tilt, thrust = command.stamp, command.tilt, command.thrust
         clean = within_limits(command, self._robot)
         if clean is None or not isfinite(stamp):
             return NOT_FINITE, None
+        if stamp == doubted:
+            return 'answers a refused estimate', None
         if now - stamp > STALE_AFTER:
             return 'stale stamp', None
         if stamp - now > AHEAD:

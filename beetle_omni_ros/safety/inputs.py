@@ -84,6 +84,7 @@ class Inputs:
         self.estimate = State(-np.inf, np.zeros(3), np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]),
                               np.zeros(3), np.zeros(4), np.zeros(4), -np.inf)
         self._offered = self.estimate       # the one before, accepted or not
+        self._doubted = -np.inf     # stamp of the last refused estimate that controllers also have
         self.last_refusal = ''
         self.refused = Counter[str]()
         self.ekf, self.joints = Silence(ESTIMATE_TIMEOUT), Silence(JOINT_TIMEOUT)
@@ -110,6 +111,8 @@ class Inputs:
         if reason:
             self.refused[f'estimate: {reason}'] += 1
             self.last_refusal = reason
+            if state.stamp > self.estimate.stamp:
+                self._doubted = state.stamp
             self.say(WARNING, f'ekf_node: estimate refused: {reason}', reason)
             return False
         self.estimate, self.last_refusal = true, ''
@@ -141,7 +144,7 @@ class Inputs:
 
     def on_command(self, controller: str, command: Command, now: float) -> bool:
         """Check one command of one controller; False when it is refused (and counted)."""
-        reason = self.streams[controller].offer(command, now)
+        reason = self.streams[controller].offer(command, now, self._doubted)
         if reason:
             # A step to a new target causes one jump; repeated jumps end in the controller's
             # timeout.

@@ -234,5 +234,7 @@ def test_a_single_jump_of_the_estimate_is_refused_and_a_lasting_one_accepted(cha
         for name, value in change.items()}) for k in (1, 2)]
     assert rig.supervisor.on_state(jumped[0]) is not refused
     assert supervisor.estimate is (good if refused else jumped[0])
+    answer = Command(jumped[0].stamp, good.tilt, np.full(4, 7.0))
+    assert supervisor.on_command('nmpc', answer, rig.now + TICK) is not refused
     assert rig.supervisor.on_state(jumped[1])
     assert supervisor.estimate is jumped[1]
