@@ -73,18 +73,16 @@ class SpikeFilter:
 
     An impact pushes again in about the same direction, and the rate that it causes remains. Two
     independent errors in a row rarely agree in all six axes. A jump is a change between two
-    readings by more than ``force_change`` [m/s^2] or ``rate_change`` [rad/s]. ``lasted``: the
-    latest reading confirmed a held one, as in an impact.
+    readings by more than ``force_change`` [m/s^2] or ``rate_change`` [rad/s].
     """
 
     def __init__(self, force_change: float, rate_change: float):
         self._limits = force_change**2, rate_change**2
         self._last: tuple[np.ndarray, np.ndarray] | None = None
-        self._held, self._count, self.lasted = np.zeros(6), 0, False
+        self._held, self._count = np.zeros(6), 0
 
     def passes(self, force: np.ndarray, rate: np.ndarray) -> bool:
         """Whether a reading (3,) [m/s^2], (3,) [rad/s] is used; False holds it back."""
-        self.lasted = False
         if self._last is not None:
             push, turn = force - self._last[0], rate - self._last[1]
             if push.dot(push) > self._limits[0] or turn.dot(turn) > self._limits[1]:
@@ -95,6 +93,5 @@ class SpikeFilter:
                 agree = dot > 0 and dot**2 >= AGREE * held.dot(held) * jump.dot(jump)
                 if not agree and self._count <= LONGEST_HELD:
                     return False
-                self.lasted = True
         self._held, self._count, self._last = np.zeros(6), 0, (force, rate)
         return True
