@@ -11,9 +11,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
 import gc
-import time
 
 import numpy as np
 
@@ -65,14 +63,6 @@ def collector_off():
         yield
     finally:
         gc.enable()
-
-
-def timed(times: list[float], function: Callable, *arguments):
-    """Run ``function(*arguments)`` and add its CPU time [s]; wall time includes other programs."""
-    start = time.thread_time()
-    result = function(*arguments)
-    times.append(time.thread_time() - start)
-    return result
 
 
 def compute_summary(times: Sequence[float], period: float) -> dict[str, float | int]:
@@ -171,7 +161,7 @@ class FlightLoop:
         self._times: dict[str, list[float]] = {name: [] for name in controllers}    # CPU [s]
         self._every = {name: max(1, round(c.period / self.simulator.tick))
                        for name, c in controllers.items()}
-        self._hosts = {name: ControllerHost(name, c, partial(timed, self._times[name]))
+        self._hosts = {name: ControllerHost(name, c, self._times[name].append)
                        for name, c in controllers.items()}
         self._joints = self._command = self._estimated = None
         self._ticks = 0
@@ -287,9 +277,9 @@ class FlightLoop:
                     continue
                 processes.send('on_state', state)
                 commands = self._control(state)
-                recorder.write('odom', Odom.of(state, *(
-                    (pose_covariance(estimate), twist_covariance(estimate, self._gyroscope_noise))
-                    if recorder.keeps_covariances else ())))
+                recorder.write('odom', state if not recorder.keeps_covariances else Odom.of(
+                    state, pose_covariance(estimate),
+                    twist_covariance(estimate, self._gyroscope_noise)))
         active = self.supervisor.active
         arrived = processes.schedule.through('request', commands.pop(active, None), now)
         for name, command in [*((active, one) for one in arrived), *commands.items()]:
@@ -310,7 +300,7 @@ class FlightLoop:
 
     def _sense(self, frame):
         recorder, send, now = self._recorder, self._processes.send, frame.time
-        recorder.write('ground_truth/odom', Odom.of(frame.truth))
+        recorder.write('ground_truth/odom', frame.truth)
         if frame.mocap is not None:
             self._estimator.pose(frame.mocap)
             send('on_mocap', frame.mocap.stamp, frame.mocap.position, frame.mocap.quaternion)

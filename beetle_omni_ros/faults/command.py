@@ -11,7 +11,7 @@ from rich.console import Console
 from beetle_omni_ros import __version__
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import guidance_of
-from beetle_omni_ros.evaluation.campaign import commit, file_digest, Store, sweep
+from beetle_omni_ros.evaluation.campaign import file_digest, Store, sweep
 from beetle_omni_ros.faults import page
 from beetle_omni_ros.faults.flight import (
     ALL_STARTS,
@@ -26,6 +26,7 @@ from beetle_omni_ros.faults.flight import (
 )
 from beetle_omni_ros.pages.page import print_grids
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.resources import commit
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.files import check_writable, write_json, write_text
 from beetle_omni_ros.sim.faults import chosen, load_cases

@@ -8,6 +8,7 @@ its kind, see :attr:`Effect.kind`.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
@@ -64,7 +65,7 @@ class SensorErrors:
     encoder_sine: tuple[float, ...] = (0.0,) * 4        # by the sine of the angle [rad]
     encoder_cosine: tuple[float, ...] = (0.0,) * 4      # by its cosine minus 1 [rad]
 
-    @property
+    @cached_property
     def encoders_err(self) -> bool:
         """Whether the encoders' readings depend on the angle."""
         return any((*self.encoder_gain, *self.encoder_sine, *self.encoder_cosine))
