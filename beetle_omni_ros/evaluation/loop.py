@@ -93,9 +93,7 @@ class Processes:
         self._reported: dict[str, str] = {}     # bridge -> last reported state
 
     def frame(self, frame: Frame) -> Frame:
-        """Start a tick; returns the frame with stamps of the flight computer's clock."""
-        if self.schedule.empty:
-            return frame
+        """Start a tick with faults; returns the frame with stamps of the computer's clock."""
         self.schedule.update(frame.time)
         self.clock_step = sum(self.schedule.each('clock'))
         self.supervisor_waits = bool(self.schedule.each('waits'))
@@ -263,7 +261,9 @@ class FlightLoop:
     def step(self) -> Frame:
         """Run one tick of the simulator and of every process that is due in it."""
         processes, recorder = self._processes, self._recorder
-        frame = processes.frame(self.simulator.step())
+        frame = self.simulator.step()
+        if not processes.schedule.empty:
+            frame = processes.frame(frame)
         self._ticks += 1
         now = frame.time
         self._sense(frame)
@@ -295,7 +295,8 @@ class FlightLoop:
                 self.simulator.command(replace(
                     command, stamp=command.stamp - processes.clock_step))
                 recorder.write('command', command, now)
-        self._note_state(now)
+        if self.supervisor.reported_state != self._reported:
+            self._note_state(now)
         return frame
 
     def _sense(self, frame):
@@ -352,9 +353,8 @@ class FlightLoop:
         return self._other_target if self._accepts_other else None
 
     def _note_state(self, now):
+        """Tell controllers and recorder the new state of the supervisor."""
         reported, before = self.supervisor.reported_state, self._reported
-        if reported == before:
-            return
         self._reported = reported
         self._recorder.write('supervisor/state', reported, now)
         for host in self._hosts.values():

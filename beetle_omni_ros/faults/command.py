@@ -29,7 +29,7 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import commit
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.files import check_writable, write_json, write_text
-from beetle_omni_ros.sim.faults import chosen, load_cases
+from beetle_omni_ros.sim.fault_lists import chosen, load_cases
 
 PAGE, FLIGHTS = 'faults.html', '.flights'
 

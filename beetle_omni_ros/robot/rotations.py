@@ -23,12 +23,6 @@ def matrix(quaternion: Vector) -> np.ndarray:
         2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y))).reshape(3, 3)
 
 
-def up(quaternion: Vector) -> np.ndarray:
-    """The world's z axis (3,) in body axes: the last row of :func:`matrix`."""
-    x, y, z, w = np.asarray(quaternion).tolist()
-    return np.array([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)])
-
-
 def multiply(a: Vector, b: Vector) -> np.ndarray:
     """Quaternion product: first ``b``, then ``a`` (R(a) R(b))."""
     return np.array(product(*np.asarray(a).tolist(), *np.asarray(b).tolist()))
