@@ -182,18 +182,18 @@ class FlightLoop:
             self.start_faults()
             while True:
                 truth = simulator.truth
-                moment = player.update(simulator.time, truth.position, truth.quaternion)
-                if moment.target is not None:
-                    self.aim(moment.target)
+                over = player.update(simulator.time, truth.position, truth.quaternion)
+                if player.target is not None:
+                    self.aim(player.target)
                     if simulator.battery.charge < SWAP_CHARGE or self.supervisor.battery_low:
                         simulator.battery.reset()
-                if moment.changed:
-                    segment = moment.segment
+                if player.changed:
+                    segment = player.segment
                     simulator.wrench = np.r_[segment.force_world, segment.torque_body]
                     simulator.payload = segment.payload
                     self._recorder.write('disturbance', Wrench(
                         simulator.time, segment.force_world, segment.torque_body))
-                over = moment.finished or self._crashed
+                over = over or self._crashed
                 if not over:
                     self.step()
                 if over or simulator.time - reported >= COMPUTE_REPORT:
