@@ -205,6 +205,8 @@ class ScheduleParameters:
                            high=1)
     kl: np.ndarray = parameter([0.01, 0.005], doc='desired divergence of an update', shape=(2,))
     entropy: np.ndarray = parameter([5e-4, 0.0], doc='weight of the entropy', shape=(2,))
+    imitation: np.ndarray = parameter([1.0, 0.0], doc='weight of the divergence from the teacher, '
+                                      'if there is one', shape=(2,))
     tilt_std_limit: np.ndarray = parameter([0.7, 0.08], doc='largest standard deviation of the '
                                            'tilt actions, in actions', shape=(2,))
     thrust_std_limit: np.ndarray = parameter([2.5, 0.25], doc='largest standard deviation of the '
