@@ -312,8 +312,8 @@ def train(output: Annotated[Path | None, Option(metavar='DIR', help=(
           json_path: JsonOption = None):
     """Train a policy and export it to ONNX; needs the extra 'train' and a GPU."""
     from beetle_omni_ros.train.command import parse_changes, run_train
-    run_train(output=output, config=config, robot=robot, device=device, resume=resume, teacher=teacher,
-              changes=parse_changes(changes, seed=seed, memory=memory),
+    run_train(output=output, config=config, robot=robot, device=device, resume=resume,
+              teacher=teacher, changes=parse_changes(changes, seed=seed, memory=memory),
               smoke=smoke, stop_after=stop_after, json_path=json_path)
 
 

@@ -59,7 +59,8 @@ class Runner:
             return float(first + done * (last - first))
 
         self.alg.scheduled.copy_(torch.tensor([
-            at(name) for name in ('kl', 'entropy', 'imitation', 'tilt_std_limit', 'thrust_std_limit')]))
+            at(name) for name in (
+                'kl', 'entropy', 'imitation', 'tilt_std_limit', 'thrust_std_limit')]))
         env.severity.fill_(at('severity'))
         factors = {term: at(name) for name, terms in SCHEDULED.items() for term in terms}
         env.weights.copy_(env.base_weights * torch.tensor(

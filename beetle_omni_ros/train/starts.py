@@ -170,7 +170,8 @@ class Starts:
         centre = (mass * centre + down) / total
         forced = d.chance(r.force_share)
         strong = d.chance(r.strong_share)
-        weak = self.severity * forced * torch.cat((d.around(r.force, 3), d.around(r.torque, 3)), -1)
+        weak = torch.cat((d.around(r.force, 3), d.around(r.torque, 3)), -1)
+        weak = self.severity * forced * weak
         thrust = d.uniform(1, 0.0, r.strong_force) * d.direction()
         force = self.severity * strong * (self._weight - thrust)
         wrench = weak + torch.cat((force, torch.zeros_like(force)), -1)
