@@ -21,7 +21,7 @@ from beetle_omni_ros.bringup.findings import (
 from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters, ServoBusParameters
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.files import check_writable, write_json
+from beetle_omni_ros.runs.files import write_json
 
 PARTS = ('servos', 'board', 'ros')
 STYLES = {OK: 'green', WARN: 'yellow', FAIL: 'bold red'}
@@ -48,7 +48,6 @@ def run_check(*, listen: Callable[[float], ObservedGraph], servo_port: str | Non
     for part in skip:
         if part not in PARTS:
             raise ParameterError(f"--skip '{part}': expected {', '.join(PARTS)}")
-    check_writable(json_path)
     console = console or Console()
     bus, link = ServoBusParameters.load(servo_bus), MotorBoardParameters.load(motor_board)
     robot_parameters = RobotParameters.load(robot)

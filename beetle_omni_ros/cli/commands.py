@@ -264,7 +264,7 @@ def gap(runs: Annotated[list[Path], Argument(metavar='RUN...', help=(
         holdout: Annotated[list[Path], Option(metavar='RUN...', help=(
             'Flights for validation only. Default: the last run of three or more.'))] = (),
         robot: TheRobotOption = None,
-        apply: Annotated[Path | None, Option(metavar='FILE', help=(
+        apply: Annotated[Path | None, Option(callback=writable, metavar='FILE', help=(
             'Write a robot file with the named effects.'))] = None,
         page: PageOption = None,
         parameters: Annotated[Path | None, Option('--gap', metavar='FILE', help=(
@@ -415,9 +415,10 @@ def rotor(paths: Annotated[list[Path], Argument(metavar='LOG.csv...', help=(
 def robot(paths: Annotated[list[Path], Argument(metavar='LOG...', help=(
               'Response logs of the joints (CSV or bag) and logs of a force-torque stand, '
               'recognised by their header.'))],
-          params: Annotated[Path, Option(metavar='FILE', help='The robot file to write.')],
+          params: Annotated[Path, Option(
+              callback=writable, metavar='FILE', help='The robot file to write.')],
           rate: RateOption = None, robot: TheRobotOption = None,
-          picture: Annotated[Path | None, Option(metavar='FILE', help=(
+          picture: Annotated[Path | None, Option(callback=writable, metavar='FILE', help=(
               'Draw the logs with both robots (.png or .svg).'))] = None,
           json_path: JsonOption = None):
     """

@@ -1,5 +1,6 @@
 """Options that several subcommands share, with the checks of their values."""
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -7,7 +8,6 @@ from typer import CallbackParam, Option
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.files import check_writable
 
 UNUSABLE, FAILED, INTERRUPTED = 2, 1, 130
 CONDITIONS = ('nominal', 'published')
@@ -25,9 +25,19 @@ def one_of(param: CallbackParam, value: str | None) -> str | None:
 
 
 def writable(file: Path | None) -> Path | None:
-    """Refuse a file that cannot be written."""
-    check_writable(file)
-    return file
+    """Refuse a file that cannot be written, before its content is computed."""
+    if file is None:
+        return None
+    folder = file.absolute().parent
+    if file.is_dir():
+        reason = 'it is a folder'
+    elif not folder.is_dir():
+        reason = f'there is no folder {folder}'
+    elif not os.access(file if file.exists() else folder, os.W_OK):
+        reason = 'no permission'
+    else:
+        return file
+    raise ParameterError(f'{file}: cannot write there ({reason})')
 
 
 def several(param: CallbackParam, text: str | None) -> list[str] | None:
@@ -93,8 +103,9 @@ OutputOption = Annotated[Path | None, Option(
 JsonOption = Annotated[Path | None, Option(
     '--json', callback=writable, metavar='FILE', help='Write the results as JSON.')]
 PageOption = Annotated[Path | None, Option(
-    '--report', metavar='FILE', help='Write a self-contained HTML page with plots.')]
+    '--report', callback=writable, metavar='FILE', help=(
+        'Write a self-contained HTML page with plots.'))]
 ParamsOption = Annotated[Path | None, Option(
-    metavar='FILE', help='Write a robot file with the result.')]
+    callback=writable, metavar='FILE', help='Write a robot file with the result.')]
 RateOption = Annotated[float | None, Option(
     min=1, metavar='HZ', help='Rows a second of time series without a column of times.')]

@@ -16,7 +16,6 @@ from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import guidance_of
 from beetle_omni_ros.control.registry import ControllerOptions
 from beetle_omni_ros.evaluation.campaign import (
-    commit,
     file_digest,
     policy_file,
     Store,
@@ -25,6 +24,7 @@ from beetle_omni_ros.evaluation.campaign import (
 )
 from beetle_omni_ros.pages.page import print_grids, rendered, Terminal
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.resources import commit
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.files import write_json, write_text
 

@@ -190,9 +190,10 @@ class Trimming:
                 self.position = _added(self.position, TRIM_RATE * elapsed, way, TRIM_DISTANCE)
                 self.rotation = _added(self.rotation, TRIM_RATE * elapsed, turn, TRIM_ANGLE)
         x, y, z = (0.5 * angle for angle in self.rotation)
-        turned = rotations.multiply(given.quaternion,
-                                    (x, y, z, sqrt(1.0 - (x * x + y * y + z * z))))
-        return PoseTarget(given.position + self.position, turned, given.stamp)
+        w = sqrt(1.0 - (x * x + y * y + z * z))
+        a, b, c, d = given.quaternion.tolist()
+        turned = rotations.product(a, b, c, d, x, y, z, w)
+        return PoseTarget(given.position + self.position, np.array(turned), given.stamp)
 
 
 # Plain floats, which are faster; turns are small, half an angle is its sine.

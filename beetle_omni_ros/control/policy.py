@@ -9,6 +9,7 @@ from beetle_omni_ros.control.base import Command, PoseTarget, Reference, State, 
 from beetle_omni_ros.control.guidance import Guidance
 from beetle_omni_ros.control.policy_file import PolicyNetwork
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.rotations import matrix
 from beetle_omni_ros.robot.schema import parameter, ParameterFile
 
 DEFAULT = 'policies/rl.onnx'
@@ -117,8 +118,8 @@ def observed(state: State, reference: Reference, previous_action) -> list[float]
     All vectors are in base_link, so that they do not depend on position, and on heading only by
     the attitude columns. ``previous_action`` (8,) is the executed command as an action.
     """
-    xx, xy, xz, yx, yy, yz, zx, zy, zz = _rotation(state.quaternion)
-    ax, bx, cx, ay, by, cy, az, bz, cz = _rotation(reference.quaternion)
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = matrix(state.quaternion).ravel().tolist()
+    ax, bx, cx, ay, by, cy, az, bz, cz = matrix(reference.quaternion).ravel().tolist()
     px, py, pz = (reference.position - state.position).tolist()
     vx, vy, vz = (state.velocity - reference.velocity).tolist()
     wx, wy, wz = state.angular_velocity.tolist()
@@ -138,15 +139,7 @@ def observed(state: State, reference: Reference, previous_action) -> list[float]
 
 def disturbed(state: State, disturbance: np.ndarray) -> list[float]:
     """Force and torque (6) in base_link, of a disturbance (10,) with its force in world."""
-    xx, xy, xz, yx, yy, yz, zx, zy, zz = _rotation(state.quaternion)
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = matrix(state.quaternion).ravel().tolist()
     fx, fy, fz, *torque = disturbance[:6].tolist()
     return [xx * fx + yx * fy + zx * fz, xy * fx + yy * fy + zy * fz,
             xz * fx + yz * fy + zz * fz, *torque]
-
-
-def _rotation(quaternion):
-    """Matrix of a unit quaternion (x, y, z, w), row by row."""
-    x, y, z, w = quaternion.tolist()
-    return (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
-            2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
-            2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y))

@@ -228,7 +228,7 @@ class ErrorStateEkf:
 
     def _apply(self, stamp, position, quaternion) -> bool:
         self._estimate = None
-        self._model.scale_noise(*self._noise.scale)
+        self._model.filter.R = self._noise.covariance
         track, candidate = self._valid, self._candidate
         if track is not None:
             if track.correct(stamp, position, quaternion) \

@@ -133,14 +133,13 @@ class NoiseMonitor:
     median over a window is robust against jumps and outliers, even one wrong pose in ten.
 
     Attributes:
-        scale: factors >= 1 on the nominal variances of position and orientation.
+        covariance: (6, 6) of a pose, at least that of the parameters.
 
     """
 
     def __init__(self, mocap: MocapParameters):
-        self._nominal = [MEDIAN * GAIN * mocap.position_noise ** 2,
-                         MEDIAN * GAIN * mocap.orientation_noise ** 2]
-        self.scale: tuple[float, ...] = (1.0, 1.0)
+        self._nominal = mocap.position_noise ** 2, mocap.orientation_noise ** 2
+        self.covariance = np.diag(np.repeat(self._nominal, 3))
         self._last: Checked | None = None
         self._moves: deque = deque(maxlen=POSES - 1)  # (translation, rotation vector, interval)
         self._excess: list[deque] = [deque(maxlen=WINDOW), deque(maxlen=WINDOW)]
@@ -162,7 +161,8 @@ class NoiseMonitor:
             excess = third - 2 * second + first
             window.append(float(excess.dot(excess)))
         if len(window) >= MIN_COUNT:
-            ratios = [sorted(values)[len(values) // 2] / nominal
+            ratios = [sorted(values)[len(values) // 2] / (MEDIAN * GAIN * nominal)
                       for values, nominal in zip(self._excess, self._nominal)]
-            self.scale = tuple(min(ratio, LARGEST_SCALE ** 2) if ratio > SIGNIFICANT else 1.0
-                               for ratio in ratios)
+            self.covariance = np.diag(np.repeat([
+                nominal * min(ratio, LARGEST_SCALE ** 2) if ratio > SIGNIFICANT else nominal
+                for ratio, nominal in zip(ratios, self._nominal)], 3))

@@ -6,6 +6,7 @@ The filter estimates the motion of the IMU at the IMU's stamps; the output is th
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from math import sqrt
 
 from filterpy.kalman import KalmanFilter
@@ -80,15 +81,8 @@ class ErrorStateModel:
         self.marker_to_base = rotations.conjugate(rotations.exp(mocap.rotation))
         self.filter.H[0:3, POSITION] = np.eye(3)
         self.filter.H[3:6, ATTITUDE] = np.eye(3)
-        self._claimed_noise = (mocap.position_noise ** 2, mocap.orientation_noise ** 2)
-        self.scale_noise(1.0, 1.0)
         # quantile of the chi-square distribution
         self.gate = float(2 * gammaincinv(MEASUREMENTS / 2, GATE))
-
-    def scale_noise(self, position: float, orientation: float) -> None:
-        """Set the MoCap's variances to these multiples of the parameters' values."""
-        self.filter.R = np.diag([position * self._claimed_noise[0]] * 3
-                                + [orientation * self._claimed_noise[1]] * 3)
 
     def start(self, stamp, force, rate, position, quaternion, biases: Node | None) -> Node:
         """
@@ -178,8 +172,10 @@ class ErrorStateModel:
 
     def covariance(self, node: Node) -> np.ndarray:
         """Covariance (16, 16) of a node, predicted now if it is pending."""
-        kalman = self.filter
-        for before, after in node.pending():
+        kalman, steps = self.filter, [node]
+        while (before := steps[-1].before) is not None:
+            steps.append(before)
+        for before, after in pairwise(reversed(steps)):
             dt = after.stamp - before.stamp
             kalman.x, kalman.P = self._no_error, before.covariance
             # Missing samples are interpolated, and the error grows with each of them.
@@ -190,9 +186,9 @@ class ErrorStateModel:
 
     def time_deviation(self, node: Node) -> float:
         """Standard deviation of a node's time offset [s], without its walk while pending."""
-        steps = node.pending()
-        known = steps[0][0] if steps else node
-        return sqrt(known.covariance[TIME_OFFSET, TIME_OFFSET])
+        while node.before is not None:
+            node = node.before
+        return sqrt(node.covariance[TIME_OFFSET, TIME_OFFSET])
 
     def correct(self, prior: Node, position: np.ndarray, quaternion: np.ndarray) -> Node | None:
         """
@@ -283,12 +279,13 @@ class ErrorStateModel:
             times = np.array(stamps)
             times -= np.add.reduce(times) / TREND
             trend = times.dot(rates) / times.dot(times)
-        turn = age * (node.rate - node.gyroscope_bias + 0.5 * age * trend)
+        turn = (age * (node.rate - node.gyroscope_bias + 0.5 * age * trend)).tolist()
         acceleration = node.rotation.dot(node.force - node.accelerometer_bias)
         acceleration[2] -= self.gravity
         return (node.position + age * node.velocity + 0.5 * age ** 2 * acceleration,
                 node.velocity + age * acceleration,
-                rotations.multiply(node.quaternion, rotations.exp(turn)),
+                np.array(rotations.product(*node.quaternion.tolist(),
+                                           *rotations.exp_parts(*turn))),
                 node.rate + age * trend)
 
     def _covariance_at_base(self, rotation, rate, covariance, lever: np.ndarray) -> np.ndarray:

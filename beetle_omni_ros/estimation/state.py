@@ -56,14 +56,6 @@ class Node:
     covariance: np.ndarray = field(default_factory=lambda: UNKNOWN)
     before: Node | None = None      # from which a pending covariance is predicted
 
-    def pending(self) -> list[tuple[Node, Node]]:
-        """Steps (before, after) from the last node with a known covariance to this node."""
-        steps, after = [], self
-        while after.before is not None:
-            steps.append((after.before, after))
-            after = after.before
-        return steps[::-1]
-
 
 def propagate(node: Node, stamp: float, force: np.ndarray, rate: np.ndarray,
               gravity: float) -> Node:

@@ -17,7 +17,6 @@ import os
 from pathlib import Path
 import platform
 import re
-import subprocess
 import warnings
 import zipfile
 
@@ -103,19 +102,6 @@ def own_files(controller: str) -> tuple[Path, ...]:
         top = top.parent
     return (file,) if top == file.parent else tuple(sorted(
         (top / file.relative_to(top).parts[0]).rglob('*.py')))
-
-
-def commit() -> str | None:
-    """Commit of the checkout, with '+' if files are changed; None outside a checkout."""
-    if not (SOURCE.parent / '.git').exists():
-        return None
-    try:
-        return subprocess.run(
-            ['git', 'describe', '--always', '--abbrev=10', '--dirty=+', '--exclude=*'],
-            cwd=SOURCE.parent, capture_output=True, text=True, timeout=20,
-            check=True).stdout.strip() or None
-    except (OSError, subprocess.SubprocessError):
-        return None
 
 
 def versions() -> dict[str, str]:

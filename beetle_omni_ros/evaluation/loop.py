@@ -11,9 +11,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
 import gc
-import time
 
 import numpy as np
 
@@ -67,14 +65,6 @@ def collector_off():
         gc.enable()
 
 
-def timed(times: list[float], function: Callable, *arguments):
-    """Run ``function(*arguments)`` and add its CPU time [s]; wall time includes other programs."""
-    start = time.thread_time()
-    result = function(*arguments)
-    times.append(time.thread_time() - start)
-    return result
-
-
 def compute_summary(times: Sequence[float], period: float) -> dict[str, float | int]:
     """Median, 99th percentile, maximum [ms], misses of ``period`` and number of ``times`` [s]."""
     used = 1e3 * np.array(times or [0.0])
@@ -103,9 +93,7 @@ class Processes:
         self._reported: dict[str, str] = {}     # bridge -> last reported state
 
     def frame(self, frame: Frame) -> Frame:
-        """Start a tick; returns the frame with stamps of the flight computer's clock."""
-        if self.schedule.empty:
-            return frame
+        """Start a tick with faults; returns the frame with stamps of the computer's clock."""
         self.schedule.update(frame.time)
         self.clock_step = sum(self.schedule.each('clock'))
         self.supervisor_waits = bool(self.schedule.each('waits'))
@@ -171,7 +159,7 @@ class FlightLoop:
         self._times: dict[str, list[float]] = {name: [] for name in controllers}    # CPU [s]
         self._every = {name: max(1, round(c.period / self.simulator.tick))
                        for name, c in controllers.items()}
-        self._hosts = {name: ControllerHost(name, c, partial(timed, self._times[name]))
+        self._hosts = {name: ControllerHost(name, c, self._times[name].append)
                        for name, c in controllers.items()}
         self._joints = self._command = self._estimated = None
         self._ticks = 0
@@ -273,7 +261,9 @@ class FlightLoop:
     def step(self) -> Frame:
         """Run one tick of the simulator and of every process that is due in it."""
         processes, recorder = self._processes, self._recorder
-        frame = processes.frame(self.simulator.step())
+        frame = self.simulator.step()
+        if not processes.schedule.empty:
+            frame = processes.frame(frame)
         self._ticks += 1
         now = frame.time
         self._sense(frame)
@@ -287,9 +277,9 @@ class FlightLoop:
                     continue
                 processes.send('on_state', state)
                 commands = self._control(state)
-                recorder.write('odom', Odom.of(state, *(
-                    (pose_covariance(estimate), twist_covariance(estimate, self._gyroscope_noise))
-                    if recorder.keeps_covariances else ())))
+                recorder.write('odom', state if not recorder.keeps_covariances else Odom.of(
+                    state, pose_covariance(estimate),
+                    twist_covariance(estimate, self._gyroscope_noise)))
         active = self.supervisor.active
         arrived = processes.schedule.through('request', commands.pop(active, None), now)
         for name, command in [*((active, one) for one in arrived), *commands.items()]:
@@ -305,12 +295,13 @@ class FlightLoop:
                 self.simulator.command(replace(
                     command, stamp=command.stamp - processes.clock_step))
                 recorder.write('command', command, now)
-        self._note_state(now)
+        if self.supervisor.reported_state != self._reported:
+            self._note_state(now)
         return frame
 
     def _sense(self, frame):
         recorder, send, now = self._recorder, self._processes.send, frame.time
-        recorder.write('ground_truth/odom', Odom.of(frame.truth))
+        recorder.write('ground_truth/odom', frame.truth)
         if frame.mocap is not None:
             self._estimator.pose(frame.mocap)
             send('on_mocap', frame.mocap.stamp, frame.mocap.position, frame.mocap.quaternion)
@@ -362,9 +353,8 @@ class FlightLoop:
         return self._other_target if self._accepts_other else None
 
     def _note_state(self, now):
+        """Tell controllers and recorder the new state of the supervisor."""
         reported, before = self.supervisor.reported_state, self._reported
-        if reported == before:
-            return
         self._reported = reported
         self._recorder.write('supervisor/state', reported, now)
         for host in self._hosts.values():

@@ -11,7 +11,7 @@ from rich.console import Console
 from beetle_omni_ros import __version__
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import guidance_of
-from beetle_omni_ros.evaluation.campaign import commit, file_digest, Store, sweep
+from beetle_omni_ros.evaluation.campaign import file_digest, Store, sweep
 from beetle_omni_ros.faults import page
 from beetle_omni_ros.faults.flight import (
     ALL_STARTS,
@@ -26,9 +26,10 @@ from beetle_omni_ros.faults.flight import (
 )
 from beetle_omni_ros.pages.page import print_grids
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.resources import commit
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.files import check_writable, write_json, write_text
-from beetle_omni_ros.sim.faults import chosen, load_cases
+from beetle_omni_ros.runs.files import write_json, write_text
+from beetle_omni_ros.sim.fault_lists import chosen, load_cases
 
 PAGE, FLIGHTS = 'faults.html', '.flights'
 
@@ -55,7 +56,6 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
             raise ParameterError(f"--from '{start}': expected {', '.join(ALL_STARTS)}")
     if bags and output is None:
         raise ParameterError('--bags: expected --output DIR to record to')
-    check_writable(json_path)
     RobotParameters.load(plant)
     guidance = guidance_of(entry.make(RobotParameters.load()))  # refuses an unusable controller
     common = {'controller': entry.reference, 'plant': str(plant or ''),

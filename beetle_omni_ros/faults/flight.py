@@ -26,7 +26,8 @@ from beetle_omni_ros.runs.log import Recorder
 from beetle_omni_ros.runs.tasks import random_poses
 from beetle_omni_ros.safety.events import INFO
 from beetle_omni_ros.safety.parameters import SupervisorParameters
-from beetle_omni_ros.sim.faults import Case, Fault
+from beetle_omni_ros.sim.fault_lists import Case
+from beetle_omni_ros.sim.faults import Fault
 from beetle_omni_ros.sim.sensors import Impact, Truth
 
 STARTS = ('hover', 'moving', 'upside_down')      # default

@@ -16,7 +16,7 @@ from beetle_omni_ros.pages.page import (
     section,
     verdict_head,
 )
-from beetle_omni_ros.sim.faults import Case
+from beetle_omni_ros.sim.fault_lists import Case
 
 NOTE = ('good: flights with the expected outcome or a better one. impact: speed of base_link at '
         'the fastest touchdown of a flight. named: median time until the supervisor detected a '

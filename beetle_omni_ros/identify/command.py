@@ -13,7 +13,7 @@ from beetle_omni_ros.identify.measured import (
     servo_values,
     write_measured,
 )
-from beetle_omni_ros.identify.robot_file import check_outputs
+from beetle_omni_ros.identify.robot_file import check_differs
 from beetle_omni_ros.identify.rotor import results as of_rotor
 from beetle_omni_ros.identify.rotor.log import chosen, read_rotor_log
 from beetle_omni_ros.identify.servo import page as of_joints
@@ -41,7 +41,7 @@ def run_identify_joint(paths: Sequence[Path], *, validate: Sequence[Path] = (),
 
     """
     console = console or Terminal()
-    check_outputs(params, robot, json_path, report, 'report')
+    check_differs(params, robot)
     robot_parameters = RobotParameters.load(robot)
     logs = [read_joint_log(path) for path in paths]
     validations = [read_joint_log(other) for other in validate]
@@ -79,7 +79,7 @@ def run_identify_rotor(paths: Sequence[Path], *, columns: Sequence[str] = (),
 
     """
     console = console or Terminal()
-    check_outputs(params, robot, json_path, report, 'report')
+    check_differs(params, robot)
     robot_parameters = RobotParameters.load(robot)
     mapping = chosen(columns)
     model = of_rotor.identify_rotor([read_rotor_log(path, mapping, rate) for path in paths])
@@ -115,7 +115,7 @@ def run_identify_robot(paths: Sequence[Path], params: Path, *, rate: float | Non
 
     """
     console = console or Terminal()
-    check_outputs(params, robot, json_path, picture, 'picture')
+    check_differs(params, robot)
     robot_parameters = RobotParameters.load(robot)
     joints, rotors, notes = read_logs(paths, rate)
     results: dict = {'servos': None, 'rotor': None, 'warnings': notes}

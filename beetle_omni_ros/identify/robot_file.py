@@ -7,7 +7,7 @@ import yaml
 from beetle_omni_ros.robot.parameters import find_robot
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.files import check_writable, write_text
+from beetle_omni_ros.runs.files import write_text
 
 SHIPPED = 'robot.yaml'
 
@@ -17,21 +17,11 @@ class _Plain(yaml.SafeDumper):
         return True         # a person reads the file
 
 
-def check_outputs(path: Path | None, base: Path | None, json_path: Path | None,
-                  page: Path | None, page_name: str) -> None:
-    """
-    Check that robot file, results and page can be written, before they are computed.
-
-    Raises:
-        ParameterError: one cannot, or the robot file would replace the one that it extends.
-
-    """
+def check_differs(path: Path | None, base: Path | None) -> None:
+    """Raise a ParameterError if a robot file would replace the one that it extends."""
     if path and base and path.resolve() == find_robot(base).resolve():
         raise ParameterError(f'{path}: --params cannot replace the file of --robot, which it '
                              'extends')
-    check_writable(json_path)
-    check_writable(page, page_name)
-    check_writable(path, 'parameter file')
 
 
 def write_robot_file(path: Path, head: str, content: dict, base: Path | None) -> None:

@@ -185,19 +185,26 @@ def read_odom(message: Any) -> Odom:
     """Read pose and velocity; the velocity is rotated from base_link to world."""
     odom = _read_odom(message)
     q, velocity = odom.quaternion, odom.velocity
-    return replace(odom, velocity=rotations.matrix(q) @ velocity if velocity.ndim == 1 else
-                   np.einsum('ijn,nj->ni', rotations.matrix(tuple(q.T)), velocity))
+    if velocity.ndim == 1:
+        return replace(odom, velocity=rotations.matrix(q) @ velocity)
+    axis, w = q[:, :3], q[:, 3:]
+    swept = 2 * np.cross(axis, velocity)
+    return replace(odom, velocity=velocity + w * swept + np.cross(axis, swept))
 
 
-def write_odom(value: Odom) -> Any:
-    """Write pose in world, twist in base_link, and covariances."""
+def write_odom(value: Any) -> Any:
+    """
+    Write pose in world, twist in base_link, and covariances of an Odom.
+
+    A state, an estimate or the truth is written as an Odom without covariances.
+    """
     message = _write_odom(value)
     message.child_frame_id = BODY
     set_parts(message.twist.twist.linear, rotations.matrix(value.quaternion).T @ value.velocity)
-    for field, matrix in ((message.pose, value.pose_covariance),
-                          (message.twist, value.twist_covariance)):
-        if matrix is not None:
-            field.covariance = np.ascontiguousarray(matrix, dtype=float).reshape(36)
+    for part in ('pose', 'twist'):
+        if (matrix := getattr(value, f'{part}_covariance', None)) is not None:
+            getattr(message, part).covariance = np.ascontiguousarray(
+                matrix, dtype=float).reshape(36)
     return message
 
 

@@ -48,10 +48,10 @@ class Odom:
     twist_covariance: np.ndarray | None = None
 
     @classmethod
-    def of(cls, state: Any, *covariances: np.ndarray, stamp: float | None = None) -> Odom:
-        """Copy stamp (unless given), pose and velocities of an estimate, state or the truth."""
-        return cls(state.stamp if stamp is None else stamp, state.position, state.velocity,
-                   state.quaternion, state.angular_velocity, *covariances)
+    def of(cls, state: Any, *covariances: np.ndarray) -> Odom:
+        """Stamp, pose and velocities of an estimate or state, with covariances."""
+        return cls(state.stamp, state.position, state.velocity, state.quaternion,
+                   state.angular_velocity, *covariances)
 
 
 @dataclass(frozen=True)

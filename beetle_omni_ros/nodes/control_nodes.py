@@ -96,7 +96,7 @@ class ControllerNode(FlightNode):
         robot = RobotParameters.load(self.parameters.robot_file or None)
         controller = entry.make(
             robot, parameters=self.parameters if entry.parameter_class else None)
-        self._host = ControllerHost(entry.name, controller, self.timed, partial(
+        self._host = ControllerHost(entry.name, controller, self.took, partial(
             self.get_logger().error, throttle_duration_sec=REPEAT))
         self._checks, self._sensors = TargetChecks(robot), robot.sensors
         self._joints = self._command = None

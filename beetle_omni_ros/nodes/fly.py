@@ -30,7 +30,8 @@ from beetle_omni_ros.runs.bag_writer import add_meta, check_new
 from beetle_omni_ros.runs.files import write_json
 from beetle_omni_ros.runs.metrics import failed, metrics
 from beetle_omni_ros.runs.tasks import make_task, Task
-from beetle_omni_ros.sim import faults as listed
+from beetle_omni_ros.sim.fault_lists import load_faults
+from beetle_omni_ros.sim.faults import DEVICES
 
 READY_TIMEOUT = 300.0   # s; the first start compiles the controller
 BRIDGES_TIMEOUT = 20.0  # s; the simulator makes their devices at its start
@@ -72,7 +73,7 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
         flown_task = make_task(task, seed, registry.find(controller).reach(
             RobotParameters.load(robot)))
         RobotParameters.load(plant or robot)
-        injected = listed.load_faults(faults) if faults else []
+        injected = load_faults(faults) if faults else []
         nodes, left_out = plan(
             controller, nmpc=_absolute(nmpc), policy=str(policy or ''),
             standby=standby, allow_other_robot=allow_other_robot,
@@ -114,7 +115,7 @@ def _checked(faults, actuators):
         if fault.is_process:
             raise ParameterError(f"--faults: '{fault.kind}' affects a process; expected a fault "
                                  'of the robot or its sensors')
-        if fault.changes(*listed.DEVICES):
+        if fault.changes(*DEVICES):
             if actuators == 'emulated':
                 raise ParameterError(f"--faults: '{fault.kind}' affects a device; expected "
                                      '--actuators direct')

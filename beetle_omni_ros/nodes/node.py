@@ -196,7 +196,7 @@ class FlightNode(Node):
         self._reports.append((name, source))
 
     def track_compute(self, deadline: float) -> None:
-        """Report the CPU times of :meth:`timed` against a deadline [s]."""
+        """Report the CPU times of :meth:`took` against a deadline [s]."""
         self._deadline = deadline
         self.report('compute', lambda: self._compute.status(
             f'{self._misses} deadline misses', WARN if self._misses else OK,
@@ -206,10 +206,13 @@ class FlightNode(Node):
         """Call ``function`` and count its CPU time."""
         begin = time.thread_time()
         result = function(*args)
-        used = time.thread_time() - begin
-        self._compute.add(used)
-        self._misses += used > self._deadline
+        self.took(time.thread_time() - begin)
         return result
+
+    def took(self, seconds: float) -> None:
+        """Count a CPU time."""
+        self._compute.add(seconds)
+        self._misses += seconds > self._deadline
 
     def introduce(self) -> None:
         """Log in one line what the node does and which inputs are missing."""

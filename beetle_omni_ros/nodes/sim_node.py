@@ -11,7 +11,6 @@ from rosgraph_msgs.msg import Clock
 from beetle_omni_ros.drivers.device_parameters import ServoBusParameters
 from beetle_omni_ros.messages.conversions import set_time
 from beetle_omni_ros.messages.topics import SENSOR
-from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.node import Distribution, ERROR, FlightNode, OK, WARN
 from beetle_omni_ros.nodes.parameters import file_parameter
@@ -19,7 +18,8 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import group, parameter, ParameterError
 from beetle_omni_ros.sim.emulated.actuators import EmulatedActuators
 from beetle_omni_ros.sim.emulated.device import BoardFaults, ServoFaults, switched_on
-from beetle_omni_ros.sim.faults import DEVICES, parse_faults
+from beetle_omni_ros.sim.fault_lists import parse_faults
+from beetle_omni_ros.sim.faults import DEVICES
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.simulator import Simulator
 
@@ -244,7 +244,7 @@ class SimNode(FlightNode):
             reading = getattr(frame, name)
             if reading is not None and name in self._publish_to:
                 self._publish_to[name].publish(replace(reading, stamp=epoch + reading.stamp))
-        self._truth.publish(Odom.of(frame.truth, stamp=epoch + frame.truth.stamp))
+        self._truth.publish(replace(frame.truth, stamp=epoch + frame.truth.stamp))
 
     def _on_command(self, command):
         self._latency.add(self.now() - command.stamp)

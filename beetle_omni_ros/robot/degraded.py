@@ -348,7 +348,7 @@ def sphere(count: int) -> np.ndarray:
 
 def up(quaternion: np.ndarray) -> np.ndarray:
     """(3,) world z axis in the body, for a quaternion of any length."""
-    return rotations.up(rotations.normalized(quaternion))
+    return rotations.matrix(rotations.normalized(quaternion))[2]
 
 
 def leaned(quaternion: np.ndarray, direction: np.ndarray) -> np.ndarray:

@@ -11,7 +11,8 @@ import casadi as ca
 import numpy as np
 
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.effects import CATALOGUE, ServoTerms, Terms
+from beetle_omni_ros.robot.effects import CATALOGUE
+from beetle_omni_ros.robot.equations import ServoTerms, Terms
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.servo import CASADI, Servo
 

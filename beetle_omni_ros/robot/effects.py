@@ -8,18 +8,14 @@ its kind, see :attr:`Effect.kind`.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from functools import cached_property
 
-import casadi as ca
 import numpy as np
 
+from beetle_omni_ros.robot import equations
 from beetle_omni_ros.robot.schema import numbers, ParameterError, quoted, unknown
 
 NAN = float('nan')
-UP = ca.DM([0, 0, 1])
-REFERENCE_HEIGHT = 0.25     # [m] of the rotor, for which the gain of the ground effect is given
-EXPONENTIAL_HEIGHT = 0.25   # [m] over which the exponential form falls to 1/e
-LEAST_HEIGHT = 0.08         # [m] below which the forms are not valid
 NO_JOINTS = 'the filter does not read the joints'
 # Terms that the simulated plant and the gap finder have -> why NMPC and training leave out an
 # effect of them.
@@ -64,7 +60,7 @@ class SensorErrors:
     encoder_sine: tuple[float, ...] = (0.0,) * 4        # by the sine of the angle [rad]
     encoder_cosine: tuple[float, ...] = (0.0,) * 4      # by its cosine minus 1 [rad]
 
-    @property
+    @cached_property
     def encoders_err(self) -> bool:
         """Whether the encoders' readings depend on the angle."""
         return any((*self.encoder_gain, *self.encoder_sine, *self.encoder_cosine))
@@ -80,62 +76,6 @@ class SensorErrors:
         for _ in range(3):
             tilt = tilt + readings - self.encoders(tilt)
         return tilt
-
-
-@dataclass
-class Terms:
-    """
-    Terms of the body's equations at one instant, as CasADi expressions; effects change them.
-
-    Vectors are in base_link, unless stated otherwise. Lists have an entry for each rotor.
-    """
-
-    mass: ca.SX                     # [kg]
-    inertia: ca.SX                  # (3,) diagonal about the centre of mass [kg m^2]
-    centre_of_mass: ca.SX           # (3,) [m]
-    torque: ca.SX                   # (3,) added on the body [N m]
-    tilt: ca.SX                     # (4,) [rad]
-    tilt_acceleration: ca.SX        # (4,) [rad/s^2]
-    tilt_axes: list                 # of (3,) unit vectors, outward along the arms
-    thrust: ca.SX                   # (4,) after the rotors' lag [N]
-    velocity: ca.SX                 # (3,) of the centre of gravity in world [m/s]
-    angular_velocity: ca.SX         # (3,) [rad/s]
-    rotation: ca.SX                 # (3, 3) body to world
-    thrust_directions: list         # of (3,) unit vectors
-    rotor_positions: list           # of (3,) [m]
-    hover_thrust: float             # of each rotor [N]
-    force_world: ca.SX              # (3,) added, in world [N]
-    rotor_forces: list              # of (3,) added at the rotors [N]
-    torque_ratio: ca.SX             # reaction torque for each newton [m]
-    tilt_rate: ca.SX                # (4,) [rad/s]
-    thrust_rate: ca.SX              # (4,) [N/s]
-    spin: tuple[float, ...]         # (4,) +1 along the thrust
-    position: ca.SX | None = None       # (3,) of base_link in world [m]; None: unknown
-    voltage_ratio: ca.SX | None = None  # of the pack over that of a full pack; None: unknown
-    # Drawn from the pack [A h], None: unknown. In the simulator since the pack was inserted, in a
-    # recording since its first battery message.
-    charge_drawn: ca.SX | None = None
-
-    def rotor_speeds(self) -> list:
-        """Rotor speeds relative to hover, computed from thrust; list of four scalars."""
-        return [ca.sqrt(ca.fmax(self.thrust[i], 0) / self.hover_thrust + 1e-9) for i in range(4)]
-
-    def hub_velocities(self) -> list:
-        """List of four (3,) velocities of the rotor hubs through still air in base_link [m/s]."""
-        body = self.rotation.T @ self.velocity
-        return [body + ca.cross(self.angular_velocity, r) for r in self.rotor_positions]
-
-
-@dataclass
-class ServoTerms:
-    """Terms that act on one tilt servo at one instant, numbers of any namespace."""
-
-    target: Any             # commanded angle [rad]
-    thrust: Any = 0.0       # of the joint's rotor [N]
-    gyroscopic: Any = 0.0   # load for each N m s of the rotor's momentum in hover [rad/s]
-    load: Any = 0.0         # torque beside the motor's [N m]
-    coulomb: Any = None     # sliding friction [N m]
-    stiction: Any = None    # friction at rest [N m]
 
 
 @dataclass(frozen=True)
@@ -208,146 +148,6 @@ class Effect:
         return [name for name, spec in self.parameters.items() if not spec.form]
 
 
-def vector(values):
-    """(n,) column of a tuple of numbers or symbols; any other value unchanged."""
-    return ca.vertcat(*ca.vertsplit(ca.SX(ca.vertcat(*values)))) if isinstance(values, tuple) \
-        else values
-
-
-def _sets(term):
-    """Equation of an effect whose one parameter replaces a term."""
-    def act(terms, **values):
-        value, = values.values()
-        setattr(terms, term, vector(value))
-    return act
-
-
-def _centre_of_mass(terms, offset):
-    terms.centre_of_mass = terms.centre_of_mass + vector(offset)
-
-
-def _module_reaction(terms, module_inertia, mass_moment):
-    for i in range(4):
-        rate, acceleration = terms.tilt_rate[i], terms.tilt_acceleration[i]
-        n, e = terms.thrust_directions[i], terms.tilt_axes[i]
-        terms.torque = terms.torque - module_inertia * acceleration * e
-        # The centre of mass of the module is below the joint axis. It moves against the thrust,
-        # and its acceleration pushes back on the axis.
-        terms.centre_of_mass = terms.centre_of_mass - mass_moment / terms.mass * (n - UP)
-        sideways = ca.cross(e, n)
-        terms.rotor_forces[i] = terms.rotor_forces[i] + mass_moment * (
-            acceleration * sideways - rate * rate * n
-            + 2 * rate * ca.cross(terms.angular_velocity, sideways))
-
-
-def _thrust_coefficient(terms, scale):
-    terms.thrust = vector(scale) * terms.thrust
-
-
-def _wind(terms, force):
-    terms.force_world = terms.force_world + vector(force)
-
-
-def _body_drag(terms, coefficient):
-    speed = ca.sqrt(ca.sumsqr(terms.velocity) + 1e-12)
-    terms.force_world = terms.force_world - coefficient * speed * terms.velocity
-
-
-def _rotor_drag(terms, coefficient):
-    speeds = terms.rotor_speeds()
-    for i, v in enumerate(terms.hub_velocities()):
-        n = terms.thrust_directions[i]
-        in_plane = v - n * ca.dot(n, v)
-        terms.rotor_forces[i] = terms.rotor_forces[i] - coefficient / 4 * speeds[i] * in_plane
-
-
-def _axial_inflow(terms, per_rotor):
-    speeds = terms.rotor_speeds()
-    loss = [per_rotor * speeds[i] * ca.dot(terms.thrust_directions[i], v)
-            for i, v in enumerate(terms.hub_velocities())]
-    terms.thrust = terms.thrust - ca.vertcat(*loss)
-
-
-def _translational_lift(terms, per_rotor):
-    gain = []
-    for i, v in enumerate(terms.hub_velocities()):
-        n = terms.thrust_directions[i]
-        gain.append(per_rotor * ca.sumsqr(v - n * ca.dot(n, v)))
-    terms.thrust = terms.thrust + ca.vertcat(*gain)
-
-
-def _tilt_thrust_loss(terms, loss_at_60deg, cosine_share=0.0):
-    sine, cosine = ca.sin(terms.tilt), ca.cos(terms.tilt)
-    shape = (1 - cosine_share) * sine * sine / 0.75 + cosine_share * 2 * (1 - cosine)
-    terms.thrust = terms.thrust * (1 - loss_at_60deg * shape)
-
-
-def _ground_effect(terms, exponential_share=0.0, **values):
-    if terms.position is None:
-        return
-    scale = []
-    for i in range(4):
-        height = ca.fmax(terms.position[2] + (terms.rotation @ terms.rotor_positions[i])[2],
-                         LEAST_HEIGHT)
-        upright = (terms.rotation @ terms.thrust_directions[i])[2]
-        ratio = REFERENCE_HEIGHT / height
-        shape = (1 - exponential_share) * ratio * ratio + exponential_share * ca.exp(
-            (REFERENCE_HEIGHT - height) / EXPONENTIAL_HEIGHT)
-        scale.append(1 + values['gain_at_0.25m'] * shape * upright * upright)
-    terms.thrust = terms.thrust * ca.vertcat(*scale)
-
-
-def _gyroscopic_load(servo, joint, angular_momentum_at_hover, spin_up_share=1.0,
-                     joint_share=0.0):
-    servo.load = servo.load + joint_share * angular_momentum_at_hover * servo.gyroscopic
-
-
-def _propeller_gyroscopic_torque(terms, angular_momentum_at_hover, spin_up_share=1.0,
-                                 joint_share=0.0):
-    speeds = terms.rotor_speeds()
-    for i in range(4):
-        momentum = angular_momentum_at_hover * terms.spin[i] * speeds[i]
-        turning = terms.angular_velocity + terms.tilt_rate[i] * terms.tilt_axes[i]
-        terms.torque = terms.torque - momentum * ca.cross(turning, terms.thrust_directions[i])
-    _rotor_acceleration_torque(terms, spin_up_share * angular_momentum_at_hover)
-
-
-def _rotor_acceleration_torque(terms, angular_momentum_at_hover):
-    speeds = terms.rotor_speeds()
-    for i in range(4):
-        # h ~ sqrt(f), so h' = h f' / 2 f; the floor keeps a stopped rotor finite
-        rate = terms.thrust_rate[i] / (2 * terms.hover_thrust * ca.fmax(speeds[i], 0.1))
-        terms.torque = terms.torque - angular_momentum_at_hover * terms.spin[i] * rate \
-            * terms.thrust_directions[i]
-
-
-def _voltage_sag(terms, exponent):
-    terms.thrust = terms.thrust * ca.exp(exponent * ca.log(terms.voltage_ratio))
-
-
-def _joint_offset(terms, offset):
-    offset = vector(offset)
-    turned = []
-    for i in range(4):
-        n, e = terms.thrust_directions[i], terms.tilt_axes[i]
-        turned.append(ca.cos(offset[i]) * n + ca.sin(offset[i]) * ca.cross(e, n))
-    terms.tilt, terms.thrust_directions = terms.tilt + offset, turned
-
-
-def _joint_deflection(servo, joint, deflection_per_newton):
-    servo.target = servo.target + per_joint(deflection_per_newton, joint) * servo.thrust
-
-
-def per_joint(value, joint: int):
-    """Value of a joint, from one number for all joints or a tuple of four."""
-    return value[joint] if isinstance(value, tuple) else value
-
-
-def _joint_friction(servo, joint, coulomb, stiction):
-    servo.coulomb = per_joint(coulomb, joint)
-    servo.stiction = per_joint(stiction, joint)
-
-
 def _delay(typical, smallest=0.003, **more):
     return {'delay': EffectParameter('s', 0.0, -0.05, 0.2, typical, smallest, curved=True, **more)}
 
@@ -364,25 +164,25 @@ CATALOGUE: dict[str, Effect] = {
                                             tolerance='angle')},
         'true tilt = encoder + offset', 'several attitudes',
         ('joint_offset', 'torque_coefficient', 'imu_misalignment'),
-        'attitudes with different sets of tilts; a jig', _joint_offset, each='joint'),
+        'attitudes with different sets of tilts; a jig', equations.joint_offset, each='joint'),
     'mass': Effect(
         'body', {'mass': EffectParameter('kg', NAN, 0.05, 200, 0.05, 0.01, number='mass',
                                          tolerance='mass')},
         "m v' = F, Newton; INTERFACES: total mass", 'any flight',
         ('thrust_coefficient', 'voltage_sag', 'wind'),
         'weigh the robot, or fly fast turns: thrust scales torques too, mass does not',
-        _sets('mass'), allocated=True, plant='model'),
+        equations.sets('mass'), allocated=True, plant='model'),
     'inertia': Effect(
         'body', {'inertia': EffectParameter('kg m^2', (NAN,) * 3, 1e-5, 50, 0.2, 0.05,
                                             number='inertia', tolerance='inertia')},
         "I w' = tau - w x I w, Euler", 'fast turns about every axis',
         ('rotor_lag', 'propeller_gyroscopic_torque', 'thrust_coefficient'),
-        'flips by 90 and 180 deg about each axis', _sets('inertia'), plant='model'),
+        'flips by 90 and 180 deg about each axis', equations.sets('inertia'), plant='model'),
     'centre_of_mass': Effect(
         'body', {'offset': EffectParameter('m', (0.0,) * 3, -0.2, 0.2, 0.005, 0.0015)},
         'forces turn the body about its centre of mass, which is displaced from base_link',
         'hover in several attitudes', ('rotor_thrust_coefficient', 'module_reaction'),
-        'hover at roll 0, 90, 180 deg and pitch 90 deg', _centre_of_mass, plant='model'),
+        'hover at roll 0, 90, 180 deg and pitch 90 deg', equations.centre_of_mass, plant='model'),
     'module_reaction': Effect(
         'body', {'module_inertia': EffectParameter('kg m^2', 0.0, 0.0, 0.1, 1e-4, 2e-5,
                                                    step=2e-5),
@@ -392,68 +192,69 @@ CATALOGUE: dict[str, Effect] = {
         "reaction force moment (n'' + 2 w x n'); "
         'multibody section of the robot file', 'fast tilting, turned attitudes',
         ('centre_of_mass', 'inertia'), 'the same attitude with tilts turned by 180 deg',
-        _module_reaction, channels='BJ', plant='model', ignored_by={
+        equations.module_reaction, channels='BJ', plant='model', ignored_by={
             'plant': 'its modules are bodies with the masses of the multibody section; without '
                      'that section it acts'}),
     'thrust_coefficient': Effect(
         'body', {'scale': EffectParameter('1', 1.0, 0.2, 2.0, 0.05, 0.01, tolerance='thrust')},
         'f = scale f*, all rotors', 'any flight', ('mass', 'voltage_sag', 'tilt_thrust_loss'),
-        'weigh the robot; flights at two states of charge', _thrust_coefficient, allocated=True,
-        plant='model'),
+        'weigh the robot; flights at two states of charge', equations.thrust_coefficient,
+        allocated=True, plant='model'),
     'rotor_thrust_coefficient': Effect(
         'body', {'scale': EffectParameter('1', (1.0,) * 4, 0.0, 2.0, 0.08, 0.015,
                                           tolerance='thrust')},
         'f_i = scale_i f*_i: damaged propeller or other speed controller',
         'hover in several attitudes', ('centre_of_mass', 'rotor_thrust_coefficient'),
-        'tilted attitudes; exchange propellers 1 and 2', _thrust_coefficient, each='rotor',
-        allocated=True, plant='model'),
+        'tilted attitudes; exchange propellers 1 and 2', equations.thrust_coefficient,
+        each='rotor', allocated=True, plant='model'),
     'torque_coefficient': Effect(
         'body', {'torque_to_thrust_ratio': EffectParameter(
             'm', NAN, 0.0, 0.2, 0.2, 0.03, number='rotors.torque_to_thrust_ratio',
             tolerance='torque_ratio')},
         'tau_i = -spin_i ratio f_i about the thrust axis', 'yaw steps, differential thrust',
         ('joint_offset', 'rotor_acceleration_torque'), 'yaw steps at zero tilt',
-        _sets('torque_ratio'), allocated=True, plant='model'),
+        equations.sets('torque_ratio'), allocated=True, plant='model'),
     'ground_effect': Effect(
         'body', {'gain_at_0.25m': EffectParameter('1', 0.0, 0.0, 1.0, 0.08, 0.01),
                  'exponential_share': EffectParameter('1', 0.0, 0.0, 1.0, default=0.0, form=True)},
         'f_i (1 + g s(h) n_z^2), s = (0.25 m / h)^2 after Cheeseman and Bennett 1955, or '
         'exp((0.25 m - h) / 0.25 m); h: rotor above the floor', 'hover below 0.6 m',
         ('thrust_coefficient', 'mass', 'tilt_thrust_loss'),
-        'hover ladder at 0.2, 0.3, 0.5, 1.0 and 1.5 m at one state of charge', _ground_effect,
-        forms=({'exponential_share': 0.0}, {'exponential_share': 1.0}), one_regime=True,
-        plant='own'),
+        'hover ladder at 0.2, 0.3, 0.5, 1.0 and 1.5 m at one state of charge',
+        equations.ground_effect, forms=({'exponential_share': 0.0}, {'exponential_share': 1.0}),
+        one_regime=True, plant='own'),
     'rotor_drag': Effect(
         'body', {'coefficient': EffectParameter('N s/m', 0.0, 0.0, 5.0, 0.4, 0.06)},
         'H-force of Faessler et al. 2018, in the rotor plane, grows with rotor speed '
         'sqrt(f / f_h)', 'translation above 1 m/s', ('body_drag', 'wind'),
-        'passes at three speeds with two rotor tilts', _rotor_drag, plant='own'),
+        'passes at three speeds with two rotor tilts', equations.rotor_drag, plant='own'),
     'body_drag': Effect(
         'body', {'coefficient': EffectParameter('N s^2/m^2', 0.0, 0.0, 5.0, 0.05, 0.02)},
         'F = -c |v| v', 'translation above 2 m/s', ('rotor_drag', 'wind'),
-        'passes above 4 m/s', _body_drag, plant='own'),
+        'passes above 4 m/s', equations.body_drag, plant='own'),
     'axial_inflow': Effect(
         'body', {'per_rotor': EffectParameter('N s/m', 0.0, 0.0, 5.0, 0.4, 0.04)},
         'f_i - k sqrt(f_i / f_h) v.n: momentum theory, linear part (Leishman 2006, ch. 2)',
         'climb and descent', ('rotor_lag', 'rotor_drag'),
-        'steady climb and descent at 1 m/s beside thrust steps', _axial_inflow, plant='own'),
+        'steady climb and descent at 1 m/s beside thrust steps', equations.axial_inflow,
+        plant='own'),
     'translational_lift': Effect(
         'body', {'per_rotor': EffectParameter('N s^2/m^2', 0.0, 0.0, 1.0, 0.03, 0.01)},
         'f_i + k |v_in_plane|^2: induced velocity falls with the flow through the disc '
         '(Leishman 2006, ch. 2)', 'fast passes', ('thrust_coefficient', 'axial_inflow'),
-        'level passes at 1, 2 and 3 m/s', _translational_lift),
+        'level passes at 1, 2 and 3 m/s', equations.translational_lift),
     'tilt_thrust_loss': Effect(
         'body', {'loss_at_60deg': EffectParameter('1', 0.0, 0.0, 0.9, 0.06, 0.01),
                  'cosine_share': EffectParameter('1', 0.0, 0.0, 1.0, default=0.0, form=True)},
         'f_i (1 - L s(q)), s = sin^2 q / 0.75 or 2 (1 - cos q): arm and body in the wake',
         'large tilts', ('thrust_coefficient', 'mass', 'ground_effect'),
-        'one attitude with tilts changed by internal force', _tilt_thrust_loss,
+        'one attitude with tilts changed by internal force', equations.tilt_thrust_loss,
         forms=({'cosine_share': 0.0}, {'cosine_share': 1.0}), one_regime=True, plant='own'),
     'wind': Effect(
         'body', {'force': EffectParameter('N', (0.0,) * 3, -100, 100, 1.0, 0.1)},
         'constant force in world', 'any flight; yaw turns', ('mass', 'imu_misalignment',
                                                             'mocap_misalignment'),
-        'hover at yaw 0 and 180 deg; fan off', _wind, allocated=True, plant='own'),
+        'hover at yaw 0 and 180 deg; fan off', equations.wind, allocated=True, plant='own'),
     'propeller_gyroscopic_torque': Effect(
         'body', {'angular_momentum_at_hover': EffectParameter('N m s', 0.0, 0.0, 1.0, 0.066,
                                                               0.008, step=5e-3),
@@ -462,8 +263,8 @@ CATALOGUE: dict[str, Effect] = {
         "-(w + q' e) x h s n - h' s n with h ~ sqrt(f): the propellers' angular momentum; the "
         'part about the tilt axis loads the servo where joint_share is 1',
         'fast turns and fast tilting', ('inertia', 'rotor_acceleration_torque', 'rotor_lag'),
-        'fast tilting by internal force at rest', _propeller_gyroscopic_torque,
-        _gyroscopic_load, channels='BJ',
+        'fast tilting by internal force at rest', equations.propeller_gyroscopic_torque,
+        equations.gyroscopic_load, channels='BJ',
         forms=({'spin_up_share': 0.0}, {'spin_up_share': -1.0}, {'joint_share': 1.0}),
         one_regime=True),
     'rotor_acceleration_torque': Effect(
@@ -471,12 +272,12 @@ CATALOGUE: dict[str, Effect] = {
                                                               0.008)},
         "-h' s n with h ~ sqrt(f): a change of rotor speed turns the body", 'thrust steps',
         ('torque_coefficient', 'propeller_gyroscopic_torque', 'rotor_lag'),
-        'differential thrust chirp', _rotor_acceleration_torque),
+        'differential thrust chirp', equations.rotor_acceleration_torque),
     'voltage_sag': Effect(
         'rotor', {'exponent': EffectParameter('1', 0.0, -1.0, 5.0, 1.0, 0.15)},
         'f = f* (V / V_full)^k: thrust of a thrust map without voltage; 6.9 %/V on this '
         "robot's map", 'flights at several states of charge', ('thrust_coefficient', 'mass'),
-        'three flights at different charge; thrust steps by internal force', _voltage_sag,
+        'three flights at different charge; thrust steps by internal force', equations.voltage_sag,
         measured=('voltage_ratio',)),
     'rotor_lag': Effect(
         'rotor', {'time_constant': _number('rotors.time_constant', 's', 0.001, 2.0, 0.4, 0.12,
@@ -532,7 +333,7 @@ CATALOGUE: dict[str, Effect] = {
         "-coulomb sgn(q') while sliding, up to stiction at rest (Armstrong-Helouvry 1994); "
         'smooth over 0.05 rad/s in the model', 'slow reversals of the tilts',
         ('joint_backlash', 'joint_bandwidth'), 'triangle of 2 deg at 0.1 Hz',
-        servo=_joint_friction, channels='J', starts=((0.004, 0.004), (0.012, 0.015))),
+        servo=equations.joint_friction, channels='J', starts=((0.004, 0.004), (0.012, 0.015))),
     'joint_backlash': Effect(
         'joint', {'gap': EffectParameter('rad', 0.0, 0.0, 0.3, 0.01, 0.003, of_each=True,
                                          curved=True),
@@ -546,7 +347,7 @@ CATALOGUE: dict[str, Effect] = {
                                                            0.0004, step=1e-4, curved=True)},
         'thrust off the axis deflects the servo from its target: q* + c f', 'thrust steps',
         ('joint_friction', 'joint_offset'), 'internal force at rest, two levels',
-        servo=_joint_deflection, channels='J'),
+        servo=equations.joint_deflection, channels='J'),
     'joint_encoder_error': Effect(
         'joint', {name: EffectParameter(unit, (0.0,) * 4, -0.3, 0.3, typical, smallest,
                                         default=(0.0,) * 4, sensor=f'encoder_{name}')

@@ -1,8 +1,8 @@
 """
 Rotations with quaternions in scipy's order (x, y, z, w), body to world.
 
-These functions convert arrays to plain floats first, because arithmetic on numpy scalars takes
-several times as long. For a few numbers ``ndarray.dot`` takes a third of the time of ``@``.
+These functions convert to plain floats first, because arithmetic on numpy scalars takes several
+times as long. For a few numbers ``ndarray.dot`` takes a third of the time of ``@``.
 """
 
 from collections.abc import Sequence
@@ -15,24 +15,17 @@ Vector = np.ndarray | Sequence[float]
 
 
 def matrix(quaternion: Vector) -> np.ndarray:
-    """Rotation matrix (3, 3) of a unit quaternion (x, y, z, w); (3, 3, N) of arrays (N,)."""
-    x, y, z, w = _floats(quaternion)
-    rows = np.array((    # flat, because nested sequences take longer
+    """Rotation matrix (3, 3) of a unit quaternion (x, y, z, w)."""
+    x, y, z, w = np.asarray(quaternion).tolist()
+    return np.array((    # flat, because nested sequences take longer
         1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
         2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
-        2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)))
-    return rows.reshape(3, 3, *rows.shape[1:])
-
-
-def up(quaternion: Vector) -> np.ndarray:
-    """The world's z axis (3,) in body axes: the last row of :func:`matrix`."""
-    x, y, z, w = _floats(quaternion)
-    return np.array([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)])
+        2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y))).reshape(3, 3)
 
 
 def multiply(a: Vector, b: Vector) -> np.ndarray:
     """Quaternion product: first ``b``, then ``a`` (R(a) R(b))."""
-    return np.array(product(*_floats(a), *_floats(b)))
+    return np.array(product(*np.asarray(a).tolist(), *np.asarray(b).tolist()))
 
 
 def product(ax, ay, az, aw, bx, by, bz, bw) -> tuple[Any, Any, Any, Any]:
@@ -43,13 +36,13 @@ def product(ax, ay, az, aw, bx, by, bz, bw) -> tuple[Any, Any, Any, Any]:
 
 def conjugate(quaternion: Vector) -> np.ndarray:
     """Inverse of a unit quaternion."""
-    x, y, z, w = _floats(quaternion)
+    x, y, z, w = np.asarray(quaternion).tolist()
     return np.array([-x, -y, -z, w])
 
 
 def exp(vector: Vector) -> np.ndarray:
     """Unit quaternion of a rotation vector [rad]."""
-    return np.array(exp_parts(*_floats(vector)))
+    return np.array(exp_parts(*np.asarray(vector).tolist()))
 
 
 def exp_parts(x: float, y: float, z: float) -> tuple[float, ...]:
@@ -65,7 +58,7 @@ def exp_parts(x: float, y: float, z: float) -> tuple[float, ...]:
 
 def log(quaternion: Vector) -> np.ndarray:
     """Rotation vector [rad] of a unit quaternion, at most pi long."""
-    x, y, z, w = _floats(quaternion)
+    x, y, z, w = np.asarray(quaternion).tolist()
     if not w >= 0:
         x, y, z, w = -x, -y, -z, -w
     norm = sqrt(x * x + y * y + z * z)
@@ -81,20 +74,20 @@ def normalized(quaternion: Vector) -> np.ndarray:
 
 def skew(vector: Vector) -> np.ndarray:
     """Cross-product matrix (3, 3) of a vector."""
-    x, y, z = _floats(vector)
+    x, y, z = np.asarray(vector).tolist()
     return np.array((0.0, -z, y, z, 0.0, -x, -y, x, 0.0)).reshape(3, 3)
 
 
 def cross(a: Vector, b: Vector) -> np.ndarray:
     """Cross product of two vectors (3,)."""
-    (ax, ay, az), (bx, by, bz) = _floats(a), _floats(b)
+    (ax, ay, az), (bx, by, bz) = np.asarray(a).tolist(), np.asarray(b).tolist()
     return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
 def geodesic_angle(a: Vector, b: Vector) -> float:
     """Angle [rad] of R(b)^T R(a), 0 to pi; the orientation error of this package."""
-    bx, by, bz, bw = _floats(b)
-    x, y, z, w = product(-bx, -by, -bz, bw, *_floats(a))
+    bx, by, bz, bw = np.asarray(b).tolist()
+    x, y, z, w = product(-bx, -by, -bz, bw, *np.asarray(a).tolist())
     return 2 * atan2(sqrt(x * x + y * y + z * z), abs(w))
 
 
@@ -109,12 +102,8 @@ def from_rpy(roll: float, pitch: float, yaw: float) -> np.ndarray:
 
 def to_rpy(quaternion: Vector) -> np.ndarray:
     """Roll, pitch, yaw [rad] with R = Rz(yaw) Ry(pitch) Rx(roll)."""
-    x, y, z, w = _floats(quaternion)
+    x, y, z, w = np.asarray(quaternion).tolist()
     sin_pitch = min(1.0, max(-1.0, 2 * (w * y - z * x)))
     return np.array([atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
                      atan2(sin_pitch, sqrt(max(0.0, 1 - sin_pitch * sin_pitch))),
                      atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))])
-
-
-def _floats(vector: Vector) -> Sequence[float]:
-    return vector.tolist() if isinstance(vector, np.ndarray) else vector

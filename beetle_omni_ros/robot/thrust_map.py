@@ -55,7 +55,8 @@ class ThrustMap:
         """As :meth:`thrust_limit` [N], but extrapolated below the lowest row, at least zero."""
         (v, w), (f, g) = self.voltages[:2], self.thrust_limits[:2]
         low = f + (voltage - v) * (g - f) / (w - v)
-        return np.maximum(0.0, np.where(voltage < v, low, self.thrust_limit(voltage)))
+        return np.maximum(0.0, np.where(voltage < v, low, np.interp(
+            voltage, self.voltages, self.thrust_limits)))
 
     def saturated(self, thrust, voltage) -> np.ndarray:
         """Whether ``thrust`` [N] exceeds the limit at ``voltage`` [V]; shapes broadcast."""

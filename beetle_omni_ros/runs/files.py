@@ -4,7 +4,6 @@ from collections.abc import Callable
 import csv
 import json
 from math import isfinite
-import os
 from pathlib import Path
 
 import numpy as np
@@ -92,29 +91,6 @@ def missing(name: str, header: list[str]) -> ParameterError:
     other = [cell for cell in header if stem and cell.rpartition('_')[0] == stem]
     hint = f" ('{other[0]}' has another unit)" if other else ''
     return ParameterError(f"column '{name}' is missing{hint}")
-
-
-def check_writable(path: str | Path | None, what: str = 'result file') -> None:
-    """
-    Check that a file can be written, before its content is computed; None: none is wanted.
-
-    Raises:
-        ParameterError: it cannot; names the file and the reason.
-
-    """
-    if path is None:
-        return
-    path = Path(path)
-    folder = path.absolute().parent
-    if path.is_dir():
-        reason = 'it is a folder'
-    elif not folder.is_dir():
-        reason = f'there is no folder {folder}'
-    elif not os.access(path if path.exists() else folder, os.W_OK):
-        reason = 'no permission'
-    else:
-        return
-    raise ParameterError(f'{path}: cannot write the {what} there ({reason})')
 
 
 def write_json(path: str | Path | None, results: dict) -> None:

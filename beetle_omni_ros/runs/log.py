@@ -15,7 +15,6 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 
 from beetle_omni_ros.control.base import PoseTarget, Target
-from beetle_omni_ros.messages.topics import controller_of
 from beetle_omni_ros.messages.values import Diagnostic
 from beetle_omni_ros.robot import rotations
 
@@ -213,10 +212,30 @@ class LogRecorder(Recorder):
 
     def write(self, topic: str, value: Any, received: float | None = None) -> None:
         """Record one value; other topics than those of a log are ignored."""
-        series = SERIES_OF.get(topic) or ('command' if controller_of(topic) else '')
-        if series:
-            self._add(self._rows.setdefault(topic, array('d')), SERIES[series], value, received)
-        elif topic in ('target_pose', 'target_trajectory'):
+        series = SERIES_OF.get(topic) or ('command' if topic.endswith('/command') else '')
+        if not series:
+            self._add_event(topic, value, received)
+            return
+        rows, stamp = self._rows.setdefault(topic, array('d')), value.stamp
+        parts = [((stamp if received is None else received) if channel == 'received' else
+                  getattr(value, channel), width) for channel, width in SERIES[series].items()]
+        if isinstance(stamp, np.ndarray):       # the fields are arrays over several messages
+            rows.frombytes(np.column_stack([stamp, *(
+                np.full((len(stamp), width), np.nan) if part is None else part
+                for part, width in parts)]).astype(float).tobytes())
+            return
+        rows.append(stamp)
+        for part, width in parts:
+            if not width:
+                rows.append(part)
+            elif isinstance(part, np.ndarray):
+                rows.extend(part.tolist())      # floats are added faster than numpy's numbers
+            else:
+                rows.extend([np.nan] * width if part is None else part)
+
+    def _add_event(self, topic, value, received):
+        """Add a target, a state of the supervisor or diagnostics."""
+        if topic in ('target_pose', 'target_trajectory'):
             self._log.targets.append(value)
         elif topic == 'supervisor/state':
             self._states.append((received, value))
@@ -232,26 +251,6 @@ class LogRecorder(Recorder):
                 self._log.compute[name] = report
                 self._log.compute_history.setdefault(name, []).append((entry.t, report))
 
-    @staticmethod
-    def _add(rows, channels, value, received):
-        """Add a row, or the rows of a value whose fields are arrays over several messages."""
-        stamp = value.stamp
-        parts = [((stamp if received is None else received) if channel == 'received' else
-                  getattr(value, channel), width) for channel, width in channels.items()]
-        if isinstance(stamp, np.ndarray):
-            rows.frombytes(np.column_stack([stamp, *(
-                np.full((len(stamp), width), np.nan) if part is None else part
-                for part, width in parts)]).astype(float).tobytes())
-            return
-        rows.append(stamp)
-        for part, width in parts:
-            if not width:
-                rows.append(part)
-            elif isinstance(part, np.ndarray):
-                rows.extend(part.tolist())      # floats are added faster than numpy's numbers
-            else:
-                rows.extend([np.nan] * width if part is None else part)
-
     def write_meta(self, meta: dict) -> None:
         """Add metadata of the flight."""
         self._log.meta.update(meta)
@@ -262,8 +261,9 @@ class LogRecorder(Recorder):
         for topic, series in SERIES_OF.items():
             for name, values in _columns(self._rows.get(topic, ()), SERIES[series]).items():
                 setattr(log, f'{series}_{name}', values)
-        log.requests = {controller_of(topic): Commands(**_columns(rows, SERIES['command']))
-                        for topic, rows in self._rows.items() if topic not in SERIES_OF}
+        log.requests = {
+            topic.removesuffix('/command'): Commands(**_columns(rows, SERIES['command']))
+            for topic, rows in self._rows.items() if topic not in SERIES_OF}
         # A latched topic repeats its target: of equal stamps, the last one is kept.
         log.targets = list({(target.stamp, type(target)): target for target in sorted(
             log.targets, key=lambda target: target.stamp)}.values())

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from math import exp, pi, sqrt
 from pathlib import Path
 import re
@@ -234,7 +235,7 @@ def make_task(name: str | Path, seed: int = 0, reach: float = np.inf) -> Task:
         ParameterError: unknown name, or an unusable file.
 
     """
-    name = str(name)
+    name, hover = str(name), partial(pose_target, HOVER)
     if name == 'waypoints':
         return _pose_task(name, np.tile(WAYPOINTS, (WAYPOINT_ROUNDS, 1)))
     if match := re.fullmatch(r'random([1-9]\d{0,5})', name):
@@ -242,10 +243,10 @@ def make_task(name: str | Path, seed: int = 0, reach: float = np.inf) -> Task:
     if name in TILTS:
         return _lemniscate_task(name)
     if name == 'hover':
-        return Task(name, name, (Segment(HOVER_DURATION, _builder(HOVER)),), HOVER[None])
+        return Task(name, name, (Segment(HOVER_DURATION, hover),), HOVER[None])
     if name == 'payload':
         return Task(name, name, tuple(
-            Segment(POSE_DURATION, _builder(HOVER), payload=mass, level=mass)
+            Segment(POSE_DURATION, hover, payload=mass, level=mass)
             for mass in PAYLOADS), np.tile(HOVER, (len(PAYLOADS), 1)))
     if name == 'steps':
         poses = np.vstack([HOVER, *(pose for step in np.diag(STEPS)
@@ -253,14 +254,14 @@ def make_task(name: str | Path, seed: int = 0, reach: float = np.inf) -> Task:
         return _pose_task(name, poses, kind=name)
     if name in ('wind', 'pushes'):
         disturbed = _wind(np.random.default_rng(seed)) if name == 'wind' else _stick()
-        return Task(name, name, (Segment(POSE_DURATION, _builder(HOVER)), *disturbed), HOVER[None])
+        return Task(name, name, (Segment(POSE_DURATION, hover), *disturbed), HOVER[None])
     if name in RISING:
         kind, direction, levels, push, rest = RISING[name]
         segments = [segment for level in levels for segment in (
             _push(push, level * np.array(direction), level), Segment(rest, level=level))
             if segment.duration]
-        return Task(name, kind, (Segment(POSE_DURATION, _builder(DISTURBED)), *segments),
-                    DISTURBED[None])
+        begin = Segment(POSE_DURATION, partial(pose_target, DISTURBED))
+        return Task(name, kind, (begin, *segments), DISTURBED[None])
     if name.lower().endswith('.csv') or name and Path(name).exists():
         return _pose_task(name, read_poses(name, reach))
     raise ParameterError(f"task '{name}': expected a CSV file of poses, random1 to random999999 "
@@ -308,12 +309,8 @@ def _stick():
         yield Segment(PUSH_PERIOD - PUSH_DURATION, level=k + 1)
 
 
-def _builder(pose):
-    return lambda start: pose_target(pose, start)
-
-
 def _pose_task(name, poses, kind='poses'):
-    segments = tuple(Segment(POSE_DURATION, _builder(pose)) for pose in poses)
+    segments = tuple(Segment(POSE_DURATION, partial(pose_target, pose)) for pose in poses)
     return Task(name, kind, segments, poses)
 
 
@@ -370,8 +367,8 @@ def trajectory_task(name: str, times: np.ndarray, positions: np.ndarray,
         return TrajectoryTarget(start + times, positions, quaternions, velocities, rates, start)
 
     duration = float(times[-1])
-    return Task(name, 'trajectory',
-                (Segment(POSE_DURATION, _builder(hold)), Segment(duration, target)), hold[None],
+    segments = Segment(POSE_DURATION, partial(pose_target, hold)), Segment(duration, target)
+    return Task(name, 'trajectory', segments, hold[None],
                 ((POSE_DURATION, POSE_DURATION + duration),))
 
 

@@ -276,7 +276,7 @@ class Inputs:
         """Latest specific force along world up [m/s^2], None without IMU."""
         if self.backup.sample is None or self.imu.silent:
             return None
-        return float(rotations.up(self.best.quaternion).dot(self.backup.sample[1]))
+        return float(rotations.matrix(self.best.quaternion)[2].dot(self.backup.sample[1]))
 
     def why_not_arm(self) -> str:
         """'' when the motors may start, else the missing condition."""

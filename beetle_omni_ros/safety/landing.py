@@ -203,7 +203,7 @@ class Landing:
         specific_force_up = inputs.specific_force_up if inputs.blind else None
         model, gravity = inputs.allocator, inputs.robot.gravity
         force, _ = model.wrench(state.tilt, inputs.thrusts)
-        lift = float(rotations.up(state.quaternion).dot(force)) / model.mass
+        lift = float(rotations.matrix(state.quaternion)[2].dot(force)) / model.mass
         felt = gravity if specific_force_up is None else specific_force_up
         # The accelerometer jitters on the floor, by more than the weight with idle rotors.
         self._support += min(1.0, dt / FELT) * ((felt - lift) / gravity - self._support)

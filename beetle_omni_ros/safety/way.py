@@ -136,7 +136,8 @@ def climb(height: float, speed: float, acceleration: float) -> list[tuple[float,
 
 def plan(quaternion: np.ndarray, tilt: np.ndarray, allocator: Allocator, rate: float) -> Way:
     """Plan the turn to level that the joints, at ``tilt`` (4,) [rad], can follow best."""
-    paths = [_path(corners) for corners in _corners(rotations.up(quaternion), allocator.axes)]
+    up = rotations.matrix(quaternion)[2]
+    paths = [_path(corners) for corners in _corners(up, allocator.axes)]
     longest = max(map(len, paths))
     # One array: shorter paths stay level at their end.
     ups = np.array([np.concatenate([path, np.tile(UP, (longest - len(path), 1))])

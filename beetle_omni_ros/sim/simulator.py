@@ -261,7 +261,7 @@ class Simulator:
             self._airborne += self.tick
             self._flown = self._flown or self._airborne >= AIRBORNE_TIME
             return
-        vertical = rotations.up(before.quaternion)[2]   # cosine of the inclination
+        vertical = rotations.matrix(before.quaternion)[2, 2]   # cosine of the inclination
         breaks = vertical < np.cos(limits.crash_inclination)
         if self._airborne > 0:
             speed = float(np.linalg.norm(before.velocity))

@@ -9,7 +9,7 @@ import yaml
 
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import nest, ParameterError, parse_yaml, quoted
-from beetle_omni_ros.runs.files import check_writable, write_json
+from beetle_omni_ros.runs.files import write_json
 from beetle_omni_ros.train.network import export_policy
 from beetle_omni_ros.train.parameters import read_parameters
 from beetle_omni_ros.train.runner import Runner
@@ -56,7 +56,6 @@ def run_train(*, output: Path | None, config: Path | None = None, robot: Path | 
 
     """
     console = Console()
-    check_writable(json_path)
     if output is None and resume is None:
         raise ParameterError('--output: missing; expected a folder for the training')
     where = choose_device(device)

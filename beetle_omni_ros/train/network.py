@@ -11,7 +11,6 @@ from dataclasses import replace
 from datetime import datetime, timezone
 import logging
 from pathlib import Path
-import subprocess
 import warnings
 
 import numpy as np
@@ -29,6 +28,7 @@ from beetle_omni_ros.control.policy_file import (
     session,
 )
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.resources import commit
 from beetle_omni_ros.robot.schema import ParameterError, RunError
 from beetle_omni_ros.train.parameters import TrainParameters
 
@@ -243,7 +243,7 @@ def export_policy(actor: FeatureModel, path: Path, robot: RobotParameters,
     written = program.model_proto
     contract = PolicyContract.default(robot, parameters.memory)
     contract = replace(
-        contract, training={**parameters.plain(), **training}, commit=_commit(),
+        contract, training={**parameters.plain(), **training}, commit=commit() or '',
         version=__version__,
         created=datetime.now(timezone.utc).isoformat(timespec='seconds'))
     _strip_paths(written)
@@ -278,14 +278,3 @@ def _strip_paths(proto):
                  *proto.graph.value_info, *proto.functions):
         del part.metadata_props[:]
         part.doc_string = ''
-
-
-def _commit() -> str:
-    """Commit of the working tree of this package, '' outside of one."""
-    try:
-        done = subprocess.run(['git', 'describe', '--always', '--dirty', '--abbrev=12'],
-                              cwd=Path(__file__).parent, capture_output=True, text=True,
-                              timeout=10, check=True)
-    except (OSError, subprocess.SubprocessError):
-        return ''
-    return done.stdout.strip()

@@ -12,15 +12,8 @@ from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.sim import sensors
 from beetle_omni_ros.sim import simulator as whole
-from beetle_omni_ros.sim.faults import (
-    Fault,
-    KINDS,
-    load_cases,
-    load_faults,
-    OF_PROCESSES,
-    parse_faults,
-    READINGS,
-)
+from beetle_omni_ros.sim.fault_lists import load_cases, load_faults, parse_faults
+from beetle_omni_ros.sim.faults import Fault, KINDS, OF_PROCESSES, READINGS
 from beetle_omni_ros.sim.simulator import Simulator
 
 HOVER = np.full(4, ROBOT.hover_thrust)

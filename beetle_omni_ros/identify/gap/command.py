@@ -19,7 +19,7 @@ from beetle_omni_ros.identify.gap.page import gap_page
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.results import grids, headline, results
 from beetle_omni_ros.identify.gap.workers import Workers
-from beetle_omni_ros.identify.robot_file import check_outputs
+from beetle_omni_ros.identify.robot_file import check_differs
 from beetle_omni_ros.identify.servo.compare import analyse_joint_logs, is_joint_log
 from beetle_omni_ros.identify.servo.page import change_grids, gap_log_page
 from beetle_omni_ros.pages.page import print_grids, Terminal
@@ -58,7 +58,7 @@ def gap_results(runs, holdout=(), robot=None, apply=None, json_path=None, page=N
     """As :func:`run_gap`, but return the results that it writes as JSON."""
     console = console or Terminal()
     runs, holdout = runs_in(runs), runs_in(holdout)
-    check_outputs(apply, robot, json_path, page, 'page')
+    check_differs(apply, robot)
     check_apart([*runs, *holdout])
     robot_parameters, p = RobotParameters.load(robot), GapParameters.load(parameters)
     if any(is_joint_log(run) for run in runs):
