@@ -302,6 +302,8 @@ def train(output: Annotated[Path | None, Option(metavar='DIR', help=(
           device: Annotated[str, Option(help='auto, cpu, cuda[:N].')] = 'auto',
           resume: Annotated[Path | None, Option(metavar='DIR', help=(
               'Continue from the last checkpoint of a run, or from a model_N.pt.'))] = None,
+          teacher: Annotated[Path | None, Option(metavar='FILE', help=(
+              'Imitate the policy of a model_N.pt at first, with a network of any size.'))] = None,
           smoke: Annotated[bool, Option('--smoke', help=(
               'Test all parts with tiny sizes.'))] = False,
           stop_after: Annotated[float | None, Option(min=0, metavar='SECONDS', help=(
@@ -311,7 +313,7 @@ def train(output: Annotated[Path | None, Option(metavar='DIR', help=(
     """Train a policy and export it to ONNX; needs the extra 'train' and a GPU."""
     from beetle_omni_ros.train.command import parse_changes, run_train
     run_train(output=output, config=config, robot=robot, device=device, resume=resume,
-              changes=parse_changes(changes, seed=seed, memory=memory),
+              teacher=teacher, changes=parse_changes(changes, seed=seed, memory=memory),
               smoke=smoke, stop_after=stop_after, json_path=json_path)
 
 

@@ -10,8 +10,8 @@ from beetle_omni_ros.robot.allocation import clipped
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.events import Silence
 
-JUMP = 'implausible jump'
 FROZEN = 'the same numbers again'
+SCATTER = 'thrust scatters'
 NOT_FINITE = 'not finite'
 
 TIMEOUT = 0.05          # [s] without a valid command: 5 periods of 100 Hz
@@ -19,8 +19,10 @@ RETURN_AFTER = 0.5      # [s] of valid commands before a controller gets control
 STALE_AFTER = 0.05      # [s] a command computed from an older state is refused
 AHEAD = 0.02            # [s] a stamp farther in the future comes from another clock
 OVERSTEP = 0.25         # [-] of a range: 5 N, 1 rad. A wrong unit exceeds it by a factor of 3
-TILT_STEP = 2.0         # [rad] a single larger jump is a spike: the joint would need 0.2 s
-THRUST_STEP = 15.0      # [N] the same for thrust, three quarters of the range
+THRUST_STEP = 10.0      # [N] half of the range, of which a rotor follows a tenth within a period.
+                        # Tilts may step: far targets on both sides set the rate of a joint
+SCATTERED = 0.5         # [-] share of commands with such a step
+MEMORY = 0.1            # [-] weight of the last command in this share
 SAME = 10               # commands or estimates in a row that are equal to the last digit
 
 
@@ -45,7 +47,7 @@ class CommandStream:
         self.silence = Silence(TIMEOUT)
         self.good_for = 0.0
         self._offered: Command | None = None
-        self._same = 0
+        self._same, self._scattered = 0, 0.0
 
     @property
     def dead(self) -> bool:
@@ -75,10 +77,7 @@ class CommandStream:
         if reason:
             self.refused[reason] += 1
             self._last_refusal = reason
-            # A step to a new target looks like a jump for one period only. Repeated jumps end in
-            # the timeout.
-            if reason != JUMP:
-                self.good_for = 0.0
+            self.good_for = 0.0
             return reason
         self.accepted, self._last_refusal = clean, ''
         self.silence.reset()
@@ -117,17 +116,13 @@ class CommandStream:
         before, self._offered = self._offered, clean
         if before is None:
             return '', clean
-        steps = (np.abs(clean.tilt - before.tilt).max(),
-                 np.abs(clean.thrust - before.thrust).max())
-        self._same = 0 if max(steps) > 0 else self._same + 1
+        same = (clean.tilt == before.tilt).all() and (clean.thrust == before.thrust).all()
+        self._same = self._same + 1 if same else 0
         if self._same >= SAME:
             return FROZEN, None
-        # Compared with the previous command, accepted or not: a single spike is refused, a real
-        # step is delayed by one period.
-        if stamp - before.stamp <= self.silence.limit and (
-                steps[0] > TILT_STEP or steps[1] > THRUST_STEP):
-            return JUMP, None
-        return '', clean
+        steps = np.abs(clean.thrust - before.thrust).max() > THRUST_STEP
+        self._scattered += MEMORY * (steps - self._scattered)
+        return (SCATTER, None) if self._scattered > SCATTERED else ('', clean)
 
 
 def within_limits(command: Command, robot: RobotParameters) -> Command | None:

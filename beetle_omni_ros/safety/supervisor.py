@@ -13,7 +13,7 @@ import numpy as np
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import Command, Fallback, PoseTarget, Target
-from beetle_omni_ros.robot.allocation import ALL_HEALTHY, NO_ZEROS, ROTORS
+from beetle_omni_ros.robot.allocation import ALL_HEALTHY, clipped, NO_ZEROS, ROTORS
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.commands import within_limits
 from beetle_omni_ros.safety.events import Answer, ERROR, INFO, WARNING
@@ -31,6 +31,8 @@ STOP_TIME = 0.3         # [s] zero thrust is sent for this time, then nothing
 HANDOVER_TIME = 0.3     # [s] longest duration: half a turn of a joint
 TILT_RATE = 9.0         # [rad/s] as in hover.yaml: below the servos' 10
 THRUST_RATE = 300.0     # [N/s] as in hover.yaml: 3 N a period
+AHEAD = 0.5             # [rad] from its target a joint turns at its full rate: 50 ms of delay and
+                        # lag at 10 rad/s
 LOOK = 0.02             # [s] after a pause without a command: two periods of MoCap, because the
                         # robot may lie on the floor
 RESUMING = 0.1          # [s] after a pause until every source has sent a message again
@@ -379,6 +381,7 @@ class Supervisor(Inputs):
     def _fall_back(self, now, severity, text):
         """Hover at the present height, in the attitude in which the present turn ends."""
         self._target, self._height = None, float(self.estimate.position[2])
+        self._start_from_joints()
         self._enter(FALLBACK, severity, text)
 
     def _land(self, now, severity, text, name=''):
@@ -386,8 +389,15 @@ class Supervisor(Inputs):
             self.watch.name(name, now)
         if not self.airborne:
             return self._enter(DISARMED, severity, f'{text}; still on the ground: motors off')
+        self._start_from_joints()
         self._landing = Landing(self, self._hover)
         return self._enter(LANDING, severity, text)
+
+    def _start_from_joints(self):
+        """Forget a command that the joints have not reached and will not reach."""
+        before, tilt = self._in_force, self.seen.tilt
+        if before is not None:
+            self._in_force = replace(before, tilt=clipped(before.tilt, tilt - AHEAD, tilt + AHEAD))
 
     def _enter(self, state, severity, text):
         self.state, self._in_state, self.target_override = state, 0.0, None

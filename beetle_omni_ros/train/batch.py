@@ -78,6 +78,12 @@ class Draw:
         """(N, 1) bool, true with this probability."""
         return self.uniform(1) < probability
 
+    def direction(self) -> torch.Tensor:
+        """(N, 3) unit vectors, uniform on the sphere."""
+        z, angle = self.around(1.0, 1), self.uniform(1, 0.0, 2 * torch.pi)
+        flat = torch.sqrt(1 - z * z)
+        return torch.cat((flat * torch.cos(angle), flat * torch.sin(angle), z), -1)
+
     def attitude(self) -> torch.Tensor:
         """
         (N, 4) quaternions, half uniform on SO(3), half with uniform axis and uniform angle.

@@ -42,7 +42,7 @@ def choose_device(name: str) -> str:
 
 def run_train(*, output: Path | None, config: Path | None = None, robot: Path | None = None,
               changes: dict | None = None, device: str = 'auto', resume: Path | None = None,
-              smoke: bool = False, stop_after: float | None = None,
+              teacher: Path | None = None, smoke: bool = False, stop_after: float | None = None,
               json_path: Path | None = None) -> None:
     """
     Train and export a policy, with the options of `beetle_omni train`.
@@ -76,7 +76,7 @@ def run_train(*, output: Path | None, config: Path | None = None, robot: Path | 
     torch.set_float32_matmul_precision('high')
     if smoke:
         torch.set_num_threads(1)    # on a loaded machine several threads wait for each other
-    runner = Runner(parameters, nominal, output, where)
+    runner = Runner(parameters, nominal, output, where, teacher=teacher)
     if checkpoint:
         runner.resume(checkpoint)
     _make_folder(output, checkpoint)

@@ -256,6 +256,9 @@ class TiltableQuadrotorEnv:
         near = (way.norm(dim=-1) <= guidance.NEAR_DISTANCE) \
             & (turn <= guidance.NEAR_ANGLE)
         changed['trim'] = new['trim'] * near[:, None]
+        # A strong force comes and goes with the targets, because a robot also meets it in flight.
+        for name, other in (('wrench', 'other_wrench'), ('other_wrench', 'wrench')):
+            changed[name] = torch.where(spread(due, new[name]), new[other], new[name])
         return changed
 
     def _observe(self, s, draw):

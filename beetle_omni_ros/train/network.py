@@ -29,7 +29,7 @@ from beetle_omni_ros.control.policy_file import (
 )
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import commit
-from beetle_omni_ros.robot.schema import RunError
+from beetle_omni_ros.robot.schema import ParameterError, RunError
 from beetle_omni_ros.train.parameters import TrainParameters
 
 OPSET = 18
@@ -127,6 +127,22 @@ class FeatureModel(MLPModel):
 
     def _get_latent_dim(self):
         return self.features(torch.zeros(1, self.obs_dim)).shape[-1]
+
+
+def actor_of(checkpoint: Path, like: FeatureModel) -> FeatureModel:
+    """Actor of a checkpoint, whose network may have other layers; ParameterError if none."""
+    try:
+        saved = torch.load(str(checkpoint), map_location='cpu', weights_only=True)
+        layers = {name.removeprefix('mlp.'): value for name, value
+                  in saved['actor_state_dict'].items() if name.startswith('mlp.')}
+        *hidden, out = [len(value) for name, value in layers.items() if name.endswith('bias')]
+        actor = copy.deepcopy(like)
+        actor.mlp = MLP(like.mlp[0].in_features, out, hidden)
+        actor.mlp.load_state_dict(layers)
+    except Exception as error:      # torch's errors for a bad file have no common base class
+        raise ParameterError(f'{checkpoint}: no checkpoint of a policy with the same inputs '
+                             f'({" ".join(str(error).split())[:160]})') from None
+    return actor.to(like.mlp[0].weight.device).requires_grad_(False)
 
 
 class ExportedPolicy(torch.nn.Module):

@@ -117,8 +117,9 @@ class RandomParameters:
                              high=50)
     strong_share: float = parameter(0.12, doc='fraction of robots with a strong constant force',
                                     low=0, high=1)
-    strong_force: float = parameter(60.0, doc='largest strong force, each axis', unit='N', low=0,
-                                    high=200)
+    strong_force: float = parameter(
+        55.0, doc='largest force that the rotors have to give against a strong force and gravity',
+        unit='N', low=0, high=200)
     payload_share: float = parameter(0.2, doc='fraction of robots with a payload', low=0, high=1)
     payload: float = parameter(1.1, doc='largest mass of a payload', unit='kg', low=0, high=10)
     torque: float = parameter(0.1, doc='largest constant torque with a constant force, each axis',
@@ -159,8 +160,8 @@ class RewardWeights:
     joint_winding: float = parameter(-3.0, doc='own: joints beyond half a turn')
     hover_tilt_rate: float = parameter(-60.0, doc='own: smooth commands at the target')
     hover_thrust_rate: float = parameter(-1.5, doc='own: smooth commands at the target')
-    sinking: float = parameter(-26.0, doc='own: below both start and target')
-    termination: float = parameter(-800.0, doc='own: smaller than the cost of the worst flight')
+    sinking: float = parameter(-48.0, doc='own: below both start and target')
+    termination: float = parameter(-2000.0, doc='own: smaller than the cost of the worst flight')
     scale: float = parameter(0.01, doc='scale of the sum')
 
 
@@ -204,6 +205,8 @@ class ScheduleParameters:
                            high=1)
     kl: np.ndarray = parameter([0.01, 0.005], doc='desired divergence of an update', shape=(2,))
     entropy: np.ndarray = parameter([5e-4, 0.0], doc='weight of the entropy', shape=(2,))
+    imitation: np.ndarray = parameter([1.0, 0.0], doc='weight of the divergence from the teacher, '
+                                      'if there is one', shape=(2,))
     tilt_std_limit: np.ndarray = parameter([0.7, 0.08], doc='largest standard deviation of the '
                                            'tilt actions, in actions', shape=(2,))
     thrust_std_limit: np.ndarray = parameter([2.5, 0.25], doc='largest standard deviation of the '

@@ -8,6 +8,7 @@ adapts on the device. On other devices the same code runs uncaptured.
 
 from collections.abc import Callable
 from math import log, pi
+from pathlib import Path
 
 from rsl_rl.algorithms import PPO
 from rsl_rl.storage import RolloutStorage
@@ -15,7 +16,7 @@ import torch
 from torch import nn
 
 from beetle_omni_ros.train.environment import TiltableQuadrotorEnv
-from beetle_omni_ros.train.network import FeatureModel
+from beetle_omni_ros.train.network import actor_of, FeatureModel
 from beetle_omni_ros.train.parameters import TrainParameters
 
 LEARNING_RATE_STEP = 1.5     # factor of rsl-rl's adaptation
@@ -26,13 +27,17 @@ class GraphPpo(PPO):
     """
     rsl-rl's PPO; :meth:`collect` and :meth:`learn_batch` run as captured graphs on a GPU.
 
+    With a ``teacher``, a student of any size also minimises the divergence from its actions
+    ("kickstarting", Schmitt et al. 2018).
+
     Attributes:
-        scheduled: (4,) on the device: desired KL, entropy weight, bounds of the standard
-            deviations of tilt and thrust actions.
+        scheduled: (5,) on the device: desired KL, weights of the entropy and of the divergence
+            from the teacher, bounds of the standard deviations of tilt and thrust actions.
 
     """
 
-    def __init__(self, env: TiltableQuadrotorEnv, parameters: TrainParameters, graphs: bool):
+    def __init__(self, env: TiltableQuadrotorEnv, parameters: TrainParameters, graphs: bool,
+                 teacher: Path | None = None):
         network, p = parameters.network, parameters.ppo
         groups, seen = {'actor': ['actor'], 'critic': ['critic']}, env.get_observations()
         actor = FeatureModel(
@@ -55,7 +60,8 @@ class GraphPpo(PPO):
             [*self.actor.parameters(), *self.critic.parameters()],
             lr=self.rate if graphs else p.learning_rate, eps=ADAM_EPSILON,
             capturable=graphs, fused=graphs or None)
-        self.scheduled = torch.zeros(4, device=self.device)
+        self.teacher = teacher and actor_of(teacher, self.actor)
+        self.scheduled = torch.zeros(5, device=self.device)
         self._loss, self._mean = (torch.compile(function, dynamic=False) if graphs else function
                                   for function in (self._losses, self.actor.mean))
         shape = (p.steps, env.num_envs)
@@ -151,7 +157,7 @@ class GraphPpo(PPO):
         self.losses.div_(self.num_learning_epochs * self.num_mini_batches)
         with torch.no_grad():       # limit the standard deviations, which rsl-rl does not
             log_std = self.actor.distribution.log_std_param
-            limits = self.scheduled[2:].repeat_interleave(4)
+            limits = self.scheduled[3:].repeat_interleave(4)
             log_std.copy_(torch.minimum(log_std, torch.log(limits)))
 
     def _step(self, batch, old_std):
@@ -176,6 +182,9 @@ class GraphPpo(PPO):
         divergence = (torch.log(std / old_std) + (old_std ** 2 + (old_mean - mean) ** 2)
                       / (2 * std ** 2) - 0.5).sum(-1).mean()
         loss = surrogate + self.value_loss_coef * value - self.scheduled[1] * entropy
+        if self.teacher is not None:
+            apart = (mean - self.teacher.mean(observation)) / std.detach()
+            loss = loss + self.scheduled[2] * 0.5 * (apart ** 2).sum(-1).mean()
         return loss, torch.stack((value, surrogate, entropy, divergence)).detach()
 
     def _adapt(self, divergence):

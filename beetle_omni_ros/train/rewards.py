@@ -15,7 +15,7 @@ from beetle_omni_ros.train.parameters import RewardWeights
 
 TERMS = tuple(entry.name for entry in fields(RewardWeights)
               if entry.name not in ('termination', 'scale'))
-SINKING_LIMIT = 0.3    # [m] largest penalty, for any depth
+SINKING_LIMIT = 0.4    # [m] largest penalty, for any depth
 
 
 def terms(*, position_error, attitude_error, speed, rate, tilt, tilt_rate, previous_tilt_rate,

@@ -31,6 +31,7 @@ class Runner:
         folder: of checkpoints and TensorBoard log; None: nothing is written.
         device: torch device.
         graphs: whether to capture CUDA graphs and compile; None: on a GPU.
+        teacher: checkpoint of a policy to imitate at first.
 
     Attributes:
         iteration: number of iterations so far; ``trained_seconds`` is their duration.
@@ -38,13 +39,14 @@ class Runner:
     """
 
     def __init__(self, parameters: TrainParameters, robot: RobotParameters,
-                 folder: Path | None = None, device: str = 'cpu', graphs: bool | None = None):
+                 folder: Path | None = None, device: str = 'cpu', graphs: bool | None = None,
+                 teacher: Path | None = None):
         self.parameters, self.folder = parameters, folder
         self._robot_hash = robot.hash()
         torch.manual_seed(parameters.seed)
         self.env = TiltableQuadrotorEnv(parameters, robot, device, compiled=graphs)
         self.alg = GraphPpo(self.env, parameters,
-                            device.startswith('cuda') if graphs is None else graphs)
+                            device.startswith('cuda') if graphs is None else graphs, teacher)
         self.iteration, self.trained_seconds = 0, 0.0
 
     def apply_schedule(self, part: float) -> None:
@@ -57,7 +59,8 @@ class Runner:
             return float(first + done * (last - first))
 
         self.alg.scheduled.copy_(torch.tensor([
-            at(name) for name in ('kl', 'entropy', 'tilt_std_limit', 'thrust_std_limit')]))
+            at(name) for name in (
+                'kl', 'entropy', 'imitation', 'tilt_std_limit', 'thrust_std_limit')]))
         env.severity.fill_(at('severity'))
         factors = {term: at(name) for name, terms in SCHEDULED.items() for term in terms}
         env.weights.copy_(env.base_weights * torch.tensor(

@@ -24,7 +24,7 @@ LONGEST_DELAY = 2 * batch.PERIOD    # [s] of the stored commands and tilts
 LEAST = 0.2     # smallest drawn quantity of an actuator, as a fraction of the smallest measured
 PAYLOAD_DEPTH = 0.08                   # [m] below base_link, as in the simulated plant
 MISSED_POSITION, MISSED_ATTITUDE = 0.10, 0.10     # [m], [rad] at the end of a target's time
-MISSED_DEPTH = 0.3                                # [m] below both start and target, in between
+MISSED_DEPTH = 0.15                               # [m] below both start and target, in between
 FULL = 0.01          # fraction of the robots with a stored state at which all replays happen
 FORGET_FLOWN, FORGET_MISSED = 0.5, 0.1            # probability of deletion after a replay
 
@@ -170,8 +170,11 @@ class Starts:
         centre = (mass * centre + down) / total
         forced = d.chance(r.force_share)
         strong = d.chance(r.strong_share)
-        force = forced * d.around(r.force, 3) + strong * d.around(r.strong_force, 3)
-        wrench = self.severity * torch.cat((force, forced * d.around(r.torque, 3)), -1)
+        weak = torch.cat((d.around(r.force, 3), d.around(r.torque, 3)), -1)
+        weak = self.severity * forced * weak
+        thrust = d.uniform(1, 0.0, r.strong_force) * d.direction()
+        force = self.severity * strong * (self._weight - thrust)
+        wrench = weak + torch.cat((force, torch.zeros_like(force)), -1)
         noise = d.uniform(1) ** r.noise_power
         bias = noise * torch.cat((
             d.around(r.position_bias, 3), d.around(r.attitude_bias, 3),
@@ -186,6 +189,7 @@ class Starts:
         disturbed = (forced | strong | pushed | (load > 0)).float()
         return {'thrust_limit': d.uniform(1, *self._thrust_limit),
                 'body': torch.cat((total, inertia, centre, actuators), -1), 'wrench': wrench,
+                'other_wrench': weak,
                 'noise': noise, 'bias': bias, 'delays': delays, 'extrapolated': extrapolated,
                 'pushed': pushed.float(),
                 'disturbed': disturbed, 'estimate': torch.zeros_like(wrench)}

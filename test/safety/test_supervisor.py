@@ -69,6 +69,31 @@ def test_fallback_and_landing_stop_a_turn_before_they_aim_at_a_pose(begin, monke
     assert 0.1 < seen[-1].position[0] - rig.position[0] < 1.0
 
 
+@pytest.mark.parametrize('begin', [
+    lambda rig: rig.supervisor.land(rig.now),
+    lambda rig: rig.supervisor.on_command(
+        'nmpc', Command(rig.now + TICK, np.full(4, np.nan), np.ones(4)), rig.now)])
+def test_fallback_and_landing_start_from_the_joints_and_not_from_a_far_target(begin):
+    rig = flown()
+    joints, publish = rig.command.tilt, rig._publish
+
+    def late():     # the joints have not moved yet
+        rig.command = replace(rig.command, tilt=joints)
+        publish()
+
+    rig._publish = late
+    rig.alive.discard('nmpc')
+    for far in (2.9, 3.0):
+        rig.supervisor.on_command(
+            'nmpc', Command(rig.now + TICK, joints + far, rig.command.thrust), rig.now)
+        rig.run(TICK)
+    assert np.abs(rig.command.tilt - joints).min() > 2.5
+    begin(rig)
+    rig.run(TICK)
+    assert rig.supervisor.source == 'hover'
+    assert np.abs(rig.command.tilt - joints).max() < 0.6
+
+
 def test_a_controller_whose_commands_are_not_finite_loses_control_at_once_with_the_reason():
     rig = flown()
     rig.alive.discard('nmpc')

@@ -207,6 +207,20 @@ def test_the_estimate_approaches_the_disturbance():
     torch.testing.assert_close(env.state['estimate'][:, :3], lag * force, atol=1e-3, rtol=1e-3)
 
 
+def test_a_strong_force_comes_and_goes_with_the_targets():
+    env = quiet({**only('hover'), 'random.strong_share': 0.5, 'random.force_share': 0.5,
+                 'episode.target_time': [0.1, 0.1]}, robots=64)
+    env.state['age'].zero_()
+    with_it, without = env.state['wrench'].clone(), env.state['other_wrench'].clone()
+    strong = (with_it != without).any(-1)
+    assert 0 < int(strong.sum()) < env.num_envs
+    for expected in (with_it, without, with_it):
+        torch.testing.assert_close(env.state['wrench'], expected)
+        while not (env.state['target_left'] <= 1).all():
+            env.advance((env.state['previous'] - env.offset) / env.scale)
+        env.advance((env.state['previous'] - env.offset) / env.scale)
+
+
 # ---- all of it
 
 

@@ -5,6 +5,7 @@ import pytest
 from rsl_rl.algorithms import PPO
 import torch
 
+from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.train.runner import Runner
 
 
@@ -95,3 +96,27 @@ def test_the_learning_rate_keeps_its_limits():
         for _ in range(20):
             alg._adapt(torch.tensor(divergence))
         assert float(alg.rate) == pytest.approx(limit)
+
+
+def test_a_smaller_student_approaches_its_teacher(tmp_path):
+    teacher = randomised(Runner(small({'network.hidden': [24, 20]}), ROBOT, tmp_path), seed=3)
+    student = Runner(small({'network.hidden': [32]}), ROBOT, teacher=teacher.checkpoint()).alg
+    student.collect()
+    student.scheduled.copy_(torch.tensor([1e3, 0.0, 1.0, 9.0, 9.0]))
+    student.storage.advantages.zero_()      # nothing else is to be learnt
+    seen = student.storage.observations['actor'].flatten(0, 1)
+
+    @torch.no_grad()
+    def apart():
+        return float((student.actor.mean(seen) - teacher.alg.actor.mean(seen)).norm())
+
+    before = apart()
+    for _ in range(40):
+        student.learn_batch()
+    assert apart() < 0.5 * before
+
+
+def test_a_teacher_with_other_inputs_is_refused(tmp_path):
+    teacher = Runner(small({'memory': True}), ROBOT, tmp_path).checkpoint()
+    with pytest.raises(ParameterError, match='no checkpoint of a policy with the same inputs'):
+        Runner(small(), ROBOT, teacher=teacher)

@@ -43,9 +43,9 @@ def test_the_schedule_is_linear_between_its_ends():
                      'schedule.sinking': [0.1, 1.0]})
     reward = made.parameters.reward
     for part, knobs, severity, smooth, near in (
-            (0.1, [0.01, 4e-4, 0.8, 3.0], 0.0, 0.1, 0.5),
-            (0.5, [0.0075, 2e-4, 0.5, 2.0], 0.5, 0.55, 0.75),
-            (1.0, [0.005, 0.0, 0.2, 1.0], 1.0, 1.0, 1.0)):
+            (0.1, [0.01, 4e-4, 1.0, 0.8, 3.0], 0.0, 0.1, 0.5),
+            (0.5, [0.0075, 2e-4, 0.5, 0.5, 2.0], 0.5, 0.55, 0.75),
+            (1.0, [0.005, 0.0, 0.0, 0.2, 1.0], 1.0, 1.0, 1.0)):
         made.apply_schedule(part)
         np.testing.assert_allclose(made.alg.scheduled, knobs, rtol=1e-6)
         assert float(made.env._starts.severity) == pytest.approx(severity)

@@ -111,6 +111,17 @@ def test_severity_scales_forces_and_payloads_of_new_robots():
     assert (full['body'][:, 6] <= 0).all()     # it hangs below
 
 
+def test_rotors_hold_a_strong_force_with_bounded_thrust_in_every_direction():
+    env = quiet({'random.strong_share': 1.0}, robots=2000)
+    weight = ROBOT.mass * ROBOT.gravity
+    thrust = env.state['wrench'].new_tensor([0, 0, weight]) - env.state['wrench'][:, :3]
+    size = thrust.norm(dim=-1)
+    assert 0.95 * env.cfg.random.strong_force < float(size.max()) \
+        <= env.cfg.random.strong_force + 1e-3
+    assert (thrust / size[:, None]).mean(0).abs().max() < 0.06
+    assert not env.state['other_wrench'].any()
+
+
 def test_drawn_actuators_are_those_of_robots_that_the_robot_file_draws():
     rng, file = np.random.default_rng(0), RobotParameters.load('measured')
     drawn = torch.tensor(np.array([actuators(file.drawn(rng)) for _ in range(DRAWN)])).float()
