@@ -6,7 +6,7 @@ A new topic is one entry. Names are relative; a robot may have a namespace.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
@@ -162,6 +162,9 @@ TARGETS = ('target_pose', 'target_trajectory')      # received with any quality 
 ALL: dict[str, Topic] = {topic.name: topic for topic in TABLE}
 TOPICS: dict[str, Topic] = {topic.name: topic for topic in TABLE if topic.in_flight}
 """Topics that every bag declares, with the commands of the standby controllers."""
+# Not of a robot alone: /NAME/command may be of a controller, and other programs have the others.
+TELLING = TOPICS.keys() - {'command', 'diagnostics', 'odom'}
+"""Topics that determine the namespace of a robot in a bag."""
 
 
 def topics_with(controllers: Iterable[str]) -> dict[str, Topic]:
@@ -179,38 +182,3 @@ def topic_of(name: str) -> Topic:
     """Return the topic of a name without namespace; KeyError for an unknown one."""
     controller = controller_of(name)
     return command_topic(controller) if controller and name not in ALL else ALL[name]
-
-
-def is_ambiguous(topic: str) -> bool:
-    """Whether ``name`` in '/name/command' may be a controller or the namespace of a robot."""
-    _, _, name = topic.removesuffix('/command').rpartition('/')
-    return topic.endswith('/command') and bool(name) and name not in registry.names()
-
-
-def split_topic(topic: str, namespaces: Container[str] = ()) -> tuple[str, str] | None:
-    """
-    Split a bag's topic into namespace and name.
-
-    Args:
-        topic: full name.
-        namespaces: known namespaces of the robots in the bag, as '' or '/robot1'. Without them,
-            '/name/command' is the topic of a controller if ``name`` is registered, else the
-            command of a robot in '/name'.
-
-    Returns:
-        (namespace, name): '/robot1/nmpc/command' -> ('/robot1', 'nmpc/command'); None for an
-        unknown topic. ``diagnostics`` may also be the global one.
-
-    """
-    space, _, last = topic.rpartition('/')
-    if last == 'command':
-        above, _, controller = space.rpartition('/')
-        is_one = above in namespaces and space not in namespaces or controller in registry.names()
-        if controller and is_one:
-            return above, f'{controller}/command'
-    for name in sorted(TOPICS, key=len, reverse=True):
-        if topic == name or topic == '/' + name:
-            return '', name
-        if topic.endswith('/' + name):
-            return topic[:-len(name) - 1], name
-    return None

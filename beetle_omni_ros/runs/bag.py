@@ -16,9 +16,9 @@ from beetle_omni_ros.control.base import TrajectoryTarget
 from beetle_omni_ros.messages.bag_types import from_bytes, read_all
 from beetle_omni_ros.messages.conversions import from_nanoseconds
 from beetle_omni_ros.messages.topics import (
+    ALL,
     controller_of,
-    is_ambiguous,
-    split_topic,
+    TELLING,
     topic_of,
     TOPICS,
 )
@@ -34,7 +34,7 @@ class Recorded(NamedTuple):
     One message of a bag, or several of one topic in the order of the file.
 
     Attributes:
-        topic: full name.
+        topic: full name; of several messages that without the namespace of the robot.
         type: ROS type.
         data: CDR, or list of it.
         received: time of recording [s], or (N,) times.
@@ -146,19 +146,28 @@ def read_messages(path: str | Path, warnings: list[str] | None = None) -> Iterat
 def read_together(path: str | Path, warnings: list[str] | None = None
                   ) -> Iterator[list[Recorded]]:
     """
-    Yield the messages of a bag by topic, a few seconds at a time.
+    Yield the messages of a bag of one robot by topic, a few seconds at a time.
 
-    Arguments and errors are as in :func:`read_messages`. Topics are in the order of their first
-    message.
+    Arguments and errors are as in :func:`read_messages`, and a ParameterError reports several
+    robots. Topics are in the order of their first message.
     """
     messages = read_messages(path, warnings)
+    spaces: set[str] = set()    # namespaces of robots
     while part := list(islice(messages, AT_ONCE)):
         groups: dict[tuple[str, str], tuple[list, list]] = {}
         for topic, kind, data, received in part:
-            all_data, times = groups.setdefault((topic, kind), ([], []))
+            all_data, times = groups.setdefault((f"/{topic.lstrip('/')}", kind), ([], []))
             all_data.append(data)
             times.append(received)
-        yield [Recorded(*name, data, np.array(times)) for name, (data, times) in groups.items()]
+        spaces |= {topic.removesuffix(name).rstrip('/') for topic, _ in groups for name in TELLING
+                   if topic.endswith(f'/{name}')}
+        if len(spaces) > 1:
+            found = ' and '.join(f"'{space}'" for space in sorted(spaces))
+            raise ParameterError(f'{path}: holds several robots ({found}); expected one')
+        begin = f"{next(iter(spaces), '')}/"
+        yield [Recorded('diagnostics' if topic == '/diagnostics' else topic.removeprefix(begin),
+                        kind, data, np.array(times))
+               for (topic, kind), (data, times) in groups.items()]
 
 
 def read_bag(path: str | Path) -> FlightLog:
@@ -175,10 +184,9 @@ def read_bag(path: str | Path) -> FlightLog:
         ParameterError: no such bag, unreadable, not MCAP, or several robots in it.
 
     """
-    reading, warnings = _Reading(str(path)), []
+    reading, warnings = _Reading(), []
     for together in read_together(path, warnings):
-        # Ambiguous names last: the other topics may determine the namespace.
-        for messages in sorted(together, key=lambda one: is_ambiguous(one.topic)):
+        for messages in together:
             reading.take(messages)
     reading.recorder.write_meta(_metadata(path, warnings))
     log = reading.recorder.log()
@@ -209,18 +217,16 @@ def read_flights(paths: Iterable[str | Path], most: int) -> dict[str, FlightLog]
 class _Reading:
     """Sorts messages by topic into a log, and counts unusable ones."""
 
-    def __init__(self, path):
+    def __init__(self):
         self.recorder = LogRecorder()
-        self._path, self._namespace = path, None
-        self._names = {}        # full topic -> name
         self._counts: Counter = Counter()
         self._bad: Counter = Counter()
         self._reason: dict[str, str] = {}
 
     def take(self, messages: Recorded) -> None:
         """Read messages of one topic; those of a series together."""
-        name = self._name(messages.topic)
-        if name is None:
+        name = messages.topic
+        if name not in ALL and not controller_of(name):
             return
         topic = topic_of(name)
         if messages.type != topic.type:
@@ -246,28 +252,6 @@ class _Reading:
     def _refuse(self, name, reason, count=1):
         self._bad[name] += count
         self._reason.setdefault(name, reason)
-
-    def _name(self, topic):
-        """Name without namespace; None for a topic that is unknown or still ambiguous."""
-        if topic not in self._names:
-            if self._namespace is None and is_ambiguous(topic):
-                return None     # until another topic determines the robot's namespace
-            self._names[topic] = self._recognise(topic)
-        return self._names[topic]
-
-    def _recognise(self, topic):
-        known = () if self._namespace is None else (self._namespace,)
-        namespace, name = split_topic(topic, known) or (None, None)
-        if name is None or name == 'diagnostics' and namespace in ('', self._namespace):
-            return name
-        if self._namespace is None:
-            self._namespace = namespace
-        if namespace == self._namespace:
-            return name
-        if name == 'diagnostics':
-            return None
-        raise ParameterError(f"{self._path}: holds several robots ('{self._namespace}' and "
-                       f"'{namespace}'); expected one")
 
     def problems(self) -> list[str]:
         """Return a line about missing topics, and one for each topic with unusable messages."""

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from beetle_omni_ros.messages.bag_types import from_bytes, read_all
-from beetle_omni_ros.messages.topics import is_ambiguous, split_topic, TOPICS
+from beetle_omni_ros.messages.topics import TOPICS
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, ROTOR_NAMES
 from beetle_omni_ros.runs.bag import BagError, read_together
 
@@ -56,23 +56,12 @@ def read_recording(path: str | Path) -> Recording:
     states: list[tuple[float, str]] = []
     data: dict[str, list] = defaultdict(list)
     when: dict[str, list] = defaultdict(list)
-    known: dict[str, str | None] = {}
+    known: set[str] = set()
     bad: dict[str, int] = {}
-    namespaces: set[str] = set()
     for together in read_together(path, warnings):
-        for messages in sorted(together, key=lambda one: is_ambiguous(one.topic)):
-            topic, count = messages.topic, len(messages.data)
-            if topic not in known:
-                if not namespaces and is_ambiguous(topic):
-                    continue
-                split = split_topic(topic, namespaces)
-                known[topic] = split[1] if split else None
-                if split and split[1] in NEEDED:
-                    namespaces.add(split[0])
-                    if len(namespaces) > 1:
-                        raise BagError(f'{path}: holds several robots '
-                                       f"({', '.join(map(repr, sorted(namespaces)))})")
-            name = known[topic]
+        for messages in together:
+            name, count = messages.topic, len(messages.data)
+            known.add(name)
             if name not in PARTS and name != 'supervisor/state':
                 continue
             if messages.type != TOPICS[name].type:
