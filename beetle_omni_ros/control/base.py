@@ -329,11 +329,22 @@ class ControllerHost:
                 state.position, state.velocity, state.quaternion, state.angular_velocity,
                 state.tilt, state.tilt_velocity))):
             return None
-        return self.call('step', corrected(state, self._health), target or self.target_in_force)
+        state, target = corrected(state, self._health), target or self.target_in_force
+        began = thread_time()   # wall time would include other programs
+        try:
+            result: Any = self.controller.step(state, target)  # type: ignore[arg-type]
+        except Exception as error:
+            return self._failed('step', f'raised {error_text(error)}')
+        self._took(thread_time() - began)
+        if isinstance(result, Command) and all(getattr(part, 'shape', None) == (ROTORS,)
+                                               for part in (result.tilt, result.thrust)):
+            return result
+        return self._failed('step', f'returned {str(result)[:100]}, expected a Command with two '
+                            f'arrays of {ROTORS}')
 
     def call(self, method: str, *arguments: Any) -> Any:
         """
-        Call the controller's ``method`` if it has one; returns its result, None after an error.
+        Call another of the controller's methods if it has it; None after an error.
 
         In a process with other nodes, an exception would end the supervisor, too.
         """
@@ -341,18 +352,11 @@ class ControllerHost:
         if function is None:
             return None
         try:
-            if method != 'step':
-                return function(*arguments)
-            began = thread_time()   # wall time would include other programs
-            result = function(*arguments)
-            self._took(thread_time() - began)
-            if isinstance(result, Command) and all(
-                    getattr(part, 'shape', None) == (ROTORS,)
-                    for part in (result.tilt, result.thrust)):
-                return result
-            text = f'returned {str(result)[:100]}, expected a Command with two arrays of {ROTORS}'
+            return function(*arguments)
         except Exception as error:
-            text = f'raised {error_text(error)}'
+            return self._failed(method, f'raised {error_text(error)}')
+
+    def _failed(self, method, text):
+        """Count and report an error; returns None."""
         self.errors, self.error = self.errors + 1, f"controller '{self._name}': {method} {text}"
         self._report(self.error)
-        return None

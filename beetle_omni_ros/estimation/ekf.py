@@ -214,7 +214,7 @@ class ErrorStateEkf:
             return False
         self._noise.add(*checked)
         # to the clock of the IMU, by the estimate of the leading track
-        leader = self._valid or self._candidate or self._track
+        leader = self._track or self._candidate
         offset = leader.nodes[-1].time_offset if leader is not None else 0.0
         stamp = max(checked[0] + offset, self._readings[0][0])
         if stamp > self._readings[-1][0] + SAME_INSTANT:
@@ -222,14 +222,11 @@ class ErrorStateEkf:
             return True
         return self._apply(stamp, *checked[1:])
 
-    @property
-    def _valid(self) -> Track | None:
-        return self._track if self.status in ('tracking', 'dead_reckoning') else None
-
     def _apply(self, stamp, position, quaternion) -> bool:
         self._estimate = None
         self._model.filter.R = self._noise.covariance
-        track, candidate = self._valid, self._candidate
+        track = self._track if self.status in ('tracking', 'dead_reckoning') else None
+        candidate = self._candidate
         if track is not None:
             if track.correct(stamp, position, quaternion) \
                     or self._corrected_with_doubt(track, stamp, position, quaternion):

@@ -13,10 +13,6 @@ Checked = tuple[float, np.ndarray, np.ndarray]   # stamp and two vectors of a sa
 GAP = 0.1           # [s] longest bridged time between two IMU samples
 RESYNC = 20         # refused consistent stamps in a row after which the clock itself has jumped
 FROZEN_READINGS = 10    # equal to the last digit, of a frozen driver; noise never repeats
-# [m/s^2] change of the specific force between two samples that is an impact of unknown impulse
-IMPACT = 30.0
-# [rad/s] a larger change of the rate in one reading is a fault; full thrust turns the body by 0.5
-SPIKE = 3.0
 FORCE_LIMIT, RATE_LIMIT = 160.0, 40.0   # [m/s^2], [rad/s] larger readings are refused
 PLACES = 100.0      # [m] largest coordinate of a pose
 DELAY_LIMIT = 0.2   # [s] largest age of a pose against the newest IMU sample
@@ -50,7 +46,7 @@ class InputGuard:
         self._pose_values: tuple[float, ...] | None = None
         self._reading_values: tuple[float, ...] | None = None
         self._same_reading = 0
-        self._spikes = SpikeFilter(IMPACT, SPIKE)
+        self._spikes = SpikeFilter()
         self._refused: list[float] = []  # consecutive refused stamps at regular distances
 
     def reading(self, sample) -> Checked | None:

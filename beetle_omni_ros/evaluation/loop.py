@@ -7,10 +7,11 @@ depends on wall time, so that a seed determines all numbers.
 
 from __future__ import annotations
 
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 import gc
 
 import numpy as np
@@ -73,33 +74,45 @@ def compute_summary(times: Sequence[float], period: float) -> dict[str, float | 
             'count': len(times)}
 
 
+class Waiting:
+    """Takes the messages to a supervisor that is not scheduled: method -> newest messages."""
+
+    def __init__(self):
+        self.messages: dict[str, deque] = defaultdict(partial(deque, maxlen=QUEUE))
+
+    def __getattr__(self, method):
+        return lambda *message: self.messages[method].append(message)
+
+
 class Processes:
     """
-    Messages to the supervisor, and the faults of estimator, controllers and supervisor.
+    Faults of estimator, controllers and supervisor.
 
     Attributes:
         schedule: faults; those of estimates, commands and targets are applied by the caller.
         clock_step: error of the flight computer's clock [s].
-        supervisor_waits: whether the supervisor is not scheduled at present.
+        inbox: supervisor, or what takes its messages while it is not scheduled.
 
     """
 
     def __init__(self, tick: float, supervisor: Supervisor):
         """``tick``: time between two calls of :meth:`frame` [s]."""
         self.schedule = Schedule(tick, np.random.SeedSequence(0))
-        self.clock_step, self.supervisor_waits = 0.0, False
+        self.clock_step = 0.0
         self._supervisor = supervisor
-        self._waiting: dict[str, deque] = {}
+        self.inbox: Supervisor | Waiting = supervisor
         self._reported: dict[str, str] = {}     # bridge -> last reported state
 
     def frame(self, frame: Frame) -> Frame:
         """Start a tick with faults; returns the frame with stamps of the computer's clock."""
         self.schedule.update(frame.time)
         self.clock_step = sum(self.schedule.each('clock'))
-        self.supervisor_waits = bool(self.schedule.each('waits'))
-        if not self.supervisor_waits:
-            waiting, self._waiting = self._waiting, {}
-            for method, messages in waiting.items():
+        waits, inbox = bool(self.schedule.each('waits')), self.inbox
+        if waits and inbox is self._supervisor:
+            self.inbox = Waiting()
+        elif not waits and isinstance(inbox, Waiting):
+            self.inbox = self._supervisor
+            for method, messages in inbox.messages.items():
                 for message in messages:
                     getattr(self._supervisor, method)(*message)
         shifted = {name: replace(reading, stamp=reading.stamp + self.clock_step)
@@ -109,15 +122,8 @@ class Processes:
             for name, text in bridges.items():
                 if self._reported.get(name) != text:
                     self._reported[name] = text
-                    self.send('on_actuators', name, text, frame.time)
+                    self.inbox.on_actuators(name, text, frame.time)
         return frame
-
-    def send(self, method: str, *message) -> None:
-        """Call one of the supervisor's ``on_`` methods, or queue the message."""
-        if self.supervisor_waits:
-            self._waiting.setdefault(method, deque(maxlen=QUEUE)).append(message)
-        else:
-            getattr(self._supervisor, method)(*message)
 
 
 class FlightLoop:
@@ -182,18 +188,18 @@ class FlightLoop:
             self.start_faults()
             while True:
                 truth = simulator.truth
-                moment = player.update(simulator.time, truth.position, truth.quaternion)
-                if moment.target is not None:
-                    self.aim(moment.target)
+                over = player.update(simulator.time, truth.position, truth.quaternion)
+                if player.target is not None:
+                    self.aim(player.target)
                     if simulator.battery.charge < SWAP_CHARGE or self.supervisor.battery_low:
                         simulator.battery.reset()
-                if moment.changed:
-                    segment = moment.segment
+                if player.changed:
+                    segment = player.segment
                     simulator.wrench = np.r_[segment.force_world, segment.torque_body]
                     simulator.payload = segment.payload
                     self._recorder.write('disturbance', Wrench(
                         simulator.time, segment.force_world, segment.torque_body))
-                over = moment.finished or self._crashed
+                over = over or self._crashed
                 if not over:
                     self.step()
                 if over or simulator.time - reported >= COMPUTE_REPORT:
@@ -275,7 +281,7 @@ class FlightLoop:
                     estimate, self._joints, self._command), 0.0):
                 if self._estimator.status == 'lost':
                     continue
-                processes.send('on_state', state)
+                processes.inbox.on_state(state)
                 commands = self._control(state)
                 recorder.write('odom', state if not recorder.keeps_covariances else Odom.of(
                     state, pose_covariance(estimate),
@@ -284,8 +290,8 @@ class FlightLoop:
         arrived = processes.schedule.through('request', commands.pop(active, None), now)
         for name, command in [*((active, one) for one in arrived), *commands.items()]:
             recorder.write(f'{name}/command', command, now)
-            processes.send('on_command', name, command, now)
-        if processes.supervisor_waits:
+            processes.inbox.on_command(name, command, now)
+        if isinstance(processes.inbox, Waiting):
             return frame
         command, last = self.supervisor.update(now), self._command
         if command is None or last is None \
@@ -300,26 +306,26 @@ class FlightLoop:
         return frame
 
     def _sense(self, frame):
-        recorder, send, now = self._recorder, self._processes.send, frame.time
+        recorder, inbox, now = self._recorder, self._processes.inbox, frame.time
         recorder.write('ground_truth/odom', frame.truth)
         if frame.mocap is not None:
             self._estimator.pose(frame.mocap)
-            send('on_mocap', frame.mocap.stamp, frame.mocap.position, frame.mocap.quaternion)
+            inbox.on_mocap(frame.mocap.stamp, frame.mocap.position, frame.mocap.quaternion)
             recorder.write('mocap/pose', frame.mocap, now)
         if frame.joints is not None:
             self._joints = joints = frame.joints.corrected(self._errors)
-            send('on_joints', joints.stamp, joints.position, joints.velocity)
+            inbox.on_joints(joints.stamp, joints.position, joints.velocity)
             recorder.write('joint_states', frame.joints, now)
         if frame.battery is not None:
-            send('on_battery', frame.battery.voltage)
+            inbox.on_battery(frame.battery.voltage)
             recorder.write('battery_state', frame.battery)
         if frame.imu is not None:
             imu = frame.imu
             self._estimator.imu(imu)
-            send('on_imu', imu.stamp, imu.specific_force, imu.angular_velocity)
+            inbox.on_imu(imu.stamp, imu.specific_force, imu.angular_velocity)
             recorder.write('imu/data_raw', imu)
         if frame.rotors is not None:
-            send('on_rotors', frame.rotors.stamp, frame.rotors.speed)
+            inbox.on_rotors(frame.rotors.stamp, frame.rotors.speed)
 
     def _control(self, state):
         """Step the controllers that are due; returns their commands."""

@@ -74,30 +74,29 @@ class ReferenceNode(FlightNode):
     def _on_timer(self):
         if self._player is None:
             return
-        now = self.now()
-        moment = self._player.update(now, *((self._odom.position, self._odom.quaternion)
-                                            if self._odom else ()))
-        if isinstance(moment.target, PoseTarget):
+        now, player = self.now(), self._player
+        over = player.update(now, *((self._odom.position, self._odom.quaternion)
+                                    if self._odom else ()))
+        target, segment = player.target, player.segment
+        if isinstance(target, PoseTarget):
             self._trajectory = None
-            self._poses.publish(moment.target)
-        elif moment.target is not None:
-            self._trajectory, self._window_end = moment.target, moment.target.times[0]
+            self._poses.publish(target)
+        elif target is not None:
+            self._trajectory, self._window_end = target, target.times[0]
         if self._trajectory is not None and now > self._window_end - WINDOW_PERIOD:
             self._publish_window(now)
-        if moment.changed and self._task.kind in WITH_WRENCHES:
-            self._wrenches.publish(Wrench(now, moment.segment.force_world,
-                                          moment.segment.torque_body))
-        if moment.changed and self._task.kind == 'payload':
-            self._payload.call_async(wire.parameter_request(
-                'payload', float(moment.segment.payload)))
-        if moment.finished:
-            level = self._player.lost_level
+        if player.changed and self._task.kind in WITH_WRENCHES:
+            self._wrenches.publish(Wrench(now, segment.force_world, segment.torque_body))
+        if player.changed and self._task.kind == 'payload':
+            self._payload.call_async(wire.parameter_request('payload', float(segment.payload)))
+        if over:
+            level = player.lost_level
             lost = '' if level is None else f': control lost at level {level:g}'
             self._player = self._trajectory = None
             self._states.update(f'done{lost}')
         else:
             ends = self._task.ends
-            current = 1 + int(np.searchsorted(ends, now - self._player.start, 'right'))
+            current = 1 + int(np.searchsorted(ends, now - player.start, 'right'))
             self._states.update(f'flying {min(current, len(ends))}/{len(ends)}')
 
     def _publish_window(self, now):

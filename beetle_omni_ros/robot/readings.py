@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import sqrt
 
 import numpy as np
 
@@ -63,6 +62,9 @@ class RotorReading:
     speed: np.ndarray
 
 
+# Changes of specific force [m/s^2] and rate [rad/s] between two readings that are jumps; full
+# thrust and torque cause 1.4 and 0.5.
+FORCE_JUMP, RATE_JUMP = 30.0, 3.0
 AGREE = 0.5         # squared cosine: two independent errors agree with a probability of 5 %
 LONGEST_HELD = 5    # readings
 
@@ -72,12 +74,10 @@ class SpikeFilter:
     Rejects outliers of the IMU: a jump is used only if the next reading confirms it.
 
     An impact pushes again in about the same direction, and the rate that it causes remains. Two
-    independent errors in a row rarely agree in all six axes. A jump is a change between two
-    readings by more than ``force_change`` [m/s^2] or ``rate_change`` [rad/s].
+    independent errors in a row rarely agree in all six axes.
     """
 
-    def __init__(self, force_change: float, rate_change: float):
-        self._limits = force_change**2, rate_change**2
+    def __init__(self):
         self._last: tuple[np.ndarray, np.ndarray] | None = None
         self._held, self._count = np.zeros(6), 0
 
@@ -85,10 +85,9 @@ class SpikeFilter:
         """Whether a reading (3,) [m/s^2], (3,) [rad/s] is used; False holds it back."""
         if self._last is not None:
             push, turn = force - self._last[0], rate - self._last[1]
-            if push.dot(push) > self._limits[0] or turn.dot(turn) > self._limits[1]:
+            if push.dot(push) > FORCE_JUMP**2 or turn.dot(turn) > RATE_JUMP**2:
                 held, self._count = self._held, self._count + 1
-                self._held = jump = np.concatenate([push / sqrt(self._limits[0]),
-                                                    turn / sqrt(self._limits[1])])
+                self._held = jump = np.concatenate([push / FORCE_JUMP, turn / RATE_JUMP])
                 dot = held.dot(jump)
                 agree = dot > 0 and dot**2 >= AGREE * held.dot(held) * jump.dot(jump)
                 if not agree and self._count <= LONGEST_HELD:

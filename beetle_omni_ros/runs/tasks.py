@@ -6,7 +6,6 @@ from functools import partial
 from math import exp, pi, sqrt
 from pathlib import Path
 import re
-from typing import NamedTuple
 
 import numpy as np
 
@@ -157,54 +156,54 @@ class Task:
                 for begin, segment in zip(begins, self.segments, strict=True) if segment.target]
 
 
-class Moment(NamedTuple):
-    """A task at one time: its segment, and the target to publish now, or None."""
-
-    segment: Segment
-    target: Target | None
-    changed: bool
-    finished: bool
-
-
 class TaskPlayer:
     """
     Plays a task in time, by periodic calls of :meth:`update`.
 
     Targets are stamped with the time at which they are due, not with the time of the call, so
-    that the 8 s of a pose are exact. ``lost_level`` is the level at which control was lost, which
-    ends the task.
+    that the 8 s of a pose are exact.
+
+    Attributes:
+        segment: the present one.
+        changed: whether it began with the last call.
+        target: to publish now, or None.
+        lost_level: level at which control was lost, which ends the task, or None.
+
     """
 
     def __init__(self, task: Task, start: float):
         self.task = task
         self.start = start
+        self.segment, self.changed = Segment(0.0), False
+        self.target: Target | None = None
         self.lost_level: float | None = None
-        self._segments = (*task.segments, Segment(0.0))     # after the task
+        self._segments = (*task.segments, self.segment)     # after the task
         self._ends = task.ends
         self._index = -1
-        self._target: Target | None = None
+        self._in_force: Target | None = None
 
     def update(self, now: float, position: np.ndarray | None = None,
-               quaternion: np.ndarray | None = None) -> Moment:
+               quaternion: np.ndarray | None = None) -> bool:
         """
-        Return the state of the task at ``now`` [s].
+        Advance to ``now`` [s]; return whether the task is over.
 
         Pose (3,) in world [m] and (4,) of the robot serve to detect a loss of control.
         """
         index = int(self._ends.searchsorted(now - self.start + 1e-6, side='right'))
         level = self._segments[self._index].level
         if position is not None and level and self.task.kind in ('force', 'torque') \
-                and control_lost(self._target, position, quaternion if
+                and control_lost(self._in_force, position, quaternion if
                                  self._segments[index].level != level else None):
             self.lost_level = level
         if self.lost_level is not None:
             index = len(self._ends)
-        target, changed = None, index != self._index
+        self.target, self.changed = None, index != self._index
         for k in range(self._index + 1, index + 1):
             if build := self._segments[k].target:
-                target = self._target = build(float(self.start + (self._ends[k - 1] if k else 0)))
-        self._index = index
-        return Moment(self._segments[index], target, changed, index == len(self._ends))
+                due = float(self.start + (self._ends[k - 1] if k else 0))
+                self.target = self._in_force = build(due)
+        self._index, self.segment = index, self._segments[index]
+        return index == len(self._ends)
 
 
 def control_lost(target: PoseTarget, position: np.ndarray,

@@ -33,8 +33,6 @@ JUMP_POSITION, JUMP_ATTITUDE = 1.0, 1.0     # [m], [rad] a single larger jump of
                         # refused, a lasting one is accepted with the next. 20 m/s and 20 rad/s
 TILT_AGE = 0.05         # [s] older joint angles are not used for thrust directions
 POSE_AGE = 0.1          # [s] between a MoCap pose and the estimate for its check
-FORCE_SPIKE, RATE_SPIKE = 30.0, 3.0     # [m/s^2], [rad/s] within a sample; full thrust and torque
-                        # cause 1.4 and 0.5
 IMU_FROZEN = 10         # equal samples; noise never repeats exactly
 ARM_TILT, ARM_SPEED, ARM_RATE = 0.35, 0.3, 0.5  # [rad] 20 deg, on its side it cannot lift off;
                         # [m/s] and [rad/s], a faster robot is being carried
@@ -96,7 +94,7 @@ class Inputs:
         self._low_for = self._empty_for = self._lost_for = 0.0
         self._same = self._same_samples = 0     # equal estimates and IMU samples in a row
         self._sample: list[float] = []
-        self._spikes = SpikeFilter(FORCE_SPIKE, RATE_SPIKE)
+        self._spikes = SpikeFilter()
         self._in_force: Command | None = None
         self.floor, self.thrusts = 0.0, np.zeros(ROTORS)
         self._now: float | None = None

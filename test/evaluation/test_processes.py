@@ -50,13 +50,12 @@ def command(stamp):
 
 def test_a_paused_supervisor_receives_the_newest_messages_of_its_queues(make_faulty):
     processes, stub = make_faulty(Fault('supervisor_waits', duration=0.1))
-    assert processes.supervisor_waits
     for k in range(20):
-        processes.send('on_battery', k)
-    processes.send('on_imu', 0)
+        processes.inbox.on_battery(k)
+    processes.inbox.on_imu(0)
     assert stub.received == []
     processes.frame(frame(0.1))
-    assert not processes.supervisor_waits
+    assert processes.inbox is stub
     assert [value for method, value in stub.received if method == 'on_battery'] \
         == list(range(20 - QUEUE, 20))
     assert ('on_imu', 0) in stub.received

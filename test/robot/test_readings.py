@@ -9,7 +9,7 @@ LEVEL, REST = np.array([0.0, 0.0, 9.81]), np.zeros(3)
 
 def used(readings):
     """Which of the readings (force, rate) pass a filter that has seen rest, and how it ended."""
-    checked = SpikeFilter(30.0, 3.0)
+    checked = SpikeFilter()
     assert checked.passes(LEVEL, REST)
     return [checked.passes(*reading) for reading in readings], checked
 

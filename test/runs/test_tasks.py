@@ -14,9 +14,9 @@ def test_every_named_task_plays_to_its_end(name):
     task = make_task(name, seed=3)
     player = TaskPlayer(task, start=10.0)
     published, t = [], 10.0
-    while not (moment := player.update(t)).finished:
-        if moment.target is not None:
-            published.append(moment.target)
+    while not player.update(t):
+        if player.target is not None:
+            published.append(player.target)
         t += 0.005
     assert t - 10.0 == pytest.approx(task.duration, abs=0.01)
     assert [p.stamp for p in published] == pytest.approx([p.stamp for p in task.targets(10.0)])
@@ -54,8 +54,8 @@ def test_each_round_of_the_lemniscate_is_the_curve_of_the_authors(name, tilt):
 def _played(task, tick=0.005):
     """Times (N,) and wrenches (N, 6) of a task."""
     player, t, rows = TaskPlayer(task, 0.0), 0.0, []
-    while not (moment := player.update(t)).finished:
-        rows.append(np.concatenate([[t], moment.segment.force_world, moment.segment.torque_body]))
+    while not player.update(t):
+        rows.append(np.concatenate([[t], player.segment.force_world, player.segment.torque_body]))
         t += tick
     rows = np.array(rows)
     return rows[:, 0], rows[:, 1:]
