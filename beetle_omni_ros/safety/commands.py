@@ -19,10 +19,10 @@ RETURN_AFTER = 0.5      # [s] of valid commands before a controller gets control
 STALE_AFTER = 0.05      # [s] a command computed from an older state is refused
 AHEAD = 0.02            # [s] a stamp farther in the future comes from another clock
 OVERSTEP = 0.25         # [-] of a range: 5 N, 1 rad. A wrong unit exceeds it by a factor of 3
-THRUST_STEP = 10.0      # [N] half of the range, of which a rotor follows a tenth within a period.
+THRUST_STEP = 4.0       # [N] largest mean step of the thrusts, a fifth of the range: a rotor
+                        # follows a tenth of a step within a period, random thrusts step by 6.7 N.
                         # Tilts may step: far targets on both sides set the rate of a joint
-SCATTERED = 0.5         # [-] share of commands with such a step
-MEMORY = 0.1            # [-] weight of the last command in this share
+MEMORY = 0.3            # [-] weight of the last step in the mean
 SAME = 10               # commands or estimates in a row that are equal to the last digit
 
 
@@ -47,7 +47,7 @@ class CommandStream:
         self.silence = Silence(TIMEOUT)
         self.good_for = 0.0
         self._offered: Command | None = None
-        self._same, self._scattered = 0, 0.0
+        self._same, self._step = 0, 0.0
 
     @property
     def dead(self) -> bool:
@@ -120,9 +120,9 @@ class CommandStream:
         self._same = self._same + 1 if same else 0
         if self._same >= SAME:
             return FROZEN, None
-        steps = np.abs(clean.thrust - before.thrust).max() > THRUST_STEP
-        self._scattered += MEMORY * (steps - self._scattered)
-        return (SCATTER, None) if self._scattered > SCATTERED else ('', clean)
+        step = np.abs(clean.thrust - before.thrust).mean()
+        self._step += MEMORY * (step - self._step)
+        return (SCATTER, None) if self._step > THRUST_STEP else ('', clean)
 
 
 def within_limits(command: Command, robot: RobotParameters) -> Command | None:
