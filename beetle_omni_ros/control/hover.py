@@ -10,7 +10,7 @@ whose joint is still turning gives only the thrust that is useful in its present
 """
 
 from dataclasses import dataclass
-from math import exp, expm1, inf, sqrt
+from math import exp, expm1, inf
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,7 @@ from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY, clipped, nearest_turn
 from beetle_omni_ros.robot.degraded import allocator, bounded_step, DegradedAllocator
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.rotations import shortened
 from beetle_omni_ros.robot.schema import parameter, ParameterFile
 
 LONGEST_STEP = 0.1   # [s] between two states from which an acceleration is computed
@@ -135,8 +136,8 @@ class HoverController:
         old = self._disturbance
         new = np.array([part + gain * (change / dt - model - part) for part, change, model in zip(
             old.tolist(), changes, modelled)])
-        old[:3] = _shortened(new[:3], COMPENSATED[0])
-        old[3:] = _shortened(new[3:], COMPENSATED[1])
+        old[:3] = shortened(new[:3], COMPENSATED[0])
+        old[3:] = shortened(new[3:], COMPENSATED[1])
 
     def _waiting_at_stops(self, goal, quaternion, present):
         """Tilt goals (4,) [rad]: a stop instead of a full turn that only a transient needs."""
@@ -154,7 +155,7 @@ class HoverController:
         """Allocation near the present tilts, towards tilts that hold a nearby attitude."""
         turn = rotations.log(rotations.multiply(rotations.conjugate(state.quaternion),
                                                 target.at(state.stamp).quaternion))
-        ahead = rotations.exp(_shortened(turn, ATTITUDE_LIMITS[0]))
+        ahead = rotations.exp(shortened(turn, ATTITUDE_LIMITS[0]))
         aim = degraded.hover(rotations.multiply(state.quaternion, ahead), present)
         force = (degraded.weight + force) @ rotations.matrix(state.quaternion)
         return degraded.allocate_near(force, torque, present, aim)
@@ -168,11 +169,11 @@ class HoverController:
         p = self.parameters
         rate_error = relative @ reference.angular_velocity - state.angular_velocity
         acceleration = \
-            p.position_kp * _shortened(reference.position - state.position, POSITION_LIMITS[0]) \
-            + p.position_kd * _shortened(reference.velocity - state.velocity, POSITION_LIMITS[1]) \
+            p.position_kp * shortened(reference.position - state.position, POSITION_LIMITS[0]) \
+            + p.position_kd * shortened(reference.velocity - state.velocity, POSITION_LIMITS[1]) \
             - self._disturbance[:3]
-        angular = p.attitude_kp * _shortened(attitude_error, ATTITUDE_LIMITS[0]) \
-            + p.attitude_kd * _shortened(rate_error, ATTITUDE_LIMITS[1]) - self._disturbance[3:]
+        angular = p.attitude_kp * shortened(attitude_error, ATTITUDE_LIMITS[0]) \
+            + p.attitude_kd * shortened(rate_error, ATTITUDE_LIMITS[1]) - self._disturbance[3:]
         inertia, rate = self._robot.inertia, state.angular_velocity
         gyroscopic = rotations.cross(rate, inertia * rate)
         return self._allocator.mass * acceleration, inertia * angular + gyroscopic
@@ -225,8 +226,3 @@ class HoverController:
             if held is not None:
                 low[i] = high[i] = held
         return bounded_step(now, wrench, np.full(4, DAMPING), helpful, low, high)
-
-
-def _shortened(vector, limit):
-    length = sqrt(vector.dot(vector))
-    return vector if length <= limit else vector * (limit / length)

@@ -84,6 +84,12 @@ def cross(a: Vector, b: Vector) -> np.ndarray:
     return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
+def shortened(vector: np.ndarray, limit: float) -> np.ndarray:
+    """The vector, at most ``limit`` long."""
+    length = sqrt(vector.dot(vector))
+    return vector if length <= limit else vector * (limit / length)
+
+
 def geodesic_angle(a: Vector, b: Vector) -> float:
     """Angle [rad] of R(b)^T R(a), 0 to pi; the orientation error of this package."""
     bx, by, bz, bw = np.asarray(b).tolist()

@@ -10,12 +10,12 @@ Without IMU the rotor model is used between MoCap poses.
 
 from collections import deque
 from dataclasses import replace
-from math import sqrt
 
 import numpy as np
 
 from beetle_omni_ros.control.base import State
 from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.rotations import shortened
 
 KEPT_POSES = 12         # MoCap poses from which the velocity is computed
 POSES_TIME = 0.1        # [s] older poses are not used for it
@@ -70,9 +70,9 @@ class BackupEstimator:
         if not self.running:
             return
         late = min(max(0.0, self._stamp - stamp), LONGEST_STEP)
-        error = _shortened(position - self._position + late * self._velocity, LARGEST_ERROR)
+        error = shortened(position - self._position + late * self._velocity, LARGEST_ERROR)
         then = rotations.multiply(self._quaternion, rotations.exp(-late * self._rate))
-        turn = _shortened(rotations.log(rotations.multiply(
+        turn = shortened(rotations.log(rotations.multiply(
             rotations.conjugate(then), quaternion)), LARGEST_ERROR)
         # Critically damped observer: position gain 2 w, velocity gain w^2.
         w = POSITION_BANDWIDTH
@@ -122,8 +122,3 @@ class BackupEstimator:
         self._quaternion = rotations.normalized(rotations.multiply(
             self._quaternion, rotations.exp(dt * self._rate)))
         self._stamp = stamp
-
-
-def _shortened(vector, limit):
-    length = sqrt(vector.dot(vector))
-    return vector if length <= limit else vector * (limit / length)
