@@ -13,9 +13,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY, NO_ZEROS
+from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY, NO_ZEROS, ROTORS
 
-ROTORS = 4
 MOTORS_OFF = ('disarmed', 'emergency_stop')     # states of the supervisor
 # Folders of the package, of installed packages and of Python itself.
 LIBRARIES = (str(Path(__file__).resolve().parents[1]),

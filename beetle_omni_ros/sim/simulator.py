@@ -12,12 +12,11 @@ from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import clipped
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.sim.faults import Drive, Fault, READINGS, Schedule
+from beetle_omni_ros.sim.faults import Drive, Fault, READINGS, ROUNDING, Schedule
 from beetle_omni_ros.sim.parameters import draw, SimulatorParameters
 from beetle_omni_ros.sim.plant import Plant, XYZW
 from beetle_omni_ros.sim.sensors import Frame, Impact, Sensors, Truth
 
-ROUNDING = 1e-9     # [s] bound of the rounding error of sums of ticks
 FUTURE_LIMIT = 0.1  # [s] stamps further ahead come from a wrong clock and are refused
 AIRBORNE_TIME = 0.3     # [s] without contact, after which a contact is a touchdown; chosen
 # Charge of a pack, and its open-circuit voltage relative to a full one: a typical lithium-polymer
