@@ -12,9 +12,9 @@ import numpy as np
 
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.effects import CATALOGUE
-from beetle_omni_ros.robot.equations import ServoTerms, Terms
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.servo import CASADI, Servo
+from beetle_omni_ros.robot.terms import ServoTerms, Terms
 
 # Slices of the full state (25): world position [m] and velocity [m/s], attitude (x, y, z, w) body
 # to world, body rates [rad/s], tilt angles [rad] and rates [rad/s], thrusts [N].

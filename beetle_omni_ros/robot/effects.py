@@ -6,16 +6,18 @@ it is confused with. A robot file enables an effect by naming it; the place of a
 its kind, see :attr:`Effect.kind`.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from collections.abc import Sequence
 
+import casadi as ca
 import numpy as np
 
-from beetle_omni_ros.robot import equations
 from beetle_omni_ros.robot.schema import numbers, ParameterError, quoted, unknown
+from beetle_omni_ros.robot.terms import Effect, EffectParameter, NAN
 
-NAN = float('nan')
+UP = ca.DM([0, 0, 1])
+REFERENCE_HEIGHT = 0.25     # [m] of the rotor, for which the gain of the ground effect is given
+EXPONENTIAL_HEIGHT = 0.25   # [m] over which the exponential form falls to 1/e
+LEAST_HEIGHT = 0.08         # [m] below which the forms are not valid
 NO_JOINTS = 'the filter does not read the joints'
 # Terms that the simulated plant and the gap finder have -> why NMPC and training leave out an
 # effect of them.
@@ -23,129 +25,144 @@ MEASURED = {'voltage_ratio': 'it has no voltage and assumes a full pack',
             'charge_drawn': 'it has no current of the pack and assumes that no charge was drawn'}
 
 
-@dataclass(frozen=True)
-class EffectParameter:
-    """One number, or vector, of an effect; SI units."""
-
-    unit: str
-    neutral: float | tuple[float, ...]      # without effect; NaN: the robot file's own number
-    low: float                              # smallest and largest legal value
-    high: float
-    typical: float = NAN    # realistic deviation from neutral; a fraction if neutral is NaN
-    smallest: float = NAN   # smallest significant deviation, likewise
-    default: float | tuple[float, ...] | None = None    # if a file omits it; None: it is required
-    of_each: bool = False   # a file may give a list of four, one for each joint
-    number: str = ''        # dotted key of the robot file's number that it replaces
-    sensor: str = ''        # field of SensorErrors that it sets
-    tolerance: str = ''     # between robots of one type: tolerance_... of params/gap.yaml
-    least: float = 0.02     # smallest ratio to the robot file's own number in a fit
-    step: float = 1e-3      # of a fit's derivatives; of the logarithm for the file's own numbers
-    curved: bool = False    # these derivatives change during a fit
-    form: bool = False      # it only chooses a form of the effect and is not fitted
+def vector(values):
+    """(n,) column of a tuple of numbers or symbols; any other value unchanged."""
+    return ca.vertcat(*ca.vertsplit(ca.SX(ca.vertcat(*values)))) if isinstance(values, tuple) \
+        else values
 
 
-@dataclass(frozen=True)
-class SensorErrors:
-    """Errors of the robot's sensors by the effects of the robot file."""
-
-    accelerometer_bias: tuple[float, ...] = (0.0,) * 3  # measured minus true [m/s^2]
-    gyroscope_bias: tuple[float, ...] = (0.0,) * 3      # measured minus true [rad/s]
-    imu_rotation: tuple[float, ...] = (0.0,) * 3        # vector from base_link to its axes [rad]
-    imu_position: tuple[float, ...] = (0.0,) * 3        # in base_link [m]
-    mocap_rotation: tuple[float, ...] = (0.0,) * 3      # from base_link to the markers' axes [rad]
-    imu_delay: float = 0.0          # age of readings at their stamps [s]
-    mocap_delay: float = 0.0
-    encoder_delay: float = 0.0
-    encoder_gain: tuple[float, ...] = (0.0,) * 4        # error per angle [1]
-    encoder_sine: tuple[float, ...] = (0.0,) * 4        # by the sine of the angle [rad]
-    encoder_cosine: tuple[float, ...] = (0.0,) * 4      # by its cosine minus 1 [rad]
-
-    @cached_property
-    def encoders_err(self) -> bool:
-        """Whether the encoders' readings depend on the angle."""
-        return any((*self.encoder_gain, *self.encoder_sine, *self.encoder_cosine))
-
-    def encoders(self, tilt: np.ndarray) -> np.ndarray:
-        """Readings [rad] of the encoders at tilts (..., 4) [rad]."""
-        return tilt + tilt * self.encoder_gain + np.sin(tilt) * self.encoder_sine \
-            + (np.cos(tilt) - 1) * self.encoder_cosine
-
-    def tilts(self, readings: np.ndarray) -> np.ndarray:
-        """Tilts (..., 4) [rad] at readings of the encoders, by three fixed-point steps."""
-        tilt = readings
-        for _ in range(3):
-            tilt = tilt + readings - self.encoders(tilt)
-        return tilt
+def sets(term):
+    """Equation of an effect whose one parameter replaces a term."""
+    def act(terms, **values):
+        value, = values.values()
+        setattr(terms, term, vector(value))
+    return act
 
 
-@dataclass(frozen=True)
-class Effect:
-    """One catalogue entry."""
+def centre_of_mass(terms, offset):
+    terms.centre_of_mass = terms.centre_of_mass + vector(offset)
 
-    layer: str      # 'body', 'rotor', 'joint', 'timing' or 'sensor'
-    parameters: dict[str, EffectParameter]
-    source: str     # equation and its source
-    excited_by: str = ''                    # flight that shows it
-    confused_with: tuple[str, ...] = ()     # entries that poor data cannot distinguish from it
-    separated_by: str = ''                  # experiment that distinguishes them
-    # Equation of a body effect, which changes Terms in place: apply(terms, **values).
-    apply: Callable | None = None
-    # Equation of a joint effect, which changes ServoTerms: servo(terms, joint, **values).
-    servo: Callable | None = None
-    each: str = ''      # 'rotor' or 'joint' if the parameters are (4,), one for each
-    # Delayed quantities: 'tilt' and 'thrust' commands, readings of 'imu', 'mocap', 'encoders'.
-    delays: tuple[str, ...] = ()
-    own_clock: bool = False     # these readings are stamped by another clock and may appear early
-    # Affected measurements. B: forces and torques, J: joints, A: MoCap's acceleration, W: MoCap's
-    # angular velocity; A and W against the IMU.
-    channels: str = 'B'
-    # Start values of a fit, if the effect has no slope at its neutral value. Those of a limit are
-    # fractions of the largest 'tilt_rate', 'torque' or 'thrust' of a flight, and must be below a
-    # fraction of the robot file's limit.
-    starts: tuple[tuple[float, ...], ...] = ()
-    limit: tuple[str, float] | None = None
-    forms: tuple[dict[str, float], ...] = ({},)     # the parameters that choose each form
-    one_regime: bool = False    # it acts in one regime only, such as near the ground
-    same_response: str = ''     # entry that is another form of the same response
-    allocated: bool = False     # the allocation includes it
-    measured: tuple[str, ...] = ()  # terms of MEASURED; where one is None, it is left out
-    # How the simulated plant includes a body effect. 'model': numbers of its bodies and rotors,
-    # 'own': equations of its own, '': the equation of this entry.
-    plant: str = ''
-    # Name of CONSUMERS -> why it ignores the effect, where this does not follow from its kind.
-    ignored_by: dict[str, str] = field(default_factory=dict)
 
-    @property
-    def settings(self) -> dict[str, str]:
-        """Parameter -> dotted key of the robot file's number that it replaces."""
-        return {} if self.apply else {name: spec.number for name, spec in self.parameters.items()
-                                      if spec.number}
+def module_reaction(terms, module_inertia, mass_moment):
+    for i in range(4):
+        rate, acceleration = terms.tilt_rate[i], terms.tilt_acceleration[i]
+        n, e = terms.thrust_directions[i], terms.tilt_axes[i]
+        terms.torque = terms.torque - module_inertia * acceleration * e
+        # The centre of mass of the module is below the joint axis. It moves against the thrust,
+        # and its acceleration pushes back on the axis.
+        terms.centre_of_mass = terms.centre_of_mass - mass_moment / terms.mass * (n - UP)
+        sideways = ca.cross(e, n)
+        terms.rotor_forces[i] = terms.rotor_forces[i] + mass_moment * (
+            acceleration * sideways - rate * rate * n
+            + 2 * rate * ca.cross(terms.angular_velocity, sideways))
 
-    def in_readings(self, parameter: str) -> bool:
-        """Whether a parameter affects sensor readings only, not the model's equations."""
-        return bool(self.parameters[parameter].sensor) or self.kind == 'play'
 
-    @property
-    def kind(self) -> str:
-        """
-        How it acts.
+def thrust_coefficient(terms, scale):
+    terms.thrust = vector(scale) * terms.thrust
 
-        'body' or 'servo': by its equation. 'number': replaces one of the robot file. 'command':
-        delays commands. 'sensor': in readings of IMU and MoCap. 'feedback': in readings of the
-        encoders. 'play': between encoder and rotor.
-        """
-        if self.apply or self.servo:
-            return 'body' if self.apply else 'servo'
-        if self.settings:
-            return 'number'
-        if any(spec.sensor for spec in self.parameters.values()):
-            return 'feedback' if 'encoders' in self.delays else 'sensor'
-        return 'command' if self.delays else 'play'
 
-    @property
-    def numbers(self) -> list[str]:
-        """Names of the fitted parameters."""
-        return [name for name, spec in self.parameters.items() if not spec.form]
+def wind(terms, force):
+    terms.force_world = terms.force_world + vector(force)
+
+
+def body_drag(terms, coefficient):
+    speed = ca.sqrt(ca.sumsqr(terms.velocity) + 1e-12)
+    terms.force_world = terms.force_world - coefficient * speed * terms.velocity
+
+
+def rotor_drag(terms, coefficient):
+    speeds = terms.rotor_speeds()
+    for i, v in enumerate(terms.hub_velocities()):
+        n = terms.thrust_directions[i]
+        in_plane = v - n * ca.dot(n, v)
+        terms.rotor_forces[i] = terms.rotor_forces[i] - coefficient / 4 * speeds[i] * in_plane
+
+
+def axial_inflow(terms, per_rotor):
+    speeds = terms.rotor_speeds()
+    loss = [per_rotor * speeds[i] * ca.dot(terms.thrust_directions[i], v)
+            for i, v in enumerate(terms.hub_velocities())]
+    terms.thrust = terms.thrust - ca.vertcat(*loss)
+
+
+def translational_lift(terms, per_rotor):
+    gain = []
+    for i, v in enumerate(terms.hub_velocities()):
+        n = terms.thrust_directions[i]
+        gain.append(per_rotor * ca.sumsqr(v - n * ca.dot(n, v)))
+    terms.thrust = terms.thrust + ca.vertcat(*gain)
+
+
+def tilt_thrust_loss(terms, loss_at_60deg, cosine_share=0.0):
+    sine, cosine = ca.sin(terms.tilt), ca.cos(terms.tilt)
+    shape = (1 - cosine_share) * sine * sine / 0.75 + cosine_share * 2 * (1 - cosine)
+    terms.thrust = terms.thrust * (1 - loss_at_60deg * shape)
+
+
+def ground_effect(terms, exponential_share=0.0, **values):
+    if terms.position is None:
+        return
+    scale = []
+    for i in range(4):
+        height = ca.fmax(terms.position[2] + (terms.rotation @ terms.rotor_positions[i])[2],
+                         LEAST_HEIGHT)
+        upright = (terms.rotation @ terms.thrust_directions[i])[2]
+        ratio = REFERENCE_HEIGHT / height
+        shape = (1 - exponential_share) * ratio * ratio + exponential_share * ca.exp(
+            (REFERENCE_HEIGHT - height) / EXPONENTIAL_HEIGHT)
+        scale.append(1 + values['gain_at_0.25m'] * shape * upright * upright)
+    terms.thrust = terms.thrust * ca.vertcat(*scale)
+
+
+def gyroscopic_load(servo, joint, angular_momentum_at_hover, spin_up_share=1.0,
+                     joint_share=0.0):
+    servo.load = servo.load + joint_share * angular_momentum_at_hover * servo.gyroscopic
+
+
+def propeller_gyroscopic_torque(terms, angular_momentum_at_hover, spin_up_share=1.0,
+                                 joint_share=0.0):
+    speeds = terms.rotor_speeds()
+    for i in range(4):
+        momentum = angular_momentum_at_hover * terms.spin[i] * speeds[i]
+        turning = terms.angular_velocity + terms.tilt_rate[i] * terms.tilt_axes[i]
+        terms.torque = terms.torque - momentum * ca.cross(turning, terms.thrust_directions[i])
+    rotor_acceleration_torque(terms, spin_up_share * angular_momentum_at_hover)
+
+
+def rotor_acceleration_torque(terms, angular_momentum_at_hover):
+    speeds = terms.rotor_speeds()
+    for i in range(4):
+        # h ~ sqrt(f), so h' = h f' / 2 f; the floor keeps a stopped rotor finite
+        rate = terms.thrust_rate[i] / (2 * terms.hover_thrust * ca.fmax(speeds[i], 0.1))
+        terms.torque = terms.torque - angular_momentum_at_hover * terms.spin[i] * rate \
+            * terms.thrust_directions[i]
+
+
+def voltage_sag(terms, exponent):
+    terms.thrust = terms.thrust * ca.exp(exponent * ca.log(terms.voltage_ratio))
+
+
+def joint_offset(terms, offset):
+    offset = vector(offset)
+    turned = []
+    for i in range(4):
+        n, e = terms.thrust_directions[i], terms.tilt_axes[i]
+        turned.append(ca.cos(offset[i]) * n + ca.sin(offset[i]) * ca.cross(e, n))
+    terms.tilt, terms.thrust_directions = terms.tilt + offset, turned
+
+
+def joint_deflection(servo, joint, deflection_per_newton):
+    servo.target = servo.target + per_joint(deflection_per_newton, joint) * servo.thrust
+
+
+def per_joint(value, joint: int):
+    """Value of a joint, from one number for all joints or a tuple of four."""
+    return value[joint] if isinstance(value, tuple) else value
+
+
+def joint_friction(servo, joint, coulomb, stiction):
+    servo.coulomb = per_joint(coulomb, joint)
+    servo.stiction = per_joint(stiction, joint)
 
 
 def _delay(typical, smallest=0.003, **more):
@@ -164,25 +181,25 @@ CATALOGUE: dict[str, Effect] = {
                                             tolerance='angle')},
         'true tilt = encoder + offset', 'several attitudes',
         ('joint_offset', 'torque_coefficient', 'imu_misalignment'),
-        'attitudes with different sets of tilts; a jig', equations.joint_offset, each='joint'),
+        'attitudes with different sets of tilts; a jig', joint_offset, each='joint'),
     'mass': Effect(
         'body', {'mass': EffectParameter('kg', NAN, 0.05, 200, 0.05, 0.01, number='mass',
                                          tolerance='mass')},
         "m v' = F, Newton; INTERFACES: total mass", 'any flight',
         ('thrust_coefficient', 'voltage_sag', 'wind'),
         'weigh the robot, or fly fast turns: thrust scales torques too, mass does not',
-        equations.sets('mass'), allocated=True, plant='model'),
+        sets('mass'), allocated=True, plant='model'),
     'inertia': Effect(
         'body', {'inertia': EffectParameter('kg m^2', (NAN,) * 3, 1e-5, 50, 0.2, 0.05,
                                             number='inertia', tolerance='inertia')},
         "I w' = tau - w x I w, Euler", 'fast turns about every axis',
         ('rotor_lag', 'propeller_gyroscopic_torque', 'thrust_coefficient'),
-        'flips by 90 and 180 deg about each axis', equations.sets('inertia'), plant='model'),
+        'flips by 90 and 180 deg about each axis', sets('inertia'), plant='model'),
     'centre_of_mass': Effect(
         'body', {'offset': EffectParameter('m', (0.0,) * 3, -0.2, 0.2, 0.005, 0.0015)},
         'forces turn the body about its centre of mass, which is displaced from base_link',
         'hover in several attitudes', ('rotor_thrust_coefficient', 'module_reaction'),
-        'hover at roll 0, 90, 180 deg and pitch 90 deg', equations.centre_of_mass, plant='model'),
+        'hover at roll 0, 90, 180 deg and pitch 90 deg', centre_of_mass, plant='model'),
     'module_reaction': Effect(
         'body', {'module_inertia': EffectParameter('kg m^2', 0.0, 0.0, 0.1, 1e-4, 2e-5,
                                                    step=2e-5),
@@ -192,20 +209,20 @@ CATALOGUE: dict[str, Effect] = {
         "reaction force moment (n'' + 2 w x n'); "
         'multibody section of the robot file', 'fast tilting, turned attitudes',
         ('centre_of_mass', 'inertia'), 'the same attitude with tilts turned by 180 deg',
-        equations.module_reaction, channels='BJ', plant='model', ignored_by={
+        module_reaction, channels='BJ', plant='model', ignored_by={
             'plant': 'its modules are bodies with the masses of the multibody section; without '
                      'that section it acts'}),
     'thrust_coefficient': Effect(
         'body', {'scale': EffectParameter('1', 1.0, 0.2, 2.0, 0.05, 0.01, tolerance='thrust')},
         'f = scale f*, all rotors', 'any flight', ('mass', 'voltage_sag', 'tilt_thrust_loss'),
-        'weigh the robot; flights at two states of charge', equations.thrust_coefficient,
+        'weigh the robot; flights at two states of charge', thrust_coefficient,
         allocated=True, plant='model'),
     'rotor_thrust_coefficient': Effect(
         'body', {'scale': EffectParameter('1', (1.0,) * 4, 0.0, 2.0, 0.08, 0.015,
                                           tolerance='thrust')},
         'f_i = scale_i f*_i: damaged propeller or other speed controller',
         'hover in several attitudes', ('centre_of_mass', 'rotor_thrust_coefficient'),
-        'tilted attitudes; exchange propellers 1 and 2', equations.thrust_coefficient,
+        'tilted attitudes; exchange propellers 1 and 2', thrust_coefficient,
         each='rotor', allocated=True, plant='model'),
     'torque_coefficient': Effect(
         'body', {'torque_to_thrust_ratio': EffectParameter(
@@ -213,7 +230,7 @@ CATALOGUE: dict[str, Effect] = {
             tolerance='torque_ratio')},
         'tau_i = -spin_i ratio f_i about the thrust axis', 'yaw steps, differential thrust',
         ('joint_offset', 'rotor_acceleration_torque'), 'yaw steps at zero tilt',
-        equations.sets('torque_ratio'), allocated=True, plant='model'),
+        sets('torque_ratio'), allocated=True, plant='model'),
     'ground_effect': Effect(
         'body', {'gain_at_0.25m': EffectParameter('1', 0.0, 0.0, 1.0, 0.08, 0.01),
                  'exponential_share': EffectParameter('1', 0.0, 0.0, 1.0, default=0.0, form=True)},
@@ -221,40 +238,40 @@ CATALOGUE: dict[str, Effect] = {
         'exp((0.25 m - h) / 0.25 m); h: rotor above the floor', 'hover below 0.6 m',
         ('thrust_coefficient', 'mass', 'tilt_thrust_loss'),
         'hover ladder at 0.2, 0.3, 0.5, 1.0 and 1.5 m at one state of charge',
-        equations.ground_effect, forms=({'exponential_share': 0.0}, {'exponential_share': 1.0}),
+        ground_effect, forms=({'exponential_share': 0.0}, {'exponential_share': 1.0}),
         one_regime=True, plant='own'),
     'rotor_drag': Effect(
         'body', {'coefficient': EffectParameter('N s/m', 0.0, 0.0, 5.0, 0.4, 0.06)},
         'H-force of Faessler et al. 2018, in the rotor plane, grows with rotor speed '
         'sqrt(f / f_h)', 'translation above 1 m/s', ('body_drag', 'wind'),
-        'passes at three speeds with two rotor tilts', equations.rotor_drag, plant='own'),
+        'passes at three speeds with two rotor tilts', rotor_drag, plant='own'),
     'body_drag': Effect(
         'body', {'coefficient': EffectParameter('N s^2/m^2', 0.0, 0.0, 5.0, 0.05, 0.02)},
         'F = -c |v| v', 'translation above 2 m/s', ('rotor_drag', 'wind'),
-        'passes above 4 m/s', equations.body_drag, plant='own'),
+        'passes above 4 m/s', body_drag, plant='own'),
     'axial_inflow': Effect(
         'body', {'per_rotor': EffectParameter('N s/m', 0.0, 0.0, 5.0, 0.4, 0.04)},
         'f_i - k sqrt(f_i / f_h) v.n: momentum theory, linear part (Leishman 2006, ch. 2)',
         'climb and descent', ('rotor_lag', 'rotor_drag'),
-        'steady climb and descent at 1 m/s beside thrust steps', equations.axial_inflow,
+        'steady climb and descent at 1 m/s beside thrust steps', axial_inflow,
         plant='own'),
     'translational_lift': Effect(
         'body', {'per_rotor': EffectParameter('N s^2/m^2', 0.0, 0.0, 1.0, 0.03, 0.01)},
         'f_i + k |v_in_plane|^2: induced velocity falls with the flow through the disc '
         '(Leishman 2006, ch. 2)', 'fast passes', ('thrust_coefficient', 'axial_inflow'),
-        'level passes at 1, 2 and 3 m/s', equations.translational_lift),
+        'level passes at 1, 2 and 3 m/s', translational_lift),
     'tilt_thrust_loss': Effect(
         'body', {'loss_at_60deg': EffectParameter('1', 0.0, 0.0, 0.9, 0.06, 0.01),
                  'cosine_share': EffectParameter('1', 0.0, 0.0, 1.0, default=0.0, form=True)},
         'f_i (1 - L s(q)), s = sin^2 q / 0.75 or 2 (1 - cos q): arm and body in the wake',
         'large tilts', ('thrust_coefficient', 'mass', 'ground_effect'),
-        'one attitude with tilts changed by internal force', equations.tilt_thrust_loss,
+        'one attitude with tilts changed by internal force', tilt_thrust_loss,
         forms=({'cosine_share': 0.0}, {'cosine_share': 1.0}), one_regime=True, plant='own'),
     'wind': Effect(
         'body', {'force': EffectParameter('N', (0.0,) * 3, -100, 100, 1.0, 0.1)},
         'constant force in world', 'any flight; yaw turns', ('mass', 'imu_misalignment',
                                                             'mocap_misalignment'),
-        'hover at yaw 0 and 180 deg; fan off', equations.wind, allocated=True, plant='own'),
+        'hover at yaw 0 and 180 deg; fan off', wind, allocated=True, plant='own'),
     'propeller_gyroscopic_torque': Effect(
         'body', {'angular_momentum_at_hover': EffectParameter('N m s', 0.0, 0.0, 1.0, 0.066,
                                                               0.008, step=5e-3),
@@ -263,8 +280,8 @@ CATALOGUE: dict[str, Effect] = {
         "-(w + q' e) x h s n - h' s n with h ~ sqrt(f): the propellers' angular momentum; the "
         'part about the tilt axis loads the servo where joint_share is 1',
         'fast turns and fast tilting', ('inertia', 'rotor_acceleration_torque', 'rotor_lag'),
-        'fast tilting by internal force at rest', equations.propeller_gyroscopic_torque,
-        equations.gyroscopic_load, channels='BJ',
+        'fast tilting by internal force at rest', propeller_gyroscopic_torque,
+        gyroscopic_load, channels='BJ',
         forms=({'spin_up_share': 0.0}, {'spin_up_share': -1.0}, {'joint_share': 1.0}),
         one_regime=True),
     'rotor_acceleration_torque': Effect(
@@ -272,12 +289,12 @@ CATALOGUE: dict[str, Effect] = {
                                                               0.008)},
         "-h' s n with h ~ sqrt(f): a change of rotor speed turns the body", 'thrust steps',
         ('torque_coefficient', 'propeller_gyroscopic_torque', 'rotor_lag'),
-        'differential thrust chirp', equations.rotor_acceleration_torque),
+        'differential thrust chirp', rotor_acceleration_torque),
     'voltage_sag': Effect(
         'rotor', {'exponent': EffectParameter('1', 0.0, -1.0, 5.0, 1.0, 0.15)},
         'f = f* (V / V_full)^k: thrust of a thrust map without voltage; 6.9 %/V on this '
         "robot's map", 'flights at several states of charge', ('thrust_coefficient', 'mass'),
-        'three flights at different charge; thrust steps by internal force', equations.voltage_sag,
+        'three flights at different charge; thrust steps by internal force', voltage_sag,
         measured=('voltage_ratio',)),
     'rotor_lag': Effect(
         'rotor', {'time_constant': _number('rotors.time_constant', 's', 0.001, 2.0, 0.4, 0.12,
@@ -333,7 +350,7 @@ CATALOGUE: dict[str, Effect] = {
         "-coulomb sgn(q') while sliding, up to stiction at rest (Armstrong-Helouvry 1994); "
         'smooth over 0.05 rad/s in the model', 'slow reversals of the tilts',
         ('joint_backlash', 'joint_bandwidth'), 'triangle of 2 deg at 0.1 Hz',
-        servo=equations.joint_friction, channels='J', starts=((0.004, 0.004), (0.012, 0.015))),
+        servo=joint_friction, channels='J', starts=((0.004, 0.004), (0.012, 0.015))),
     'joint_backlash': Effect(
         'joint', {'gap': EffectParameter('rad', 0.0, 0.0, 0.3, 0.01, 0.003, of_each=True,
                                          curved=True),
@@ -347,7 +364,7 @@ CATALOGUE: dict[str, Effect] = {
                                                            0.0004, step=1e-4, curved=True)},
         'thrust off the axis deflects the servo from its target: q* + c f', 'thrust steps',
         ('joint_friction', 'joint_offset'), 'internal force at rest, two levels',
-        servo=equations.joint_deflection, channels='J'),
+        servo=joint_deflection, channels='J'),
     'joint_encoder_error': Effect(
         'joint', {name: EffectParameter(unit, (0.0,) * 4, -0.3, 0.3, typical, smallest,
                                         default=(0.0,) * 4, sensor=f'encoder_{name}')

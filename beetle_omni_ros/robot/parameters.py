@@ -16,6 +16,7 @@ from beetle_omni_ros.robot import effects as catalogue
 from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import parameter, ParameterError, quoted
+from beetle_omni_ros.robot.terms import SensorErrors
 
 JOINT_NAMES = ('gimbal1', 'gimbal2', 'gimbal3', 'gimbal4')
 ROTOR_NAMES = ('rotor1', 'rotor2', 'rotor3', 'rotor4')
@@ -307,9 +308,9 @@ class RobotParameters:
         return self.joints.kd / self.joints.kp + self.command_delays[0] + np.zeros(4)
 
     @property
-    def sensors(self) -> catalogue.SensorErrors:
+    def sensors(self) -> SensorErrors:
         """Sensor errors by the effects."""
-        return catalogue.SensorErrors(**{
+        return SensorErrors(**{
             spec.sensor: values[parameter] for name, values in self.effects.items()
             for parameter, spec in catalogue.CATALOGUE[name].parameters.items() if spec.sensor})
 

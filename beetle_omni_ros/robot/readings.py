@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from beetle_omni_ros.robot.effects import SensorErrors
 from beetle_omni_ros.robot.parameters import JOINT_NAMES
+from beetle_omni_ros.robot.terms import SensorErrors
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,8 +15,9 @@ import numpy as np
 
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.inference.prior import Prior
-from beetle_omni_ros.robot.effects import CATALOGUE, delaying, EffectParameter, ignored
+from beetle_omni_ros.robot.effects import CATALOGUE, delaying, ignored
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.terms import EffectParameter
 
 MODULES = 'module_reaction'
 # Effects without a slope at their neutral value; they need a start where they act.

@@ -13,9 +13,9 @@ import numpy as np
 from beetle_omni_ros.identify.gap.keys import friction, MODULES
 from beetle_omni_ros.identify.gap.signals import Signals
 from beetle_omni_ros.robot.effects import CATALOGUE
-from beetle_omni_ros.robot.equations import ServoTerms
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.servo import NUMPY, Servo, Step
+from beetle_omni_ros.robot.terms import ServoTerms
 
 
 @dataclass(frozen=True)
