@@ -361,8 +361,10 @@ class Supervisor(Inputs):
         return self._hover.step(state, self._target)
 
     def _descend(self, now, dt):
-        self.source = 'hover'
+        self.source, plan = 'hover', self._landing.ramp
         command = self._landing.step(now, dt)
+        if self.target_override is not None and self._landing.ramp is not plan:
+            self.target_override = self._landing.way
         if self._landing.given_up:
             self.emergency_stop(now, self._landing.given_up)
             return self._stand(now, dt)
