@@ -12,7 +12,6 @@ from beetle_omni_ros.safety.events import Silence
 
 FROZEN = 'the same numbers again'
 SCATTER = 'thrust scatters'
-NOT_FINITE = 'not finite'
 
 TIMEOUT = 0.05          # [s] without a valid command: 5 periods of 100 Hz
 RETURN_AFTER = 0.5      # [s] of valid commands before a controller gets control (again)
@@ -32,7 +31,6 @@ class CommandStream:
 
     Attributes:
         accepted: the last valid command, clipped to the ranges, or None.
-        clipped: number of accepted commands that were clipped.
         refused: reason -> count.
         silence: time since the last valid command.
         good_for: time of valid commands without a gap or refusal [s].
@@ -42,7 +40,7 @@ class CommandStream:
     def __init__(self, robot: RobotParameters):
         self._robot = robot
         self.accepted: Command | None = None
-        self.clipped, self.refused = 0, Counter[str]()
+        self.refused = Counter[str]()
         self._last_refusal = ''
         self.silence = Silence(TIMEOUT)
         self.good_for = 0.0
@@ -50,19 +48,14 @@ class CommandStream:
         self._same, self._scattered = 0, 0.0
 
     @property
-    def dead(self) -> bool:
-        """Whether it loses control: it is silent, or its last command is not finite."""
-        return self.silence.silent or self._last_refusal == NOT_FINITE
-
-    @property
     def good(self) -> bool:
         """Whether the controller may get control."""
-        return not self.dead and self.good_for >= RETURN_AFTER - 1e-9
+        return not self.silence.silent and self.good_for >= RETURN_AFTER - 1e-9
 
     @property
     def complaint(self) -> str:
         """Why the controller may not get control, for messages."""
-        if self.dead:
+        if self.silence.silent:
             last = f'; last refused: {self._last_refusal}' if self._last_refusal else ''
             return self.silence.text + last
         return f'good for only {self.good_for:.2f} s of {RETURN_AFTER:g} s'
@@ -98,7 +91,7 @@ class CommandStream:
         stamp, tilt, thrust = command.stamp, command.tilt, command.thrust
         clean = within_limits(command, self._robot)
         if clean is None or not isfinite(stamp):
-            return NOT_FINITE, None
+            return 'not finite', None
         if stamp == doubted:
             return 'answers a refused estimate', None
         if now - stamp > STALE_AFTER:
@@ -107,12 +100,10 @@ class CommandStream:
             return 'stamp in the future', None
         if self.accepted is not None and stamp <= self.accepted.stamp:
             return 'repeated or older stamp', None
-        beyond = np.abs(tilt - clean.tilt).max(), np.abs(thrust - clean.thrust).max()
-        if beyond[0] > OVERSTEP * self._robot.joints.position_limit:
+        if np.abs(tilt - clean.tilt).max() > OVERSTEP * self._robot.joints.position_limit:
             return 'tilt out of range', None
-        if beyond[1] > OVERSTEP * self._robot.rotors.thrust_max:
+        if np.abs(thrust - clean.thrust).max() > OVERSTEP * self._robot.rotors.thrust_max:
             return 'thrust out of range', None
-        self.clipped += bool(max(beyond) > 0)
         before, self._offered = self._offered, clean
         if before is None:
             return '', clean

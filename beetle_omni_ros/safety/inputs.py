@@ -85,7 +85,6 @@ class Inputs:
                               np.zeros(3), np.zeros(4), np.zeros(4), -np.inf)
         self._offered = self.estimate       # the one before, accepted or not
         self._doubted = -np.inf     # stamp of the last refused estimate that controllers also have
-        self.last_refusal = ''
         self.refused = Counter[str]()
         self.ekf, self.joints = Silence(ESTIMATE_TIMEOUT), Silence(JOINT_TIMEOUT)
         self.imu, self.mocap = Silence(IMU_TIMEOUT), Silence(MOCAP_TIMEOUT)
@@ -110,12 +109,11 @@ class Inputs:
         reason = self._why_not(true)
         if reason:
             self.refused[f'estimate: {reason}'] += 1
-            self.last_refusal = reason
             if state.stamp > self.estimate.stamp:
                 self._doubted = state.stamp
             self.say(WARNING, f'ekf_node: estimate refused: {reason}', reason)
             return False
-        self.estimate, self.last_refusal = true, ''
+        self.estimate = true
         self.ekf.reset()
         self.on_joints(state.tilt_stamp, state.tilt, state.tilt_velocity)
         return True

@@ -115,6 +115,7 @@ class Landing:
         self.grounded, self.given_up = False, ''
         self._standing_for = self._still_for = self._blind_for = 0.0
         self._support = 0.0     # share of the weight that the rotors do not carry, filtered
+        self._rise = 0.0        # of the present plan, before a turn over [m]
         if 'estimator_wrong' in inputs.faults or inputs.ekf.silent:
             inputs.backup.start(inputs.estimate)
         self.set_out()
@@ -157,35 +158,35 @@ class Landing:
     def set_out(self) -> None:
         """Plan the way down from the present pose, with the actuators that work."""
         inputs, state = self._inputs, self._inputs.seen
-        self._halting = self._climbs = False
+        climbed, self._halting, self._rise = self._rise > 0, False, 0.0
         if inputs.health.healthy:
             way = plan(state.quaternion, state.tilt, inputs.allocator, LEVEL_RATE)
         else:
-            way = self._escape(state)
+            way = self._escape(state, climbed)
         slanted = inclination(state.quaternion) > LEVEL_FIRST or not inputs.health.healthy
         begin = way.duration if slanted else 0.0
         knots = [(begin + 1e-9, 0.0), (begin + SPEED / ACCELERATION, -SPEED)]
-        if self._climbs:
-            knots = [(begin + time, speed) for time, speed in climb(
-                TURN_HEIGHT + NEAR - inputs.height, CLIMB_SPEED, ACCELERATION)]
+        if self._rise > 0:
+            knots = [(begin + time, speed)
+                     for time, speed in climb(self._rise, CLIMB_SPEED, ACCELERATION)]
         self.ramp = Ramp(state.stamp, coasted(state), way, [(0.0, 0.0), *knots])
 
-    def _escape(self, state):
+    def _escape(self, state, climbed):
         """
         First to the attitude where control is regained soonest, then towards level.
 
         With a weak pack the attitudes on the side can be passed only fast, at a loss of height. A
         low robot on its back remains there and climbs first.
         """
-        inputs = self._inputs
+        inputs, height = self._inputs, self._inputs.height
         holding = Holding(inputs.robot, inputs.health)
-        height = inputs.height
-        self._climbs = replace(inputs.health, thrust_limit=None).healthy \
-            and inclination(state.quaternion) > 0.5 * np.pi \
-            and height is not None and height < TURN_HEIGHT
+        on_back = inclination(state.quaternion) > 0.5 * np.pi
+        if not climbed and on_back and height is not None and height < TURN_HEIGHT \
+                and replace(inputs.health, thrust_limit=None).healthy:
+            self._rise = TURN_HEIGHT + NEAR - height
         escape = holding.quickest(state.quaternion, state.angular_velocity, state.tilt,
-                                  FLYING_MARGIN, np.inf if self._climbs else LEVEL_RATE)
-        if self._climbs:
+                                  FLYING_MARGIN, np.inf if self._rise > 0 else LEVEL_RATE)
+        if self._rise > 0:
             return Way(np.array([0.0, ESCAPE_TIME]), np.array([escape, escape]))
         level = rotations.from_rpy(0.0, 0.0, rotations.to_rpy(state.quaternion)[2])
         goal = holding.nearest(level, FLYING_MARGIN)
@@ -199,7 +200,7 @@ class Landing:
         """Follow the ramp, whose target waits for the robot."""
         halt = halting(state, self.ramp.position[2]) if self._halting else None
         if self._halting and halt is None \
-                or self._climbs and state.stamp > self.ramp.stamp + self.ramp.duration:
+                or self._rise > 0 and state.stamp > self.ramp.stamp + self.ramp.duration:
             self.set_out()
         reference = halt or self.ramp.at(state.stamp)
         height = max(reference.position[2], state.position[2] - TARGET_LEAD)

@@ -43,10 +43,10 @@ def test_bad_command_is_refused_with_its_reason_and_counted(bad, reason):
     assert checked.accepted is None and checked.complaint.endswith(f'last refused: {reason}')
 
 
-def test_a_small_excess_is_clipped_and_counted():
+def test_a_small_excess_is_clipped():
     checked, top = stream(), ROBOT.rotors.thrust_max
     given = command(tilt=[0.1, 0.2, 0.3, 4.5], thrust=[7.0, -3.0, 7.0, top + 3.0])
-    assert checked.offer(given, NOW) == '' and checked.clipped == 1
+    assert checked.offer(given, NOW) == ''
     assert checked.accepted.thrust.tolist() == [7.0, 0.0, 7.0, top]
     assert checked.accepted.tilt[3] == ROBOT.joints.position_limit
     assert given.tilt[3] == 4.5     # a copy
