@@ -60,13 +60,15 @@ class CommandStream:
             return self.silence.text + last
         return f'good for only {self.good_for:.2f} s of {RETURN_AFTER:g} s'
 
-    def offer(self, command: Command, now: float, doubted: float = -np.inf) -> str:
+    def offer(self, command: Command, now: float, doubted: float = -np.inf,
+              scatters: bool = False) -> str:
         """
         Check one command; '' when a copy is stored, else the reason of the refusal.
 
-        ``doubted`` is the stamp of a refused estimate, which controllers also received [s].
+        ``doubted`` is the stamp of a refused estimate, which controllers also received [s]. The
+        thrust of a robot with failed actuators ``scatters``, because they work at their limits.
         """
-        reason, clean = self._check(command, now, doubted)
+        reason, clean = self._check(command, now, doubted, scatters)
         if reason:
             self.refused[reason] += 1
             self._last_refusal = reason
@@ -86,7 +88,7 @@ class CommandStream:
         self.accepted = self._offered = None
         self.silence = Silence(TIMEOUT)
 
-    def _check(self, command, now, doubted):
+    def _check(self, command, now, doubted, scatters):
         """Reason of a refusal and, without one, a copy within the limits."""
         stamp, tilt, thrust = command.stamp, command.tilt, command.thrust
         clean = within_limits(command, self._robot)
@@ -113,7 +115,8 @@ class CommandStream:
             return FROZEN, None
         steps = np.abs(clean.thrust - before.thrust).max() > THRUST_STEP
         self._scattered += MEMORY * (steps - self._scattered)
-        return (SCATTER, None) if self._scattered > SCATTERED else ('', clean)
+        bad = self._scattered > SCATTERED and not scatters
+        return (SCATTER, None) if bad else ('', clean)
 
 
 def within_limits(command: Command, robot: RobotParameters) -> Command | None:

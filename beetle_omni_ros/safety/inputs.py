@@ -142,7 +142,8 @@ class Inputs:
 
     def on_command(self, controller: str, command: Command, now: float) -> bool:
         """Check one command of one controller; False when it is refused (and counted)."""
-        reason = self.streams[controller].offer(command, now, self._doubted)
+        reason = self.streams[controller].offer(command, now, self._doubted,
+                                                not self.health.healthy)
         if reason:
             self.say(WARNING, f'{controller}_node: command refused: {reason}',
                      f'{controller}: {reason}')

@@ -67,6 +67,9 @@ def test_steps_of_tilts_and_single_steps_of_thrust_pass_but_scattered_thrust_is_
         reasons.append(checked.offer(noisy(now, np.zeros(4), random.uniform(0, 20, 4)), now))
     assert set(reasons[40:]) <= {'', commands.SCATTER}
     assert reasons.index(commands.SCATTER) < 40 and reasons[40:].count('') < 10
+    # With failed actuators the others work at their limits.
+    now += 0.01
+    assert checked.offer(noisy(now, np.zeros(4), np.zeros(4)), now, scatters=True) == ''
 
 
 def test_a_stream_of_repeated_numbers_is_refused_until_they_change():
