@@ -11,17 +11,16 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.events import Silence
 
 FROZEN = 'the same numbers again'
-SCATTER = 'thrust scatters'
+JUMP = 'implausible jump'
 
 TIMEOUT = 0.05          # [s] without a valid command: 5 periods of 100 Hz
 RETURN_AFTER = 0.5      # [s] of valid commands before a controller gets control (again)
 STALE_AFTER = 0.05      # [s] a command computed from an older state is refused
 AHEAD = 0.02            # [s] a stamp farther in the future comes from another clock
 OVERSTEP = 0.25         # [-] of a range: 5 N, 1 rad. A wrong unit exceeds it by a factor of 3
-THRUST_STEP = 10.0      # [N] half of the range, of which a rotor follows a tenth within a period.
-                        # Tilts may step: far targets on both sides set the rate of a joint
-SCATTERED = 0.5         # [-] share of commands with such a step
-MEMORY = 0.1            # [-] weight of the last command in this share
+THRUST_STEP = 15.0      # [N] a single larger jump is a spike: three quarters of the range
+TILT_STEP = 2.0, 7.5    # [rad] and [N] at once: likewise. A jump of tilts alone is none: by far
+                        # targets on both sides a policy sets the rate of a joint
 SAME = 10               # commands or estimates in a row that are equal to the last digit
 
 
@@ -45,7 +44,7 @@ class CommandStream:
         self.silence = Silence(TIMEOUT)
         self.good_for = 0.0
         self._offered: Command | None = None
-        self._same, self._scattered = 0, 0.0
+        self._same = 0
 
     @property
     def good(self) -> bool:
@@ -60,19 +59,19 @@ class CommandStream:
             return self.silence.text + last
         return f'good for only {self.good_for:.2f} s of {RETURN_AFTER:g} s'
 
-    def offer(self, command: Command, now: float, doubted: float = -np.inf,
-              scatters: bool = False) -> str:
+    def offer(self, command: Command, now: float, doubted: float = -np.inf) -> str:
         """
         Check one command; '' when a copy is stored, else the reason of the refusal.
 
-        ``doubted`` is the stamp of a refused estimate, which controllers also received [s]. The
-        thrust of a robot with failed actuators ``scatters``, because they work at their limits.
+        ``doubted`` is the stamp of a refused estimate, which controllers also received [s].
         """
-        reason, clean = self._check(command, now, doubted, scatters)
+        reason, clean = self._check(command, now, doubted)
         if reason:
             self.refused[reason] += 1
             self._last_refusal = reason
-            self.good_for = 0.0
+            # A step to a new target causes one jump. Repeated jumps end in the timeout.
+            if reason != JUMP:
+                self.good_for = 0.0
             return reason
         self.accepted, self._last_refusal = clean, ''
         self.silence.reset()
@@ -88,7 +87,7 @@ class CommandStream:
         self.accepted = self._offered = None
         self.silence = Silence(TIMEOUT)
 
-    def _check(self, command, now, doubted, scatters):
+    def _check(self, command, now, doubted):
         """Reason of a refusal and, without one, a copy within the limits."""
         stamp, tilt, thrust = command.stamp, command.tilt, command.thrust
         clean = within_limits(command, self._robot)
@@ -113,10 +112,12 @@ class CommandStream:
         self._same = self._same + 1 if same else 0
         if self._same >= SAME:
             return FROZEN, None
-        steps = np.abs(clean.thrust - before.thrust).max() > THRUST_STEP
-        self._scattered += MEMORY * (steps - self._scattered)
-        bad = self._scattered > SCATTERED and not scatters
-        return (SCATTER, None) if bad else ('', clean)
+        # Compared with the previous command, accepted or not: a single spike is refused, a real
+        # step is delayed by one period.
+        tilt = np.abs(clean.tilt - before.tilt).max()
+        thrust = np.abs(clean.thrust - before.thrust).max()
+        jumps = thrust > THRUST_STEP or tilt > TILT_STEP[0] and thrust > TILT_STEP[1]
+        return (JUMP, None) if jumps and stamp - before.stamp <= TIMEOUT else ('', clean)
 
 
 def within_limits(command: Command, robot: RobotParameters) -> Command | None:
