@@ -11,18 +11,16 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.events import Silence
 
 FROZEN = 'the same numbers again'
-SCATTER = 'thrust scatters'
-NOT_FINITE = 'not finite'
+JUMP = 'implausible jump'
 
 TIMEOUT = 0.05          # [s] without a valid command: 5 periods of 100 Hz
 RETURN_AFTER = 0.5      # [s] of valid commands before a controller gets control (again)
 STALE_AFTER = 0.05      # [s] a command computed from an older state is refused
 AHEAD = 0.02            # [s] a stamp farther in the future comes from another clock
 OVERSTEP = 0.25         # [-] of a range: 5 N, 1 rad. A wrong unit exceeds it by a factor of 3
-THRUST_STEP = 4.0       # [N] largest mean step of the thrusts, a fifth of the range: a rotor
-                        # follows a tenth of a step within a period, random thrusts step by 6.7 N.
-                        # Tilts may step: far targets on both sides set the rate of a joint
-MEMORY = 0.3            # [-] weight of the last step in the mean
+THRUST_STEP = 15.0      # [N] a single larger jump is a spike: three quarters of the range
+TILT_STEP = 2.0, 7.5    # [rad] and [N] at once: likewise. A jump of tilts alone is none: by far
+                        # targets on both sides a policy sets the rate of a joint
 SAME = 10               # commands or estimates in a row that are equal to the last digit
 
 
@@ -32,7 +30,6 @@ class CommandStream:
 
     Attributes:
         accepted: the last valid command, clipped to the ranges, or None.
-        clipped: number of accepted commands that were clipped.
         refused: reason -> count.
         silence: time since the last valid command.
         good_for: time of valid commands without a gap or refusal [s].
@@ -42,27 +39,22 @@ class CommandStream:
     def __init__(self, robot: RobotParameters):
         self._robot = robot
         self.accepted: Command | None = None
-        self.clipped, self.refused = 0, Counter[str]()
+        self.refused = Counter[str]()
         self._last_refusal = ''
         self.silence = Silence(TIMEOUT)
         self.good_for = 0.0
         self._offered: Command | None = None
-        self._same, self._step = 0, 0.0
-
-    @property
-    def dead(self) -> bool:
-        """Whether it loses control: it is silent, or its last command is not finite."""
-        return self.silence.silent or self._last_refusal == NOT_FINITE
+        self._same = 0
 
     @property
     def good(self) -> bool:
         """Whether the controller may get control."""
-        return not self.dead and self.good_for >= RETURN_AFTER - 1e-9
+        return not self.silence.silent and self.good_for >= RETURN_AFTER - 1e-9
 
     @property
     def complaint(self) -> str:
         """Why the controller may not get control, for messages."""
-        if self.dead:
+        if self.silence.silent:
             last = f'; last refused: {self._last_refusal}' if self._last_refusal else ''
             return self.silence.text + last
         return f'good for only {self.good_for:.2f} s of {RETURN_AFTER:g} s'
@@ -77,7 +69,9 @@ class CommandStream:
         if reason:
             self.refused[reason] += 1
             self._last_refusal = reason
-            self.good_for = 0.0
+            # A step to a new target causes one jump. Repeated jumps end in the timeout.
+            if reason != JUMP:
+                self.good_for = 0.0
             return reason
         self.accepted, self._last_refusal = clean, ''
         self.silence.reset()
@@ -98,7 +92,7 @@ class CommandStream:
         stamp, tilt, thrust = command.stamp, command.tilt, command.thrust
         clean = within_limits(command, self._robot)
         if clean is None or not isfinite(stamp):
-            return NOT_FINITE, None
+            return 'not finite', None
         if stamp == doubted:
             return 'answers a refused estimate', None
         if now - stamp > STALE_AFTER:
@@ -107,12 +101,10 @@ class CommandStream:
             return 'stamp in the future', None
         if self.accepted is not None and stamp <= self.accepted.stamp:
             return 'repeated or older stamp', None
-        beyond = np.abs(tilt - clean.tilt).max(), np.abs(thrust - clean.thrust).max()
-        if beyond[0] > OVERSTEP * self._robot.joints.position_limit:
+        if np.abs(tilt - clean.tilt).max() > OVERSTEP * self._robot.joints.position_limit:
             return 'tilt out of range', None
-        if beyond[1] > OVERSTEP * self._robot.rotors.thrust_max:
+        if np.abs(thrust - clean.thrust).max() > OVERSTEP * self._robot.rotors.thrust_max:
             return 'thrust out of range', None
-        self.clipped += bool(max(beyond) > 0)
         before, self._offered = self._offered, clean
         if before is None:
             return '', clean
@@ -120,9 +112,12 @@ class CommandStream:
         self._same = self._same + 1 if same else 0
         if self._same >= SAME:
             return FROZEN, None
-        step = np.abs(clean.thrust - before.thrust).mean()
-        self._step += MEMORY * (step - self._step)
-        return (SCATTER, None) if self._step > THRUST_STEP else ('', clean)
+        # Compared with the previous command, accepted or not: a single spike is refused, a real
+        # step is delayed by one period.
+        tilt = np.abs(clean.tilt - before.tilt).max()
+        thrust = np.abs(clean.thrust - before.thrust).max()
+        jumps = thrust > THRUST_STEP or tilt > TILT_STEP[0] and thrust > TILT_STEP[1]
+        return (JUMP, None) if jumps and stamp - before.stamp <= TIMEOUT else ('', clean)
 
 
 def within_limits(command: Command, robot: RobotParameters) -> Command | None:

@@ -14,9 +14,9 @@ from beetle_omni_ros.robot.allocation import ActuatorHealth, Allocator, ROTORS
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import SpikeFilter
 from beetle_omni_ros.safety.backup import BackupEstimator
-from beetle_omni_ros.safety.commands import CommandStream, FROZEN, SAME
+from beetle_omni_ros.safety.commands import CommandStream, FROZEN, JUMP, SAME
 from beetle_omni_ros.safety.detectors import FaultWatch
-from beetle_omni_ros.safety.events import Event, Silence, WARNING
+from beetle_omni_ros.safety.events import Event, INFO, Silence, WARNING
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.way import inclination
 
@@ -83,7 +83,6 @@ class Inputs:
                               np.zeros(3), np.zeros(4), np.zeros(4), -np.inf)
         self._offered = self.estimate       # the one before, accepted or not
         self._doubted = -np.inf     # stamp of the last refused estimate that controllers also have
-        self.last_refusal = ''
         self.refused = Counter[str]()
         self.ekf, self.joints = Silence(ESTIMATE_TIMEOUT), Silence(JOINT_TIMEOUT)
         self.imu, self.mocap = Silence(IMU_TIMEOUT), Silence(MOCAP_TIMEOUT)
@@ -108,12 +107,11 @@ class Inputs:
         reason = self._why_not(true)
         if reason:
             self.refused[f'estimate: {reason}'] += 1
-            self.last_refusal = reason
             if state.stamp > self.estimate.stamp:
                 self._doubted = state.stamp
             self.say(WARNING, f'ekf_node: estimate refused: {reason}', reason)
             return False
-        self.estimate, self.last_refusal = true, ''
+        self.estimate = true
         self.ekf.reset()
         self.on_joints(state.tilt_stamp, state.tilt, state.tilt_velocity)
         return True
@@ -138,14 +136,14 @@ class Inputs:
         jumped = 0 < state.stamp - before.stamp <= ESTIMATE_TIMEOUT and (
             dist(before.position, state.position) > JUMP_POSITION
             or rotations.geodesic_angle(before.quaternion, state.quaternion) > JUMP_ATTITUDE)
-        return 'implausible jump' if jumped else ''
+        return JUMP if jumped else ''
 
     def on_command(self, controller: str, command: Command, now: float) -> bool:
         """Check one command of one controller; False when it is refused (and counted)."""
         reason = self.streams[controller].offer(command, now, self._doubted)
         if reason:
-            self.say(WARNING, f'{controller}_node: command refused: {reason}',
-                     f'{controller}: {reason}')
+            self.say(INFO if reason == JUMP else WARNING,
+                     f'{controller}_node: command refused: {reason}', f'{controller}: {reason}')
         return not reason
 
     def on_joints(self, stamp: float, position: np.ndarray,

@@ -25,6 +25,7 @@ ALIGN_PATIENCE = 4.0    # [s] the farthest joint needs 2 s
 NEAR, SLOW = 0.15, 0.2  # [m] error of the hover controller with a 10 % wrong mass; [m/s]
 PATIENCE = 4.0          # [s] after the climb
 # Levelling
+TURN_HEIGHT = 1.2       # [m] above the ground to turn over with a weak pack, which costs 0.5 m
 LEVEL_RATE = 0.8        # [rad/s] from upside down to level in 4 s
 LEVEL_FIRST = 0.3       # [rad] a larger inclination is levelled before the descent
 BLIND_LIMIT = 0.3       # [s] without any sensor the attitude is then unknown: motors off
@@ -105,6 +106,7 @@ class Landing:
     Attributes:
         grounded: whether the robot is on the ground.
         given_up: '' or the reason why a controlled descent is no longer possible.
+        ramp: the plan.
 
     """
 
@@ -113,6 +115,7 @@ class Landing:
         self.grounded, self.given_up = False, ''
         self._standing_for = self._still_for = self._blind_for = 0.0
         self._support = 0.0     # share of the weight that the rotors do not carry, filtered
+        self._rise = 0.0        # of the present plan, before a turn over [m]
         if 'estimator_wrong' in inputs.faults or inputs.ekf.silent:
             inputs.backup.start(inputs.estimate)
         self.set_out()
@@ -121,7 +124,7 @@ class Landing:
     @property
     def way(self) -> TrajectoryTarget:
         """The planned way, for a controller that can fly a trajectory."""
-        ramp = self._ramp
+        ramp = self.ramp
         times = ramp.stamp + np.arange(0.0, ramp.duration + AHEAD, BETWEEN)
         samples = [ramp.at(time) for time in times]
         return TrajectoryTarget(times, np.array([one.position for one in samples]),
@@ -155,21 +158,36 @@ class Landing:
     def set_out(self) -> None:
         """Plan the way down from the present pose, with the actuators that work."""
         inputs, state = self._inputs, self._inputs.seen
-        self._halting = False
+        climbed, self._halting, self._rise = self._rise > 0, False, 0.0
         if inputs.health.healthy:
             way = plan(state.quaternion, state.tilt, inputs.allocator, LEVEL_RATE)
         else:
-            way = self._escape(state)
+            way = self._escape(state, climbed)
         slanted = inclination(state.quaternion) > LEVEL_FIRST or not inputs.health.healthy
         begin = way.duration if slanted else 0.0
-        self._ramp = Ramp(state.stamp, coasted(state), way, [
-            (0.0, 0.0), (begin + 1e-9, 0.0), (begin + SPEED / ACCELERATION, -SPEED)])
+        knots = [(begin + 1e-9, 0.0), (begin + SPEED / ACCELERATION, -SPEED)]
+        if self._rise > 0:
+            knots = [(begin + time, speed)
+                     for time, speed in climb(self._rise, CLIMB_SPEED, ACCELERATION)]
+        self.ramp = Ramp(state.stamp, coasted(state), way, [(0.0, 0.0), *knots])
 
-    def _escape(self, state):
-        """First to the attitude where control is regained soonest, then towards level."""
-        holding = Holding(self._inputs.robot, self._inputs.health)
+    def _escape(self, state, climbed):
+        """
+        First to the attitude where control is regained soonest, then towards level.
+
+        With a weak pack the attitudes on the side can be passed only fast, at a loss of height. A
+        low robot on its back remains there and climbs first.
+        """
+        inputs, height = self._inputs, self._inputs.height
+        holding = Holding(inputs.robot, inputs.health)
+        on_back = inclination(state.quaternion) > 0.5 * np.pi
+        if not climbed and on_back and height is not None and height < TURN_HEIGHT \
+                and replace(inputs.health, thrust_limit=None).healthy:
+            self._rise = TURN_HEIGHT + NEAR - height
         escape = holding.quickest(state.quaternion, state.angular_velocity, state.tilt,
-                                  FLYING_MARGIN, LEVEL_RATE)
+                                  FLYING_MARGIN, np.inf if self._rise > 0 else LEVEL_RATE)
+        if self._rise > 0:
+            return Way(np.array([0.0, ESCAPE_TIME]), np.array([escape, escape]))
         level = rotations.from_rpy(0.0, 0.0, rotations.to_rpy(state.quaternion)[2])
         goal = holding.nearest(level, FLYING_MARGIN)
         turn = max(rotations.geodesic_angle(goal, escape) / LEVEL_RATE, 1e-3)
@@ -180,10 +198,11 @@ class Landing:
 
     def _follow(self, state, dt):
         """Follow the ramp, whose target waits for the robot."""
-        halt = halting(state, self._ramp.position[2]) if self._halting else None
-        if self._halting and halt is None:
+        halt = halting(state, self.ramp.position[2]) if self._halting else None
+        if self._halting and halt is None \
+                or self._rise > 0 and state.stamp > self.ramp.stamp + self.ramp.duration:
             self.set_out()
-        reference = halt or self._ramp.at(state.stamp)
+        reference = halt or self.ramp.at(state.stamp)
         height = max(reference.position[2], state.position[2] - TARGET_LEAD)
         reference = replace(reference, position=np.array([*reference.position[:2], height]))
         self._feel_ground(state, dt, reference.velocity[2])

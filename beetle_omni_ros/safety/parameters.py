@@ -1,9 +1,4 @@
-"""
-What an operator may set of the supervisor.
-
-Limits that follow from the robot, its sensors and noise are constants beside their check, with
-unit and reason.
-"""
+"""What an operator may set of the supervisor; other limits are constants beside their check."""
 
 from dataclasses import dataclass
 

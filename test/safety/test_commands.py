@@ -43,29 +43,38 @@ def test_bad_command_is_refused_with_its_reason_and_counted(bad, reason):
     assert checked.accepted is None and checked.complaint.endswith(f'last refused: {reason}')
 
 
-def test_a_small_excess_is_clipped_and_counted():
+def test_a_small_excess_is_clipped():
     checked, top = stream(), ROBOT.rotors.thrust_max
     given = command(tilt=[0.1, 0.2, 0.3, 4.5], thrust=[7.0, -3.0, 7.0, top + 3.0])
-    assert checked.offer(given, NOW) == '' and checked.clipped == 1
+    assert checked.offer(given, NOW) == ''
     assert checked.accepted.thrust.tolist() == [7.0, 0.0, 7.0, top]
     assert checked.accepted.tilt[3] == ROBOT.joints.position_limit
     assert given.tilt[3] == 4.5     # a copy
 
 
-def test_steps_of_tilts_and_single_steps_of_thrust_pass_but_scattered_thrust_is_refused():
-    checked, random, now = stream(), np.random.default_rng(3), NOW
-    assert checked.offer(command(), now) == ''
+def test_a_single_spike_is_refused_and_a_real_step_loses_one_command():
+    checked, far = stream(), (0.1 + commands.TILT_STEP[0] + 0.1, 0.2, 0.3, 0.4)
+    assert checked.offer(command(), NOW) == ''
     for stamp in (NOW, NOW - 0.01):
         assert checked.offer(command(stamp), NOW) == 'repeated or older stamp'
-    for k in range(100):
-        now += 0.01
-        tilt, thrust = np.full(4, (-1.0) ** k * ROBOT.joints.position_limit), 10.0 * (k % 10 > 4)
-        assert checked.offer(noisy(now, tilt, np.full(4, thrust)), now) == ''
-    reasons = []
-    for _ in range(100):
-        now += 0.01
-        reasons.append(checked.offer(noisy(now, np.zeros(4), random.uniform(0, 20, 4)), now))
-    assert set(reasons[5:]) == {commands.SCATTER}
+    assert checked.offer(command(NOW + 0.01, far, (15, 15, 15, 15)), NOW + 0.01) == commands.JUMP
+    assert checked.offer(command(NOW + 0.02, far, (15, 15, 15, 15)), NOW + 0.02) == ''
+    assert checked.offer(command(NOW + 0.03, far, (1, 1, 1, 1)), NOW + 0.03) == ''
+    assert checked.offer(command(NOW + 0.04, far, (17, 17, 17, 17)), NOW + 0.04) == commands.JUMP
+
+
+def test_far_tilts_on_both_sides_with_calm_thrusts_keep_control_and_random_commands_lose_it():
+    random = np.random.default_rng(3)
+    for wild in (False, True):
+        checked, silent = stream(), False
+        for k in range(1, 200):
+            now = NOW + 0.01 * k
+            checked.tick(0.01)
+            silent = silent or k > 1 and checked.silence.silent
+            given = (random.uniform(-3, 3, 4), random.uniform(0, 20, 4)) if wild else \
+                (np.full(4, 3.9 * (-1) ** k), 7.0 + random.uniform(-3, 3, 4))
+            checked.offer(command(now, *given), now)
+        assert silent is wild and checked.good is not wild
 
 
 def test_a_stream_of_repeated_numbers_is_refused_until_they_change():

@@ -11,7 +11,9 @@ from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.safety.commands import RETURN_AFTER, TIMEOUT
 from beetle_omni_ros.safety.inputs import ESTIMATE_TIMEOUT, JOINT_TIMEOUT, LOST_TIME, LOW_TIME
+from beetle_omni_ros.safety.landing import TURN_HEIGHT
 from beetle_omni_ros.safety.supervisor import STOP_TIME
+from beetle_omni_ros.safety.way import inclination
 
 
 @pytest.mark.parametrize('spoil, text', [
@@ -71,8 +73,7 @@ def test_fallback_and_landing_stop_a_turn_before_they_aim_at_a_pose(begin, monke
 
 @pytest.mark.parametrize('begin', [
     lambda rig: rig.supervisor.land(rig.now),
-    lambda rig: rig.supervisor.on_command(
-        'nmpc', Command(rig.now + TICK, np.full(4, np.nan), np.ones(4)), rig.now)])
+    lambda rig: rig.run(TIMEOUT - TICK)])     # silent
 def test_fallback_and_landing_start_from_the_joints_and_not_from_a_far_target(begin):
     rig = flown()
     joints, publish = rig.command.tilt, rig._publish
@@ -94,11 +95,11 @@ def test_fallback_and_landing_start_from_the_joints_and_not_from_a_far_target(be
     assert np.abs(rig.command.tilt - joints).max() < 0.6
 
 
-def test_a_controller_whose_commands_are_not_finite_loses_control_at_once_with_the_reason():
+def test_a_controller_whose_commands_are_not_finite_loses_control_with_the_reason():
     rig = flown()
     rig.alive.discard('nmpc')
     rig.supervisor.on_command('nmpc', Command(rig.now, np.full(4, np.nan), np.ones(4)), rig.now)
-    rig.run(TICK)
+    rig.run(TIMEOUT)
     assert rig.supervisor.state == 'fallback'
     assert any('last refused: not finite' in text for text in rig.texts('error'))
     assert rig.supervisor.diagnostics()['nmpc.refused.not finite'] == 1
@@ -202,6 +203,30 @@ def test_a_pack_that_sags_under_the_same_load_leads_to_a_landing_within_half_a_s
     limit = rig.supervisor.health.thrust_limit
     assert ROBOT.hover_thrust < limit < 2 * ROBOT.hover_thrust
     assert all(command.thrust.max() <= limit + 1e-9 for command in rig.run(0.5))
+
+
+@pytest.mark.parametrize('height, climbs', [(0.6, True), (1.6, False)])
+def test_with_a_weak_pack_a_low_robot_on_its_back_climbs_before_it_turns_over(height, climbs):
+    rig = flown()
+    supervisor, start = rig.supervisor, rig.position
+    for part in np.linspace(0.0, 1.0, 500):
+        rig.quaternion = rotations.from_rpy(np.pi * part, 0.0, 0.0)
+        rig.position = (1 - part) * start + part * np.array([0.3, -0.2, supervisor.floor + height])
+        rig.run(TICK)
+    rig.voltage -= 6.0
+    rig.run(0.5)
+    assert supervisor.state == 'landing' and 'battery_weak' in supervisor.faults
+    way = supervisor.target_override
+    turned = [inclination(quaternion) < 0.5 * np.pi for quaternion in way.quaternions]
+    assert any(turned) is not climbs
+    if climbs:
+        top = supervisor.floor + TURN_HEIGHT
+        assert way.positions[-1, 2] > top
+        while rig.position[2] <= top and rig.now < way.times[-1]:
+            rig.position = way.at(rig.now).position
+            rig.run(TICK)
+        rig.run(1.0)
+        assert inclination(supervisor.target_override.quaternions[-1]) < 0.5
 
 
 @pytest.mark.parametrize('motion', [{'rate': np.array([20.0, 0, 0])},
