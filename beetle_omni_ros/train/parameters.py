@@ -224,7 +224,7 @@ class TrainParameters(ParameterFile, file='train.yaml'):
     """All parameters of a training; each run saves them beside its checkpoints."""
 
     seed: int = parameter(0, doc='random seed', low=0, high=2**31 - 1)
-    iterations: int = parameter(11050, doc='PPO iterations', low=1, high=10**7)
+    iterations: int = parameter(12300, doc='PPO iterations', low=1, high=10**7)
     memory: bool = parameter(False, doc='whether the policy observes the disturbance estimate')
     log_every: int = parameter(50, doc='iterations between two rows of progress', low=1,
                                high=10**6)
