@@ -101,7 +101,7 @@ def fly_flight(flight: Flight, task: Task) -> dict:
     """
     Fly a flight and compute its metrics; ``task`` was made on the computer with the pose file.
 
-    Returned are ``failure`` (None or one line), ``metrics`` (None or as in INTERFACES),
+    Returned are ``failure`` (None or one line), ``metrics`` (None or as `evaluate --json`),
     ``cpu_s``, ``host`` and ``trace``, see :func:`trace`.
     """
     start = time.process_time()

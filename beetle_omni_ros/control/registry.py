@@ -85,7 +85,11 @@ class ControllerEntry:
             return None
         if not file and self.parameters_file:
             file = Path(self.parameters_file)
-            file = file if file.is_file() else share_path(self.parameters_file)
+            try:
+                file = file if file.is_file() else share_path(self.parameters_file)
+            except FileNotFoundError:
+                raise ParameterError(f"controller '{self.reference}': parameters_file '{file}': "
+                                     'not found') from None
         parameters = schema.bind(kind, schema.load_yaml(file) if file else {}, str(file or ''))
         given = {'policy': str(options.policy or ''), 'without': options.without,
                  'allow_other_robot': options.allow_other_robot}

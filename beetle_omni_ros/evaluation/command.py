@@ -69,8 +69,8 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
     Fly a task with each controller and report; arguments as of `beetle_omni evaluate`.
 
     ``options`` are files in place of a controller's own. With several controllers, ``bag``
-    contains one bag for each. Returned are ``meta`` and a key for each controller, as in
-    INTERFACES. A ParameterError reports unusable input.
+    contains one bag for each. Returned are ``meta`` and a key for each controller, as
+    `--json` writes them. A ParameterError reports unusable input.
     """
     console = console or table.Terminal()
     believed = RobotParameters.load(robot)

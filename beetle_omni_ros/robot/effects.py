@@ -185,7 +185,7 @@ CATALOGUE: dict[str, Effect] = {
     'mass': Effect(
         'body', {'mass': EffectParameter('kg', NAN, 0.05, 200, 0.05, 0.01, number='mass',
                                          tolerance='mass')},
-        "m v' = F, Newton; INTERFACES: total mass", 'any flight',
+        "m v' = F, Newton; total mass", 'any flight',
         ('thrust_coefficient', 'voltage_sag', 'wind'),
         'weigh the robot, or fly fast turns: thrust scales torques too, mass does not',
         sets('mass'), allocated=True, plant='model'),

@@ -268,7 +268,7 @@ def _stamped(value, received):
     """The value; without a stamp (`ros2 topic pub`), it gets the time of receipt."""
     if isinstance(value, list):
         return [entry if entry.t else replace(entry, t=received) for entry in value]
-    if isinstance(value, str) or value.stamp:
+    if getattr(value, 'stamp', True):   # a text has none, neither has the health of the actuators
         return value
     if isinstance(value, TrajectoryTarget):
         return replace(value, stamp=received, times=value.times + received)

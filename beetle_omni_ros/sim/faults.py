@@ -390,10 +390,11 @@ class Schedule:
         """Start and end the faults due at ``now`` [s], with the true state and servo targets."""
         for state in self._states:
             if not (state.active or state.over) and now >= state.begin - ROUNDING:
-                state.now, state.truth, state.held, state.active = now, truth, held, True
+                state.truth, state.held, state.active = truth, held, True
                 state.random = np.random.default_rng(self._seed.spawn(1)[0])
             if state.active and now >= state.begin + state.fault.duration - ROUNDING:
                 state.active, state.over = False, True
+            state.now = now
 
     @property
     def active(self) -> list[tuple[Kind, Any]]:

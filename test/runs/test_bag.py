@@ -17,6 +17,7 @@ from synthetic_flights import (
 )
 
 from beetle_omni_ros.messages.bag_types import new, to_bytes, TYPESTORE
+from beetle_omni_ros.robot.allocation import ALL_HEALTHY
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.bag import read_bag
 from beetle_omni_ros.runs.bag_writer import add_meta, BagWriter
@@ -94,6 +95,13 @@ def test_a_message_that_cannot_be_used_is_counted_and_loses_no_other(tmp_path):
     assert log.joint_t.tolist() == [1.0, 3.0]
     assert any('joint_states: 1 messages not used' in w and 'gimbal1' in w for w in log.warnings)
     assert any('odom: 1 messages not used' in w for w in log.warnings)
+
+
+def test_values_without_a_stamp_are_read_without_a_warning(tmp_path):
+    with BagWriter(tmp_path / 'bag', {}) as writer:
+        writer.write('supervisor/actuators', ALL_HEALTHY, 1.0)
+        writer.write('supervisor/target', None, 1.0)
+    assert not [line for line in read_bag(tmp_path / 'bag').warnings if 'not used' in line]
 
 
 def test_namespaces_are_removed_and_several_robots_refused(tmp_path):
