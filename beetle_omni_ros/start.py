@@ -30,6 +30,10 @@ def run(name: str) -> int | None:
         return main()
     except KeyboardInterrupt:
         return INTERRUPTED
+    except RuntimeError as error:   # Python 3.11 wraps an interrupt while a class is made
+        if isinstance(error.__cause__, KeyboardInterrupt):
+            return INTERRUPTED
+        raise
 
 
 def __getattr__(name):
