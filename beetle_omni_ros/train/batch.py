@@ -3,6 +3,7 @@
 import torch
 
 from beetle_omni_ros.robot import dynamics as model
+from beetle_omni_ros.train.model import ARM, GAIN, MASS
 
 PERIOD = 0.01   # [s] between two entries of a history
 
@@ -170,7 +171,7 @@ def actor_observation(random, s, previous_action, memory, draw):
 
 
 def critic_observation(s, previous_action, torque_ratio, memory):
-    """(N, 47) true state with torques and thrusts of the rotors and trim; + 6 with memory."""
+    """(N, 47) true state with torques and thrusts of the rotors and trim; + 12 with memory."""
     x = s['x']
     rotation, target = matrix(x[:, model.QUATERNION]), matrix(s['target_attitude'])
     thrust = x[:, model.THRUST]
@@ -179,5 +180,6 @@ def critic_observation(s, previous_action, torque_ratio, memory):
               rotation[:, :, 0], rotation[:, :, 2], target[:, :, 0], target[:, :, 2],
               x[:, model.TILT], torque_ratio * thrust, thrust, previous_action, s['trim']]
     if memory:
-        blocks += [transpose_product(rotation, s['estimate'][:, :3]), s['estimate'][:, 3:]]
+        blocks += [transpose_product(rotation, s['estimate'][:, :3]), s['estimate'][:, 3:],
+                   s['body'][:, MASS], s['body'][:, ARM], s['body'][:, GAIN]]
     return torch.cat(blocks, -1)

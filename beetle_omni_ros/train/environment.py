@@ -15,7 +15,15 @@ from beetle_omni_ros.control.policy_file import PolicyContract
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.train import batch, rewards
-from beetle_omni_ros.train.model import CENTRE, INERTIA, MASS, module_reaction, nominal_body
+from beetle_omni_ros.train.model import (
+    ARM,
+    CENTRE,
+    GAIN,
+    INERTIA,
+    MASS,
+    module_reaction,
+    nominal_body,
+)
 from beetle_omni_ros.train.parameters import TrainParameters
 from beetle_omni_ros.train.physics import Physics
 from beetle_omni_ros.train.starts import (
@@ -29,7 +37,7 @@ from beetle_omni_ros.train.starts import (
 
 SUBSTEPS = 4        # of the physics in a period
 FORCE_BANDWIDTH, TORQUE_BANDWIDTH = 3.0, 4.0    # [rad/s] of the controller's estimate
-NUMBERS = 169       # random numbers for each robot and step
+NUMBERS = 176       # random numbers for each robot and step
 REACHED_POSITION, REACHED_ATTITUDE = 0.10, 0.17453    # [m], [rad] limits of the task metrics
 
 
@@ -63,7 +71,8 @@ class TiltableQuadrotorEnv:
         self._module_moment = module_reaction(robot)['mass_moment'] if robot.multibody else 0.0
         self._axes = self._tensor(robot.tilt_axes)
         self._sideways = self._tensor(np.cross(robot.tilt_axes, [0.0, 0.0, 1.0]))
-        self._nominal_mass = nominal_body(robot)[0]
+        self._rotors = self._tensor(rotors.positions)
+        self._nominal = self._tensor(nominal_body(robot))
         self.base_weights = self._tensor([getattr(parameters.reward, name)
                                           for name in rewards.TERMS]) * parameters.reward.scale
         self.weights = self.base_weights.clone()
@@ -80,7 +89,8 @@ class TiltableQuadrotorEnv:
         self._finish = self._after_physics
         if compiled if compiled is not None else self.device.type == 'cuda':
             self._finish = torch.compile(self._after_physics, fullgraph=True, dynamic=False)
-        self.observation, self.critic = self._observe(self.state, batch.Draw(numbers[:, 131:]))
+        self.state['estimate'] = self._outside(self.state)
+        self.observation, self.critic = self._observe(self.state, batch.Draw(numbers[:, 138:]))
         self.reward = torch.zeros(self.num_envs, device=self.device)
         self.done, self.timeout = self.reward > 0, self.reward > 0
 
@@ -92,7 +102,7 @@ class TiltableQuadrotorEnv:
         return torch.rand(self.num_envs, NUMBERS, device=self.device)
 
     def get_observations(self) -> TensorDict:
-        """Observation groups 'actor' (N, 33 or 39) and 'critic' (N, 47 or 53)."""
+        """Observation groups 'actor' (N, 33 or 39) and 'critic' (N, 47 or 59)."""
         return TensorDict({'actor': self.observation, 'critic': self.critic},
                           batch_size=[self.num_envs], device=self.device)
 
@@ -145,13 +155,15 @@ class TiltableQuadrotorEnv:
             (finished * angle).sum(), reward.sum(), died.sum(), timeout.sum(),
             torch.ones_like(reward).sum()]),
             torch.where(broken[:, None], 0.0, terms).sum(0)])
-        new = self._continued(s, x, command, rotation, age, inputs['depth'])
+        new = self._continued(s, x, command, age, inputs['depth'])
         missed = calm & ((died & ~broken) | due & (
             (distance > MISSED_POSITION) | (angle > MISSED_ATTITUDE)
             | (new['deepest'] > MISSED_DEPTH)))
         new = self._retarget(new, due, rotation, draw)
         self._replays.step(s, new, self._starts.draw(draw),
                            {'due': due, 'done': done, 'missed': missed}, draw)
+        # The estimate of a real robot has settled before its first target.
+        new['estimate'] = torch.where(done[:, None], self._outside(new), new['estimate'])
         observation, critic = self._observe(new, draw)
         return new, observation, critic, reward, done, timeout, tally
 
@@ -180,7 +192,7 @@ class TiltableQuadrotorEnv:
             'tilt_limit': self.robot.joints.position_limit,
             'thrust_limit': self.robot.rotors.thrust_max}
 
-    def _continued(self, s, x, command, rotation, age, depth):
+    def _continued(self, s, x, command, age, depth):
         """State after a step without resets and new targets."""
         new = dict(s)
         old = batch.matrix(s['x'][:, model.QUATERNION])
@@ -192,7 +204,8 @@ class TiltableQuadrotorEnv:
             past_motion=torch.cat((motion[:, None], s['past_motion'][:, :3]), 1),
             past_tilt=torch.cat((s['x'][:, None, model.TILT], s['past_tilt'][:, :1]), 1),
             trim=self._trim(s, x),
-            estimate=self._disturbance_estimate(s, x, rotation))
+            estimate=s['estimate'])
+        new['estimate'] = self._disturbance_estimate(s, new)
         return new
 
     def _trim(self, s, x):
@@ -212,28 +225,49 @@ class TiltableQuadrotorEnv:
                      made.split(3, -1), (guidance.TRIM_DISTANCE, guidance.TRIM_ANGLE))]
         return torch.cat(parts, -1)
 
-    def _disturbance_estimate(self, s, x, rotation):
+    def _disturbance_estimate(self, s, new):
         """
         Disturbance estimate (N, 6): the wrench outside the nominal model, through a lag.
 
-        The estimator compares the measured body rate with the effect of the present commands. A
-        delayed rate gives an error: the difference of the delayed, extrapolated change of rate
-        and the present change.
+        The estimator compares the measured motion with the effect of the present commands on the
+        nominal robot. A delayed rate gives an error: the difference of the delayed, extrapolated
+        change of rate and the present change.
         """
-        mass, weight = s['body'][:, MASS], torch.zeros_like(s['wrench'][:, :3])
+        x, old, body = new['x'], s['x'], new['body']
+        changes = (x[:, model.VELOCITY] - old[:, model.VELOCITY],
+                   x[:, model.RATE] - old[:, model.RATE])
+        beyond = self._outside(new) + torch.cat((
+            (self._nominal[MASS] - body[:, MASS]) / batch.PERIOD * changes[0],
+            ((self._nominal[INERTIA] - body[:, INERTIA]) * changes[1]
+             + body[:, INERTIA] * self._delay_error(s, x)) / batch.PERIOD), -1)
+        lag = torch.full_like(beyond, FORCE_BANDWIDTH * batch.PERIOD)
+        lag[:, 3:] = TORQUE_BANDWIDTH * batch.PERIOD
+        return s['estimate'] + lag * (beyond - s['estimate'])
+
+    def _outside(self, s):
+        """(N, 6) force in world and torque in body outside the nominal model, at rest."""
+        x, body = s['x'], s['body']
+        rotation, tilt, thrust = batch.matrix(x[:, model.QUATERNION]), x[:, model.TILT], \
+            x[:, model.THRUST]
+        mass, weight = body[:, MASS], torch.zeros_like(s['wrench'][:, :3])
         weight[:, 2] = -self.robot.gravity
-        tilt = x[:, model.TILT]
-        thrusts = torch.sin(tilt) @ self._sideways
-        up = torch.zeros_like(thrusts)
-        up[:, 2] = (torch.cos(tilt) - 1).sum(-1)
-        centre = s['body'][:, CENTRE] - self._module_moment / mass * (thrusts + up)
+        turned = torch.sin(tilt)[:, :, None] * self._sideways     # (N, 4, 3)
+        directions = turned.clone()
+        directions[:, :, 2] += torch.cos(tilt)
+        leaned = directions.sum(1)
+        leaned[:, 2] -= 4
+        centre = body[:, CENTRE] - self._module_moment / mass * leaned
         pull = batch.transpose_product(rotation, weight * mass)
-        force = s['wrench'][:, :3] + (mass - self._nominal_mass) * weight
-        torque = s['wrench'][:, 3:] + torch.linalg.cross(centre, pull) \
-            + s['body'][:, INERTIA] / batch.PERIOD * self._delay_error(s, x)
-        lag = torch.cat((torch.full_like(force, FORCE_BANDWIDTH * batch.PERIOD),
-                         torch.full_like(torque, TORQUE_BANDWIDTH * batch.PERIOD)), -1)
-        return s['estimate'] + lag * (torch.cat((force, torque), -1) - s['estimate'])
+        more = (body[:, GAIN] - self._nominal[GAIN])[:, :, None] * thrust[:, :, None] * directions
+        # With longer arms the torque also grows by the whole thrust.
+        levers = (body[:, ARM] * body[:, GAIN] - self._nominal[GAIN])[:, :, None] \
+            * thrust[:, :, None] * torch.linalg.cross(self._rotors.expand_as(directions),
+                                                      directions)
+        force = s['wrench'][:, :3] + (mass - self._nominal[MASS]) * weight \
+            + (rotation * more.sum(1)[:, None]).sum(-1)
+        torque = s['wrench'][:, 3:] + torch.linalg.cross(centre, pull) + levers.sum(1) \
+            + (self._torque_ratio[:, None] * more).sum(1)
+        return torch.cat((force, torque), -1)
 
     @staticmethod
     def _delay_error(s, x):

@@ -18,12 +18,13 @@ from beetle_omni_ros.robot.servo import CASADI, SLIDING_RATE, Step
 
 # Quantities of each robot: mass [kg], inertia (3) [kg m^2], centre of mass (3) [m]; for the four
 # joints stiffness [N m/rad], damping [N m s/rad], Coulomb friction and stiction [N m] and play
-# [rad]; lag of the rotors [s].
+# [rad]; lag of the rotors [s]; for the rotors their distance from the centre of gravity as a
+# fraction of the robot file's, and thrust for a command (4).
 MASS, INERTIA, CENTRE = slice(0, 1), slice(1, 4), slice(4, 7)
 STIFFNESS, DAMPING, COULOMB, STICTION, PLAY = (slice(k, k + 4) for k in range(7, 27, 4))
-LAG = slice(27, 28)
-ACTUATORS = slice(7, 28)
-BODY_SIZE = 28
+LAG, ACTUATORS = slice(27, 28), slice(7, 28)
+ARM, GAIN = slice(28, 29), slice(29, 33)
+BODY_SIZE = 33
 SERVO_STEPS = 2    # servo steps in a substep; a servo reaches its rate limit within 1 ms
 WRENCH_SIZE = 6    # external force in world [N], torque in body [N m]
 
@@ -37,12 +38,13 @@ def module_reaction(robot: RobotParameters) -> dict[str, float]:
 
 
 def nominal_body(robot: RobotParameters) -> list[float]:
-    """(28,) quantities of the robot file, with its effects."""
+    """(33,) quantities of the robot file, with its effects."""
     effects = robot.effects
+    gain = effects.get('rotor_thrust_coefficient', {}).get('scale', (1.0,) * 4)
     return [effects.get('mass', {}).get('mass', robot.mass),
             *effects.get('inertia', {}).get('inertia', tuple(robot.inertia)),
             *effects.get('centre_of_mass', {}).get('offset', (0.0, 0.0, 0.0)),
-            *actuators(robot)]
+            *actuators(robot), 1.0, *gain]
 
 
 def actuators(robot: RobotParameters) -> np.ndarray:
@@ -88,7 +90,7 @@ def _behind_play(gap, tilt, rate):
 
 def substep(robot: RobotParameters, duration: float) -> ca.Function:
     """
-    One integration step of ``duration`` [s]: x (25), u (8), wrench (6), body (28) -> x_next (25).
+    One integration step of ``duration`` [s]: x (25), u (8), wrench (6), body (33) -> x_next (25).
 
     The servos take shorter steps within rate limit and stops. The rotor lag is exact. The body
     uses the acceleration at the mean thrust and the new tilt. The slices are those of
@@ -113,14 +115,16 @@ def substep(robot: RobotParameters, duration: float) -> ca.Function:
     if robot.multibody is not None:
         effects.setdefault('module_reaction', module_reaction(robot))
     effects.update(mass={'mass': body[MASS]}, inertia={'inertia': body[INERTIA]},
-                   centre_of_mass={'offset': body[CENTRE]})
+                   centre_of_mass={'offset': body[CENTRE]},
+                   rotor_thrust_coefficient={'scale': body[GAIN]})
     order = ['mass', *(name for name in effects if name != 'mass')]
     acceleration, angular_acceleration = model.rigid_body(
         robot, x[model.VELOCITY], x[model.QUATERNION], x[model.RATE],
         _behind_play(body[PLAY], new_tilt, new_rate),
         (thrust + new_thrust) / 2, wrench[:3], wrench[3:], (new_rate - rate) / h,
         {name: effects[name] for name in order}, tilt_rate=new_rate,
-        thrust_rate=(new_thrust - thrust) / h, position=x[model.POSITION])
+        thrust_rate=(new_thrust - thrust) / h, position=x[model.POSITION],
+        rotor_positions=body[ARM] * ca.DM(rotors.positions))
     velocity = x[model.VELOCITY] + h * acceleration
     angular_velocity = x[model.RATE] + h * angular_acceleration
     position = x[model.POSITION] + h * (x[model.VELOCITY] + velocity) / 2

@@ -42,7 +42,8 @@ RATE, FORCE, TORQUE, THRUST, TILT_ACTION, THRUST_ACTION = 0.5, 0.1, 2.0, 0.1, 0.
 VELOCITY, ANGULAR_VELOCITY, TARGET = slice(0, 3), slice(3, 6), slice(6, 9)
 TILT = slice(21, 25)
 ACTION, ACTOR_SIZE = slice(25, 33), 33
-ROTORS, CRITIC_ACTION, TRIM, CRITIC_SIZE = slice(25, 33), slice(33, 41), slice(41, 47), 47
+ROTORS, CRITIC_ACTION, TRIM = slice(25, 33), slice(33, 41), slice(41, 47)
+ESTIMATE = slice(47, 53)    # of a policy with memory; then mass, arm and gains of the robot
 
 
 def _dot(a, b):
@@ -65,11 +66,12 @@ def features(observation: torch.Tensor, not_linear=NOT_LINEAR) -> torch.Tensor:
 
 
 def critic_features(state: torch.Tensor) -> torch.Tensor:
-    """(N, 64) features of the (N, 47) privileged state, or (N, 70) of (N, 53)."""
+    """(N, 64) features of the (N, 47) privileged state, or (N, 76) of (N, 59)."""
     shared = _shared(state, state[..., CRITIC_ACTION], *NOT_LINEAR)
     rotors = state[..., ROTORS]
     return torch.cat([*shared, rotors[..., :4], THRUST * rotors[..., 4:],
-                      state[..., TRIM] / NEAR, *_disturbance(state[..., CRITIC_SIZE:])], -1)
+                      state[..., TRIM] / NEAR, *_disturbance(state[..., ESTIMATE]),
+                      state[..., ESTIMATE.stop:]], -1)
 
 
 def _shared(o, action, cross, dot, fine, sin, cos):

@@ -69,6 +69,12 @@ class RandomParameters:
 
     mass_scale: float = parameter(0.05, doc='mass', low=0, high=0.5)
     inertia_scale: float = parameter(0.05, doc='inertia, each axis', low=0, high=0.5)
+    arm_scale: float = parameter(0.0, doc='distance of the rotors from the centre of gravity',
+                                 low=0, high=0.5)
+    thrust_scale: float = parameter(0.0, doc='thrust of all rotors for a command', low=0, high=0.5)
+    lag_scale: float = parameter(0.0, doc='lags of servos and rotors', low=0, high=0.5)
+    weak_share: float = parameter(0.0, doc='fraction of robots with one weak rotor', low=0, high=1)
+    weak_loss: float = parameter(0.3, doc='largest loss of thrust of a weak rotor', low=0, high=1)
     centre_of_mass: float = parameter(0.01, doc='each axis', unit='m', low=0, high=0.1)
     position_bias: float = parameter(0.01, doc='each axis', unit='m', low=0, high=0.2)
     position_noise: float = parameter(0.01, doc='each axis', unit='m', low=0, high=0.2)

@@ -182,7 +182,7 @@ class Physics:
             commands: newest, previous and the one before, each (N, 8).
             delays: (N, 2) of tilt and thrust commands [s], at most two periods.
             wrench: (N, 6) external force in world [N], torque in body [N m].
-            body: (N, 28) quantities of each robot, slices of :mod:`train.model`.
+            body: (N, 33) quantities of each robot, slices of :mod:`train.model`.
 
         """
         advance = self._launch if self.has_kernel else self.advance_torch

@@ -11,16 +11,19 @@ import numpy as np
 import torch
 
 from beetle_omni_ros.robot.allocation import Allocator
+from beetle_omni_ros.robot.degraded import sphere
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.train import batch
-from beetle_omni_ros.train.model import actuators, nominal_body
+from beetle_omni_ros.train.model import actuators, ARM, GAIN, nominal_body
 from beetle_omni_ros.train.parameters import STRATA, TrainParameters
 
 NEAR_POSITION, NEAR_ANGLE = 0.3, 0.6   # [m], [rad] of a target near the present pose
 MOVING_SPEED, MOVING_RATE = 1.5, 3.0   # [m/s], [rad/s] largest of a moving start, each axis
 DRAWN = 2048    # robots from the measured intervals, of which the robots of the training are made
 LONGEST_DELAY = 2 * batch.PERIOD    # [s] of the stored commands and tilts
+DIRECTIONS = 200     # of up in the body, for the thrust that a robot needs to hover
+FULL_THRUST = 0.95   # of the largest thrust, which the most demanding attitude may need
 LEAST = 0.2     # smallest drawn quantity of an actuator, as a fraction of the smallest measured
 PAYLOAD_DEPTH = 0.08                   # [m] below base_link, as in the simulated plant
 MISSED_POSITION, MISSED_ATTITUDE = 0.10, 0.10     # [m], [rad] at the end of a target's time
@@ -73,6 +76,10 @@ class Starts:
         self._weight = tensor([0.0, 0.0, nominal_body(robot)[0] * robot.gravity])
         self._body = tensor(nominal_body(robot))
         self._region = tensor(parameters.episode.region)
+        self._rotors = torch.arange(4, device=device)
+        _, thrusts = Allocator(robot).upright(sphere(DIRECTIONS))
+        self._least_gain = float(thrusts.max() / (FULL_THRUST * robot.rotors.thrust_max)) \
+            / nominal_body(robot)[0]
         self.severity = torch.ones((), device=device)
         self._limit = float(robot.joints.position_limit)
         # plain floats, because a compiler takes numpy scalars for tensors of the host
@@ -156,6 +163,9 @@ class Starts:
         servo, rotor = d.uniform(2, *self._spread).split(1, -1)
         share = torch.cat((servo.expand(-1, drawn.shape[1] - 3), rotor, servo, rotor), -1)
         made = torch.maximum(self._nominal + share * (drawn - self._nominal), self._least)
+        slower = 1 + d.around(self._p.random.lag_scale, 2)
+        made = torch.cat((made[:, :4], made[:, 4:8] * slower[:, :1], made[:, 8:20],
+                          made[:, 20:21] * slower[:, 1:], made[:, 21:]), -1)
         return made[:, :-2], made[:, -2:] - self._nominal[-2:]
 
     def _randomisation(self, d):
@@ -163,6 +173,12 @@ class Starts:
         body = self._body.expand(self._count, -1)
         load = self.severity * d.chance(r.payload_share) * d.uniform(1, 0.0, r.payload)
         mass = body[:, 0:1] * (1 + d.around(r.mass_scale, 1))
+        arm = body[:, ARM] * (1 + d.around(r.arm_scale, 1))
+        weak = d.chance(r.weak_share) & (torch.floor(4 * d.uniform(1)) == self._rotors)
+        gain = body[:, GAIN] * (1 + d.around(r.thrust_scale, 1)) \
+            * (1 - weak * d.uniform(1, 0.0, r.weak_loss))
+        # Other robots cannot hover at every attitude.
+        gain = torch.maximum(gain, self._least_gain * mass)
         inertia = body[:, 1:4] * (1 + d.around(r.inertia_scale, 3))
         centre = body[:, 4:7] + d.around(r.centre_of_mass, 3)
         down = torch.cat((torch.zeros_like(centre[:, :2]), -PAYLOAD_DEPTH * load), -1)
@@ -170,11 +186,11 @@ class Starts:
         centre = (mass * centre + down) / total
         forced = d.chance(r.force_share)
         strong = d.chance(r.strong_share)
-        weak = torch.cat((d.around(r.force, 3), d.around(r.torque, 3)), -1)
-        weak = self.severity * forced * weak
+        usual = torch.cat((d.around(r.force, 3), d.around(r.torque, 3)), -1)
+        usual = self.severity * forced * usual
         thrust = d.uniform(1, 0.0, r.strong_force) * d.direction()
         force = self.severity * strong * (self._weight - thrust)
-        wrench = weak + torch.cat((force, torch.zeros_like(force)), -1)
+        wrench = usual + torch.cat((force, torch.zeros_like(force)), -1)
         noise = d.uniform(1) ** r.noise_power
         bias = noise * torch.cat((
             d.around(r.position_bias, 3), d.around(r.attitude_bias, 3),
@@ -188,8 +204,9 @@ class Starts:
         extrapolated = d.chance(r.carried_share).float()
         disturbed = (forced | strong | pushed | (load > 0)).float()
         return {'thrust_limit': d.uniform(1, *self._thrust_limit),
-                'body': torch.cat((total, inertia, centre, actuators), -1), 'wrench': wrench,
-                'other_wrench': weak,
+                'body': torch.cat((total, inertia, centre, actuators, arm, gain), -1),
+                'wrench': wrench,
+                'other_wrench': usual,
                 'noise': noise, 'bias': bias, 'delays': delays, 'extrapolated': extrapolated,
                 'pushed': pushed.float(),
                 'disturbed': disturbed, 'estimate': torch.zeros_like(wrench)}

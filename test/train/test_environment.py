@@ -13,6 +13,8 @@ from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.simulator import Battery
 from beetle_omni_ros.train import rewards
+from beetle_omni_ros.train.environment import FORCE_BANDWIDTH, TORQUE_BANDWIDTH
+from beetle_omni_ros.train.model import nominal_body
 from beetle_omni_ros.train.parameters import TrainParameters
 from beetle_omni_ros.train.physics import Physics
 
@@ -194,17 +196,37 @@ def test_pushes_change_velocities_by_their_severity(severity):
 def test_the_estimate_approaches_the_disturbance():
     env = quiet({**only('hold'), 'memory': True, 'random.force_share': 1.0, 'random.torque': 0.0,
                  'random.force': 1.0, 'episode.target_time': [100, 100]}, robots=32)
-    assert not env.state['estimate'].any()
+    force = env.state['wrench'][:, :3]
+    torch.testing.assert_close(env.state['estimate'][:, :3], force)     # it begins settled
+    env.state['estimate'].zero_()
     env.state['age'].zero_()
     begin = env.state['x'][:, :13].clone()
     for _ in range(60):
         env.state['x'][:, :13] = begin
         env.advance((env.state['previous'] - env.offset) / env.scale)
     assert not env.done.any()
-    force = env.state['wrench'][:, :3]
     assert force.abs().max() > 0.5
     lag = 1 - (1 - DisturbanceParameters().force_bandwidth * PERIOD) ** 60
     torch.testing.assert_close(env.state['estimate'][:, :3], lag * force, atol=1e-3, rtol=1e-3)
+
+
+def test_the_estimate_is_the_motion_that_the_nominal_robot_does_not_explain():
+    env = quiet({**only('hold'), 'memory': True, 'random.command_latency': [0.0, 0.0], **{
+        f'random.{name}': 0.3 for name in ('mass_scale', 'inertia_scale', 'arm_scale',
+                                           'thrust_scale')},
+        'random.weak_share': 0.5, 'random.force_share': 1.0}, robots=64,
+        robot=replace(ROBOT, multibody=None))
+    nominal = torch.tensor(nominal_body(ROBOT)).float().expand(env.num_envs, -1)
+    given, s = env.state['previous'].clone(), env.state
+    env.state['estimate'].zero_()
+    alone = env.physics.advance(s['x'], (given,) * 3, s['delays'][:, :2], 0 * s['wrench'], nominal)
+    env.advance((given - env.offset) / env.scale)
+    unexplained = env.state['x'] - alone
+    inertia = torch.tensor(ROBOT.inertia).float()
+    expected = torch.cat((FORCE_BANDWIDTH * ROBOT.mass * unexplained[:, model.VELOCITY],
+                          TORQUE_BANDWIDTH * inertia * unexplained[:, model.RATE]), -1)
+    assert expected[:, :3].abs().max() > 0.1 and expected[:, 3:].abs().max() > 0.02
+    torch.testing.assert_close(env.state['estimate'], expected, atol=2e-3, rtol=0.02)
 
 
 def test_a_strong_force_comes_and_goes_with_the_targets():

@@ -73,7 +73,8 @@ def test_the_critic_observes_the_truth_with_rotor_torques_and_thrusts():
                back.apply(s['target_position'].numpy() - x[:, :3]),
                body.as_matrix()[:, :, 0], body.as_matrix()[:, :, 2], goal[:, :, 0], goal[:, :, 2],
                x[:, 13:17], torque, x[:, 21:25], action, s['trim'],
-               back.apply(s['estimate'][:, :3].numpy()), s['estimate'][:, 3:]]
+               back.apply(s['estimate'][:, :3].numpy()), s['estimate'][:, 3:],
+               s['body'][:, :1], s['body'][:, 28:]]
     np.testing.assert_allclose(seen, np.hstack(columns), atol=2e-5)
 
 

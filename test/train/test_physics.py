@@ -41,7 +41,7 @@ def states(count, seed=0, dtype=torch.float64):
     x = torch.cat((torch.randn(count, 6, generator=g), quaternion,
                    torch.randn(count, 3, generator=g), tilt, joint_rate, thrust), -1)
     u = torch.cat((uniform(g, -6, 6, count, 4), uniform(g, -5, 25, count, 4)), -1)
-    body = torch.tensor(model.nominal_body(EVERYTHING)) * uniform(g, 0.9, 1.1, count, 28)
+    body = torch.tensor(model.nominal_body(EVERYTHING)) * uniform(g, 0.9, 1.1, count, 33)
     return [value.to(dtype) for value in (x, u, torch.randn(count, 6, generator=g), body)]
 
 
