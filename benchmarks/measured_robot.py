@@ -1,21 +1,24 @@
 """
-False alarms and reached poses on the measured robot, and on robots drawn from its intervals.
+False alarms and reached poses on the measured robot, on robots drawn from its intervals, and on
+robots that no controller has met.
 
-    python benchmarks/measured_robot.py [--controllers nmpc,rl] [--hours 1] [--draws 20] [--seed 0]
-                                        [--robot FILE] [--plant measured] [--jobs 2] [--json FILE]
+    python benchmarks/measured_robot.py [--controllers nmpc,rl] [--hours 1] [--draws 20]
+                                        [--unmet 0] [--seed 0] [--robot FILE] [--plant measured]
+                                        [--jobs 2] [--json FILE]
 
 Each controller flies `--hours` in each condition to random poses of 8 s, in flights of 15 poses.
 It also flies ten poses with each of `--draws` robots, whose measured values are drawn from the
-intervals of the robot file (`RobotParameters.drawn`). No fault is injected, so each reported
+intervals of the robot file (`RobotParameters.drawn`), and with each of `--unmet` robots, which are
+built differently from the shipped one (:func:`unmet`). No fault is injected, so each reported
 fault, fallback or landing is a false alarm. The bound is the largest rate with which so few alarms
 still occur in 5 % of such campaigns; without an alarm it is 3 / hours. The flight stack has the
-shipped robot file, or `--robot`.
+shipped robot file, or `--robot`; with `--unmet` it has the robot's own file.
 """
 
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 import json
 from math import ceil
 from pathlib import Path
@@ -31,13 +34,16 @@ from scipy.stats import chi2
 from beetle_omni_ros.control.registry import ControllerOptions
 from beetle_omni_ros.evaluation.campaign import workers
 from beetle_omni_ros.evaluation.command import fly
-from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.allocation import Allocator
+from beetle_omni_ros.robot.degraded import sphere
+from beetle_omni_ros.robot.parameters import mass_properties, RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.metrics import metrics
 from beetle_omni_ros.runs.tasks import make_task
 
 POSES, POSE_TIME, OF_DRAWN = 15, 8.0, 10    # of a flight; [s]; poses of a drawn robot
-DRAWN = 'drawn'
+DRAWN, UNMET = 'drawn', 'unmet'
+DIRECTIONS, FULL_THRUST = 200, 0.95     # of up, at which a robot must hover with this share
 
 
 @dataclass(frozen=True)
@@ -51,7 +57,40 @@ class Trial:
     @property
     def poses(self) -> int:
         """Number of poses."""
-        return OF_DRAWN if self.kind == DRAWN else POSES
+        return OF_DRAWN if self.kind in (DRAWN, UNMET) else POSES
+
+
+def unmet(rng: np.random.Generator) -> RobotParameters:
+    """
+    Draw a robot that differs from the shipped one.
+
+    Mass, inertia and arms by +-30 %, thrust and lags by +-25 %; a third each have one rotor that
+    loses up to 30 % and a payload of up to 1 kg, 8 cm below the centre. Robots that are impossible
+    or cannot hover at every attitude are drawn again.
+    """
+    shipped = RobotParameters.load()
+    rotors, joints = shipped.rotors, shipped.joints
+    while True:
+        mass, arm = shipped.mass * rng.uniform(0.7, 1.3), rng.uniform(0.7, 1.3)
+        load = rng.uniform(0.0, 1.0) * (rng.random() < 1 / 3)
+        gain = np.full(4, rng.uniform(0.75, 1.25))
+        gain[rng.integers(4)] *= 1 - rng.uniform(0.0, 0.3) * (rng.random() < 1 / 3)
+        robot = replace(
+            shipped, intervals={},
+            rotors=replace(rotors, positions=arm * rotors.positions,
+                           time_constant=rotors.time_constant * rng.uniform(0.75, 1.25)),
+            joints=replace(joints, kd=joints.kd * rng.uniform(0.75, 1.25)),
+            effects={'mass': {'mass': mass + load},
+                     'inertia': {'inertia': tuple(shipped.inertia * rng.uniform(0.7, 1.3, 3))},
+                     'rotor_thrust_coefficient': {'scale': tuple(gain)},
+                     'centre_of_mass': {'offset': (0.0, 0.0, -0.08 * load / (mass + load))}})
+        _, thrusts = Allocator(robot).upright(sphere(DIRECTIONS))
+        try:
+            mass_properties(robot)
+        except ParameterError:
+            continue
+        if thrusts.max() <= FULL_THRUST * rotors.thrust_max:
+            return robot
 
 
 def fly_one(trial: Trial, robot: str | None, plant: str) -> dict:
@@ -59,9 +98,11 @@ def fly_one(trial: Trial, robot: str | None, plant: str) -> dict:
     known, true = RobotParameters.load(robot), RobotParameters.load(plant)
     if trial.kind == DRAWN:
         true = true.drawn(np.random.default_rng(trial.seed))
+    elif trial.kind == UNMET:
+        known = true = unmet(np.random.default_rng(trial.seed))
     task = make_task(f'random{trial.poses}', trial.seed)
     log = fly(trial.controller, task, robot=known, plant=true, seed=trial.seed,
-              conditions='nominal' if trial.kind == DRAWN else trial.kind,
+              conditions='nominal' if trial.kind in (DRAWN, UNMET) else trial.kind,
               options={trial.controller: ControllerOptions(allow_other_robot=True)})
     result = metrics(log, task)
     poses, ended = result['poses'], result.get('ended', '')
@@ -102,6 +143,7 @@ def main() -> None:
     parser.add_argument('--controllers', default='nmpc,rl')
     parser.add_argument('--hours', type=float, default=1.0)
     parser.add_argument('--draws', type=int, default=20)
+    parser.add_argument('--unmet', type=int, default=0)
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--robot')
     parser.add_argument('--plant', default='measured')
@@ -112,7 +154,8 @@ def main() -> None:
     trials = [Trial(controller, kind, chosen.seed + k)
               for controller in chosen.controllers.split(',')
               for kind, count in (('nominal', number), ('published', number),
-                                  (DRAWN, chosen.draws)) for k in range(count)]
+                                  (DRAWN, chosen.draws), (UNMET, chosen.unmet))
+              for k in range(count)]
     console = Console(width=None if sys.stdout.isatty() else 140)
     with workers(jobs=chosen.jobs):
         flights = list(track(joblib.Parallel(return_as='generator_unordered', batch_size=1)(

@@ -38,7 +38,7 @@ FILES = {
                             'The same with one other weight.'),
     'rl.yaml': ('control.policy:PolicyParameters', 'The policy and its guidance.'),
     'rl_bare.yaml': ('control.policy:PolicyParameters', 'The policy without guidance.'),
-    'rl_memory.yaml': ('control.policy:PolicyParameters',
+    'rl_any.yaml': ('control.policy:PolicyParameters',
                        'The policy with the estimated disturbance as input.'),
     'rl_published.yaml': ('control.policy:PolicyParameters',
                           'The policy of train_published.yaml.'),

@@ -297,8 +297,6 @@ def train(output: Annotated[Path | None, Option(metavar='DIR', help=(
               'repeated.'))] = (),
           seed: Annotated[int | None, Option(min=0, max=2**31 - 1, help=(
               'Seed of all random numbers.'))] = None,
-          memory: Annotated[bool | None, Option('--memory', help=(
-              'Add the estimated disturbance to the inputs of the policy.'))] = None,
           device: Annotated[str, Option(help='auto, cpu, cuda[:N].')] = 'auto',
           resume: Annotated[Path | None, Option(metavar='DIR', help=(
               'Continue from the last checkpoint of a run, or from a model_N.pt.'))] = None,
@@ -313,7 +311,7 @@ def train(output: Annotated[Path | None, Option(metavar='DIR', help=(
     """Train a policy and export it to ONNX; needs the extra 'train' and a GPU."""
     from beetle_omni_ros.train.command import parse_changes, run_train
     run_train(output=output, config=config, robot=robot, device=device, resume=resume,
-              teacher=teacher, changes=parse_changes(changes, seed=seed, memory=memory),
+              teacher=teacher, changes=parse_changes(changes, seed=seed),
               smoke=smoke, stop_after=stop_after, json_path=json_path)
 
 

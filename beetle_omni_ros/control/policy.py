@@ -10,7 +10,7 @@ from beetle_omni_ros.control.guidance import Guidance
 from beetle_omni_ros.control.policy_file import PolicyNetwork
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.rotations import matrix
-from beetle_omni_ros.robot.schema import parameter, ParameterFile
+from beetle_omni_ros.robot.schema import bind, parameter, ParameterFile
 
 DEFAULT = 'policies/rl.onnx'
 LATEST = 10             # steps within which a command is reported as the executed command
@@ -56,8 +56,11 @@ class PolicyController:
         if contract.memory:
             from beetle_omni_ros.control import disturbance
             from beetle_omni_ros.robot.dynamics import integrator
+            # The disturbance of another robot is its difference from that of the training.
+            known = robot if contract.robot_hash == robot.hash() else bind(
+                RobotParameters, {'name': contract.robot, **contract.robot_values}, p.policy)
             self._estimator = disturbance.DisturbanceEstimator(
-                robot, disturbance.DisturbanceParameters(), COMMAND_DELAY, integrator(robot))
+                known, disturbance.DisturbanceParameters(), COMMAND_DELAY, integrator(known))
         self._guidance = Guidance(robot.tilt_axes, p.without)
         self.guidance = self._guidance.text
         self.reset()

@@ -81,7 +81,7 @@ class PolicyContract:
                    action_scale=[TILT_SCALE] * 4 + [THRUST_SCALE] * 4,
                    action_offset=[0.0] * 4 + [robot.hover_thrust] * 4, rate_hz=RATE_HZ,
                    robot=robot.name, robot_hash=robot.hash(), robot_values=robot.as_dict(),
-                   name='rl_memory' if memory else 'rl')
+                   name='rl_any' if memory else 'rl')
 
     @property
     def memory(self) -> bool:

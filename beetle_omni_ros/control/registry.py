@@ -148,10 +148,10 @@ SHIPPED: Mapping[str, ControllerEntry] = {entry.name: entry for entry in (
         controller=_POLICY, parameters_file='params/rl_bare.yaml', policy_file='policies/rl.onnx',
         compared=True, line=('#0b2d5c', (0, (2, 1)))),
     ControllerEntry(
-        name='rl_memory', label='RL, memory',
-        description='the learned policy with the estimated disturbance as input',
-        controller=_POLICY, parameters_file='params/rl_memory.yaml',
-        policy_file='policies/rl_memory.onnx', line=('#58b4e8', (0, (5, 1.6)))),
+        name='rl_any', label='RL, any robot',
+        description='the estimated disturbance as input, trained for robots that differ',
+        controller=_POLICY, parameters_file='params/rl_any.yaml',
+        policy_file='policies/rl_any.onnx', line=('#58b4e8', (0, (5, 1.6)))),
     ControllerEntry(
         name='rl_published', label='RL, published training',
         description='params/train_published.yaml, without guidance', controller=_POLICY,

@@ -121,7 +121,7 @@ class RandomParameters:
                                    high=1)
     force: float = parameter(4.0, doc='largest constant force, each axis', unit='N', low=0,
                              high=50)
-    strong_share: float = parameter(0.12, doc='fraction of robots with a strong constant force',
+    strong_share: float = parameter(0.3, doc='fraction of robots with a strong constant force',
                                     low=0, high=1)
     strong_force: float = parameter(
         55.0, doc='largest force that the rotors have to give against a strong force and gravity',

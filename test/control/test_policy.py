@@ -70,7 +70,7 @@ def test_targets_follow_from_the_observation_by_scale_and_offset(tmp_path, memor
     size = 39 if memory else 33
     weights, bias = 0.05 * rng.normal(size=(size, 8)), 0.1 * rng.normal(size=8)
     policy = controller(write(tmp_path / 'p.onnx', memory=memory, weights=weights, bias=bias))
-    assert policy.name == ('rl_memory' if memory else 'rl') and policy.period == 0.01
+    assert policy.name == ('rl_any' if memory else 'rl') and policy.period == 0.01
     given = state(command=Command(0.99, np.full(4, 0.1), np.full(4, 7.0)))
     contract = policy.contract
     scale, offset = np.array(contract.action_scale), np.array(contract.action_offset)

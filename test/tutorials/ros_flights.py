@@ -37,7 +37,7 @@ def check_own_controller(folder):
 
 def write_policy(folder):
     """Copy a shipped policy under another name."""
-    shutil.copy(share_path('policies/rl_memory.onnx'), folder / 'hover.onnx')
+    shutil.copy(share_path('policies/rl_any.onnx'), folder / 'hover.onnx')
 
 
 def check_policy(folder):
