@@ -31,6 +31,7 @@ MOVED = 0.02            # [rad] the same for the angle of a stuck joint
 DIRECTIONS = 200        # of up in the body, with a computed hover load, 14 deg apart
 STEPS = 500             # between no and full thrust, for the thrust of all rotors together
 TIME = 0.2              # [s] three readings; full thrust in a manoeuvre is shorter
+REST_TIME = 10.0        # [s] of the filtered rest voltage, which falls by 0.1 V meanwhile at most
 
 
 class FaultWatch:
@@ -182,11 +183,16 @@ class FaultWatch:
 
 class PackWatch:
     """
-    A pack is weak if its voltage allows less thrust than the most demanding attitude needs.
+    A pack is weak if at the load of some hover attitude it allows too little thrust for it.
 
     A rotor draws power with thrust to the power of 1.5, so the voltage under load is ``V = rest -
-    drop * load / V`` with the load being the sum of those powers. With the highest voltage of the
-    flight as ``rest``, a reading gives ``drop``, and this the thrust of all rotors together.
+    drop * load / V`` with the load being the sum of those powers. The changes between readings
+    give ``drop``, because the charge does not change meanwhile. It converts a reading to the load
+    of each attitude, so that a manoeuvre with a larger one is no sign of weakness.
+
+    A pack that becomes worse loses voltage at the same load, which this ``drop`` does not include.
+    The slowly filtered ``rest`` then gives the present one, and this the thrust of all rotors
+    together.
 
     Attributes:
         limit: thrust that all rotors can give at the same time [N], None while the pack is strong
@@ -197,25 +203,45 @@ class PackWatch:
     def __init__(self, robot: RobotParameters, allocator: Allocator, rotor_map: ThrustMap):
         self._map, self._thrust_max = rotor_map, robot.rotors.thrust_max
         _, thrusts = allocator.upright(sphere(DIRECTIONS))
-        self._need = min(float(thrusts.max()), self._thrust_max)
+        self._needs = np.minimum(thrusts.max(axis=1), self._thrust_max)
+        self._loads = (thrusts ** 1.5).sum(axis=1)
         self.limit: float | None = None
         self._rest, self._read_at, self._weak_for = 0.0, -np.inf, 0.0
+        self._before = 0.0, 0.0     # voltage, and load over voltage, of the last reading
+        self._products = self._squares = 0.0    # sums over the changes between readings
 
     def on_voltage(self, stamp: float, voltage: float, thrust: np.ndarray) -> None:
-        """Receive a reading [V] under modelled thrusts (4,) [N]."""
+        """Receive a reading [V] under modelled thrusts (4,) [N], zero before lift-off."""
         since, self._read_at = min(stamp - self._read_at, 1.0), stamp
-        self._rest = max(self._rest, voltage)
-        allowed, load = float(self._map.thrust_limit_below(voltage)), float((thrust ** 1.5).sum())
-        self._weak_for = self._weak_for + since if allowed < self._need else 0.0
+        load = float((thrust ** 1.5).sum())
+        if load == 0:
+            self._rest = max(self._rest, voltage)
+            self._before = self._rest, 0.0
+            return
+        ratio = load / voltage
+        change = ratio - self._before[1]
+        self._products += change * (self._before[0] - voltage)
+        self._squares += change * change
+        self._before = voltage, ratio
+        drop = max(0.0, self._products / self._squares)
+        rest = voltage + drop * ratio
+        self._rest += min(1.0, since / REST_TIME) * (rest - self._rest)
+        allowed = self._map.thrust_limit_below(loaded(rest, drop, self._loads))
+        weak = bool((allowed < self._needs).any())
+        self._weak_for = self._weak_for + since if weak else 0.0
+        allowed = float(self._map.thrust_limit_below(voltage))
         if self.limit is not None:
             self.limit = min(self.limit, allowed)
-        elif self._weak_for > TIME and load > 0:
+        elif self._weak_for > TIME:
             self.limit = min(allowed, self._together(voltage * (self._rest - voltage) / load))
 
     def _together(self, drop):
         """Thrust [N] that all rotors can give at the same time."""
         thrusts = np.linspace(0.0, self._thrust_max, STEPS)
-        # V (rest - V) = drop * load; beyond the pack's largest power V is half of rest.
-        voltages = 0.5 * (self._rest + np.sqrt(np.maximum(
-            self._rest ** 2 - 4 * drop * ROTORS * thrusts ** 1.5, 0.0)))
+        voltages = loaded(self._rest, drop, ROTORS * thrusts ** 1.5)
         return float(thrusts[self._map.thrust_limit_below(voltages) >= thrusts].max())
+
+
+def loaded(rest, drop, loads):
+    """Voltages [V] from ``V (rest - V) = drop * load``; beyond the largest power half of rest."""
+    return 0.5 * (rest + np.sqrt(np.maximum(rest ** 2 - 4 * drop * loads, 0.0)))
