@@ -95,7 +95,8 @@ NamespaceOption = Annotated[str, Option(
     metavar='NAME', help="Namespace of the robot's topics in a running graph.")]
 FaultsOption = Annotated[Path | None, Option(
     exists=True, dir_okay=False, metavar='FILE', help=(
-        'Faults with times and durations (YAML, see docs/faults.md).'))]
+        'Faults, all in one flight; at counts from the start of the task (YAML, see '
+        'docs/faults.md).'))]
 JobsOption = Annotated[int | None, Option(
     '--jobs', '-j', min=1, help='Parallel flights. Default: one on each core.')]
 OutputOption = Annotated[Path | None, Option(
