@@ -44,9 +44,11 @@ def made(seed, *changed, **both):
                                for band, own in zip(BANDS, changed, strict=True)], seed)
 
 
-def judged(log, file_robot=None):
+def judged(log, file_robot=None, apart=None):
+    """Gap to a robot file; ``apart`` is the log's own identification, the noise floor."""
     file_robot = file_robot or robot()
-    return gap_of(compare(log, file_robot), identify([log], file_robot), file_robot)
+    apart = apart or identify([log], file_robot)
+    return gap_of(compare(log, file_robot), apart, file_robot)
 
 
 def corrected(file_robot, result):
@@ -103,7 +105,8 @@ def line_zero(log, joint):
 
 def test_a_zero_beside_an_encoder_error_is_that_of_a_line_fit():
     log = made(6, {'offset': -0.012, 'cosine': 0.1}, {})
-    result = judged(log)
+    apart = identify([log], robot())
+    result = judged(log, robot(), apart)
     assert {(n, effect['joint']) for effect in result['effects'] for n in effect['names']} == {
         ('joint_offset', 1), ('joint_encoder_error', 1)}
     zero, = (effect['parameters']['offset'] for effect in result['effects']
@@ -111,7 +114,7 @@ def test_a_zero_beside_an_encoder_error_is_that_of_a_line_fit():
     low, high = zero['interval']
     assert low < -line_zero(log, 0) < high and high - low < 0.004
     assert zero['written'] == pytest.approx(0.012, abs=0.002) and zero['written'] < low
-    assert judged(log, corrected(robot(), result))['verdict'] == 'no_gap'
+    assert judged(log, corrected(robot(), result), apart)['verdict'] == 'no_gap'
 
 
 @pytest.mark.parametrize(('changed', 'both', 'name'), [
@@ -134,11 +137,12 @@ def test_a_change_is_named_alone(changed, both, name):
     (1, ()), (21, ({'gain': 0.03, 'offset': -0.01}, {'gain': -0.006}))])
 def test_a_corrected_log_has_no_gap(seed, changed):
     log = made(seed, *changed)
-    result = judged(log, SHIPPED)
+    apart = identify([log], SHIPPED)
+    result = judged(log, SHIPPED, apart)
     assert result['verdict'] in ('named', 'named_set') and result['gap_before'] > 10
     for effect in result['effects']:
         assert effect['evidence']['delta_bic'] > 0 and effect['evidence']['cv_gain'] > 0
-    again = judged(log, corrected(SHIPPED, result))
+    again = judged(log, corrected(SHIPPED, result), apart)
     assert again['verdict'] == 'no_gap' and again['gap_before'] < 1.2
 
 
@@ -183,8 +187,9 @@ def test_the_command_line_writes_a_file_that_explains_the_log(tmp_path, capsys):
 @pytest.mark.parametrize('path', REAL, ids=lambda path: path.stem)
 def test_a_real_log_has_no_gap_to_its_own_correction(path):
     log = read_joint_log(path)
-    result = judged(log, SHIPPED)
+    apart = identify([log], SHIPPED)
+    result = judged(log, SHIPPED, apart)
     assert {'joint_bandwidth', 'joint_friction'} <= {n for e in result['effects']
                                                      for n in e['names']}
-    again = judged(log, corrected(SHIPPED, result))
+    again = judged(log, corrected(SHIPPED, result), apart)
     assert again['verdict'] == 'no_gap', names(again)
