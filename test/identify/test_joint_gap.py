@@ -1,4 +1,4 @@
-"""Response logs against a robot file: changes are named, and a corrected file shows no gap."""
+"""Response logs and a robot file: changes are named, a corrected file has no gap, predictions."""
 
 from dataclasses import replace
 import json
@@ -11,7 +11,7 @@ from servo_logs import log_of, servo, sweep, write
 from beetle_omni_ros import cli
 from beetle_omni_ros.identify.gap.apply import effects_with
 from beetle_omni_ros.identify.servo.compare import changes, compare, gap_of
-from beetle_omni_ros.identify.servo.joint import identify
+from beetle_omni_ros.identify.servo.joint import identify, joint_results
 from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
 from beetle_omni_ros.identify.servo.model import simulate
 from beetle_omni_ros.identify.servo.robot import file_sets, own_delay
@@ -183,13 +183,52 @@ def test_the_command_line_writes_a_file_that_explains_the_log(tmp_path, capsys):
         assert new['published_heldout_rms_rad'] < 1.3 * old['heldout_rms_rad']
 
 
-@pytest.mark.skipif(not REAL, reason='the measured logs are not here')
-@pytest.mark.parametrize('path', REAL, ids=lambda path: path.stem)
-def test_a_real_log_has_no_gap_to_its_own_correction(path):
-    log = read_joint_log(path)
-    apart = identify([log], SHIPPED)
+@pytest.fixture(scope='module', params=REAL, ids=lambda path: path.stem)
+def real(request):
+    """Measured log and its own identification."""
+    log = read_joint_log(request.param)
+    return log, identify([log], SHIPPED)
+
+
+def test_a_real_log_has_no_gap_to_its_own_correction(real):
+    log, apart = real
     result = judged(log, SHIPPED, apart)
     assert {'joint_bandwidth', 'joint_friction'} <= {n for e in result['effects']
                                                      for n in e['names']}
     again = judged(log, corrected(SHIPPED, result), apart)
     assert again['verdict'] == 'no_gap', names(again)
+
+
+def line_errors(log, joint, halves):
+    """Held-out RMS [rad] of gain * play(command(t - delay)) + offset, of the best fit."""
+    rows = np.flatnonzero(log.fresh & (log.t >= log.t[0] + 0.3))
+    fitted = rows < log.end_of(0.6)
+    read, t = log.measured[joint, rows], log.read_t[rows]
+
+    def one(delay, half):
+        x = log.command_at(joint, t - delay)
+        if half:
+            shown = np.empty_like(x)
+            last = x[0]
+            for k, value in enumerate(x):
+                last = shown[k] = min(max(last, value - half), value + half)
+            x = shown
+        a = np.stack([x, np.ones_like(x)], axis=1)
+        solution = np.linalg.lstsq(a[fitted], read[fitted], rcond=None)[0]
+        error = a @ solution - read
+        return np.mean(error[fitted]**2), np.sqrt(np.mean(error[~fitted]**2))
+
+    best = min((one(delay, half) + (delay, half) for delay in np.arange(0.0, 0.0901, 0.004)
+                for half in halves[::4]))
+    return min(one(best[2] + d, h) for d in np.arange(-0.004, 0.0041, 0.0005)
+               for h in halves[np.abs(halves - best[3]) < 0.0041])[1]
+
+
+def test_real_servos_are_predicted_as_well_as_by_a_line_with_play(real):
+    log, apart = real
+    results = joint_results(apart, [], SHIPPED)
+    for k, joint in enumerate(results['joints']):
+        line = min(line_errors(log, k, np.zeros(1)),
+                   line_errors(log, k, 1e-3 * np.arange(41)))
+        assert joint['heldout_rms_rad'] < 1.1 * line, (k + 1, line)
+        assert joint['heldout_rms_rad'] < 0.5 * joint['published_heldout_rms_rad']
