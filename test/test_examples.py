@@ -74,16 +74,6 @@ def test_the_public_names_are_there_and_import_nothing_heavy():
                           check=False).returncode == 0
 
 
-def test_robot_is_a_class_and_a_subpackage():
-    assert beetle_omni_ros.robot().mass == pytest.approx(3.0386)
-    heavy = beetle_omni_ros.robot(ROOT / 'params' / 'robot_weak_and_heavy.yaml')
-    assert heavy.mass == pytest.approx(3.19053)
-    from beetle_omni_ros.robot import rotations
-    assert beetle_omni_ros.robot.rotations is rotations
-    with pytest.raises(ParameterError, match='none.yaml'):
-        beetle_omni_ros.robot('none.yaml')
-
-
 class Still:
     """Constant tilts and nearly constant hover thrusts; a constant command would be refused."""
 
