@@ -24,15 +24,14 @@ FILES = {
     'unknown.yaml': 'masss: 3.0\n', 'binary.yaml': b'\xff\xfe\x00x',
     'effect.yaml': 'extends: robot.yaml\neffects: {rotor_drg: {coefficient: 0.4}}\n',
     'extends.yaml': 'extends: nobody.yaml\nmass: 3.0\n',
-    'no_list.yaml': 'faults: 3\n', 'no_fault.yaml': 'faults: [{what: rotor_stop, rotor: 1}]\n',
-    'no_rotor.yaml': 'faults: [{what: rotor_stops}]\n', 'key.yaml': 'fault: []\n',
-    'rotor_9.yaml': 'faults: [{what: rotor_stops, rotor: 9}]\n',
-    'horizon.yaml': 'horizn: 20\n',
+    'list.yaml': 'faults: [{kind: mocap_lost}]\n', 'horizon.yaml': 'horizn: 20\n',
+    'no_fault.yaml': 'faults: {a: {strike: [{kind: rotor_stop, rotor: 1}]}}\n',
+    'rotor_9.yaml': 'faults: {a: {strike: [{kind: rotor_stops, rotor: 9}]}}\n',
     'policy.onnx': b'no network', 'notes.txt': 'nothing', 'not.mcap': b'no bag at all',
     'times.csv': JOINTS + '0,0,0,0,0,0\n0,0,0,0,0,0\n', 'one_joint.csv': JOINTS + '0,0,0,0,0,0\n',
     'word_joint.csv': JOINTS + '0,0,0,0,0,x\n0.01,0,0,0,0,0\n', 'columns.csv': 'a,b\n1,2\n',
-    'process.yaml': 'faults: [{what: controller_silent, at: 1}]\n',
-    'device.yaml': 'faults: [{what: joints_lost}]\n',
+    'process.yaml': 'faults: {a: {strike: [{kind: controller_silent, at: 1}]}}\n',
+    'device.yaml': 'faults: {a: {strike: [{kind: joints_lost}]}}\n',
     'baud.yaml': share_path('params/servo_bus.yaml').read_text() + '    baud_rate: fast\n',
     'port.yaml': 'prt: /dev/x\n'}
 DB3 = 'old/old_0.db3'
@@ -65,10 +64,8 @@ CASES = {
     f'{EVALUATE} --seed': [
         ('1.5', "'--seed': Input should be"), ('99999999999', "'--seed': Input should be")],
     f'{EVALUATE} --faults': [
-        ('none.yaml', "'none.yaml' does not exist"),
-        ('no_list.yaml', "key 'faults': expected a list"),
-        ('no_fault.yaml', "did you mean 'rotor_stops'"), ('no_rotor.yaml', "key 'rotor': missing"),
-        ('key.yaml', "key 'fault': unknown key; did you mean 'faults'"),
+        ('list.yaml', "key 'faults': expected a mapping"),
+        ('no_fault.yaml', "did you mean 'rotor_stops'"),
         ('rotor_9.yaml', "key 'rotor': 9 is outside 1 to 4")],
     f'{EVALUATE} --json': [
         ('no/result.json', 'there is no folder'), ('folder', 'it is a folder'),
@@ -105,7 +102,7 @@ CASES = {
         ('--policy none.onnx', "'none.onnx' does not exist"), ('--output notes.txt', 'notes'),
         ('--json no/result.json', 'there is no folder')],
     FAULTS: [
-        ('--faults no_list.yaml', "'faults'"),
+        ('--faults list.yaml', "key 'faults': expected a mapping"),
         ('--only rotor_9_stops', "unknown fault 'rotor_9_stops'; did you mean 'rotor_4_stops'"),
         ('--from bed', "--from 'bed': expected hover, moving, upside_down"),
         ('--seeds 0', "'--seeds': Input should be"), ('--healthy nan', "'--healthy'"),

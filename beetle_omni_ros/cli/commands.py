@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -41,12 +42,12 @@ from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.registry import ControllerOptions, DEFAULT, OWNER
 from beetle_omni_ros.robot.schema import ParameterError
 
-HELP = {'help_option_names': ['-h', '--help']}
+# The panels of rich show a flag as <bool> and leave out the other name of --standby/--alone.
+Commands = partial(Typer, no_args_is_help=True, rich_markup_mode=None,
+                   context_settings={'help_option_names': ['-h', '--help']})
 
-app = Typer(no_args_is_help=True, context_settings=HELP,
-            help='Fly, evaluate and report on the tiltable quadrotor.')
-identify = Typer(no_args_is_help=True, context_settings=HELP,
-                 help='Fit the actuator models from measured data.')
+app = Commands(help='Fly, evaluate and report on the tiltable quadrotor.')
+identify = Commands(help='Fit the actuator models from measured data.')
 
 
 @app.command()
@@ -78,7 +79,7 @@ def fly(controller: ControllerOption = DEFAULT,
             'Show the flight in the browser, as beetle_omni view does.'))] = False,
         json_path: JsonOption = None):
     """
-    Fly the whole ROS graph in real time against the simulated robot.
+    Fly the simulated robot with the whole ROS graph in real time.
 
     Takes off, flies the task, lands, records a bag and prints the result table.
     Example: beetle_omni fly --controller nmpc --task waypoints --bag my_flight
@@ -111,7 +112,7 @@ def evaluate(controllers: Annotated[str, Option(callback=several, metavar='NAME,
              faults: FaultsOption = None,
              json_path: JsonOption = None):
     """
-    Fly a task in one process, deterministic and without a real-time clock.
+    Fly a task in one process, deterministic and without a clock.
 
     Plant, sensors, estimator, controllers and actuators are those of the ROS graph.
     Example: beetle_omni evaluate --controllers nmpc --task random100 --json result.json
@@ -160,7 +161,7 @@ def compare(controllers: Annotated[str | None, Option(callback=several, metavar=
                 'Cache of finished flights. Default: .flights in the output.'))] = None,
             json_path: JsonOption = None):
     """
-    Fly every experiment with several controllers and write one page about it.
+    Fly every experiment with several controllers; write one page.
 
     An interrupted or repeated comparison flies only the missing flights. Example: beetle_omni
     compare --controllers rl,nmpc --tasks waypoints --seeds 0,1,2
@@ -199,9 +200,10 @@ def faults(faults: Annotated[Path | None, Option(metavar='FILE', help=(
            output: OutputOption = None,
            json_path: JsonOption = None):
     """
-    Inject a list of faults into flights, on all cores, and compare outcomes with expectations.
+    Inject a list of faults into flights, on all cores.
 
     Each fault occurs in hover, on the move and upside down; each flight ends with a landing.
+    Outcomes are compared with the expected ones.
     Example: beetle_omni faults --only rotor_1_stops,mocap_lost --seeds 3 --output runs_out/faults
     """
     given = dict(locals())
@@ -219,7 +221,7 @@ def report(paths: Annotated[list[Path], Argument(metavar='RUN...', help=(
            = Path('report.html'),
            json_path: JsonOption = None):
     """
-    Write one self-contained HTML page with metrics and plots of one or several runs.
+    Write one HTML page with metrics and plots of one or more runs.
 
     Example: beetle_omni report flight_a flight_b --output report.html
     """
@@ -236,9 +238,10 @@ def view(runs: Annotated[list[Path] | None, Argument(metavar='RUN...', help=(
          host: Annotated[str, Option(metavar='ADDRESS', help=(
              'Address at which the page is served; 0.0.0.0: to the whole network.'))]
          = '127.0.0.1',
-         port: Annotated[int, Option(min=1, max=65535, help='Port of the page.')] = 8080):
+         port: Annotated[int, Option(
+             metavar='N', min=1, max=65535, help='Port of the page.')] = 8080):
     """
-    Show a running graph, or play recorded runs, in 3D in the browser.
+    Show a running graph or recorded runs in 3D in the browser.
 
     Prints the address of the page, which needs no network, and runs until Ctrl-C. Example:
     beetle_omni view my_run/rl my_run/nmpc
@@ -277,7 +280,7 @@ def gap(runs: Annotated[list[Path], Argument(metavar='RUN...', help=(
             'positions, as fitted within tolerance.'))] = False,
         json_path: JsonOption = None):
     """
-    Compare flights with the robot model, identify the missing effect and add it to the model.
+    Identify and add effects that the model lacks from flights.
 
     Example: beetle_omni gap flight1 flight2 --holdout flight3 --apply robot_new.yaml
     """
@@ -295,9 +298,9 @@ def train(output: Annotated[Path | None, Option(metavar='DIR', help=(
           changes: Annotated[list[str], Option('--set', metavar='KEY=VALUE', help=(
               'Replace a parameter, e.g. iterations=5000 or ppo.robots=8192; may be '
               'repeated.'))] = (),
-          seed: Annotated[int | None, Option(min=0, max=2**31 - 1, help=(
+          seed: Annotated[int | None, Option(metavar='N', min=0, max=2**31 - 1, help=(
               'Seed of all random numbers.'))] = None,
-          device: Annotated[str, Option(help='auto, cpu, cuda[:N].')] = 'auto',
+          device: Annotated[str, Option(metavar='NAME', help='auto, cpu, cuda[:N].')] = 'auto',
           resume: Annotated[Path | None, Option(metavar='DIR', help=(
               'Continue from the last checkpoint of a run, or from a model_N.pt.'))] = None,
           teacher: Annotated[Path | None, Option(metavar='FILE', help=(
@@ -308,7 +311,11 @@ def train(output: Annotated[Path | None, Option(metavar='DIR', help=(
               'End the training after this time.'))] = None,
           robot: TheRobotOption = None,
           json_path: JsonOption = None):
-    """Train a policy and export it to ONNX; needs the extra 'train' and a GPU."""
+    """
+    Train a policy and export it to ONNX.
+
+    Needs the extra 'train' and a GPU.
+    """
     from beetle_omni_ros.train.command import parse_changes, run_train
     run_train(output=output, config=config, robot=robot, device=device, resume=resume,
               teacher=teacher, changes=parse_changes(changes, seed=seed),
@@ -326,14 +333,14 @@ def check(servo_port: Annotated[str | None, Option(metavar='PORT', help=(
               'Settings of the motor board. Default: the shipped '
               'params/motor_board.yaml.'))] = None,
           robot: TheRobotOption = None,
-          seconds: Annotated[float, Option(min=1, max=600, help=(
+          seconds: Annotated[float, Option(metavar='S', min=1, max=600, help=(
               'Time to receive from the motor board, and from ROS.'))] = 3.0,
           skip: Annotated[list[str], Option(metavar='servos|board|ros', help=(
               'Skip a part; may be repeated.'))] = (),
           namespace: NamespaceOption = '',
           json_path: JsonOption = None):
     """
-    Check the real robot before a flight: ports, servos, motor board, MoCap, IMU, clocks.
+    Check ports, devices and clocks of the real robot before flight.
 
     It moves nothing and changes no setting. Exit status 0: nothing failed; 1: something failed.
     Example: beetle_omni check --servo-port /dev/ttyUSB0 --skip board
@@ -358,9 +365,9 @@ def drive(source: Annotated[str, Argument(
           robot: RobotOption = None,
           domain_id: DomainOption = None):
     """
-    Drive a running graph by hand: the target moves at limited speed, within all supervisor checks.
+    Drive a running graph by hand, within all supervisor checks.
 
-    Example: beetle_omni drive keyboard
+    The target moves at limited speed. Example: beetle_omni drive keyboard
     """
     given = dict(locals())
     from beetle_omni_ros.nodes.driver import run_drive
@@ -375,7 +382,7 @@ def joint(paths: Annotated[list[Path], Argument(metavar='LOG...', help=(
           robot: TheRobotOption = None, report: PageOption = None, params: ParamsOption = None,
           json_path: JsonOption = None):
     """
-    Fit one servo model to the first 60 % of response logs; the rest is for validation.
+    Fit one servo model to response logs; the last 40 % validate it.
 
     Several logs of the same servos are fitted together.
 
@@ -398,7 +405,7 @@ def rotor(paths: Annotated[list[Path], Argument(metavar='LOG.csv...', help=(
           robot: TheRobotOption = None, report: PageOption = None, params: ParamsOption = None,
           json_path: JsonOption = None):
     """
-    Fit thrust, torque and lag of a rotor to logs of a force-torque stand.
+    Fit thrust, torque and lag of a rotor to logs of a stand.
 
     Ends with status 3 for the verdict bad_data.
 
@@ -420,7 +427,7 @@ def robot(paths: Annotated[list[Path], Argument(metavar='LOG...', help=(
               'Draw the logs with both robots (.png or .svg).'))] = None,
           json_path: JsonOption = None):
     """
-    Write a robot file with intervals and origins from all logs of servos and rotors.
+    Write a robot file with intervals from logs of servos and rotors.
 
     Example: beetle_omni identify robot slow.csv fast.csv bench.csv --params my_robot.yaml
     """

@@ -71,7 +71,7 @@ ConditionsOption = Annotated[str, Option(
         "nominal: the simulator with the measured parameters; published: with the publication's "
         'randomisation, drawn from --seed.'))]
 SeedOption = Annotated[int, Option(
-    min=0, max=2**31 - 1, help='Seed of random poses and of the simulation.')]
+    metavar='N', min=0, max=2**31 - 1, help='Seed of random poses and of the simulation.')]
 RobotOption = Annotated[Path | None, Option(
     metavar='FILE', help=f'Robot file of estimator and controller. {DEFAULT_ROBOT}')]
 TheRobotOption = Annotated[Path | None, Option(
@@ -90,14 +90,15 @@ PolicyOption = Annotated[Path | None, Option(
 OtherRobotOption = Annotated[bool, Option('--allow-other-robot', help=(
     'Fly a policy although it was trained for other robot parameters.'))]
 DomainOption = Annotated[int | None, Option(
-    min=0, max=101, help='ROS domain. Default: ROS_DOMAIN_ID; of fly, a free one.')]
+    metavar='N', min=0, max=101, help='ROS domain. Default: ROS_DOMAIN_ID; of fly, a free one.')]
 NamespaceOption = Annotated[str, Option(
     metavar='NAME', help="Namespace of the robot's topics in a running graph.")]
 FaultsOption = Annotated[Path | None, Option(
     exists=True, dir_okay=False, metavar='FILE', help=(
-        'Faults with times and durations (YAML, see docs/faults.md).'))]
+        'Faults, all in one flight; their times count from the start of the task (YAML, see '
+        'docs/faults.md).'))]
 JobsOption = Annotated[int | None, Option(
-    '--jobs', '-j', min=1, help='Parallel flights. Default: one on each core.')]
+    '--jobs', '-j', metavar='N', min=1, help='Parallel flights. Default: one on each core.')]
 OutputOption = Annotated[Path | None, Option(
     '--output', '-o', metavar='DIR', help='Folder for page, pictures or Markdown, and JSON.')]
 JsonOption = Annotated[Path | None, Option(

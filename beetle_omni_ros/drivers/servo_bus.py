@@ -262,7 +262,9 @@ class ServoBus:
 
     def reboot(self, index: int):
         """Start the restart of a servo; calls of :meth:`upkeep` finish it in about 0.5 s."""
-        self._recover(self.servos[index], forced=True)
+        servo = self.servos[index]
+        servo.recoveries, servo.kept_off = 0, False     # a missing answer does not end it
+        self._recover(servo, forced=True)
 
     def write_goals(self, tilt: np.ndarray) -> bool:
         """
@@ -529,15 +531,17 @@ class ServoBus:
 
         A restarted servo has lost gains, watchdog, torque and turn count. At the end it has
         torque if the bus is enabled. With ``forced``, and after a shutdown, it is restarted; the
-        ping that it answers starts another recovery.
+        ping that it answers starts another recovery. So does a missing answer, as long as the
+        servo is not kept off.
         """
         link, identifier = self.link, servo.identifier
-        servo.error = link.read(identifier, registers.HARDWARE_ERROR)
-        yield
-        servo.torque = bool(link.read(identifier, registers.TORQUE_ENABLE))
-        yield
-        if servo.torque and not forced:
-            return
+        if not forced:
+            servo.error = link.read(identifier, registers.HARDWARE_ERROR)
+            yield
+            servo.torque = bool(link.read(identifier, registers.TORQUE_ENABLE))
+            yield
+            if servo.torque:
+                return
         if forced or servo.error:
             if not forced and not (self.enabled and servo.recoveries < RECOVERIES
                                    and not servo.error & registers.OVERHEATING):

@@ -33,11 +33,10 @@ from beetle_omni_ros.sim.sensors import Impact, Truth
 STARTS = ('hover', 'moving', 'upside_down')      # default
 ALL_STARTS = (*STARTS, 'random')
 # Landings from a random attitude and healthy flights, which are no faults of a list.
-LANDING = Case('landing', 'flies_on', 'landing from a random attitude', ())
-LANDING_BLIND = Case('landing_without_mocap', 'flies_on',
-                     'landing from a random attitude, motion capture is lost',
-                     (Fault('mocap_lost'),))
-HEALTHY = Case('healthy', 'flies_on', 'poses without a fault', ())
+LANDING = Case('landing', (), what='landing from a random attitude')
+LANDING_BLIND = Case('landing_without_mocap', (Fault('mocap_lost'),),
+                     what='landing from a random attitude, motion capture is lost')
+HEALTHY = Case('healthy', (), what='poses without a fault')
 CONDITIONS = ('nominal', 'published', 'effects')    # of healthy flights
 EFFECTS = {     # of the plant of healthy flights; sizes of docs/gap.md
     'thrust_coefficient': {'scale': 0.95},

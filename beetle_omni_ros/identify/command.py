@@ -34,7 +34,7 @@ def run_identify_joint(paths: Sequence[Path], *, validate: Sequence[Path] = (),
     Arguments are those of `beetle_omni identify joint`.
 
     Returns:
-        results with the keys of INTERFACES: ``joints`` and ``meta``.
+        ``joints`` and ``meta``.
 
     Raises:
         LogError, ParameterError: unusable input.

@@ -16,6 +16,7 @@ from beetle_omni_ros.nodes import runner
 from beetle_omni_ros.nodes.graph import (
     BRIDGES,
     child_environment,
+    COMPOSED,
     Graph,
     plan,
     reserved_domain,
@@ -228,8 +229,8 @@ class Flight(Operator):
     def land(self) -> None:
         """Land if the robot flies, and wait for the motors to stop."""
         self._lands = True
-        if self.state in ('', *MOTORS_OFF):
-            return
+        if self.state in ('', *MOTORS_OFF) or COMPOSED in self._graph.dead():
+            return      # a dead supervisor does not answer, and its clock stands still
         self.show('landing')
         accepted, answer = self.call('land')
         if not accepted:

@@ -1,4 +1,4 @@
-"""Lists of faults: the named ones of the campaign, those of one flight, and those of a text."""
+"""Lists of faults, of a file and of a text."""
 
 from dataclasses import dataclass, make_dataclass, replace
 from pathlib import Path
@@ -19,25 +19,21 @@ OUTCOMES = ('flies_on', 'lands', 'stops', 'refused')
 
 @dataclass(frozen=True)
 class Case:
-    """One named fault of the campaign."""
+    """One named fault of a file."""
 
     name: str = parameter(doc='')
-    expected: str = parameter(doc='', choices=OUTCOMES)
-    what: str = parameter(doc='')       # description
-    strike: tuple = parameter(doc='')   # its faults; ``at`` counts from the onset
-
-
-def _content(path, kind):
-    """Value of the key 'faults', the only one of a file."""
-    kind = make_dataclass('File', [('faults', kind, parameter(doc=''))])
-    return bind(kind, load_yaml(path), str(path)).faults
+    strike: tuple = parameter(doc='')   # faults; ``at`` counts from the onset, or in one flight
+                                        # from the start of its task
+    expected: str = parameter('flies_on', doc='', choices=OUTCOMES)
+    what: str = parameter('', doc='')   # description
 
 
 def load_cases(path: str | Path | None = None) -> dict[str, Case]:
     """Read named faults, by default the shipped ones; a ParameterError has file and key."""
     path = path or share_path('params/faults.yaml')
+    file = make_dataclass('File', [('faults', dict, parameter(doc=''))])
     cases = {}
-    for name, entry in _content(path, dict).items():
+    for name, entry in bind(file, load_yaml(path), str(path)).faults.items():
         case = bind(Case, entry | {'name': name} if isinstance(entry, dict) else entry, str(path),
                     f'faults.{name}')
         cases[name] = replace(case, strike=tuple(
@@ -54,35 +50,19 @@ def chosen(cases: dict[str, Case], names: list[str]) -> list[Case]:
     return [cases[name] for name in names]
 
 
-def _fault(entry, at, key='kind'):
-    """Fault of a mapping whose ``key`` is the kind."""
-    if not isinstance(entry, dict) or not isinstance(entry.get(key), str):
-        raise ParameterError(f"{at}: expected a mapping with the key '{key}'")
+def _fault(entry, at):
+    if not isinstance(entry, dict) or not isinstance(entry.get('kind'), str):
+        raise ParameterError(f"{at}: expected a mapping with the key 'kind'")
     try:
-        return Fault(entry[key], **{str(name): value for name, value in entry.items()
-                                    if name != key})
+        return Fault(entry['kind'], **{str(key): value for key, value in entry.items()
+                                       if key != 'kind'})
     except ParameterError as error:
         raise ParameterError(f'{at}: {error}') from None
 
 
 def load_faults(path: str | Path) -> list[Fault]:
-    """
-    Read the faults of one flight, each with the keys what, at [s], duration [s] and numbers.
-
-    ``what`` is a name of the shipped list without numbers, or a kind. A ParameterError has file
-    and key.
-    """
-    named, faults = load_cases(), []
-    for k, entry in enumerate(_content(path, tuple), 1):
-        at = f'{path}: fault {k}'
-        what = entry.get('what') if isinstance(entry, dict) else None
-        if isinstance(what, str) and what in named and set(entry) <= {'what', 'at', 'duration'}:
-            times = {key: value for key, value in entry.items() if key != 'what'}
-            faults += [_fault({'kind': fault.kind, **fault.numbers, 'duration': fault.duration,
-                               **times}, at) for fault in named[what].strike]
-        else:
-            faults.append(_fault(entry, at, 'what'))
-    return faults
+    """Read all faults of a file, for one flight."""
+    return [fault for case in load_cases(path).values() for fault in case.strike]
 
 
 def parse_faults(text: str) -> list[Fault]:

@@ -19,7 +19,7 @@ from beetle_omni_ros.identify.gap.signals import Signals
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 MOTION = Motion(9, 12.0)
-FINE = 1e-4
+FINE = 2e-4
 JOINT = ROBOT.joints
 
 

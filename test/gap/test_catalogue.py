@@ -1,6 +1,4 @@
-"""Every name of INTERFACES is in the catalogue, with a complete description."""
-
-
+"""Every name that programs rely on is in the catalogue, with a complete description."""
 
 from beetle_omni_ros.robot.effects import CATALOGUE
 

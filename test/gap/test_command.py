@@ -4,6 +4,8 @@ from dataclasses import replace
 from io import StringIO
 import json
 from pathlib import Path
+import re
+import runpy
 import shutil
 import sys
 
@@ -12,6 +14,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+import beetle_omni_ros
 from beetle_omni_ros import cli
 from beetle_omni_ros.cli import spread
 from beetle_omni_ros.identify.gap import workers
@@ -21,6 +24,7 @@ from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.bag import names_of, read_messages
 from beetle_omni_ros.runs.bag_writer import BagWriter
 
+EXAMPLE = Path(__file__).parents[2] / 'examples' / 'gap_two_bags.py'
 TRUE = np.array(WIND)
 
 
@@ -53,12 +57,18 @@ def test_the_hidden_wind_is_named_with_its_size_and_closes_the_held_out_gap(made
 
 
 @pytest.mark.skipif(sys.platform != 'linux', reason='forks on Linux only')
-def test_two_cores_give_the_same_result_as_one(made, monkeypatch):
+def test_the_example_on_two_cores_gives_the_same_result(made, monkeypatch, capsys):
     _, results, _ = made
+    found = []
     monkeypatch.setattr(workers, 'width', lambda: 2)
-    again = gap_results([flight('windy_0')], [flight('windy_1')], console=quiet())
+    monkeypatch.setattr(beetle_omni_ros, 'find_gap', lambda *runs, find=beetle_omni_ros.find_gap,
+                        **options: found.append(find(*runs, **options)) or found[0])
+    monkeypatch.setattr(sys, 'argv', [str(EXAMPLE), str(flight('windy_0')),
+                                      str(flight('windy_1'))])
+    runpy.run_path(str(EXAMPLE), run_name='__main__')
+    assert re.match(r'named: gap [\d.]+ before, [\d.]+ after.*\nwind', capsys.readouterr().out)
     for name in results.keys() - {'meta'}:
-        assert again[name] == results[name], name
+        assert found[0][name] == results[name], name
 
 
 def test_the_json_has_the_fixed_keys(made):

@@ -1,8 +1,7 @@
-"""Servos are recovered from artificial logs, and real ones are predicted."""
+"""Servos are recovered from artificial logs."""
 
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,14 +9,10 @@ from servo_logs import COUNT, log_of, sweep
 
 from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.servo.joint import identify, interval, joint_results
-from beetle_omni_ros.identify.servo.log import read_joint_log
 from beetle_omni_ros.identify.servo.model import INDEX
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 ROBOT = RobotParameters.load()
-DATA = Path(__file__).resolve().parents[3] / 'shared' / 'data'
-REAL = [path for path in (DATA / f'joint_{name}.csv' for name in (
-    'fading_50Hz', 'fast_50Hz', 'response_100Hz')) if path.is_file()]
 PARTS = {'slow': {'duration': 6.0},
          'fast': {'duration': 4.0, 'periods': (0.3, 0.6), 'amplitudes': (0.3, 0.6)}}
 SERVOS = ({'coulomb': 0.013, 'frequency': 47.0, 'delay': 0.015},
@@ -91,40 +86,3 @@ def test_samples_of_the_validation_part_are_not_used_by_the_fit():
     one, other = (identify([each], ROBOT) for each in (log, replace(log, measured=measured)))
     assert one.chosen.entries == other.chosen.entries
     assert one.values() == pytest.approx(other.values(), rel=1e-9)
-
-
-def line_errors(log, joint, halves):
-    """Held-out RMS [rad] of gain * play(command(t - delay)) + offset, of the best fit."""
-    rows = np.flatnonzero(log.fresh & (log.t >= log.t[0] + 0.3))
-    fitted = rows < log.end_of(0.6)
-    read, t = log.measured[joint, rows], log.read_t[rows]
-
-    def one(delay, half):
-        x = log.command_at(joint, t - delay)
-        if half:
-            shown = np.empty_like(x)
-            last = x[0]
-            for k, value in enumerate(x):
-                last = shown[k] = min(max(last, value - half), value + half)
-            x = shown
-        a = np.stack([x, np.ones_like(x)], axis=1)
-        solution = np.linalg.lstsq(a[fitted], read[fitted], rcond=None)[0]
-        error = a @ solution - read
-        return np.mean(error[fitted]**2), np.sqrt(np.mean(error[~fitted]**2))
-
-    best = min((one(delay, half) + (delay, half) for delay in np.arange(0.0, 0.0901, 0.004)
-                for half in halves[::4]))
-    return min(one(best[2] + d, h) for d in np.arange(-0.004, 0.0041, 0.0005)
-               for h in halves[np.abs(halves - best[3]) < 0.0041])[1]
-
-
-@pytest.mark.skipif(not REAL, reason='the measured logs are not here')
-@pytest.mark.parametrize('path', REAL, ids=lambda path: path.stem)
-def test_real_servos_are_predicted_as_well_as_by_a_line_with_play(path):
-    log = read_joint_log(path)
-    results = joint_results(identify([log], ROBOT), [], ROBOT)
-    for k, joint in enumerate(results['joints']):
-        line = min(line_errors(log, k, np.zeros(1)),
-                   line_errors(log, k, 1e-3 * np.arange(41)))
-        assert joint['heldout_rms_rad'] < 1.1 * line, (k + 1, line)
-        assert joint['heldout_rms_rad'] < 0.5 * joint['published_heldout_rms_rad']

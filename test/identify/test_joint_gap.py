@@ -1,4 +1,4 @@
-"""Response logs against a robot file: changes are named, and a corrected file shows no gap."""
+"""Response logs and a robot file: changes are named, a corrected file has no gap, predictions."""
 
 from dataclasses import replace
 import json
@@ -11,7 +11,7 @@ from servo_logs import log_of, servo, sweep, write
 from beetle_omni_ros import cli
 from beetle_omni_ros.identify.gap.apply import effects_with
 from beetle_omni_ros.identify.servo.compare import changes, compare, gap_of
-from beetle_omni_ros.identify.servo.joint import identify
+from beetle_omni_ros.identify.servo.joint import identify, joint_results
 from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
 from beetle_omni_ros.identify.servo.model import simulate
 from beetle_omni_ros.identify.servo.robot import file_sets, own_delay
@@ -44,9 +44,11 @@ def made(seed, *changed, **both):
                                for band, own in zip(BANDS, changed, strict=True)], seed)
 
 
-def judged(log, file_robot=None):
+def judged(log, file_robot=None, apart=None):
+    """Gap to a robot file; ``apart`` is the log's own identification, the noise floor."""
     file_robot = file_robot or robot()
-    return gap_of(compare(log, file_robot), identify([log], file_robot), file_robot)
+    apart = apart or identify([log], file_robot)
+    return gap_of(compare(log, file_robot), apart, file_robot)
 
 
 def corrected(file_robot, result):
@@ -103,7 +105,8 @@ def line_zero(log, joint):
 
 def test_a_zero_beside_an_encoder_error_is_that_of_a_line_fit():
     log = made(6, {'offset': -0.012, 'cosine': 0.1}, {})
-    result = judged(log)
+    apart = identify([log], robot())
+    result = judged(log, robot(), apart)
     assert {(n, effect['joint']) for effect in result['effects'] for n in effect['names']} == {
         ('joint_offset', 1), ('joint_encoder_error', 1)}
     zero, = (effect['parameters']['offset'] for effect in result['effects']
@@ -111,7 +114,7 @@ def test_a_zero_beside_an_encoder_error_is_that_of_a_line_fit():
     low, high = zero['interval']
     assert low < -line_zero(log, 0) < high and high - low < 0.004
     assert zero['written'] == pytest.approx(0.012, abs=0.002) and zero['written'] < low
-    assert judged(log, corrected(robot(), result))['verdict'] == 'no_gap'
+    assert judged(log, corrected(robot(), result), apart)['verdict'] == 'no_gap'
 
 
 @pytest.mark.parametrize(('changed', 'both', 'name'), [
@@ -134,11 +137,12 @@ def test_a_change_is_named_alone(changed, both, name):
     (1, ()), (21, ({'gain': 0.03, 'offset': -0.01}, {'gain': -0.006}))])
 def test_a_corrected_log_has_no_gap(seed, changed):
     log = made(seed, *changed)
-    result = judged(log, SHIPPED)
+    apart = identify([log], SHIPPED)
+    result = judged(log, SHIPPED, apart)
     assert result['verdict'] in ('named', 'named_set') and result['gap_before'] > 10
     for effect in result['effects']:
         assert effect['evidence']['delta_bic'] > 0 and effect['evidence']['cv_gain'] > 0
-    again = judged(log, corrected(SHIPPED, result))
+    again = judged(log, corrected(SHIPPED, result), apart)
     assert again['verdict'] == 'no_gap' and again['gap_before'] < 1.2
 
 
@@ -179,12 +183,52 @@ def test_the_command_line_writes_a_file_that_explains_the_log(tmp_path, capsys):
         assert new['published_heldout_rms_rad'] < 1.3 * old['heldout_rms_rad']
 
 
-@pytest.mark.skipif(not REAL, reason='the measured logs are not here')
-@pytest.mark.parametrize('path', REAL, ids=lambda path: path.stem)
-def test_a_real_log_has_no_gap_to_its_own_correction(path):
-    log = read_joint_log(path)
-    result = judged(log, SHIPPED)
+@pytest.fixture(scope='module', params=REAL, ids=lambda path: path.stem)
+def real(request):
+    """Measured log and its own identification."""
+    log = read_joint_log(request.param)
+    return log, identify([log], SHIPPED)
+
+
+def test_a_real_log_has_no_gap_to_its_own_correction(real):
+    log, apart = real
+    result = judged(log, SHIPPED, apart)
     assert {'joint_bandwidth', 'joint_friction'} <= {n for e in result['effects']
                                                      for n in e['names']}
-    again = judged(log, corrected(SHIPPED, result))
+    again = judged(log, corrected(SHIPPED, result), apart)
     assert again['verdict'] == 'no_gap', names(again)
+
+
+def line_errors(log, joint, halves):
+    """Held-out RMS [rad] of gain * play(command(t - delay)) + offset, of the best fit."""
+    rows = np.flatnonzero(log.fresh & (log.t >= log.t[0] + 0.3))
+    fitted = rows < log.end_of(0.6)
+    read, t = log.measured[joint, rows], log.read_t[rows]
+
+    def one(delay, half):
+        x = log.command_at(joint, t - delay)
+        if half:
+            shown = np.empty_like(x)
+            last = x[0]
+            for k, value in enumerate(x):
+                last = shown[k] = min(max(last, value - half), value + half)
+            x = shown
+        a = np.stack([x, np.ones_like(x)], axis=1)
+        solution = np.linalg.lstsq(a[fitted], read[fitted], rcond=None)[0]
+        error = a @ solution - read
+        return np.mean(error[fitted]**2), np.sqrt(np.mean(error[~fitted]**2))
+
+    best = min((one(delay, half) + (delay, half) for delay in np.arange(0.0, 0.0901, 0.004)
+                for half in halves[::4]))
+    return min(one(best[2] + d, h) for d in np.arange(-0.004, 0.0041, 0.0005)
+               for h in halves[np.abs(halves - best[3]) < 0.0041])[1]
+
+
+def test_real_servos_are_predicted_as_well_as_by_a_line_with_play(real):
+    log, apart = real
+    results = joint_results(apart, [], SHIPPED)
+    for k, joint in enumerate(results['joints']):
+        line = min(line_errors(log, k, np.zeros(1)),
+                   line_errors(log, k, 1e-3 * np.arange(41)))
+        assert joint['heldout_rms_rad'] < 1.1 * line, (k + 1, line)
+        assert joint['heldout_rms_rad'] < 0.5 * joint['published_heldout_rms_rad']

@@ -1,4 +1,4 @@
-"""Tasks: the properties in INTERFACES."""
+"""Tasks: size and distribution of their poses, disturbances and trajectories."""
 
 import numpy as np
 import pytest

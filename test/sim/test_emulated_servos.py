@@ -86,3 +86,13 @@ def test_the_sdk_reads_writes_pings_and_receives_errors():
         assert handler.read1ByteTxRx(port, 1, 64) == (0, 0, 0)
         assert bus.refusals == 1
         port.closePort()
+
+
+def test_a_stall_does_not_split_the_answers_to_one_request():
+    bus = EmulatedServoBus()
+    bus.close()     # ends its thread
+    sent, request = [], packet(emulated.BROADCAST, emulated.SYNC_READ,
+                               bytes((126, 0, 10, 0, 1, 2, 3, 4)))
+    bus._read, bus._send = (lambda: request), sent.append
+    bus._serve(time.monotonic())
+    assert [len(list(packets(bytearray(data)))) for data in sent] == [4]

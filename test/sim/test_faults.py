@@ -241,15 +241,15 @@ def test_the_shipped_list_and_the_page_contain_every_kind():
     assert flown == set(KINDS) <= described
 
 
-def test_a_fault_file_of_one_flight_is_read(tmp_path):
+def test_a_file_is_a_list_of_cases_and_the_faults_of_one_flight(tmp_path):
     path = tmp_path / 'faults.yaml'
-    path.write_text('faults:\n- {what: rotor_stops, at: 3, duration: 2, rotor: 2}\n'
-                    '- {what: servo_bus_lost, at: 4}\n- {what: rotor_blinks, at: 1}\n')
-    faults = load_faults(path)
-    assert faults[0] == Fault('rotor_stops', 3.0, 2.0, rotor=2)
-    assert [(fault.kind, fault.at) for fault in faults[1:3]] == [
-        ('servo_bus_lost', 4.0), ('servo_limp', 4.0)]
-    assert faults[-1] == Fault('rotor_stops', 1.0, 0.03, rotor=1)
+    path.write_text('faults:\n  two: {strike: [{kind: rotor_stops, at: 3, duration: 2, rotor: 2}, '
+                    '{kind: joints_lost}]}\n  last: {expected: lands, what: no pose, '
+                    'strike: [{kind: mocap_lost}]}\n')
+    two, last = load_cases(path).values()
+    assert two.strike == (Fault('rotor_stops', 3.0, 2.0, rotor=2), Fault('joints_lost'))
+    assert (two.expected, last.expected, last.what) == ('flies_on', 'lands', 'no pose')
+    assert load_faults(path) == [*two.strike, *last.strike]
 
 
 def test_short_texts_describe_a_fault():

@@ -9,7 +9,8 @@ from beetle_omni_ros.control import registry
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.runs.bag import read_bag
 
-FAULTS = 'faults: [{what: rotor_half, at: 100}, {what: mocap_lost, at: 3, duration: 0.3}]\n'
+FAULTS = 'faults: {after: {strike: [{kind: rotor_weak, rotor: 1, share: 0.5, at: 100}]}, ' \
+    'within: {strike: [{kind: mocap_lost, at: 3, duration: 0.3}]}}\n'
 
 
 def write_faults(folder):

@@ -48,7 +48,7 @@ class Analysis:
     All results.
 
     Attributes:
-        verdict: verdict as in INTERFACES.
+        verdict: a key of `results.WORDS`.
         reason: reason of the verdict.
         keys: all keys by name.
         found: result of the search.

@@ -1,4 +1,4 @@
-"""The analysis as JSON (docs: INTERFACES), as tables, and as one sentence."""
+"""The analysis as JSON, as tables, and as one sentence."""
 
 from dataclasses import asdict
 import math
@@ -25,7 +25,7 @@ SPELLED = {'imu': 'IMU', 'mocap': 'MoCap'}
 
 
 def results(a: Analysis, robot: RobotParameters, p: GapParameters, meta: dict) -> dict:
-    """Results as plain data with the keys of INTERFACES."""
+    """Plain data of ``gap --json``; ``meta`` is added."""
     judged = a.gaps.get(HORIZONS[JUDGED], {})
     result = {
         'verdict': a.verdict, 'reason': a.reason, 'closure': judged.get('closure'),

@@ -98,7 +98,7 @@ def compare(log: JointLog, robot: RobotParameters) -> Found:
 
 def gap_of(found: Found, apart: Found, robot: RobotParameters) -> dict:
     """
-    Verdict, effects and errors, with the keys of INTERFACES.
+    Verdict, effects and errors, with the keys of a gap of flights (`gap/results.py`).
 
     Args:
         found: comparison with the robot file.

@@ -67,7 +67,7 @@ def interval(found: Found, trial: Trial, unit: int, name: str) -> tuple[float, f
 
 
 def joint_results(found: Found, validations: Sequence[JointLog], robot: RobotParameters) -> dict:
-    """Results with the keys of INTERFACES: ``joints`` for the joints of the first log."""
+    """Return ``meta``, ``joints`` (those of the first log) and ``text``, their summary."""
     log, plan = found.servos.logs[0], separating_sine(found)
     joints = [_joint(found, unit, validations, robot, plan)
               for unit, (k, *_) in enumerate(found.servos.units) if k == 0]

@@ -326,8 +326,12 @@ class EmulatedServoBus(Device):
             servo.advance(now, self.faults.supply_voltage)
             if servo['ID'] in self.faults.overload and servo.torque:
                 servo.trip(OVERLOAD)
+        # In one write, so that a stall of this thread does not split the answers to one request.
+        due = b''
         while self._due() <= now:
-            self._send(self._answers.popleft()[1])
+            due += self._answers.popleft()[1]
+        if due:
+            self._send(due)
 
     def _due(self):
         return self._answers[0][0] if self._answers else inf
