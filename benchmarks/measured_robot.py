@@ -1,6 +1,5 @@
 """
-False alarms and reached poses on the measured robot, on robots drawn from its intervals, and on
-robots that no controller has met.
+False alarms and reached poses on the measured robot, its drawn variants, and unmet robots.
 
     python benchmarks/measured_robot.py [--controllers nmpc,rl] [--hours 1] [--draws 20]
                                         [--unmet 0] [--seed 0] [--robot FILE] [--plant measured]
@@ -65,8 +64,8 @@ def unmet(rng: np.random.Generator) -> RobotParameters:
     Draw a robot that differs from the shipped one.
 
     Mass, inertia and arms by +-30 %, thrust and lags by +-25 %; a third each have one rotor that
-    loses up to 30 % and a payload of up to 1 kg, 8 cm below the centre. Robots that are impossible,
-    or cannot hover at every attitude with a half empty pack, are drawn again.
+    loses up to 30 % and a payload of up to 1 kg, 8 cm below the centre. An impossible robot is
+    drawn again, also one that cannot hover at every attitude with a half empty pack.
     """
     shipped = RobotParameters.load()
     rotors, joints = shipped.rotors, shipped.joints
