@@ -112,6 +112,18 @@ def test_only_its_latest_commands_put_the_policy_in_charge(tmp_path):
     assert charges == [False, True, False, False]
 
 
+def test_the_disturbance_of_another_robot_is_its_difference_from_that_of_the_training(tmp_path):
+    heavy = replace(ROBOT, mass=ROBOT.mass + 0.5)
+    policy = controller(write(tmp_path / 'p.onnx', memory=True), heavy, allow_other_robot=True)
+    still = {'velocity': np.zeros(3), 'quaternion': LEVEL, 'angular_velocity': np.zeros(3),
+             'tilt': np.zeros(4)}
+    for k in range(400):
+        stamp = 0.01 * (k + 1)
+        hover = Command(stamp - 0.01, np.zeros(4), np.full(4, heavy.hover_thrust))
+        policy.step(state(stamp, hover, **still), TARGET)
+    assert policy.diagnostics()['force_estimate_N'] == pytest.approx(0.5 * ROBOT.gravity, abs=0.1)
+
+
 def test_the_policy_with_memory_observes_a_push_in_body_axes(tmp_path):
     # action = disturbance_force / 20, on the rotors
     weights = np.zeros((39, 8))
