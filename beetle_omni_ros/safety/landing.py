@@ -11,6 +11,7 @@ from beetle_omni_ros.robot.degraded import FLYING_MARGIN, Holding
 from beetle_omni_ros.safety.events import ERROR
 from beetle_omni_ros.safety.inputs import Inputs
 from beetle_omni_ros.safety.way import climb, coasted, halting, inclination, plan, Ramp, Way
+from beetle_omni_ros.safety.wrench import NEAR_GROUND
 
 ESCAPE_TIME = 1.5       # [s] of the attitude of an escape, before the turn to level
 ACCELERATION = 0.5      # [m/s^2] of climb and descent
@@ -29,6 +30,10 @@ TURN_HEIGHT = 1.2       # [m] above the ground to turn over with a weak pack, wh
 LEVEL_RATE = 0.8        # [rad/s] from upside down to level in 4 s
 LEVEL_FIRST = 0.3       # [rad] a larger inclination is levelled before the descent
 BLIND_LIMIT = 0.3       # [s] without any sensor the attitude is then unknown: motors off
+# Silent joints that are not where they were commanded
+CONTRADICTED = 0.5      # [-] of the weight, by which accelerometer and modelled force differ:
+                        # joints 0.5 rad beside their commands; the lag of a turn is below 0.1 rad
+CONTRADICTED_TIME = 0.3     # [s] in which the robot gains 1.5 m/s
 # The ground
 SPEED = 0.3             # [m/s] of the descent, harmless for the legs
 TARGET_LEAD = 0.5       # [m] depth of the target below the robot
@@ -113,7 +118,7 @@ class Landing:
     def __init__(self, inputs: Inputs, hover: Fallback):
         self._inputs, self._hover = inputs, hover
         self.grounded, self.given_up = False, ''
-        self._standing_for = self._still_for = self._blind_for = 0.0
+        self._standing_for = self._still_for = self._blind_for = self._contradicted_for = 0.0
         self._support = 0.0     # share of the weight that the rotors do not carry, filtered
         self._rise = 0.0        # of the present plan, before a turn over [m]
         if 'estimator_wrong' in inputs.faults or inputs.ekf.silent:
@@ -206,6 +211,7 @@ class Landing:
         height = max(reference.position[2], state.position[2] - TARGET_LEAD)
         reference = replace(reference, position=np.array([*reference.position[:2], height]))
         self._feel_ground(state, dt, reference.velocity[2])
+        self._doubt_joints(state, dt)
         # Rates from MoCap only are late and noisy: no update of the disturbance.
         self._hover.observe(state, free=self._inputs.backup.imu_alive)
         return self._hover.step(state, reference)
@@ -231,3 +237,15 @@ class Landing:
         self._standing_for = self._standing_for + dt if stands else 0.0
         self._still_for = self._still_for + dt if no_imu and sinking and still else 0.0
         self.grounded = self._standing_for >= GROUND_TIME - 1e-9 or self._still_for >= STILL_TIME
+
+    def _doubt_joints(self, state, dt):
+        """Without feedback the joints may have stopped: motors off before the robot flies away."""
+        inputs, sample, contradicted = self._inputs, self._inputs.backup.sample, False
+        near = inputs.height is not None and inputs.height < NEAR_GROUND
+        if inputs.joints.silent and not inputs.imu.silent and sample is not None and not near:
+            force, _ = inputs.allocator.wrench(state.tilt, inputs.thrusts)
+            missing = np.linalg.norm(force / inputs.allocator.mass - sample[1])
+            contradicted = bool(missing > CONTRADICTED * inputs.robot.gravity)
+        self._contradicted_for = self._contradicted_for + dt if contradicted else 0.0
+        if self._contradicted_for >= CONTRADICTED_TIME:
+            self.given_up = 'the silent joints are not where they were commanded'

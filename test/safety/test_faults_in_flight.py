@@ -55,6 +55,20 @@ def test_limits_hold_while_landing(spoil):
     assert rig.supervisor.state == 'emergency_stop'
 
 
+def test_silent_joints_that_act_beside_their_commands_stop_the_motors():
+    rig = flown()
+    rig.alive.discard('joints')
+    rig.velocity = np.array([0.0, 0.0, -0.3])
+    rig.run(1.0)
+    assert rig.supervisor.reported_state == 'landing:joints_lost'
+    follows = rig._specific_force
+    rig._specific_force = lambda tilt: follows(tilt + [1.0, 1.0, -1.0, -1.0])
+    rig.run(0.2)
+    assert rig.supervisor.state == 'landing'
+    rig.run(0.3)
+    assert rig.supervisor.state == 'emergency_stop'
+
+
 def test_landing_and_fallback_end_in_time(monkeypatch):
     monkeypatch.setattr('beetle_omni_ros.safety.supervisor.LANDING_LIMIT', 10.0)
     monkeypatch.setattr('beetle_omni_ros.safety.supervisor.FALLBACK_TIME', 3.0)
