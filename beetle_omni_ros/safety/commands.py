@@ -18,9 +18,9 @@ RETURN_AFTER = 0.5      # [s] of valid commands before a controller gets control
 STALE_AFTER = 0.05      # [s] a command computed from an older state is refused
 AHEAD = 0.02            # [s] a stamp farther in the future comes from another clock
 OVERSTEP = 0.25         # [-] of a range: 5 N, 1 rad. A wrong unit exceeds it by a factor of 3
-THRUST_STEP = 7.5       # [N] a larger jump is a spike: the hover thrust, while by its lag a rotor
-                        # changes by 2 N a period at most. A jump of tilts is none: by far targets
-                        # on both sides a policy sets the rate of a joint
+STEP = 1.0, 7.5         # [rad] and [N] at once: ten times what a joint can turn in a period, and
+                        # four times what a rotor can change. A jump of tilts alone is none: by far
+                        # targets on both sides a policy sets the rate of a joint
 SAME = 10               # commands or estimates in a row that are equal to the last digit
 
 
@@ -114,7 +114,8 @@ class CommandStream:
             return FROZEN, None
         # Compared with the previous command, accepted or not: a single spike is refused, a real
         # step is delayed by one period.
-        jumps = np.abs(clean.thrust - before.thrust).max() > THRUST_STEP
+        jumps = np.abs(clean.tilt - before.tilt).max() > STEP[0] \
+            and np.abs(clean.thrust - before.thrust).max() > STEP[1]
         return (JUMP, None) if jumps and stamp - before.stamp <= TIMEOUT else ('', clean)
 
 

@@ -53,13 +53,13 @@ def test_a_small_excess_is_clipped():
 
 
 def test_a_single_spike_is_refused_and_a_real_step_loses_one_command():
-    checked, far = stream(), (3.0, 0.2, 0.3, 0.4)
+    checked, far = stream(), (0.1 + commands.STEP[0] + 0.1, 0.2, 0.3, 0.4)
     assert checked.offer(command(), NOW) == ''
     for stamp in (NOW, NOW - 0.01):
         assert checked.offer(command(stamp), NOW) == 'repeated or older stamp'
-    assert checked.offer(command(NOW + 0.01, thrust=(16, 7, 8, 9)), NOW + 0.01) == commands.JUMP
-    assert checked.offer(command(NOW + 0.02, thrust=(16, 7, 8, 8)), NOW + 0.02) == ''
-    assert checked.offer(command(NOW + 0.03, far, (10, 10, 10, 10)), NOW + 0.03) == ''
+    assert checked.offer(command(NOW + 0.01, far, (16, 16, 16, 16)), NOW + 0.01) == commands.JUMP
+    assert checked.offer(command(NOW + 0.02, far, (16, 16, 16, 15)), NOW + 0.02) == ''
+    assert checked.offer(command(NOW + 0.03, far, (1, 1, 1, 1)), NOW + 0.03) == ''
 
 
 def test_far_tilts_on_both_sides_with_calm_thrusts_keep_control_and_random_commands_lose_it():
