@@ -89,7 +89,8 @@ class TiltableQuadrotorEnv:
         self._finish = self._after_physics
         if compiled if compiled is not None else self.device.type == 'cuda':
             self._finish = torch.compile(self._after_physics, fullgraph=True, dynamic=False)
-        self.state['estimate'] = self._outside(self.state)
+        if parameters.memory:
+            self.state['estimate'] = self._outside(self.state)
         self.observation, self.critic = self._observe(self.state, batch.Draw(numbers[:, 138:]))
         self.reward = torch.zeros(self.num_envs, device=self.device)
         self.done, self.timeout = self.reward > 0, self.reward > 0
@@ -162,8 +163,8 @@ class TiltableQuadrotorEnv:
         new = self._retarget(new, due, rotation, draw)
         self._replays.step(s, new, self._starts.draw(draw),
                            {'due': due, 'done': done, 'missed': missed}, draw)
-        # The estimate of a real robot has settled before its first target.
-        new['estimate'] = torch.where(done[:, None], self._outside(new), new['estimate'])
+        if self.cfg.memory:     # the estimate of a real robot has settled before its first target
+            new['estimate'] = torch.where(done[:, None], self._outside(new), new['estimate'])
         observation, critic = self._observe(new, draw)
         return new, observation, critic, reward, done, timeout, tally
 
@@ -203,9 +204,9 @@ class TiltableQuadrotorEnv:
             target_left=s['target_left'] - 1, deepest=torch.maximum(s['deepest'], depth),
             past_motion=torch.cat((motion[:, None], s['past_motion'][:, :3]), 1),
             past_tilt=torch.cat((s['x'][:, None, model.TILT], s['past_tilt'][:, :1]), 1),
-            trim=self._trim(s, x),
-            estimate=s['estimate'])
-        new['estimate'] = self._disturbance_estimate(s, new)
+            trim=self._trim(s, x))
+        if self.cfg.memory:
+            new['estimate'] = self._disturbance_estimate(s, new)
         return new
 
     def _trim(self, s, x):
