@@ -55,6 +55,8 @@ FILES = {
     'recording.yaml': ('identify.recording.limits:RecordingLimits',
                        'Limits of the checks of a recording against itself.'),
     'train.yaml': ('train.parameters:TrainParameters', 'The training of a policy.'),
+    'train_any.yaml': ('train.parameters:TrainParameters',
+                       'The training for robots that differ.'),
     'train_published.yaml': ('train.parameters:TrainParameters',
                              'The training with the settings of the publication.'),
     'identify.yaml': ('identify.parameters:IdentifyParameters',
