@@ -15,11 +15,22 @@ from beetle_omni_ros.robot.degraded import sphere
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.train import batch
-from beetle_omni_ros.train.model import actuators, ARM, GAIN, nominal_body
+from beetle_omni_ros.train.model import (
+    ACTUATORS,
+    actuators,
+    ARM,
+    DAMPING,
+    GAIN,
+    LAG,
+    nominal_body,
+)
 from beetle_omni_ros.train.parameters import STRATA, TrainParameters
 
 NEAR_POSITION, NEAR_ANGLE = 0.3, 0.6   # [m], [rad] of a target near the present pose
 MOVING_SPEED, MOVING_RATE = 1.5, 3.0   # [m/s], [rad/s] largest of a moving start, each axis
+# Places of damping and lag among the drawn quantities of the actuators.
+_DAMPING, _LAG = (slice(part.start - ACTUATORS.start, part.stop - ACTUATORS.start)
+                  for part in (DAMPING, LAG))
 DRAWN = 2048    # robots from the measured intervals, of which the robots of the training are made
 LONGEST_DELAY = 2 * batch.PERIOD    # [s] of the stored commands and tilts
 DIRECTIONS = 200     # of up in the body, for the thrust that a robot needs to hover
@@ -164,8 +175,8 @@ class Starts:
         share = torch.cat((servo.expand(-1, drawn.shape[1] - 3), rotor, servo, rotor), -1)
         made = torch.maximum(self._nominal + share * (drawn - self._nominal), self._least)
         slower = 1 + d.around(self._p.random.lag_scale, 2)
-        made = torch.cat((made[:, :4], made[:, 4:8] * slower[:, :1], made[:, 8:20],
-                          made[:, 20:21] * slower[:, 1:], made[:, 21:]), -1)
+        made[:, _DAMPING] *= slower[:, :1]
+        made[:, _LAG] *= slower[:, 1:]
         return made[:, :-2], made[:, -2:] - self._nominal[-2:]
 
     def _randomisation(self, d):

@@ -12,6 +12,7 @@ from beetle_omni_ros.train.batch import Draw
 from beetle_omni_ros.train.model import (
     ACTUATORS,
     actuators,
+    DAMPING,
     LAG,
     nominal_body,
     STIFFNESS,
@@ -120,6 +121,18 @@ def test_rotors_hold_a_strong_force_with_bounded_thrust_in_every_direction():
         <= env.cfg.random.strong_force + 1e-3
     assert (thrust / size[:, None]).mean(0).abs().max() < 0.06
     assert not env.state['other_wrench'].any()
+
+
+def test_slower_actuators_have_more_damping_and_lag_alone():
+    nominal, other = (quiet({'random.lag_scale': scale}, robots=500).state['body'][:, ACTUATORS]
+                      for scale in (0.0, 0.25))
+    ratio = (other / nominal).nan_to_num(1.0)
+    for part in (DAMPING, LAG):
+        own = ratio[:, part.start - 7:part.stop - 7]
+        assert (own == own[:, :1]).all() and 0.75 <= float(own.min()) < 0.76
+        assert 1.24 < float(own.max()) <= 1.2501
+        ratio[:, part.start - 7:part.stop - 7] = 1.0
+    assert (ratio == 1.0).all()
 
 
 def test_drawn_actuators_are_those_of_robots_that_the_robot_file_draws():
