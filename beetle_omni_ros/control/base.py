@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import inf, isfinite, sqrt
 from pathlib import Path
 import sysconfig
@@ -91,9 +91,9 @@ class Reference:
 
 
 @dataclass(frozen=True)
-class PoseTarget:
+class PoseTarget(Reference):
     """
-    A pose to reach and hold.
+    A pose to reach and hold, at rest.
 
     Attributes:
         position: (3,) in world [m].
@@ -102,13 +102,9 @@ class PoseTarget:
 
     """
 
-    position: np.ndarray
-    quaternion: np.ndarray
+    velocity: np.ndarray = field(init=False, default_factory=lambda: AT_REST)
+    angular_velocity: np.ndarray = field(init=False, default_factory=lambda: AT_REST)
     stamp: float = 0.0
-
-    def at(self, time: float) -> Reference:
-        """The reference at ``time``: the same pose at rest."""
-        return Reference(self.position, self.quaternion, AT_REST, AT_REST)
 
     def same_pose(self, other: PoseTarget) -> bool:
         """Whether another target is the same pose."""

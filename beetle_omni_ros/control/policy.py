@@ -88,13 +88,12 @@ class PolicyController:
             observation += disturbed(state, self._estimator.disturbance)
         action = self.network(observation)
         values = [s * a + o for a, o, s in zip(action, self._offset, self._scale)]
-        if all(-ACTION_LIMIT <= a <= ACTION_LIMIT for a in action):     # false for NaN
-            cut = [low if v < low else high if v > high else v
-                   for v, (low, high) in zip(values, self._limits)]
-            self._cut += cut != values
-            values = cut
-        else:
-            self._faults += 1
+        if not all(low <= v <= high for v, (low, high) in zip(values, self._limits)):
+            if all(-ACTION_LIMIT <= a <= ACTION_LIMIT for a in action):     # false for NaN
+                values = [min(max(v, low), high) for v, (low, high) in zip(values, self._limits)]
+                self._cut += 1
+            else:
+                self._faults += 1
         self._latest.append(values)
         return Command(state.stamp, np.array(values[:4]), np.array(values[4:]))
 
