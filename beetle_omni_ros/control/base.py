@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import inf, isfinite, sqrt
 from pathlib import Path
 import sysconfig
@@ -15,6 +15,8 @@ import numpy as np
 
 from beetle_omni_ros.robot.allocation import ActuatorHealth, ALL_HEALTHY, NO_ZEROS, ROTORS
 
+AT_REST = np.zeros(3)           # velocity of a pose
+AT_REST.flags.writeable = False
 MOTORS_OFF = ('disarmed', 'emergency_stop')     # states of the supervisor
 # Folders of the package, of installed packages and of Python itself.
 LIBRARIES = (str(Path(__file__).resolve().parents[1]),
@@ -89,9 +91,9 @@ class Reference:
 
 
 @dataclass(frozen=True)
-class PoseTarget:
+class PoseTarget(Reference):
     """
-    A pose to reach and hold.
+    A pose to reach and hold, at rest.
 
     Attributes:
         position: (3,) in world [m].
@@ -100,13 +102,9 @@ class PoseTarget:
 
     """
 
-    position: np.ndarray
-    quaternion: np.ndarray
+    velocity: np.ndarray = field(init=False, default_factory=lambda: AT_REST)
+    angular_velocity: np.ndarray = field(init=False, default_factory=lambda: AT_REST)
     stamp: float = 0.0
-
-    def at(self, time: float) -> Reference:
-        """The reference at ``time``: the same pose at rest."""
-        return Reference(self.position, self.quaternion, np.zeros(3), np.zeros(3))
 
     def same_pose(self, other: PoseTarget) -> bool:
         """Whether another target is the same pose."""
@@ -146,7 +144,7 @@ class TrajectoryTarget:
         quaternion /= sqrt(quaternion @ quaternion)
         position = (1 - s) * self.positions[k] + s * self.positions[k + 1]
         if not own[0] < time < own[-1]:
-            return Reference(position, quaternion, np.zeros(3), np.zeros(3))
+            return Reference(position, quaternion, AT_REST, AT_REST)
         return Reference(
             position, quaternion, (1 - s) * self.velocities[k] + s * self.velocities[k + 1],
             (1 - s) * self.angular_velocities[k] + s * self.angular_velocities[k + 1])

@@ -170,6 +170,7 @@ class Trimming:
     def __init__(self):
         self.position, self.rotation = [0.0] * 3, [0.0] * 3
         self._given: PoseTarget | None = None
+        self._modified: PoseTarget | None = None    # None after a change
         self._seen = -inf
 
     def target(self, state: State, given: PoseTarget, learn: bool = True) -> PoseTarget:
@@ -181,7 +182,7 @@ class Trimming:
         if given is not self._given:
             if self._given is not None and not _near(*_between(self._given, given)):
                 self.position, self.rotation, self._seen = [0.0] * 3, [0.0] * 3, -inf
-            self._given = given
+            self._given, self._modified = given, None
         elapsed, self._seen = state.stamp - self._seen, state.stamp
         if learn and 0.0 < elapsed <= LONGEST_STEP and hypot(*state.velocity.tolist()) <= SLOW \
                 and hypot(*state.angular_velocity.tolist()) <= SLOW_TURN:
@@ -189,11 +190,15 @@ class Trimming:
             if _near(way, turn):
                 self.position = _added(self.position, TRIM_RATE * elapsed, way, TRIM_DISTANCE)
                 self.rotation = _added(self.rotation, TRIM_RATE * elapsed, turn, TRIM_ANGLE)
-        x, y, z = (0.5 * angle for angle in self.rotation)
-        w = sqrt(1.0 - (x * x + y * y + z * z))
-        a, b, c, d = given.quaternion.tolist()
-        turned = rotations.product(a, b, c, d, x, y, z, w)
-        return PoseTarget(given.position + self.position, np.array(turned), given.stamp)
+                self._modified = None
+        if self._modified is None:
+            x, y, z = (0.5 * angle for angle in self.rotation)
+            w = sqrt(1.0 - (x * x + y * y + z * z))
+            a, b, c, d = given.quaternion.tolist()
+            turned = rotations.product(a, b, c, d, x, y, z, w)
+            self._modified = PoseTarget(given.position + self.position, np.array(turned),
+                                        given.stamp)
+        return self._modified
 
 
 # Plain floats, which are faster; turns are small, half an angle is its sine.

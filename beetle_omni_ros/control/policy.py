@@ -9,7 +9,7 @@ from beetle_omni_ros.control.base import Command, PoseTarget, Reference, State, 
 from beetle_omni_ros.control.guidance import Guidance
 from beetle_omni_ros.control.policy_file import PolicyNetwork
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.rotations import matrix
+from beetle_omni_ros.robot.rotations import entries
 from beetle_omni_ros.robot.schema import bind, parameter, ParameterFile
 
 DEFAULT = 'policies/rl.onnx'
@@ -88,13 +88,12 @@ class PolicyController:
             observation += disturbed(state, self._estimator.disturbance)
         action = self.network(observation)
         values = [s * a + o for a, o, s in zip(action, self._offset, self._scale)]
-        if all(-ACTION_LIMIT <= a <= ACTION_LIMIT for a in action):     # false for NaN
-            cut = [low if v < low else high if v > high else v
-                   for v, (low, high) in zip(values, self._limits)]
-            self._cut += cut != values
-            values = cut
-        else:
-            self._faults += 1
+        if not all(low <= v <= high for v, (low, high) in zip(values, self._limits)):
+            if all(-ACTION_LIMIT <= a <= ACTION_LIMIT for a in action):     # false for NaN
+                values = [min(max(v, low), high) for v, (low, high) in zip(values, self._limits)]
+                self._cut += 1
+            else:
+                self._faults += 1
         self._latest.append(values)
         return Command(state.stamp, np.array(values[:4]), np.array(values[4:]))
 
@@ -121,8 +120,8 @@ def observed(state: State, reference: Reference, previous_action) -> list[float]
     All vectors are in base_link, so that they do not depend on position, and on heading only by
     the attitude columns. ``previous_action`` (8,) is the executed command as an action.
     """
-    xx, xy, xz, yx, yy, yz, zx, zy, zz = matrix(state.quaternion).ravel().tolist()
-    ax, bx, cx, ay, by, cy, az, bz, cz = matrix(reference.quaternion).ravel().tolist()
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = entries(*state.quaternion.tolist())
+    ax, bx, cx, ay, by, cy, az, bz, cz = entries(*reference.quaternion.tolist())
     px, py, pz = (reference.position - state.position).tolist()
     vx, vy, vz = (state.velocity - reference.velocity).tolist()
     wx, wy, wz = state.angular_velocity.tolist()
@@ -142,7 +141,7 @@ def observed(state: State, reference: Reference, previous_action) -> list[float]
 
 def disturbed(state: State, disturbance: np.ndarray) -> list[float]:
     """Force and torque (6) in base_link, of a disturbance (10,) with its force in world."""
-    xx, xy, xz, yx, yy, yz, zx, zy, zz = matrix(state.quaternion).ravel().tolist()
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = entries(*state.quaternion.tolist())
     fx, fy, fz, *torque = disturbance[:6].tolist()
     return [xx * fx + yx * fy + zx * fz, xy * fx + yy * fy + zy * fz,
             xz * fx + yz * fy + zz * fz, *torque]

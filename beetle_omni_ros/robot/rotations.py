@@ -16,11 +16,15 @@ Vector = np.ndarray | Sequence[float]
 
 def matrix(quaternion: Vector) -> np.ndarray:
     """Rotation matrix (3, 3) of a unit quaternion (x, y, z, w)."""
-    x, y, z, w = np.asarray(quaternion).tolist()
-    return np.array((    # flat, because nested sequences take longer
-        1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
-        2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
-        2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y))).reshape(3, 3)
+    # from flat entries, because nested sequences take longer
+    return np.array(entries(*np.asarray(quaternion).tolist())).reshape(3, 3)
+
+
+def entries(x: float, y: float, z: float, w: float) -> tuple[float, ...]:
+    """Entries of :func:`matrix`, row by row."""
+    return (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
+            2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
+            2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y))
 
 
 def multiply(a: Vector, b: Vector) -> np.ndarray:

@@ -160,16 +160,18 @@ class ExportedPolicy(torch.nn.Module):
         super().__init__()
         self.mlp: MLP = copy.deepcopy(actor.mlp).cpu()
         stages, linear = _folded(actor.obs_dim)
-        self.stages = [[factor.clone() for factor in stage] for stage in stages]
-        self.linear = linear.T.contiguous()
-        count = len(self.linear)
+        self.stages = [[factor.T.contiguous() for factor in stage] for stage in stages]
+        count = linear.shape[1]
         self.offset = torch.zeros(count)
         self.offset[COSINES] = 0.5 * torch.pi       # cosines are sines
+        self.angles = torch.zeros(count, actor.obs_dim)
+        for block in (SINES, COSINES):
+            self.angles[block] = linear[:actor.obs_dim, block].T
+            linear[:, block] = 0.0
+        self.linear = linear
         self.norms, self.near = torch.zeros(count, count), torch.ones(count)
         for block in FINE:
             self.norms[block, block], self.near[block] = 1.0, NEAR ** 2
-        self.angle = torch.zeros(count, dtype=torch.bool)
-        self.angle[SINES] = self.angle[COSINES] = True
         last = self.mlp[-1]
         self.carry = torch.zeros(last.out_features, actor.obs_dim)
         self.carry[:, ACTION] = actor.carry * torch.eye(last.out_features)
@@ -179,17 +181,17 @@ class ExportedPolicy(torch.nn.Module):
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
         """(1, 8) action of a (1, 33 or 39) observation."""
-        known = observation
+        linear, known = torch.nn.functional.linear, observation
         for left, right in self.stages:
-            known = torch.cat((known, (known @ left) * (known @ right)), -1)
-        features = torch.nn.functional.linear(known, self.linear, self.offset)
-        norms = torch.sqrt(torch.nn.functional.linear(features * features, self.norms, self.near))
-        features = torch.where(self.angle, torch.sin(features), features / norms)
+            known = torch.cat((known, linear(known, left) * linear(known, right)), -1)
+        sines = torch.sin(linear(observation, self.angles, self.offset))
+        features = torch.addmm(sines, known, self.linear)   # of angles: nothing but the sines
+        features = features / torch.sqrt(linear(features * features, self.norms, self.near))
         *hidden, last = self.mlp
         for layer in hidden:
             features = layer(features)
-        return torch.nn.functional.linear(torch.cat((features, observation), -1),
-                                          torch.cat((last.weight, self.carry), -1), last.bias)
+        return linear(torch.cat((features, observation), -1),
+                      torch.cat((last.weight, self.carry), -1), last.bias)
 
 
 # Places of the normalised errors and of the sines and cosines of the tilts in the features.
