@@ -113,10 +113,10 @@ class FaultWatch:
         if deaf is not None and self.health.rotors[deaf] and self.name(
                 f'rotor{deaf + 1}_deaf', stamp, f'rotor {deaf + 1} does not follow its commands, '
                 f'by its ESC; it gives {thrust[deaf]:.1f} N'):
-            self._set('held', deaf, min(float(thrust[deaf]), self._thrust_max))
+            self._set('held', deaf, min(thrust[deaf], self._thrust_max))
         for rotor, held in enumerate(self.health.held):
             if held is not None and abs(thrust[rotor] - held) > NOTICEABLE:
-                self._set('held', rotor, min(max(float(thrust[rotor]), 0.0), self._thrust_max))
+                self._set('held', rotor, min(max(thrust[rotor], 0.0), self._thrust_max))
 
     def _lose_rotor(self, rotor, stamp, by):
         if self.name(f'rotor{rotor + 1}_lost', stamp, f'rotor {rotor + 1} gives less thrust than '
@@ -131,13 +131,14 @@ class FaultWatch:
         """
         watch = self._joints
         watch.on_joints(stamp, tilt)
-        if not trusted or not watch.suspects and not watch.jump.any() \
+        if not trusted or not watch.suspects and not any(watch.jump) \
                 and self.health.stuck == ALL_HEALTHY.stuck:
             return
-        for joint in np.flatnonzero(watch.jump).tolist():
-            self.name(f'joint{joint + 1}_encoder_jump', stamp, f'the encoder of '
-                      f'gimbal{joint + 1} jumped by {watch.jump[joint]:+.2f} rad at once')
-            self._set('zeros', joint, self.health.zeros[joint] + float(watch.jump[joint]))
+        for joint, jump in enumerate(watch.jump):
+            if jump:
+                self.name(f'joint{joint + 1}_encoder_jump', stamp, f'the encoder of '
+                          f'gimbal{joint + 1} jumped by {jump:+.2f} rad at once')
+                self._set('zeros', joint, self.health.zeros[joint] + jump)
         true = clipped(self.health.true(tilt), -self._limit, self._limit).tolist()
         for joint, angle in enumerate(true):
             stuck = self.health.stuck[joint]
