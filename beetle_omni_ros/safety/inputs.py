@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
-from math import dist, isfinite
+from math import dist, hypot, isfinite
 
 import numpy as np
 
@@ -26,7 +26,7 @@ STALE_AFTER = 0.05      # [s] older estimates are refused
 JOINT_TIMEOUT = 0.2     # [s]
 IMU_TIMEOUT = 0.05      # [s]
 MOCAP_TIMEOUT = 0.2     # [s]
-ABSURD = 1e4            # [m, m/s, m/s^2, rad/s] beyond any robot and sensor; no overflow
+ABSURD = 1e4            # [m, m/s, m/s^2, rad/s] length beyond any robot and sensor; no overflow
 VOLTAGES = 1.0, 1000.0  # [V] plausible readings; that of a disconnected sensor is smaller
 UNIT_TOLERANCE = 0.02   # of a quaternion's squared length
 JUMP_POSITION, JUMP_ATTITUDE = 1.0, 1.0     # [m], [rad] a single larger jump of the estimate is
@@ -43,8 +43,8 @@ QUIET_TIME = 1.0        # [s] in which the same message is logged once
 
 
 def plausible(*arrays: np.ndarray) -> bool:
-    """Whether all numbers are finite and below ABSURD."""
-    return all(bool(np.abs(array).max() < ABSURD) for array in arrays)
+    """Whether all numbers are finite, and vectors shorter than ABSURD."""
+    return all([hypot(*array.tolist()) < ABSURD for array in arrays])
 
 
 class Inputs:
@@ -130,7 +130,7 @@ class Inputs:
         if state.stamp <= self.estimate.stamp:
             return 'repeated or older stamp'
         before, self._offered = self._offered, state
-        self._same = self._same + 1 if np.array_equal(before.position, state.position) else 0
+        self._same = self._same + 1 if before.position.tolist() == state.position.tolist() else 0
         if self._same >= SAME and self.airborne:
             return FROZEN
         jumped = 0 < state.stamp - before.stamp <= ESTIMATE_TIMEOUT and (
@@ -153,8 +153,10 @@ class Inputs:
 
         Only complete feedback resets the timeout of the joints.
         """
+        if not stamp > self.tilt_stamp or self._ahead(stamp):
+            return
         known = np.abs(position) < ABSURD
-        if not stamp > self.tilt_stamp or self._ahead(stamp) or not known.any():
+        if not known.any():
             return
         self.tilt = np.where(known, self.watch.health.true(position), self.tilt)
         self.tilt_velocity = np.zeros(4) if velocity is None else \
