@@ -185,9 +185,9 @@ class ErrorStateEkf:
             checked = self._guard.reading(sample)
         if checked is None:
             return False
-        stamp = checked[0]
-        reading = (stamp, *(self._axes.dot(measured - bias)
-                            for measured, bias in zip(checked[1:], self._known_biases)))
+        stamp, force, rate = checked
+        reading = (stamp, self._axes.dot(force - self._known_biases[0]),
+                   self._axes.dot(rate - self._known_biases[1]))
         self._estimate = None
         self._readings.append(reading)
         while self._readings[0][0] < stamp - DELAY_LIMIT:
