@@ -43,8 +43,11 @@ QUIET_TIME = 1.0        # [s] in which the same message is logged once
 
 
 def plausible(*arrays: np.ndarray) -> bool:
-    """Whether all numbers are finite, and vectors shorter than ABSURD."""
-    return all([hypot(*array.tolist()) < ABSURD for array in arrays])
+    """Whether all numbers are finite, as one vector shorter than ABSURD."""
+    numbers: list[float] = []
+    for array in arrays:
+        numbers += array.tolist()
+    return hypot(*numbers) < ABSURD
 
 
 class Inputs:

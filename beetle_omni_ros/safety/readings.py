@@ -37,9 +37,9 @@ class JointWatch:
 
     Attributes:
         commands: stamps [s] and joint targets (4,) [rad], the newest last.
-        astray: joints (4 bool) that do not follow their command.
-        jump: 4 numbers [rad], jump of the last reading relative to the motion before it, if it is larger
-            than a joint can turn, else 0.
+        astray: joints (4) that do not follow their command.
+        jump: 4 jumps [rad] of the last reading relative to the motion before it, if larger than a
+            joint can turn, else 0.
         suspects: whether a joint differed from its model at the last reading.
 
     """

@@ -166,15 +166,16 @@ class Supervisor(Inputs):
         if command is self._given:
             return self._asked
         self._given = command
-        self._in_force = self._asked = within_limits(command, self.robot)
-        if self._in_force is None:
+        self._in_force = self._asked = asked = within_limits(command, self.robot)
+        if asked is None:
             self.emergency_stop(now, f'{self.source} gave a command that is not finite')
             return None
         if self.health.zeros != NO_ZEROS:       # in angles of the encoder that jumped
-            self._asked = within_limits(
-                replace(self._in_force, tilt=self.health.read(self._in_force.tilt)), self.robot)
-        self.watch.on_command(self._asked)
-        return self._asked
+            limit = self.robot.joints.position_limit
+            self._asked = asked = replace(
+                asked, tilt=clipped(self.health.read(asked.tilt), -limit, limit))
+        self.watch.on_command(asked)
+        return asked
 
     # Faults -----------------------------------------------------------------------------------
 
