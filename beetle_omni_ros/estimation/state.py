@@ -114,7 +114,7 @@ def transition(before: Node, after: Node, out: np.ndarray) -> np.ndarray:
     return out
 
 
-@dataclass(frozen=True)
+@dataclass
 class Estimate:
     """State of base_link at the newest IMU sample."""
 

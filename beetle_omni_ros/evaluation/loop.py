@@ -18,6 +18,7 @@ import numpy as np
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import (
+    Command,
     Controller,
     ControllerHost,
     PoseTarget,
@@ -298,8 +299,8 @@ class FlightLoop:
                 or not 0 <= last.stamp - command.stamp <= CLOCK_SET_BACK:
             self._command = command
             if command is not None:
-                self.simulator.command(replace(
-                    command, stamp=command.stamp - processes.clock_step))
+                self.simulator.command(Command(
+                    command.stamp - processes.clock_step, command.tilt, command.thrust))
                 recorder.write('command', command, now)
         if self.supervisor.reported_state != self._reported:
             self._note_state(now)

@@ -267,8 +267,9 @@ class Inputs:
         if self.joints.silent and in_force is not None and not self.bridges.get(
                 'joint', '').startswith('lost:'):
             tilt, velocity = in_force.tilt, np.zeros(4)
-        return replace(self.best, tilt=tilt, tilt_velocity=velocity, tilt_stamp=self.tilt_stamp,
-                       command=in_force)
+        best = self.best
+        return State(best.stamp, best.position, best.velocity, best.quaternion,
+                     best.angular_velocity, tilt, velocity, self.tilt_stamp, in_force)
 
     @property
     def specific_force_up(self) -> float | None:

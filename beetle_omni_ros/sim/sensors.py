@@ -29,7 +29,7 @@ ROTOR_LATENCY = 0.01                # [s] from capture to arrival, chosen
 ROTOR_NOISE = 0.01                  # [-] standard deviation relative to the speed, chosen
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Impact:
     """Motion at a touchdown, the first contact with the floor after flight."""
 
@@ -38,7 +38,7 @@ class Impact:
     inclination: float              # angle between base_link's z axis and the vertical [rad]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Truth:
     """The true state."""
 
@@ -55,7 +55,7 @@ class Truth:
     broken: bool = False            # then rotors and servos do not work until reset
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Frame:
     """Readings that arrive in one tick, or None, and the true state."""
 
