@@ -7,7 +7,7 @@ external torque in body and an offset of each servo's resting angle. For a robot
 """
 
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
@@ -111,7 +111,7 @@ class DisturbanceEstimator:
             # with the tilts at which each servo would rest without friction
             rest = clipped(self._commands[-1].tilt, self._sent - self._band,
                            self._sent + self._band) if self._commands else self._sent
-            self._commands.append(replace(state.command, tilt=rest))
+            self._commands.append(Command(state.command.stamp, rest, state.command.thrust))
         step = state.stamp - self._stamp
         if self._state is None or not 0 < step <= LONGEST_STEP:
             thrust = np.zeros(4) if state.command is None else state.command.thrust
@@ -186,7 +186,7 @@ class DisturbanceEstimator:
             newest = self._commands[-1]
             rest = clipped(newest.tilt + change, self._sent - self._band, self._sent + self._band)
             change = change - (rest - newest.tilt)
-            self._commands[-1] = replace(newest, tilt=rest)
+            self._commands[-1] = Command(newest.stamp, rest, newest.thrust)
         offset = self.disturbance[model.TILT_OFFSET] + change
         self.disturbance[model.TILT_OFFSET] = clipped(offset, -limit, limit)
 

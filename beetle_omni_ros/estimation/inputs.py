@@ -135,7 +135,8 @@ class NoiseMonitor:
     """
 
     def __init__(self, mocap: MocapParameters):
-        self._nominal = mocap.position_noise ** 2, mocap.orientation_noise ** 2
+        self._nominal = self._variances = [mocap.position_noise ** 2,
+                                           mocap.orientation_noise ** 2]
         self.covariance = np.diag(np.repeat(self._nominal, 3))
         self._last: Checked | None = None
         self._moves: deque = deque(maxlen=POSES - 1)  # (translation, rotation vector, interval)
@@ -164,6 +165,8 @@ class NoiseMonitor:
         if len(window) >= MIN_COUNT:
             ratios = [ordered[len(ordered) // 2] / (MEDIAN * GAIN * nominal)
                       for (_, ordered), nominal in zip(self._excess, self._nominal)]
-            self.covariance = np.diag(np.repeat([
+            variances = [
                 nominal * min(ratio, LARGEST_SCALE ** 2) if ratio > SIGNIFICANT else nominal
-                for ratio, nominal in zip(ratios, self._nominal)], 3))
+                for ratio, nominal in zip(ratios, self._nominal)]
+            if variances != self._variances:
+                self._variances, self.covariance = variances, np.diag(np.repeat(variances, 3))

@@ -79,6 +79,7 @@ class ErrorStateModel:
         self._beside = imu.position.any()       # whether the IMU is beside base_link
         # vector from the navigated point (the IMU) to the marker body, in base_link axes
         self._lever = mocap.position - imu.position
+        self._turning = rotations.skew(self._lever)
         self.marker_to_base = rotations.conjugate(rotations.exp(mocap.rotation))
         self._jacobian = np.zeros((MEASUREMENTS, STATES))       # of a pose
         self._jacobian[0:3, POSITION] = self._jacobian[3:6, ATTITUDE] = np.eye(3)
@@ -100,7 +101,7 @@ class ErrorStateModel:
         """
         attitude = rotations.normalized(rotations.multiply(quaternion, self.marker_to_base))
         rotation = rotations.matrix(attitude)
-        arm = rotation @ rotations.skew(self._lever)
+        arm = rotation @ self._turning
         noise = self.noise
         covariance = np.zeros((STATES, STATES))
         covariance[POSITION, POSITION] = noise[:3, :3] + arm @ noise[3:, 3:] @ arm.T
@@ -205,12 +206,12 @@ class ErrorStateModel:
         x, y, z, w = prior.quaternion.tolist()
         measured = rotations.product(*quaternion.tolist(), *self.marker_to_base.tolist())
         residual[3:] = rotations.log(rotations.product(-x, -y, -z, w, *measured))
-        residual[:3] -= prior.rotation @ self._lever
-        jacobian[0:3, ATTITUDE] = -prior.rotation @ rotations.skew(self._lever)
+        residual[:3] -= prior.rotation.dot(self._lever)
+        jacobian[0:3, ATTITUDE] = -prior.rotation.dot(self._turning)
         # A moving pose is displaced by motion times clock offset. Near rest velocity and rate are
         # mostly noise, which is correlated with the residual and would bias the offset.
         rate = prior.rate - prior.gyroscope_bias
-        velocity = prior.velocity + prior.rotation @ rotations.cross(rate, self._lever)
+        velocity = prior.velocity + prior.rotation.dot(rotations.cross(rate, self._lever))
         jacobian[0:3, TIME_OFFSET] = velocity if velocity.dot(velocity) > LEAST_SPEED ** 2 else 0.0
         jacobian[3:6, TIME_OFFSET] = rate if rate.dot(rate) > LEAST_RATE ** 2 else 0.0
         covariance = self.covariance(prior)

@@ -16,7 +16,6 @@ import gc
 
 import numpy as np
 
-from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import (
     Command,
     Controller,
@@ -149,12 +148,12 @@ class FlightLoop:
     def __init__(self, robot: RobotParameters, plant: RobotParameters,
                  controllers: dict[str, Controller], recorder: Recorder, *,
                  conditions: str = 'nominal', seed: int = 0, faults: Sequence[Fault] = ()):
-        estimator, active = EkfParameters.load().of_robot(robot), next(iter(controllers))
+        estimator = EkfParameters.load().of_robot(robot)
         self.simulator = Simulator(plant, SimulatorParameters.load(), conditions=conditions,
                                    seed=seed)
         self.supervisor = Supervisor(SupervisorParameters.load(), robot, HoverController(robot),
-                                     tuple(dict.fromkeys((*registry.names(), active))))
-        self.supervisor.select(active)
+                                     tuple(controllers))
+        self.supervisor.select(next(iter(controllers)))
         self.refusals: list[str] = []
         self._estimator = ErrorStateEkf(estimator, robot.gravity)
         self._gyroscope_noise, self._errors = estimator.imu.gyroscope_noise, robot.sensors

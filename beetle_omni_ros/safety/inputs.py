@@ -158,14 +158,16 @@ class Inputs:
         """
         if not stamp > self.tilt_stamp or self._ahead(stamp):
             return
-        known = np.abs(position) < ABSURD
-        if not known.any():
+        known = [abs(angle) < ABSURD for angle in position.tolist()]
+        if not any(known):
             return
-        self.tilt = np.where(known, self.watch.health.true(position), self.tilt)
-        self.tilt_velocity = np.zeros(4) if velocity is None else \
-            np.where(known & np.isfinite(velocity), velocity, 0.0)
+        true = self.watch.health.true(position)
+        self.tilt = true if all(known) else np.where(known, true, self.tilt)
+        self.tilt_velocity = np.zeros(4) if velocity is None else np.array([
+            rate if there and isfinite(rate) else 0.0
+            for there, rate in zip(known, velocity.tolist())])
         self.tilt_stamp = float(stamp)
-        if known.all():
+        if all(known):
             self.joints.reset()
             zeros = self.watch.health.zeros
             self.watch.on_joints(stamp, position, self.airborne)
