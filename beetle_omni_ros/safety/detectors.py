@@ -61,6 +61,7 @@ class FaultWatch:
         self.faults.clear()
         self.health: ActuatorHealth = ALL_HEALTHY
         self.news: list[str] = []
+        self._thrust = np.zeros(ROTORS)     # executed [N]
         self._pack = None if self._map is None else PackWatch(self._robot, self._allocator,
                                                               self._map)
         self.restart()
@@ -84,18 +85,16 @@ class FaultWatch:
 
     def on_command(self, command: Command) -> None:
         """Receive the executed command."""
-        thrust = clipped(command.thrust, 0.0, self._limit_now)
+        self._thrust = clipped(command.thrust, 0.0, self._limit_now)
         self._joints.commands.append((command.stamp, command.tilt))
-        self._speeds.commands.append((command.stamp, thrust))
+        self._speeds.commands.append((command.stamp, self._thrust))
 
     def on_imu(self, stamp: float, force: np.ndarray, rate: np.ndarray, tilt: np.ndarray | None,
-               command: Command | None, height: float | None) -> None:
+               height: float | None) -> None:
         """Receive an IMU sample of a robot in the air, see the two detectors."""
         dt, self._stamp = stamp - self._stamp, stamp
-        thrust = np.zeros(ROTORS) if command is None else \
-            clipped(command.thrust, 0.0, self._limit_now)
         self._wrench.supported = self._speeds.slow
-        self._wrench.on_imu(stamp, force, rate, tilt, thrust, self.health)
+        self._wrench.on_imu(stamp, force, rate, tilt, self._thrust, self.health)
         self.contact.update(min(max(dt, 0.0), 0.05), height, self._wrench)
         if height is not None and height < NEAR_GROUND:
             return      # the floor also exerts a force

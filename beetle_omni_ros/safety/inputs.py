@@ -192,7 +192,7 @@ class Inputs:
         if self.airborne:
             known = stamp - self.tilt_stamp < TILT_AGE
             self.watch.on_imu(stamp, specific_force, angular_velocity,
-                              self.tilt if known else None, self._in_force, self.height)
+                              self.tilt if known else None, self.height)
 
     def on_rotors(self, stamp: float, speed: np.ndarray) -> None:
         """Receive the rotor speeds (4,) reported by the ESCs [rad/s], nan where unknown."""

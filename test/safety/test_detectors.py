@@ -254,7 +254,7 @@ def test_a_rotor_that_gives_more_thrust_than_asked_is_deaf_and_not_lost(sticks):
         watch.on_command(command)
         if n % 4 == 0:
             watch.on_speeds(t, 300.0 * np.sqrt(thrust))
-        watch.on_imu(t, force / ALLOCATOR.mass, rate, tilt, command, 1.0)
+        watch.on_imu(t, force / ALLOCATOR.mass, rate, tilt, 1.0)
         if watch.faults:
             break
     assert list(watch.faults) == ['rotor3_deaf' if sticks else 'rotor3_lost']
