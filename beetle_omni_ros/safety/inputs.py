@@ -133,11 +133,12 @@ class Inputs:
         if state.stamp <= self.estimate.stamp:
             return 'repeated or older stamp'
         before, self._offered = self._offered, state
-        self._same = self._same + 1 if before.position.tolist() == state.position.tolist() else 0
+        was, at = before.position.tolist(), state.position.tolist()
+        self._same = self._same + 1 if was == at else 0
         if self._same >= SAME and self.airborne:
             return FROZEN
         jumped = 0 < state.stamp - before.stamp <= ESTIMATE_TIMEOUT and (
-            dist(before.position, state.position) > JUMP_POSITION
+            dist(was, at) > JUMP_POSITION
             or rotations.geodesic_angle(before.quaternion, state.quaternion) > JUMP_ATTITUDE)
         return JUMP if jumped else ''
 

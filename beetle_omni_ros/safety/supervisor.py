@@ -67,6 +67,8 @@ class Supervisor(Inputs):
         self._handover_left = 0.0   # after a change of the controller [s]
         self.state, self.source = DISARMED, 'none'
         self.target_override: Target | None = None
+        self._cycle = {TAKEOFF: self._take_off, FLYING: self._fly, FALLBACK: self._hold,
+                       LANDING: self._descend}
         # Objects of the present state, created when it is entered.
         self._takeoff: Takeoff
         self._landing: Landing
@@ -150,9 +152,7 @@ class Supervisor(Inputs):
         self._look_for_faults(now)
         if self.state in IN_FLIGHT:
             self._react(now)
-        command = self._guarded({TAKEOFF: self._take_off, FLYING: self._fly, FALLBACK: self._hold,
-                                 LANDING: self._descend}.get(self.state, self._stand)(now, dt),
-                                now)
+        command = self._guarded(self._cycle.get(self.state, self._stand)(now, dt), now)
         if self.state in IN_FLIGHT:
             self.airborne = self.state != TAKEOFF or self._takeoff.airborne
             share = 1 - exp(-dt / self.robot.rotors.time_constant)
