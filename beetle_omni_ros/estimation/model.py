@@ -200,8 +200,8 @@ class ErrorStateModel:
             the corrected node, or None if the pose fails the chi-square gate.
 
         """
-        jacobian, self.residual = self._jacobian, np.empty(MEASUREMENTS)
-        residual = self.residual
+        jacobian, residual = self._jacobian, np.empty(MEASUREMENTS)
+        self.residual = residual
         residual[:3] = position - prior.position
         x, y, z, w = prior.quaternion.tolist()
         measured = rotations.product(*quaternion.tolist(), *self.marker_to_base.tolist())

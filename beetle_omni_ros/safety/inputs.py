@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
+from itertools import chain
 from math import dist, hypot, isfinite
 
 import numpy as np
@@ -44,10 +45,7 @@ QUIET_TIME = 1.0        # [s] in which the same message is logged once
 
 def plausible(*arrays: np.ndarray) -> bool:
     """Whether all numbers are finite, as one vector shorter than ABSURD."""
-    numbers: list[float] = []
-    for array in arrays:
-        numbers += array.tolist()
-    return hypot(*numbers) < ABSURD
+    return hypot(*chain(*map(np.ndarray.tolist, arrays))) < ABSURD
 
 
 class Inputs:
