@@ -108,8 +108,8 @@ class PoseTarget(Reference):
 
     def same_pose(self, other: PoseTarget) -> bool:
         """Whether another target is the same pose."""
-        return np.array_equal(self.position, other.position) \
-            and np.array_equal(self.quaternion, other.quaternion)
+        return self.position.tolist() == other.position.tolist() \
+            and self.quaternion.tolist() == other.quaternion.tolist()
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ external torque in body and an offset of each servo's resting angle. For a robot
 """
 
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
@@ -69,6 +69,7 @@ class DisturbanceEstimator:
         self._tilt_bandwidth = p.tilt_bandwidth
         servos = [model.tilt_servo(robot, joint, 0.0)[0] for joint in range(4)]
         self._band = np.array([(servo.coulomb or 0.0) / servo.kp for servo in servos])
+        self._sticks = self._band.any()
         self._health = ALL_HEALTHY
         self._movable = np.ones(4)
         self.reset()
@@ -110,8 +111,9 @@ class DisturbanceEstimator:
             self._sent = state.command.tilt
             # with the tilts at which each servo would rest without friction
             rest = clipped(self._commands[-1].tilt, self._sent - self._band,
-                           self._sent + self._band) if self._commands else self._sent
-            self._commands.append(replace(state.command, tilt=rest))
+                           self._sent + self._band) if self._sticks and self._commands \
+                else self._sent
+            self._commands.append(Command(state.command.stamp, rest, state.command.thrust))
         step = state.stamp - self._stamp
         if self._state is None or not 0 < step <= LONGEST_STEP:
             thrust = np.zeros(4) if state.command is None else state.command.thrust
@@ -131,7 +133,7 @@ class DisturbanceEstimator:
 
     def sent(self, tilt: np.ndarray) -> np.ndarray:
         """Targets (4,) [rad] that overcome the friction, for targets without friction."""
-        if self._commands:
+        if self._sticks and self._commands:
             motion = tilt - self._commands[-1].tilt
             self._direction = np.where(np.abs(motion) > RESOLUTION, np.sign(motion),
                                        self._direction)
@@ -181,12 +183,12 @@ class DisturbanceEstimator:
         error = self._movable * clipped(state.tilt - modelled, -limit, limit)
         present[model.TILT] += TILT_CORRECTION * error
         change = self._tilt_bandwidth * step * error
-        if self._commands:
+        if self._sticks and self._commands:
             # Friction explains a reading within the band, the offset only what is beyond.
             newest = self._commands[-1]
             rest = clipped(newest.tilt + change, self._sent - self._band, self._sent + self._band)
             change = change - (rest - newest.tilt)
-            self._commands[-1] = replace(newest, tilt=rest)
+            self._commands[-1] = Command(newest.stamp, rest, newest.thrust)
         offset = self.disturbance[model.TILT_OFFSET] + change
         self.disturbance[model.TILT_OFFSET] = clipped(offset, -limit, limit)
 

@@ -234,11 +234,10 @@ class NmpcController:
         return np.minimum(targets, lowest if self._above else NO_HEIGHT)
 
     def _command(self, stamp):
-        planned = self._rti.inputs[0]
-        command = clipped(np.r_[self._estimator.sent(planned[:4]), planned[4:]],
-                          self._bounds[:8], self._bounds[8:16])
-        rotors = self._robot.rotors
-        tilt, thrust = command[:4], clipped(command[4:], rotors.thrust_min, rotors.thrust_max)
+        planned, bounds, rotors = self._rti.inputs[0], self._bounds, self._robot.rotors
+        tilt = clipped(self._estimator.sent(planned[:4]), bounds[:4], bounds[8:12])
+        thrust = clipped(clipped(planned[4:], bounds[4:8], bounds[12:16]),
+                         rotors.thrust_min, rotors.thrust_max)
         if not self._health.healthy:
             tilt, thrust = self._health.possible(tilt, thrust)
         return Command(stamp, tilt, thrust)

@@ -185,9 +185,9 @@ class ErrorStateEkf:
             checked = self._guard.reading(sample)
         if checked is None:
             return False
-        stamp = checked[0]
-        reading = (stamp, *(self._axes.dot(measured - bias)
-                            for measured, bias in zip(checked[1:], self._known_biases)))
+        stamp, force, rate = checked
+        reading = (stamp, self._axes.dot(force - self._known_biases[0]),
+                   self._axes.dot(rate - self._known_biases[1]))
         self._estimate = None
         self._readings.append(reading)
         while self._readings[0][0] < stamp - DELAY_LIMIT:
@@ -224,7 +224,7 @@ class ErrorStateEkf:
 
     def _apply(self, stamp, position, quaternion) -> bool:
         self._estimate = None
-        self._model.filter.R = self._noise.covariance
+        self._model.noise = self._noise.covariance
         track = self._track if self.status in ('tracking', 'dead_reckoning') else None
         candidate = self._candidate
         if track is not None:
@@ -256,8 +256,8 @@ class ErrorStateEkf:
         Such poses continue smoothly from the last good one, and their residuals have the same
         direction. The residuals of poses that are only noisy do not.
         """
-        before, self._residual = self._residual, np.ravel(
-            self._model.filter.y) / np.sqrt(np.diag(self._model.filter.R))
+        before, self._residual = self._residual, \
+            self._model.residual / np.sqrt(np.diag(self._model.noise))
         lengths = float(np.linalg.norm(before) * np.linalg.norm(self._residual))
         aligned = float(before @ self._residual) > ALIGNED * lengths
         smooth = self._continues_smoothly(track, stamp, position, quaternion)

@@ -1,5 +1,6 @@
 """Checks of the filter's inputs (finite, plausible, new, in time), and the MoCap's noise."""
 
+from bisect import bisect_left, insort
 from collections import Counter, deque
 from math import hypot, inf, isfinite, sqrt
 
@@ -134,11 +135,13 @@ class NoiseMonitor:
     """
 
     def __init__(self, mocap: MocapParameters):
-        self._nominal = mocap.position_noise ** 2, mocap.orientation_noise ** 2
+        self._nominal = self._variances = [mocap.position_noise ** 2,
+                                           mocap.orientation_noise ** 2]
         self.covariance = np.diag(np.repeat(self._nominal, 3))
         self._last: Checked | None = None
         self._moves: deque = deque(maxlen=POSES - 1)  # (translation, rotation vector, interval)
-        self._excess: list[deque] = [deque(maxlen=WINDOW), deque(maxlen=WINDOW)]
+        # of position and orientation, in the order of time and of size
+        self._excess: list[tuple[deque, list[float]]] = [(deque(), []), (deque(), [])]
 
     def add(self, stamp: float, position: np.ndarray, quaternion: np.ndarray) -> None:
         """Add one pose: stamp [s], (3,) [m], (4,) unit."""
@@ -153,12 +156,17 @@ class NoiseMonitor:
         moves, turns, intervals = zip(*self._moves)
         if max(intervals) - min(intervals) > EVEN * max(intervals):
             return
-        for (first, second, third), window in zip((moves, turns), self._excess):
+        for (first, second, third), (window, ordered) in zip((moves, turns), self._excess):
             excess = third - 2 * second + first
+            if len(window) == WINDOW:
+                del ordered[bisect_left(ordered, window.popleft())]
             window.append(float(excess.dot(excess)))
+            insort(ordered, window[-1])
         if len(window) >= MIN_COUNT:
-            ratios = [sorted(values)[len(values) // 2] / (MEDIAN * GAIN * nominal)
-                      for values, nominal in zip(self._excess, self._nominal)]
-            self.covariance = np.diag(np.repeat([
+            ratios = [ordered[len(ordered) // 2] / (MEDIAN * GAIN * nominal)
+                      for (_, ordered), nominal in zip(self._excess, self._nominal)]
+            variances = [
                 nominal * min(ratio, LARGEST_SCALE ** 2) if ratio > SIGNIFICANT else nominal
-                for ratio, nominal in zip(ratios, self._nominal)], 3))
+                for ratio, nominal in zip(ratios, self._nominal)]
+            if variances != self._variances:
+                self._variances, self.covariance = variances, np.diag(np.repeat(variances, 3))

@@ -1,5 +1,5 @@
 """
-The error-state model: a rigid body for filterpy, which computes covariance and gain.
+The error-state model: covariance and correction of a rigid body.
 
 The filter estimates the motion of the IMU at the IMU's stamps; the output is that of base_link.
 """
@@ -9,7 +9,6 @@ from dataclasses import replace
 from itertools import pairwise
 from math import sqrt
 
-from filterpy.kalman import KalmanFilter
 import numpy as np
 from scipy.special import gammaincinv
 
@@ -55,6 +54,8 @@ class ErrorStateModel:
     Covariance and correction of one node; contains constants and buffers, no state.
 
     Attributes:
+        noise: (6, 6) covariance of a pose.
+        residual: (6,) position [m] and rotation vector [rad] of the last pose.
         marker_to_base: (4,) quaternion from base_link's axes to those of the marker body.
 
     """
@@ -63,9 +64,8 @@ class ErrorStateModel:
         imu, mocap = parameters.imu, parameters.mocap
         self.gravity = gravity
         self.parameters = parameters
-        self.filter = KalmanFilter(dim_x=STATES, dim_z=MEASUREMENTS)
-        self._no_error = np.zeros(STATES)
-        self._transition = np.eye(STATES)
+        self.noise, self.residual = np.eye(MEASUREMENTS), np.zeros(MEASUREMENTS)
+        self._identity, self._transition = np.eye(STATES), np.eye(STATES)
         density = np.zeros(STATES)      # of the process noise, per second
         density[VELOCITY] = imu.accelerometer_noise ** 2 / imu.rate
         density[ATTITUDE] = imu.gyroscope_noise ** 2 / imu.rate
@@ -76,11 +76,13 @@ class ErrorStateModel:
         self._period = 1 / imu.rate
         self._doubt = np.diag([*np.repeat(np.square(DOUBT), 3), *np.zeros(4)])
 
+        self._beside = imu.position.any()       # whether the IMU is beside base_link
         # vector from the navigated point (the IMU) to the marker body, in base_link axes
         self._lever = mocap.position - imu.position
+        self._turning = rotations.skew(self._lever)
         self.marker_to_base = rotations.conjugate(rotations.exp(mocap.rotation))
-        self.filter.H[0:3, POSITION] = np.eye(3)
-        self.filter.H[3:6, ATTITUDE] = np.eye(3)
+        self._jacobian = np.zeros((MEASUREMENTS, STATES))       # of a pose
+        self._jacobian[0:3, POSITION] = self._jacobian[3:6, ATTITUDE] = np.eye(3)
         # quantile of the chi-square distribution
         self.gate = float(2 * gammaincinv(MEASUREMENTS / 2, GATE))
 
@@ -99,8 +101,8 @@ class ErrorStateModel:
         """
         attitude = rotations.normalized(rotations.multiply(quaternion, self.marker_to_base))
         rotation = rotations.matrix(attitude)
-        arm = rotation @ rotations.skew(self._lever)
-        noise = self.filter.R
+        arm = rotation @ self._turning
+        noise = self.noise
         covariance = np.zeros((STATES, STATES))
         covariance[POSITION, POSITION] = noise[:3, :3] + arm @ noise[3:, 3:] @ arm.T
         covariance[POSITION, ATTITUDE] = arm @ noise[3:, 3:]
@@ -172,16 +174,16 @@ class ErrorStateModel:
 
     def covariance(self, node: Node) -> np.ndarray:
         """Covariance (16, 16) of a node, predicted now if it is pending."""
-        kalman, steps = self.filter, [node]
+        steps = [node]
         while (before := steps[-1].before) is not None:
             steps.append(before)
         for before, after in pairwise(reversed(steps)):
             dt = after.stamp - before.stamp
-            kalman.x, kalman.P = self._no_error, before.covariance
+            change = transition(before, after, self._transition)
             # Missing samples are interpolated, and the error grows with each of them.
-            kalman.predict(F=transition(before, after, self._transition),
-                           Q=self._process * (dt * max(1.0, dt / self._period) ** 3))
-            after.covariance, after.before = kalman.P, None
+            after.covariance = change.dot(before.covariance).dot(change.T) \
+                + self._process * (dt * max(1.0, dt / self._period) ** 3)
+            after.before = None
         return node.covariance
 
     def time_deviation(self, node: Node) -> float:
@@ -198,27 +200,29 @@ class ErrorStateModel:
             the corrected node, or None if the pose fails the chi-square gate.
 
         """
-        kalman, jacobian = self.filter, self.filter.H
-        residual = np.empty(MEASUREMENTS)
+        jacobian, residual = self._jacobian, np.empty(MEASUREMENTS)
+        self.residual = residual
         residual[:3] = position - prior.position
         x, y, z, w = prior.quaternion.tolist()
         measured = rotations.product(*quaternion.tolist(), *self.marker_to_base.tolist())
         residual[3:] = rotations.log(rotations.product(-x, -y, -z, w, *measured))
-        residual[:3] -= prior.rotation @ self._lever
-        jacobian[0:3, ATTITUDE] = -prior.rotation @ rotations.skew(self._lever)
+        residual[:3] -= prior.rotation.dot(self._lever)
+        jacobian[0:3, ATTITUDE] = -prior.rotation.dot(self._turning)
         # A moving pose is displaced by motion times clock offset. Near rest velocity and rate are
         # mostly noise, which is correlated with the residual and would bias the offset.
         rate = prior.rate - prior.gyroscope_bias
-        velocity = prior.velocity + prior.rotation @ rotations.cross(rate, self._lever)
+        velocity = prior.velocity + prior.rotation.dot(rotations.cross(rate, self._lever))
         jacobian[0:3, TIME_OFFSET] = velocity if velocity.dot(velocity) > LEAST_SPEED ** 2 else 0.0
         jacobian[3:6, TIME_OFFSET] = rate if rate.dot(rate) > LEAST_RATE ** 2 else 0.0
-        kalman.P = self.covariance(prior)
-        kalman.x = self._no_error
-        kalman.update(residual, H=jacobian)
-        # The innovation is filterpy's y with inverse covariance SI; not <= also catches NaN.
-        if not kalman.y.dot(kalman.SI).dot(kalman.y) <= self.gate:
+        covariance = self.covariance(prior)
+        both = covariance.dot(jacobian.T)
+        inverse = np.linalg.inv(jacobian.dot(both) + self.noise)
+        if not residual.dot(inverse).dot(residual) <= self.gate:    # also NaN
             return None
-        return self._inject(prior, kalman.x, kalman.P)
+        gain = both.dot(inverse)
+        kept = self._identity - gain.dot(jacobian)
+        return self._inject(prior, gain.dot(residual), kept.dot(covariance).dot(kept.T)
+                            + gain.dot(self.noise).dot(gain.T))     # Joseph's form
 
     def _inject(self, prior: Node, error: np.ndarray, covariance: np.ndarray) -> Node:
         """Add the estimated error to the state; the remaining error has mean zero."""
@@ -251,16 +255,19 @@ class ErrorStateModel:
         position, velocity, quaternion, measured_rate = (
             self._extrapolated(node, age, readings) if late else
             (node.position, node.velocity, node.quaternion, node.rate))
-        rate = measured_rate - node.gyroscope_bias
-        rotation, arm = rotations.matrix(quaternion), self.parameters.imu.position
+        rate, arm = measured_rate - node.gyroscope_bias, self.parameters.imu.position
+        if self._beside:
+            rotation = rotations.matrix(quaternion)
+            position = position - rotation.dot(arm)
+            velocity = velocity - rotation.dot(rotations.cross(rate, arm))
 
         def covariance():
             # that at the stamp of the reading, which is up to 50 ms older than the estimate
             return self._covariance_at_base(
-                rotation, rate, self.covariance(node)[:ERROR_STATES, :ERROR_STATES], arm)
+                rotations.matrix(quaternion), rate,
+                self.covariance(node)[:ERROR_STATES, :ERROR_STATES], arm)
 
-        return Estimate(node.stamp, position - rotation.dot(arm),
-                        velocity - rotation.dot(rotations.cross(rate, arm)), quaternion, rate,
+        return Estimate(node.stamp, position, velocity, quaternion, rate,
                         node.accelerometer_bias, node.gyroscope_bias, covariance)
 
     def _extrapolated(self, node, age, readings) -> tuple[np.ndarray, ...]:

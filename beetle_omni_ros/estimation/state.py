@@ -69,8 +69,8 @@ def propagate(node: Node, stamp: float, force: np.ndarray, rate: np.ndarray,
                                h * (az + bz) + c * (ax * by - ay * bx))
     x, y, z, w = rotations.product(*node.quaternion.tolist(), *turn)
     scale = 1.5 - 0.5 * (x * x + y * y + z * z + w * w)  # Newton step of 1 / norm near 1
-    unit = (scale * x, scale * y, scale * z, scale * w)
-    rotation = rotations.matrix(unit)
+    quaternion = np.array((scale * x, scale * y, scale * z, scale * w))
+    rotation = rotations.matrix(quaternion)
 
     # ndarray.dot takes a third of the time of @ at this size
     acceleration0 = node.rotation.dot(node.force - node.accelerometer_bias)
@@ -80,7 +80,7 @@ def propagate(node: Node, stamp: float, force: np.ndarray, rate: np.ndarray,
     position = node.position + dt * node.velocity \
         + dt * dt / 6 * (acceleration0 + acceleration0 + acceleration1)
     position[2] -= 0.5 * gravity * dt * dt
-    return Node(stamp, force, rate, position, velocity, np.array(unit), rotation,
+    return Node(stamp, force, rate, position, velocity, quaternion, rotation,
                 node.accelerometer_bias, node.gyroscope_bias, node.time_offset, before=node)
 
 
@@ -114,7 +114,7 @@ def transition(before: Node, after: Node, out: np.ndarray) -> np.ndarray:
     return out
 
 
-@dataclass(frozen=True)
+@dataclass
 class Estimate:
     """State of base_link at the newest IMU sample."""
 

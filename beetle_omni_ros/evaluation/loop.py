@@ -7,6 +7,7 @@ depends on wall time, so that a seed determines all numbers.
 
 from __future__ import annotations
 
+from array import array
 from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
@@ -16,8 +17,8 @@ import gc
 
 import numpy as np
 
-from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import (
+    Command,
     Controller,
     ControllerHost,
     PoseTarget,
@@ -69,9 +70,9 @@ def collector_off():
 def compute_summary(times: Sequence[float], period: float) -> dict[str, float | int]:
     """Median, 99th percentile, maximum [ms], misses of ``period`` and number of ``times`` [s]."""
     used = 1e3 * np.array(times or [0.0])
-    return {'median': float(np.median(used)), 'p99': float(np.percentile(used, 99)),
-            'max': float(used.max()), 'deadline_misses': int(np.sum(used > 1e3 * period)),
-            'count': len(times)}
+    median, p99 = np.percentile(used, [50, 99]).tolist()
+    return {'median': median, 'p99': p99, 'max': float(used.max()),
+            'deadline_misses': int(np.sum(used > 1e3 * period)), 'count': len(times)}
 
 
 class Waiting:
@@ -148,12 +149,12 @@ class FlightLoop:
     def __init__(self, robot: RobotParameters, plant: RobotParameters,
                  controllers: dict[str, Controller], recorder: Recorder, *,
                  conditions: str = 'nominal', seed: int = 0, faults: Sequence[Fault] = ()):
-        estimator, active = EkfParameters.load().of_robot(robot), next(iter(controllers))
+        estimator = EkfParameters.load().of_robot(robot)
         self.simulator = Simulator(plant, SimulatorParameters.load(), conditions=conditions,
                                    seed=seed)
         self.supervisor = Supervisor(SupervisorParameters.load(), robot, HoverController(robot),
-                                     tuple(dict.fromkeys((*registry.names(), active))))
-        self.supervisor.select(active)
+                                     tuple(controllers))
+        self.supervisor.select(next(iter(controllers)))
         self.refusals: list[str] = []
         self._estimator = ErrorStateEkf(estimator, robot.gravity)
         self._gyroscope_noise, self._errors = estimator.imu.gyroscope_noise, robot.sensors
@@ -162,7 +163,7 @@ class FlightLoop:
         self._processes = Processes(self.simulator.tick, self.supervisor)
         self._other_target: Target | None = None     # of a fault
         self._accepts_other = False
-        self._times: dict[str, list[float]] = {name: [] for name in controllers}    # CPU [s]
+        self._times = {name: array('d') for name in controllers}    # CPU [s]
         self._every = {name: max(1, round(c.period / self.simulator.tick))
                        for name, c in controllers.items()}
         self._hosts = {name: ControllerHost(name, c, self._times[name].append)
@@ -298,8 +299,8 @@ class FlightLoop:
                 or not 0 <= last.stamp - command.stamp <= CLOCK_SET_BACK:
             self._command = command
             if command is not None:
-                self.simulator.command(replace(
-                    command, stamp=command.stamp - processes.clock_step))
+                self.simulator.command(Command(
+                    command.stamp - processes.clock_step, command.tilt, command.thrust))
                 recorder.write('command', command, now)
         if self.supervisor.reported_state != self._reported:
             self._note_state(now)

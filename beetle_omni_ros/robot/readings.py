@@ -11,7 +11,7 @@ from beetle_omni_ros.robot.parameters import JOINT_NAMES
 from beetle_omni_ros.robot.terms import SensorErrors
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class ImuReading:
     """One IMU reading (REP-145), in the IMU's own axes."""
 
@@ -20,7 +20,7 @@ class ImuReading:
     angular_velocity: np.ndarray    # (3,) [rad/s]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class PoseReading:
     """One MoCap pose of the tracked body in world."""
 
@@ -29,7 +29,7 @@ class PoseReading:
     quaternion: np.ndarray      # (4,) body to world (x, y, z, w), of either sign
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class JointReading:
     """One reading of the tilt joints."""
 
@@ -45,7 +45,7 @@ class JointReading:
             else self
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class BatteryReading:
     """Pack voltage under load [V] and current [A], negative in discharge."""
 
@@ -54,7 +54,7 @@ class BatteryReading:
     current: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class RotorReading:
     """Rotor speeds from the ESCs (4,) [rad/s], positive for both spins; NaN: unknown."""
 

@@ -9,7 +9,9 @@ loop. A loop records into memory (:class:`LogRecorder`), onto disk
 from __future__ import annotations
 
 from array import array
+from collections import defaultdict
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
@@ -206,7 +208,8 @@ class LogRecorder(Recorder):
     """Collects a :class:`FlightLog`; see there for units and frames."""
 
     def __init__(self, meta: dict | None = None):
-        self._rows: dict[str, array] = {}     # topic -> flat rows: hours of flight fit
+        # topic -> flat rows: hours of flight fit
+        self._rows: dict[str, array] = defaultdict(partial(array, 'd'))
         self._log = FlightLog(meta=dict(meta or {}))
         self._states: list[tuple[float, str]] = []
 
@@ -216,7 +219,7 @@ class LogRecorder(Recorder):
         if not series:
             self._add_event(topic, value, received)
             return
-        rows, stamp = self._rows.setdefault(topic, array('d')), value.stamp
+        rows, stamp = self._rows[topic], value.stamp
         parts = [((stamp if received is None else received) if channel == 'received' else
                   getattr(value, channel), width) for channel, width in SERIES[series].items()]
         if isinstance(stamp, np.ndarray):       # the fields are arrays over several messages
@@ -224,14 +227,15 @@ class LogRecorder(Recorder):
                 np.full((len(stamp), width), np.nan) if part is None else part
                 for part, width in parts)]).astype(float).tobytes())
             return
-        rows.append(stamp)
+        row = [stamp]
         for part, width in parts:
             if not width:
-                rows.append(part)
+                row.append(part)
             elif isinstance(part, np.ndarray):
-                rows.extend(part.tolist())      # floats are added faster than numpy's numbers
+                row += part.tolist()    # floats are added faster than numpy's numbers
             else:
-                rows.extend([np.nan] * width if part is None else part)
+                row += [np.nan] * width if part is None else part
+        rows.fromlist(row)
 
     def _add_event(self, topic, value, received):
         """Add a target, a state of the supervisor or diagnostics."""

@@ -1,5 +1,6 @@
 """Tasks: targets, external wrenches and payloads over time."""
 
+from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -178,7 +179,7 @@ class TaskPlayer:
         self.target: Target | None = None
         self.lost_level: float | None = None
         self._segments = (*task.segments, self.segment)     # after the task
-        self._ends = task.ends
+        self._ends = task.ends.tolist()
         self._index = -1
         self._in_force: Target | None = None
 
@@ -189,7 +190,7 @@ class TaskPlayer:
 
         Pose (3,) in world [m] and (4,) of the robot serve to detect a loss of control.
         """
-        index = int(self._ends.searchsorted(now - self.start + 1e-6, side='right'))
+        index = bisect_right(self._ends, now - self.start + 1e-6)
         level = self._segments[self._index].level
         if position is not None and level and self.task.kind in ('force', 'torque') \
                 and control_lost(self._in_force, position, quaternion if

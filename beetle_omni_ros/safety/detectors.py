@@ -61,6 +61,7 @@ class FaultWatch:
         self.faults.clear()
         self.health: ActuatorHealth = ALL_HEALTHY
         self.news: list[str] = []
+        self._thrust = np.zeros(ROTORS)     # executed [N]
         self._pack = None if self._map is None else PackWatch(self._robot, self._allocator,
                                                               self._map)
         self.restart()
@@ -84,18 +85,16 @@ class FaultWatch:
 
     def on_command(self, command: Command) -> None:
         """Receive the executed command."""
-        thrust = clipped(command.thrust, 0.0, self._limit_now)
+        self._thrust = clipped(command.thrust, 0.0, self._limit_now)
         self._joints.commands.append((command.stamp, command.tilt))
-        self._speeds.commands.append((command.stamp, thrust))
+        self._speeds.commands.append((command.stamp, self._thrust))
 
     def on_imu(self, stamp: float, force: np.ndarray, rate: np.ndarray, tilt: np.ndarray | None,
-               command: Command | None, height: float | None) -> None:
+               height: float | None) -> None:
         """Receive an IMU sample of a robot in the air, see the two detectors."""
         dt, self._stamp = stamp - self._stamp, stamp
-        thrust = np.zeros(ROTORS) if command is None else \
-            clipped(command.thrust, 0.0, self._limit_now)
         self._wrench.supported = self._speeds.slow
-        self._wrench.on_imu(stamp, force, rate, tilt, thrust, self.health)
+        self._wrench.on_imu(stamp, force, rate, tilt, self._thrust, self.health)
         self.contact.update(min(max(dt, 0.0), 0.05), height, self._wrench)
         if height is not None and height < NEAR_GROUND:
             return      # the floor also exerts a force
@@ -113,10 +112,10 @@ class FaultWatch:
         if deaf is not None and self.health.rotors[deaf] and self.name(
                 f'rotor{deaf + 1}_deaf', stamp, f'rotor {deaf + 1} does not follow its commands, '
                 f'by its ESC; it gives {thrust[deaf]:.1f} N'):
-            self._set('held', deaf, min(float(thrust[deaf]), self._thrust_max))
+            self._set('held', deaf, min(thrust[deaf], self._thrust_max))
         for rotor, held in enumerate(self.health.held):
             if held is not None and abs(thrust[rotor] - held) > NOTICEABLE:
-                self._set('held', rotor, min(max(float(thrust[rotor]), 0.0), self._thrust_max))
+                self._set('held', rotor, min(max(thrust[rotor], 0.0), self._thrust_max))
 
     def _lose_rotor(self, rotor, stamp, by):
         if self.name(f'rotor{rotor + 1}_lost', stamp, f'rotor {rotor + 1} gives less thrust than '
@@ -131,13 +130,14 @@ class FaultWatch:
         """
         watch = self._joints
         watch.on_joints(stamp, tilt)
-        if not trusted or not watch.suspects and not watch.jump.any() \
+        if not trusted or not watch.suspects and not any(watch.jump) \
                 and self.health.stuck == ALL_HEALTHY.stuck:
             return
-        for joint in np.flatnonzero(watch.jump).tolist():
-            self.name(f'joint{joint + 1}_encoder_jump', stamp, f'the encoder of '
-                      f'gimbal{joint + 1} jumped by {watch.jump[joint]:+.2f} rad at once')
-            self._set('zeros', joint, self.health.zeros[joint] + float(watch.jump[joint]))
+        for joint, jump in enumerate(watch.jump):
+            if jump:
+                self.name(f'joint{joint + 1}_encoder_jump', stamp, f'the encoder of '
+                          f'gimbal{joint + 1} jumped by {jump:+.2f} rad at once')
+                self._set('zeros', joint, self.health.zeros[joint] + jump)
         true = clipped(self.health.true(tilt), -self._limit, self._limit).tolist()
         for joint, angle in enumerate(true):
             stuck = self.health.stuck[joint]

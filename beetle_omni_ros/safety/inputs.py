@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
-from math import dist, isfinite
+from itertools import chain
+from math import dist, hypot, isfinite
 
 import numpy as np
 
@@ -26,7 +27,7 @@ STALE_AFTER = 0.05      # [s] older estimates are refused
 JOINT_TIMEOUT = 0.2     # [s]
 IMU_TIMEOUT = 0.05      # [s]
 MOCAP_TIMEOUT = 0.2     # [s]
-ABSURD = 1e4            # [m, m/s, m/s^2, rad/s] beyond any robot and sensor; no overflow
+ABSURD = 1e4            # [m, m/s, m/s^2, rad/s] length beyond any robot and sensor; no overflow
 VOLTAGES = 1.0, 1000.0  # [V] plausible readings; that of a disconnected sensor is smaller
 UNIT_TOLERANCE = 0.02   # of a quaternion's squared length
 JUMP_POSITION, JUMP_ATTITUDE = 1.0, 1.0     # [m], [rad] a single larger jump of the estimate is
@@ -43,8 +44,8 @@ QUIET_TIME = 1.0        # [s] in which the same message is logged once
 
 
 def plausible(*arrays: np.ndarray) -> bool:
-    """Whether all numbers are finite and below ABSURD."""
-    return all(bool(np.abs(array).max() < ABSURD) for array in arrays)
+    """Whether all numbers are finite, as one vector shorter than ABSURD."""
+    return hypot(*chain(*map(np.ndarray.tolist, arrays))) < ABSURD
 
 
 class Inputs:
@@ -130,11 +131,12 @@ class Inputs:
         if state.stamp <= self.estimate.stamp:
             return 'repeated or older stamp'
         before, self._offered = self._offered, state
-        self._same = self._same + 1 if np.array_equal(before.position, state.position) else 0
+        was, at = before.position.tolist(), state.position.tolist()
+        self._same = self._same + 1 if was == at else 0
         if self._same >= SAME and self.airborne:
             return FROZEN
         jumped = 0 < state.stamp - before.stamp <= ESTIMATE_TIMEOUT and (
-            dist(before.position, state.position) > JUMP_POSITION
+            dist(was, at) > JUMP_POSITION
             or rotations.geodesic_angle(before.quaternion, state.quaternion) > JUMP_ATTITUDE)
         return JUMP if jumped else ''
 
@@ -153,14 +155,18 @@ class Inputs:
 
         Only complete feedback resets the timeout of the joints.
         """
-        known = np.abs(position) < ABSURD
-        if not stamp > self.tilt_stamp or self._ahead(stamp) or not known.any():
+        if not stamp > self.tilt_stamp or self._ahead(stamp):
             return
-        self.tilt = np.where(known, self.watch.health.true(position), self.tilt)
-        self.tilt_velocity = np.zeros(4) if velocity is None else \
-            np.where(known & np.isfinite(velocity), velocity, 0.0)
+        known = [abs(angle) < ABSURD for angle in position.tolist()]
+        if not any(known):
+            return
+        true = self.watch.health.true(position)
+        self.tilt = true if all(known) else np.where(known, true, self.tilt)
+        self.tilt_velocity = np.zeros(4) if velocity is None else np.array([
+            rate if there and isfinite(rate) else 0.0
+            for there, rate in zip(known, velocity.tolist())])
         self.tilt_stamp = float(stamp)
-        if known.all():
+        if all(known):
             self.joints.reset()
             zeros = self.watch.health.zeros
             self.watch.on_joints(stamp, position, self.airborne)
@@ -185,7 +191,7 @@ class Inputs:
         if self.airborne:
             known = stamp - self.tilt_stamp < TILT_AGE
             self.watch.on_imu(stamp, specific_force, angular_velocity,
-                              self.tilt if known else None, self._in_force, self.height)
+                              self.tilt if known else None, self.height)
 
     def on_rotors(self, stamp: float, speed: np.ndarray) -> None:
         """Receive the rotor speeds (4,) reported by the ESCs [rad/s], nan where unknown."""
@@ -262,8 +268,9 @@ class Inputs:
         if self.joints.silent and in_force is not None and not self.bridges.get(
                 'joint', '').startswith('lost:'):
             tilt, velocity = in_force.tilt, np.zeros(4)
-        return replace(self.best, tilt=tilt, tilt_velocity=velocity, tilt_stamp=self.tilt_stamp,
-                       command=in_force)
+        best = self.best
+        return State(best.stamp, best.position, best.velocity, best.quaternion,
+                     best.angular_velocity, tilt, velocity, self.tilt_stamp, in_force)
 
     @property
     def specific_force_up(self) -> float | None:

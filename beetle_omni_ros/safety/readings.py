@@ -1,19 +1,18 @@
 """Detection of encoders and MoCap poses that contradict the models, and of joints that stick."""
 
 from collections import deque
-from math import expm1, sqrt
+from math import expm1, inf, sqrt
 
 import numpy as np
 
 from beetle_omni_ros.control.base import State
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.allocation import clipped, ROTORS
+from beetle_omni_ros.robot.allocation import ROTORS
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.servo import Responses
 
 KEPT = 64               # commands, 0.3 s at 200 Hz
 LONGEST = 0.1           # [s] between two readings; after a longer gap no jump is detected
-NO_JUMP = np.zeros(ROTORS)
 ERROR = 0.25            # [rad] beside both models, and the friction of the file
 TIME = 0.12             # [s] until it is a fault
 DELAY = 0.025           # [s] command 10 to 15 ms, feedback 5 to 10 ms
@@ -38,9 +37,9 @@ class JointWatch:
 
     Attributes:
         commands: stamps [s] and joint targets (4,) [rad], the newest last.
-        astray: joints (4,) bool that do not follow their command.
-        jump: (4,) [rad] jump of the last reading relative to the motion before it, if it is larger
-            than a joint can turn, else 0.
+        astray: joints (4) that do not follow their command.
+        jump: 4 jumps [rad] of the last reading relative to the motion before it, if larger than a
+            joint can turn, else 0.
         suspects: whether a joint differed from its model at the last reading.
 
     """
@@ -52,30 +51,35 @@ class JointWatch:
         self._delays = max(0.0, DELAY - SPREAD + low), DELAY + SPREAD + high
         self._error = ERROR + allowed.friction
         self.commands: deque = deque(maxlen=KEPT)
-        self._stamp, self._tilt, self._models = -np.inf, np.zeros(ROTORS), np.zeros((2, ROTORS))
-        self._change, self._for = np.zeros(ROTORS), np.zeros(ROTORS)
-        self.astray, self.jump, self.suspects = np.zeros(ROTORS, dtype=bool), NO_JUMP, False
+        self._stamp, zero = -inf, [0.0] * ROTORS
+        self._tilt, self._models, self._change, self._for = zero, [zero, zero], zero, zero
+        self.astray, self.jump, self.suspects = [False] * ROTORS, zero, False
 
     def on_joints(self, stamp: float, tilt: np.ndarray) -> None:
         """Receive a complete reading (4,) [rad] of the time ``stamp`` [s]."""
-        dt, change, models = stamp - self._stamp, tilt - self._tilt, self._models
-        self._stamp, self._tilt, self.jump = stamp, tilt, NO_JUMP
+        dt, before, angles = stamp - self._stamp, self._tilt, tilt.tolist()
+        self._stamp, self._tilt, self.jump = stamp, angles, [0.0] * ROTORS
         if dt > LONGEST:
-            models[:], self._change, self._for = tilt, np.zeros(ROTORS), np.zeros(ROTORS)
+            self._models, self._change, self._for = [angles, angles], self.jump, self.jump
             return
         reach = self._rate_limit * dt
-        for model, delay, lag in zip(models, self._delays, self._lags):
+        for k, (delay, lag) in enumerate(zip(self._delays, self._lags)):
             target = next((asked for at, asked in reversed(self.commands) if at <= stamp - delay),
                           tilt)
-            model += clipped(-expm1(-dt / lag) * (target - model), -reach, reach)
-        jumped = np.abs(change) > reach + JUMP
-        if jumped.any():
-            self.jump = np.where(jumped, change - self._change, 0.0)
-            models[:] = np.where(jumped, tilt, models)
-        self._change = np.where(jumped, self._change, change)
-        off = (tilt < models.min(axis=0) - self._error) | (tilt > models.max(axis=0) + self._error)
-        self._for = np.where(off, self._for + dt, 0.0)
-        self.astray, self.suspects = self._for >= TIME, bool(off.any())
+            gain = -expm1(-dt / lag)
+            self._models[k] = [model + min(max(gain * (goal - model), -reach), reach)
+                               for model, goal in zip(self._models[k], target.tolist())]
+        changes = [new - old for new, old in zip(angles, before)]
+        for i, change in enumerate(changes):
+            if abs(change) > reach + JUMP:
+                self.jump[i], changes[i] = change - self._change[i], self._change[i]
+                for model in self._models:
+                    model[i] = angles[i]
+        self._change = changes
+        self._for = [
+            0.0 if min(one, other) - self._error <= angle <= max(one, other) + self._error
+            else time + dt for time, angle, one, other in zip(self._for, angles, *self._models)]
+        self.astray, self.suspects = [time >= TIME for time in self._for], any(self._for)
 
 
 class MocapWatch:
@@ -104,8 +108,8 @@ class MocapWatch:
         if before is not None:
             dt, moved = stamp - before[0], position - before[1]
             turn = rotations.geodesic_angle(before[2], quaternion)
-            self._same = self._same + 1 if not moved.any() and np.array_equal(
-                quaternion, before[2]) else 0
+            self._same = self._same + 1 if not any(moved.tolist()) \
+                and quaternion.tolist() == before[2].tolist() else 0
             if dt < LONGEST:
                 self.jumped |= turn > ATTITUDE + turning * dt \
                     or sqrt(moved.dot(moved)) > DISTANCE + FASTEST * dt

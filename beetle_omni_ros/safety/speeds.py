@@ -1,11 +1,11 @@
 """Detection of rotors whose ESC speed differs from the commanded thrust."""
 
 from collections import deque
-from math import expm1, inf
+from math import expm1, inf, isfinite, nan
 
 import numpy as np
 
-from beetle_omni_ros.robot.allocation import clipped, ROTORS
+from beetle_omni_ros.robot.allocation import ROTORS
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.servo import Responses
 
@@ -39,8 +39,8 @@ class SpeedWatch:
         commands: stamps [s] and commanded thrusts (4,) [N], the newest last.
         lost: the rotor (0 to 3) that turns too slowly, or None.
         deaf: the rotor (0 to 3) that gives more than commanded, or None.
-        thrust: (4,) computed from the speeds [N], nan where unknown.
-        slow: (4,) bool, rotors that turn noticeably too slowly at the last report.
+        thrust: 4 numbers computed from the speeds [N], nan where unknown.
+        slow: 4 bool, rotors that turn noticeably too slowly at the last report.
 
     """
 
@@ -51,14 +51,15 @@ class SpeedWatch:
         self._stamp, self._interval, self._settled_at = -inf, 0.0, -inf
         self.commands: deque = deque(maxlen=KEPT)
         self._modelled = np.zeros((2, ROTORS))      # with the shortest and with the longest lag
-        self._learnt_for, self._mean_thrust, self._mean_square = np.zeros((3, ROTORS))
-        self.thrust = np.full(ROTORS, np.nan)
+        self._learnt_for, self._mean_thrust, self._mean_square = (
+            [0.0] * ROTORS for _ in range(3))
+        self.thrust = [nan] * ROTORS
         self.forget()
 
     def forget(self) -> None:
         """Suspect no rotor."""
-        self.slow = np.zeros(ROTORS, dtype=bool)
-        self._slow_for, self._more_for = np.zeros((2, ROTORS))
+        self.slow = [False] * ROTORS
+        self._slow_for, self._more_for = [0.0] * ROTORS, [0.0] * ROTORS
         self.lost: int | None = None
         self.deaf: int | None = None
 
@@ -74,7 +75,11 @@ class SpeedWatch:
         self._follow(before, stamp)
         if stamp < self._settled_at:
             return self.forget()
-        self._compare(speed * speed, dt)
+        for k, (one, low, high) in enumerate(zip(speed.tolist(), *self._modelled.tolist())):
+            self._compare(k, one * one, (low, high), dt)
+        slow, more = max(self._slow_for), max(self._more_for)
+        self.lost = self._slow_for.index(slow) if slow >= TIME else None
+        self.deaf = self._more_for.index(more) if more >= TIME else None
 
     def _follow(self, start, end):
         """Thrusts that the commands build up between two times [s]."""
@@ -88,27 +93,23 @@ class SpeedWatch:
                 if span > 0:
                     modelled -= expm1(-span / lag) * (asked - modelled)
 
-    def _compare(self, square, dt):
-        """Judge squared speeds (4,) [rad^2/s^2], nan where unknown; nan is never suspect."""
-        modelled, slowest = self._modelled, self._modelled[1]
-        learnt = self._learnt_for >= LEARNT
-        y = np.where(learnt, self._mean_thrust / np.where(learnt, self._mean_square, 1.0) * square,
-                     np.nan)
-        # Of the lags between, the one nearest to the measurement; with nan the longest.
-        x = np.where(np.isfinite(y), clipped(y, modelled.min(axis=0), modelled.max(axis=0)),
-                     slowest)
-        judged = np.isfinite(square) & (x > LEAST_THRUST)
-        known = judged & learnt
-        too_slow = known & (y < (1 - SHARE) * x)
-        more = known & (y > (1 + SHARE) * x) & (y - x > EXCESS)
-        self.thrust = np.where(known, y, np.nan)
-        self.slow = known & (y < (1 - NOTICED) * x)
-        good = judged & ~too_slow & ~more & (square > 0)
-        gain = np.where(good, dt / np.minimum(np.maximum(self._learnt_for, dt), LEARNT), 0.0)
-        self._mean_thrust += gain * (slowest - self._mean_thrust)
-        self._mean_square += gain * (np.nan_to_num(square) - self._mean_square)
-        self._learnt_for += np.where(good, dt, 0.0)
-        self._slow_for = np.where(too_slow, self._slow_for + dt, 0.0)
-        self._more_for = np.where(more, self._more_for + dt, 0.0)
-        self.lost = int(self._slow_for.argmax()) if self._slow_for.max() >= TIME else None
-        self.deaf = int(self._more_for.argmax()) if self._more_for.max() >= TIME else None
+    def _compare(self, k, square, modelled, dt):
+        """Judge the squared speed [rad^2/s^2] of a rotor, nan if unknown, which is no suspect."""
+        learnt, slowest = self._learnt_for[k] >= LEARNT, modelled[1]
+        y = self._mean_thrust[k] / self._mean_square[k] * square if learnt else nan
+        known, x = isfinite(y), slowest
+        if known:   # of the lags between, the one nearest to the measurement
+            x = min(max(y, min(modelled)), max(modelled))
+        judged = isfinite(square) and x > LEAST_THRUST
+        known = known and judged
+        too_slow = known and y < (1 - SHARE) * x
+        more = known and y > (1 + SHARE) * x and y - x > EXCESS
+        self.thrust[k] = y if known else nan
+        self.slow[k] = known and y < (1 - NOTICED) * x
+        if judged and not too_slow and not more and square > 0:
+            gain = dt / min(max(self._learnt_for[k], dt), LEARNT)
+            self._mean_thrust[k] += gain * (slowest - self._mean_thrust[k])
+            self._mean_square[k] += gain * (square - self._mean_square[k])
+            self._learnt_for[k] += dt
+        self._slow_for[k] = self._slow_for[k] + dt if too_slow else 0.0
+        self._more_for[k] = self._more_for[k] + dt if more else 0.0

@@ -67,6 +67,8 @@ class Supervisor(Inputs):
         self._handover_left = 0.0   # after a change of the controller [s]
         self.state, self.source = DISARMED, 'none'
         self.target_override: Target | None = None
+        self._cycle = {TAKEOFF: self._take_off, FLYING: self._fly, FALLBACK: self._hold,
+                       LANDING: self._descend}
         # Objects of the present state, created when it is entered.
         self._takeoff: Takeoff
         self._landing: Landing
@@ -74,6 +76,8 @@ class Supervisor(Inputs):
         self._height: float
         self._in_state = 0.0    # time since the last change of the state [s]
         self._acted_on = ALL_HEALTHY    # health to which landing and hover are adapted
+        self._given: Command | None = None      # the last output before the final check
+        self._asked: Command | None = None      # and after it
         self._before = np.inf       # time of the update before [s]
         self._resumed = -np.inf     # time of the last pause [s]
 
@@ -84,7 +88,7 @@ class Supervisor(Inputs):
         reason = self.why_not_arm() if self.state == DISARMED else f'{self.state}, not disarmed'
         if reason:
             return self._refuse(f'arm refused: {reason}')
-        self._in_force = None
+        self._in_force = self._given = None
         self._takeoff = Takeoff(self._parameters.takeoff_height, self.allocator, self._hover,
                                 self.seen)
         self.floor = float(self.estimate.position[2])
@@ -148,29 +152,30 @@ class Supervisor(Inputs):
         self._look_for_faults(now)
         if self.state in IN_FLIGHT:
             self._react(now)
-        command = self._guarded({TAKEOFF: self._take_off, FLYING: self._fly, FALLBACK: self._hold,
-                                 LANDING: self._descend}.get(self.state, self._stand)(now, dt),
-                                now)
-        asked = command
-        if command is not None:
-            if self.health.zeros != NO_ZEROS:       # in angles of the encoder that jumped
-                asked = within_limits(replace(command, tilt=self.health.read(command.tilt)),
-                                      self.robot)
-            self.watch.on_command(asked)
+        command = self._guarded(self._cycle.get(self.state, self._stand)(now, dt), now)
         if self.state in IN_FLIGHT:
             self.airborne = self.state != TAKEOFF or self._takeoff.airborne
             share = 1 - exp(-dt / self.robot.rotors.time_constant)
             self.thrusts += share * ((0.0 if command is None else command.thrust) - self.thrusts)
-        return asked
+        return command
 
     def _guarded(self, command, now):
-        """Final check of the output: finite, inside limits."""
+        """Final check of a new output: finite, inside limits."""
         if command is None or now - self._resumed < LOOK:
             return None
-        self._in_force = within_limits(command, self.robot)
-        if self._in_force is None:
+        if command is self._given:
+            return self._asked
+        self._given = command
+        self._in_force = self._asked = asked = within_limits(command, self.robot)
+        if asked is None:
             self.emergency_stop(now, f'{self.source} gave a command that is not finite')
-        return self._in_force
+            return None
+        if self.health.zeros != NO_ZEROS:       # in angles of the encoder that jumped
+            limit = self.robot.joints.position_limit
+            self._asked = asked = replace(
+                asked, tilt=clipped(self.health.read(asked.tilt), -limit, limit))
+        self.watch.on_command(asked)
+        return asked
 
     # Faults -----------------------------------------------------------------------------------
 
@@ -206,7 +211,7 @@ class Supervisor(Inputs):
 
     def _degrade(self, now):
         """Land with the working actuators, in the attitude nearest level with a margin."""
-        before, self._acted_on = self._acted_on, self.health
+        before, self._acted_on, self._given = self._acted_on, self.health, None
         if self.health.healthy:
             return      # a zero has moved, which is corrected in commands and readings
         self._hover.set_health(self.health)
@@ -396,6 +401,7 @@ class Supervisor(Inputs):
         if state in (FALLBACK, LANDING) and before is not None:
             tilt = self.seen.tilt       # the last command may be far from the joints
             self._in_force = replace(before, tilt=clipped(before.tilt, tilt - AHEAD, tilt + AHEAD))
+            self._given = None
         self.say(severity, text)
         return Answer(True, text)
 

@@ -56,7 +56,7 @@ class WrenchWatch:
     Attributes:
         lost: the rotor (0 to 3) that is missing, or None.
         impact: largest specific force of the last sample beyond the rotors' reach [m/s^2], or 0.
-        supported: (4,) bool, rotors that are also slow by their ESC; set by the caller.
+        supported: 4 bool, rotors that are also slow by their ESC; set by the caller.
         thrust: (2, 4) modelled thrusts with the shortest and with the longest lag [N].
         unexplained: (3,) filtered force that neither the rotors nor another thrust vector of one
             rotor explains, in base_link [m/s^2].
@@ -80,12 +80,12 @@ class WrenchWatch:
         # The first of two rows is that of the shortest lag.
         self.thrust = np.zeros((2, ROTORS))
         self._stamp: float | None = None
-        self.supported = np.zeros(ROTORS, dtype=bool)
+        self.supported = [False] * ROTORS
         self._measured, self._vectors = np.zeros(6), np.zeros((2, 2 * ROTORS))
         self._steady, self._steady_vectors = np.zeros(6), np.zeros((2, 2 * ROTORS))
         self._waited = self.impact = 0.0
         self.unexplained = np.zeros(3)
-        self._lost_for, self._weak_for = np.zeros(ROTORS), np.zeros(ROTORS)
+        self._lost_for, self._weak_for = [0.0] * ROTORS, [0.0] * ROTORS
         self.lost: int | None = None
 
     def on_imu(self, stamp: float, force: np.ndarray, rate: np.ndarray, tilt: np.ndarray | None,
@@ -131,25 +131,24 @@ class WrenchWatch:
             self._steady_vectors += gain * (self._vectors - self._steady_vectors)
             weak, _ = self._judged(self._steady_vectors, self._steady, STEADY_EVIDENCE,
                                    STEADY_EXPLAINED, STEADY_SHARE)
-            self._weak_for = np.maximum(
-                0.0, self._weak_for + np.where(weak, self._waited, -self._waited))
+            self._weak_for = _counted(self._weak_for, weak, self._waited)
             self._waited = 0.0
         lost, self.unexplained = self._judged(self._vectors, self._measured, EVIDENCE, EXPLAINED,
                                               SHARE)
-        self._lost_for = np.maximum(0.0, self._lost_for + np.where(lost, dt, -dt))
-        named = (self._lost_for >= np.where(self.supported, TIME, TIME_ALONE)) \
-            | (self._weak_for >= STEADY_TIME)
-        self.lost = int(np.argmax(named)) if named.any() else None
+        self._lost_for = _counted(self._lost_for, lost, dt)
+        self.lost = next((rotor for rotor, (lost, weak, slow) in enumerate(zip(
+            self._lost_for, self._weak_for, self.supported))
+            if lost >= (TIME if slow else TIME_ALONE) or weak >= STEADY_TIME), None)
 
     def _judged(self, vectors, measured, evidence, explained, share):
         """
-        Which rotors (4,) bool lack a share of their thrust, and the unexplained force (3,).
+        Which rotor lacks a share of its thrust, or None, and the unexplained force (3,).
 
         Thrust vectors of lags between the two are close to a line: a first-order lag is a point on
         a half circle from 1 to 0, and the line cuts off at most 8 % of the circle for lags of one
         to three.
         """
-        lost = np.zeros(ROTORS, dtype=bool)
+        lost = None
         residuals = measured - vectors.dot(self._model)
         change = residuals[0] - residuals[1]
         part = min(1.0, max(0.0, -residuals[1].dot(change) / (change.dot(change) + TINY)))
@@ -163,8 +162,13 @@ class WrenchWatch:
             length = float(np.hypot(*modelled))
             if left[i] @ left[i] < (1 - explained) * size and length > LEAST_THRUST:
                 true = float(np.hypot(*(modelled + self._fits[i] @ residual)))
-                lost[i], rest = true < (1 - share) * length, left[i]
+                lost, rest = i if true < (1 - share) * length else None, left[i]
         return lost, rest[:3] / self._weights[:3]
+
+
+def _counted(times, rotor, dt):
+    """Times for which each rotor was named [s], which decrease while it is not."""
+    return [max(0.0, time + (dt if k == rotor else -dt)) for k, time in enumerate(times)]
 
 
 class ContactWatch:

@@ -373,6 +373,8 @@ class Schedule:
         # (for its functions, at first None), and from its onset random, truth and held.
         self._states: list[SimpleNamespace] = []
         self.empty = True
+        # Kind and state of each active fault, in the order of the list.
+        self.active: list[tuple[Kind, Any]] = []
 
     def set(self, faults: Sequence[Fault], now: float) -> None:
         """Replace the faults, ``at`` counts from ``now`` [s]; one that stays continues."""
@@ -385,6 +387,7 @@ class Schedule:
                 **fault.numbers, fault=fault, begin=now + fault.at, active=False, over=False,
                 k=int(fault.numbers.get('rotor', fault.numbers.get('servo', 1))) - 1,
                 tick=self._tick, memory=None))
+        self._list_active()
 
     def update(self, now: float, truth: Any = None, held: np.ndarray | None = None) -> None:
         """Start and end the faults due at ``now`` [s], with the true state and servo targets."""
@@ -395,11 +398,10 @@ class Schedule:
             if state.active and now >= state.begin + state.fault.duration - ROUNDING:
                 state.active, state.over = False, True
             state.now = now
+        self._list_active()
 
-    @property
-    def active(self) -> list[tuple[Kind, Any]]:
-        """Kind and state of each active fault, in the order of the list."""
-        return [(KINDS[state.fault.kind], state) for state in self._states if state.active]
+    def _list_active(self):
+        self.active = [(KINDS[state.fault.kind], state) for state in self._states if state.active]
 
     def through(self, signal: str, item: Any, now: float) -> list:
         """Items that arrive ``now`` [s] if ``item``, or None, is sent through the faults."""

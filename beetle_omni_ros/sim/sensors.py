@@ -29,7 +29,7 @@ ROTOR_LATENCY = 0.01                # [s] from capture to arrival, chosen
 ROTOR_NOISE = 0.01                  # [-] standard deviation relative to the speed, chosen
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Impact:
     """Motion at a touchdown, the first contact with the floor after flight."""
 
@@ -38,7 +38,7 @@ class Impact:
     inclination: float              # angle between base_link's z axis and the vertical [rad]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Truth:
     """The true state."""
 
@@ -55,7 +55,7 @@ class Truth:
     broken: bool = False            # then rotors and servos do not work until reset
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Frame:
     """Readings that arrive in one tick, or None, and the true state."""
 
@@ -92,7 +92,7 @@ class Sensors:
                  robot: RobotParameters):
         self._tick, self._plant, self._gravity = parameters.tick, plant, robot.gravity
         self._errors = errors = robot.sensors
-        self._to_imu = np.kron(np.eye(2), rotations.matrix(rotations.exp(errors.imu_rotation)))
+        self._to_imu = np.kron(np.eye(2), rotations.matrix(rotations.exp(errors.imu_rotation))).T
         self._lever_arm = np.array(errors.imu_position) if any(errors.imu_position) else None
         imu, mocap, tilt, pack, rotors = (np.random.Generator(np.random.PCG64(seed))
                                           for seed in seeds)
@@ -123,8 +123,8 @@ class Sensors:
         self._imu_shift = errors.imu_delay - self._tick * imu_delay
         self._before = first
         length = 1 + self._ticks('imu latency', conditions.imu_latency) + imu_delay
-        self._imu = deque([self._to_imu.T @ np.concatenate(
-            [plant.specific_force, first.angular_velocity])] * length, length)
+        self._imu = deque([self._to_imu.dot(np.concatenate(
+            [plant.specific_force, first.angular_velocity]))] * length, length)
         length = 1 + self._ticks('rotor latency', ROTOR_LATENCY)
         self._rotors: deque = deque([None] * length, length)
         length = 1 + self._ticks('encoder latency', conditions.tilt_latency) + encoder_delay
@@ -159,7 +159,7 @@ class Sensors:
         if (arm := self._lever_arm) is not None:
             turning = (after.angular_velocity - before.angular_velocity) / self._tick
             motion[:3] += np.cross(turning, arm) + np.cross(rate, np.cross(rate, arm))
-        return self._to_imu.T @ motion
+        return self._to_imu.dot(motion)
 
     def read(self, tick: int, truth: Truth, battery, wear: np.ndarray,
              devices: bool = False) -> Frame:

@@ -18,6 +18,7 @@ from beetle_omni_ros.sim.plant import Plant, XYZW
 from beetle_omni_ros.sim.sensors import Frame, Impact, Sensors, Truth
 
 FUTURE_LIMIT = 0.1  # [s] stamps further ahead come from a wrong clock and are refused
+INTACT = np.ones(4)     # wear of four propellers
 AIRBORNE_TIME = 0.3     # [s] without contact, after which a contact is a touchdown; chosen
 # Charge of a pack, and its open-circuit voltage relative to a full one: a typical lithium-polymer
 # cell, over 4.2 V.
@@ -169,7 +170,7 @@ class Simulator:
         self.battery.reset()
         self._impact: Impact | None = None
         self._airborne, self._flown, self._broken = 0.0, False, False
-        self.wrench, self.payload, self._wear = np.zeros(6), 0.0, np.ones(4)
+        self.wrench, self.payload, self._wear = np.zeros(6), 0.0, INTACT
         self.link = CommandLink(self._robot, self._parameters.command_timeout,
                                 self.command_delays)
         self.truth = self._truth()
@@ -232,8 +233,9 @@ class Simulator:
         plant.voltage_ratio = battery.voltage / self._robot.battery.full_voltage
         plant.charge_drawn = battery.drawn
         plant.step()
-        # Wear shows with the thrust, which follows with the rotors' lag.
-        self._wear = self._wear + self._rotor_gain * (drive.wear - self._wear)
+        if struck or self._wear is not INTACT:
+            # Wear shows with the thrust, which follows with the rotors' lag.
+            self._wear = self._wear + self._rotor_gain * (drive.wear - self._wear)
         self._ticks += 1
         self.time = self._ticks * self.tick
         self._watch_contact(self.truth, plant.contact)

@@ -153,7 +153,7 @@ def follow(watch, asked, follows, delay, robot):
         watch.commands.append((t, asked(t)))
         tilt, rate = servo(asked(t - delay), tilt, rate)
         watch.on_joints(t, follows(tilt) + 0.005 * random.uniform(-1, 1, 4))
-        if (watch.astray | (watch.jump != 0)).any():
+        if any(watch.astray) or any(watch.jump):
             return t
     return None
 
@@ -192,7 +192,7 @@ def esc(lag, asked, works, noise=0.0, seed=0):
         watch.commands.append((t, command))
         if k % 4 == 0:
             watch.on_speeds(t, 300.0 * np.sqrt(thrust) * random.normal(1.0, noise, 4))
-            if noticed is None and watch.slow.any():
+            if noticed is None and any(watch.slow):
                 noticed = t - 4.0
             if watch.lost is not None or watch.deaf is not None:
                 return watch, t - 4.0, noticed
@@ -254,7 +254,7 @@ def test_a_rotor_that_gives_more_thrust_than_asked_is_deaf_and_not_lost(sticks):
         watch.on_command(command)
         if n % 4 == 0:
             watch.on_speeds(t, 300.0 * np.sqrt(thrust))
-        watch.on_imu(t, force / ALLOCATOR.mass, rate, tilt, command, 1.0)
+        watch.on_imu(t, force / ALLOCATOR.mass, rate, tilt, 1.0)
         if watch.faults:
             break
     assert list(watch.faults) == ['rotor3_deaf' if sticks else 'rotor3_lost']
