@@ -3,13 +3,14 @@ False alarms and reached poses on the measured robot, its drawn variants, and un
 
     python benchmarks/measured_robot.py [--controllers nmpc,rl] [--hours 1] [--draws 20]
                                         [--unmet 0] [--seed 0] [--robot FILE] [--plant measured]
-                                        [--jobs 2] [--json FILE]
+                                        [--policy FILE] [--jobs 2] [--json FILE]
 
 Each controller flies `--hours` in each condition to random poses of 8 s, in flights of 15 poses.
 It also flies ten poses with each of `--draws` robots, drawn from the intervals of the robot file,
 and with each of `--unmet` robots (:func:`unmet`). No fault is injected, so each reported fault,
 fallback or landing is a false alarm. The bound is the 95 % limit of their rate. The flight stack
 has the shipped robot file, or `--robot`; with `--unmet` it has the robot's own file.
+`--policy` replaces the controllers' policy file.
 """
 
 from __future__ import annotations
@@ -90,7 +91,7 @@ def unmet(rng: np.random.Generator) -> RobotParameters:
             return robot
 
 
-def fly_one(trial: Trial, robot: str | None, plant: str) -> dict:
+def fly_one(trial: Trial, robot: str | None, plant: str, policy: Path | None) -> dict:
     """Fly one trial; returns its fields, hours, poses, reached, the errors and the alarms."""
     known, true = RobotParameters.load(robot), RobotParameters.load(plant)
     if trial.kind == DRAWN:
@@ -100,7 +101,8 @@ def fly_one(trial: Trial, robot: str | None, plant: str) -> dict:
     task = make_task(f'random{trial.poses}', trial.seed)
     log = fly(trial.controller, task, robot=known, plant=true, seed=trial.seed,
               conditions='nominal' if trial.kind in (DRAWN, UNMET) else trial.kind,
-              options={trial.controller: ControllerOptions(allow_other_robot=True)})
+              options={trial.controller: ControllerOptions(
+                  policy=policy, allow_other_robot=True)})
     result = metrics(log, task)
     poses, ended = result['poses'], result.get('ended', '')
     alarms = [*log.named_faults(), ended, result.get('controller_error', '')]
@@ -145,6 +147,7 @@ def main() -> None:
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--robot')
     parser.add_argument('--plant', default='measured')
+    parser.add_argument('--policy', type=Path)
     parser.add_argument('--jobs', type=int, default=2)
     parser.add_argument('--json', type=Path)
     chosen = parser.parse_args()
@@ -157,7 +160,8 @@ def main() -> None:
     console = Console(width=None if sys.stdout.isatty() else 140)
     with workers(jobs=chosen.jobs):
         flights = list(track(joblib.Parallel(return_as='generator_unordered', batch_size=1)(
-            joblib.delayed(fly_one)(trial, chosen.robot, chosen.plant) for trial in trials),
+            joblib.delayed(fly_one)(trial, chosen.robot, chosen.plant, chosen.policy)
+            for trial in trials),
             'flights', total=len(trials), console=console))
     flights.sort(key=lambda one: trials.index(Trial(*(
         one[key] for key in ('controller', 'kind', 'seed')))))
@@ -180,7 +184,7 @@ def main() -> None:
             console.print(f"{row['controller']}, {row['kind']}, {alarm}", markup=False)
     if chosen.json:
         chosen.json.write_text(json.dumps(
-            {'meta': {**vars(chosen), 'json': str(chosen.json)}, 'summary': rows,
+            {'meta': {key: str(value) for key, value in vars(chosen).items()}, 'summary': rows,
              'flights': flights}, indent=1))
 
 
