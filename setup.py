@@ -38,6 +38,7 @@ def shared(*folders):
 # compiled controller links to; mujoco: as far back as the tests pass, 4 has no Python 3.10 wheel.
 REQUIREMENTS = [
     'casadi>=3.8,<4',
+    'filterpy>=1.4.5,<3',
     'jinja2>=3.0,<4',
     'joblib>=1.4,<2',
     'matplotlib>=3.6,<4',

@@ -9,7 +9,6 @@ every byte of the file except its own entry. See docs/reference/policy_file.md.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import partial
 from hashlib import sha256
 from itertools import zip_longest
 import json
@@ -225,19 +224,19 @@ class PolicyNetwork:
     def __call__(self, observation: list[float]) -> list[float]:
         """Action (8) for an observation (n), both in plain numbers."""
         self._input[0] = observation
-        self._run()
+        self._session.run_with_iobinding(self._binding)
         return self._output[0].tolist()
 
     def _open(self, data, robot, allow_other_robot):
         """Check contract and tensors, let the session use two arrays at every call, warm up."""
         verify(data)
-        network = session(data)
+        network = self._session = session(data)
         self.contract = PolicyContract.from_metadata(network.get_modelmeta().custom_metadata_map)
         warning = self.contract.check(robot, allow_other_robot)
         size = self.contract.observation_size
         self._input = np.zeros((1, size), np.float32)
         self._output = np.zeros((1, len(self.contract.actions)), np.float32)
-        binding = network.io_binding()
+        binding = self._binding = network.io_binding()
         for name, bind, array, found in (
                 (INPUT, binding.bind_input, self._input, network.get_inputs()),
                 (OUTPUT, binding.bind_output, self._output, network.get_outputs())):
@@ -246,9 +245,6 @@ class PolicyNetwork:
             if tensors != expected:
                 raise ParameterError(f'expected {expected}, found {tensors}')
             bind(name, 'cpu', 0, np.float32, array.shape, array.ctypes.data)
-        # Past `run_with_iobinding`, which makes and checks options at every call (5 us on board).
-        from onnxruntime import RunOptions
-        self._run = partial(network._sess.run_with_iobinding, binding._iobinding, RunOptions())
         for _ in range(WARM_UP):
             action = self([0.1] * size)
         if not all(map(isfinite, action)):

@@ -224,7 +224,7 @@ class ErrorStateEkf:
 
     def _apply(self, stamp, position, quaternion) -> bool:
         self._estimate = None
-        self._model.noise = self._noise.covariance
+        self._model.filter.R = self._noise.covariance
         track = self._track if self.status in ('tracking', 'dead_reckoning') else None
         candidate = self._candidate
         if track is not None:
@@ -256,8 +256,8 @@ class ErrorStateEkf:
         Such poses continue smoothly from the last good one, and their residuals have the same
         direction. The residuals of poses that are only noisy do not.
         """
-        before, self._residual = self._residual, \
-            self._model.residual / np.sqrt(np.diag(self._model.noise))
+        before, self._residual = self._residual, np.ravel(
+            self._model.filter.y) / np.sqrt(np.diag(self._model.filter.R))
         lengths = float(np.linalg.norm(before) * np.linalg.norm(self._residual))
         aligned = float(before @ self._residual) > ALIGNED * lengths
         smooth = self._continues_smoothly(track, stamp, position, quaternion)

@@ -1,5 +1,5 @@
 """
-The error-state model: covariance and correction of a rigid body.
+The error-state model: a rigid body for filterpy, which computes covariance and gain.
 
 The filter estimates the motion of the IMU at the IMU's stamps; the output is that of base_link.
 """
@@ -9,6 +9,7 @@ from dataclasses import replace
 from itertools import pairwise
 from math import sqrt
 
+from filterpy.kalman import KalmanFilter
 import numpy as np
 from scipy.special import gammaincinv
 
@@ -54,8 +55,6 @@ class ErrorStateModel:
     Covariance and correction of one node; contains constants and buffers, no state.
 
     Attributes:
-        noise: (6, 6) covariance of a pose.
-        residual: (6,) position [m] and rotation vector [rad] of the last pose.
         marker_to_base: (4,) quaternion from base_link's axes to those of the marker body.
 
     """
@@ -64,8 +63,9 @@ class ErrorStateModel:
         imu, mocap = parameters.imu, parameters.mocap
         self.gravity = gravity
         self.parameters = parameters
-        self.noise, self.residual = np.eye(MEASUREMENTS), np.zeros(MEASUREMENTS)
-        self._identity, self._transition = np.eye(STATES), np.eye(STATES)
+        self.filter = KalmanFilter(dim_x=STATES, dim_z=MEASUREMENTS)
+        self._no_error = np.zeros(STATES)
+        self._transition = np.eye(STATES)
         density = np.zeros(STATES)      # of the process noise, per second
         density[VELOCITY] = imu.accelerometer_noise ** 2 / imu.rate
         density[ATTITUDE] = imu.gyroscope_noise ** 2 / imu.rate
@@ -81,8 +81,7 @@ class ErrorStateModel:
         self._lever = mocap.position - imu.position
         self._turning = rotations.skew(self._lever)
         self.marker_to_base = rotations.conjugate(rotations.exp(mocap.rotation))
-        self._jacobian = np.zeros((MEASUREMENTS, STATES))       # of a pose
-        self._jacobian[0:3, POSITION] = self._jacobian[3:6, ATTITUDE] = np.eye(3)
+        self.filter.H[0:3, POSITION] = self.filter.H[3:6, ATTITUDE] = np.eye(3)
         # quantile of the chi-square distribution
         self.gate = float(2 * gammaincinv(MEASUREMENTS / 2, GATE))
 
@@ -102,7 +101,7 @@ class ErrorStateModel:
         attitude = rotations.normalized(rotations.multiply(quaternion, self.marker_to_base))
         rotation = rotations.matrix(attitude)
         arm = rotation @ self._turning
-        noise = self.noise
+        noise = self.filter.R
         covariance = np.zeros((STATES, STATES))
         covariance[POSITION, POSITION] = noise[:3, :3] + arm @ noise[3:, 3:] @ arm.T
         covariance[POSITION, ATTITUDE] = arm @ noise[3:, 3:]
@@ -174,16 +173,16 @@ class ErrorStateModel:
 
     def covariance(self, node: Node) -> np.ndarray:
         """Covariance (16, 16) of a node, predicted now if it is pending."""
-        steps = [node]
+        kalman, steps = self.filter, [node]
         while (before := steps[-1].before) is not None:
             steps.append(before)
         for before, after in pairwise(reversed(steps)):
             dt = after.stamp - before.stamp
-            change = transition(before, after, self._transition)
+            kalman.x, kalman.P = self._no_error, before.covariance
             # Missing samples are interpolated, and the error grows with each of them.
-            after.covariance = change.dot(before.covariance).dot(change.T) \
-                + self._process * (dt * max(1.0, dt / self._period) ** 3)
-            after.before = None
+            kalman.predict(F=transition(before, after, self._transition),
+                           Q=self._process * (dt * max(1.0, dt / self._period) ** 3))
+            after.covariance, after.before = kalman.P, None
         return node.covariance
 
     def time_deviation(self, node: Node) -> float:
@@ -200,8 +199,8 @@ class ErrorStateModel:
             the corrected node, or None if the pose fails the chi-square gate.
 
         """
-        jacobian, residual = self._jacobian, np.empty(MEASUREMENTS)
-        self.residual = residual
+        kalman, jacobian = self.filter, self.filter.H
+        residual = np.empty(MEASUREMENTS)
         residual[:3] = position - prior.position
         x, y, z, w = prior.quaternion.tolist()
         measured = rotations.product(*quaternion.tolist(), *self.marker_to_base.tolist())
@@ -214,15 +213,13 @@ class ErrorStateModel:
         velocity = prior.velocity + prior.rotation.dot(rotations.cross(rate, self._lever))
         jacobian[0:3, TIME_OFFSET] = velocity if velocity.dot(velocity) > LEAST_SPEED ** 2 else 0.0
         jacobian[3:6, TIME_OFFSET] = rate if rate.dot(rate) > LEAST_RATE ** 2 else 0.0
-        covariance = self.covariance(prior)
-        both = covariance.dot(jacobian.T)
-        inverse = np.linalg.inv(jacobian.dot(both) + self.noise)
-        if not residual.dot(inverse).dot(residual) <= self.gate:    # also NaN
+        kalman.P = self.covariance(prior)
+        kalman.x = self._no_error
+        kalman.update(residual, H=jacobian)
+        # The innovation is filterpy's y with inverse covariance SI; not <= also catches NaN.
+        if not kalman.y.dot(kalman.SI).dot(kalman.y) <= self.gate:
             return None
-        gain = both.dot(inverse)
-        kept = self._identity - gain.dot(jacobian)
-        return self._inject(prior, gain.dot(residual), kept.dot(covariance).dot(kept.T)
-                            + gain.dot(self.noise).dot(gain.T))     # Joseph's form
+        return self._inject(prior, kalman.x, kalman.P)
 
     def _inject(self, prior: Node, error: np.ndarray, covariance: np.ndarray) -> Node:
         """Add the estimated error to the state; the remaining error has mean zero."""
