@@ -298,7 +298,7 @@ def _tracking(log, body, task, start):
 
 
 def _levels(log, body, task, start):
-    """Peak errors of each disturbance level and the level at which control was lost."""
+    """Peak errors, and recovery, of each level, and the level at which control was lost."""
     unit = 'N' if task.kind == 'force' else 'N_m'
     target = next(t for t in log.targets if isinstance(t, PoseTarget))
     levels, lost_at = [], None
@@ -306,12 +306,14 @@ def _levels(log, body, task, start):
         window = body.window(begin, end)
         if body.t[window].size == 0:
             break
+        peaks = _peaks(body, target, window, begin)
+        if task.kind == 'force':        # which acts for most of the level
+            del peaks['recovery_s']
         position, orientation = errors(body, target, window)
         where, turned = body.position[window], body.quaternion[window]
         lost = not body.covers(begin, end) or control_lost(target, where[-1], turned[-1]) \
             or any(control_lost(target, position) for position in where)
-        levels.append({f'level_{unit}': level, 'peak_position_m': float(np.max(position)),
-                       'peak_orientation_deg': float(np.max(orientation)),
+        levels.append({f'level_{unit}': level, **peaks,
                        'end_position_m': float(position[-1]),
                        'end_orientation_deg': float(orientation[-1]), 'lost': bool(lost)})
         if lost:
@@ -320,6 +322,15 @@ def _levels(log, body, task, start):
     held = [entry[f'level_{unit}'] for entry in levels if not entry['lost']]
     return {'levels': levels, f'lost_at_{unit}': lost_at,
             f'withstood_{unit}': max(held, default=0.0)}
+
+
+def _peaks(body, target, window, begin):
+    """Peak errors in a window, and the time from ``begin`` to the recovery."""
+    position, orientation = errors(body, target, window)
+    outside = (position > RECOVERED[0]) | (orientation > RECOVERED[1])
+    return {'peak_position_m': float(np.max(position)),
+            'peak_orientation_deg': float(np.max(orientation)),
+            'recovery_s': settling_time(body.t[window] - begin, outside)}
 
 
 def _winds(log, body, task, start):
@@ -335,12 +346,7 @@ def _pushes(log, body, task, start):
     for _, begin, end in windows:
         push = dict.fromkeys(('peak_position_m', 'peak_orientation_deg', 'recovery_s'))
         if body.covers(begin, end):
-            window = body.window(begin, end)
-            position, orientation = errors(body, log.targets[0], window)
-            outside = (position > RECOVERED[0]) | (orientation > RECOVERED[1])
-            push = {'peak_position_m': float(np.max(position)),
-                    'peak_orientation_deg': float(np.max(orientation)),
-                    'recovery_s': settling_time(body.t[window] - begin, outside)}
+            push = _peaks(body, log.targets[0], body.window(begin, end), begin)
         pushes.append(push)
     whole = body.window(windows[0][1], windows[-1][2])
     return {'speed_mean_m_s': _reduced(

@@ -102,12 +102,14 @@ SPREADS = (('position mean ± std (max) [m]', 'position_{}_m', 3),
            ('orientation mean ± std (max) [deg]', 'orientation_{}_deg', 2))
 PEAKS = (('peak position [m]', 'peak_position_m', 3),
          ('peak orientation [deg]', 'peak_orientation_deg', 2))
+RECOVERY = *PEAKS, ('recovery [s]', 'recovery_s', 2)
 # Key of a result -> title of its table, heading and names of its parts, and columns.
 KINDS: dict[str, tuple[str, str, Callable, tuple]] = {
     'trajectory': ('Trajectory tracking', 'round', lambda found: [
         *_numbered(found['rounds']), ('all', found)], SPREADS),
     'force': ('Disturbance: force', 'force [N]', lambda found: _levels(found, 'N'), PEAKS),
-    'torque': ('Disturbance: torque', 'torque [N m]', lambda found: _levels(found, 'N_m'), PEAKS),
+    'torque': ('Disturbance: torque', 'torque [N m]', lambda found: _levels(found, 'N_m'),
+               RECOVERY),
     'payload': ('Payload, steady errors', 'payload [kg]', lambda found: [
         (f"{part['payload_kg']:g}", part) for part in found], (
             ('height error [m]', 'height_error_m', 4),
@@ -117,7 +119,7 @@ KINDS: dict[str, tuple[str, str, Callable, tuple]] = {
         (f"{part['speed_m_s']:g} m/s", part) for part in found], SPREADS),
     'pushes': ('Stick pushes', 'push', lambda found: [
         *_numbered(found['pushes']), ('all', found)], (
-            *PEAKS, ('recovery [s]', 'recovery_s', 2), ('mean speed [m/s]', 'speed_mean_m_s', 3),
+            *RECOVERY, ('mean speed [m/s]', 'speed_mean_m_s', 3),
             ('mean rate [rad/s]', 'angular_speed_mean_rad_s', 3))),
     'steps': ('Step responses', 'step', lambda found: [(step['axis'], step) for step in found], (
         ('rise [s]', 'rise_s', 2), ('settling [s]', 'settling_s', 2),

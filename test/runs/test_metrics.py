@@ -198,6 +198,21 @@ def test_the_level_at_which_control_was_lost_is_reported():
     assert complete['withstood_N'] == 100
 
 
+def test_a_torque_has_its_time_of_recovery_and_a_lasting_force_has_none():
+    task, recorder = make_task('torque'), LogRecorder()
+    target, = task.targets(0.0)
+    write_state(recorder, -1.0, 'flying:nmpc')
+    write_target(recorder, target)
+    for t in np.arange(0, 12.001, 0.005):
+        since = (t - 8.001) % 2 if t > 8.001 else 100.0
+        write_truth(recorder, t, target.position + [0.1 * np.exp(-2 * since), 0, 0],
+                    target.quaternion, np.zeros(3), np.zeros(3))
+    pulse, *_ = metrics(recorder.log(), task)['torque']['levels']
+    assert pulse['recovery_s'] == pytest.approx(np.log(5) / 2, abs=6e-3)
+    force, *_ = metrics(flown(make_task('force')), make_task('force'))['force']['levels']
+    assert 'recovery_s' not in force
+
+
 def test_a_step_of_a_second_order_system_has_its_known_rise_settling_and_overshoot():
     damping, frequency = 0.6, 5.0
     fast = frequency * np.sqrt(1 - damping ** 2)
