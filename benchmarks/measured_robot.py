@@ -9,8 +9,7 @@ Each controller flies `--hours` in each condition to random poses of 8 s, in fli
 It also flies ten poses with each of `--draws` robots, drawn from the intervals of the robot file,
 and with each of `--unmet` robots (:func:`unmet`). No fault is injected, so each reported fault,
 fallback or landing is a false alarm. The bound is the 95 % limit of their rate. The flight stack
-has the shipped robot file, or `--robot`; with `--unmet` it has the robot's own file.
-`--policy` replaces the controllers' policy file.
+has the shipped robot file, or `--robot`; of `--unmet` the robot's own. `--policy`: another file.
 """
 
 from __future__ import annotations
