@@ -198,16 +198,23 @@ def test_the_level_at_which_control_was_lost_is_reported():
     assert complete['withstood_N'] == 100
 
 
-def test_a_torque_has_its_time_of_recovery_and_a_lasting_force_has_none():
-    task, recorder = make_task('torque'), LogRecorder()
+def decaying(task, duration, period, lag):
+    """Log of a hover with an error of 0.1 m at each disturbance, which decays with lag(t) [s]."""
+    recorder = LogRecorder()
     target, = task.targets(0.0)
     write_state(recorder, -1.0, 'flying:nmpc')
     write_target(recorder, target)
-    for t in np.arange(0, 12.001, 0.005):
-        since = (t - 8.001) % 2 if t > 8.001 else 100.0
-        write_truth(recorder, t, target.position + [0.1 * np.exp(-2 * since), 0, 0],
-                    target.quaternion, np.zeros(3), np.zeros(3))
-    pulse, *_ = metrics(recorder.log(), task)['torque']['levels']
+    for t in np.arange(0, duration + 0.001, 0.005):
+        since = (t - 8.001) % period if t > 8.001 else 100.0
+        write_truth(recorder, t, target.position + [0.1 * np.exp(-since / lag(t)), 0, 0],
+                    target.quaternion, np.array([0.03, 0, 0.04]), np.array([0, 0.2, 0]))
+    return recorder.log()
+
+
+def test_a_torque_has_its_time_of_recovery_and_a_lasting_force_has_none():
+    task = make_task('torque')
+    log = decaying(task, 12.0, 2.0, lambda t: 0.5)
+    pulse, *_ = metrics(log, task)['torque']['levels']
     assert pulse['recovery_s'] == pytest.approx(np.log(5) / 2, abs=6e-3)
     force, *_ = metrics(flown(make_task('force')), make_task('force'))['force']['levels']
     assert 'recovery_s' not in force
@@ -256,16 +263,10 @@ def test_each_axis_has_its_own_step_response():
 
 
 def test_pushes_report_their_peaks_and_when_the_robot_has_recovered():
-    task, recorder = make_task('pushes'), LogRecorder()
-    target, = task.targets(0.0)
-    write_state(recorder, -1.0, 'flying:nmpc')
-    write_target(recorder, target)
-    for t in np.arange(0, 28.001, 0.005):
-        since = (t - 8.001) % 5 if t > 8.001 else 100.0
-        lag = 1.0 if t < 23.001 else 5.0        # the last push is not settled after 5 s
-        write_truth(recorder, t, target.position + [0.1 * np.exp(-since / lag), 0, 0],
-                    target.quaternion, np.array([0.03, 0, 0.04]), np.array([0, 0.2, 0]))
-    pushes = metrics(recorder.log(), task)['pushes']
+    task = make_task('pushes')
+    # the last push is not settled after 5 s
+    log = decaying(task, 28.0, 5.0, lambda t: 1.0 if t < 23.001 else 5.0)
+    pushes = metrics(log, task)['pushes']
     assert pushes['speed_mean_m_s'] == pytest.approx(0.05)
     assert pushes['angular_speed_mean_rad_s'] == pytest.approx(0.2)
     assert [push['peak_position_m'] for push in pushes['pushes']] == pytest.approx(
