@@ -278,15 +278,29 @@ def gap(runs: Annotated[list[Path], Argument(metavar='RUN...', help=(
         tolerances: Annotated[bool, Option('--tolerances', help=(
             "With --apply: also write this robot's own mass, inertia, gains, lags and rotor "
             'positions, as fitted within tolerance.'))] = False,
+        form: Annotated[str | None, Option('--format', metavar='NAME|FILE', help=(
+            'Flights are tables (CSV, .gz) with the columns of this format: nanobench, '
+            'crazypad_motor, or a YAML file.'))] = None,
+        alpha: Annotated[float, Option(metavar='P', help=(
+            'With --format: accepted probability of a false alarm.'))] = 0.05,
         json_path: JsonOption = None):
     """
     Identify and add effects that the model lacks from flights.
 
     Example: beetle_omni gap flight1 flight2 --holdout flight3 --apply robot_new.yaml
     """
-    given = dict(locals())
+    if form is not None:
+        for name, value in (('page', page), ('gap', parameters), ('fix', fix),
+                            ('tolerances', tolerances)):
+            if value:
+                raise ParameterError(f'--{name}: expected without --format, which does not '
+                                     'support it')
+        from beetle_omni_ros.identify.flights.command import table_results
+        result = table_results(runs, holdout, form, robot, apply, json_path, alpha)
+        return 3 if result['verdict'] == 'bad_data' else 0
     from beetle_omni_ros.identify.gap.command import run_gap
-    return run_gap(**given)
+    return run_gap(runs, holdout, robot, apply, json_path, page, parameters=parameters, fix=fix,
+                   tolerances=tolerances)
 
 
 @app.command()

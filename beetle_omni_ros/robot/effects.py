@@ -78,6 +78,13 @@ def rotor_drag(terms, coefficient):
         terms.rotor_forces[i] = terms.rotor_forces[i] - coefficient / 4 * speeds[i] * in_plane
 
 
+def rotor_hub_moment(terms, coefficient):
+    speeds = terms.rotor_speeds()
+    for i, v in enumerate(terms.hub_velocities()):
+        terms.torque = terms.torque - coefficient / 4 * speeds[i] * ca.cross(
+            terms.thrust_directions[i], v)
+
+
 def axial_inflow(terms, per_rotor):
     speeds = terms.rotor_speeds()
     loss = [per_rotor * speeds[i] * ca.dot(terms.thrust_directions[i], v)
@@ -183,14 +190,14 @@ CATALOGUE: dict[str, Effect] = {
         ('joint_offset', 'torque_coefficient', 'imu_misalignment'),
         'attitudes with different sets of tilts; a jig', joint_offset, each='joint'),
     'mass': Effect(
-        'body', {'mass': EffectParameter('kg', NAN, 0.05, 200, 0.05, 0.01, number='mass',
+        'body', {'mass': EffectParameter('kg', NAN, 0.005, 200, 0.05, 0.01, number='mass',
                                          tolerance='mass')},
         "m v' = F, Newton; total mass", 'any flight',
         ('thrust_coefficient', 'voltage_sag', 'wind'),
         'weigh the robot, or fly fast turns: thrust scales torques too, mass does not',
         sets('mass'), allocated=True, plant='model'),
     'inertia': Effect(
-        'body', {'inertia': EffectParameter('kg m^2', (NAN,) * 3, 1e-5, 50, 0.2, 0.05,
+        'body', {'inertia': EffectParameter('kg m^2', (NAN,) * 3, 1e-6, 50, 0.2, 0.05,
                                             number='inertia', tolerance='inertia')},
         "I w' = tau - w x I w, Euler", 'fast turns about every axis',
         ('rotor_lag', 'propeller_gyroscopic_torque', 'thrust_coefficient'),
@@ -245,6 +252,12 @@ CATALOGUE: dict[str, Effect] = {
         'H-force of Faessler et al. 2018, in the rotor plane, grows with rotor speed '
         'sqrt(f / f_h)', 'translation above 1 m/s', ('body_drag', 'wind'),
         'passes at three speeds with two rotor tilts', rotor_drag, plant='own'),
+    'rotor_hub_moment': Effect(
+        'body', {'coefficient': EffectParameter('N s', 0.0, -5.0, 5.0, 0.1, 0.015)},
+        '-k n x v of stiff blades: the disc tilts back and turns the hub, grows with rotor speed '
+        'sqrt(f / f_h) (Mahony et al. 2012; Leishman 2006, ch. 4); k of all rotors',
+        'translation above 0.5 m/s', ('centre_of_mass', 'inertia', 'rotor_drag'),
+        'passes at three speeds, forwards and sideways', rotor_hub_moment),
     'body_drag': Effect(
         'body', {'coefficient': EffectParameter('N s^2/m^2', 0.0, 0.0, 5.0, 0.05, 0.02)},
         'F = -c |v| v', 'translation above 2 m/s', ('rotor_drag', 'wind'),
@@ -307,7 +320,7 @@ CATALOGUE: dict[str, Effect] = {
         ('rotor_lag', 'command_latency'), 'thrust chirp 0.5 to 8 Hz', delays=('thrust',),
         same_response='rotor_lag'),
     'thrust_saturation': Effect(
-        'rotor', {'thrust_max': _number('rotors.thrust_max', 'N', 1.0, 200, 0.3, 0.02)},
+        'rotor', {'thrust_max': _number('rotors.thrust_max', 'N', 0.01, 200, 0.3, 0.02)},
         'f = min(f*, f_max): voltage or speed controller limit', 'commands at the limit',
         ('voltage_sag', 'thrust_coefficient'), 'climb at full thrust',
         starts=((0.95,), (0.8,)), limit=('thrust', 1.2)),

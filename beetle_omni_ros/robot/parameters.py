@@ -35,6 +35,17 @@ class RotorMapRow:
 
 
 @dataclass(frozen=True, kw_only=True)
+class MotorMap:
+    """Thrust of a brushed motor's rotor by its mean voltage, duty times pack voltage."""
+
+    nominal_voltage: float = parameter(
+        doc='pack voltage that a model without voltage assumes; the base of voltage_sag',
+        unit='V', low=1, high=60)
+    coefficients: np.ndarray = parameter(
+        doc='thrust [N] = sum_k c_k (motor voltage / 1 V)^k, k = 0..3', shape=(4,))
+
+
+@dataclass(frozen=True, kw_only=True)
 class RotorParameters:
     """Positions of the four rotors and their thrust."""
 
@@ -51,6 +62,8 @@ class RotorParameters:
         doc='first-order thrust response', unit='s', low=0.001, high=2)
     map: tuple[RotorMapRow, ...] = parameter(
         (), doc='thrust-to-PWM rows, one for each measured voltage')
+    motor: MotorMap | None = parameter(
+        None, doc='thrust by motor voltage, for recordings of duty and voltage')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,7 +175,7 @@ class MultibodyParameters:
 class RobotParameters:
     """All parameters of one robot; effects are effect -> parameter -> value."""
 
-    mass: float = parameter(doc='total mass', unit='kg', low=0.05, high=200)
+    mass: float = parameter(doc='total mass', unit='kg', low=0.005, high=200)
     gravity: float = parameter(9.80665, doc='gravity', unit='m/s^2', low=0, high=30)
     inertia: np.ndarray = parameter(doc='diagonal', unit='kg m^2', shape=(3,), low=1e-6, high=100)
     rotors: RotorParameters = parameter(doc='rotors')
@@ -328,6 +341,8 @@ class RobotParameters:
         """All physical values as plain nested data, without name, intervals and provenance."""
         values = asdict(self)
         del values['name'], values['intervals'], values['provenance']
+        if self.rotors.motor is None:   # so that policy files of robots without it stay valid
+            del values['rotors']['motor']
         return json.loads(json.dumps(values, default=np.ndarray.tolist))
 
 
@@ -339,7 +354,7 @@ def find_robot(name: str | Path, seen: tuple[Path, ...] = ()) -> Path:
     the folder of that file. If there is no such file, the path is the given one.
     """
     path, shipped = (seen[-1].parent / name if seen else Path(name)), share_path('params')
-    for each in (path, shipped / name, shipped / f'robot_{name}.yaml'):
+    for each in (path, shipped / name, shipped / f'robot_{name}.yaml', shipped / f'{name}.yaml'):
         if isfile(each) and each.resolve() not in seen:
             return each
     return path

@@ -1,0 +1,1 @@
+"""Flights of any laboratory: tables with declared formats, residuals, evidence, verdict."""

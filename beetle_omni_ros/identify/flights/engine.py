@@ -1,0 +1,342 @@
+"""The flight engine: linearise, learn the noise, weigh sets of catalogue entries."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+from math import comb, log
+
+import numpy as np
+
+from beetle_omni_ros.identify.flights.evidence import Judge, Normal, normal, Posterior
+from beetle_omni_ros.identify.flights.priors import Entry, Spread
+from beetle_omni_ros.identify.flights.spectrum import EDGES, pooled, Spectrum, spectrum
+
+FREE = 100.0            # typical deviations that known effects may have while noise is learned,
+                        # so that the noise holds nothing that they explain
+ROUNDS = 3              # linearisations
+FORM = 0.1              # relative error of an entry by its form
+MOST = 8                # entries of a set
+FLOORS = {'force': 0.02, 'torque': 0.05, 'acceleration': 0.02, 'rate': 0.004, 'joint': 0.0005}
+RELEVANT = 0.01         # of hover thrust and of weight: smallest relevant discrepancy
+GROUPS = (0.0, 0.5, 2.0)    # [Hz] lower ends of the groups of bands of the test of constancy
+
+
+@dataclass(eq=False)
+class Solution:
+    """
+    Result of the engine.
+
+    Attributes:
+        names: keys.
+        entries: catalogue entries.
+        posteriors: set of indices of entries -> evidence and estimate.
+        log_prior: of sets, by their size.
+        best: most probable set.
+        theta: (K,) mean of the keys with the best set.
+
+    """
+
+    names: list[str]
+    entries: list[Entry]
+    posteriors: dict[tuple[int, ...], Posterior]
+    best: tuple[int, ...]
+    theta: np.ndarray
+    equations: Normal
+    judge: Judge
+    spectra: list[Spectrum] = field(default_factory=list)
+    unsteady: dict[int, float] = field(default_factory=dict)
+    banned: dict[int, float] = field(default_factory=dict)
+
+    def log_weight(self, chosen: tuple[int, ...]) -> float:
+        """Ln of prior times evidence of a set."""
+        return log_prior(len(chosen), len(self.entries)) + self.posteriors[chosen].gain
+
+    @property
+    def e_value(self) -> float:
+        """Ln of the evidence of any set over the empty one, averaged over their prior."""
+        total = [log_prior(len(c), len(self.entries)) + p.gain
+                 for c, p in self.posteriors.items() if c]
+        return float(np.logaddexp.reduce(total) - log(0.5))
+
+
+def log_prior(size: int, count: int) -> float:
+    """Ln of the prior of one set of ``size`` of ``count`` entries; one more is half as likely."""
+    return -(size + 1) * log(2.0) - log(comb(count, size))
+
+
+class Engine:
+    """
+    Weighs sets of entries on several flights.
+
+    Args:
+        flights: objects with ``linear(theta, names)``, ``mask``, ``period`` and ``channels``.
+        names: (K,) keys.
+        spreads: their priors.
+        entries: catalogue entries that may be named.
+        positive: keys that cannot be negative.
+        progress: gets a short text at each stage.
+
+    """
+
+    def __init__(self, flights: Sequence, names: list[str], spreads: dict[str, Spread],
+                 entries: list[Entry], positive: frozenset[str] = frozenset(),
+                 far: frozenset[str] = frozenset(), alpha: float = 0.05,
+                 progress: Callable[[str], None] = lambda text: None):
+        self.flights, self.names, self.entries = list(flights), list(names), list(entries)
+        self.narrow, self.typical, self.flight = (np.array(
+            [getattr(spreads[name], kind) for name in names])
+            for kind in ('narrow', 'typical', 'flight'))
+        self.positive = np.array([name in positive for name in names])
+        self.index = {name: k for k, name in enumerate(names)}
+        self._generic()
+        self.owner = np.zeros(self.known, dtype=int)
+        for k, entry in enumerate(self.entries):
+            self.owner[[self.index[key] for key in entry.keys]] = k
+        self.progress, self.alpha = progress, alpha
+        self.far = np.array([name in far for name in self.names[:self.known]])
+
+    def _generic(self):
+        """Keys of the generic discrepancy: weights of features, by rotors and by world forces."""
+        self.channels = self.flights[0].channels
+        self.generic = [flight.discrepancy() for flight in self.flights]
+        sources, count = self.generic[0].shape[2:]
+        self.known = len(self.names)
+        index = self.known + np.arange(sources * count).reshape(sources, count)
+        self.weights = [index[:4].ravel(), index[4:].ravel()]   # share one power each
+        self.names += [f'{kind}.{k}' for kind in range(sources) for k in range(count)]
+        size = index.size
+        self.narrow = np.concatenate([self.narrow, np.full(size, RELEVANT / np.sqrt(count))])
+        self.start = self.narrow.copy()
+        self.typical = np.concatenate([self.typical, np.zeros(size)])
+        self.flight = np.concatenate([self.flight, np.zeros(size)])
+        self.positive = np.concatenate([self.positive, np.zeros(size, dtype=bool)])
+
+    def run(self) -> Solution:
+        """Relinearise, learn the noise and search, several times."""
+        theta = np.zeros(len(self.names))
+        etas = np.zeros((len(self.flights), len(self.names)))
+        for _ in range(2):      # to a point near the flights, before any noise is learned
+            theta, etas = self._flexible(self._spectra(theta, etas))
+        for turn in range(ROUNDS):
+            self.progress(f'linearising, {turn + 1} of {ROUNDS}')
+            spectra = self._spectra(theta, etas)
+            self.narrow[self.known:] = self.start[self.known:]
+            self._learn(spectra)
+            self.progress(f'weighing effects, {turn + 1} of {ROUNDS}')
+            solution = self._steady(spectra)
+            etas = np.array([solution.equations.of_flight(k, solution.theta)
+                             for k in range(len(spectra))])
+            theta[:self.known] = solution.theta
+        return solution
+
+    def _steady(self, spectra):
+        """
+        Search until each named entry has one value in all bands.
+
+        In a closed loop, noise reaches the commands, and an entry explains the feedback instead of
+        the robot. Its value then differs between frequencies. The most unsteady entry is
+        excluded, and the search begins again without it.
+        """
+        banned: dict[int, float] = {}
+        while True:
+            solution = self._search(spectra, frozenset(banned))
+            self._constancy(solution)
+            worst = max(solution.unsteady, key=solution.unsteady.get, default=None)
+            if worst is None or solution.unsteady[worst] <= 0:
+                solution.banned = banned
+                return solution
+            banned[worst] = solution.unsteady[worst]
+
+    def _spectra(self, theta, etas):
+        spectra = []
+        for flight, eta, phi in zip(self.flights, etas, self.generic, strict=True):
+            at = theta + eta
+            linear = flight.linear(dict(zip(self.names[:self.known], at, strict=False)),
+                                   self.names[:self.known])
+            # linear about the robot file
+            residual = linear.residual - linear.slopes @ at[:self.known]
+            floor = np.array([FLOORS[c.split('_')[0]] for c in flight.channels])
+            slopes = np.concatenate([linear.slopes, -phi.reshape(*residual.shape, -1)], axis=2)
+            found = spectrum(residual, slopes, flight.mask, flight.period, floor,
+                             flight.highest)
+            spectra.append(found)
+        return spectra
+
+    def _wide(self):
+        """(K,) prior deviations of a fit in which every key may be far from the file."""
+        return np.hypot(self.narrow, np.concatenate([np.where(self.far, FREE, 1), np.zeros(
+            len(self.names) - self.known)]) * self.typical)
+
+    def _flexible(self, spectra):
+        """Deviations, and those of each flight, of a fit of everything."""
+        equations = normal(spectra, self.names, self.flight)
+        theta = np.linalg.solve(equations.info + np.diag(self._wide()**-2), equations.right)
+        return theta, np.array([equations.of_flight(k, theta) for k in range(len(spectra))])
+
+    def _learn(self, spectra, passes=8):
+        """Learn noise and discrepancy around a fit in which every key may be far."""
+        wide = self._wide()
+        for _ in range(passes):
+            equations = normal(spectra, self.names, self.flight)
+            # in units of the priors, so that the sum is well conditioned
+            covariance = wide[:, None] * np.linalg.inv(
+                wide[:, None] * equations.info * wide + np.eye(len(wide))) * wide
+            theta = covariance @ equations.right
+            for own in self.weights:
+                # each weight has its own power, with the median of its kind as one observation
+                power = theta[own]**2 + np.diag(covariance)[own]
+                self.narrow[own] = wide[own] = np.sqrt(0.5 * (power + np.median(power)))
+            prior = pooled(spectra)
+            for k, each in enumerate(spectra):
+                own, inner, left, right = equations.flights[k]
+                x = theta + equations.of_flight(k, theta)
+                # theta + eta, eta = a - b theta + its own scatter
+                move = np.eye(len(theta))
+                move[own] -= inner @ left
+                total = move @ covariance @ move.T
+                total[np.ix_(own, own)] += inner
+                each.learn(x, total, prior, weight=len(each.noise[0]) + 2.0)
+
+    def indices(self, chosen: Sequence[int]) -> list[int]:
+        """Indices of the keys of some entries."""
+        return [self.index[key] for k in chosen for key in self.entries[k].keys]
+
+    def _search(self, spectra, banned):
+        k = self.known
+        equations = normal(spectra, self.names, self.flight, generic=self.narrow[k:])
+        judge = self._judge(equations)
+        posteriors: dict[tuple[int, ...], Posterior] = {}
+        count = len(self.entries)
+
+        def weight(chosen):
+            if chosen not in posteriors:
+                posteriors[chosen] = judge.posterior(self.indices(chosen))
+            return log_prior(len(chosen), count) + posteriors[chosen].gain
+
+        best: tuple[int, ...] = ()
+        top = weight(best)
+        allowed = [k for k in range(count) if k not in banned]
+        singles: list[tuple[int, ...]] = [(k,) for k in allowed]
+        for chosen in (*singles, *combinations(allowed, 2)):
+            value = weight(chosen)
+            if value > top:
+                best, top = chosen, value
+        while True:
+            near = {tuple(sorted(set(best) - out | more))
+                    for out in [set(), *({k} for k in best)]
+                    for more in [set(), *({k} for k in allowed if k not in best)]}
+            gain, chosen = max((self.gain(judge, c, best), c) for c in near if len(c) <= MOST)
+            if gain <= 1e-9:
+                break
+            best = chosen
+        weight(best)
+        return Solution(self.names, self.entries, posteriors, best, posteriors[best].theta,
+                        equations, judge, spectra)
+
+    def gain(self, judge: Judge, one: tuple[int, ...], other: tuple[int, ...]) -> float:
+        """Ln of the probability of one set of entries over that of another."""
+        count = len(self.entries)
+        return judge.gain(self.indices(one), self.indices(other)) \
+            + log_prior(len(one), count) - log_prior(len(other), count)
+
+    def explained(self, solution: Solution, group: str) -> float:
+        """Share of the variance of a group's measurements that the fit predicts, by motion."""
+        left = total = 0.0
+        for k, (flight, found) in enumerate(zip(self.flights, solution.spectra, strict=True)):
+            own = [c for c, name in enumerate(flight.channels) if name.startswith(group)]
+            theta = np.concatenate([solution.theta, np.zeros(len(self.names) - self.known)])
+            theta[self.known:] = solution.equations.of_generic(solution.theta)
+            x = theta + solution.equations.of_flight(k, solution.theta)
+            moving = found.band > 0
+            left += (((found.residual + found.slopes @ x) / np.sqrt(np.diagonal(
+                found.noise, axis1=1, axis2=2))[found.band])[:, moving][:, :, own]**2).sum()
+            measured = spectrum(flight.linear({}, []).measured, np.zeros((*flight.mask.shape, 0)),
+                                flight.mask, flight.period, found.floor, flight.highest)
+            total += ((measured.residual / np.sqrt(np.diagonal(
+                found.noise, axis1=1, axis2=2))[found.band])[:, moving][:, :, own]**2).sum()
+        return 1 - left / total
+
+    def _constancy(self, solution):
+        """
+        Gain [nat] of one value for each group of bands over one value, of each named entry.
+
+        One value admits the error of the entry's form in each group of bands.
+        """
+        bands = np.array([0, *np.searchsorted(GROUPS, EDGES[:-1], side='right') - 1])
+        copies = int(bands.max()) + 1
+        named = self.indices(solution.best)
+        for k in solution.best:
+            keys = np.array(self.indices((k,)))
+            split = normal(solution.spectra, self.names, self.flight, keys, bands,
+                           self.narrow[self.known:])
+            size = np.maximum(self.typical[keys], np.abs(solution.theta[keys]))
+            form = np.maximum(self.narrow[keys], FORM * np.abs(solution.theta[keys]))
+            judge = self._judge(split, np.hypot(self.narrow, self.typical * 9), named,
+                                np.tile(form, copies), np.tile(size, copies))
+            solution.unsteady[k] = judge.posterior(range(
+                self.known, self.known + copies * len(keys))).gain
+
+    def disagreement(self, solution: Solution) -> list[tuple[str, float, float]]:
+        """Channel, RMS of the file's residual over the noise, RMS of the discrepancy."""
+        weights = solution.equations.of_generic(solution.theta)
+        raw = [flight.linear({}, []).residual for flight in self.flights]
+        rows = []
+        for c, name in enumerate(self.channels):
+            here = [flight.mask[:, c] for flight in self.flights]
+            found = np.concatenate([(g[m, c].reshape(m.sum(), -1) @ weights)
+                                    for g, m in zip(self.generic, here, strict=True)])
+            size = np.sqrt(np.mean(np.concatenate([r[m, c] for r, m in zip(
+                raw, here, strict=True)])**2))
+            noise = np.sqrt(np.mean([np.mean(s.noise[s.band][:, c, c]) for s in solution.spectra]))
+            rows.append((name, float(size / noise), float(found.std())))
+        return rows
+
+    def errors(self, solution: Solution, named: Sequence[int], flights: Sequence
+               ) -> tuple[float, float, float]:
+        """
+        Whitened RMS of flights with the file, with the named entries, and with everything.
+
+        The flights' own deviations are fitted within their priors in each case. The noise is that
+        of the fitted flights.
+        """
+        keep = self.flights, self.generic
+        self.flights = list(flights)
+        self.generic = [flight.discrepancy() for flight in flights]
+        zeros = np.zeros((len(flights), len(self.names)))
+        theta = np.concatenate([solution.theta, np.zeros(len(self.names) - self.known)])
+        spectra = self._spectra(theta, zeros)
+        self.flights, self.generic = keep
+        noise, total, count = pooled(solution.spectra), np.zeros(3), 0
+        some = np.zeros(len(theta))
+        some[self.indices(named)] = theta[self.indices(named)]
+        for each in spectra:
+            each.noise = noise
+            g, h = (part.sum(axis=(0, 1)) for part in each.grams())
+            r2 = each.power()
+            for k, point in enumerate((np.zeros(len(theta)), some, None)):
+                own = np.flatnonzero(self.flight > 0) if point is not None else slice(None)
+                prior = self.flight[own]**-2 if point is not None else \
+                    np.hypot(self._wide(), self.flight)**-2
+                start = np.zeros(len(theta)) if point is None else point
+                left = h - g @ start
+                move = np.linalg.solve(g[own][:, own] + np.diag(prior), left[own])
+                value = r2 - 2 * h @ start + start @ g @ start
+                total[k] += value - 2 * left[own] @ move + move @ g[own][:, own] @ move
+            count += each.residual.size
+        before, after, floor = np.sqrt(np.maximum(total, 0.0) / count)
+        return float(before), float(after), float(floor)
+
+    def _judge(self, equations, wide=None, named=(), form=(), size=()):
+        """Judge of all known keys, and of deviations of bands with priors ``form``, ``size``."""
+        more = len(form)
+        narrow = self.narrow[:self.known].copy()
+        for k in named:
+            narrow[k] = wide[k]
+        flat = np.zeros(more, dtype=bool)
+        return Judge(equations, np.concatenate([narrow, form]),
+                     np.concatenate([self.typical[:self.known], size]),
+                     np.concatenate([self.positive[:self.known], flat]),
+                     np.concatenate([self.owner, np.full(more, len(self.entries))]),
+                     self.alpha / len(self.entries), np.concatenate([self.far, flat]))

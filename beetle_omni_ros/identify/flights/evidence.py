@@ -1,0 +1,273 @@
+"""
+Evidence of sets of catalogue entries from the normal equations of several flights.
+
+For flight f, linearised at its own point,
+
+    r_f = -(A_f theta + B_f eta_f) + e_f,
+
+with the common deviations ``theta``, those of the flight ``eta_f`` and the noise ``e_f``. Keys
+have normal priors. A set of entries widens the priors of its keys from narrow to typical. The
+evidence of a set against the empty one is closed: with the profile of its keys, estimate m and
+information I, it is the ratio of the densities of m under both priors. The covariance of m is
+widened in each direction in which the blocks scatter more than their noise allows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.special import log_ndtr
+from scipy.stats import norm, t
+
+from beetle_omni_ros.identify.flights.spectrum import Spectrum
+
+NONE = np.zeros(0, dtype=int)
+
+
+@dataclass(eq=False)
+class Normal:
+    """
+    Normal equations of all flights without the deviations of the flights.
+
+    Attributes:
+        names: (K,) keys.
+        info: (K, K) information of the data.
+        right: (K,) right side.
+        scores: (B, K) and slopes (B, K, K): score of a block at theta is scores - slopes theta.
+
+    """
+
+    names: list[str]
+    info: np.ndarray
+    right: np.ndarray
+    scores: np.ndarray
+    slopes: np.ndarray
+    flights: list[tuple] = field(default_factory=list, repr=False)
+    eliminated: tuple[np.ndarray, np.ndarray] | None = None
+
+    def of_generic(self, theta: np.ndarray) -> np.ndarray:
+        """Weights of the eliminated generic keys at ``theta`` (K,); empty if none was."""
+        if self.eliminated is None:
+            return np.zeros(0)
+        a, b = self.eliminated
+        return a - b @ theta
+
+    def of_flight(self, k: int, theta: np.ndarray) -> np.ndarray:
+        """(K,) deviations of flight k from the common ``theta`` (K,)."""
+        theta = np.concatenate([theta, self.of_generic(theta)])
+        own, inner, left, right = self.flights[k]
+        eta = np.zeros(len(theta))
+        eta[own] = inner @ (right - left @ theta)
+        return eta
+
+
+def normal(spectra: Sequence[Spectrum], names: list[str], flight: np.ndarray,
+           split: np.ndarray = NONE, groups: np.ndarray = NONE,
+           generic: np.ndarray | None = None) -> Normal:
+    """
+    Eliminate the deviations of each flight.
+
+    Args:
+        spectra: one for each flight.
+        names: (K,) keys.
+        flight: (K,) standard deviations between flights; 0: none.
+        split: indices of keys that get a further deviation for each group of bands.
+        groups: (bands,) group of each band, from 0.
+        generic: standard deviations of the last keys, which are eliminated too; None: kept.
+
+    Returns:
+        normal equations; the deviations of split keys follow the K keys.
+
+    """
+    count, copies = len(names), int(groups.max(initial=-1)) + 1
+    further = copies * len(split)
+    size = count + further
+    own = np.flatnonzero(flight > 0)
+    info, right = np.zeros((size, size)), np.zeros(size)
+    scores, slopes, flights = [], [], []
+    for each in spectra:
+        g, h = each.grams()
+        gs, hs = np.zeros((len(g), size, size)), np.zeros((len(g), size))
+        gs[:, :count, :count], hs[:, :count] = g.sum(axis=1), h.sum(axis=1)
+        for group in range(copies):
+            part = g[:, groups == group].sum(axis=1)
+            at = count + group * len(split) + np.arange(len(split))
+            gs[:, :count, at] = part[:, :, split]
+            gs[:, at, :count] = part[:, split]
+            gs[:, at[:, None], at] = part[:, split][:, :, split]
+            hs[:, at] = h[:, groups == group].sum(axis=1)[:, split]
+        ge, gee, he = gs[:, own], gs[:, own][:, :, own], hs[:, own]
+        inner = np.linalg.inv(gee.sum(axis=0) + np.diag(flight[own]**-2))
+        left, right_e = ge.sum(axis=0), he.sum(axis=0)
+        project = left.T @ inner                        # (size, E)
+        a, b = inner @ right_e, inner @ left            # eta = a - b theta
+        # each block carries its share of the prior, so that the sum is the score of all
+        coupling = ge.transpose(0, 2, 1) - project @ gee - project * flight[own]**-2 / len(g)
+        scores.append(hs - he @ project.T - coupling @ a)
+        slopes.append(gs - project @ ge - coupling @ b)
+        info += gs.sum(axis=0) - left.T @ inner @ left
+        right += hs.sum(axis=0) - left.T @ a
+        flights.append((own, inner, left, right_e))
+    whole = Normal(list(names), info, right, np.concatenate(scores), np.concatenate(slopes),
+                   flights)
+    return whole if generic is None else _without(whole, count, generic)
+
+
+def _without(whole, count, generic):
+    """Normal equations without the generic keys, which end at ``count``."""
+    size = len(whole.info)
+    w = np.arange(count - len(generic), count)
+    keep = np.setdiff1d(np.arange(size), w)
+    inner = np.linalg.inv(whole.info[np.ix_(w, w)] + np.diag(generic**-2))
+    left = whole.info[np.ix_(w, keep)]
+    a, b = inner @ whole.right[w], inner @ left         # w = a - b theta
+    project = left.T @ inner
+    info = whole.info[np.ix_(keep, keep)] - left.T @ b
+    right = whole.right[keep] - left.T @ a
+    # scores at w: of the others less the projection of those of w
+    s, g = whole.scores, whole.slopes
+    scores = s[:, keep] - g[:, keep][:, :, w] @ a - (s[:, w] - g[:, w][:, :, w] @ a) @ project.T
+    slopes = g[:, keep][:, :, keep] - g[:, keep][:, :, w] @ b \
+        - project @ (g[:, w][:, :, keep] - g[:, w][:, :, w] @ b)
+    return Normal(whole.names[:count - len(generic)], info, right, scores, slopes, whole.flights,
+                  (a, b))
+
+
+@dataclass(eq=False)
+class Posterior:
+    """
+    Evidence and estimate of one set.
+
+    Attributes:
+        gain: ln of the evidence over that of the empty set [nat].
+        theta: (K,) mean of all keys.
+        estimate: (d,) posterior mean of the set's keys.
+        deviation: (d,) their posterior standard deviation, widened by the blocks.
+
+    """
+
+    gain: float
+    theta: np.ndarray
+    estimate: np.ndarray
+    deviation: np.ndarray
+
+
+class Judge:
+    """
+    Evidence of sets for given normal equations and priors.
+
+    Args:
+        equations: normal equations.
+        narrow: (K,) standard deviations that every key has.
+        typical: (K,) what a candidate adds.
+        positive: (K,) keys that cannot be negative.
+        owner: (K,) index of the entry of each key.
+        level: probability at which the widening by few blocks holds.
+        far: (K,) keys whose deviation may be much larger than typical; not those of sensors.
+
+    """
+
+    def __init__(self, equations: Normal, narrow: np.ndarray, typical: np.ndarray,
+                 positive: np.ndarray, owner: np.ndarray, level: float, far: np.ndarray):
+        self.equations, self.narrow, self.typical = equations, narrow, typical
+        self.positive = positive
+        self.covariance = np.linalg.inv(equations.info + np.diag(narrow**-2))
+        self.mean = self.covariance @ equations.right
+        self.blocks = len(equations.scores)
+        # The scatter between few blocks is uncertain: variance by Student's t at this level.
+        self.owner, self.far = owner, far
+        self.student = float((t.isf(level / 2, max(self.blocks - 1, 1)) / norm.isf(level / 2))**2)
+        self._kept: dict[tuple[int, ...], Posterior] = {}
+        self._profiles: dict[tuple[int, ...], tuple] = {}
+
+    def posterior(self, chosen: Sequence[int]) -> Posterior:
+        """Evidence of the set of keys ``chosen`` (indices) over the empty set."""
+        index = tuple(sorted(chosen))
+        if index not in self._kept:
+            if not index:
+                return Posterior(0.0, self.mean, np.zeros(0), np.zeros(0))
+            c, estimate, wide, slab, _, theta = self._profile(index)
+            total = np.linalg.inv(np.linalg.inv(wide) + np.diag(slab**-2))
+            self._kept[index] = Posterior(self.gain(index, ()), theta, theta[c],
+                                          np.sqrt(np.diag(total)))
+        return self._kept[index]
+
+    def gain(self, one: Sequence[int], other: Sequence[int]) -> float:
+        """
+        Ln of the evidence of one set of keys over that of another [nat].
+
+        Both are judged with the covariance of a fit of both together, so that the comparison of
+        two sets with common keys depends on the others alone.
+        """
+        if not {*one, *other}:
+            return 0.0
+        c, estimate, wide, slab, price, _ = self._profile(tuple(sorted({*one, *other})))
+        total = 0.0
+        for chosen, sign in ((one, 1.0), (other, -1.0)):
+            free = np.isin(c, list(chosen))
+            prior = np.where(free, slab, self.narrow[c])
+            value = _log_density(estimate, wide, prior) \
+                - price * len(np.unique(self.owner[c[free]]))
+            value += sum(self._orthant(estimate, wide, prior, k)
+                         for k in np.flatnonzero(self.positive[c]))
+            total += sign * value
+        return float(total)
+
+    def _profile(self, index):
+        """Keys, estimate, its covariance, prior deviations, price of an entry, mean of all."""
+        if index in self._profiles:
+            return self._profiles[index]
+        c = np.array(index, dtype=int)
+        own = np.linalg.inv(self.covariance[np.ix_(c, c)])
+        direction = self.covariance[:, c] @ own                     # (K, d)
+        info = own - np.diag(self.narrow[c]**-2)
+        info = 0.5 * (info + info.T)
+        values, vectors = np.linalg.eigh(info)
+        info = vectors @ np.diag(np.maximum(values, 1e-9 * self.narrow[c].min()**-2)) @ vectors.T
+        score = own @ self.mean[c]
+        estimate = np.linalg.solve(info, score)
+        slab = np.hypot(self.narrow[c], self._scales(c, estimate) * self.typical[c])
+        fitted = np.linalg.solve(info + np.diag(slab**-2), score)
+        theta = self.mean + direction @ (fitted - self.mean[c])
+        wide = self.widened(direction, info, theta)
+        self._profiles[index] = c, estimate, wide, slab, np.log(3), theta
+        return self._profiles[index]
+
+    def _scales(self, c, estimate):
+        """
+        Factors (d,) of the typical deviations.
+
+        The prior of a candidate is a mixture of three normal ones, 1, 3 and 9 times typical. Its
+        term that reaches the estimate is used, a lower bound; its weight costs ln 3.
+        """
+        ratio = np.abs(estimate) / self.typical[c]
+        group = np.zeros(len(c), dtype=int)
+        for owner in np.unique(self.owner[c]):
+            own = self.owner[c] == owner
+            if self.far[c][own].all():
+                group[own] = np.searchsorted((1.5, 4.5), ratio[own].max())
+        return 3.0**group
+
+    def widened(self, direction, info, theta):
+        """(d, d) covariance of a profile, widened where blocks scatter more than their noise."""
+        scores = (self.equations.scores - self.equations.slopes @ theta) @ direction
+        scatter = scores.T @ scores * self.blocks / max(self.blocks - 1, 1)
+        values, vectors = np.linalg.eigh(info)
+        root = vectors @ np.diag(values**-0.5) @ vectors.T
+        ratio, axes = np.linalg.eigh(root @ scatter @ root)
+        return self.student * root @ axes @ np.diag(np.maximum(ratio, 1.0)) @ axes.T @ root
+
+    @staticmethod
+    def _orthant(estimate, covariance, prior, k):
+        """Ln of twice the probability that key k is positive, for a prior on one side."""
+        total = np.linalg.inv(np.linalg.inv(covariance) + np.diag(prior**-2))
+        mean = total @ np.linalg.solve(covariance, estimate)
+        return np.log(2) + log_ndtr(mean[k] / np.sqrt(total[k, k]))
+
+
+def _log_density(x, covariance, prior):
+    """Ln of the normal density of x (d,) with the covariance of noise and prior."""
+    total = covariance + np.diag(prior**2)
+    return -0.5 * (x @ np.linalg.solve(total, x) + np.linalg.slogdet(2 * np.pi * total)[1])

@@ -1,0 +1,193 @@
+"""The flight engine against dense algebra, quadrature, and flights with known effects."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.stats import norm
+
+from beetle_omni_ros.identify.flights.command import table_results
+from beetle_omni_ros.identify.flights.evidence import Judge, normal
+from beetle_omni_ros.identify.flights.spectrum import EDGES, spectrum
+from beetle_omni_ros.robot.resources import share_path
+from beetle_omni_ros.robot.schema import ParameterError
+
+REAL = Path(__file__).parents[3] / 'shared/data/flights'
+ROBOT = share_path('params/crazyflie.yaml')
+HEADER = ('t,px,py,pz,qx,qy,qz,qw,fx,fy,fz,wx,wy,wz,pwm1,pwm2,pwm3,pwm4,vbat,sp_x,sp_y,sp_z,'
+          'des_roll,des_pitch')
+
+
+def linear_flight(rng, theta, count=3200, period=0.01, keys=3):
+    """Spectrum of white noise of deviation 0.1 and a linear model with known keys."""
+    slopes = rng.normal(size=(count, 2, keys))
+    residual = -slopes @ theta + 0.1 * rng.normal(size=(count, 2))
+    found = spectrum(residual, slopes, np.ones((count, 2), dtype=bool), period,
+                     np.full(2, 1e-6), np.inf)
+    found.noise[:] = 0.01 * np.eye(2)
+    return found
+
+
+def test_deviations_of_flights_are_eliminated_as_in_the_dense_problem():
+    rng = np.random.default_rng(1)
+    spectra = [linear_flight(rng, np.array([0.2, 0.0, -0.1]) + shift) for shift in (0.0, 0.05)]
+    flight = np.array([0.0, 0.03, 0.1])
+    found = normal(spectra, ['a', 'b', 'c'], flight)
+    grams = [[part.sum(axis=(0, 1)) for part in s.grams()] for s in spectra]
+    own = [1, 2]
+    dense = np.zeros((7, 7))
+    right = np.zeros(7)
+    for k, (g, h) in enumerate(grams):
+        at = [0, 1, 2, 3 + 2 * k, 4 + 2 * k]
+        which = [0, 1, 2, *own]
+        dense[np.ix_(at, at)] += g[np.ix_(which, which)]
+        right[at] += h[which]
+    dense[range(3, 7), range(3, 7)] += np.tile(flight[own]**-2, 2)
+    assert np.allclose(np.linalg.solve(found.info, found.right),
+                       np.linalg.solve(dense, right)[:3])
+    theta = np.linalg.solve(dense, right)
+    assert np.allclose(found.of_flight(1, theta[:3])[own], theta[5:])
+    # scores of the blocks vanish in sum at the solution
+    assert np.allclose((found.scores - found.slopes @ theta[:3]).sum(axis=0), 0, atol=1e-6)
+
+
+@pytest.mark.parametrize('positive', [False, True])
+def test_evidence_of_one_key_agrees_with_quadrature(positive):
+    rng = np.random.default_rng(2)
+    found = normal([linear_flight(rng, np.array([0.004]), keys=1)], ['a'], np.zeros(1))
+    narrow, typical = np.array([0.001]), np.array([0.02])
+    judge = Judge(found, narrow, typical, np.array([positive]), np.zeros(1, dtype=int), 0.05,
+                  np.array([False]))
+    info, estimate = found.info[0, 0], found.right[0] / found.info[0, 0]
+    posterior = judge.posterior((0,))
+    # the widened deviation of the estimate, from its posterior
+    slab = np.hypot(narrow[0], typical[0])
+    sigma = (posterior.deviation[0]**-2 - slab**-2)**-0.5
+    assert sigma >= info**-0.5 * (1 - 1e-9)
+    low, factor = (0.0, 2.0) if positive else (-0.5, 1.0)
+
+    def integral(width):
+        return quad(lambda x: factor * norm.pdf(x, 0, width) * norm.pdf(estimate, x, sigma), low,
+                    0.5, points=[0, estimate], limit=200)[0]
+    price = np.log(3)       # of the mixture of three widths
+    assert posterior.gain == pytest.approx(
+        np.log(integral(slab)) - np.log(integral(narrow[0])) - price, abs=1e-3)
+
+
+def test_noise_of_a_flexible_fit_is_not_too_small():
+    rng = np.random.default_rng(3)
+    variances = []
+    for _ in range(5):
+        flight = linear_flight(rng, np.zeros(40), count=1600, keys=40)
+        flight.noise[:] = 1.0 * np.eye(2)
+        prior = np.tile(0.01 * np.eye(2), (len(EDGES), 1, 1))
+        for _ in range(30):
+            g, h = (part.sum(axis=(0, 1)) for part in flight.grams())
+            covariance = np.linalg.inv(g + 1e-4 * np.eye(40))
+            flight.learn(covariance @ h, covariance, prior, weight=1e-3)
+        variances.append(np.diagonal(flight.noise[1:], axis1=1, axis2=2).mean())
+    assert np.mean(variances) == pytest.approx(0.01, rel=0.15)
+
+
+def write_flight(path, seed, scale=1.0, drag=0.0, sag=True, seconds=34.0):
+    """
+    A flight in the columns of NanoBench, from equations of its own.
+
+    Thrust by motor voltage with a lag of 60 ms, level attitude, prescribed motion.
+    """
+    rng = np.random.default_rng(seed)
+    t = np.arange(0, seconds, 0.01)
+    slow = sum(rng.normal() * np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) for f in (
+        0.3, 0.7, 1.1, 1.9)) * 0.02
+    volts = 4.0 - 0.5 * t / seconds - 0.05 * rng.random()
+    duty = np.clip(2.75 / volts * (1 + slow), 0, 0.97)
+    motor = duty * (volts if sag else 3.7)
+    force = 4 * (-0.01483 + 0.04724 * motor - 0.01847 * motor**2 + 0.005961 * motor**3)
+    lagged = np.empty_like(force)
+    lagged[0] = force[0]
+    for k in range(1, len(t)):
+        lagged[k] = lagged[k - 1] + (1 - np.exp(-0.01 / 0.06)) * (force[k] - lagged[k - 1])
+    v = np.stack([np.cos(0.9 * t + seed), np.sin(0.7 * t), 0 * t], axis=1)
+    p = np.cumsum(v, axis=0) * 0.01 + [0, 0, 1]
+    p[t < 1, 2] = 0
+    hover = 0.0319 * 9.81 / 4
+    speed = np.sqrt(scale * lagged / 4 / hover)
+    specific = np.zeros((len(t), 3))
+    specific[:, 2] = scale * lagged / 0.0319
+    specific -= (drag * speed / 0.0319)[:, None] * v
+    # coloured noise: white and a slow wander
+    noise = rng.normal(size=(len(t), 3)) * 0.05 + np.cumsum(
+        rng.normal(size=(len(t), 3)), axis=0) * 0.002
+    rates = rng.normal(size=(len(t), 3)) * 0.01
+    columns = np.column_stack([
+        t, p, np.tile([0, 0, 0, 1], (len(t), 1)), specific + noise, rates,
+        np.tile(duty[:, None] * 65535, 4), volts, p, np.zeros((len(t), 2))])
+    np.savetxt(path, columns, delimiter=',', header=HEADER, comments='', fmt='%.7g')
+    return path
+
+
+def named(result):
+    return {name for effect in result['effects'] for name in effect['names']}
+
+
+def test_a_hidden_thrust_and_drag_are_named_with_their_sizes(tmp_path):
+    flights = [write_flight(tmp_path / f'{k}.csv', k, scale=0.8, drag=0.012) for k in range(3)]
+    result = table_results(flights, [], 'nanobench', ROBOT)
+    found = {effect['names'][0]: effect['parameters'] for effect in result['effects']}
+    assert {'thrust_coefficient', 'rotor_drag'} == set(found)
+    for name, key, true in (('thrust_coefficient', 'scale', 0.8),
+                            ('rotor_drag', 'coefficient', 0.012)):
+        low, high = found[name][key]['interval']
+        assert low - 0.01 * true <= true <= high + 0.01 * true
+    assert result['false_alarm_probability'] < 1e-3
+    assert result['gap_after'] < 0.2 * result['gap_before'] + 0.8
+
+
+def test_flights_of_the_robot_of_the_file_have_no_named_effect(tmp_path):
+    flights = [write_flight(tmp_path / f'{k}.csv', 10 + k) for k in range(3)]
+    result = table_results(flights, [], 'nanobench', ROBOT)
+    assert not result['effects']
+    assert result['false_alarm_probability'] > 0.05
+
+
+def test_a_file_that_ignores_the_voltage_is_told_so(tmp_path):
+    robot = tmp_path / 'robot.yaml'
+    robot.write_text('extends: crazyflie.yaml\neffects: {}\n')
+    flights = [write_flight(tmp_path / f'{k}.csv', 20 + k) for k in range(3)]
+    result = table_results(flights, [], 'nanobench', robot, apply=tmp_path / 'corrected.yaml')
+    assert 'voltage_sag' in named(result)
+    assert 'voltage_sag' in (tmp_path / 'corrected.yaml').read_text()
+
+
+def test_what_a_format_lacks_is_listed_with_its_reason(tmp_path):
+    form = tmp_path / 'bare.yaml'
+    form.write_text('time: {columns: [t], unit: s}\n'
+                    'specific_force: {columns: [null, null, fz], unit: m/s^2}\n'
+                    'duty: {columns: [pwm1, pwm2, pwm3, pwm4], full: 65535}\n'
+                    'voltage: {columns: [vbat], unit: V}\n')
+    flights = [write_flight(tmp_path / f'{k}.csv', 30 + k) for k in range(2)]
+    result = table_results(flights, [], str(form), ROBOT)
+    groups = result['groups']
+    assert groups['force'] == {'used': True, 'channels': ['force_z'], 'reason': (
+        'no specific force or acceleration along this axis')}
+    assert groups['torque'] == {'used': False, 'channels': [], 'reason': 'no gyroscope'}
+    assert not groups['acceleration']['used'] and not groups['joint']['used']
+
+
+def test_duty_needs_a_robot_with_a_motor_map(tmp_path):
+    flight = write_flight(tmp_path / 'a.csv', 1, seconds=5)
+    with pytest.raises(ParameterError, match="'rotors.motor' is missing"):
+        table_results([flight], [], 'nanobench', None)
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason='the real flights are not beside the repository')
+@pytest.mark.timeout(600)
+def test_real_flights_name_thrust_and_drag_and_never_an_inertia():
+    flights = [REAL / f'nano_{name}.csv.gz' for name in (
+        'B2_circle_fast_rep3', 'B7_oval_slow_rep3', 'B5_helix_fast_rep2')]
+    result = table_results(flights, [REAL / 'nano_B8_star_fast_rep3.csv.gz'], 'nanobench', ROBOT)
+    assert {'thrust_coefficient', 'rotor_drag'} <= named(result)
+    assert not {'inertia', 'torque_coefficient', 'joint_offset'} & named(result)
+    assert not result['groups']['rate']['used']
+    assert result['closure'] > 0.8

@@ -1,0 +1,94 @@
+"""Flights as tables: formats, units, frames and missing samples."""
+
+import gzip
+
+import numpy as np
+import pytest
+
+from beetle_omni_ros.identify.flights.table import Format, read_flight
+from beetle_omni_ros.robot.schema import ParameterError
+
+FORMAT = """
+time: {columns: [ms], unit: ms}
+specific_force: {columns: [a, b, c], unit: g, sign: [1, -1, 1]}
+quaternion: {columns: [w, x, y, z], order: wxyz, frame: world_to_body}
+duty: {columns: [d1, d2, d3, d4], full: 65535}
+"""
+HEADER = 'ms,a,b,c,w,x,y,z,d1,d2,d3,d4\n'
+
+
+def declared(tmp_path, text=FORMAT):
+    path = tmp_path / 'own.yaml'
+    path.write_text(text)
+    return Format.load(str(path))
+
+
+def rows(times, cells='0,0.5,1,0.8,0.6,0,0,65535,0,0,0'):
+    return ''.join(f'{t},{cells}\n' for t in times)
+
+
+def test_units_signs_orders_and_directions_are_those_that_the_format_declares(tmp_path):
+    path = tmp_path / 'flight.csv.gz'
+    path.write_bytes(gzip.compress((HEADER + rows(range(0, 200, 10))).encode()))
+    table = read_flight(path, declared(tmp_path))
+    assert table.period == pytest.approx(0.01)
+    assert np.allclose(table.values['specific_force'][0], [0, -0.5 * 9.80665, 9.80665])
+    # w, x, y, z of the world in the body becomes x, y, z, w of the body in the world
+    assert np.allclose(table.values['quaternion'][0], [-0.6, 0, 0, 0.8])
+    assert np.allclose(table.values['duty'][0], [1, 0, 0, 0])
+
+
+def test_empty_cells_and_lost_rows_are_samples_that_do_not_exist(tmp_path):
+    path = tmp_path / 'flight.csv'
+    lines = rows(range(0, 100, 10)) + '100,,0,1,1,0,0,0,,0,0,0\n' + rows(range(130, 200, 10))
+    path.write_text(HEADER + lines)
+    table = read_flight(path, declared(tmp_path))
+    assert len(table) == 20
+    assert np.isnan(table.values['specific_force'][10]).tolist() == [True, False, False]
+    assert np.isnan(table.values['duty'][11:13]).all()
+    assert table.has('duty') and not np.isnan(table.values['duty'][13]).any()
+
+
+@pytest.mark.parametrize('text, message', [
+    ('duty: {columns: [a, b, c, d]}', "'time' is missing"),
+    ('time: {columns: [t], unit: h}', "'unit': expected one of s, ms, us, ns, found 'h'"),
+    ('time: {columns: [t], unit: s}\nposition: {columns: [x, y], unit: m}',
+     "'columns': expected 3 names"),
+    ('time: {columns: [t], unit: s}\nspeed: {columns: [x]}', 'unknown signal'),
+    ('time: {columns: [t], unit: s}\nquaternion: {columns: [a, b, c, d], order: zyxw}',
+     "'order': expected xyzw or wxyz"),
+])
+def test_a_wrong_format_is_refused_with_file_and_key(tmp_path, text, message):
+    with pytest.raises(ParameterError, match='own.yaml') as error:
+        declared(tmp_path, text)
+    assert message in str(error.value)
+
+
+@pytest.mark.parametrize('lines, message', [
+    (rows(range(0, 100, 10)) + '100,up,0,1,1,0,0,0,0,0,0,0\n', "row 12, column 'a'"),
+    (rows([0, 10, 10] + list(range(20, 100, 10))), 'increasing times'),
+    ('1,2,3\n', 'expected 12 cells, found 3'),
+])
+def test_a_wrong_row_is_refused_with_file_row_and_column(tmp_path, lines, message):
+    path = tmp_path / 'flight.csv'
+    path.write_text(HEADER + lines)
+    with pytest.raises(ParameterError, match='flight.csv') as error:
+        read_flight(path, declared(tmp_path))
+    assert message in str(error.value)
+
+
+def test_a_column_of_the_format_that_the_table_lacks_is_named(tmp_path):
+    path = tmp_path / 'flight.csv'
+    path.write_text('ms,a,b,c\n0,0,0,1\n')
+    with pytest.raises(ParameterError, match="no column 'w'"):
+        read_flight(path, declared(tmp_path))
+
+
+@pytest.mark.parametrize('name', ['nanobench', 'crazypad_motor'])
+def test_shipped_formats_load(name):
+    assert Format.load(name).name == name
+
+
+def test_an_unknown_format_names_the_shipped_ones():
+    with pytest.raises(ParameterError, match='crazypad_motor, nanobench'):
+        Format.load('px4')
