@@ -1,7 +1,7 @@
 """`beetle_omni evaluate`: flies tasks in one process with one or several controllers."""
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import contextmanager, ExitStack
+from contextlib import ExitStack
 from pathlib import Path
 import signal
 import threading
@@ -98,7 +98,18 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
     if injected:
         meta['faults'] = [str(fault) for fault in injected]
     results: dict = {'meta': meta}
-    with Progress(console=console, transient=True) as bars, _noted_interrupts() as interrupts:
+    interrupts: list[int] = []
+
+    def interrupt(number, _):
+        """End the flight after a tick, so that no record is cut; the second time at once."""
+        if interrupts:
+            raise KeyboardInterrupt
+        interrupts.append(number)
+
+    with Progress(console=console, transient=True) as bars, ExitStack() as stack:
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler \
+                and threading.current_thread() is threading.main_thread():
+            stack.callback(signal.signal, signal.SIGINT, signal.signal(signal.SIGINT, interrupt))
         for entry, controller in built.items():
             name = entry.name
             bar = bars.add_task(f'{name}: {task.name}, {conditions}', total=1.0)
@@ -119,20 +130,3 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
         console.print(f"interrupted; kept {bag or 'the results above'}", soft_wrap=True)
         raise KeyboardInterrupt
     return results
-
-
-@contextmanager
-def _noted_interrupts():
-    """Yield a list that Ctrl-C extends, so that no record is cut; the second one interrupts."""
-    noted: list[int] = []
-    before = signal.getsignal(signal.SIGINT)
-    ours = before is signal.default_int_handler \
-        and threading.current_thread() is threading.main_thread()
-    if ours:
-        signal.signal(signal.SIGINT, lambda number, _: (
-            noted.append(number), signal.signal(number, before)))
-    try:
-        yield noted
-    finally:
-        if ours:
-            signal.signal(signal.SIGINT, before)
