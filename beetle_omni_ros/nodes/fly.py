@@ -110,7 +110,8 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             result = _report(bag, controller, flown_task, meta, json_path, console)
             failure = failure or failed(result)
         if 'interrupted' in meta:
-            _print(console, f'interrupted; kept {bag}' if bag.exists() else 'interrupted')
+            if bag.exists():
+                _print(console, f'interrupted; kept {bag}')
             raise KeyboardInterrupt
         if failure:
             _complain(failure + slow)
