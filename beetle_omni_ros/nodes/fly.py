@@ -271,7 +271,7 @@ def _report(bag, controller, task, meta, json_path, console) -> dict:
     for line in log.warnings:
         _print(console, line, style='yellow')
     results = {'meta': meta, controller: metrics(log, task)}
-    if log.controllers():       # a controller flew
+    if log.targets:     # a controller flew
         table.print_results(results, console)
     write_json(json_path, results)
     return results[controller]
