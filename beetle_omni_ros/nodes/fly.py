@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from contextlib import contextmanager, ExitStack
-from functools import partial
 from pathlib import Path
 import subprocess
 import sys
@@ -168,7 +167,7 @@ def _fly(graph: Graph, controller: str, task: Task, console: Console,
         graph.start()
         with console.status('starting') as status:
             flight = Flight(graph, controller, task, status.update)
-            for part in (partial(flight.fly, faults), flight.land):
+            for part in (lambda: flight.fly(faults), flight.land):
                 try:
                     part()
                 except RunError as error:
