@@ -31,6 +31,8 @@ def main(args: list[str] | None = None) -> int:
     try:
         status = get_command(app).main(args=spread(args), prog_name='beetle_omni',
                                        standalone_mode=False)
+        if status == INTERRUPTED:       # typer turns the exception into its status
+            return _fail('interrupted', INTERRUPTED)
         return status if isinstance(status, int) else 0
     except ModuleNotFoundError as error:
         top = (error.name or '').partition('.')[0]

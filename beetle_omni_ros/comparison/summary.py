@@ -17,7 +17,7 @@ from beetle_omni_ros.comparison.statistics import compared
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.pages.page import at
 from beetle_omni_ros.runs import table as published
-from beetle_omni_ros.runs.metrics import failed, POSE_KEYS
+from beetle_omni_ros.runs.metrics import CRASHED, failed, POSE_KEYS
 from beetle_omni_ros.runs.tasks import PUSH_PERIOD, RISING, TILTS
 
 PREFIX = 'published_'    # prefix of a controller in the publication
@@ -218,7 +218,7 @@ def summarise(flown: dict[Flight, dict]) -> dict:
                 'seeds': sorted(by_seed),
                 'failures': {str(seed): result['failure'] for seed, result in by_seed.items()
                              if result['failure']},
-                'lost': sum(map(failed, judged[name].values()))}
+                'lost': sum(failed(one) == CRASHED for one in judged[name].values())}
                 for name, by_seed in by_name.items()},
             'metrics': {key: compared({name: _sample(metric, by_seed)
                                        for name, by_seed in judged.items()}, metric.more)

@@ -2,8 +2,9 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from functools import partial
 from pathlib import Path
+import signal
+import threading
 from time import time
 from types import MappingProxyType
 
@@ -35,7 +36,8 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
     Fly one task with one controller, a name or a reference to a class; ``built`` is that one.
 
     Other arguments are those of :func:`run_evaluate`. The flight is returned after a crash, too
-    (``meta['crashed']``). ParameterError: a pose of the task is beyond the controller's reach.
+    (``meta['crashed']``), or an interruption by ``progress`` (``meta['interrupted']``).
+    ParameterError: a pose of the task is beyond the controller's reach.
     """
     entry = registry.find(controller)
     flying = built or entry.make(robot, options.get(entry.reference, ControllerOptions()))
@@ -70,7 +72,8 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
 
     ``options`` are files in place of a controller's own. With several controllers, ``bag``
     contains one bag for each. Returned are ``meta`` and a key for each controller, as
-    `--json` writes them. A ParameterError reports unusable input.
+    `--json` writes them. A ParameterError reports unusable input. A KeyboardInterrupt comes after
+    the results of what was flown.
     """
     console = console or table.Terminal()
     believed = RobotParameters.load(robot)
@@ -95,17 +98,35 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
     if injected:
         meta['faults'] = [str(fault) for fault in injected]
     results: dict = {'meta': meta}
-    with Progress(console=console, transient=True) as bars:
+    interrupts: list[int] = []
+
+    def interrupt(number, _):
+        """End the flight after a tick, so that no record is cut; the second time at once."""
+        if interrupts:
+            raise KeyboardInterrupt
+        interrupts.append(number)
+
+    with Progress(console=console, transient=True) as bars, ExitStack() as stack:
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler \
+                and threading.current_thread() is threading.main_thread():
+            stack.callback(signal.signal, signal.SIGINT, signal.signal(signal.SIGINT, interrupt))
         for entry, controller in built.items():
             name = entry.name
             bar = bars.add_task(f'{name}: {task.name}, {conditions}', total=1.0)
             log = fly(entry.reference, task, robot=believed, plant=true, conditions=conditions,
                       seed=seed, options=options, built=controller,
                       bag=bag / name if bag and len(built) > 1 else bag, meta=meta,
-                      faults=injected, progress=partial(bars.update, bar))
+                      faults=injected, progress=lambda completed, bar=bar: bars.update(
+                          bar, completed=completed) or interrupts)
             results[name] = metrics(log, task)
             if error := log.meta['controller_error']:
                 console.print(f'{name}: {error}', style='yellow', markup=False, highlight=False)
+            if interrupts:
+                meta['interrupted'] = True
+                break
     table.print_results(results, console)
     write_json(json_path, results)
+    if interrupts:
+        console.print(f"interrupted; kept {bag or 'the results above'}", soft_wrap=True)
+        raise KeyboardInterrupt
     return results

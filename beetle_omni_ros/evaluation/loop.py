@@ -178,8 +178,8 @@ class FlightLoop:
         """
         Take off and fly the task; return whether the robot was airborne to the end.
 
-        ``progress`` gets the fraction ``completed``, 0 to 1. ParameterError and RunError: no
-        take-off.
+        ``progress`` gets the fraction ``completed``, 0 to 1; the flight is interrupted if it
+        returns true. ParameterError and RunError: no take-off.
         """
         simulator = self.simulator
         with collector_off():
@@ -210,8 +210,9 @@ class FlightLoop:
                         self._recorder.write('diagnostics', [Diagnostic(
                             simulator.time, f'{controller}_node: {COMPUTE_STATUS}', 0, '',
                             {key: str(summary[name]) for key, name in COMPUTE_KEYS.items()})])
-                    if progress:
-                        progress(completed=(simulator.time - began) / task.duration)
+                    if progress and progress(completed=(simulator.time - began) / task.duration):
+                        self._recorder.write_meta({'interrupted': True})
+                        over = True
                 if over:
                     break
         stayed = not (self._crashed or player.lost_level is not None or truth.broken)

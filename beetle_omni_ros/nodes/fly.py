@@ -89,6 +89,8 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
         number = stack.enter_context(reserved_domain()) if domain_id is None else domain_id
         if view:
             stack.enter_context(viewer_process(number, console))
+        else:
+            _print(console, f'to watch: beetle_omni view --domain-id {number}')
         meta = {'task': task, 'conditions': conditions, 'seed': seed,
                 'robot': str(robot) if robot else 'params/robot.yaml',
                 'plant': str(plant) if plant else None, 'version': __version__,
@@ -97,17 +99,24 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
         if injected:
             meta['faults'] = [str(fault) for fault in injected]
         graph = Graph(nodes, folder, number)
+        failure = slow = ''
         try:
-            status = _fly(graph, controller, flown_task, console,
-                          '; '.join(map(str, injected)))
+            failure, slow = _fly(graph, controller, flown_task, console,
+                                 '; '.join(map(str, injected)))
         except KeyboardInterrupt:
-            _complain('interrupted; everything is stopped')
-            if (bag / 'metadata.yaml').exists():
-                add_meta(bag, {**meta, 'interrupted': True})
-            raise
-        if not bag.exists():
-            return status or runner.FAILED
-        return max(status, _report(bag, controller, flown_task, meta, json_path, console))
+            meta['interrupted'] = True
+        if bag.exists() and not failure.startswith(str(bag)):    # of the recorder
+            result = _report(bag, controller, flown_task, meta, json_path, console)
+            failure = failure or failed(result)
+        if 'interrupted' in meta:
+            if bag.exists():
+                _print(console, f'interrupted; kept {bag}')
+            raise KeyboardInterrupt
+        if failure:
+            _complain(failure + slow)
+        elif slow:
+            _print(console, slow.removeprefix('; '), style='yellow')
+        return runner.FAILED if failure else runner.OK
 
 
 def _checked(faults, actuators):
@@ -143,35 +152,38 @@ def viewer_process(domain_id: int, console: Console):
 
 
 def _print(console, text, **style):
-    console.print(text, markup=False, emoji=False, highlight=False, **style)
+    console.print(text, markup=False, emoji=False, highlight=False, soft_wrap=True, **style)
 
 
 def _complain(error):
     print(f'beetle_omni fly: error: {error}', file=sys.stderr)
 
 
-def _fly(graph: Graph, controller: str, task: Task, console: Console, faults: str) -> int:
+def _fly(graph: Graph, controller: str, task: Task, console: Console,
+         faults: str) -> tuple[str, str]:
+    """Fly, and return why the flight failed, or '', and :meth:`Flight.slow`."""
     failure, flight = '', None
     try:
         graph.start()
         with console.status('starting') as status:
             flight = Flight(graph, controller, task, status.update)
-            try:
-                flight.fly(faults)
-            except RunError as error:
-                _complain(error)
-                failure = str(error)
-            flight.land()
+            for part in (lambda: flight.fly(faults), flight.land):
+                try:
+                    part()
+                except RunError as error:
+                    failure = failure or str(error)
     finally:
-        stubborn = graph.stop()
+        stubborn = graph.stop(in_flight=bool(flight and flight.state not in ('', *MOTORS_OFF)))
         if flight:
             flight.close()
     for name in stubborn:
         _complain(f'{name} did not stop and was killed')
     for line in graph.warnings():
-        if not failure or not line.endswith(failure):       # printed above
+        if line.startswith('recorder_node: error: '):
+            failure = failure or line.partition(' error: ')[2]
+        elif not failure or not line.endswith(failure):     # printed at the end
             _print(console, line, style='yellow')
-    return runner.FAILED if failure else runner.OK
+    return failure, flight.slow()
 
 
 class Flight(Operator):
@@ -180,29 +192,28 @@ class Flight(Operator):
     def __init__(self, graph: Graph, controller: str, task: Task, show: Callable[[str], None]):
         super().__init__(graph.domain, controller)
         self._graph, self._task, self.show, self._lands = graph, task, show, False
+        self._lost_before = float('inf')    # s, of the simulator before the take-off
         self.required = [node for node in graph.nodes if node in BRIDGES]
 
     def fly(self, faults: str) -> None:
         """
         Wait for the graph, take off and fly the task, with faults of sim_node, to its end.
 
-        Raises:
-            RunError: a failure; the text states whether the computer was too slow.
-
+        A RunError reports a failure.
         """
         self.expect('starting (the first time compiles the controller)',
                     lambda: self.ready and self.progress, READY_TIMEOUT)
         self.expect('actuators and simulator', lambda: not self.waits_for(self.required)
                     and PACING in self.diagnostics, BRIDGES_TIMEOUT)
-        lost = self._lost_time()
-        try:
-            self.take_off()
-            self._fly_task(faults)
-        except RunError as error:
-            if (late := self._lost_time() - lost) < SLOW_TIME:
-                raise
-            raise RunError(f'{error}; this computer was too slow, the simulator fell {late:.1f} s '
-                           'behind: try --clock simulated') from None
+        self._lost_before = self._lost_time()
+        self.take_off()
+        self._fly_task(faults)
+
+    def slow(self) -> str:
+        """Return a text if the computer was too slow, else ''."""
+        late = self._lost_time() - self._lost_before
+        return '' if late < SLOW_TIME else f'; this computer was too slow, the simulator fell ' \
+            f'{late:.1f} s behind: try --clock simulated'
 
     def _lost_time(self):
         """Return the time that the simulator skipped because it was late [s]."""
@@ -227,20 +238,18 @@ class Flight(Operator):
                     lambda: f"; the task does not continue at '{self.progress}'")
 
     def land(self) -> None:
-        """Land if the robot flies, and wait for the motors to stop."""
+        """Land if the robot flies, and wait for the motors to stop; RunError: no landing."""
         self._lands = True
         if self.state in ('', *MOTORS_OFF) or COMPOSED in self._graph.dead():
             return      # a dead supervisor does not answer, and its clock stands still
-        self.show('landing')
         accepted, answer = self.call('land')
         if not accepted:
-            _complain(f'no landing: {answer}')
-        else:
-            self.wait(lambda: self.state in MOTORS_OFF, LANDING_TIMEOUT)
-            self.spin(1.1)      # the last diagnostics
+            raise RunError(f'no landing: {answer}')
+        self.expect('landing', lambda: self.state in MOTORS_OFF, LANDING_TIMEOUT)
+        self.spin(1.1)      # the last diagnostics
 
     def spin(self, seconds: float) -> None:
-        """Process messages; before landing, an ended process and a failing controller raise."""
+        """Process messages; before landing, the end of a process, controller or bag raises."""
         super().spin(seconds)
         if self._lands:
             return
@@ -249,16 +258,19 @@ class Flight(Operator):
         status = self.diagnostics.get(f'{self.controller}_node: controller')
         if status is not None and status.level >= ERROR and not self.state.startswith('flying'):
             raise RunError(status.message)
+        status = self.diagnostics.get('recorder_node: bag')
+        if status is not None and status.level >= ERROR:
+            raise RunError(status.message)
 
 
-def _report(bag, controller, task, meta, json_path, console) -> int:
+def _report(bag, controller, task, meta, json_path, console) -> dict:
     if (bag / 'metadata.yaml').exists():
         add_meta(bag, meta)
     log = read_bag(bag)
     for line in log.warnings:
         _print(console, line, style='yellow')
     results = {'meta': meta, controller: metrics(log, task)}
-    if log.controllers():       # a controller flew
+    if log.targets:     # a controller flew
         table.print_results(results, console)
     write_json(json_path, results)
-    return runner.FAILED if failed(results[controller]) else runner.OK
+    return results[controller]

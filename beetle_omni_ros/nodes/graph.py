@@ -11,6 +11,7 @@ from copy import deepcopy
 from itertools import count
 import os
 from pathlib import Path
+import re
 import signal
 import socket
 import subprocess
@@ -85,6 +86,13 @@ def reserved_domain():
                     yield number
                     return
     raise RunError('no free ROS domain between 1 and 101')
+
+
+def domains_in_use() -> list[int]:
+    """Return the ROS domains in which an estimator or simulator runs on this computer."""
+    claims = Path('/proc/net/unix').read_text()     # of FlightNode
+    return sorted(set(map(int, re.findall(
+        r'@beetle_omni/(\d+)/\S*\b(?:ekf|sim)_node$', claims, re.MULTILINE))))
 
 
 def _ports_are_free(domain):
@@ -279,14 +287,16 @@ class Graph:
         self.processes[name].send_signal(signal.SIGKILL)
         self.processes[name].wait()
 
-    def stop(self) -> list[str]:
+    def stop(self, *, in_flight: bool = False) -> list[str]:
         """
         Stop all processes; return the names of those that had to be killed.
 
         Bridges stop first, because they switch off the actuators, which the simulator emulates.
+        With ``in_flight`` they stop last: the recorder shall not record a fall.
         """
         bridges = {BRIDGES_COMPOSED, *BRIDGES} & set(self.processes)
-        return self._end(bridges) + self._end(set(self.processes) - bridges)
+        parts = [bridges, set(self.processes) - bridges]
+        return [name for part in parts[::-1 if in_flight else 1] for name in self._end(part)]
 
     def _end(self, names):
         """Send SIGINT every second: a process that still imports may lose the first one."""
@@ -303,13 +313,14 @@ class Graph:
         return left
 
     def warnings(self) -> list[str]:
-        """Return the lines that the processes logged as warning or error, without duplicates."""
-        lines = {}
+        """Return logged warnings and errors, without duplicates, in the order of their times."""
+        lines: dict[str, str] = {}
         for name in self.processes:
             for line in self.log(name).read_text(errors='replace').splitlines():
                 if '[WARN]' in line or '[ERROR]' in line or ': error: ' in line:
-                    lines[line.split(']: ', 1)[-1]] = line
-        return list(lines.values())
+                    lines.setdefault(line.split(']: ', 1)[-1], line)
+        # '[WARN] [1700000000.123456789] [node]: text'
+        return sorted(lines.values(), key=lambda line: line.partition('] ')[2])
 
 
 def child_environment(domain: int) -> dict[str, str]:

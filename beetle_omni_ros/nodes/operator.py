@@ -28,7 +28,7 @@ from beetle_omni_ros.messages.topics import (
 )
 from beetle_omni_ros.messages.values import Diagnostic, MessageError
 from beetle_omni_ros.nodes import runner, wire
-from beetle_omni_ros.nodes.graph import BRIDGES, confine, READY
+from beetle_omni_ros.nodes.graph import BRIDGES, confine, domains_in_use, READY
 from beetle_omni_ros.robot.schema import ParameterError, RunError
 
 # Simulated time may be slow, or stop if the simulator dies: waiting ends after this much steady
@@ -288,14 +288,22 @@ class LiveGraph(Client):
         self._newest = newest
         self.spin_steadily(SPIN)
 
+    def waits(self) -> str:
+        """Return what is missing before the first pose, and where there is a flight."""
+        others = ', '.join(f'--domain-id {n}' for n in domains_in_use() if n != self.domain)
+        return f'waiting for odom or ground_truth/odom in ROS domain {self.domain}' + (
+            others and f'; flights on this computer: {others}')
+
 
 def run_live(*, namespace: str = '', domain_id: int | None = None,
              host: str, port: int) -> None:
-    """Show a running graph until Ctrl-C; arguments are the options of `beetle_omni view`."""
+    """Show a running graph until Ctrl-C, by default that of the only domain in use."""
     from beetle_omni_ros.view.live import draw
     from beetle_omni_ros.view.recorded import announce
     from beetle_omni_ros.view.scene import close, serve
     runner.end_with_parent()
+    if domain_id is None and not os.environ.get('ROS_DOMAIN_ID') and len(domains_in_use()) == 1:
+        domain_id, = domains_in_use()
     with ExitStack() as stack:
         graph = LiveGraph(namespace, domain_id)
         stack.callback(graph.close)
@@ -303,5 +311,7 @@ def run_live(*, namespace: str = '', domain_id: int | None = None,
         server = serve(host, port)
         stack.callback(close, server)
         announce(host, server.get_port())
+        if graph.domain not in domains_in_use():
+            print(graph.waits(), flush=True)
         with suppress(KeyboardInterrupt):       # the regular end
             draw(server, graph)

@@ -18,7 +18,7 @@ from beetle_omni_ros.messages.topics import (
 from beetle_omni_ros.messages.values import Wrench
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.node import ERROR, FlightNode, OK, WARN
-from beetle_omni_ros.robot.schema import parameter, ParameterError
+from beetle_omni_ros.robot.schema import parameter, RunError
 from beetle_omni_ros.runs.bag_writer import BagWriter, FRAMES, FrameWriter
 from beetle_omni_ros.runs.tasks import make_task, TaskPlayer, WITH_WRENCHES
 
@@ -151,7 +151,7 @@ class RecorderNode(FlightNode):
             self._writes += 1
             if self._writes % FLUSH_WRITES == 0:
                 self._bag.flush()
-        except ParameterError as error:
+        except RunError as error:
             # A full disk ends the recording but not the process, which is shared with other nodes.
             self._failure = str(error)
             self.get_logger().error(f'recording ended: {error}')
@@ -172,7 +172,7 @@ class RecorderNode(FlightNode):
             if self._bag:
                 self._write()
                 self._bag.close()
-        except ParameterError as error:
+        except RunError as error:
             print(f'recorder_node: error: {error}', file=sys.stderr)
         self._bag = None
 

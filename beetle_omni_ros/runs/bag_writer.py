@@ -19,7 +19,7 @@ import yaml
 from beetle_omni_ros.messages.bag_types import from_bytes, new, offered, to_bytes, TYPESTORE
 from beetle_omni_ros.messages.conversions import BODY, nanoseconds, WORLD
 from beetle_omni_ros.messages.topics import ALL, EVENT, LATCHED, Qos, topic_of, TOPICS
-from beetle_omni_ros.robot.schema import ParameterError, read_yaml
+from beetle_omni_ros.robot.schema import ParameterError, read_yaml, RunError
 from beetle_omni_ros.robot.urdf import description, links
 from beetle_omni_ros.runs.files import write_text
 from beetle_omni_ros.runs.log import META_KEY, Recorder
@@ -125,7 +125,7 @@ class BagWriter(Recorder):
         check_new(self.path)
         self._writer: Writer | None = Writer(self.path, version=VERSION,
                                              storage_plugin=StoragePlugin.MCAP)
-        with self._disk():
+        with self._disk(ParameterError):
             self._writer.open()
         for name in topics:
             self._declare(self._prefix + name, topic_of(name).type, topic_of(name).qos)
@@ -178,7 +178,7 @@ class BagWriter(Recorder):
             t: time of recording since ``epoch`` [s].
 
         Raises:
-            ParameterError: the file cannot be written.
+            RunError: the file cannot be written.
 
         """
         connection = self._connections.get(topic)
@@ -213,11 +213,11 @@ class BagWriter(Recorder):
             writer.close()
 
     @contextmanager
-    def _disk(self):
+    def _disk(self, kind=RunError):
         try:
             yield
         except OSError as error:
-            raise ParameterError(f'{self.path}: {error.strerror}') from error
+            raise kind(f'{self.path}: {error.strerror}') from error
 
     def write_meta(self, meta: dict) -> None:
         """Add metadata."""

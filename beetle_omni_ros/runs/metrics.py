@@ -10,7 +10,8 @@ from itertools import groupby
 
 import numpy as np
 
-from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
+from beetle_omni_ros.control.base import MOTORS_OFF, PoseTarget, TrajectoryTarget
+from beetle_omni_ros.pages.page import at
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.schema import shortened
 from beetle_omni_ros.runs.log import (
@@ -43,6 +44,10 @@ AXES = ('x', 'y', 'z', 'roll', 'pitch', 'yaw')
 COMMAND_PERIOD = 0.010  # [s] for changes of the command
 END_MARGIN = 0.1  # [s] before the end of the task, above which a landing is early
 CRASH = 'emergency_stop:crash'    # supervisor/state after a crash
+CRASHED = 'the robot crashed'
+# [m/s] at the touchdown, [deg] after it: the simulated robot breaks (params/simulator.yaml)
+FALL_SPEED, FALL_INCLINATION = 1.0, 60.0
+TOUCHDOWN = 0.05  # [m] above the place where the robot lies at the end
 SUMMARY = (('mean', np.mean), ('std', np.std), ('min', np.min), ('max', np.max))
 POSE_KEYS = ('U_position_m', 'U_orientation_deg', 'L_position_m', 'L_orientation_deg')
 
@@ -99,6 +104,8 @@ def _split(log, task):
     ends = [target.stamp for target in log.targets[1:]]
     ends.append(log.targets[0].stamp + task.duration if task else
                 last.stamp + POSE_DURATION if isinstance(last, PoseTarget) else last.times[-1])
+    if log.meta.get('interrupted'):
+        ends[-1] = min(ends[-1], log.end)
     name = next(iter(parts))
     for k, (target, end) in enumerate(zip(log.targets, ends, strict=True)):
         shares: Counter = Counter()
@@ -123,9 +130,13 @@ def _split(log, task):
 def _controller_metrics(log, task, name, poses, intervals, *, is_alone):
     body = motion(log)
     ended_at, ending = _early_end(log, task)
-    flown = [_pose(body, log.targets[k], task, ended_at) for k in poses]
+    states = [state.partition(':')[0] for state in log.states]
+    hovered = [(t, until) for t, until, state in zip(
+        log.state_t, [*log.state_t[1:], np.inf], states, strict=False) if state == 'fallback']
+    flown = [_pose(body, log.targets[k], task, ended_at, hovered) for k in poses]
     # If one controller flew the whole task, poses after an early end count as missed.
-    for missing in task.poses[len(flown):] if task and is_alone else ():
+    whole = task and is_alone and not log.meta.get('interrupted')
+    for missing in task.poses[len(flown):] if whole else ():
         flown.append({'target': [float(v) for v in missing], **dict.fromkeys(POSE_KEYS),
                       'reached': False})
     result: dict = {'poses': flown}
@@ -134,6 +145,8 @@ def _controller_metrics(log, task, name, poses, intervals, *, is_alone):
         result[word] = {key: _reduced(reduce, [pose[key] for pose in flown]) for key in POSE_KEYS}
     result['success_rate'] = _reduced(np.mean, [pose['reached'] for pose in flown])
     result['crashed'] = _crashed(log, body, intervals)
+    if landing := _landing(log, body, states):
+        result['landing'] = landing
     if ending:
         result['ended'] = ending
     if log.meta.get('controller_error'):
@@ -175,10 +188,24 @@ def _early_end(log, task):
         if t < due and (reason or (task and task.kind not in ('force', 'torque'))):
             return float(t), f"{kind}{': ' if reason else ''}{reason} at {t - start:.1f} s"
         break
-    return np.inf, ''
+    stopped = log.meta.get('interrupted')
+    return np.inf, f'interrupted at {log.end - log.begin:.1f} s' if stopped else ''
 
 
-def _pose(body, target, task, ended_at):
+def _landing(log, body, states):
+    """Speed at the touchdown of the last landing, and whether it was a fall; None without one."""
+    k = 1 + max((k for k, state in enumerate(states)
+                 if state not in ('landing', *MOTORS_OFF)), default=-1)
+    if not len(body.t) or 'landing' not in states[k:k + 1] or states[-1] == 'landing':
+        return None
+    near = (body.t >= log.state_t[k]) & (body.position[:, 2] < body.position[-1, 2] + TOUCHDOWN)
+    speed = _reduced(np.max, np.linalg.norm(body.velocity[near], axis=1))
+    upright = rotations.matrix(body.quaternion[-1])[2, 2] > np.cos(np.radians(FALL_INCLINATION))
+    return {'speed_m_s': speed, 'fell': bool(
+        states[-1] == 'emergency_stop' or not upright or (speed or 0.0) > FALL_SPEED)}
+
+
+def _pose(body, target, task, ended_at, hovered):
     result: dict = {'target': _numbers(target, task), **dict.fromkeys(POSE_KEYS)}
     for keys, window in ((POSE_KEYS[:2], U_WINDOW), (POSE_KEYS[2:], L_WINDOW)):
         begin, end = target.stamp + window[0], target.stamp + window[1]
@@ -188,6 +215,9 @@ def _pose(body, target, task, ended_at):
     position, orientation = (result[key] for key in POSE_KEYS[:2])
     result['reached'] = bool(position is not None and position < REACHED_POSITION
                              and orientation < REACHED_ORIENTATION)
+    begin, end = (target.stamp + edge for edge in U_WINDOW)
+    if any(since < end and until > begin for since, until in hovered):
+        result.update(reached=False, fallback=True)     # hover reached it, not the controller
     return result
 
 
@@ -211,9 +241,14 @@ def _rms(values):
     return np.sqrt(np.mean(values ** 2))
 
 
-def failed(result: dict) -> bool:
-    """Whether the results of a flight are a crash; tasks that end with lost control may crash."""
-    return bool(result.get('crashed')) and not {'force', 'torque'} & result.keys()
+def failed(result: dict) -> str:
+    """Why a flight failed by its results, or ''; tasks that end with lost control may crash."""
+    if not {'force', 'torque'} & result.keys():
+        if result.get('crashed'):
+            return CRASHED
+        if at(result, 'landing.fell'):
+            return 'the robot fell in the landing'
+    return result.get('controller_error', '')
 
 
 def _crashed(log, body, intervals):
@@ -304,7 +339,7 @@ def _levels(log, body, task, start):
     levels, lost_at = [], None
     for level, begin, end in _level_windows(task, start):
         window = body.window(begin, end)
-        if body.t[window].size == 0:
+        if body.t[window].size == 0 or log.meta.get('interrupted') and log.end < end:
             break
         peaks = _peaks(body, target, window, begin)
         if task.kind == 'force':        # which acts for most of the level

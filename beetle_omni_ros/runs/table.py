@@ -190,8 +190,11 @@ def _summary(by_label, task):
             for text, path, digits in (ERROR_ROWS if posed else ())]
     if posed:
         rows.append(['poses reached', *(
-            f"{sum(pose['reached'] for pose in column['poses'])} of {len(column['poses'])}"
-            if 'poses' in column else ABSENT for column in columns)])
+            _reached(column['poses']) if 'poses' in column else ABSENT for column in columns)])
+    if any('landing' in column for column in columns):
+        rows.append(['landing [m/s]', *(
+            ('fell, ' if at(column, 'landing.fell') else '') + _cell(
+                column, 'landing.speed_m_s', 2) for column in columns)])
     if any('ended' in column for column in columns):
         rows.append(['ended', *(column.get('ended', ABSENT) for column in columns)])
     rows.append(['crashed', *({True: 'yes', False: 'no'}.get(column.get('crashed'), ABSENT)
@@ -204,6 +207,12 @@ def _summary(by_label, task):
     return Grid(POSE_ROWS if posed else 'Flight',
                 ['', *by_label, *(f'published {name}' for name in others)], rows,
                 faint_columns=frozenset(range(first, first + len(others))))
+
+
+def _reached(poses):
+    text = f"{sum(pose['reached'] for pose in poses)} of {len(poses)}"
+    hovered = sum('fallback' in pose for pose in poses)
+    return f'{text}, {hovered} in fallback' if hovered else text
 
 
 def _poses(by_label):

@@ -193,10 +193,10 @@ class Supervisor(Inputs):
             self.watch.name('supervisor_paused', now)
             self.watch.restart()
             self._resumed = now
-            self.say(ERROR, f'supervisor_node was not scheduled for {1000 * paused:.0f} ms: the '
+            self.say(WARNING, f'supervisor_node was not scheduled for {1000 * paused:.0f} ms: the '
                             'actuators had stopped')
             if self.state == FLYING:
-                self._fall_back(now, ERROR, 'fallback to hover after the pause')
+                self._fall_back(now, WARNING, 'fallback to hover after the pause')
         # Messages queued during the pause are older. The estimate may be wrong after a fall.
         elif now - self._resumed < RESUMING and not self.mocap.silent \
                 and poses[-1][1][2] - self.floor < NEAR_GROUND:

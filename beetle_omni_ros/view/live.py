@@ -10,7 +10,6 @@ from beetle_omni_ros.runs.log import FAULT_KEY, Recorder
 from beetle_omni_ros.view.scene import Moment, Room, target_at
 
 RATE = 30.0             # [Hz]
-WAITING = 'waiting for odom or ground_truth/odom'
 LOW, HIGH = np.array([-1.8, -1.8, 0.0]), np.array([1.8, 1.8, 2.0])      # [m] seen at the start
 
 
@@ -69,15 +68,14 @@ def draw(server: viser.ViserServer, graph) -> None:
     """Draw a :class:`~beetle_omni_ros.nodes.operator.LiveGraph` as it runs, until Ctrl-C."""
     newest, room = Newest(), Room(server)
     room.look_at(LOW, HIGH)
-    shown = server.gui.add_markdown(WAITING)
+    shown = server.gui.add_markdown('')
     while True:
         time.sleep(1 / RATE)
         graph.take(newest)
         moment = newest.moment()
-        if moment is None:
-            continue
         with server.atomic():
-            room.show([moment], [''])
-            text = newest.text(moment)
+            if moment:
+                room.show([moment], [''])
+            text = newest.text(moment) if moment else graph.waits()
             if shown.content != text:
                 shown.content = text

@@ -3,6 +3,10 @@
 from dataclasses import replace
 import io
 import json
+import resource
+import signal
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -115,6 +119,65 @@ def test_an_exception_in_flight_falls_back_and_is_in_the_results(tmp_path):
     assert results['controller_error'].startswith(
         "controller 'bad': step raised AttributeError: 'Bad' object has no attribute 'absent' "
         '(bad.py:8)')
+
+
+def test_a_controller_that_fails_all_the_time_fails_the_command(poses, tmp_path, capsys):
+    own, result = tmp_path / 'bad.py', tmp_path / 'result.json'
+    own.write_text('from beetle_omni_ros.control.hover import HoverController\n'
+                   'class Bad(HoverController):\n'
+                   '    def step(self, state, target):\n'
+                   '        if target.position[2] == 1.1:       # of the task\n'
+                   '            raise ValueError("bad")\n'
+                   '        return super().step(state, target)\n')
+    assert cli.main(['evaluate', '--controllers', f'{own}:Bad', '--task', str(poses), '--json',
+                     str(result)]) == 1
+    assert '0 of 1, 1 in fallback' in capsys.readouterr().out
+    bad = json.loads(result.read_text())['bad']
+    assert bad['success_rate'] == 0 and not bad['crashed'] and bad['controller_error']
+
+
+@pytest.fixture
+def interruptible():
+    """Ctrl-C as in a program of its own, whatever the test's process does with it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    assert signal.signal(signal.SIGINT, before) is signal.default_int_handler
+
+
+def test_ctrl_c_keeps_what_was_flown_and_marks_it(poses, tmp_path, capsys, interruptible):
+    own, result = tmp_path / 'own.py', tmp_path / 'result.json'
+    own.write_text('import os, signal\n'
+                   'from beetle_omni_ros.control.hover import HoverController\n'
+                   'class Own(HoverController):\n'
+                   '    def step(self, state, target):\n'
+                   '        if target.position[2] == 1.1 and state.position[0] > 0.2:\n'
+                   '            target.position[2] = 1.2    # once\n'
+                   '            os.kill(os.getpid(), signal.SIGINT)\n'
+                   '        return super().step(state, target)\n')
+    assert cli.main(['evaluate', '--controllers', f'hover,{own}:Own', '--task', str(poses),
+                     '--json', str(result), '--bag', str(tmp_path / 'bags')]) == 130
+    printed = capsys.readouterr()
+    assert f"interrupted; kept {tmp_path / 'bags'}" in printed.out.replace('\n', '')
+    assert printed.err == 'beetle_omni: error: interrupted\n'
+    first, second = (read_bag(tmp_path / 'bags' / name) for name in ('hover', 'own'))
+    assert not (first.warnings or second.warnings)
+    assert 'interrupted' not in first.meta and second.meta['interrupted']
+    results = json.loads(result.read_text())
+    assert results['meta']['interrupted'] and results['hover']['success_rate'] == 1
+    for of in (results['own'], metrics(second, make_task(str(poses)))):
+        assert of['poses'] == [] and of['ended'].startswith('interrupted at ')
+
+
+def test_a_full_disk_is_one_line_and_what_was_written_is_readable(poses, tmp_path):
+    done = subprocess.run(
+        [sys.executable, '-m', 'beetle_omni_ros.cli', 'evaluate', '--controllers', 'hover',
+         '--task', str(poses), '--bag', str(tmp_path / 'bag')], capture_output=True, text=True,
+        check=False, preexec_fn=lambda: resource.setrlimit(
+            resource.RLIMIT_FSIZE, (3 * 2**20, 3 * 2**20)))
+    line, = done.stderr.splitlines()
+    assert done.returncode == 1 and line.startswith(f"beetle_omni: error: {tmp_path / 'bag'}: ")
+    log = read_bag(tmp_path / 'bag')
+    assert len(log.truth_t) > 300 and 'cut off' in log.warnings[0]
 
 
 def test_an_empty_pack_is_swapped_at_the_next_target(monkeypatch):

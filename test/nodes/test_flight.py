@@ -8,16 +8,23 @@ time. The robot is observed through ground_truth/odom, which does not depend on 
 from contextlib import contextmanager
 import os
 from pathlib import Path
+import resource
 import signal
 import subprocess
 import sys
 import time
 
 import numpy as np
+import pytest
+from synthetic_flights import fly, write_state, write_truth
 from witness import HEADER, READY, running_graph
 
-from beetle_omni_ros.nodes.graph import in_simulated_time
+from beetle_omni_ros.nodes import fly as fly_module
+from beetle_omni_ros.nodes.graph import Graph, in_simulated_time
 from beetle_omni_ros.runs.bag import read_bag
+from beetle_omni_ros.runs.bag_writer import BagWriter
+from beetle_omni_ros.runs.metrics import metrics
+from beetle_omni_ros.runs.tasks import make_task
 
 NODES = ('recorder_node', 'sim_node', 'ekf_node', 'nmpc_node', 'supervisor_node',
          'reference_node')
@@ -85,14 +92,14 @@ def loses_one_node_after_another(graph, witness, bag):
 
 @contextmanager
 def flying(tmp_path):
-    """Fly by the command line; yield process and bag in flight."""
+    """Fly ten poses by the command line; yield process and bag in flight."""
     task, bag, temporary = tmp_path / 'poses.csv', tmp_path / 'bag', tmp_path / 'tmp'
     task.write_text(HEADER + '0,0,1.2,0,0,0\n' * 10)
     temporary.mkdir()
     process = subprocess.Popen(
         [sys.executable, '-m', 'beetle_omni_ros.cli', 'fly', '--task', str(task), '--bag',
          str(bag), '--alone', '--clock', 'simulated'], stderr=subprocess.PIPE,
-        stdout=subprocess.DEVNULL, text=True, env={**os.environ, 'TMPDIR': str(temporary)})
+        stdout=subprocess.PIPE, text=True, env={**os.environ, 'TMPDIR': str(temporary)})
     deadline = time.monotonic() + READY
     try:
         while not any(b'flying:nmpc' in file.read_bytes() for file in bag.glob('*.mcap')):
@@ -119,8 +126,78 @@ def test_sigterm_ends_a_flight_cleanly_and_the_bag_is_complete(tmp_path):
         for _ in range(2):
             process.send_signal(signal.SIGTERM)
             time.sleep(0.1)
-        _, error = process.communicate(timeout=60)
-    assert error.startswith('beetle_omni fly: error: interrupted; everything is stopped\n')
+        printed, error = process.communicate(timeout=60)
+    first, *_, last = printed.splitlines()
+    assert first.startswith('to watch: beetle_omni view --domain-id ')
+    assert last == f'interrupted; kept {bag}' and 'interrupted at ' in printed
+    assert error == 'beetle_omni: error: interrupted\n'
     assert process.returncode == 130
     log = read_bag(bag)
-    assert not log.warnings and 'flying:nmpc' in log.states and log.meta['interrupted']
+    assert not log.warnings and log.states[-1] == 'flying:nmpc' and log.meta['interrupted']
+    result = metrics(log, make_task(str(tmp_path / 'poses.csv')))
+    assert not result['crashed'] and len(result['poses']) < 10
+
+
+def test_bridges_stop_first_except_in_flight(tmp_path, monkeypatch):
+    graph, ended = Graph({}, tmp_path, 0), []
+    graph.processes = {'composed': None, 'bridges': None}
+    monkeypatch.setattr(graph, '_end', lambda names: ended.extend(names) or [])
+    graph.stop()
+    graph.stop(in_flight=True)
+    assert ended == ['bridges', 'composed', 'composed', 'bridges']
+
+
+def test_warnings_are_in_the_order_of_time_each_once(tmp_path):
+    graph = Graph({}, tmp_path, 0)
+    graph.processes = {'one': None, 'two': None}
+    graph.log('one').write_text('[WARN] [20.5] [a]: late\n[INFO] [21.0] [a]: no matter\n'
+                                '[ERROR] [22.0] [b]: early\n')
+    graph.log('two').write_text('[ERROR] [19.0] [b]: first\n[WARN] [23.0] [b]: late\n')
+    assert graph.warnings() == ['[ERROR] [19.0] [b]: first', '[WARN] [20.5] [a]: late',
+                                '[ERROR] [22.0] [b]: early']
+
+
+@pytest.mark.parametrize('speed', [0.3, 3.0])
+def test_a_fall_in_the_landing_is_the_last_line_with_its_likely_cause(tmp_path, monkeypatch,
+                                                                      capfd, speed):
+    bag = tmp_path / 'bag'
+
+    def flown(graph, controller, task, *_):
+        with BagWriter(bag, epoch=1_700_000_000) as writer:
+            fly(writer, task)
+            for t in np.arange(10, 11, 0.005):
+                write_truth(writer, t, np.array([0, 0, 0.15]), np.array([0, 0, 0, 1.0]),
+                            np.array([0, 0, -speed * (t == 10)]), np.zeros(3))
+            write_state(writer, 10.5, 'disarmed')
+        return '', '; this computer was too slow'
+
+    monkeypatch.setattr(fly_module, '_fly', flown)
+    assert fly_module.run_fly(task='random1', bag=bag, standby=False) == (speed > 1)
+    out, err = capfd.readouterr()
+    if speed > 1:
+        assert err == ('beetle_omni fly: error: the robot fell in the landing; this computer was '
+                       'too slow\n')
+    else:
+        assert not err and out.splitlines()[-1] == 'this computer was too slow'
+    assert 'landing [m/s]' in out
+
+
+def test_the_computer_was_too_slow_if_the_simulator_lost_time_in_the_flight():
+    flight = object.__new__(fly_module.Flight)
+    for before, lost, slow in ((0.0, 0.4, True), (0.4, 0.45, False), (float('inf'), 3.0, False)):
+        flight._lost_before, flight._lost_time = before, lambda lost=lost: lost
+        assert ('try --clock simulated' in flight.slow()) is slow
+
+
+def test_a_full_disk_ends_the_flight_with_one_line_and_the_bag_is_readable(tmp_path):
+    task, bag, limit = tmp_path / 'poses.csv', tmp_path / 'bag', 3 * 2**20
+    task.write_text(HEADER + '0,0,1.2,0,0,0\n' * 10)
+    done = subprocess.run(
+        [sys.executable, '-m', 'beetle_omni_ros.cli', 'fly', '--task', str(task), '--bag',
+         str(bag), '--alone', '--clock', 'simulated', '--controller', 'hover'],
+        capture_output=True, text=True, timeout=READY, check=False,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)))
+    assert done.returncode == 1
+    assert done.stderr == f'beetle_omni fly: error: {bag}: File too large\n'
+    assert len(done.stdout.splitlines()) == 1       # how to watch it
+    assert len(read_bag(bag).truth_t) > 100

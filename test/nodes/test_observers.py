@@ -1,6 +1,6 @@
 """Observers of a running graph: `beetle_omni check`, the browser, RViz."""
 
-from contextlib import closing
+from contextlib import closing, suppress
 import threading
 import time
 
@@ -14,7 +14,8 @@ from beetle_omni_ros.control.base import Command, PoseTarget
 from beetle_omni_ros.messages.bag_types import from_bytes
 from beetle_omni_ros.messages.topics import SENSOR
 from beetle_omni_ros.messages.values import Diagnostic, Odom
-from beetle_omni_ros.nodes import wire
+from beetle_omni_ros.nodes import operator, wire
+from beetle_omni_ros.nodes.graph import claim, domains_in_use
 from beetle_omni_ros.nodes.operator import Client, listen, LiveGraph
 from beetle_omni_ros.nodes.side_nodes import ViewerNode
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -74,6 +75,24 @@ def test_messages_of_real_publishers_are_recorded_and_checked(ros_domain):
               if finding.level == 'fail'}
     assert failed >= {'imu/data_raw age', 'mocap/pose publishers', 'joint_states content',
                       'joint_bridge gimbal2'}
+
+
+def test_the_view_names_the_domains_with_a_flight_and_shows_the_only_one(
+        ros_domain, monkeypatch):
+    assert ros_domain not in domains_in_use()
+    with closing(LiveGraph(domain=ros_domain)) as graph, claim('230/robot1/ekf_node'), \
+            claim('231/ekf_node'), claim('231/sim_node'), claim('229/other_node'):
+        assert {230, 231} <= set(domains_in_use()) and 229 not in domains_in_use()
+        assert f'in ROS domain {ros_domain}; ' in graph.waits()
+        assert '--domain-id 230, --domain-id 231' in graph.waits()
+    shown = []
+    monkeypatch.setattr(operator, 'LiveGraph', lambda namespace, domain: shown.append(domain))
+    monkeypatch.setattr(operator, 'domains_in_use', lambda: [230])
+    for environment in ('', '5'):
+        monkeypatch.setenv('ROS_DOMAIN_ID', environment)
+        with suppress(AttributeError):      # of the graph that is not made
+            operator.run_live(host='127.0.0.1', port=8080)
+    assert shown == [230, None]
 
 
 def test_messages_become_a_moment(make_bench, ros_domain):

@@ -21,7 +21,8 @@ from beetle_omni_ros.control.base import TrajectoryTarget
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.runs.files import write_json
 from beetle_omni_ros.runs.log import geodesic_angles, LogRecorder, roll_pitch_yaw
-from beetle_omni_ros.runs.metrics import metrics, metrics_by_controller, step_response
+from beetle_omni_ros.runs.metrics import failed, metrics, metrics_by_controller, step_response
+from beetle_omni_ros.runs.table import grids
 from beetle_omni_ros.runs.tasks import make_task, pose_target
 
 LEVEL = np.array([0, 0, 0, 1.0])
@@ -141,6 +142,65 @@ def test_a_crash_is_detected_in_the_flight(height):
     else:
         write_truth(recorder, 15.001, np.array([0, 0, height]), LEVEL, np.zeros(3), np.zeros(3))
     assert metrics(recorder.log())['crashed'] is True
+
+
+def landed(speed, upright=True, ends=('landing', 'disarmed:supervisor_paused')):
+    """Result of a pose and of a descent of 0.85 m at a constant speed [m/s] onto the legs."""
+    task, recorder, end = make_task('random1', seed=1), LogRecorder(), 9.2
+    fly(recorder, task)
+    for t in np.arange(0, 0.85 / speed + 1, 0.005):
+        height = max(1.0 - speed * t, 0.15)
+        moves = height > 0.15
+        write_truth(recorder, end + t, np.array([0, 0, height]),
+                    LEVEL if upright or moves else rotations.from_rpy(1.2, 0, 0),
+                    np.array([0, 0, -speed * moves]), np.zeros(3))
+    for state, after in zip(ends, (0.0, 0.85 / speed), strict=False):
+        write_state(recorder, end + after, state)
+    return metrics(recorder.log(), task)
+
+
+@pytest.mark.parametrize(('speed', 'upright', 'fell'), [
+    (0.3, True, False), (3.1, True, True), (0.3, False, True)])
+def test_a_landing_has_the_speed_of_its_touchdown_and_a_fall_is_a_failure(speed, upright, fell):
+    result = landed(speed, upright)
+    assert result['landing'] == {'speed_m_s': pytest.approx(speed), 'fell': fell}
+    assert not result['crashed'] and result['success_rate'] == 1
+    assert failed(result) == ('the robot fell in the landing' if fell else '')
+    row = next(row for row in grids({'nmpc': result})[0].rows if row[0].startswith('landing'))
+    assert row[1] == ('fell, ' if fell else '') + f'{speed:.2f}'
+
+
+def test_without_an_ended_landing_there_is_none_and_an_emergency_stop_in_it_is_a_fall():
+    assert 'landing' not in landed(0.3, ends=('landing',))
+    assert 'landing' not in landed(0.3, ends=())
+    assert 'landing' not in landed(0.3, ends=('flying:nmpc', 'emergency_stop:crash'))
+    assert landed(0.3, ends=('landing', 'emergency_stop:control_lost'))['landing']['fell']
+
+
+def test_a_pose_that_hover_reached_in_fallback_is_not_reached():
+    task, recorder = make_task('waypoints'), LogRecorder()
+    fly(recorder, task, duration=24.0)
+    for t, state in ((12.0, 'fallback:controller_silent'), (20.0, 'flying:nmpc')):
+        write_state(recorder, t, state)     # in the U window of the second pose only
+    result = metrics(recorder.log(), task)
+    assert [pose['reached'] for pose in result['poses'][:3]] == [True, False, True]
+    cell = next(row[1] for row in grids({'nmpc': result})[0].rows if row[0] == 'poses reached')
+    assert cell == '2 of 15, 1 in fallback'
+
+
+def test_an_interrupted_flight_has_what_was_flown_and_misses_nothing():
+    task = make_task('waypoints')
+    log = flown(task, duration=20.0)
+    log.state_t, log.states = log.state_t[:-1], log.states[:-1]     # no landing
+    assert len(metrics(log, task)['poses']) == 15
+    log.meta['interrupted'] = True
+    result = metrics(log, task)
+    assert [pose['reached'] for pose in result['poses']] == [True, True]
+    assert result['ended'] == 'interrupted at 20.2 s' and not failed(result)
+    task = make_task('force')
+    log = flown(task, start=0.0, duration=13.0, after=0.0)
+    log.meta['interrupted'] = True
+    assert metrics(log, task)['force']['lost_at_N'] is None
 
 
 def test_poses_after_an_early_landing_have_no_errors_and_the_end_is_stated():

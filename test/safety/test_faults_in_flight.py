@@ -33,6 +33,9 @@ def test_a_pause_in_the_air_ends_in_fallback_and_on_the_floor_with_motors_off():
     assert any(command and command.thrust.any() for command in rig.run(0.05))
     assert 'supervisor_paused' in rig.supervisor.faults
     assert rig.supervisor.state in ('fallback', 'flying')
+    severities = [event.severity for event in rig.supervisor.events if 'paus' in event.text
+                  or 'not scheduled' in event.text]
+    assert set(severities) == {'warning'}, 'the robot survived it'
     rig = flown()
     rig.now += 1.0
     rig.position = np.array([0.3, -0.2, 0.2])
