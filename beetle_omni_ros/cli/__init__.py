@@ -48,10 +48,13 @@ def main(args: list[str] | None = None) -> int:
     except Exception as error:
         # usage errors of typer's parser; importing their type would slow --help
         if hasattr(error, 'format_message'):
-            text = error.format_message()   # empty after the help of `beetle_omni` alone
+            text = error.format_message()
+            if not text or text.startswith('Usage: '):      # the help of `beetle_omni` alone
+                print(text, file=sys.stderr)
+                return UNUSABLE
             context = getattr(error, 'ctx', None)
             command = context.command_path if context else 'beetle_omni'
-            return _fail(f'{text} See {command} --help.', UNUSABLE) if text else UNUSABLE
+            return _fail(f'{text} See {command} --help.', UNUSABLE)
         raise
 
 
