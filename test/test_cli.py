@@ -49,12 +49,13 @@ def test_a_command_without_its_subcommand_shows_the_help(capsys, command):
     assert len((shown.out + shown.err).splitlines()) > 9 and 'error' not in shown.err
 
 
-@pytest.mark.parametrize(('found', 'text'), [('0123456789', ', commit 0123456789'), (None, '')])
+@pytest.mark.parametrize(('found', 'text'), [('0123456789+', '0123456789+'), (None, 'unknown')])
 def test_the_version_is_printed_with_the_commit_where_it_is_known(capsys, monkeypatch, found,
                                                                  text):
-    monkeypatch.setattr('beetle_omni_ros.cli.commands.commit', lambda: found)
+    monkeypatch.setattr('beetle_omni_ros.cli.commit', lambda: found)
     assert cli.main(['--version']) == 0
-    assert capsys.readouterr().out == f'beetle_omni_ros {beetle_omni_ros.__version__}{text}\n'
+    assert capsys.readouterr().out == (f'beetle_omni_ros {beetle_omni_ros.__version__}, '
+                                        f'commit {text}\n')
 
 
 def test_help_needs_neither_ros_nor_any_heavy_module():

@@ -8,9 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
-from typer import Argument, echo, Exit, Option, Typer
+from typer import Argument, echo, Option, Typer
 
-from beetle_omni_ros import __version__
 from beetle_omni_ros.cli.options import (
     CONDITIONS,
     ConditionsOption,
@@ -41,28 +40,14 @@ from beetle_omni_ros.cli.options import (
 )
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.registry import ControllerOptions, DEFAULT, OWNER
-from beetle_omni_ros.robot.resources import commit
 from beetle_omni_ros.robot.schema import ParameterError
 
 # The panels of rich show a flag as <bool> and leave out the other name of --standby/--alone.
 Commands = partial(Typer, no_args_is_help=True, rich_markup_mode=None,
                    context_settings={'help_option_names': ['-h', '--help']})
 
-app = Commands(help='Fly, evaluate and report on the tiltable quadrotor.')
+app = Commands(help='Fly, evaluate and report on the tiltable quadrotor; --version: its version.')
 identify = Commands(help='Fit the actuator models from measured data.')
-
-
-def _version(asked: bool):
-    if asked:
-        found = commit()
-        echo(f"beetle_omni_ros {__version__}{f', commit {found}' if found else ''}")
-        raise Exit
-
-
-@app.callback()
-def _common(version: Annotated[bool, Option('--version', callback=_version, is_eager=True, help=(
-        'Print the version, in a checkout also the commit, and end.'))] = False):
-    pass
 
 
 @app.command()

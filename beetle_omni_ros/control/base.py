@@ -225,7 +225,7 @@ def corrected(state: State, health: ActuatorHealth) -> State:
 
 def error_text(error: Exception) -> str:
     """An exception in one line, with the file and line of the last frame outside libraries."""
-    if isinstance(error, SyntaxError) and error.filename:      # has no frame in the file
+    if isinstance(error, SyntaxError) and error.filename:   # no frame is in the file
         return f'{type(error).__name__}: {error.msg} ({Path(error.filename).name}:{error.lineno})'
     frames = traceback.extract_tb(error.__traceback__)
     own = [frame for frame in frames if not frame.filename.startswith(LIBRARIES)] or frames

@@ -374,10 +374,7 @@ def trajectory_task(name: str, times: np.ndarray, positions: np.ndarray,
 
 def poses_task(name: str, poses: np.ndarray) -> Task:
     """Make a task of (N, 6) poses: x, y, z [m], roll, pitch, yaw [deg], 8 s each."""
-    try:
-        poses = np.atleast_2d(np.asarray(poses, dtype=float))
-    except (TypeError, ValueError) as error:
-        raise ParameterError(f"task '{name}': expected poses (N, 6) of numbers: {error}") from None
+    poses = np.atleast_2d(np.asarray(poses, dtype=float))
     if poses.ndim != 2 or poses.shape[1] != 6 or not len(poses):
         raise ParameterError(f"task '{name}': expected poses (N, 6), found shape {poses.shape}")
     for k, pose in enumerate(poses):

@@ -36,8 +36,7 @@ def test_random_poses_fill_the_stated_ranges_and_follow_the_seed():
 
 @pytest.mark.parametrize(('poses', 'text'), [
     ([[0, 0, 1, 0, 0, 0], [0, 0, np.nan, 0, 0, 0]], r'poses\[1\].*nan'),
-    ([[0, 0, 1]], r'found shape \(1, 3\)'), (np.zeros((0, 6)), r'found shape \(0, 6\)'),
-    ([[0, 0, 1], [0]], r'expected poses \(N, 6\)'), ([['x'] * 6], "of numbers.*'x'")])
+    ([[0, 0, 1]], r'found shape \(1, 3\)'), (np.zeros((0, 6)), r'found shape \(0, 6\)')])
 def test_poses_are_refused_with_the_reason(poses, text):
     with pytest.raises(ParameterError, match=text):
         poses_task('own', poses)
