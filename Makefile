@@ -12,7 +12,7 @@ unexport LD_LIBRARY_PATH
 endif
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE PYTHONHOME VIRTUAL_ENV
 
-.PHONY: help setup setup-train fly test lint docs evaluate compare faults gap report clean
+.PHONY: help setup setup-train fly test oldest lint docs evaluate compare faults gap report clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z]*\):.*## /\1|/p' Makefile | awk -F'|' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -28,6 +28,9 @@ fly: setup  ## fly the waypoints in real time through ROS nodes; the bag is in r
 
 test: setup-train  ## the whole test suite
 	@.ci/test $(ARGS)
+
+oldest: setup  ## the commands with the oldest versions that setup.py admits
+	@.ci/oldest
 
 lint: setup  ## style of every Python file, types of the core
 	@.venv/bin/ruff check .

@@ -34,27 +34,29 @@ def shared(*folders):
 
 
 # Everything that simulates, flies in one process and reads bags; no ROS, no compiler.
-# Lower bounds admit what apt gives on Ubuntu 24.04. casadi: the wheel holds the BLASFEO that the
-# compiled controller links to; mujoco: as far back as the tests pass, 4 has no Python 3.10 wheel.
+# Lower bounds are versions that exist, and `make oldest` runs the commands with them. apt of
+# Ubuntu 24.04 has older ones of joblib, matplotlib, rich and typer. casadi: the wheel holds the
+# BLASFEO that the compiled controller links to; mujoco: as far back as the tests pass, 4 has no
+# Python 3.10 wheel; typer: some older versions fail with the click and rich that pip gives them.
 REQUIREMENTS = [
     'casadi>=3.8,<4',
     'filterpy>=1.4.5,<3',
     'jinja2>=3.0,<4',
     'joblib>=1.4,<2',
-    'matplotlib>=3.6,<4',
-    'mcap>=1.2,<2',
+    'matplotlib>=3.7,<4',
+    'mcap>=1.2.1,<2',
     'mujoco>=3.3.7,<5',
     'numpy>=1.26,<3',
     'onnxruntime>=1.18,<2',
     'pillow>=9.1',
     'plotly>=6,<8',
     'pyyaml>=6.0',
-    'rich>=13.7',
+    'rich>=13.8',
     'rosbags>=0.11,<0.12',
-    'scipy>=1.11,<2',
+    'scipy>=1.11.1,<2',
     'threadpoolctl>=3.1',
     'trimesh>=4,<6',
-    'typer>=0.12',
+    'typer>=0.17.4',
     'viser>=1.1,<2',
     # Comes with mujoco 3. From 1.14 on it needs Python 3.11; where an index does not say so,
     # the pip 23.0 of Python 3.10 searches without end.
@@ -68,7 +70,7 @@ ROS = [
 ]
 
 HARDWARE = [
-    'dynamixel-sdk>=3.8,<5',
+    'dynamixel-sdk>=3.8.4,<5',
     'pymavlink>=2.4.41,<3',
     'pyserial>=3.5,<4',
 ]

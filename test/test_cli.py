@@ -9,6 +9,7 @@ import sys
 import pytest
 from synthetic_flights import fly
 
+import beetle_omni_ros
 from beetle_omni_ros import cli
 from beetle_omni_ros.runs.bag_writer import BagWriter
 from beetle_omni_ros.runs.tasks import make_task
@@ -39,6 +40,22 @@ def refused(capsys, *arguments):
 def test_every_command_has_help(capsys, command):
     assert cli.main([*command, '--help']) == 0
     assert 'Usage' in (shown := capsys.readouterr().out) and '<bool>' not in shown
+
+
+@pytest.mark.parametrize('command', [[], ['identify']])
+def test_a_command_without_its_subcommand_shows_the_help(capsys, command):
+    assert cli.main(command) == 2
+    shown = capsys.readouterr()
+    assert len((shown.out + shown.err).splitlines()) > 9 and 'error' not in shown.err
+
+
+@pytest.mark.parametrize(('found', 'text'), [('0123456789+', '0123456789+'), (None, 'unknown')])
+def test_the_version_is_printed_with_the_commit_where_it_is_known(capsys, monkeypatch, found,
+                                                                 text):
+    monkeypatch.setattr('beetle_omni_ros.cli.commit', lambda: found)
+    assert cli.main(['--version']) == 0
+    assert capsys.readouterr().out == (f'beetle_omni_ros {beetle_omni_ros.__version__}, '
+                                        f'commit {text}\n')
 
 
 def test_help_needs_neither_ros_nor_any_heavy_module():

@@ -10,9 +10,10 @@ import sys
 import typer
 from typer.main import get_command
 
+from beetle_omni_ros import __version__
 from beetle_omni_ros.cli.commands import app
 from beetle_omni_ros.cli.options import FAILED, INTERRUPTED, UNUSABLE
-from beetle_omni_ros.robot.resources import PACKAGE
+from beetle_omni_ros.robot.resources import commit, PACKAGE
 from beetle_omni_ros.robot.schema import ParameterError, RunError
 
 ROS_ENDINGS = ('rclpy', 'ament_index_python', '_msgs', '_srvs', '_interfaces')     # of modules
@@ -28,6 +29,9 @@ MAY_BE_EMPTY = ('--namespace',)
 def main(args: list[str] | None = None) -> int:
     """Run the command and return its exit status."""
     args = list(sys.argv[1:] if args is None else args)
+    if args == ['--version']:
+        print(f"beetle_omni_ros {__version__}, commit {commit() or 'unknown'}")
+        return 0
     try:
         status = get_command(app).main(args=spread(args), prog_name='beetle_omni',
                                        standalone_mode=False)
@@ -50,10 +54,13 @@ def main(args: list[str] | None = None) -> int:
     except Exception as error:
         # usage errors of typer's parser; importing their type would slow --help
         if hasattr(error, 'format_message'):
-            text = error.format_message()   # empty after the help of `beetle_omni` alone
+            text = error.format_message()
+            if not text or text.startswith('Usage: '):      # the help of `beetle_omni` alone
+                print(text, file=sys.stderr)
+                return UNUSABLE
             context = getattr(error, 'ctx', None)
             command = context.command_path if context else 'beetle_omni'
-            return _fail(f'{text} See {command} --help.', UNUSABLE) if text else UNUSABLE
+            return _fail(f'{text} See {command} --help.', UNUSABLE)
         raise
 
 

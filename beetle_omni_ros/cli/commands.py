@@ -46,7 +46,7 @@ from beetle_omni_ros.robot.schema import ParameterError
 Commands = partial(Typer, no_args_is_help=True, rich_markup_mode=None,
                    context_settings={'help_option_names': ['-h', '--help']})
 
-app = Commands(help='Fly, evaluate and report on the tiltable quadrotor.')
+app = Commands(help='Fly, evaluate and report on the tiltable quadrotor; --version: its version.')
 identify = Commands(help='Fit the actuator models from measured data.')
 
 

@@ -225,6 +225,8 @@ def corrected(state: State, health: ActuatorHealth) -> State:
 
 def error_text(error: Exception) -> str:
     """An exception in one line, with the file and line of the last frame outside libraries."""
+    if isinstance(error, SyntaxError) and error.filename:   # no frame is in the file
+        return f'{type(error).__name__}: {error.msg} ({Path(error.filename).name}:{error.lineno})'
     frames = traceback.extract_tb(error.__traceback__)
     own = [frame for frame in frames if not frame.filename.startswith(LIBRARIES)] or frames
     at = f' ({Path(own[-1].filename).name}:{own[-1].lineno})' if own else ''

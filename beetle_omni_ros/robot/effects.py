@@ -246,12 +246,12 @@ CATALOGUE: dict[str, Effect] = {
         ('thrust_coefficient', 'mass', 'tilt_thrust_loss'),
         'hover ladder at 0.2, 0.3, 0.5, 1.0 and 1.5 m at one state of charge',
         ground_effect, forms=({'exponential_share': 0.0}, {'exponential_share': 1.0}),
-        one_regime=True, plant='own'),
+        one_regime=True),
     'rotor_drag': Effect(
         'body', {'coefficient': EffectParameter('N s/m', 0.0, 0.0, 5.0, 0.4, 0.06)},
         'H-force of Faessler et al. 2018, in the rotor plane, grows with rotor speed '
         'sqrt(f / f_h)', 'translation above 1 m/s', ('body_drag', 'wind'),
-        'passes at three speeds with two rotor tilts', rotor_drag, plant='own'),
+        'passes at three speeds with two rotor tilts', rotor_drag),
     'rotor_hub_moment': Effect(
         'body', {'coefficient': EffectParameter('N s', 0.0, -5.0, 5.0, 0.1, 0.015)},
         '-k n x v of stiff blades: the disc tilts back and turns the hub, grows with rotor speed '
@@ -261,13 +261,12 @@ CATALOGUE: dict[str, Effect] = {
     'body_drag': Effect(
         'body', {'coefficient': EffectParameter('N s^2/m^2', 0.0, 0.0, 5.0, 0.05, 0.02)},
         'F = -c |v| v', 'translation above 2 m/s', ('rotor_drag', 'wind'),
-        'passes above 4 m/s', body_drag, plant='own'),
+        'passes above 4 m/s', body_drag),
     'axial_inflow': Effect(
         'body', {'per_rotor': EffectParameter('N s/m', 0.0, 0.0, 5.0, 0.4, 0.04)},
         'f_i - k sqrt(f_i / f_h) v.n: momentum theory, linear part (Leishman 2006, ch. 2)',
         'climb and descent', ('rotor_lag', 'rotor_drag'),
-        'steady climb and descent at 1 m/s beside thrust steps', axial_inflow,
-        plant='own'),
+        'steady climb and descent at 1 m/s beside thrust steps', axial_inflow),
     'translational_lift': Effect(
         'body', {'per_rotor': EffectParameter('N s^2/m^2', 0.0, 0.0, 1.0, 0.03, 0.01)},
         'f_i + k |v_in_plane|^2: induced velocity falls with the flow through the disc '
@@ -279,12 +278,12 @@ CATALOGUE: dict[str, Effect] = {
         'f_i (1 - L s(q)), s = sin^2 q / 0.75 or 2 (1 - cos q): arm and body in the wake',
         'large tilts', ('thrust_coefficient', 'mass', 'ground_effect'),
         'one attitude with tilts changed by internal force', tilt_thrust_loss,
-        forms=({'cosine_share': 0.0}, {'cosine_share': 1.0}), one_regime=True, plant='own'),
+        forms=({'cosine_share': 0.0}, {'cosine_share': 1.0}), one_regime=True),
     'wind': Effect(
         'body', {'force': EffectParameter('N', (0.0,) * 3, -100, 100, 1.0, 0.1)},
         'constant force in world', 'any flight; yaw turns', ('mass', 'imu_misalignment',
                                                             'mocap_misalignment'),
-        'hover at yaw 0 and 180 deg; fan off', wind, allocated=True, plant='own'),
+        'hover at yaw 0 and 180 deg; fan off', wind, allocated=True),
     'propeller_gyroscopic_torque': Effect(
         'body', {'angular_momentum_at_hover': EffectParameter('N m s', 0.0, 0.0, 1.0, 0.066,
                                                               0.008, step=5e-3),

@@ -14,7 +14,7 @@ from functools import lru_cache
 from pathlib import Path
 import reprlib
 from types import NoneType
-from typing import Any, ClassVar, get_args, get_type_hints, Self
+from typing import Any, ClassVar, get_args, get_type_hints, TypeVar
 
 import numpy as np
 import yaml
@@ -23,6 +23,7 @@ from beetle_omni_ros.robot.resources import share_path
 
 NAMES = tuple[str, ...]     # type of a parameter that is a list of names
 NUMBER = (int, float, np.number)
+Loaded = TypeVar('Loaded', bound='ParameterFile')     # Python 3.10 lacks Self
 # Type of a field -> types of its value in a file, and their name.
 KINDS: dict[Any, tuple[Any, str]] = {
     bool: (bool, 'true or false'), int: (NUMBER, 'an integer'), float: (NUMBER, 'a number'),
@@ -133,7 +134,7 @@ class ParameterFile:
             cls._file = file
 
     @classmethod
-    def load(cls, path: str | Path | None = None) -> Self:
+    def load(cls: type[Loaded], path: str | Path | None = None) -> Loaded:
         """Read a file, by default the shipped one; an error names file, key and expectation."""
         path = path or share_path(f'params/{cls._file}')
         return bind(cls, load_yaml(path), str(path))

@@ -72,6 +72,8 @@ def bag_files(path: str | Path) -> list[Path]:
         other = sorted(p.name for pattern in ('*.db3', '*.mcap.*', '*.bag')
                        for p in path.glob(pattern))
         hint = f' (found {other[0]}; convert it with ros2 bag convert)' if other else ''
+        if (inside := runs_in([path])) != [path]:
+            hint = f"; expected one of the runs in it: {', '.join(run.name for run in inside)}"
         raise ParameterError(f'{path}: no .mcap file in this folder{hint}')
     return files
 

@@ -375,7 +375,10 @@ def trajectory_task(name: str, times: np.ndarray, positions: np.ndarray,
 def poses_task(name: str, poses: np.ndarray) -> Task:
     """Make a task of (N, 6) poses: x, y, z [m], roll, pitch, yaw [deg], 8 s each."""
     poses = np.atleast_2d(np.asarray(poses, dtype=float))
-    if poses.ndim != 2 or poses.shape[1] != 6 or not np.isfinite(poses).all():
-        raise ParameterError(f"task '{name}': expected finite poses (N, 6), found shape "
-                             f'{poses.shape}')
+    if poses.ndim != 2 or poses.shape[1] != 6 or not len(poses):
+        raise ParameterError(f"task '{name}': expected poses (N, 6), found shape {poses.shape}")
+    for k, pose in enumerate(poses):
+        if not np.isfinite(pose).all():
+            raise ParameterError(f"task '{name}': poses[{k}]: expected finite numbers, found "
+                                 f'{pose.tolist()}')
     return _pose_task(name, poses)

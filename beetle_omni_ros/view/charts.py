@@ -1,6 +1,7 @@
 """Interactive charts of flights over time."""
 
 from dataclasses import dataclass
+import json
 
 import numpy as np
 import plotly.graph_objects as go
@@ -9,6 +10,7 @@ from plotly.subplots import make_subplots
 
 from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.pages.figures import COLOURS, FAINT, INK, PARTS
+from beetle_omni_ros.pages.page import rendered
 from beetle_omni_ros.robot.schema import shortened
 from beetle_omni_ros.runs.log import (
     errors,
@@ -22,7 +24,8 @@ from beetle_omni_ros.runs.log import (
 from beetle_omni_ros.runs.metrics import L_WINDOW, U_WINDOW
 
 MAX_RUNS = len(COLOURS)     # each run has its own colour
-POINTS = 800            # of a line; extremes are kept
+BINS = 400              # of the visible part of a line; of each, the extremes are drawn
+MOST = 24000            # samples of a line in the page, two minutes at 200 Hz; extremes are kept
 STALE = 0.3             # [s] without a newer value at which a line is interrupted
 TRAJECTORY_STEP = 0.05  # [s] between the drawn poses of a trajectory
 FEW_POSES = 20          # up to this number, L and U windows are shaded
@@ -80,9 +83,12 @@ def html(runs: list[Run]) -> str:
         margin={'l': 50, 'r': 10, 't': 50, 'b': 40}, plot_bgcolor='#ffffff', barmode='overlay',
         legend={'orientation': 'h', 'y': 1, 'yanchor': 'top', 'yref': 'container'},
         hovermode='x', dragmode='zoom')
-    return f'<script>{get_plotlyjs()}</script>' + figure.to_html(
-        full_html=False, include_plotlyjs=False,
-        config={'responsive': True, 'displaylogo': False})
+    found, times = json.loads(figure.to_json()), {}
+    for trace in found['data']:     # lines of one clock share its times; a target has float64
+        if isinstance(trace['x'], dict) and trace['x']['dtype'] == 'f4':
+            trace['x'] = times.setdefault(trace['x']['bdata'], len(times))
+    return rendered('charts.html', plotly=get_plotlyjs(), figure={**found, 'times': list(times)},
+                    bins=BINS)
 
 
 def _mark(figure, runs, row):
@@ -101,16 +107,13 @@ def _mark(figure, runs, row):
 
 
 def _thinned(t, values):
-    """About POINTS samples of a series: minimum, maximum and a gap of each bin."""
-    if len(t) <= POINTS:
+    """About MOST samples of a series: minimum, maximum and a gap of each bin."""
+    if len(t) <= MOST:
         return t, values
-    kept: set[int] = set()
-    for part in np.array_split(np.arange(len(t)), POINTS // 2):
-        known = part[np.isfinite(values[part])]
-        kept.update(part[~np.isfinite(values[part])][:1])
-        if len(known):
-            kept.update((known[values[known].argmin()], known[values[known].argmax()]))
-    index = sorted(kept)
+    missing = np.isnan(values)
+    extremes = missing, -np.where(missing, np.inf, values), np.where(missing, -np.inf, values)
+    index = sorted({part[0] + of[part].argmax() for of in extremes
+                    for part in np.array_split(np.arange(len(t)), MOST // 2)})
     return t[index], values[index]
 
 

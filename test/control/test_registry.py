@@ -135,6 +135,12 @@ def test_an_unusable_class_is_refused_in_one_line(module, spec, message):
     assert '\n' not in str(caught.value)
 
 
+def test_a_class_with_a_syntax_error_is_refused_with_file_and_line(tmp_path):
+    (tmp_path / 'wrong.py').write_text('import numpy\n\nclass My:\n    def step(self:\n')
+    with pytest.raises(ParameterError, match=r'raised SyntaxError: .* \(wrong.py:4\)$'):
+        registry.find(f'{tmp_path}/wrong.py:My')
+
+
 def test_two_controllers_of_the_same_name_are_refused(module, tmp_path):
     with pytest.raises(ParameterError, match='both are called my_controller'):
         registry.find_all(['nmpc', f'{module}:MyController', f'{module}.py:MyController'])

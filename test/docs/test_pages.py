@@ -23,6 +23,14 @@ def test_every_relative_link_outside_the_site_has_a_file(page):
         assert (ROOT / page).parent.joinpath(target).exists(), target
 
 
+@pytest.mark.parametrize('page', PAGES)
+def test_a_cited_benchmark_exists_or_is_said_to_be_removed(page):
+    for paragraph in read(page).split('\n\n'):
+        for name in re.findall(r'benchmarks/[a-z]\w+\.py', paragraph):
+            told = re.search(r'of commit \w{7}[^.]*removed\s+since', paragraph)
+            assert (ROOT / name).is_file() or told, name
+
+
 @pytest.fixture(scope='module')
 def site(tmp_path_factory):
     """The built site; every page is in the navigation, and every link has its target."""

@@ -64,6 +64,33 @@ def verdict(folder, file):
         [section('Evidence', LONG, '')], verdict_head('named: x or y', '#123456', LONG)))
 
 
+def test_a_zoomed_chart_shows_every_sample_and_the_way_back(chromium, tmp_path):
+    report(tmp_path, tmp_path / 'page.html')
+    shown, samples = chromium.new_page(), """range => {
+        const {data, layout} = document.getElementById('charts'), [from, to] = layout.xaxis.range;
+        return data.filter(line => line.name === 'near' && line.yaxis === 'y5').map(line => [
+            line.x.length, line.x.filter(t => from <= t && t <= to).length, from, to])[0];
+    }"""
+    shown.goto((tmp_path / 'page.html').as_uri(), timeout=60_000)
+    shown.locator('.main-svg').first.wait_for(timeout=60_000)
+    whole, all_visible, *_ = shown.evaluate(samples)
+    assert whole == all_visible <= 900
+    chart = shown.locator('.nsewdrag').nth(5)
+    chart.scroll_into_view_if_needed()
+    box = chart.bounding_box()
+    x, y = box['x'] + box['width'] / 3, box['y'] + box['height'] / 2
+    shown.mouse.move(x, y)
+    shown.mouse.down()
+    shown.mouse.move(x + box['width'] / 30, y, steps=4)
+    shown.mouse.up()
+    shown.wait_for_function("document.getElementById('charts').data.some(a => a.x.length > 900)")
+    _, visible, begin, end = shown.evaluate(samples)
+    assert end - begin < 2 and visible == pytest.approx(200 * (end - begin), abs=2)     # 200 Hz
+    shown.mouse.dblclick(x, y)
+    shown.wait_for_function("!document.getElementById('charts').data.some(a => a.x.length > 900)")
+    assert shown.evaluate(samples)[:2] == [whole, all_visible]
+
+
 @pytest.mark.parametrize('made', [report, rotor, comparison, verdict],
                          ids=lambda made: made.__name__)
 def test_a_page_is_complete_without_errors(chromium, made, tmp_path):

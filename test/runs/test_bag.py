@@ -118,6 +118,14 @@ def test_namespaces_are_removed_and_several_robots_refused(tmp_path):
         read_bag(tmp_path / 'both')
 
 
+def test_a_folder_of_runs_is_refused_with_their_names(tmp_path):
+    for name in ('rl', 'nmpc'):
+        with BagWriter(tmp_path / 'runs' / name) as writer:
+            write_imu(writer, 1.0, (0, 0, 9.8), (0, 0, 0))
+    with pytest.raises(ParameterError, match='expected one of the runs in it: nmpc, rl$'):
+        read_bag(tmp_path / 'runs')
+
+
 def test_compute_times_come_from_the_diagnostics_of_the_nodes(tmp_path):
     with BagWriter(tmp_path / 'bag') as writer:
         for count in (10, 20):

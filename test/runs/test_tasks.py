@@ -6,7 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.control.base import TrajectoryTarget
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.runs.tasks import make_task, NAMES, pose_target, TaskPlayer
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.runs.tasks import make_task, NAMES, pose_target, poses_task, TaskPlayer
 
 
 @pytest.mark.parametrize('name', NAMES)
@@ -31,6 +32,14 @@ def test_random_poses_fill_the_stated_ranges_and_follow_the_seed():
     assert np.array_equal(poses, make_task('random1000', seed=1).poses)
     assert not np.array_equal(poses, make_task('random1000', seed=2).poses)
     assert np.array_equal(make_task('random100', seed=1).poses, poses[:100])
+
+
+@pytest.mark.parametrize(('poses', 'text'), [
+    ([[0, 0, 1, 0, 0, 0], [0, 0, np.nan, 0, 0, 0]], r'poses\[1\].*nan'),
+    ([[0, 0, 1]], r'found shape \(1, 3\)'), (np.zeros((0, 6)), r'found shape \(0, 6\)')])
+def test_poses_are_refused_with_the_reason(poses, text):
+    with pytest.raises(ParameterError, match=text):
+        poses_task('own', poses)
 
 
 @pytest.mark.parametrize(('name', 'tilt'), [('lemniscate', 0.5), ('lemniscate_large', 2.5)])

@@ -1,4 +1,8 @@
-"""MuJoCo's plant, the CasADi model and Newton-Euler by hand describe the same rigid body."""
+"""
+MuJoCo's plant and the CasADi model describe the same rigid body.
+
+Wind and drag have the same equations in both; here they show frames and points of application.
+"""
 
 from dataclasses import replace
 

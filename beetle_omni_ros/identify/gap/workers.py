@@ -21,11 +21,7 @@ from typing import Any
 import warnings
 
 import joblib
-
-try:
-    from threadpoolctl import threadpool_limits
-except ImportError:     # apt has it, but rosdep no key for it
-    threadpool_limits = None
+from threadpoolctl import threadpool_limits
 
 WIDTH_KEY = 'OMP_NUM_THREADS'       # a limit of threads also limits the processes
 _inside = False                     # whether this process is a worker
@@ -33,8 +29,8 @@ _subject: Any = None                # subject of a worker
 
 
 def width() -> int:
-    """Number of processes; one if threads of linear algebra cannot be limited."""
-    if sys.platform != 'linux' or threadpool_limits is None:
+    """Number of processes; one where processes are not forked."""
+    if sys.platform != 'linux':
         return 1
     allowed = os.environ.get(WIDTH_KEY, '')
     cores = joblib.cpu_count()
