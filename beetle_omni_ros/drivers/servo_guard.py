@@ -13,6 +13,7 @@ import time
 
 import serial
 
+HOLD = 10.0         # [s] with torque, but stopped by the watchdogs: a landing from 2 m
 OPEN_TIMEOUT = 2.0  # [s] for a port that is busy or unplugged
 REPEATS = 3         # a broadcast has no acknowledgement
 PAUSE = 0.02        # [s] between repetitions
@@ -37,12 +38,16 @@ def dismiss(guard: subprocess.Popen):
 
 
 def main():
-    """Wait for the end of the pipe, then send the packet as soon as the port can be opened."""
+    """Wait for the end of the pipe and a landing, then send the packet; not to a new driver."""
     port, baud_rate, packet = sys.argv[1], int(sys.argv[2]), bytes.fromhex(sys.argv[3])
-    end = 0.0 if os.read(0, 1) else time.monotonic() + OPEN_TIMEOUT
+    if os.read(0, 1):
+        return
+    time.sleep(HOLD)
+    end = time.monotonic() + OPEN_TIMEOUT
     while time.monotonic() < end:
         try:
-            with serial.Serial(port, baud_rate, timeout=0, write_timeout=0.1) as line:
+            with serial.Serial(port, baud_rate, timeout=0, write_timeout=0.1,
+                               exclusive=True) as line:
                 # The header of this packet also ends an incomplete packet of the driver.
                 for _ in range(REPEATS):
                     line.write(packet)

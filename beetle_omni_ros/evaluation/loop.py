@@ -283,7 +283,7 @@ class FlightLoop:
                     estimate, self._joints, self._command), 0.0):
                 if self._estimator.status == 'lost':
                     continue
-                processes.inbox.on_state(state)
+                processes.inbox.on_state(state, now)
                 commands = self._control(state)
                 recorder.write('odom', state if not recorder.keeps_covariances else Odom.of(
                     state, pose_covariance(estimate),

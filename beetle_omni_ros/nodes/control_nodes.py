@@ -247,7 +247,7 @@ class SupervisorNode(FlightNode):
     def _on_odom(self, odom):
         if self._joints is None:
             return
-        self._supervisor.on_state(State.join(odom, self._joints))
+        self._supervisor.on_state(State.join(odom, self._joints), self.now())
         if self._supervisor.state not in (DISARMED, FLYING):
             self._update()      # the fallback controller answers each estimate
 

@@ -8,7 +8,7 @@ import numpy as np
 from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.robot.allocation import clipped
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.safety.events import Silence
+from beetle_omni_ros.safety.events import Lateness, Silence
 
 FROZEN = 'the same numbers again'
 JUMP = 'implausible jump'
@@ -32,16 +32,17 @@ class CommandStream:
         accepted: the last valid command, clipped to the ranges, or None.
         refused: reason -> count.
         silence: time since the last valid command.
-        good_for: time of valid commands without a gap or refusal [s].
+        ages: of the commands, also of refused ones.
+        good_for: time of valid commands without a gap or refusal, and not late [s].
 
     """
 
-    def __init__(self, robot: RobotParameters):
+    def __init__(self, robot: RobotParameters, age_limit: float):
         self._robot = robot
         self.accepted: Command | None = None
         self.refused = Counter[str]()
         self._last_refusal = ''
-        self.silence = Silence(TIMEOUT)
+        self.silence, self.ages = Silence(TIMEOUT), Lateness(age_limit)
         self.good_for = 0.0
         self._offered: Command | None = None
         self._same = 0
@@ -57,6 +58,8 @@ class CommandStream:
         if self.silence.silent:
             last = f'; last refused: {self._last_refusal}' if self._last_refusal else ''
             return self.silence.text + last
+        if self.ages.late:
+            return self.ages.text
         return f'good for only {self.good_for:.2f} s of {RETURN_AFTER:g} s'
 
     def offer(self, command: Command, now: float, doubted: float = -np.inf) -> str:
@@ -65,6 +68,7 @@ class CommandStream:
 
         ``doubted`` is the stamp of a refused estimate, which controllers also received [s].
         """
+        self.ages.add(now - command.stamp)
         reason, clean = self._check(command, now, doubted)
         if reason:
             self.refused[reason] += 1
@@ -80,7 +84,7 @@ class CommandStream:
     def tick(self, dt: float) -> None:
         """``dt`` seconds passed."""
         self.silence.tick(dt)
-        self.good_for = 0.0 if self.silence.silent else self.good_for + dt
+        self.good_for = 0.0 if self.silence.silent or self.ages.late else self.good_for + dt
 
     def forget(self) -> None:
         """Accept any stamp, after a step of the clock."""

@@ -45,6 +45,7 @@ class FaultWatch:
         faults: name -> time of detection [s].
         health: which actuators work, and the zeros of encoders that jumped.
         news: texts of faults, emptied by the reader.
+        paused: whether no rotor and no joint is suspected, because commands were late.
 
     """
 
@@ -61,6 +62,7 @@ class FaultWatch:
         self.faults.clear()
         self.health: ActuatorHealth = ALL_HEALTHY
         self.news: list[str] = []
+        self.paused = False
         self._thrust = np.zeros(ROTORS)     # executed [N]
         self._pack = None if self._map is None else PackWatch(self._robot, self._allocator,
                                                               self._map)
@@ -99,13 +101,16 @@ class FaultWatch:
         if height is not None and height < NEAR_GROUND:
             return      # the floor also exerts a force
         lost = self._wrench.lost
-        if lost is None or not self.health.rotors[lost] or self.health.held[lost] is not None:
+        if lost is None or self.paused or not self.health.rotors[lost] \
+                or self.health.held[lost] is not None:
             return
         self._lose_rotor(lost, stamp, 'the wrench')
 
     def on_speeds(self, stamp: float, speed: np.ndarray) -> None:
         """Receive ESC speeds (4,) [rad/s], nan where unknown."""
         self._speeds.on_speeds(stamp, speed)
+        if self.paused:
+            self._speeds.forget()
         lost, deaf, thrust = self._speeds.lost, self._speeds.deaf, self._speeds.thrust
         if lost is not None:
             self._lose_rotor(lost, stamp, 'its ESC')
@@ -143,7 +148,7 @@ class FaultWatch:
             stuck = self.health.stuck[joint]
             if stuck is not None and abs(stuck - angle) > MOVED:
                 self._set('stuck', joint, angle)
-            elif stuck is None and watch.astray[joint]:
+            elif stuck is None and watch.astray[joint] and not self.paused:
                 self.name(f'joint{joint + 1}_astray', stamp, f'gimbal{joint + 1} does not follow '
                           f'its command, at {angle:.2f} rad')
                 self._set('stuck', joint, angle)

@@ -1,9 +1,12 @@
-"""Outputs of the supervisor: events, answers to requests, and timeouts of sources."""
+"""Outputs of the supervisor: events, answers to requests, timeouts and ages of sources."""
 
-from math import inf
+from collections import deque
+from math import inf, isfinite
 from typing import NamedTuple
 
 INFO, WARNING, ERROR = 'info', 'warning', 'error'
+AGES = 30               # messages: 0.3 s of commands at 100 Hz; a queue after a stall holds ten
+SOME = 5                # late ones, 50 ms: before the fastest detector names an actuator (60 ms)
 
 
 class Event(NamedTuple):
@@ -61,3 +64,30 @@ class Silence:
         """For messages: 'silent for 52 ms', or 'silent since the start'."""
         return 'silent since the start' if self.elapsed == inf else \
             f'silent for {1000 * self.elapsed:.0f} ms'
+
+
+class Lateness:
+    """
+    Ages of the last messages of a source [s], from the IMU sample that they answer to now.
+
+    Attributes:
+        age: the median, so that single late messages have no effect.
+        late, partly: whether the median, or at least SOME ages, are above the limit.
+
+    """
+
+    def __init__(self, limit: float):
+        self._limit, self._ages = limit, deque([0.0] * AGES, AGES)
+        self.age, self.late, self.partly = 0.0, False, False
+
+    def add(self, age: float) -> None:
+        """Receive the age of a message [s], of no stamp 0."""
+        self._ages.append(age if isfinite(age) else 0.0)
+        ages, limit = sorted(self._ages), self._limit + 1e-6    # tolerance for rounding
+        self.age = ages[AGES // 2]
+        self.late, self.partly = self.age > limit, ages[-SOME] > limit
+
+    @property
+    def text(self) -> str:
+        """For messages: 'late: median age 31 ms, at most 20 ms'."""
+        return f'late: median age {1000 * self.age:.0f} ms, at most {1000 * self._limit:.0f} ms'

@@ -17,14 +17,14 @@ from beetle_omni_ros.robot.readings import SpikeFilter
 from beetle_omni_ros.safety.backup import BackupEstimator
 from beetle_omni_ros.safety.commands import CommandStream, FROZEN, JUMP, SAME
 from beetle_omni_ros.safety.detectors import FaultWatch
-from beetle_omni_ros.safety.events import Event, INFO, Silence, WARNING
+from beetle_omni_ros.safety.events import Event, INFO, Lateness, Silence, WARNING
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.way import inclination
 
 TICK_LIMIT = 0.02       # [s] a longer pause of the supervisor counts as this for the sources
 ESTIMATE_TIMEOUT = 0.05     # [s] 10 periods of 200 Hz
 STALE_AFTER = 0.05      # [s] older estimates are refused
-JOINT_TIMEOUT = 0.2     # [s]
+JOINT_TIMEOUT = ROTORS_TIMEOUT = 0.2    # [s]
 IMU_TIMEOUT = 0.05      # [s]
 MOCAP_TIMEOUT = 0.2     # [s]
 ABSURD = 1e4            # [m, m/s, m/s^2, rad/s] length beyond any robot and sensor; no overflow
@@ -61,6 +61,7 @@ class Inputs:
             no influence, because without bridges the simulator gets the commands directly.
         battery_low, battery_empty, lost: pack below its voltages, robot tumbling or falling, for
             long enough.
+        ages: of the estimates, also of refused ones.
         refused: 'estimate: stale stamp' and the like -> count.
         floor: height of base_link on the ground before the flight [m].
         thrusts: (4,) modelled with the rotors' lag [N].
@@ -76,7 +77,8 @@ class Inputs:
         self._said: dict[str, float] = {}   # when the events with a key were last added [s]
         self.watch = FaultWatch(robot, self.allocator)
         self.faults = self.watch.faults
-        self.streams = {name: CommandStream(robot) for name in controllers}
+        self.ages = Lateness(parameters.age_limit)
+        self.streams = {name: CommandStream(robot, parameters.age_limit) for name in controllers}
         self.active = parameters.controller if parameters.controller in controllers \
             else controllers[0]
         self.backup = BackupEstimator(robot.gravity)
@@ -87,6 +89,7 @@ class Inputs:
         self.refused = Counter[str]()
         self.ekf, self.joints = Silence(ESTIMATE_TIMEOUT), Silence(JOINT_TIMEOUT)
         self.imu, self.mocap = Silence(IMU_TIMEOUT), Silence(MOCAP_TIMEOUT)
+        self.rotors = Silence(ROTORS_TIMEOUT)
         self.tilt, self.tilt_velocity, self.tilt_stamp = np.zeros(4), np.zeros(4), -np.inf
         self.voltage: float | None = None
         self.bridges: dict[str, str] = {}
@@ -102,9 +105,10 @@ class Inputs:
 
     # Messages ---------------------------------------------------------------------------------
 
-    def on_state(self, state: State) -> bool:
-        """Receive the estimator's state; False when it is refused."""
+    def on_state(self, state: State, now: float | None = None) -> bool:
+        """Receive the estimator's state, None: at the last update; False when it is refused."""
         true = corrected(state, self.watch.health)
+        self.ages.add((now or self._now or state.stamp) - state.stamp)
         reason = self._why_not(true)
         if reason:
             self.refused[f'estimate: {reason}'] += 1
@@ -195,6 +199,7 @@ class Inputs:
 
     def on_rotors(self, stamp: float, speed: np.ndarray) -> None:
         """Receive the rotor speeds (4,) reported by the ESCs [rad/s], nan where unknown."""
+        self.rotors.reset()
         if self.airborne and not self._ahead(stamp):
             self.watch.on_speeds(stamp, speed)
 
@@ -239,6 +244,15 @@ class Inputs:
         """Health of the actuators by the detectors."""
         return self.watch.health
 
+    @property
+    def late(self) -> tuple[str, str] | None:
+        """Name of the fault and its text while estimates or commands stay too old."""
+        for name, node, ages in (('estimates_late', 'ekf', self.ages), (
+                'commands_late', self.active, self.streams[self.active].ages)):
+            if ages.late:
+                return name, f'{node}_node {ages.text}'
+        return None
+
     def unready(self, bridge: str) -> str:
         """'' while 'joint' or 'rotor' is ready or never reported, else its node and state."""
         text = self.bridges.get(bridge, 'ready')
@@ -264,9 +278,8 @@ class Inputs:
     def seen(self) -> State:
         """The best state, for the hover controller; silent joints are where they were asked to."""
         tilt, velocity, in_force = self.tilt, self.tilt_velocity, self._in_force
-        # Joints of a bridge that lost them keep their last angles.
-        if self.joints.silent and in_force is not None and not self.bridges.get(
-                'joint', '').startswith('lost:'):
+        # Without their bridge the servos stop at their angles.
+        if self.joints.silent and in_force is not None and 'joint' not in self.bridges:
             tilt, velocity = in_force.tilt, np.zeros(4)
         best = self.best
         return State(best.stamp, best.position, best.velocity, best.quaternion,
@@ -290,6 +303,8 @@ class Inputs:
             return f'no fresh pose (MoCap {self.mocap.text})'
         if self.joints.silent:
             return f'no fresh joint angles (joint_bridge_node {self.joints.text})'
+        if self.late:
+            return f'{self.late[1]}: the computer is too slow'
         angle = np.degrees(inclination(state.quaternion))
         speed, rate = np.linalg.norm(state.velocity), np.linalg.norm(state.angular_velocity)
         if angle > np.degrees(ARM_TILT):
@@ -325,7 +340,7 @@ class Inputs:
             self._forget_stamps(now, before - now)
             return 0.0
         dt = min(now - before, TICK_LIMIT)
-        for source in (self.ekf, self.joints, self.imu, self.mocap):
+        for source in (self.ekf, self.joints, self.imu, self.mocap, self.rotors):
             source.tick(dt)
         for stream in self.streams.values():
             stream.tick(dt)

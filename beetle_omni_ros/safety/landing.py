@@ -30,10 +30,11 @@ TURN_HEIGHT = 1.2       # [m] above the ground to turn over with a weak pack, wh
 LEVEL_RATE = 0.8        # [rad/s] from upside down to level in 4 s
 LEVEL_FIRST = 0.3       # [rad] a larger inclination is levelled before the descent
 BLIND_LIMIT = 0.3       # [s] without any sensor the attitude is then unknown: motors off
-# Silent joints that are not where they were commanded
+# Silent joints that are not where they should be
 CONTRADICTED = 0.5      # [-] of the weight, by which accelerometer and modelled force differ:
                         # joints 0.5 rad beside their commands; the lag of a turn is below 0.1 rad
 CONTRADICTED_TIME = 0.3     # [s] in which the robot gains 1.5 m/s
+ADRIFT = 2.0            # [m/s] a faster robot is not held by its stopped joints
 # The ground
 SPEED = 0.3             # [m/s] of the descent, harmless for the legs
 TARGET_LEAD = 0.5       # [m] depth of the target below the robot
@@ -245,7 +246,8 @@ class Landing:
         if inputs.joints.silent and not inputs.imu.silent and sample is not None and not near:
             force, _ = inputs.allocator.wrench(state.tilt, inputs.thrusts)
             missing = np.linalg.norm(force / inputs.allocator.mass - sample[1])
-            contradicted = bool(missing > CONTRADICTED * inputs.robot.gravity)
+            adrift = 'joint' in inputs.bridges and np.linalg.norm(state.velocity) > ADRIFT
+            contradicted = bool(adrift or missing > CONTRADICTED * inputs.robot.gravity)
         self._contradicted_for = self._contradicted_for + dt if contradicted else 0.0
         if self._contradicted_for >= CONTRADICTED_TIME:
-            self.given_up = 'the silent joints are not where they were commanded'
+            self.given_up = 'the silent joints are not where they should be'

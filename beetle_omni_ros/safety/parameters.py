@@ -14,6 +14,9 @@ class SupervisorParameters(ParameterFile, file='supervisor.yaml'):
     takeoff_height: float = parameter(
         1.0, doc='height of base_link in world where the controller takes over', unit='m',
         low=0.1, high=20)
+    age_limit: float = parameter(
+        0.015, doc='largest median age of commands and estimates, usually 0.004; the tilts of a '
+        'hovering policy swing by 2 rad at 0.02', unit='s', low=0.01, high=0.05)
     fence_half_width: float = parameter(
         20.0, doc='largest |x| and |y| in world; beyond it the robot lands', unit='m', low=0.5,
         high=1000)

@@ -35,6 +35,7 @@ AHEAD = 0.5             # [rad] from its target a joint turns at its full rate: 
                         # lag at 10 rad/s
 LOOK = 0.02             # [s] after a pause without a command: two periods of MoCap, because the
                         # robot may lie on the floor
+LATE_TIME = 0.3         # [s] three lags of a rotor after late commands: no actuator is suspected
 RESUMING = 0.1          # [s] after a pause until every source has sent a message again
 FALLBACK_TIME = 30.0    # [s] of fallback until landing; enough to restart a controller
 MOCAP_PATIENCE = 1.5    # [s] of dead reckoning until landing; its velocity error is then 0.1 m/s
@@ -184,11 +185,15 @@ class Supervisor(Inputs):
         paused, self._before = now - self._before, now
         if self.airborne and self.imu.lost and 'imu_frozen' not in self.faults:
             self.watch.name('imu_lost', now, f'the raw IMU is {self.imu.text}')
+        if self.airborne and self.rotors.lost and 'rotor' in self.bridges:
+            self.watch.name('rotor_bridge_silent', now, f'rotor_bridge_node {self.rotors.text}')
         while self.watch.news:
             self.say(ERROR, self.watch.news.pop(0))
         if not self.airborne:
             return
         contact, poses = self.watch.contact.reason, self.backup.poses
+        flies = self.state == FLYING or self._in_state < LATE_TIME
+        self.watch.paused = self.ages.partly or flies and self.streams[self.active].ages.partly
         if paused > AGE_LIMIT:
             self.watch.name('supervisor_paused', now)
             self.watch.restart()
@@ -260,11 +265,11 @@ class Supervisor(Inputs):
             return '', 'MoCap jumped: landing'
         if self.mocap.lost and self.mocap.elapsed > MOCAP_PATIENCE:
             return 'mocap_lost', f'MoCap {self.mocap.text}: landing by dead reckoning'
-        if no_joints := self.unready('joint'):
-            return 'joint_bridge_lost', f'{no_joints}: landing with the joints as they are'
-        if self.joints.silent:
-            return 'joints_lost', f'joint_bridge_node {self.joints.text}: landing with the ' \
-                                  'joints assumed where they were commanded'
+        if self.joints.silent or self.unready('joint'):
+            text = self.unready('joint') or f'joint_bridge_node {self.joints.text}'
+            return ('joint_bridge_lost', f'{text}: landing with the joints as they are') \
+                if 'joint' in self.bridges else \
+                ('joints_lost', f'{text}: landing with the joints where they were commanded')
         if self.battery_empty:
             return 'battery_empty', f'battery empty ({self.voltage:.1f} V): landing'
         if self.outside(0.0):
@@ -314,11 +319,11 @@ class Supervisor(Inputs):
 
     def _fly(self, now, dt):
         stream = self.streams[self.active]
-        if stream.silence.silent or stream.accepted is None:
-            if self.ekf.elapsed <= 0.5 * self.ekf.limit:    # a controller answers estimates
-                self.watch.name('controller_silent', now)
-            self._fall_back(now, ERROR,
-                            f'{self.active}_node {stream.complaint}: fallback to hover')
+        if (late := self.late) or stream.silence.silent or stream.accepted is None:
+            name, text = late or ('controller_silent', f'{self.active}_node {stream.complaint}')
+            if late or self.ekf.elapsed <= 0.5 * self.ekf.limit:    # it answers estimates
+                self.watch.name(name, now)
+            self._fall_back(now, ERROR, f'{text}: fallback to hover')
             return self._hold(now, dt)
         self.source = self.active
         self._hover.observe(self.seen)

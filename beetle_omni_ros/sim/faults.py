@@ -280,6 +280,7 @@ KINDS = {
     'target': Kind(vector('m', z=1.0) | vector('rad', RPY),
                    target=lambda fault: (_axes(fault), _turn(fault))),
     'motor_board_lost': Kind(bridges=lambda fault: {'rotor': 'lost: motor board silent'}),
+    'joint_bridge_used': Kind(bridges=lambda fault: {'joint': 'ready'}),
     'servo_bus_lost': Kind(bridges=lambda fault: {'joint': 'lost: a servo is silent'}),
 
     'mocap_lost': Kind(mocap=lost),

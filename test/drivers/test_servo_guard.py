@@ -9,6 +9,7 @@ import time
 import pytest
 
 import beetle_omni_ros
+from beetle_omni_ros.drivers.servo_guard import HOLD
 from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
 
 pytestmark = pytest.mark.real_time
@@ -31,7 +32,7 @@ while True:
 ROOT = Path(beetle_omni_ros.__file__).parents[1]
 
 
-def test_torque_is_off_after_the_process_is_killed():
+def test_torque_holds_for_a_landing_and_is_off_after_the_process_is_killed():
     with EmulatedServoBus() as emulated:
         process = subprocess.Popen(
             [sys.executable, '-c', DRIVER, emulated.port], cwd=ROOT, text=True,
@@ -41,7 +42,9 @@ def test_torque_is_off_after_the_process_is_killed():
                 assert process.stdout.readline() == 'tick\n'
             assert emulated.torque_enabled.all()
             process.kill()
-            end = time.monotonic() + 10.0
+            time.sleep(0.5 * HOLD)
+            assert emulated.torque_enabled.all()
+            end = time.monotonic() + HOLD + 5.0
             while emulated.torque_enabled.any() and time.monotonic() < end:
                 time.sleep(0.005)
             assert not emulated.torque_enabled.any()

@@ -10,6 +10,7 @@ import pytest
 from std_srvs.srv import Trigger
 from witness import running_graph, Witness
 
+from beetle_omni_ros.drivers.servo_guard import HOLD
 from beetle_omni_ros.nodes.graph import bridge_parameters, BRIDGES, BRIDGES_COMPOSED
 
 pytestmark = pytest.mark.alone
@@ -56,9 +57,9 @@ def test_a_lost_servo_or_board_lands_and_killed_bridges_leave_nothing_on(tmp_pat
         assert not graph.dead()
         graph.kill(BRIDGES_COMPOSED)
         assert operator.wait(lambda: operator.device('armed') == 'False', 10)
-        assert operator.wait(lambda: 'True' not in operator.device('torque'), 10)
         assert operator.wait(
             lambda: operator.state in ('landing', 'disarmed', 'emergency_stop'), 5)
+        assert operator.wait(lambda: 'True' not in operator.device('torque'), HOLD + 5)
 
 
 def lands(operator, name, value, mended, text, reboot):

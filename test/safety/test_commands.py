@@ -24,7 +24,7 @@ def noisy(stamp, *numbers):
 
 
 def stream():
-    return CommandStream(ROBOT)
+    return CommandStream(ROBOT, 0.02)
 
 
 @pytest.mark.parametrize('bad, reason', [

@@ -96,8 +96,8 @@ def test_a_turn_of_the_markers_or_of_the_estimate_is_named_and_leads_to_a_landin
     if wrong == 'mocap':
         rig.quaternion = turned
     on_state = rig.supervisor.on_state
-    rig.supervisor.on_state = lambda state: on_state(
-        replace(state, quaternion=attitude if wrong == 'mocap' else turned))
+    rig.supervisor.on_state = lambda state, now: on_state(
+        replace(state, quaternion=attitude if wrong == 'mocap' else turned), now)
     rig.run(2.0)
     assert fault in rig.supervisor.faults
     assert rig.supervisor.state == 'landing'

@@ -105,6 +105,54 @@ def test_a_controller_whose_commands_are_not_finite_loses_control_with_the_reaso
     assert rig.supervisor.diagnostics()['nmpc.refused.not finite'] == 1
 
 
+@pytest.mark.parametrize('late, text', [('nmpc', 'nmpc_node late: median age 30 ms'),
+                                        ('estimate', 'ekf_node late: median age 30 ms')])
+def test_late_commands_or_estimates_prevent_arming_with_the_reason(late, text):
+    rig = VehicleRig()
+    rig.age[late] = 0.03
+    rig.run(0.6)
+    answer = rig.supervisor.arm(rig.now)
+    assert not answer and text in answer.text
+    rig.age[late] = 0.0
+    rig.run(0.6)
+    assert rig.supervisor.arm(rig.now)
+
+
+def test_commands_that_stay_late_fall_back_with_the_reason_until_they_are_punctual_again():
+    rig = flown()
+    rig.age['nmpc'] = 0.03
+    rig.run(0.1)
+    assert rig.supervisor.state == 'flying'
+    rig.run(0.2)
+    assert rig.supervisor.reported_state == 'fallback:commands_late'
+    assert any('nmpc_node late: median age 30 ms' in text for text in rig.texts('error'))
+    rig.run(2.0)
+    assert rig.supervisor.state == 'fallback'
+    assert 'late' in rig.supervisor.streams['nmpc'].complaint
+    rig.age['nmpc'] = 0.0
+    rig.run(RETURN_AFTER)
+    assert rig.supervisor.state == 'fallback'
+    rig.run(0.3)
+    assert rig.supervisor.reported_state == 'flying:nmpc'
+
+
+def test_late_estimates_are_named_although_the_commands_that_answer_them_are_late_too():
+    rig = flown()
+    rig.age = dict.fromkeys(rig.age, 0.03)
+    rig.run(0.3)
+    assert rig.supervisor.reported_state == 'fallback:estimates_late'
+
+
+def test_single_late_commands_have_no_effect():
+    rig = flown()
+    for _ in range(100):
+        rig.age['nmpc'] = 0.03
+        rig.run(TICK)
+        rig.age['nmpc'] = 0.0
+        rig.run(2 * TICK)
+    assert rig.supervisor.state == 'flying' and not rig.supervisor.faults
+
+
 def test_selecting_in_flight_needs_a_good_controller():
     rig = VehicleRig()
     rig.alive.discard('rl')

@@ -36,6 +36,7 @@ class VehicleRig:
         self.position, self.velocity = np.array([0.3, -0.2, 0.16]), np.zeros(3)
         self.quaternion, self.rate = LEVEL, np.zeros(3)
         self.voltage = 24.0
+        self.age = dict.fromkeys(ALL, 0.0)      # of estimates and commands [s]
         self.lifts = True           # whether takeoff moves it
         self.command = None
         self.thrust = np.zeros(4)
@@ -93,12 +94,13 @@ class VehicleRig:
         if 'estimate' in alive:
             noise = 1e-9 * np.sin(1e3 * self.now + np.arange(3))    # no two estimates are equal
             supervisor.on_state(State(
-                self.now, self.position + noise, self.velocity, self.quaternion, self.rate,
-                tilt, np.zeros(4), stamp))
+                self.now - self.age['estimate'], self.position + noise, self.velocity,
+                self.quaternion, self.rate, tilt, np.zeros(4), stamp), self.now)
         supervisor.on_battery(self.voltage)
         for name in ('nmpc', 'rl'):
             if name in alive:
-                supervisor.on_command(name, hover_command(self.now, self.quaternion), self.now)
+                supervisor.on_command(name, hover_command(self.now - self.age[name],
+                                                          self.quaternion), self.now)
 
 
 def flown():
