@@ -11,6 +11,7 @@ import time
 import numpy as np
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
+from rclpy.task import Future
 
 from beetle_omni_ros.messages.topics import Qos, topic_of
 from beetle_omni_ros.messages.values import Diagnostic, MessageError
@@ -84,6 +85,8 @@ class FlightNode(Node):
         inputs: topic -> its counts.
         steady_clock: clock for timers that are independent of the flight.
         flight_clock: clock for timers of the flight; simulated time if ``use_sim_time`` is set.
+        stop: ends the process when it is done. A failure is its exception, because the executor
+            prints a traceback of one that a callback raises.
 
     """
 
@@ -111,6 +114,7 @@ class FlightNode(Node):
             self, parameters.extended(f'{name}_parameters', base, more), file, file_key,
             on_change, changeable)
         self.inputs: dict[str, Input] = {}
+        self.stop = Future()
         self._supervisor_identity = ''
         self._diagnostics = wire.Publisher(self, 'diagnostics')
         self._reports = [('inputs', self._input_status)]
