@@ -114,6 +114,7 @@ class FlightNode(Node):
             self, parameters.extended(f'{name}_parameters', base, more), file, file_key,
             on_change, changeable)
         self.inputs: dict[str, Input] = {}
+        self.warn = wire.warner(self)
         self.stop = Future()
         self._supervisor_identity = ''
         self._diagnostics = wire.Publisher(self, 'diagnostics')
@@ -185,13 +186,13 @@ class FlightNode(Node):
 
     def reject(self, topic: str, reason: str, kind: str) -> None:
         """
-        Count a refused message under ``kind``; log the first of a kind.
+        Count a refused message under ``kind``, and log it, see :func:`.wire.warner`.
 
-        Old stamps before the first accepted message are not logged.
+        Of refused stamps only the first after an accepted message is logged.
         """
         entry = self.inputs[topic]
-        if kind not in entry.rejected and (entry.received or 'stamp' not in kind):
-            self.get_logger().warning(f'{topic}: message refused, {reason}')
+        if 'stamp' not in kind or entry.received and kind not in entry.rejected:
+            self.warn(f'{topic}: {kind}', f'{topic}: message refused, {reason}')
         entry.rejected[kind] += 1
         entry.last_refusal = reason
 
