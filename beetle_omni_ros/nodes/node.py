@@ -188,10 +188,13 @@ class FlightNode(Node):
         """
         Count a refused message under ``kind``, and log it, see :func:`.wire.warner`.
 
-        Of refused stamps only the first after an accepted message is logged.
+        Of an expected input only the first of a kind is logged, because its readings come by the
+        hundred, and of old stamps only the first after an accepted message.
         """
         entry = self.inputs[topic]
-        if 'stamp' not in kind or entry.received and kind not in entry.rejected:
+        late = 'stamp' in kind
+        if (entry.received or not late) and not (
+                kind in entry.rejected and (entry.expected or late)):
             self.warn(f'{topic}: {kind}', f'{topic}: message refused, {reason}')
         entry.rejected[kind] += 1
         entry.last_refusal = reason

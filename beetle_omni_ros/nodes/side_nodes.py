@@ -138,7 +138,8 @@ class RecorderNode(FlightNode):
         self.create_timer(WRITE_PERIOD, self._write, clock=self.steady_clock)
 
     def _keep(self, topic, message_type, data, *_):
-        self._received.append((topic, message_type, data, self.now()))
+        if not self._failure:       # nothing would empty the list any more
+            self._received.append((topic, message_type, data, self.now()))
 
     def _write(self):
         # Before the first /clock the time is 0: a bag that begins in 1970 cannot be viewed.

@@ -23,10 +23,11 @@ from beetle_omni_ros.messages.values import MessageError
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.bridge_nodes import JointBridgeNode, RotorBridgeNode
 from beetle_omni_ros.nodes.control_nodes import ControllerNode, EkfNode, SupervisorNode
-from beetle_omni_ros.nodes.node import FlightNode, IDENTITY, Input
+from beetle_omni_ros.nodes.node import ERROR, FlightNode, IDENTITY, Input
 from beetle_omni_ros.nodes.side_nodes import RecorderNode
 from beetle_omni_ros.nodes.sim_node import SimNode
 from beetle_omni_ros.robot.readings import ImuReading, JointReading
+from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.bag import read_bag
 
 pytestmark = pytest.mark.real_time
@@ -66,7 +67,7 @@ def test_a_bad_target_pose_is_refused_with_its_reason_and_the_old_one_stays(benc
         assert node._host.target is first
     poses.publish(pose(1.4, now + 0.8))     # of a clock ahead, which does not block later ones
     assert bench.wait(lambda: node._host.target.position[2] == 1.4)
-    poses.publish(pose(1.5, time.time()))
+    poses.publish(pose(1.5, time.time(), frame=''))
     assert bench.wait(lambda: node._host.target.position[2] == 1.5)
     assert entry.rejected['cannot be flown'] == 4 and entry.rejected.total() == 5
 
@@ -99,9 +100,10 @@ def test_refusals_of_a_kind_are_logged_again_after_two_seconds_with_their_number
     log.now[0] += wire.QUIET
     assert refuse('z = -4 m') == ['target_pose: message refused, z = -4 m']
     node.inputs['odom'].received = 1
-    assert len(refuse('stale', kind='stale stamp', topic='odom')) == 1
-    log.now[0] += wire.QUIET    # they come by the hundred on a slow computer
-    assert not refuse('stale', kind='stale stamp', topic='odom')
+    for kind in ('stale stamp', 'not finite'):
+        assert len(refuse(kind, kind=kind, topic='odom')) == 1
+        log.now[0] += wire.QUIET    # readings come by the hundred
+        assert not refuse(kind, kind=kind, topic='odom')
     assert node.inputs['target_pose'].rejected == {'cannot be flown': 5, 'not finite': 1}
 
 
@@ -132,12 +134,24 @@ def test_hostile_messages_are_of_few_kinds(bench, log):
 def test_lost_messages_are_one_line_in_two_seconds_and_an_unknown_number_counts_once(
         make_bench, tmp_path, log):
     recorder = make_bench(f'bag:={tmp_path}/bag').add(RecorderNode())
-    for change in (3, 2**31 - 1, 1):
+    for change in (3, 2**31 - 1, 1):        # as Fast DDS reports
         recorder._on_lost(SimpleNamespace(total_count_change=change))
     assert log.lines == ['3 messages lost so far'] and recorder._bag_status()[2]['lost'] == 5
     log.now[0] += wire.QUIET
     recorder._on_lost(SimpleNamespace(total_count_change=2))
     assert log.lines[1:] == ['7 messages lost so far (2 more before)']
+
+
+def test_a_recorder_that_cannot_write_keeps_no_messages(make_bench, tmp_path, monkeypatch):
+    recorder = make_bench(f'bag:={tmp_path}/bag').add(RecorderNode())
+
+    def full(*_):
+        raise ParameterError('bag: No space left on device')
+    monkeypatch.setattr(recorder._bag, 'write_raw', full)
+    for _ in range(3):
+        recorder._keep('/odom', ALL['odom'].type, b'')
+        recorder._write()
+    assert not recorder._received and recorder._bag_status()[0] == ERROR
 
 
 def test_bad_and_stale_samples_are_refused_and_counted_by_reason(bench):
