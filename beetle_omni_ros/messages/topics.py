@@ -128,8 +128,7 @@ TABLE = (
           in_flight=False),
     _odom('odom', 'estimate: pose in world, twist in base_link, both covariances', required=True),
     Topic('target_pose', c.POSE, LATCHED, PoseTarget, c.read_pose_target, c.write_pose_target,
-          'target pose in world, also with an empty frame_id; `reference_node` or a user publishes '
-          'it', required=True),
+          'target pose in world; `reference_node` or a user publishes it', required=True),
     Topic('target_trajectory', c.TRAJECTORY, LATCHED, TrajectoryTarget, c.read_trajectory,
           c.write_trajectory,
           'time-parameterised reference; `reference_node` or a user publishes it'),

@@ -192,9 +192,8 @@ class FlightNode(Node):
         hundred, and of old stamps only the first after an accepted message.
         """
         entry = self.inputs[topic]
-        late = 'stamp' in kind
-        if (entry.received or not late) and not (
-                kind in entry.rejected and (entry.expected or late)):
+        once = entry.expected or 'stamp' in kind
+        if not (once and kind in entry.rejected) and (entry.received or 'stamp' not in kind):
             self.warn(f'{topic}: {kind}', f'{topic}: message refused, {reason}')
         entry.rejected[kind] += 1
         entry.last_refusal = reason

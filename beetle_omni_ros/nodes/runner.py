@@ -61,13 +61,12 @@ def main(name: str) -> int:
         rclpy.init(args=[each for each in sys.argv if each not in names],
                    signal_handler_options=SignalHandlerOptions.NO)
         executor = EventsExecutor()
-        executable = name
         for name in names:
             node = maker(name)()
             nodes.append(node)
             node.introduce()
             executor.add_node(node)
-        name = executable
+        name = name if len(names) == 1 else COMPOSED
         # Objects of the start-up live as long as the process. Freezing them avoids pauses of the
         # garbage collector of some 10 ms in a control cycle.
         gc.collect()

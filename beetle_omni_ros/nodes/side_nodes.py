@@ -28,7 +28,6 @@ IMPULSE_PERIOD = 0.005  # s, the same for tasks with impulses of 50 ms
 # decode the whole of it, and a node that starts late soon receives the next window.
 WINDOW, WINDOW_PERIOD, WINDOW_SAMPLE = 3.0, 1.5, 0.05   # s
 WRITE_PERIOD = 0.02     # s between writes of the received messages, so that no callback waits
-UNKNOWN = 2**31 - 1     # lost messages
 FLUSH_WRITES = 20       # writes between flushes; a crash loses only messages after the last one
 
 
@@ -159,8 +158,8 @@ class RecorderNode(FlightNode):
             self.get_logger().error(f'recording ended: {error}')
 
     def _on_lost(self, event):
-        # Fast DDS reports this number for a gap of unknown length.
-        self._lost += 1 if event.total_count_change == UNKNOWN else event.total_count_change
+        new = event.total_count_change
+        self._lost += new if new < 2**31 - 1 else 1     # so Fast DDS reports an unknown number
         self.warn('lost', f'{self._lost} messages lost so far')
 
     def _bag_status(self):

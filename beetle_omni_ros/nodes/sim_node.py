@@ -33,9 +33,7 @@ SLEW = 0.01             # largest shift of a tick to a later time, in ticks
 LAG = 0.02              # s between the newest sample and the newest answered one
 PATIENCE = 0.3          # s of steady time without an answer after which a node has stopped
 COMMAND_AGE = 0.1       # s, older commands are not executed
-# A disturbance is at most this multiple of what all rotors can produce: no controller could answer
-# it, and its number is a mistake.
-OVERPOWERED = 10.0
+HOPELESS = 10.0     # times what all rotors produce: a larger disturbance is a mistake
 
 
 class RealTimePacing:
@@ -155,7 +153,7 @@ class SimNode(FlightNode):
         self._simulator = Simulator(
             robot, SimulatorParameters.load(given.simulator_file or None),
             conditions=given.conditions, seed=given.seed)
-        lift = OVERPOWERED * 4 * robot.rotors.thrust_max
+        lift = HOPELESS * 4 * robot.rotors.thrust_max
         self._most_wrench = lift, lift * np.linalg.norm(robot.rotors.positions, axis=1).max()
         self._pacing = self._make_pacing(given)
         self._latency = Distribution()
@@ -264,11 +262,10 @@ class SimNode(FlightNode):
             self._simulator.command(replace(command, stamp=command.stamp - self._pacing.epoch))
 
     def _on_disturbance(self, wrench):
-        for what, vector, most, unit in zip(('force', 'torque'), (wrench.force, wrench.torque),
-                                            self._most_wrench, ('N', 'N m'), strict=True):
-            if (size := np.linalg.norm(vector)) > most:
-                raise MessageError(f'{what} of {size:.3g} {unit}, expected at most {most:.3g} '
-                                   f'{unit}', f'{what} too large')
+        size, most = np.linalg.norm([wrench.force, wrench.torque], axis=1), self._most_wrench
+        if (size > most).any():
+            raise MessageError('{:.3g} N and {:.3g} N m, expected at most {:.3g} N and {:.3g} N m'
+                               .format(*size, *most), 'too large')
         self._simulator.wrench = np.concatenate([wrench.force, wrench.torque])
 
     def _pacing_status(self):

@@ -89,13 +89,10 @@ def warner(node: Node) -> Callable[[str, str], None]:
     kinds: dict[str, tuple[float, int]] = {}        # time of the last line, number left out since
 
     def warn(kind, text):
-        now = time.monotonic()
-        last, left_out = kinds.get(kind, (-math.inf, 0))
-        if now < last + QUIET:
-            kinds[kind] = last, left_out + 1
-            return
-        kinds[kind] = now, 0
-        node.get_logger().warning(f'{text} ({left_out} more before)' if left_out else text)
+        now, (last, left_out) = time.monotonic(), kinds.get(kind, (-math.inf, 0))
+        kinds[kind] = (now, 0) if now >= last + QUIET else (last, left_out + 1)
+        if not kinds[kind][1]:
+            node.get_logger().warning(f'{text} ({left_out} more before)' if left_out else text)
 
     return warn
 

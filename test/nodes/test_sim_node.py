@@ -53,8 +53,8 @@ def test_faults_are_switched_in_flight_and_reported(sim):
 
 
 @pytest.mark.parametrize('force, torque, refused', [
-    ([0, 0, 1e9], [0, 0, 0], 'force of 1e+09 N, expected at most 800 N'),
-    ([0, 0, 0], [0, -1e3, 0], 'torque of 1e+03 N m, expected at most 221 N m'),
+    ([0, 0, 1e9], [0, 0, 0], '1e+09 N and 0 N m, expected at most 800 N and 221 N m'),
+    ([0, 0, 0], [0, -1e3, 0], '0 N and 1e+03 N m, expected at most 800 N and 221 N m'),
     ([0, 0, 100], [100, 0, 0], '')])      # the highest levels of tasks
 def test_a_disturbance_beyond_any_controller_is_refused(sim, force, torque, refused):
     node, given = sim(actuators='direct'), Wrench(0.0, np.array(force), np.array(torque))
