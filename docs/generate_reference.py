@@ -74,6 +74,8 @@ state: beside a changed `mass` or `rotors.positions`, state the `inertia`.
 # Topics that viewers and clocks need, which no other part of the package reads.
 OTHERS = {
     '/clock': ('rosgraph_msgs/Clock', 'SENSOR', 'simulated time, with `--clock simulated`'),
+    '/rosout': ('rcl_interfaces/Log', 'LATCHED', 'lines of the log of every node; in the bag of '
+                'a flight through ROS'),
     '/tf': ('tf2_msgs/TFMessage', 'EVENT', 'moving frames: `world`, `base_link`, each '
             'tilting module; 50 Hz, in each bag'),
     '/tf_static': ('tf2_msgs/TFMessage', 'LATCHED',

@@ -18,6 +18,7 @@ from std_msgs.msg import String
 
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.control.registry import ControllerEntry
+from beetle_omni_ros.messages.bag_types import from_bytes
 from beetle_omni_ros.messages.topics import ALL, COMMAND, EVENT, LATCHED, SENSOR
 from beetle_omni_ros.messages.values import MessageError
 from beetle_omni_ros.nodes import wire
@@ -28,7 +29,7 @@ from beetle_omni_ros.nodes.side_nodes import RecorderNode
 from beetle_omni_ros.nodes.sim_node import SimNode
 from beetle_omni_ros.robot.readings import ImuReading, JointReading
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.bag import read_bag
+from beetle_omni_ros.runs.bag import read_bag, read_messages
 
 pytestmark = pytest.mark.real_time
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
@@ -216,6 +217,18 @@ def test_the_supervisor_signs_its_commands_and_publishes_its_identity(bench):
 
 
 BEST_EFFORT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+def test_the_log_of_the_nodes_is_in_the_bag(make_bench, tmp_path):
+    bench = make_bench(f'bag:={tmp_path}/bag')
+    bench.user.get_logger().warning('before the recorder')
+    recorder = bench.add(RecorderNode())
+    bench.user.get_logger().error('beside the recorder')
+    assert bench.wait(lambda: recorder._bag.counts.get('/rosout', 0) >= 2)
+    recorder.close()
+    lines = [from_bytes(one.data, one.type).msg for one in read_messages(tmp_path / 'bag')
+             if one.topic == '/rosout']
+    assert {'before the recorder', 'beside the recorder'} <= set(lines)
 
 
 @pytest.mark.parametrize('profile', [wire.profile(EVENT), wire.profile(LATCHED), BEST_EFFORT])
