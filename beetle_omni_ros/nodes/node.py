@@ -85,8 +85,7 @@ class FlightNode(Node):
         inputs: topic -> its counts.
         steady_clock: clock for timers that are independent of the flight.
         flight_clock: clock for timers of the flight; simulated time if ``use_sim_time`` is set.
-        stop: ends the process when it is done. A failure is its exception, because the executor
-            prints a traceback of one that a callback raises.
+        stop: future that ends the process; its exception is reported without a traceback.
 
     """
 
