@@ -6,6 +6,7 @@ The robot stays on the ground until ``supervisor_node/arm`` is called.
 
 import atexit
 from functools import partial
+import os
 from pathlib import Path
 import shutil
 import sys
@@ -66,8 +67,8 @@ def actions(context):
         raise ParameterError(f"seed:={given['seed']}: expected a whole number from 0 to "
                              f'{SEEDS[-1]}')
     # Private to this launch, so that the ports of two simulations do not meet.
-    folder = tempfile.mkdtemp(prefix='beetle_omni_')
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    folder, codes = tempfile.mkdtemp(prefix='beetle_omni_'), []
+    atexit.register(finish, folder, codes)
     graph.confine()
     nodes, left_out = graph.plan(
         simulated=given['backend'] == 'sim', ports=folder, bag=given['record'],
@@ -81,27 +82,37 @@ def actions(context):
     more = ['-r', f'__ns:=/{namespace}'] if namespace else []
     if given['params_file']:
         more += ['--params-file', given['params_file']]
-    commands, codes = graph.commands(nodes, Path(folder)), []
     return [ExecuteProcess(cmd=[*command, *more], name=name, output='screen',
-                           on_exit=partial(on_exit, name, codes, len(commands)))
-            for name, command in commands.items()]
+                           on_exit=partial(on_exit, name, codes))
+            for name, command in graph.commands(nodes, Path(folder)).items()]
 
 
-def on_exit(name, codes, processes, event, context):
+def on_exit(name, codes, event, context):
     """
-    End the launch, with the status of the process that failed first.
+    End the launch when a process has ended.
 
     The robot lands without the bridges, so they end the launch only if they could not start.
-    launch itself ends with 0 however its processes end.
     """
     from beetle_omni_ros.nodes import graph, runner
     codes.append(event.returncode)
-    status = next(filter(None, codes), 0)
-    if len(codes) == processes and status:
-        raise SystemExit(status if status > 0 else SIGNALLED - status)
-    if not context.is_shutdown and (name == graph.COMPOSED or status == runner.UNUSABLE):
+    if not context.is_shutdown and (
+            name == graph.COMPOSED or event.returncode == runner.UNUSABLE):
         return Shutdown(reason=f'{name} ended with status {event.returncode}')
     return None
+
+
+def finish(folder, codes):
+    """
+    Remove the folder, and end with the status of the process that failed first.
+
+    launch itself ends with 0 however its processes end. At this point all have ended, also those
+    of a launch file that includes this one.
+    """
+    shutil.rmtree(folder, ignore_errors=True)
+    if status := next(filter(None, codes), 0):
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status if status > 0 else SIGNALLED - status)
 
 
 def generate_launch_description():

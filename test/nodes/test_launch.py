@@ -2,6 +2,7 @@
 
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+import shutil
 import stat
 import subprocess
 import sys
@@ -50,8 +51,12 @@ def bringup(monkeypatch):
                             lambda self, context: given[self.args[0]], raising=False)
         return module.actions(None)
 
-    module.start = start
-    return module
+    module.start, module.at_exit = start, []
+    monkeypatch.setattr(module, 'atexit', SimpleNamespace(
+        register=lambda *call: module.at_exit.append(call)))
+    yield module
+    for _, folder, _ in module.at_exit:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def given_to(processes):
@@ -113,20 +118,20 @@ def test_a_parameter_file_overrides_the_arguments_in_every_process(bringup, tmp_
     ([('bridges', 2), ('composed', 0)], [True, False], 2),
     ([('bridges', -9), ('composed', 0)], [False, True], 137),   # the nodes land first
     ([('composed', 0), ('bridges', 0)], [True, False], 0)])
-def test_the_launch_ends_with_the_status_of_what_failed_first(bringup, endings, shuts_down,
-                                                              status):
+def test_the_launch_ends_with_the_status_of_what_failed_first(bringup, monkeypatch, endings,
+                                                              shuts_down, status):
     processes = {one.kwargs['name']: one for one in bringup.start()}
     assert list(processes) == ['composed', 'bridges']
-    context, reached = SimpleNamespace(is_shutdown=False), []
-    try:
-        for name, code in endings:
-            action = processes[name].kwargs['on_exit'](SimpleNamespace(returncode=code), context)
-            reached.append(action is not None)
-            context.is_shutdown |= reached[-1]
-    except SystemExit as end:
-        assert end.code == status and reached == shuts_down[:1]
-    else:
-        assert status == 0 and reached == shuts_down
+    context, reached, left = SimpleNamespace(is_shutdown=False), [], []
+    for name, code in endings:
+        action = processes[name].kwargs['on_exit'](SimpleNamespace(returncode=code), context)
+        reached.append(action is not None)
+        context.is_shutdown |= reached[-1]
+    assert reached == shuts_down
+    monkeypatch.setattr(bringup.os, '_exit', left.append)
+    (function, folder, codes), = bringup.at_exit
+    function(folder, codes)
+    assert left == [status] * bool(status) and not Path(folder).exists()
 
 
 def test_a_launch_with_a_bag_that_exists_ends_with_the_status_of_the_nodes(ros_domain, tmp_path):
