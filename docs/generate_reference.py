@@ -1,8 +1,8 @@
 """
 Pages of docs/reference that are made from code, for docs/hooks.py.
 
-``python docs/generate_reference.py`` writes effects.md, the only one in the repository. ROS is not
-needed.
+``python docs/generate_reference.py`` writes those that the repository has in full. With the name
+of a page, for example ``parameters``, it prints this page. ROS is not needed.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from importlib import import_module
 import inspect
 from pathlib import Path
 import re
+import sys
 from textwrap import fill
 
 import numpy as np
@@ -74,6 +75,8 @@ state: beside a changed `mass` or `rotors.positions`, state the `inertia`.
 # Topics that viewers and clocks need, which no other part of the package reads.
 OTHERS = {
     '/clock': ('rosgraph_msgs/Clock', 'SENSOR', 'simulated time, with `--clock simulated`'),
+    '/rosout': ('rcl_interfaces/Log', 'LATCHED', 'lines of the log of every node; in the bag of '
+                'a flight through ROS'),
     '/tf': ('tf2_msgs/TFMessage', 'EVENT', 'moving frames: `world`, `base_link`, each '
             'tilting module; 50 Hz, in each bag'),
     '/tf_static': ('tf2_msgs/TFMessage', 'LATCHED',
@@ -331,7 +334,12 @@ def _documented(name, call, documented):
 
 PAGES = {'parameters.md': parameters, 'topics.md': topics, 'command_line.md': command_line,
          'effects.md': effects, 'python.md': python}
+IN_FULL = 'effects.md', 'topics.md'     # the others change with each option and default
 
 
 if __name__ == '__main__':
-    (REFERENCE / 'effects.md').write_text(effects(), encoding='utf-8')
+    if sys.argv[1:]:
+        print(PAGES[f'{sys.argv[1]}.md'](), end='')
+    else:
+        for page in IN_FULL:
+            (REFERENCE / page).write_text(PAGES[page](), encoding='utf-8')

@@ -11,10 +11,10 @@ from generate_reference import PAGES
 
 
 def on_files(files, config):
-    """Add the pages that are not in the repository."""
+    """Put pages made from code in the place of those that name where their content is."""
     for name, make in PAGES.items():
-        if files.get_file_from_path(f'reference/{name}') is None:
-            files.append(File.generated(config, f'reference/{name}', content=make()))
+        files.remove(files.get_file_from_path(f'reference/{name}'))
+        files.append(File.generated(config, f'reference/{name}', content=make()))
     return files
 
 

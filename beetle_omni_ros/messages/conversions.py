@@ -227,7 +227,7 @@ def _of(message, field, names):
     except ValueError:
         raise MessageError(f"names are not {', '.join(names)}") from None
     except IndexError:
-        raise MessageError(f'{field} has {len(values)} values, too few for the names') from None
+        raise MessageError(f'{field} has too few values for the names') from None
 
 
 def _joint_state(stamp, names, **fields):

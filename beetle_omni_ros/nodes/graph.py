@@ -192,9 +192,10 @@ def controller_nodes(controller: str, robot: dict, *, standby: bool = True, nmpc
         first.make(RobotParameters.load(robot_file))
     entries = [first, *(registry.find(name) for name in registry.STANDING_BY
                         if standby and name != first.name)]
-    if nmpc and not any(entry.option == '--nmpc' for entry in entries):
-        raise ParameterError(f"--nmpc {nmpc}: for the controller '{registry.OWNER['--nmpc']}', "
-                             'which does not run')
+    for option, file in (('--nmpc', nmpc), ('--policy', policy)):
+        if file and registry.OWNER[option] not in [entry.name for entry in entries]:
+            raise ParameterError(f"{option} {file}: for the controller "
+                                 f"'{registry.OWNER[option]}', which does not run")
     nodes, left_out = {}, {}
     for entry in entries:
         node = f'{entry.name}_node'
@@ -207,7 +208,7 @@ def controller_nodes(controller: str, robot: dict, *, standby: bool = True, nmpc
             values |= {'policy': str(Path(given).absolute())} if given else {}
             values |= {'allow_other_robot': True} if allow_other_robot else {}
             if reason := unfit(given or entry.policy_file, robot_file, allow_other_robot):
-                if entry is first:
+                if entry is first or given:
                     raise ParameterError(reason)
                 left_out[entry.name] = reason
                 continue

@@ -11,6 +11,7 @@ import time
 import numpy as np
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
+from rclpy.task import Future
 
 from beetle_omni_ros.messages.topics import Qos, topic_of
 from beetle_omni_ros.messages.values import Diagnostic, MessageError
@@ -84,6 +85,7 @@ class FlightNode(Node):
         inputs: topic -> its counts.
         steady_clock: clock for timers that are independent of the flight.
         flight_clock: clock for timers of the flight; simulated time if ``use_sim_time`` is set.
+        stop: future that ends the process; its exception is reported without a traceback.
 
     """
 
@@ -111,6 +113,8 @@ class FlightNode(Node):
             self, parameters.extended(f'{name}_parameters', base, more), file, file_key,
             on_change, changeable)
         self.inputs: dict[str, Input] = {}
+        self.warn = wire.warner(self)
+        self.stop = Future()
         self._supervisor_identity = ''
         self._diagnostics = wire.Publisher(self, 'diagnostics')
         self._reports = [('inputs', self._input_status)]
@@ -181,13 +185,15 @@ class FlightNode(Node):
 
     def reject(self, topic: str, reason: str, kind: str) -> None:
         """
-        Count a refused message under ``kind``; log the first of a kind.
+        Count a refused message under ``kind``, and log it, see :func:`.wire.warner`.
 
-        Old stamps before the first accepted message are not logged.
+        Of an expected input only the first of a kind is logged, because its readings come by the
+        hundred, and of old stamps only the first after an accepted message.
         """
         entry = self.inputs[topic]
-        if kind not in entry.rejected and (entry.received or 'stamp' not in kind):
-            self.get_logger().warning(f'{topic}: message refused, {reason}')
+        once = entry.expected or 'stamp' in kind
+        if not (once and kind in entry.rejected) and (entry.received or 'stamp' not in kind):
+            self.warn(f'{topic}: {kind}', f'{topic}: message refused, {reason}')
         entry.rejected[kind] += 1
         entry.last_refusal = reason
 

@@ -21,7 +21,7 @@ from rclpy.utilities import remove_ros_args
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.nodes.graph import COMPOSED, confine, CONTROLLER, NODES
-from beetle_omni_ros.robot.schema import load_yaml, ParameterError
+from beetle_omni_ros.robot.schema import load_yaml, ParameterError, RunError
 
 OK, FAILED, UNUSABLE = 0, 1, 2
 # s; without a timeout, the events executor of Jazzy dispatches no callbacks.
@@ -66,6 +66,7 @@ def main(name: str) -> int:
             nodes.append(node)
             node.introduce()
             executor.add_node(node)
+        name = name if len(names) == 1 else COMPOSED
         # Objects of the start-up live as long as the process. Freezing them avoids pauses of the
         # garbage collector of some 10 ms in a control cycle.
         gc.collect()
@@ -75,7 +76,11 @@ def main(name: str) -> int:
         # simulator by a third of a second.
         if len(nodes) > 1:
             use_real_time_priority()
-        executor.spin_until_future_complete(_stop_on_signal(), FOREVER)
+        stop = _stop_on_signal()
+        for node in nodes:
+            node.stop = stop
+        executor.spin_until_future_complete(stop, FOREVER)
+        stop.result()       # raises the failure of a node
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except ParameterError as error:
@@ -83,7 +88,7 @@ def main(name: str) -> int:
     except ModuleNotFoundError as error:
         status = _fail(name, f"needs the Python package '{error.name}': "
                        'docs/how-to/install.md', UNUSABLE)
-    except OSError as error:
+    except (OSError, RunError) as error:
         status = _fail(name, error, FAILED)
     finally:
         # A second signal, forwarded by a launch system, must not interrupt the clean-up.

@@ -27,6 +27,7 @@ IMPULSE_PERIOD = 0.005  # s, the same for tasks with impulses of 50 ms
 # A trajectory is published in overlapping windows: a reader would need tenths of a second to
 # decode the whole of it, and a node that starts late soon receives the next window.
 WINDOW, WINDOW_PERIOD, WINDOW_SAMPLE = 3.0, 1.5, 0.05   # s
+LINE = 'rcl_interfaces/msg/Log'
 WRITE_PERIOD = 0.02     # s between writes of the received messages, so that no callback waits
 FLUSH_WRITES = 20       # writes between flushes; a crash loses only messages after the last one
 
@@ -115,7 +116,7 @@ class ReferenceNode(FlightNode):
 # --- recorder -----------------------------------------------------------------------------------
 
 class RecorderNode(FlightNode):
-    """Writes the messages of every topic of the package into a bag, like ``ros2 bag record``."""
+    """Writes every topic of the package and /rosout into a bag, like ``ros2 bag record``."""
 
     def __init__(self):
         super().__init__(
@@ -133,11 +134,14 @@ class RecorderNode(FlightNode):
         for name, topic in {**ALL, **topics}.items():
             wire.subscribe_raw(self, name, partial(self._keep, prefix + name, topic.type),
                                LATCHED_LOG if topic.qos.latched else LOG, self._on_lost)
+        self.create_subscription(wire.message_class(LINE), '/rosout', partial(
+            self._keep, '/rosout', LINE), wire.profile(LATCHED_LOG), raw=True)
         self.report('bag', self._bag_status)
         self.create_timer(WRITE_PERIOD, self._write, clock=self.steady_clock)
 
     def _keep(self, topic, message_type, data, *_):
-        self._received.append((topic, message_type, data, self.now()))
+        if not self._failure:       # nothing would empty the list any more
+            self._received.append((topic, message_type, data, self.now()))
 
     def _write(self):
         # Before the first /clock the time is 0: a bag that begins in 1970 cannot be viewed.
@@ -157,8 +161,9 @@ class RecorderNode(FlightNode):
             self.get_logger().error(f'recording ended: {error}')
 
     def _on_lost(self, event):
-        self._lost += event.total_count_change
-        self.get_logger().warning(f'{event.total_count_change} messages lost')
+        new = event.total_count_change
+        self._lost += new if new < 2**31 - 1 else 1     # so Fast DDS reports an unknown number
+        self.warn('lost', f'{self._lost} messages lost so far')
 
     def _bag_status(self):
         values = {'written': self._written, 'lost': self._lost}

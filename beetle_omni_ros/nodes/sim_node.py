@@ -11,11 +11,12 @@ from rosgraph_msgs.msg import Clock
 from beetle_omni_ros.drivers.device_parameters import ServoBusParameters
 from beetle_omni_ros.messages.conversions import set_time
 from beetle_omni_ros.messages.topics import SENSOR
+from beetle_omni_ros.messages.values import MessageError
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.node import Distribution, ERROR, FlightNode, OK, WARN
 from beetle_omni_ros.nodes.parameters import file_parameter
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import group, parameter, ParameterError
+from beetle_omni_ros.robot.schema import group, parameter, ParameterError, RunError
 from beetle_omni_ros.sim.emulated.actuators import EmulatedActuators
 from beetle_omni_ros.sim.emulated.device import BoardFaults, ServoFaults, switched_on
 from beetle_omni_ros.sim.fault_lists import parse_faults
@@ -32,6 +33,7 @@ SLEW = 0.01             # largest shift of a tick to a later time, in ticks
 LAG = 0.02              # s between the newest sample and the newest answered one
 PATIENCE = 0.3          # s of steady time without an answer after which a node has stopped
 COMMAND_AGE = 0.1       # s, older commands are not executed
+HOPELESS = 10.0     # times what all rotors produce: a larger disturbance is a mistake
 
 
 class RealTimePacing:
@@ -151,6 +153,8 @@ class SimNode(FlightNode):
         self._simulator = Simulator(
             robot, SimulatorParameters.load(given.simulator_file or None),
             conditions=given.conditions, seed=given.seed)
+        lift = HOPELESS * 4 * robot.rotors.thrust_max
+        self._most_wrench = lift, lift * np.linalg.norm(robot.rotors.positions, axis=1).max()
         self._pacing = self._make_pacing(given)
         self._latency = Distribution()
         topics = {'mocap': 'mocap/pose', 'imu': 'imu/data_raw'}
@@ -228,7 +232,11 @@ class SimNode(FlightNode):
     def _on_timer(self):
         step = (self._devices or self._simulator).step
         for _ in range(self._pacing.due()):
-            frame = self.timed(step)
+            try:
+                frame = self.timed(step)
+            except RunError as error:
+                self.stop.set_exception(error)
+                return
             if self._clock_publisher is not None:
                 message = Clock()
                 set_time(message.clock, self._pacing.now)
@@ -254,6 +262,10 @@ class SimNode(FlightNode):
             self._simulator.command(replace(command, stamp=command.stamp - self._pacing.epoch))
 
     def _on_disturbance(self, wrench):
+        size, most = np.linalg.norm([wrench.force, wrench.torque], axis=1), self._most_wrench
+        if (size > most).any():
+            raise MessageError('{:.3g} N and {:.3g} N m, expected at most {:.3g} N and {:.3g} N m'
+                               .format(*size, *most), 'too large')
         self._simulator.wrench = np.concatenate([wrench.force, wrench.torque])
 
     def _pacing_status(self):

@@ -6,6 +6,7 @@ from functools import cache
 from importlib import import_module
 import inspect
 import math
+import time
 from typing import Any
 
 from rcl_interfaces.srv import SetParameters
@@ -19,6 +20,7 @@ from beetle_omni_ros.messages.topics import Qos, TARGETS, Topic, topic_of
 from beetle_omni_ros.messages.values import MessageError
 
 COPIES = 64             # newest messages that are compared to detect a copy
+QUIET = 2.0             # s between two warnings of a kind
 TARGET_DEPTH = 10       # messages of a target at least that wait for a slow reader
 TWO_ARGUMENTS = inspect.Signature([
     inspect.Parameter(name, inspect.Parameter.POSITIONAL_ONLY) for name in ('message', 'info')])
@@ -82,16 +84,29 @@ class Publisher:
         return True
 
 
+def warner(node: Node) -> Callable[[str, str], None]:
+    """Return a function (kind, text) that logs one warning of a kind every ``QUIET`` s at most."""
+    kinds: dict[str, tuple[float, int]] = {}        # time of the last line, number left out since
+
+    def warn(kind, text):
+        now, (last, left_out) = time.monotonic(), kinds.get(kind, (-math.inf, 0))
+        kinds[kind] = (now, 0) if now >= last + QUIET else (last, left_out + 1)
+        if not kinds[kind][1]:
+            node.get_logger().warning(f'{text} ({left_out} more before)' if left_out else text)
+
+    return warn
+
+
 def subscribe(node: Node, topic: str, handle: Callable[[Any], None],
               qos: Qos | None = None) -> None:
     """Pass the values of a topic to ``handle``, without checks of age."""
-    entry = topic_of(topic)
+    entry, warn = topic_of(topic), warner(node)
 
     def callback(data, *_):
         try:
             handle(entry.take(message(entry, data)))
         except MessageError as error:
-            node.get_logger().warning(f'{topic}: message refused, {error}')
+            warn(error.kind, f'{topic}: message refused, {error}')
 
     subscribe_raw(node, topic, callback, qos)
 

@@ -9,6 +9,7 @@ from beetle_omni_ros.robot import dynamics, native, rotations
 from beetle_omni_ros.robot.allocation import clipped
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import mass_properties, RobotParameters, Variation
+from beetle_omni_ros.robot.schema import RunError
 from beetle_omni_ros.robot.servo import NUMPY
 from beetle_omni_ros.sim.mjcf import BASE, build_model, CONTACT_TIME, set_payload
 from beetle_omni_ros.sim.parameters import SimulatorParameters
@@ -142,7 +143,7 @@ class Plant:
             set_payload(self.model, self._parts, mass)
 
     def step(self) -> None:
-        """Advance one tick with the present targets; a RuntimeError reports a diverged state."""
+        """Advance one tick with the present targets; a RunError reports a diverged state."""
         model, data = self.model, self.data
         if self._has_servo_loads:
             self._load_servos()
@@ -176,8 +177,8 @@ class Plant:
             effort = self._robot.joints.effort_limit
             model.actuator_forcerange[4:] = (-effort, effort)
         if not abs(np.add.reduce(data.qacc)) < DIVERGED:
-            raise RuntimeError(f'the simulated plant diverged: position {self._qpos[:3]} m, '
-                               f'velocity {self._qvel[:3]} m/s, tilts {self._tilt} rad')
+            raise RunError(f'the simulated plant diverged: position {self._qpos[:3]} m, '
+                           f'velocity {self._qvel[:3]} m/s, tilts {self._tilt} rad')
 
     def _near_limits(self):
         """Whether contact with floor or stops, and no rate limit is possible in the next tick."""

@@ -16,17 +16,20 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import String
 
-from beetle_omni_ros.control.base import Command, PoseTarget
+from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.control.registry import ControllerEntry
+from beetle_omni_ros.messages.bag_types import from_bytes
 from beetle_omni_ros.messages.topics import ALL, COMMAND, EVENT, LATCHED, SENSOR
+from beetle_omni_ros.messages.values import MessageError
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.bridge_nodes import JointBridgeNode, RotorBridgeNode
 from beetle_omni_ros.nodes.control_nodes import ControllerNode, EkfNode, SupervisorNode
-from beetle_omni_ros.nodes.node import IDENTITY
+from beetle_omni_ros.nodes.node import ERROR, FlightNode, IDENTITY, Input
 from beetle_omni_ros.nodes.side_nodes import RecorderNode
 from beetle_omni_ros.nodes.sim_node import SimNode
-from beetle_omni_ros.robot.readings import ImuReading
-from beetle_omni_ros.runs.bag import read_bag
+from beetle_omni_ros.robot.readings import ImuReading, JointReading
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.runs.bag import read_bag, read_messages
 
 pytestmark = pytest.mark.real_time
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
@@ -65,9 +68,91 @@ def test_a_bad_target_pose_is_refused_with_its_reason_and_the_old_one_stays(benc
         assert node._host.target is first
     poses.publish(pose(1.4, now + 0.8))     # of a clock ahead, which does not block later ones
     assert bench.wait(lambda: node._host.target.position[2] == 1.4)
-    poses.publish(pose(1.5, time.time()))
+    poses.publish(pose(1.5, time.time(), frame=''))
     assert bench.wait(lambda: node._host.target.position[2] == 1.5)
     assert entry.rejected['cannot be flown'] == 4 and entry.rejected.total() == 5
+
+
+@pytest.fixture
+def log(monkeypatch):
+    """Warnings of all nodes, and a clock of their throttle, a list with the present time [s]."""
+    lines, now = [], [100.0]
+    logger = SimpleNamespace(warning=lines.append, **dict.fromkeys(
+        ('debug', 'info', 'error'), lambda *_, **__: None))
+    monkeypatch.setattr(FlightNode, 'get_logger', lambda self: logger)
+    monkeypatch.setattr(wire, 'time', SimpleNamespace(monotonic=lambda: now[0]))
+    return SimpleNamespace(lines=lines, now=now)
+
+
+def test_refusals_of_a_kind_are_logged_again_after_two_seconds_with_their_number(bench, log):
+    node = bench.add(still())
+
+    def refuse(*reasons, kind='cannot be flown', topic='target_pose'):
+        before = len(log.lines)
+        for reason in reasons:
+            node.reject(topic, reason, kind)
+        return log.lines[before:]
+
+    assert refuse('z = 9 m', 'z = -1 m', 'z = -2 m') == ['target_pose: message refused, z = 9 m']
+    assert len(refuse('too far', topic='target_trajectory')) == 1
+    assert len(refuse('NaN', kind='not finite')) == 1
+    log.now[0] += wire.QUIET
+    assert refuse('z = -3 m') == ['target_pose: message refused, z = -3 m (2 more before)']
+    log.now[0] += wire.QUIET
+    assert refuse('z = -4 m') == ['target_pose: message refused, z = -4 m']
+    node.inputs['odom'].received = 1
+    for kind in ('stale stamp', 'not finite'):
+        assert len(refuse(kind, kind=kind, topic='odom')) == 1
+        log.now[0] += wire.QUIET    # readings come by the hundred
+        assert not refuse(kind, kind=kind, topic='odom')
+    assert node.inputs['target_pose'].rejected == {'cannot be flown': 5, 'not finite': 1}
+
+
+def test_hostile_messages_are_of_few_kinds(bench, log):
+    node = bench.add(EkfNode())
+    for n in range(4):
+        for topic in ('joint_states', 'target_trajectory', 'target_pose'):
+            message = ALL[topic].write({
+                'joint_states': JointReading(1.0, np.zeros(4), np.zeros(4)),
+                'target_pose': PoseTarget([0, 0, 1], LEVEL, 1.0),
+                'target_trajectory': TrajectoryTarget(
+                    np.arange(2.0), np.ones((2, 3)), np.tile(LEVEL, (2, 1)), np.zeros((2, 3)),
+                    np.zeros((2, 3)))}[topic])
+            if topic == 'joint_states':
+                message.position = message.position[:n]
+            elif topic == 'target_pose':
+                message.header.frame_id = f'frame {n}'
+            else:
+                message.points = [message.points[0]] * (10_001 + n)
+            with pytest.raises(MessageError) as refused:
+                ALL[topic].take(message)
+            node.inputs.setdefault(topic, Input(expected=False))
+            node.reject(topic, str(refused.value), refused.value.kind)
+    assert all(len(entry.rejected) == 1 for entry in node.inputs.values() if entry.rejected)
+    assert len(log.lines) == 3
+
+
+def test_lost_messages_are_one_line_in_two_seconds_and_an_unknown_number_counts_once(
+        make_bench, tmp_path, log):
+    recorder = make_bench(f'bag:={tmp_path}/bag').add(RecorderNode())
+    for change in (3, 2**31 - 1, 1):        # as Fast DDS reports
+        recorder._on_lost(SimpleNamespace(total_count_change=change))
+    assert log.lines == ['3 messages lost so far'] and recorder._bag_status()[2]['lost'] == 5
+    log.now[0] += wire.QUIET
+    recorder._on_lost(SimpleNamespace(total_count_change=2))
+    assert log.lines[1:] == ['7 messages lost so far (2 more before)']
+
+
+def test_a_recorder_that_cannot_write_keeps_no_messages(make_bench, tmp_path, monkeypatch):
+    recorder = make_bench(f'bag:={tmp_path}/bag').add(RecorderNode())
+
+    def full(*_):
+        raise ParameterError('bag: No space left on device')
+    monkeypatch.setattr(recorder._bag, 'write_raw', full)
+    for _ in range(3):
+        recorder._keep('/odom', ALL['odom'].type, b'')
+        recorder._write()
+    assert not recorder._received and recorder._bag_status()[0] == ERROR
 
 
 def test_bad_and_stale_samples_are_refused_and_counted_by_reason(bench):
@@ -132,6 +217,18 @@ def test_the_supervisor_signs_its_commands_and_publishes_its_identity(bench):
 
 
 BEST_EFFORT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+def test_the_log_of_the_nodes_is_in_the_bag(make_bench, tmp_path):
+    bench = make_bench(f'bag:={tmp_path}/bag')
+    bench.user.get_logger().warning('before the recorder')
+    recorder = bench.add(RecorderNode())
+    bench.user.get_logger().error('beside the recorder')
+    assert bench.wait(lambda: recorder._bag.counts.get('/rosout', 0) >= 2)
+    recorder.close()
+    lines = [from_bytes(one.data, one.type).msg for one in read_messages(tmp_path / 'bag')
+             if one.topic == '/rosout']
+    assert {'before the recorder', 'beside the recorder'} <= set(lines)
 
 
 @pytest.mark.parametrize('profile', [wire.profile(EVENT), wire.profile(LATCHED), BEST_EFFORT])

@@ -2,9 +2,11 @@
 
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+import shutil
 import stat
+import subprocess
 import sys
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import pytest
 import yaml
@@ -12,6 +14,7 @@ import yaml
 from beetle_omni_ros.nodes import graph
 from beetle_omni_ros.nodes.graph import BRIDGES
 from beetle_omni_ros.robot.resources import share_path
+from beetle_omni_ros.robot.schema import ParameterError
 
 
 class Recorded:
@@ -25,7 +28,8 @@ class Recorded:
 def bringup(monkeypatch):
     """Load the launch file against stand-ins for the modules of launch."""
     classes = {'launch': ['LaunchDescription'],
-               'launch.actions': ['DeclareLaunchArgument', 'ExecuteProcess', 'OpaqueFunction'],
+               'launch.actions': ['DeclareLaunchArgument', 'ExecuteProcess', 'OpaqueFunction',
+                                  'Shutdown'],
                'launch.substitutions': ['LaunchConfiguration']}
     for name, members in classes.items():
         module = ModuleType(name)
@@ -47,8 +51,12 @@ def bringup(monkeypatch):
                             lambda self, context: given[self.args[0]], raising=False)
         return module.actions(None)
 
-    module.start = start
-    return module
+    module.start, module.at_exit = start, []
+    monkeypatch.setattr(module, 'atexit', SimpleNamespace(
+        register=lambda *call: module.at_exit.append(call)))
+    yield module
+    for _, folder, _ in module.at_exit:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def given_to(processes):
@@ -79,11 +87,68 @@ def test_simulator_and_bridges_meet_at_the_same_ports_in_a_private_folder(bringu
     assert nodes['joint_bridge_node']['autostart'] == 'activate'
     folder = Path(nodes['sim_node']['servo_port']).parent
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
-    direct, = given_to(bringup.start(actuators='direct', robot_file='a.yaml',
-                                     plant_file='b.yaml'))
+    files = [str(share_path(f'params/{name}.yaml')) for name in ('robot', 'robot_measured')]
+    direct, = given_to(bringup.start(actuators='direct', robot_file=files[0],
+                                     plant_file=files[1]))
     assert 'actuators' not in direct['sim_node']
-    assert [direct[name]['robot_file'] for name in ('sim_node', 'ekf_node')] == [
-        'b.yaml', 'a.yaml']
+    assert [direct[name]['robot_file'] for name in ('ekf_node', 'sim_node')] == files
+
+
+@pytest.mark.parametrize('argument, value, expected', [
+    ('seed', 'abc', 'a whole number from 0 to 2147483647'), ('seed', '-1', 'a whole number'),
+    ('seed', '2147483648', 'a whole number'), ('policy', '/nope.onnx', 'no such file'),
+    ('params_file', '/nope.yaml', 'no such file'), ('robot_file', '/nope.yaml', 'no such file'),
+    ('plant_file', '/nope.yaml', 'no such file')])
+def test_an_unusable_argument_is_refused_by_its_name(bringup, argument, value, expected):
+    with pytest.raises(ParameterError, match=f'^{argument}:={value}: (expected )?{expected}'):
+        bringup.start(**{argument: value})
+
+
+def test_a_parameter_file_overrides_the_arguments_in_every_process(bringup, tmp_path):
+    file = tmp_path / 'mine.yaml'
+    file.touch()
+    for process in bringup.start(params_file=str(file), namespace='robot1'):
+        words = process.kwargs['cmd']
+        assert [words[k + 1] for k, word in enumerate(words) if word == '--params-file'][1:] == [
+            str(file)]
+
+
+@pytest.mark.parametrize('endings, shuts_down, status', [
+    ([('composed', 2), ('bridges', 0)], [True, False], 2),      # a bag that exists
+    ([('bridges', 2), ('composed', 0)], [True, False], 2),
+    ([('bridges', -9), ('composed', 0)], [False, True], 137),   # the nodes land first
+    ([('composed', 0), ('bridges', 0)], [True, False], 0)])
+def test_the_launch_ends_with_the_status_of_what_failed_first(bringup, monkeypatch, endings,
+                                                              shuts_down, status):
+    processes = {one.kwargs['name']: one for one in bringup.start()}
+    assert list(processes) == ['composed', 'bridges']
+    context, reached, left = SimpleNamespace(is_shutdown=False), [], []
+    for name, code in endings:
+        action = processes[name].kwargs['on_exit'](SimpleNamespace(returncode=code), context)
+        reached.append(action is not None)
+        context.is_shutdown |= reached[-1]
+    assert reached == shuts_down
+    monkeypatch.setattr(bringup.os, '_exit', left.append)
+    (function, folder, codes), = bringup.at_exit
+    function(folder, codes)
+    assert left == [status] * bool(status) and not Path(folder).exists()
+
+
+def test_a_launch_with_a_bag_that_exists_ends_with_the_status_of_the_nodes(ros_domain, tmp_path):
+    pytest.importorskip('launch.actions')       # of ROS; not on PyPI
+    script = ('import sys\n'
+              'from launch import LaunchService\n'
+              'from launch.actions import IncludeLaunchDescription\n'
+              'from launch.launch_description_sources import PythonLaunchDescriptionSource\n'
+              'service = LaunchService()\n'
+              'service.include_launch_description(IncludeLaunchDescription(\n'
+              '    PythonLaunchDescriptionSource(sys.argv[1]),\n'
+              '    launch_arguments=[("record", sys.argv[2])]))\n'
+              'sys.exit(service.run())\n')
+    done = subprocess.run([sys.executable, '-c', script, share_path('launch/bringup.launch.py'),
+                           tmp_path], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    assert '[composed-1] recorder_node: error: ' in done.stdout and 'exists already' in done.stdout
 
 
 @pytest.mark.parametrize('given, holds', [

@@ -55,6 +55,19 @@ def test_unusable_parameters_end_in_one_line_and_status_2(ros_domain, tmp_path, 
     assert line.startswith(f'{node.split()[-1]}: error: ') and named in line
 
 
+def test_a_diverged_plant_ends_the_process_in_one_line(ros_domain):
+    script = ('import sys, beetle_omni_ros.sim.plant as plant\n'
+              'from beetle_omni_ros.start import run\n'
+              'plant.DIVERGED = 0.0\n'
+              'sys.exit(run("composed"))\n')
+    status, error = finish(subprocess.Popen(
+        [sys.executable, '-c', script, 'sim_node', 'ekf_node'], stderr=subprocess.PIPE, text=True))
+    assert status == 1
+    *logged, line = error.strip().splitlines()
+    assert line.startswith('composed: error: the simulated plant diverged: position [')
+    assert all(each.startswith('[INFO]') for each in logged)
+
+
 def test_a_node_names_missing_inputs_is_unique_and_ends_cleanly(ros_domain):
     first = start('ekf_node')
     try:

@@ -1,11 +1,13 @@
 """sim_node with emulated actuators: ports instead of topics, faults in flight."""
 
 import os
+import re
 
 import numpy as np
 import pytest
 from rclpy.parameter import Parameter
 
+from beetle_omni_ros.messages.values import MessageError, Wrench
 from beetle_omni_ros.nodes import node as base
 from beetle_omni_ros.nodes.sim_node import SimNode
 
@@ -48,6 +50,22 @@ def test_faults_are_switched_in_flight_and_reported(sim):
     assert node._simulator.faults == ['mocap_lost', 'rotor_stops']
     assert put(node, faults='').successful
     assert node._simulator.faults == []
+
+
+@pytest.mark.parametrize('force, torque, refused', [
+    ([0, 0, 1e9], [0, 0, 0], '1e+09 N and 0 N m, expected at most 800 N and 221 N m'),
+    ([0, 0, 0], [0, -1e3, 0], '0 N and 1e+03 N m, expected at most 800 N and 221 N m'),
+    ([0, 0, 100], [100, 0, 0], '')])      # the highest levels of tasks
+def test_a_disturbance_beyond_any_controller_is_refused(sim, force, torque, refused):
+    node, given = sim(actuators='direct'), Wrench(0.0, np.array(force), np.array(torque))
+    before = node._simulator.wrench
+    if refused:
+        with pytest.raises(MessageError, match=re.escape(refused)):
+            node._on_disturbance(given)
+        assert node._simulator.wrench is before
+    else:
+        node._on_disturbance(given)
+        np.testing.assert_array_equal(node._simulator.wrench, [*force, *torque])
 
 
 def test_the_simulator_publishes_simulated_time_only_without_serial_devices(sim):
