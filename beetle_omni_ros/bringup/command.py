@@ -10,14 +10,7 @@ from rich.text import Text
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.bringup.devices import check_board, check_servos
-from beetle_omni_ros.bringup.findings import (
-    check_topics,
-    FAIL,
-    Findings,
-    ObservedGraph,
-    OK,
-    WARN,
-)
+from beetle_omni_ros.bringup.findings import check_topics, FAIL, Findings, ObservedGraph, OK, WARN
 from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters, ServoBusParameters
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError

@@ -9,13 +9,7 @@ import numpy as np
 from std_srvs.srv import Trigger
 
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.control.base import (
-    ControllerHost,
-    guidance_of,
-    MOTORS_OFF,
-    PoseTarget,
-    State,
-)
+from beetle_omni_ros.control.base import ControllerHost, guidance_of, MOTORS_OFF, PoseTarget, State
 from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.control.registry import ControllerEntry
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
