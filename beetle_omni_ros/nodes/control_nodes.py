@@ -275,11 +275,9 @@ class SupervisorNode(FlightNode):
 
     def _supervisor_status(self):
         supervisor = self._supervisor
-        values = supervisor.diagnostics()
-        for name, at in supervisor.faults.items():
-            values[f'fault.{name}'] = f'{at:.3f}'     # [s]: six digits are too few for a stamp
         level = {FALLBACK: WARN, STOPPED: ERROR}.get(
             supervisor.state, WARN if supervisor.faults else OK)
         named = ', '.join(supervisor.faults)
         state = self._states.value
-        return level, f'{state}; faults: {named}' if named else state, values
+        return level, f'{state}; faults: {named}' if named else state, \
+            supervisor.diagnostics()
