@@ -10,14 +10,7 @@ from rich.text import Text
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.bringup.devices import check_board, check_servos
-from beetle_omni_ros.bringup.findings import (
-    check_topics,
-    FAIL,
-    Findings,
-    ObservedGraph,
-    OK,
-    WARN,
-)
+from beetle_omni_ros.bringup.findings import check_topics, FAIL, Findings, ObservedGraph, OK, WARN
 from beetle_omni_ros.drivers.device_parameters import MotorBoardParameters, ServoBusParameters
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
@@ -30,8 +23,7 @@ STYLES = {OK: 'green', WARN: 'yellow', FAIL: 'bold red'}
 def run_check(*, listen: Callable[[float], ObservedGraph], servo_port: str | None = None,
               board_port: str | None = None, servo_bus: Path | None = None,
               motor_board: Path | None = None, robot: Path | None = None, seconds: float = 3.0,
-              skip: tuple[str, ...] = (), json_path: Path | None = None,
-              console: Console | None = None) -> int:
+              skip: tuple[str, ...] = (), json_path: Path | None = None) -> int:
     """
     Check everything and print a table.
 
@@ -48,7 +40,7 @@ def run_check(*, listen: Callable[[float], ObservedGraph], servo_port: str | Non
     for part in skip:
         if part not in PARTS:
             raise ParameterError(f"--skip '{part}': expected {', '.join(PARTS)}")
-    console = console or Console()
+    console = Console()
     bus, link = ServoBusParameters.load(servo_bus), MotorBoardParameters.load(motor_board)
     robot_parameters = RobotParameters.load(robot)
     bus = replace(bus, port=servo_port or bus.port)

@@ -210,11 +210,7 @@ def _check_answers(findings, link, servos):
 
 def check_board(parameters: MotorBoardParameters, robot: RobotParameters, seconds: float,
                 graph: ObservedGraph | None = None) -> Findings:
-    """
-    Check the motor board, listening for ``seconds``. A failure may end the list of findings.
-
-    ``graph`` is the observed ROS graph, used if a bridge has the port open.
-    """
+    """Check the motor board, listening for ``seconds``; otherwise as :func:`check_servos`."""
     findings = Findings()
     try:
         from beetle_omni_ros.drivers.motor_board import MotorBoard

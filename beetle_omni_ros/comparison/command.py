@@ -15,13 +15,7 @@ from beetle_omni_ros.comparison.summary import summarise
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import guidance_of
 from beetle_omni_ros.control.registry import ControllerOptions
-from beetle_omni_ros.evaluation.campaign import (
-    file_digest,
-    policy_file,
-    Store,
-    sweep,
-    versions,
-)
+from beetle_omni_ros.evaluation.campaign import file_digest, policy_file, Store, sweep, versions
 from beetle_omni_ros.pages.page import print_grids, rendered, Terminal
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import commit

@@ -212,7 +212,10 @@ class NmpcController:
         disturbance = self._estimator.disturbance
         references = self._planner.plan(target, start, state.quaternion, full[model.TILT],
                                         disturbance)
-        bounds = np.concatenate([self._bounds, self._lowest(full[2], references[1:, 2])])
+        lowest = self._parameters.limits.height
+        self._above = self._above or full[2] > lowest   # no bound before, as on the floor
+        bounds = np.concatenate([self._bounds, np.minimum(
+            references[1:, 2], lowest if self._above else NO_HEIGHT)])
         if not self._started:
             self._rti.fill(x0, np.clip(references[0, 13:21], self._bounds[:8], self._bounds[8:16]))
             self._iterate = FIRST_ITERATIONS
@@ -226,12 +229,6 @@ class NmpcController:
         self._failures = 0 if solved else self._failures + 1
         self._started = self._failures < FAILURES_TO_RESTART
         return self._command(state.stamp)
-
-    def _lowest(self, height, targets):
-        """Smallest height at each node; none until the robot was above it, as on the floor."""
-        lowest = self._parameters.limits.height
-        self._above = self._above or height > lowest
-        return np.minimum(targets, lowest if self._above else NO_HEIGHT)
 
     def _command(self, stamp):
         planned, bounds, rotors = self._rti.inputs[0], self._bounds, self._robot.rotors

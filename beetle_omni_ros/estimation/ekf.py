@@ -15,13 +15,7 @@ import numpy as np
 from beetle_omni_ros.estimation.inputs import DELAY_LIMIT, GAP, InputGuard, NoiseMonitor
 from beetle_omni_ros.estimation.model import ErrorStateModel, MEASUREMENTS
 from beetle_omni_ros.estimation.parameters import EkfParameters
-from beetle_omni_ros.estimation.state import (
-    Estimate,
-    Node,
-    POSITION,
-    propagate,
-    SAME_INSTANT,
-)
+from beetle_omni_ros.estimation.state import Estimate, Node, POSITION, propagate, SAME_INSTANT
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.readings import ImuReading, PoseReading
 from beetle_omni_ros.robot.rotations import geodesic_angle

@@ -53,8 +53,7 @@ class MocapParameters:
         low=1e-6, high=1)
     position: np.ndarray = parameter(
         [0.0, 0.0, 0.0], doc='position of the marker body in base_link', unit='m', shape=(3,),
-        low=-5,
-        high=5)
+        low=-5, high=5)
     rotation: np.ndarray = parameter(
         [0.0, 0.0, 0.0], doc="rotation vector from the marker body's axes to base_link axes",
         unit='rad', shape=(3,), low=-3.2, high=3.2)

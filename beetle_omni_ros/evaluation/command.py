@@ -24,6 +24,7 @@ from beetle_omni_ros.runs.log import FlightLog, LogRecorder, Recorder
 from beetle_omni_ros.runs.metrics import metrics
 from beetle_omni_ros.runs.targets import check_steps
 from beetle_omni_ros.runs.tasks import make_task, Task
+from beetle_omni_ros.sim.fault_lists import load_faults
 from beetle_omni_ros.sim.faults import Fault
 
 
@@ -83,10 +84,7 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
              for entry in registry.find_all(controllers)}
     if not isinstance(task, Task):
         task = make_task(task, seed, min(map(reach_of, built.values())))
-    injected: list[Fault] = []
-    if faults:
-        from beetle_omni_ros.sim.fault_lists import load_faults
-        injected = load_faults(faults)
+    injected = load_faults(faults) if faults else []
     meta = {'task': task.name, 'conditions': conditions, 'seed': seed,
             'robot': str(robot) if robot else 'params/robot.yaml',
             'plant': str(plant) if plant else None, 'version': __version__}

@@ -7,15 +7,7 @@ import numpy as np
 
 from beetle_omni_ros.faults.flight import PLAN
 from beetle_omni_ros.pages import page as shared
-from beetle_omni_ros.pages.page import (
-    ABSENT,
-    Grid,
-    html,
-    markdown,
-    number,
-    section,
-    verdict_head,
-)
+from beetle_omni_ros.pages.page import ABSENT, Grid, html, markdown, number, section, verdict_head
 from beetle_omni_ros.sim.fault_lists import Case
 
 NOTE = ('good: flights with the expected outcome or a better one. impact: speed of base_link at '

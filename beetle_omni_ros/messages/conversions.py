@@ -17,16 +17,9 @@ import numpy as np
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.messages.bag_types import new
 from beetle_omni_ros.messages.values import Diagnostic, MessageError, Odom, Wrench
-from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot import readings, rotations
 from beetle_omni_ros.robot.allocation import ActuatorHealth
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, ROTOR_NAMES
-from beetle_omni_ros.robot.readings import (
-    BatteryReading,
-    ImuReading,
-    JointReading,
-    PoseReading,
-    RotorReading,
-)
 
 WORLD, BODY = 'world', 'base_link'
 JOINTS, ROTORS = list(JOINT_NAMES), list(ROTOR_NAMES)
@@ -146,14 +139,14 @@ def vectors(value: type, name: str, frame: str, **places: str
 
 
 POSE_PLACES = {'position': 'pose.position xyz', 'quaternion': 'pose.orientation xyzw'}
-read_pose, write_pose = vectors(PoseReading, POSE, WORLD, **POSE_PLACES)
+read_pose, write_pose = vectors(readings.PoseReading, POSE, WORLD, **POSE_PLACES)
 _read_target, write_pose_target = vectors(PoseTarget, POSE, WORLD, **POSE_PLACES)
 read_imu, _write_imu = vectors(
-    ImuReading, 'sensor_msgs/msg/Imu', BODY, specific_force='linear_acceleration xyz',
+    readings.ImuReading, 'sensor_msgs/msg/Imu', BODY, specific_force='linear_acceleration xyz',
     angular_velocity='angular_velocity xyz')
 read_wrench, write_wrench = vectors(Wrench, 'geometry_msgs/msg/WrenchStamped', WORLD,
                                     force='wrench.force xyz', torque='wrench.torque xyz')
-read_battery, _write_battery = vectors(BatteryReading, 'sensor_msgs/msg/BatteryState', '',
+read_battery, _write_battery = vectors(readings.BatteryReading, 'sensor_msgs/msg/BatteryState', '',
                                        voltage='voltage', current='current')
 # The twist of the message is in base_link, the velocity of the value in world.
 _read_odom, _write_odom = vectors(
@@ -162,7 +155,7 @@ _read_odom, _write_odom = vectors(
     angular_velocity='twist.twist.angular xyz')
 
 
-def write_imu(value: ImuReading) -> Any:
+def write_imu(value: readings.ImuReading) -> Any:
     """Write specific force and angular rates, without orientation (REP-145)."""
     message = _write_imu(value)
     message.orientation.w = 1.0
@@ -170,7 +163,7 @@ def write_imu(value: ImuReading) -> Any:
     return message
 
 
-def write_battery(value: BatteryReading) -> Any:
+def write_battery(value: readings.BatteryReading) -> Any:
     """Write voltage and current; unmeasured fields are NaN."""
     message = _write_battery(value)
     message.temperature = message.charge = message.capacity = message.design_capacity \
@@ -240,14 +233,14 @@ def _joint_state(stamp, names, **fields):
     return message
 
 
-def read_joints(message: Any) -> JointReading:
-    return JointReading(
+def read_joints(message: Any) -> readings.JointReading:
+    return readings.JointReading(
         seconds(message.header.stamp), _of(message, 'position', JOINTS),
         _of(message, 'velocity', JOINTS) if len(message.velocity) else None,
         _of(message, 'effort', JOINTS) if len(message.effort) else None)
 
 
-def take_joints(message: Any) -> JointReading:
+def take_joints(message: Any) -> readings.JointReading:
     """Read the tilt joints for flight: NaN for a joint that is not named, 0 for missing rates."""
     names = [name for name in JOINTS if name in message.name]
     known = [name in names for name in JOINTS]
@@ -256,19 +249,19 @@ def take_joints(message: Any) -> JointReading:
     velocity[known] = _of(message, 'velocity', names) if len(message.velocity) else 0.0
     finite(position[known], 'position')
     finite(velocity[known], 'velocity')
-    return JointReading(seconds(message.header.stamp), position, velocity)
+    return readings.JointReading(seconds(message.header.stamp), position, velocity)
 
 
-def write_joints(value: JointReading) -> Any:
+def write_joints(value: readings.JointReading) -> Any:
     return _joint_state(value.stamp, value.names, position=value.position,
                         velocity=value.velocity, effort=value.effort)
 
 
-def read_rotors(message: Any) -> RotorReading:
-    return RotorReading(seconds(message.header.stamp), _of(message, 'velocity', ROTORS))
+def read_rotors(message: Any) -> readings.RotorReading:
+    return readings.RotorReading(seconds(message.header.stamp), _of(message, 'velocity', ROTORS))
 
 
-def write_rotors(value: RotorReading) -> Any:
+def write_rotors(value: readings.RotorReading) -> Any:
     return _joint_state(value.stamp, ROTORS, velocity=value.speed)
 
 

@@ -9,13 +9,7 @@ import numpy as np
 from std_srvs.srv import Trigger
 
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.control.base import (
-    ControllerHost,
-    guidance_of,
-    MOTORS_OFF,
-    PoseTarget,
-    State,
-)
+from beetle_omni_ros.control.base import ControllerHost, guidance_of, MOTORS_OFF, PoseTarget, State
 from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.control.registry import ControllerEntry
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
@@ -281,11 +275,9 @@ class SupervisorNode(FlightNode):
 
     def _supervisor_status(self):
         supervisor = self._supervisor
-        values = supervisor.diagnostics()
-        for name, at in supervisor.faults.items():
-            values[f'fault.{name}'] = f'{at:.3f}'     # [s]: six digits are too few for a stamp
         level = {FALLBACK: WARN, STOPPED: ERROR}.get(
             supervisor.state, WARN if supervisor.faults else OK)
         named = ', '.join(supervisor.faults)
         state = self._states.value
-        return level, f'{state}; faults: {named}' if named else state, values
+        return level, f'{state}; faults: {named}' if named else state, \
+            supervisor.diagnostics()

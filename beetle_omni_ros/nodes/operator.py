@@ -19,13 +19,7 @@ from std_srvs.srv import Trigger
 from beetle_omni_ros.bringup import findings
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.messages.conversions import seconds as seconds_of
-from beetle_omni_ros.messages.topics import (
-    LOG,
-    Qos,
-    SENSOR,
-    TARGETS,
-    TOPICS,
-)
+from beetle_omni_ros.messages.topics import LOG, Qos, SENSOR, TARGETS, TOPICS
 from beetle_omni_ros.messages.values import Diagnostic, MessageError
 from beetle_omni_ros.nodes import runner, wire
 from beetle_omni_ros.nodes.graph import BRIDGES, confine, domains_in_use, READY

@@ -8,13 +8,7 @@ from rcl_interfaces.srv import SetParameters
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import MOTORS_OFF, PoseTarget, TrajectoryTarget
-from beetle_omni_ros.messages.topics import (
-    ALL,
-    LATCHED_LOG,
-    LOG,
-    SENSOR,
-    topics_with,
-)
+from beetle_omni_ros.messages.topics import ALL, LATCHED_LOG, LOG, SENSOR, topics_with
 from beetle_omni_ros.messages.values import Wrench
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.node import ERROR, FlightNode, OK, WARN

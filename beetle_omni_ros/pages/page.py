@@ -147,14 +147,10 @@ def page(title: str, subtitle: str, grids: list[Grid], notes: list[str],
     :func:`verdict_head`.
     """
     items = ''.join(f'<li>{escape(note)}</li>' for note in notes)
-    return frame(title, subtitle, f"""{head}<section>{''.join(map(html, grids))}
+    content = f"""{head}<section>{''.join(map(html, grids))}
 {f'<ul>{items}</ul>' if items else ''}</section>
-{''.join(sections)}""")
-
-
-def frame(title: str, subtitle: str, content: str, css: str = '') -> str:
-    """Return a page with the HTML ``content`` and additional ``css``."""
-    return rendered('page.html', title=title, subtitle=subtitle, content=content, css=css)
+{''.join(sections)}"""
+    return rendered('page.html', title=title, subtitle=subtitle, content=content)
 
 
 def rendered(template: str, **values) -> str:

@@ -15,13 +15,7 @@ import numpy as np
 from beetle_omni_ros.control.base import TrajectoryTarget
 from beetle_omni_ros.messages.bag_types import from_bytes, read_all
 from beetle_omni_ros.messages.conversions import from_nanoseconds
-from beetle_omni_ros.messages.topics import (
-    ALL,
-    controller_of,
-    TELLING,
-    topic_of,
-    TOPICS,
-)
+from beetle_omni_ros.messages.topics import ALL, controller_of, TELLING, topic_of, TOPICS
 from beetle_omni_ros.robot.schema import ParameterError, read_yaml
 from beetle_omni_ros.runs.log import FlightLog, LogRecorder, META_KEY, motion, SERIES_OF
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 import json
 from math import isfinite
 import os
@@ -90,7 +90,7 @@ def _transforms(frames):
     return to_bytes(message, TRANSFORMS)
 
 
-class BagWriter(Recorder):
+class BagWriter(Recorder, AbstractContextManager):
     """
     Writes one bag; a context manager, or call :meth:`close`.
 
@@ -134,9 +134,6 @@ class BagWriter(Recorder):
             self._frames = FrameWriter(self.write_raw, self._prefix)
             for name, kind in FRAMES.items():
                 self._declare(name if name.startswith('/') else self._prefix + name, *kind)
-
-    def __enter__(self) -> BagWriter:
-        return self
 
     def __exit__(self, *exception) -> None:
         """Close the bag, also after an error, so that it is readable."""

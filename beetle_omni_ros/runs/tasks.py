@@ -150,12 +150,6 @@ class Task:
         """Duration of the whole task [s]."""
         return float(self.ends[-1])
 
-    def targets(self, start: float) -> list[Target]:
-        """Return all targets of a flight of this task that starts at ``start`` [s]."""
-        begins = start + np.concatenate([[0.0], self.ends[:-1]])
-        return [segment.target(float(begin))
-                for begin, segment in zip(begins, self.segments, strict=True) if segment.target]
-
 
 class TaskPlayer:
     """

@@ -238,13 +238,11 @@ class PackWatch:
         if self.limit is not None:
             self.limit = min(self.limit, allowed)
         elif self._weak_for > TIME:
-            self.limit = min(allowed, self._together(voltage * (self._rest - voltage) / load))
-
-    def _together(self, drop):
-        """Thrust [N] that all rotors can give at the same time."""
-        thrusts = np.linspace(0.0, self._thrust_max, STEPS)
-        voltages = loaded(self._rest, drop, ROTORS * thrusts ** 1.5)
-        return float(thrusts[self._map.thrust_limit_below(voltages) >= thrusts].max())
+            thrusts = np.linspace(0.0, self._thrust_max, STEPS)     # of all rotors together
+            voltages = loaded(self._rest, voltage * (self._rest - voltage) / load,
+                              ROTORS * thrusts ** 1.5)
+            self.limit = min(allowed, float(
+                thrusts[self._map.thrust_limit_below(voltages) >= thrusts].max()))
 
 
 def loaded(rest, drop, loads):

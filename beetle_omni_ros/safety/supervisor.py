@@ -432,7 +432,8 @@ class Supervisor(Inputs):
         values: dict[str, float | int | str] = {
             'state': self.state, 'controller': self.active, 'source': self.source,
             'on_backup_estimator': int(self.backup.running)}
-        values.update({f'fault.{name}': at for name, at in self.faults.items()})
+        # [s]: the six digits of a diagnostic number are too few for a stamp
+        values.update({f'fault.{name}': f'{at:.3f}' for name, at in self.faults.items()})
         values.update({f'{name}_bridge_node': state for name, state in self.bridges.items()})
         for name, stream in self.streams.items():
             values[f'{name}.good'] = int(stream.good)

@@ -6,15 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot import readings, rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.readings import (
-    BatteryReading,
-    ImuReading,
-    JointReading,
-    PoseReading,
-    RotorReading,
-)
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.sim.parameters import Conditions, RPM_AT_1_NEWTON, SimulatorParameters
 from beetle_omni_ros.sim.plant import Plant
@@ -60,12 +53,12 @@ class Frame:
     """Readings that arrive in one tick, or None, and the true state."""
 
     time: float
-    imu: ImuReading | None
-    mocap: PoseReading | None
-    joints: JointReading | None
-    battery: BatteryReading | None
+    imu: readings.ImuReading | None
+    mocap: readings.PoseReading | None
+    joints: readings.JointReading | None
+    battery: readings.BatteryReading | None
     truth: Truth
-    rotors: RotorReading | None = None
+    rotors: readings.RotorReading | None = None
 
 
 def noise(generator: np.random.Generator, bias: Sequence[float] | np.ndarray,
@@ -179,26 +172,27 @@ class Sensors:
         self._joints.append((truth.stamp, tilt, truth.tilt_velocity, effort))
         error = next(self._tilt_noise)
         if devices:
-            joints = JointReading(truth.stamp, tilt + error, truth.tilt_velocity, effort)
+            joints = readings.JointReading(truth.stamp, tilt + error, truth.tilt_velocity, effort)
         else:
             stamp, tilt, velocity, effort = self._joints[0]
-            joints = JointReading(
+            joints = readings.JointReading(
                 stamp + self._errors.encoder_delay, np.rint((tilt + error) / RESOLUTION)
                 * RESOLUTION, np.rint(velocity / RATE_RESOLUTION) * RATE_RESOLUTION, effort)
         rotors = pack = None
         if tick % self._battery_period == 0:
             voltage, current = next(self._battery_noise).tolist()
-            pack = BatteryReading(truth.stamp, battery.voltage + voltage,
+            pack = readings.BatteryReading(truth.stamp, battery.voltage + voltage,
                                   -(battery.current + current))
         if tick % self._rotor_period == 0:
             speed = RPM_AT_1_NEWTON * np.pi / 30 * np.sqrt(np.maximum(truth.thrust, 0.0) / wear)
-            rotors = RotorReading(truth.stamp, speed * next(self._rotor_noise))
+            rotors = readings.RotorReading(truth.stamp, speed * next(self._rotor_noise))
         self._rotors.append(rotors)
-        return Frame(truth.stamp, ImuReading(truth.stamp + self._imu_shift, imu[:3], imu[3:]),
-                     self._mocap[0], joints, pack, truth, self._rotors[0])
+        sample = readings.ImuReading(truth.stamp + self._imu_shift, imu[:3], imu[3:])
+        return Frame(truth.stamp, sample, self._mocap[0], joints, pack, truth, self._rotors[0])
 
     def _capture(self, truth):
         row = next(self._mocap_noise)
-        return PoseReading(truth.stamp + self._errors.mocap_delay, truth.position + row[:3],
-                           np.array(rotations.product(*truth.quaternion.tolist(),
-                                                      *rotations.exp_parts(*row[3:].tolist()))))
+        return readings.PoseReading(
+            truth.stamp + self._errors.mocap_delay, truth.position + row[:3],
+            np.array(rotations.product(*truth.quaternion.tolist(),
+                                       *rotations.exp_parts(*row[3:].tolist()))))

@@ -39,22 +39,18 @@ def module_reaction(robot: RobotParameters) -> dict[str, float]:
 
 def nominal_body(robot: RobotParameters) -> list[float]:
     """(33,) quantities of the robot file, with its effects."""
-    effects = robot.effects
-    gain = effects.get('rotor_thrust_coefficient', {}).get('scale', (1.0,) * 4)
-    return [effects.get('mass', {}).get('mass', robot.mass),
-            *effects.get('inertia', {}).get('inertia', tuple(robot.inertia)),
-            *effects.get('centre_of_mass', {}).get('offset', (0.0, 0.0, 0.0)),
-            *actuators(robot), 1.0, *gain]
+    return [robot.effect('mass.mass', robot.mass), *robot.effect('inertia.inertia', robot.inertia),
+            *robot.effect('centre_of_mass.offset', (0.0, 0.0, 0.0)), *actuators(robot), 1.0,
+            *robot.effect('rotor_thrust_coefficient.scale', (1.0,) * 4)]
 
 
 def actuators(robot: RobotParameters) -> np.ndarray:
     """(21,) quantities ``ACTUATORS`` of a robot."""
-    effects = robot.effects
-    friction = effects.get('joint_friction', {'coulomb': 0.0, 'stiction': 0.0})
-    play = effects.get('joint_backlash', {'gap': 0.0})
-    gains = effects.get('joint_bandwidth', {'kp': robot.joints.kp, 'kd': robot.joints.kd})
-    joints = (gains['kp'], gains['kd'], friction['coulomb'], friction['stiction'], play['gap'])
-    lag = effects.get('rotor_lag', {}).get('time_constant', robot.rotors.time_constant)
+    joints = [robot.effect(key, neutral) for key, neutral in (
+        ('joint_bandwidth.kp', robot.joints.kp), ('joint_bandwidth.kd', robot.joints.kd),
+        ('joint_friction.coulomb', 0.0), ('joint_friction.stiction', 0.0),
+        ('joint_backlash.gap', 0.0))]
+    lag = robot.effect('rotor_lag.time_constant', robot.rotors.time_constant)
     return np.hstack([*(np.broadcast_to(value, 4) for value in joints), lag])
 
 

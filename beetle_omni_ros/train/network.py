@@ -46,17 +46,13 @@ ROTORS, CRITIC_ACTION, TRIM = slice(25, 33), slice(33, 41), slice(41, 47)
 ESTIMATE = slice(47, 53)    # of a policy with memory; then mass, arm and gains of the robot
 
 
-def _dot(a, b):
-    return (a * b).sum(-1)
-
-
 def _fine(error):
     """Normalised error vector, linear for small errors."""
     return error / torch.sqrt((error * error).sum(-1, keepdim=True) + NEAR ** 2)
 
 
 # What is not linear in the features. The export replaces these functions.
-NOT_LINEAR = (torch.linalg.cross, _dot, _fine, torch.sin, torch.cos)
+NOT_LINEAR = (torch.linalg.cross, lambda a, b: (a * b).sum(-1), _fine, torch.sin, torch.cos)
 
 
 def features(observation: torch.Tensor, not_linear=NOT_LINEAR) -> torch.Tensor:
@@ -250,7 +246,12 @@ def export_policy(actor: FeatureModel, path: Path, robot: RobotParameters,
         contract, training={**parameters.plain(), **training}, commit=commit() or '',
         version=__version__,
         created=datetime.now(timezone.utc).isoformat(timespec='seconds'))
-    _strip_paths(written)
+    # The exporter's notes on the origin of nodes contain local paths.
+    graph = written.graph
+    for noted in (written, graph, *graph.node, *graph.input, *graph.output, *graph.value_info,
+                  *written.functions):
+        del noted.metadata_props[:]
+        noted.doc_string = ''
     for key, value in contract.to_metadata().items():
         written.metadata_props.add(key=key, value=value)
     part = path.with_suffix('.part')
@@ -274,11 +275,3 @@ def _difference(mean, path, size):
     found = np.concatenate([network.run([OUTPUT], {INPUT: row[None].numpy()})[0]
                             for row in probes])
     return float(np.abs(found - expected).max() / max(np.abs(expected).max(), 1.0))
-
-
-def _strip_paths(proto):
-    """Remove the exporter's notes on the origin of nodes, because they contain local paths."""
-    for part in (proto, proto.graph, *proto.graph.node, *proto.graph.input, *proto.graph.output,
-                 *proto.graph.value_info, *proto.functions):
-        del part.metadata_props[:]
-        part.doc_string = ''

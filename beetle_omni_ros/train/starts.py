@@ -15,15 +15,7 @@ from beetle_omni_ros.robot.degraded import sphere
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.train import batch
-from beetle_omni_ros.train.model import (
-    ACTUATORS,
-    actuators,
-    ARM,
-    DAMPING,
-    GAIN,
-    LAG,
-    nominal_body,
-)
+from beetle_omni_ros.train.model import ACTUATORS, actuators, ARM, DAMPING, GAIN, LAG, nominal_body
 from beetle_omni_ros.train.parameters import STRATA, TrainParameters
 
 NEAR_POSITION, NEAR_ANGLE = 0.3, 0.6   # [m], [rad] of a target near the present pose

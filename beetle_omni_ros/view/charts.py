@@ -49,7 +49,10 @@ class Run:
 
     def line(self, t: np.ndarray, values: np.ndarray, name: str = '', **style) -> go.Scatter:
         """Return a line through values (N,) at times (N,) [s] of the flight's clock."""
-        t, values = _thinned(*_interrupted(t - self.log.begin, values))
+        steps = np.diff(t)
+        gaps = np.flatnonzero(steps > max(STALE, 3 * np.median(steps))) + 1 if len(steps) else []
+        t, values = _thinned(np.insert(t, gaps, t[gaps]) - self.log.begin, np.insert(
+            np.asarray(values, dtype=float), gaps, np.nan))
         return go.Scatter(x=t.astype('f4'), y=values.astype('f4'), legendgroup=self.label,
                           name=f'{self.label}, {name}' if name else self.label, mode='lines',
                           line={'color': self.colour, 'width': 1.3, **style})
@@ -115,13 +118,6 @@ def _thinned(t, values):
     index = sorted({part[0] + of[part].argmax() for of in extremes
                     for part in np.array_split(np.arange(len(t)), MOST // 2)})
     return t[index], values[index]
-
-
-def _interrupted(t, values):
-    """Series with NaN in its gaps."""
-    steps = np.diff(t)
-    gaps = np.flatnonzero(steps > max(STALE, 3 * np.median(steps))) + 1 if len(steps) else []
-    return np.insert(t, gaps, t[gaps]), np.insert(np.asarray(values, dtype=float), gaps, np.nan)
 
 
 def _charts(runs):

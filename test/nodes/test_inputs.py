@@ -28,7 +28,7 @@ from beetle_omni_ros.nodes.node import ERROR, FlightNode, IDENTITY, Input
 from beetle_omni_ros.nodes.side_nodes import RecorderNode
 from beetle_omni_ros.nodes.sim_node import SimNode
 from beetle_omni_ros.robot.readings import ImuReading, JointReading
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.schema import RunError
 from beetle_omni_ros.runs.bag import read_bag, read_messages
 
 pytestmark = pytest.mark.real_time
@@ -147,7 +147,7 @@ def test_a_recorder_that_cannot_write_keeps_no_messages(make_bench, tmp_path, mo
     recorder = make_bench(f'bag:={tmp_path}/bag').add(RecorderNode())
 
     def full(*_):
-        raise ParameterError('bag: No space left on device')
+        raise RunError('bag: No space left on device')
     monkeypatch.setattr(recorder._bag, 'write_raw', full)
     for _ in range(3):
         recorder._keep('/odom', ALL['odom'].type, b'')

@@ -10,6 +10,13 @@ from beetle_omni_ros.robot.readings import BatteryReading, ImuReading, JointRead
 TICK = 0.005
 
 
+def targets_of(task, start):
+    """All targets of a flight of a task that starts at ``start`` [s]."""
+    begins = start + np.concatenate([[0.0], task.ends[:-1]])
+    return [segment.target(float(begin))
+            for begin, segment in zip(begins, task.segments, strict=True) if segment.target]
+
+
 def fly(recorder, task, *, start=1.0, controller='nmpc', offset=0.02, angle=3.0, approach=0.5,
         seed=0, duration=None, after=0.2):
     """
@@ -29,7 +36,7 @@ def fly(recorder, task, *, start=1.0, controller='nmpc', offset=0.02, angle=3.0,
 
     """
     rng = np.random.default_rng(seed)
-    targets = task.targets(start)
+    targets = targets_of(task, start)
     length = (task.duration if duration is None else duration) + after
     write_state(recorder, start - 1.0, 'takeoff')
     write_state(recorder, start - 0.01, f'flying:{controller}')

@@ -9,6 +9,7 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 from synthetic_flights import (
     fly,
+    targets_of,
     write_command,
     write_joints,
     write_odom,
@@ -81,7 +82,7 @@ def steady(task, position, write=write_truth, recorder=None):
     """
     recorder = recorder or LogRecorder()
     write_state(recorder, 0.0, 'flying:nmpc')
-    for k, target in enumerate(task if isinstance(task, list) else task.targets(1.0)):
+    for k, target in enumerate(task if isinstance(task, list) else targets_of(task, 1.0)):
         write_target(recorder, target)
         for t in np.arange(0, 8, 0.005):
             write(recorder, target.stamp + t, target.position + position(k, t), target.quaternion,
@@ -261,7 +262,7 @@ def test_the_level_at_which_control_was_lost_is_reported():
 def decaying(task, duration, period, lag):
     """Log of a hover with an error of 0.1 m at each disturbance, which decays with lag(t) [s]."""
     recorder = LogRecorder()
-    target, = task.targets(0.0)
+    target, = targets_of(task, 0.0)
     write_state(recorder, -1.0, 'flying:nmpc')
     write_target(recorder, target)
     for t in np.arange(0, duration + 0.001, 0.005):
@@ -304,7 +305,7 @@ def test_each_axis_has_its_own_step_response():
     task, recorder = make_task('steps'), LogRecorder()
     lags = [0.2 + 0.1 * k for k in range(6)]
     write_state(recorder, 0.0, 'flying:nmpc')
-    for k, target in enumerate(task.targets(1.0)):
+    for k, target in enumerate(targets_of(task, 1.0)):
         write_target(recorder, target)
         before, now = np.array(HOVER), task.poses[k]
         for t in np.arange(0.005, 8.001, 0.005) if k < 10 else ():  # no step of pitch and yaw

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from synthetic_flights import targets_of
 
 from beetle_omni_ros.control.base import TrajectoryTarget
 from beetle_omni_ros.robot import rotations
@@ -20,7 +21,7 @@ def test_every_named_task_plays_to_its_end(name):
             published.append(player.target)
         t += 0.005
     assert t - 10.0 == pytest.approx(task.duration, abs=0.01)
-    assert [p.stamp for p in published] == pytest.approx([p.stamp for p in task.targets(10.0)])
+    assert [p.stamp for p in published] == pytest.approx([p.stamp for p in targets_of(task, 10.0)])
 
 
 def test_random_poses_fill_the_stated_ranges_and_follow_the_seed():
@@ -45,7 +46,7 @@ def test_poses_are_refused_with_the_reason(poses, text):
 @pytest.mark.parametrize(('name', 'tilt'), [('lemniscate', 0.5), ('lemniscate_large', 2.5)])
 def test_each_round_of_the_lemniscate_is_the_curve_of_the_authors(name, tilt):
     period, task = 20.0, make_task(name)
-    path, = (target for target in task.targets(0.0) if isinstance(target, TrajectoryTarget))
+    path, = (target for target in targets_of(task, 0.0) if isinstance(target, TrajectoryTarget))
     for begin, end in task.rounds:
         assert end - begin == pytest.approx(period)
         for t in np.linspace(0, period, 101):

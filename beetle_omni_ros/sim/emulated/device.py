@@ -1,6 +1,6 @@
 """Base of the emulated devices: a serial port without hardware, served by a thread, and faults."""
 
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 import os
 from pathlib import Path
@@ -56,7 +56,7 @@ def switched_on(faults: ServoFaults | BoardFaults) -> list[str]:
             for name, value in vars(faults).items() if not np.array_equal(value, healthy[name])]
 
 
-class Device:
+class Device(AbstractContextManager):
     """
     The device's end of a serial cable, as a context manager.
 
@@ -74,9 +74,6 @@ class Device:
         self.plug()
         self._thread = Thread(target=self._run, name=f'emulated {name}', daemon=True)
         self._thread.start()
-
-    def __enter__(self):
-        return self
 
     def __exit__(self, *_):
         self.close()
