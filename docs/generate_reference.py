@@ -32,6 +32,8 @@ FILES = {
                             'The robot as measured logs show it.'),
     'robot_weak_and_heavy.yaml': ('robot.parameters:RobotParameters',
                                   'A robot with less thrust and more mass than in robot.yaml.'),
+    'crazyflie.yaml': ('robot.parameters:RobotParameters',
+                       'A conventional quadrotor, for recordings of others.'),
     'nmpc.yaml': ('control.nmpc:NmpcParameters', 'The NMPC.'),
     'nmpc_published.yaml': ('control.nmpc:NmpcParameters',
                             'The NMPC with the settings of the publication.'),

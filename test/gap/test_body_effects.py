@@ -49,6 +49,10 @@ def rotor_drag(x):
     return on_rotors(-x / 4 * speeds()[:, :, None] * split(MOTION.hubs)[1])
 
 
+def hub_moment(x):
+    return 0.0, (-x / 4 * speeds()[:, :, None] * np.cross(MOTION.normals, MOTION.hubs)).sum(axis=1)
+
+
 def body_drag(x):
     v = MOTION.velocity
     return MOTION.attitude.inv().apply(-x * np.linalg.norm(v, axis=1, keepdims=True) * v), 0.0
@@ -120,7 +124,8 @@ def mass(x):
 
 
 CASES = {
-    'rotor_drag.coefficient': (rotor_drag, 0.4), 'body_drag.coefficient': (body_drag, 0.1),
+    'rotor_drag.coefficient': (rotor_drag, 0.4), 'rotor_hub_moment.coefficient': (hub_moment, 0.1),
+    'body_drag.coefficient': (body_drag, 0.1),
     'axial_inflow.per_rotor': (axial_inflow, 0.4),
     'translational_lift.per_rotor': (translational_lift, 0.03),
     'tilt_thrust_loss.loss_at_60deg': (tilt_thrust_loss, 0.08),

@@ -223,14 +223,17 @@ class Engine:
             value = weight(chosen)
             if value > top:
                 best, top = chosen, value
+        visited = {best}        # pairwise gains need not be transitive
         while True:
             near = {tuple(sorted(set(best) - out | more))
                     for out in [set(), *({k} for k in best)]
                     for more in [set(), *({k} for k in allowed if k not in best)]}
-            gain, chosen = max((self.gain(judge, c, best), c) for c in near if len(c) <= MOST)
-            if gain <= 1e-9:
+            gain, chosen = max(((self.gain(judge, c, best), c) for c in near - visited
+                                if len(c) <= MOST), default=(0.0, best))
+            if gain <= 0:
                 break
             best = chosen
+            visited.add(best)
         weight(best)
         return Solution(self.names, self.entries, posteriors, best, posteriors[best].theta,
                         equations, judge, spectra)
