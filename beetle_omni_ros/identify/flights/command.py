@@ -213,7 +213,8 @@ def _named(engine: Engine, solution: Solution, alpha: float) -> list[tuple[int, 
         if needed < log(1 / alpha):
             continue
         rivals = [(gain(solution.judge, tuple(sorted(rest | {j})), best), j)
-                  for j in range(len(solution.entries)) if j not in best]
+                  for j in range(len(solution.entries))
+                  if j not in best and j not in solution.banned]
         members = [k, *(j for less, j in sorted(rivals, reverse=True) if less > log(alpha))]
         named.append((-needed, k, members))
     return [(k, members) for _, k, members in sorted(named)]

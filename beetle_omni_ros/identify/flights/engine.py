@@ -249,9 +249,9 @@ class Engine:
         left = total = 0.0
         for k, (flight, found) in enumerate(zip(self.flights, solution.spectra, strict=True)):
             own = [c for c, name in enumerate(flight.channels) if name.startswith(group)]
-            theta = np.concatenate([solution.theta, np.zeros(len(self.names) - self.known)])
-            theta[self.known:] = solution.equations.of_generic(solution.theta)
-            x = theta + solution.equations.of_flight(k, solution.theta)
+            # without the generic discrepancy, which predicts what feedback leaves
+            x = solution.equations.of_flight(k, solution.theta)
+            x[:self.known] += solution.theta
             moving = found.band > 0
             left += (((found.residual + found.slopes @ x) / np.sqrt(np.diagonal(
                 found.noise, axis1=1, axis2=2))[found.band])[:, moving][:, :, own]**2).sum()
