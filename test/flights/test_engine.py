@@ -175,6 +175,23 @@ def test_what_a_format_lacks_is_listed_with_its_reason(tmp_path):
     assert not groups['acceleration']['used'] and not groups['joint']['used']
 
 
+def test_flights_on_the_ground_and_other_channels_are_told_by_name(tmp_path):
+    good = write_flight(tmp_path / 'good.csv', 1, seconds=20)
+    lines = good.read_text().splitlines()
+    ground = tmp_path / 'ground.csv'
+    cells = [line.split(',') for line in lines]
+    ground.write_text('\n'.join([lines[0], *(','.join([*c[:3], '0', *c[4:]])
+                                             for c in cells[1:])]))
+    assert table_results([ground], [], 'nanobench', ROBOT)['verdict'] == 'bad_data'
+    result = table_results([good, ground], [], 'nanobench', ROBOT)
+    assert result['findings'] == ['ground.csv: not used, no block of commands and measurements '
+                                  'in the air']
+    blind = tmp_path / 'blind.csv'
+    blind.write_text('\n'.join([lines[0], *(','.join([*c[:8], '', *c[9:]]) for c in cells[1:])]))
+    with pytest.raises(ParameterError, match='blind.csv: its channels are force_y'):
+        table_results([good, blind], [], 'nanobench', ROBOT)
+
+
 def test_duty_needs_a_robot_with_a_motor_map(tmp_path):
     flight = write_flight(tmp_path / 'a.csv', 1, seconds=5)
     with pytest.raises(ParameterError, match="'rotors.motor' is missing"):

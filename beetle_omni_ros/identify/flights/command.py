@@ -85,6 +85,8 @@ def table_results(runs: Sequence[Path], holdout: Sequence[Path], form: str,
         write_corrected(apply, result, model, robot)
     console.print(headline(result), style='bold', highlight=False, markup=False)
     console.print(result['summary'], highlight=False, markup=False)
+    for finding in result['findings']:
+        console.print(finding, style='dim', highlight=False, markup=False)
     print_grids(grids(result), console)
     if result['next_experiment']:
         console.print(f"Next: {result['next_experiment']}", highlight=False, markup=False)
@@ -132,6 +134,13 @@ def _judged(flights, judging, robot, declared, alpha, progress):
         return _result('bad_data', groups, summary=(
             f'No flight can be used: {flights[0].name} has no block of commands and measurements '
             'in the air.'), false_alarm_probability=None)
+    for flight in [*usable, *judging]:
+        if flight.usable and flight.channels != usable[0].channels:
+            raise ParameterError(f'{flight.name}: its channels are '
+                                 f"{', '.join(flight.channels)}, expected those of "
+                                 f"{usable[0].name}: {', '.join(usable[0].channels)}")
+    findings = [f'{flight.name}: not used, no block of commands and measurements in the air'
+                for flight in [*flights, *judging] if not flight.usable]
     engine, keys = _engine(usable, robot, declared, alpha, progress)
     solution = engine.run()
     if groups['torque']['used'] and engine.explained(solution, 'torque') < EXPLAINED:
@@ -159,7 +168,7 @@ def _judged(flights, judging, robot, declared, alpha, progress):
         verdict, groups, effects=effects if verdict != 'not_decidable' else [],
         partial=effects if verdict == 'not_decidable' else [],
         candidates=_candidates(solution, named), where=_where(engine, solution),
-        false_alarm_probability=error, held_out=bool(judging), **gap,
+        false_alarm_probability=error, held_out=bool(judging), findings=findings, **gap,
         next_experiment=separating_experiment(unclear[0]) if unclear else None,
         summary=_summary(verdict, sets, error, solution))
 
@@ -167,7 +176,7 @@ def _judged(flights, judging, robot, declared, alpha, progress):
 def _result(verdict, groups, summary, **more):
     base = {'verdict': verdict, 'effects': [], 'partial': [], 'where': [], 'closure': None,
             'gap_before': None, 'gap_after': None, 'noise_floor': None, 'candidates': [],
-            'next_experiment': None, 'groups': groups, 'summary': summary}
+            'next_experiment': None, 'groups': groups, 'summary': summary, 'findings': []}
     return base | more
 
 
@@ -192,7 +201,8 @@ def _groups(flight, declared):
         'not compared for tables'
     groups['rate'] = {'used': False, 'channels': [], 'reason': why}
     groups['joint'] = {'used': False, 'channels': [],
-                       'reason': 'no commands and readings of tilts'}
+                       'reason': 'not compared for tables' if 'tilt' in signals
+                       else 'the rotors do not tilt'}
     return groups
 
 

@@ -32,9 +32,10 @@ class Solution:
         names: keys.
         entries: catalogue entries.
         posteriors: set of indices of entries -> evidence and estimate.
-        log_prior: of sets, by their size.
         best: most probable set.
         theta: (K,) mean of the keys with the best set.
+        unsteady: named entry -> gain of one value for each group of bands over one value [nat].
+        banned: entry that was excluded for this -> its gain.
 
     """
 
@@ -48,10 +49,6 @@ class Solution:
     spectra: list[Spectrum] = field(default_factory=list)
     unsteady: dict[int, float] = field(default_factory=dict)
     banned: dict[int, float] = field(default_factory=dict)
-
-    def log_weight(self, chosen: tuple[int, ...]) -> float:
-        """Ln of prior times evidence of a set."""
-        return log_prior(len(chosen), len(self.entries)) + self.posteriors[chosen].gain
 
     @property
     def e_value(self) -> float:
@@ -76,6 +73,8 @@ class Engine:
         spreads: their priors.
         entries: catalogue entries that may be named.
         positive: keys that cannot be negative.
+        far: keys whose deviation may be many times typical.
+        alpha: accepted probability of a false alarm.
         progress: gets a short text at each stage.
 
     """

@@ -23,7 +23,7 @@ SIZE = {'N': (1, 0), 'N s/m': (1, 0), 'N s^2/m^2': (1, 0), 'N m': (1, 1), 'N m s
         'm': (0, 1), 'kg m': (1, 1), 'kg m^2': (1, 2)}
 # Standard deviations between the flights of one vehicle, by key.
 FLIGHT = {'thrust_coefficient.scale': 0.017, 'rotor_thrust_coefficient.scale': 0.01,
-          'imu_accelerometer_bias.bias': 0.05, 'imu_gyroscope_bias.bias': 0.004,
+          'imu_accelerometer_bias.bias': 0.05,
           'imu_misalignment.rotation': 0.002, 'rotor_dead_time.delay': 0.002}
 FLIGHT_OFFSET = 0.0033          # share of the arm: centre of mass, repeats of one vehicle
 

@@ -178,8 +178,7 @@ class TableFlight:
     def _thrust(self, theta):
         """Thrusts after delay and lag (N, 4) [N] and their rates."""
         rotors, command = self.robot.rotors, self._command
-        delay = sum(self.robot.command_delays[1:]) + sum(theta.get(key, 0.0) for key in DELAYS) \
-            + theta.get('imu_filter_lag.delay', 0.0)
+        delay = sum(self.robot.command_delays[1:]) + sum(theta.get(key, 0.0) for key in DELAYS)
         if 'duty' in self.table.values:
             motor = self._motor
             exponent = self.robot.effect('voltage_sag.exponent', 0.0) \

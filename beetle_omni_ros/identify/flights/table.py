@@ -167,11 +167,6 @@ class Table:
         """Count of the grid's points."""
         return len(next(iter(self.values.values())))
 
-    def has(self, signal: str, component: int = 0) -> bool:
-        """Whether one component of a signal has samples."""
-        return signal in self.values and bool(
-            np.isfinite(self.values[signal][:, component]).any())
-
 
 def read_flight(path: Path, form: Format) -> Table:
     """
