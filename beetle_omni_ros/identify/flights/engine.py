@@ -9,9 +9,16 @@ from math import comb, log
 
 import numpy as np
 
+from beetle_omni_ros.identify.flights.discrepancy import discrepancies
 from beetle_omni_ros.identify.flights.evidence import Judge, Normal, normal, Posterior
 from beetle_omni_ros.identify.flights.priors import Entry, Spread
-from beetle_omni_ros.identify.flights.spectrum import EDGES, pooled, Spectrum, spectrum
+from beetle_omni_ros.identify.flights.spectrum import (
+    EDGES,
+    pooled,
+    Spectrum,
+    spectrum,
+    whitening,
+)
 
 FREE = 100.0            # typical deviations that known effects may have while noise is learned,
                         # so that the noise holds nothing that they explain
@@ -82,6 +89,7 @@ class Engine:
     def __init__(self, flights: Sequence, names: list[str], spreads: dict[str, Spread],
                  entries: list[Entry], positive: frozenset[str] = frozenset(),
                  far: frozenset[str] = frozenset(), alpha: float = 0.05,
+                 curved: frozenset[str] = frozenset(),
                  progress: Callable[[str], None] = lambda text: None):
         self.flights, self.names, self.entries = list(flights), list(names), list(entries)
         self.narrow, self.typical, self.flight = (np.array(
@@ -90,16 +98,20 @@ class Engine:
         self.positive = np.array([name in positive for name in names])
         self.index = {name: k for k, name in enumerate(names)}
         self._generic()
+        self.filters = [None] * len(self.flights)
+        body = np.array([c.split('_')[0] in ('force', 'torque') for c in self.channels])
+        self.groups = [g for g in (np.flatnonzero(body), np.flatnonzero(~body)) if len(g)]
         self.owner = np.zeros(self.known, dtype=int)
         for k, entry in enumerate(self.entries):
             self.owner[[self.index[key] for key in entry.keys]] = k
         self.progress, self.alpha = progress, alpha
         self.far = np.array([name in far for name in self.names[:self.known]])
+        self.curved = np.array([name in curved for name in self.names[:self.known]])
 
     def _generic(self):
         """Keys of the generic discrepancy: weights of features, by rotors and by world forces."""
         self.channels = self.flights[0].channels
-        self.generic = [flight.discrepancy() for flight in self.flights]
+        self.generic = discrepancies(self.flights)
         sources, count = self.generic[0].shape[2:]
         self.known = len(self.names)
         index = self.known + np.arange(sources * count).reshape(sources, count)
@@ -116,18 +128,29 @@ class Engine:
         """Relinearise, learn the noise and search, several times."""
         theta = np.zeros(len(self.names))
         etas = np.zeros((len(self.flights), len(self.names)))
-        for _ in range(2):      # to a point near the flights, before any noise is learned
-            theta, etas = self._flexible(self._spectra(theta, etas))
+        self._learn(spectra := self._spectra(theta, etas))
+        self.filters = [whitening(np.diagonal(s.noise, axis1=1, axis2=2), f.period)
+                        for s, f in zip(spectra, self.flights, strict=True)]
         for turn in range(ROUNDS):
             self.progress(f'linearising, {turn + 1} of {ROUNDS}')
+            for flight, eta in zip(self.flights, etas, strict=True):
+                flight.settle(dict(zip(self.names, (theta + eta)[:self.known], strict=False)))
             spectra = self._spectra(theta, etas)
             self.narrow[self.known:] = self.start[self.known:]
-            self._learn(spectra)
+            if turn:
+                for each, before in zip(spectra, known, strict=True):
+                    each.noise = before
+            self._learn(spectra, 2 if turn else 5)
+            known = [each.noise for each in spectra]
             self.progress(f'weighing effects, {turn + 1} of {ROUNDS}')
             solution = self._steady(spectra)
-            etas = np.array([solution.equations.of_flight(k, solution.theta)
+            etas = np.array([solution.equations.of_flight(k, solution.theta)[:len(self.names)]
                              for k in range(len(spectra))])
-            theta[:self.known] = solution.theta
+            theta[:self.known] = solution.theta[:self.known]
+            theta[:self.known][self.curved] = 0.0
+            own = self.indices(solution.best)
+            theta[own] = solution.theta[own]
+            etas[:, :self.known][:, self.curved] = 0.0
         return solution
 
     def _steady(self, spectra):
@@ -140,8 +163,8 @@ class Engine:
         """
         banned: dict[int, float] = {}
         while True:
-            solution = self._search(spectra, frozenset(banned))
-            self._constancy(solution)
+            solution = self._search(spectra, banned)
+            self._constancy(solution, banned)
             worst = max(solution.unsteady, key=solution.unsteady.get, default=None)
             if worst is None or solution.unsteady[worst] <= 0:
                 solution.banned = banned
@@ -150,16 +173,17 @@ class Engine:
 
     def _spectra(self, theta, etas):
         spectra = []
-        for flight, eta, phi in zip(self.flights, etas, self.generic, strict=True):
-            at = theta + eta
-            linear = flight.linear(dict(zip(self.names[:self.known], at, strict=False)),
+        for flight, eta, phi, own in zip(self.flights, etas, self.generic, self.filters,
+                                         strict=True):
+            at = (theta + eta)[:self.known]
+            linear = flight.linear(dict(zip(self.names, at, strict=False)),
                                    self.names[:self.known])
             # linear about the robot file
-            residual = linear.residual - linear.slopes @ at[:self.known]
+            residual = linear.residual - linear.slopes @ at
             floor = np.array([FLOORS[c.split('_')[0]] for c in flight.channels])
             slopes = np.concatenate([linear.slopes, -phi.reshape(*residual.shape, -1)], axis=2)
             found = spectrum(residual, slopes, flight.mask, flight.period, floor,
-                             flight.highest)
+                             flight.highest, own, self.groups)
             spectra.append(found)
         return spectra
 
@@ -167,12 +191,6 @@ class Engine:
         """(K,) prior deviations of a fit in which every key may be far from the file."""
         return np.hypot(self.narrow, np.concatenate([np.where(self.far, FREE, 1), np.zeros(
             len(self.names) - self.known)]) * self.typical)
-
-    def _flexible(self, spectra):
-        """Deviations, and those of each flight, of a fit of everything."""
-        equations = normal(spectra, self.names, self.flight)
-        theta = np.linalg.solve(equations.info + np.diag(self._wide()**-2), equations.right)
-        return theta, np.array([equations.of_flight(k, theta) for k in range(len(spectra))])
 
     def _learn(self, spectra, passes=8):
         """Learn noise and discrepancy around a fit in which every key may be far."""
@@ -203,9 +221,9 @@ class Engine:
         return [self.index[key] for k in chosen for key in self.entries[k].keys]
 
     def _search(self, spectra, banned):
-        k = self.known
-        equations = normal(spectra, self.names, self.flight, generic=self.narrow[k:])
-        judge = self._judge(equations)
+        equations, keys, copies, _ = self._split(spectra, banned)
+        wide = np.tile(self.typical[keys], copies)
+        judge = self._judge(equations, form=wide, size=wide)
         posteriors: dict[tuple[int, ...], Posterior] = {}
         count = len(self.entries)
 
@@ -216,7 +234,13 @@ class Engine:
 
         best: tuple[int, ...] = ()
         top = weight(best)
-        allowed = [k for k in range(count) if k not in banned]
+        # of the variants of an entry, the one that explains most alone
+        variants: dict[tuple, int] = {}
+        for k in (k for k in range(count) if k not in banned):
+            same = self.entries[k].name, self.entries[k].member
+            if same not in variants or weight((k,)) > weight((variants[same],)):
+                variants[same] = k
+        allowed = list(variants.values())
         singles: list[tuple[int, ...]] = [(k,) for k in allowed]
         for chosen in (*singles, *combinations(allowed, 2)):
             value = weight(chosen)
@@ -249,8 +273,8 @@ class Engine:
         for k, (flight, found) in enumerate(zip(self.flights, solution.spectra, strict=True)):
             own = [c for c, name in enumerate(flight.channels) if name.startswith(group)]
             # without the generic discrepancy, which predicts what feedback leaves
-            x = solution.equations.of_flight(k, solution.theta)
-            x[:self.known] += solution.theta
+            x = solution.equations.of_flight(k, solution.theta)[:len(self.names)]
+            x[:self.known] += solution.theta[:self.known]
             moving = found.band > 0
             left += (((found.residual + found.slopes @ x) / np.sqrt(np.diagonal(
                 found.noise, axis1=1, axis2=2))[found.band])[:, moving][:, :, own]**2).sum()
@@ -260,25 +284,76 @@ class Engine:
                 found.noise, axis1=1, axis2=2))[found.band])[:, moving][:, :, own]**2).sum()
         return 1 - left / total
 
-    def _constancy(self, solution):
+    def _split(self, spectra, banned, entry=None):
+        """
+        Normal equations with separate values for the groups of bands, and their judge.
+
+        Excluded entries have a value of typical size in each group always: what feedback makes of
+        them must not be explained by others. ``entry`` has a deviation by the error of its form.
+        """
+        bands = np.array([0, *np.searchsorted(GROUPS, EDGES[:-1], side='right') - 1])
+        copies = int(bands.max()) + 1
+        own = np.array(self.indices((entry,)) if entry is not None else [], dtype=int)
+        free = np.array(self.indices(tuple(banned)), dtype=int)
+        keys = np.concatenate([own, free])
+        equations = normal(spectra, self.names, self.flight, keys, bands,
+                           self.narrow[self.known:])
+        return equations, keys, copies, len(own)
+
+    def _constancy(self, solution, banned):
         """
         Gain [nat] of one value for each group of bands over one value, of each named entry.
 
         One value admits the error of the entry's form in each group of bands.
         """
-        bands = np.array([0, *np.searchsorted(GROUPS, EDGES[:-1], side='right') - 1])
-        copies = int(bands.max()) + 1
         named = self.indices(solution.best)
         for k in solution.best:
-            keys = np.array(self.indices((k,)))
-            split = normal(solution.spectra, self.names, self.flight, keys, bands,
-                           self.narrow[self.known:])
+            if not self.entries[k].of_body:
+                continue        # no command reaches its channels
+            split, keys, copies, count = self._split(solution.spectra, banned, k)
             size = np.maximum(self.typical[keys], np.abs(solution.theta[keys]))
             form = np.maximum(self.narrow[keys], FORM * np.abs(solution.theta[keys]))
+            form[count:] = self.typical[keys[count:]]
             judge = self._judge(split, np.hypot(self.narrow, self.typical * 9), named,
                                 np.tile(form, copies), np.tile(size, copies))
-            solution.unsteady[k] = judge.posterior(range(
-                self.known, self.known + copies * len(keys))).gain
+            own = self.known + (np.arange(copies)[:, None] * len(keys) + np.arange(count)).ravel()
+            solution.unsteady[k] = judge.posterior(own).gain
+
+    def remainder(self, solution: Solution) -> tuple[float, np.ndarray, int]:
+        """
+        Whether the generic discrepancy predicts flights on which it was not fitted.
+
+        Returns:
+            mean gain of a block over its standard error, (C,) RMS of the predicted discrepancy in
+            the units of the channels, and the number of blocks.
+
+        """
+        parts = [(k, s, None) for k, s in enumerate(solution.spectra)]
+        if len(parts) == 1:
+            spectrum, half = solution.spectra[0], len(solution.spectra[0].residual) // 2
+            parts = [(0, spectrum.blocks(rows), rows)
+                     for rows in (slice(0, half), slice(half, None))]
+        prior = self.narrow.copy()
+        own = self.indices(solution.best)
+        prior[own] = np.hypot(prior[own], np.maximum(
+            9 * self.typical[own], np.abs(solution.theta[own])))
+        known, gains, squares, count = self.known, [], 0.0, 0
+        for held, (flight, spectrum, _) in enumerate(parts):
+            rest = normal([s for k, (_, s, _) in enumerate(parts) if k != held], self.names,
+                          self.flight)
+            with_it = np.linalg.solve(rest.info + np.diag(prior**-2), rest.right)
+            without = np.zeros(len(prior))
+            without[:known] = np.linalg.solve(
+                rest.info[:known, :known] + np.diag(prior[:known]**-2), rest.right[:known])
+            move, test = with_it - without, normal([spectrum], self.names, self.flight)
+            gains.append((test.scores - test.slopes @ without) @ move
+                         - 0.5 * np.einsum('i,bij,j->b', move, test.slopes, move))
+            phi, mask = self.generic[flight], self.flights[flight].mask
+            squares += ((phi.reshape(*phi.shape[:2], -1) @ with_it[known:])**2 * mask).sum(axis=0)
+            count += mask.sum(axis=0)
+        gains = np.concatenate(gains)
+        error = gains.std(ddof=1) / np.sqrt(len(gains))
+        return float(gains.mean() / error), np.sqrt(squares / np.maximum(count, 1)), len(gains)
 
     def disagreement(self, solution: Solution) -> list[tuple[str, float, float]]:
         """Channel, RMS of the file's residual over the noise, RMS of the discrepancy."""
@@ -305,9 +380,10 @@ class Engine:
         """
         keep = self.flights, self.generic
         self.flights = list(flights)
-        self.generic = [flight.discrepancy() for flight in flights]
+        self.generic = discrepancies(self.flights)
         zeros = np.zeros((len(flights), len(self.names)))
-        theta = np.concatenate([solution.theta, np.zeros(len(self.names) - self.known)])
+        theta = np.concatenate([solution.theta[:self.known],
+                                np.zeros(len(self.names) - self.known)])
         spectra = self._spectra(theta, zeros)
         self.flights, self.generic = keep
         noise, total, count = pooled(solution.spectra), np.zeros(3), 0

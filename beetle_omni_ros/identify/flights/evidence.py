@@ -56,7 +56,8 @@ class Normal:
 
     def of_flight(self, k: int, theta: np.ndarray) -> np.ndarray:
         """(K,) deviations of flight k from the common ``theta`` (K,)."""
-        theta = np.concatenate([theta, self.of_generic(theta)])
+        count = len(self.names)
+        theta = np.concatenate([theta[:count], self.of_generic(theta), theta[count:]])
         own, inner, left, right = self.flights[k]
         eta = np.zeros(len(theta))
         eta[own] = inner @ (right - left @ theta)
@@ -209,7 +210,7 @@ class Judge:
             free = np.isin(c, list(chosen))
             prior = np.where(free, slab, self.narrow[c])
             value = _log_density(estimate, wide, prior) \
-                - price * len(np.unique(self.owner[c[free]]))
+                - price * len(np.unique(self.owner[c[free & self.far[c]]]))
             value += sum(self._orthant(estimate, wide, prior, k)
                          for k in np.flatnonzero(self.positive[c]))
             total += sign * value

@@ -44,6 +44,7 @@ class Entry:
     name: str
     keys: tuple[str, ...]
     member: int | None = None
+    of_body: bool = True        # acts on forces and torques alone
 
     @property
     def label(self) -> str:
@@ -85,6 +86,7 @@ def entries_of(keys: dict[str, Key]) -> list[Entry]:
         effect = CATALOGUE[name]
         own = tuple(key for parameter in effect.numbers for key in names_of(name, parameter)
                     if key in keys)
-        result += [Entry(name, (key,), k + 1) for k, key in enumerate(own)] \
-            if effect.each else [Entry(name, own)]
+        body = effect.channels == 'B'
+        result += [Entry(name, (key,), k + 1, body) for k, key in enumerate(own)] \
+            if effect.each else [Entry(name, own, None, body)]
     return result

@@ -27,7 +27,6 @@ AIRBORNE = 0.15         # [m] above the first position, one rotor diameter: no c
 MEMORY = 2.0            # rotor time constants after which a lost command is forgotten
 BRIDGED = 0.06          # [s] gaps of inputs that interpolation bridges, about a rotor lag
 FULL = 0.995            # share of full duty from which a command is saturated
-WAVES = 5               # random features of the discrepancy
 PHASE = 0.1             # [rad] error by wrong stamps up to which a frequency counts
 SMOOTH = 0.05           # [s] moving average of positions before their derivative
 DELAYS = ('rotor_dead_time.delay', 'command_latency.delay')
@@ -252,37 +251,18 @@ class TableFlight:
         return Linear(self._measured - now[:, self._chosen], slopes[:, self._chosen],
                       self._measured)
 
-    def discrepancy(self) -> np.ndarray:
-        """
-        (N, C, 7, P) generic discrepancy: channels by the thrust of each rotor and world forces.
+    @property
+    def motion(self) -> dict[str, np.ndarray]:
+        """Velocity (world), quaternion, position and tilts of the samples."""
+        return self._inputs
 
-        The features, of order one, are velocity in the body [m/s], tilt of the body [0.3 rad],
-        height [m], time [min] and cosines of random directions among these. Thrusts and forces
-        are of relative size one: the thrust itself, and the weight.
-        """
-        robot, inputs = self.robot, self._inputs
-        rotation = Rotation.from_quat(inputs['quaternion']).as_matrix()
-        velocity = np.einsum('nji,nj->ni', rotation, inputs['velocity'])
-        height = inputs['position'][:, 2:] - inputs['position'][:, 2:].mean()
-        plain = np.concatenate([velocity, rotation[:, 2, :2] / 0.3, height,
-                                self._t[:, None] / 60], axis=1)
-        rng = np.random.default_rng(0)
-        waves = np.cos(plain @ rng.normal(size=(plain.shape[1], WAVES)) + rng.uniform(
-            0, 2 * np.pi, WAVES))
-        features = np.concatenate([plain, waves], axis=1)
-        acting = np.zeros((len(plain), 6, 7))
-        places, axis = robot.rotors.positions, np.array([0.0, 0.0, 1.0])
-        for i in range(4):
-            tilt, yaw = inputs['tilt'][:, i], robot.rotors.arm_yaw[i]
-            axis = np.stack([np.sin(tilt) * np.sin(yaw), -np.sin(tilt) * np.cos(yaw),
-                             np.cos(tilt)], axis=1) * robot.hover_thrust
-            acting[:, :3, i] = axis / robot.mass
-            acting[:, 3:, i] = np.cross(places[i], axis) / robot.inertia
-        acting[:, :3, 4:] = rotation.transpose(0, 2, 1) * robot.gravity
-        # A force linear in velocity is the form of drag; as a discrepancy it would replace drag.
-        world = np.concatenate([0 * plain[:, :3], plain[:, 3:], waves], axis=1)
-        factor = np.stack([*[features] * 4, *[world] * 3], axis=1)
-        return acting[:, self._chosen, :, None] * factor[:, None]
+    @property
+    def time(self) -> np.ndarray:
+        """(N,) times of the samples [s]."""
+        return self._t
+
+    def settle(self, theta: dict[str, float]) -> None:
+        """Choose inputs that depend on deviations; a table has none."""
 
     def _full(self, theta):
         inputs, body_theta = self._at(theta)

@@ -11,13 +11,16 @@ not make the noise look small.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.fft import dct
+from scipy.signal import fftconvolve
 
 BLOCK = 8.0         # [s] of a block: longer than the memory of a flight controller
-EDGES = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)    # [Hz] of the bands; the first is the mean alone
+EDGES = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 25.0)  # [Hz] of the bands; the first is the mean alone
+MANY = 4            # times as many coefficients as keys: the variance of the fit is negligible
+TAPS = 1.0          # [s] length of a whitening filter
 LEAST = 0.25         # share of a block that must count
 
 
@@ -40,7 +43,10 @@ class Spectrum:
     band: np.ndarray
     noise: np.ndarray
     floor: np.ndarray
+    groups: list[np.ndarray]
+    level: bool = False
     _kept: tuple | None = None
+    _parts: list = field(default_factory=list)
 
     def grams(self) -> tuple[np.ndarray, np.ndarray]:
         """
@@ -55,24 +61,45 @@ class Spectrum:
             self._kept = self._grams()
         return self._kept
 
+    def blocks(self, rows: slice) -> Spectrum:
+        """The spectrum of some blocks."""
+        return replace(self, residual=self.residual[rows], slopes=self.slopes[rows], _kept=None,
+                       _parts=[])
+
     def power(self) -> float:
         """Sum of squares of the whitened residual."""
         inverse = np.linalg.inv(self.noise)[self.band]
         return float(np.einsum('bfc,fcd,bfd->', self.residual, inverse, self.residual))
 
+    def _bands(self):
+        """Range of frequencies of each band."""
+        edges = np.searchsorted(self.band, np.arange(len(self.noise) + 1))
+        return [slice(a, b) for a, b in zip(edges, edges[1:], strict=False)]
+
     def _grams(self):
         blocks, _, _, count = self.slopes.shape
         bands = len(self.noise)
         info, right = np.zeros((blocks, bands, count, count)), np.zeros((blocks, bands, count))
-        for k in range(bands):
-            own = self.band == k
-            root = np.linalg.inv(np.linalg.cholesky(self.noise[k]))
-            s = np.einsum('cd,bfdk->bfck', root, self.slopes[:, own])
-            r = self.residual[:, own] @ root.T
-            s, r = s.reshape(blocks, -1, count), r.reshape(blocks, -1)
-            info[:, k] = s.transpose(0, 2, 1) @ s
-            right[:, k] = -(s.transpose(0, 2, 1) @ r[..., None])[..., 0]
+        for channels, keys, slopes in self.parts:
+            for k, own in enumerate(self._bands()):
+                noise = self.noise[k][np.ix_(channels, channels)]
+                root = np.linalg.inv(np.linalg.cholesky(noise))
+                s = root @ slopes[:, own]
+                r = self.residual[:, own, channels] @ root.T
+                s, r = s.reshape(blocks, -1, len(keys)), r.reshape(blocks, -1)
+                info[:, k, keys[:, None], keys] += s.transpose(0, 2, 1) @ s
+                right[:, k, keys] -= (s.transpose(0, 2, 1) @ r[..., None])[..., 0]
         return info, right
+
+    @property
+    def parts(self) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """Groups of channels with common noise, keys that act on them, and slopes by these."""
+        if not self._parts:
+            for channels in self.groups:
+                own = self.slopes[:, :, channels]
+                keys = np.flatnonzero(np.abs(own).max(axis=(0, 1, 2)) > 0)
+                self._parts.append((channels, keys, np.ascontiguousarray(own[..., keys])))
+        return self._parts
 
     def learn(self, x: np.ndarray, covariance: np.ndarray, prior: np.ndarray,
               weight: float) -> None:
@@ -87,15 +114,24 @@ class Spectrum:
 
         """
         self._kept = None
-        left = self.residual + self.slopes @ x
-        spread = self.slopes @ covariance
-        for k in range(len(self.noise)):
-            own = self.band == k
-            e, w, j = (part[:, own].reshape(-1, *part.shape[2:])
-                       for part in (left, spread, self.slopes))
-            total = e.T @ e + np.einsum('nck,ndk->cd', w, j, optimize=True)
-            self.noise[k] = (total + weight * prior[k]) / (len(e) + weight) \
-                + np.diag(self.floor**2)
+        for channels, keys, slopes in self.parts:
+            of_keys = covariance[np.ix_(keys, keys)]
+            totals, counts = [], []
+            for own in self._bands():
+                j = slopes[:, own].reshape(-1, len(channels), len(keys))
+                e = self.residual[:, own, channels].reshape(len(j), -1) + j @ x[keys]
+                total = e.T @ e
+                if len(j) < MANY * len(keys):
+                    w = (j.reshape(-1, len(keys)) @ of_keys).reshape(j.shape)
+                    total = total + np.einsum('nck,ndk->cd', w, j, optimize=True)
+                totals.append(total)
+                counts.append(len(j))
+            if self.level:
+                totals, counts = [sum(totals)] * len(totals), [sum(counts)] * len(counts)
+            for k, (total, size) in enumerate(zip(totals, counts, strict=True)):
+                at = np.ix_([k], channels, channels)
+                self.noise[at] = (total + weight * prior[at][0]) / (size + weight) \
+                    + np.diag(self.floor[channels]**2)
 
 
 def blocks_of(mask: np.ndarray, period: float) -> np.ndarray:
@@ -110,7 +146,8 @@ def blocks_of(mask: np.ndarray, period: float) -> np.ndarray:
 
 
 def spectrum(residual: np.ndarray, slopes: np.ndarray, mask: np.ndarray, period: float,
-             floor: np.ndarray, highest: float) -> Spectrum:
+             floor: np.ndarray, highest: float, filters: np.ndarray | None = None,
+             groups: list[np.ndarray] | None = None) -> Spectrum:
     """
     Cosine coefficients of a flight that has blocks.
 
@@ -123,6 +160,19 @@ def spectrum(residual: np.ndarray, slopes: np.ndarray, mask: np.ndarray, period:
         highest: largest frequency that counts [Hz].
 
     """
+    groups = groups or [np.arange(residual.shape[1])]
+    if filters is not None:
+        residual, slopes, mask = residual.copy(), slopes.copy(), mask.copy()
+        warm = int(0.5 / period)
+        for c in range(residual.shape[1]):
+            there = mask[:, c]
+            r, s = residual[:, c] * there, slopes[:, c] * there[:, None]
+            used = np.flatnonzero(np.abs(s).max(axis=0) > 0)
+            residual[:, c] = fftconvolve(r, filters[c])[:len(r)]
+            slopes[:, c, used] = fftconvolve(s[:, used], filters[c][:, None], axes=0)[:len(r)]
+            lost = np.convolve(~there, np.ones(warm))[:len(there)] > 0
+            lost[:warm] = True
+            mask[:, c] &= ~lost
     rows = blocks_of(mask, period)
     weight, size = mask[rows], rows.shape[1]
     frequency = np.arange(size) / (2 * size * period)
@@ -134,7 +184,32 @@ def spectrum(residual: np.ndarray, slopes: np.ndarray, mask: np.ndarray, period:
     for k in np.unique(band):
         own = coefficients[:, band == k].reshape(-1, coefficients.shape[2])
         noise[k] += np.diag((own**2).mean(axis=0))
-    return Spectrum(coefficients, derivatives, band, noise, floor)
+    return Spectrum(coefficients, derivatives, band, noise, floor, groups, filters is not None)
+
+
+def whitening(power: np.ndarray, period: float) -> np.ndarray:
+    """
+    Causal filters (C, L) that make noise white, of its power (bands, C) in each band.
+
+    The filter is the minimum phase one, by the cepstrum. In a closed loop commands depend on past
+    noise, and only innovations are independent of it.
+    """
+    n = 4096
+    frequency = np.fft.rfftfreq(n, period)
+    top = 0.5 / period
+    edges = [e for e in EDGES if e < top] + [top]
+    middle = np.sqrt(np.maximum(edges[1:-1], 1e-9) * np.array(edges[2:]))
+    middle = np.concatenate([[edges[1] / 2], middle])
+    taps = int(TAPS / period)
+    out = np.zeros((power.shape[1], taps))
+    for c in range(power.shape[1]):
+        density = np.exp(np.interp(np.log(np.maximum(frequency, 1e-3)), np.log(middle),
+                                   np.log(power[1:len(middle) + 1, c])))
+        cepstrum = np.fft.irfft(-0.5 * np.log(density))
+        cepstrum[1:n // 2] *= 2
+        cepstrum[n // 2 + 1:] = 0
+        out[c] = np.fft.irfft(np.exp(np.fft.rfft(cepstrum)))[:taps]
+    return out
 
 
 def pooled(spectra: list[Spectrum]) -> np.ndarray:

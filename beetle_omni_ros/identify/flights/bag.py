@@ -1,0 +1,184 @@
+"""
+Residuals of a flight that was recorded as a bag, with their slopes.
+
+Four groups of channels are compared on one grid:
+
+- force and torque: specific force and angular acceleration minus the body equations at the
+  measured tilts,
+- acceleration: of MoCap minus that of the IMU; independent of the robot's model,
+- rate: of MoCap minus gyroscope; independent of the robot's model,
+- joint: encoders minus servos that are simulated from the commands.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+
+from beetle_omni_ros.identify.flights.residual import Linear
+from beetle_omni_ros.identify.flights.spectrum import blocks_of
+from beetle_omni_ros.identify.gap.keys import LIMITS
+from beetle_omni_ros.identify.gap.residual import BOTH_SIDES, CHANNELS, FlightModel
+from beetle_omni_ros.identify.gap.series import low_pass, matrices, THIN, within
+
+WIDEST = 16.0           # [Hz] low-pass edge of joint angles, of which every second one counts
+POSES = 8.0             # [Hz] the same of MoCap, whose noise grows with the square of frequency
+
+
+class BagFlight(FlightModel):
+    """
+    A flight of a bag for the engine.
+
+    Attributes:
+        period: of the samples [s].
+        mask: (N, 16) samples that count.
+        rows: (N,) rows of the grid of the signals.
+
+    """
+
+    channels = tuple(name for group in 'BAWJ' for name in CHANNELS[group])
+    highest = np.inf
+    usable = True
+
+    def __init__(self, flight, robot, body, keys, p):
+        super().__init__(flight, robot, body, keys, p)
+        self.starts = {}
+        self.name, self.period = flight.name, THIN * p.grid
+        self.reasons = dict.fromkeys(self.channels, '')
+        first, count = self._starts[0], self._length * len(self._starts)
+        self.rows = first + THIN * np.arange(count // THIN)
+        self._readings = low_pass(p.smooth_imu, 1, p.grid)
+        self._fine = low_pass(WIDEST, 1, p.grid)
+        self._poses = low_pass(POSES, 1, p.grid)
+        self.mask = np.ones((len(self.rows), len(self.channels)), dtype=bool)
+        self.mask[:, :6] = self.trusted[self.rows, None]
+        far = self._poses.margin
+        inside = (self.rows >= far) & (self.rows < len(self.signals.t) - far)
+        self.mask[:, 6:12] = inside[:, None]
+        self.usable = len(blocks_of(self.mask, self.period)) > 0
+
+    def _thinned(self, theta):
+        inputs = self.inputs(theta)
+        # as the readings are smoothed that the forces are compared with
+        for name in ('thrust', 'thrust_rate'):
+            inputs[name] = within(self._readings, inputs[name], 0)
+        return {name: values[self.rows] for name, values in inputs.items()}
+
+    def _residual(self, theta, groups):
+        result = {}
+        force, rate, turning = self.signals.imu(theta)
+        if 'B' in groups:
+            result['B'] = np.concatenate([force, turning], axis=1)[self.rows] \
+                - self._body(self._thinned(theta), theta)
+        if 'A' in groups or 'W' in groups:
+            position, quaternion, _ = self.signals.pose(theta)
+            rotation = matrices(quaternion)
+        if 'A' in groups:
+            world = np.einsum('nij,nj->ni', rotation, force)
+            world[:, 2] -= self.robot.gravity
+            result['A'] = (within(self._poses, world, 0)
+                           - within(self._poses, position, 2))[self.rows]
+        if 'W' in groups:
+            change = np.gradient(rotation, self.p.grid, axis=0)
+            skew = np.einsum('nji,njk->nik', rotation, change)
+            seen = np.stack([skew[:, 2, 1] - skew[:, 1, 2], skew[:, 0, 2] - skew[:, 2, 0],
+                             skew[:, 1, 0] - skew[:, 0, 1]], axis=1) / 2
+            result['W'] = within(self._poses, rate - seen, 0)[self.rows]
+        if 'J' in groups:
+            result['J'] = self._joints([theta])[0]
+        return result
+
+    def _smooth_joints(self, series):
+        return within(self._fine, series, 0)[::THIN]
+
+    def _joints(self, sets):
+        first, count = self._starts[0], self._length * len(self._starts)
+        keep, self.filters['J'] = self.filters['J'], self._smooth_joints
+        try:
+            return super()._joints(sets)
+        finally:
+            self.filters['J'] = keep
+
+    def _joint_slopes(self, theta, names):
+        keep, self.filters['J'] = self.filters['J'], self._smooth_joints
+        try:
+            return super()._joint_slopes(theta, names)
+        finally:
+            self.filters['J'] = keep
+
+    def linear(self, theta, names):
+        """Residual and its slopes at deviations ``theta``."""
+        theta, own = self._real(theta)
+        now = self.residual(theta)
+        residual = np.concatenate([now[group] for group in 'BAWJ'], axis=1)
+        slopes = np.zeros((*residual.shape, len(names)))
+        place = {'B': slice(0, 6), 'A': slice(6, 9), 'W': slice(9, 12), 'J': slice(12, 16)}
+        self._secants(slopes, theta, own, now, names, place)
+        every, names = names, [name for name in names if name not in self.starts]
+        where = {name: k for k, name in enumerate(every)}
+        body = [name for name in names if self.keys[name].body]
+        if body:
+            exact = self._body.derivatives(self._thinned(theta), theta, tuple(body))
+            for k, name in enumerate(body):
+                slopes[:, place['B'], where[name]] = -exact[:, :, k]
+        for name in names:
+            key = self.keys[name]
+            groups = '' if key.body else key.groups.replace('J', '')
+            if groups:
+                h, here = key.step, theta.get(name, 0.0)
+                ahead = self._residual({**theta, name: here + h}, groups)
+                both = key.parameter == BOTH_SIDES
+                behind = self._residual({**theta, name: here - h}, groups) if both else now
+                for group in groups:
+                    slopes[:, place[group], where[name]] = (ahead[group] - behind[group]) / (
+                        2 * h if both else h)
+        turning = [name for name in names if 'J' in self.keys[name].groups]
+        for name, slope in zip(turning, self._joint_slopes(theta, turning), strict=True):
+            slopes[:, place['J'], where[name]] = slope
+        return Linear(residual, slopes, residual)
+
+    def _real(self, theta):
+        """Deviations of real keys, and factor of each start that acts."""
+        own = {name: value for name, value in theta.items() if name in self.starts and value}
+        theta = {name: value for name, value in theta.items()
+                 if name not in self.starts and value}
+        return self._started(theta, own), own
+
+    def _started(self, theta, own):
+        return {**theta, **{key: theta.get(key, 0.0) + factor * part
+                            for name, factor in own.items()
+                            for key, part in self.starts[name].items()}}
+
+    def _secants(self, slopes, theta, own, now, names, place):
+        """Slopes from no effect to the start, or to the deviation where it acts."""
+        for k, name in enumerate(names):
+            if name not in self.starts:
+                continue
+            start, factor = self.starts[name], own.get(name, 1.0)
+            groups = ''.join(dict.fromkeys(''.join(self.keys[key].groups for key in start)))
+            less = {key: theta.get(key, 0.0) - (factor * part if name in own else 0.0)
+                    for key, part in start.items()}
+            # of another start of the same effect, only one can act
+            less = {key: value if abs(value) > 1e-12 else 0.0 for key, value in less.items()}
+            with_it = now if name in own else self._residual(
+                self._started({**theta, **dict.fromkeys(start, 0.0)}, {name: factor}), groups)
+            without = self._residual({**theta, **less}, groups) if name in own else \
+                now if not any(theta.get(key) for key in start) else \
+                self._residual({**theta, **dict.fromkeys(start, 0.0)}, groups)
+            for group in groups:
+                slopes[:, place[group], k] = (with_it[group] - without[group]) / factor
+
+    def settle(self, theta):
+        """Take the fast part of noisy tilts from the servo model at ``theta``."""
+        self.smooth_tilts(self._real(theta)[0])
+
+    @property
+    def motion(self) -> dict[str, np.ndarray]:
+        """Velocity (world), quaternion, position and tilts of the samples."""
+        return self._thinned({})
+
+    @property
+    def time(self) -> np.ndarray:
+        """(N,) times of the samples [s]."""
+        return self.signals.t[self.rows]
