@@ -1,7 +1,9 @@
 """Damaged recordings are refused with topic, cause and time."""
 
 from copy import deepcopy
+from dataclasses import fields
 from functools import cache
+import re
 import warnings
 
 from flown_once import flight
@@ -15,8 +17,9 @@ from beetle_omni_ros.identify.gap.ingest import prepare, UnusableFlight
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.recording.check import damages, repaired
 from beetle_omni_ros.identify.recording.limits import RecordingLimits
-from beetle_omni_ros.identify.recording.readings import reading_damages
+from beetle_omni_ros.identify.recording.readings import sensor_damages
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.resources import share_path
 
 ROBOT = RobotParameters.load()
 
@@ -213,7 +216,7 @@ KINDS = {
     'MoCap body turned on the way': (flipped_from_half, POSE, ['turned', 'jumps'], HALF),
     'MoCap frozen': (frozen(POSE, 10, 13.5), POSE, ['frozen'], 10.0),
     'marker flips': (flips, POSE, ['markers'], 3.0),
-    'MoCap interleaved': (interleaved, POSE, ['sources', 'interleaved'], 0.0),
+    'MoCap interleaved': (interleaved, POSE, ['sources', 'interleaved'], None),
     'MoCap clock back': (shifted(POSE, -0.3), POSE, ['clock'], HALF),
     'MoCap clock back, recorded so': (silent_clock(shifted(POSE, -0.3)), POSE, ['clock'], HALF),
     'MoCap clock drifts': (drifting, POSE, ['drift'], None),
@@ -276,6 +279,49 @@ def test_a_sound_recording_has_no_damage():
     assert damages(silent_clock(lambda made: made)(recording()), ROBOT) == []
 
 
+def rested(before, after):
+    """A recording with rests [s] on the ground, in which neither MoCap nor encoders change."""
+    made = recording()
+    for topic, t in made.times.items():
+        values, received = made.values[topic], made.received[topic]
+        if not len(t):
+            continue
+        for first, k, span in ((t[0] - before, 0, before), (t[-1] + 0.005, -1, after)):
+            more = first + np.arange(0, span - 0.004, np.median(np.diff(t)))
+            rest = np.tile(values[k], (len(more), 1))
+            if topic == COMMAND:
+                rest[:, 4:] = 0.0
+            if topic == POSE:
+                rest[:, :3] = values[0, :3]
+            order = slice(None, None, 1 if k else -1)
+            for part, new in ((made.times, more), (made.values, rest),
+                              (made.received, more + np.median(received - t))):
+                part[topic] = np.concatenate([part[topic], new][order])
+    return made
+
+
+@pytest.mark.parametrize(('before', 'after'), [(60.0, 60.0), (300.0, 220.0)])
+def test_rests_on_the_ground_are_neither_damage_nor_flight(before, after):
+    # 24 s of flight in a bag of two, and of nine minutes.
+    flown_part, whole = prepare(recording(), ROBOT, P), prepare(rested(before, after), ROBOT, P)
+    assert whole.start == pytest.approx(flown_part.start, abs=0.1)
+    assert whole.duration == pytest.approx(flown_part.duration, abs=1.0)
+    silent = rested(before, after)
+    silent.received = {}
+    assert prepare(silent, ROBOT, P).duration == pytest.approx(flown_part.duration, abs=1.0)
+    damaged = frozen(POSE, before + 10, before + 13.5)(rested(before, after))
+    with pytest.raises(UnusableFlight, match='frozen') as error:
+        prepare(damaged, ROBOT, P)
+    assert error.value.problems[0].at_s == pytest.approx(before + 10, abs=0.1)
+
+
+def test_each_number_is_a_range_a_specification_or_statistical():
+    text = share_path('params/recording.yaml').read_text()
+    kinds = re.findall(r'^\w+:.*# \[[^]]*\] (physical|sensor|statistical): ', text, re.MULTILINE)
+    assert len(kinds) == len(fields(RecordingLimits))
+    assert kinds.count('statistical') <= 12
+
+
 def joint_step(size, lag, end, frozen_from=np.inf):
     """A joint at rest with one step of its command 8 s after the start; ``end`` [s] after that."""
     made, joints = recording(), ROBOT.joints
@@ -298,11 +344,11 @@ def test_a_joint_that_rests_until_its_command_arrives_is_not_frozen(seed):
     rng, limits = np.random.default_rng(seed), RecordingLimits.load()
     size, lag = rng.choice([-1, 1]) * rng.uniform(0.27, 0.35), rng.uniform(0, 0.3)
     for end in (rng.uniform(0, lag), rng.uniform(lag, 1.0), 10.0):
-        found = reading_damages(joint_step(size, lag, end), limits, ROBOT)
+        found = sensor_damages(joint_step(size, lag, end), limits)
         assert not found, (size, lag, end, found[0].text)
     # Frozen at any time before the step, it is found once every valid servo would have turned.
     held = joint_step(size, lag, limits.servo_lag[1] + 0.1, frozen_from=0.0)
-    damage, = reading_damages(held, limits, ROBOT)
+    damage, = sensor_damages(held, limits)
     assert damage.topic == JOINTS and 'gimbal2 is frozen' in damage.cause
 
 
