@@ -140,6 +140,9 @@ def prepare(recording: Recording, robot: RobotParameters, p: GapParameters,
         cut[topic] = t[keep] - begin, values[keep]
     pose = cut['mocap/pose'][1].copy()
     norm = np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
+    if abs(np.median(norm) - 1) > 0.01:
+        findings.append(f'{name}: mocap/pose: orientations of norm {np.median(norm):.3g}, '
+                        'expected unit quaternions; normalised')
     pose[:, 3:] = aligned(pose[:, 3:] / np.where(norm > 1e-6, norm, 1.0))
     flight = Flight(name, begin, end - begin, *cut['imu/data_raw'], cut['mocap/pose'][0], pose,
                     *cut['joint_states'], *cut['command'], *cut['battery_state'],
@@ -162,6 +165,8 @@ def _in_order(name, topic, recording, findings):
     if not fine.all():
         findings.append(f'{name}: {topic}: {int((~fine).sum())} messages hold no numbers')
         t, values = t[fine], values[fine]
+    if back := int((np.diff(t) < 0).sum()):
+        findings.append(f'{name}: {topic}: {back} messages are out of order; sorted by stamp')
     t, first = np.unique(t, return_index=True)
     lost = len(values) - len(first)
     if lost > 2:

@@ -69,9 +69,10 @@ def repaired(recording: Recording, robot: RobotParameters, begin: float | None =
     """
     done: list[str] = []
     found = damages(recording, robot, begin, limits)
-    while len(done) < MOST_REPAIRS and (first := next((d for d in found if d.repair), None)):
-        recording = first.repair(recording)
-        done.append(f'{first.text}; corrected: {first.fix}')
+    while len(done) < MOST_REPAIRS and (certain := [(d, d.repair) for d in found if d.repair]):
+        damage, repair = certain[0]
+        recording = repair(recording)
+        done.append(f'{damage.text}; corrected: {damage.fix}')
         found = damages(recording, robot, begin, limits)
     return recording, done, found
 
@@ -101,7 +102,7 @@ class Agreement:
         return (self.late[part]**2 + self.early[part]**2).mean(axis=0) + 1e-12
 
     def unlike(self, part: slice = slice(None)) -> np.ndarray:
-        """(n,) errors of each column beyond noise, over its size there or in the flight: 0 to 2."""
+        """(n,) errors of columns beyond noise, over their size there or in the flight: 0 to 2."""
         return np.maximum(self.error[part].mean(axis=0) - self.noise, 0) / np.maximum(
             self.size(part), self.size())
 

@@ -10,85 +10,52 @@ which may be out of range, step or drift.
 import numpy as np
 
 from beetle_omni_ros.identify.gap.bags import NEEDED, Recording
-from beetle_omni_ros.identify.recording.damage import changed, Damage
+from beetle_omni_ros.identify.recording.damage import changed, Damage, IMU
 from beetle_omni_ros.identify.recording.limits import RecordingLimits
 from beetle_omni_ros.identify.recording.relations import Relation
 from beetle_omni_ros.identify.recording.signals import Signals
 
-FACTORS = {1e-9: 'nanoseconds', 1e-6: 'microseconds', 1e-3: 'milliseconds'}
 OVERLAP = 6     # windows that share a sample; a motion counts once
 
 
 def begin_of(recording: Recording) -> float:
     """First stamp of the IMU [s], the origin of stated times."""
-    t = recording.times['imu/data_raw']
-    return float(t[0]) if len(t) else 0.0
+    return float(recording.times[IMU][0]) if len(recording.times[IMU]) else 0.0
 
 
 def clock_damages(recording: Recording, limits: RecordingLimits) -> list[Damage]:
     """Damages by stamps alone, at most one for each topic."""
-    ages, found = relative_ages(recording, limits), []
-    for topic in NEEDED:
-        damage = _advance(recording, topic, limits) \
-            or _age(recording, topic, ages, limits) \
-            or _order(recording, topic, limits) or _repeats(recording, topic, limits)
-        if damage:
-            found.append(damage)
-    return found
+    ages = relative_ages(recording, limits)
+    found = (_advance(recording, topic, limits) or _age(recording, topic, ages, limits)
+             or _order(recording, topic, limits) for topic in NEEDED)
+    return [damage for damage in found if damage]
 
 
 def _advance(recording, topic, limits):
     """Stamps that do not advance, or are in another unit."""
-    t, received = recording.times[topic], recording.received.get(topic)
-    ahead = np.diff(t)[np.diff(t) > 0]
-    if len(ahead) < limits.few * len(t):
-        return Damage(recording.name, topic, f'{len(t) - len(ahead)} of {len(t)} stamps do not '
-                      f'advance (first stamp {t[0]:.3f} s)')
-    period, (low, high) = float(np.median(ahead)), limits.period
-    if low <= period <= high:
-        return None
-    cause = f'stamps are {period:g} s apart; expected {low:g} to {high:g} s'
-    if received is not None and len(received) > 1:
-        factor = max(float(np.median(np.diff(received))), 1e-12) / period
-        unit = min(FACTORS, key=lambda f: abs(np.log(factor / f)))
-        cause += f': {FACTORS[unit]} taken for seconds?' if 0.5 < factor / unit < 2 else ''
-    return Damage(recording.name, topic, cause)
+    steps, (low, high) = np.diff(recording.times[topic]), limits.period
+    ahead = steps[steps > 0]
+    if len(ahead) < limits.few * len(steps):
+        return Damage(recording.name, topic, f'{len(steps) - len(ahead)} of {len(steps)} stamps '
+                      f'do not advance (first stamp {recording.times[topic][0]:.3f} s)')
+    period = float(np.median(ahead))
+    return None if low <= period <= high else Damage(
+        recording.name, topic, f'stamps are {period:g} s apart; expected {low:g} to {high:g} s: '
+        'another unit taken for seconds, such as milliseconds or nanoseconds?')
 
 
 def _order(recording, topic, limits):
-    """Stamps that go back: a clock that was set, or messages out of order."""
-    t = recording.times[topic]
-    steps = np.diff(t)
-    back = np.flatnonzero(steps < 0)
-    if len(back) > limits.few * len(t):
-        order = np.argsort(t, kind='stable')
-        return Damage(
-            recording.name, topic, f'{len(back)} of {len(t)} messages are out of order by up to '
-            f'{-steps.min():.3f} s: several sources on one topic, or a transport that reorders',
-            t[back[0]], fix='sort the messages by stamp',
-            repair=lambda r: changed(r, topic, keep=order))
+    """Stamps that go back far, or occur twice with other values."""
+    t, steps = recording.times[topic], np.diff(recording.times[topic])
     if steps.min() < -limits.period[1]:
         return Damage(recording.name, topic, f'the clock goes back by {-steps.min():.2f} s',
                       t[np.argmin(steps)])
-    return None
-
-
-def _repeats(recording, topic, limits):
-    """Messages that were recorded twice, or two sources with the same stamps."""
-    order = np.argsort(recording.times[topic], kind='stable')
-    t, rows = recording.times[topic][order], recording.values[topic][order]
-    same = np.diff(t) <= 0
-    if same.sum() <= limits.few * len(t):
-        return None
-    cause = f'{int(same.sum())} of {len(t)} stamps occur twice with '
-    equal = (rows[1:] == rows[:-1]).all(axis=1)
-    if equal[same].mean() < 1 - limits.few:
-        return Damage(recording.name, topic, f'{cause}other values: two sources publish on one '
-                      'topic', t[np.argmax(same)])
-    keep = order[np.concatenate([[True], ~same])]
-    return Damage(recording.name, topic, f'{cause}the same values: messages were recorded twice',
-                  t[np.argmax(same)], fix='keep each message once',
-                  repair=lambda r: changed(r, topic, keep=keep))
+    order = np.argsort(t, kind='stable')
+    rows = recording.values[topic][order]
+    twice = (np.diff(t[order]) <= 0) & (rows[1:] != rows[:-1]).any(axis=1)
+    return None if twice.mean() <= limits.few else Damage(
+        recording.name, topic, f'{twice.sum()} of {len(t)} stamps occur twice with other values: '
+        'two sources publish on one topic', t[order][np.argmax(twice)])
 
 
 def relative_ages(recording: Recording,
@@ -98,14 +65,13 @@ def relative_ages(recording: Recording,
              if len(recording.received.get(topic, ())) == len(recording.times[topic]) > 1}
     if len(known) < 3:
         return {}
-    begin, end = max(r.min() for r in known.values()), min(r.max() for r in known.values())
-    edges = np.arange(begin, end, limits.bin)
-    medians = {}
+    edges = np.arange(max(r.min() for r in known.values()), min(r.max() for r in known.values()),
+                      limits.bin)
+    medians, result = {}, {}
     for topic, received in known.items():
         age, cuts = received - recording.times[topic], np.searchsorted(received, edges)
         medians[topic] = np.array([np.median(age[a:b]) if b > a else np.nan
                                    for a, b in zip(cuts[:-1], cuts[1:], strict=True)])
-    result = {}
     for topic, own in medians.items():
         age = own - np.nanmedian([m for name, m in medians.items() if name != topic], axis=0)
         result[topic] = edges[:-1][np.isfinite(age)], age[np.isfinite(age)]
@@ -114,20 +80,19 @@ def relative_ages(recording: Recording,
 
 def _age(recording, topic, ages, limits):
     """Offset, step or drift of a topic's clock against the times of recording."""
-    judged = judge(*ages[topic], limits.clock_offset, limits) \
-        if topic in ages else None
+    at, lags = ages.get(topic, ((), ()))
+    judged = judge(at, lags, limits.clock_offset, limits)
     if not judged:
         return None
-    cause, moment, late = judged
+    cause, moment, late_at = judged
     t, received = recording.times[topic], recording.received[topic]
+    late = late_at(received)
     if moment is not None:      # the message at the step
         near = np.flatnonzero(np.abs(received - moment) < 2 * limits.bin)
         k = near[np.argmax(np.abs(np.diff((received - t)[near])))] + 1
-        moment, late = t[k], np.where(np.arange(len(t)) < k, *late(moment + [-1, 1]))
-    else:
-        late = late(received)
-    return Damage(recording.name, topic, f'the clock {cause}, against the other topics recorded at '
-                  'the same time: clocks of two computers differ, or another time base', moment,
+        moment, late = t[k], np.where(np.arange(len(t)) < k, late[0], late[-1])
+    return Damage(recording.name, topic, f'the clock {cause}, against the other topics recorded '
+                  'at the same time: clocks of two computers differ, or another time base', moment,
                   fix='shift the stamps', repair=lambda r: changed(r, topic, times=t + late))
 
 
@@ -135,13 +100,14 @@ def lag_damage(name: str, relation: Relation, signals: Signals,
                limits: RecordingLimits) -> Damage | None:
     """A lag of two motions that is out of range, steps or drifts."""
     late, early = (np.linalg.norm(x, axis=1) for x in relation.pair(signals))
-    judged = judge(*window_lags(signals.t, late, early, limits, signals.silent),
-                   getattr(limits, relation.lag), limits)
+    at, lags = window_lags(signals.t, late, early, limits, signals.silent)
+    judged = judge(at, lags, getattr(limits, relation.lag), limits)
     return Damage(name, relation.late, f'the clock of {relation.late} or of {relation.early} '
                   f'{judged[0]}, by {relation.words}', judged[1]) if judged else None
 
 
-def judge(at: np.ndarray, lags: np.ndarray, allowed: np.ndarray, limits: RecordingLimits):
+def judge(at: np.ndarray, lags: np.ndarray, allowed: np.ndarray,
+          limits: RecordingLimits) -> list | None:
     """
     Whether lags (n,) [s] at times (n,) are out of range, step or drift; None if they are valid.
 
@@ -153,33 +119,29 @@ def judge(at: np.ndarray, lags: np.ndarray, allowed: np.ndarray, limits: Recordi
 
     """
     n = len(lags)
-    if n < 3:
+    if n < 4:
         return None
-    middle = float(np.median(lags))
-    usual = np.abs(lags - middle).sum()
+    middle, usual = float(np.median(lags)), np.abs(lags - np.median(lags)).sum()
+    # Largest difference of means, weighted by their numbers of values, of two or more values.
     total, counts = np.cumsum(lags - lags.mean())[:-1], np.arange(1, n)
-    split = int(np.argmax(total**2 * (1 / counts + 1 / (n - counts)))) + 1
+    split = int(np.argmax((total**2 * (1 / counts + 1 / (n - counts)))[1:-1])) + 2
     before, after = float(np.median(lags[:split])), float(np.median(lags[split:]))
     slope, start = np.polyfit(at - at[0], lags, 1)
-    drift = slope * (at[-1] - at[0])
-    models = []
-    if min(split, n - split) > 1:
-        moment = 0.5 * (at[split - 1] + at[split])
-        models.append((after - before, lambda t: np.where(t < moment, before, after), moment,
-                       f'steps by {after - before:.2f} s: its lag is {before:.2f} s before and '
-                       f'{after:.2f} s after'))
-    models.append((drift, lambda t: start + slope * (t - at[0]), None, f'drifts by {slope:.2%}: '
-                   f'its lag is {start:.2f} s at first and {start + drift:.2f} s at the end'))
-    rest, (change, lag, moment, cause) = min(
-        ((np.abs(lags - model[1](at)).sum(), model) for model in models), key=lambda x: x[0])
-    noise = max(rest / n, limits.step / 10)
-    if abs(change) > limits.step and (usual - rest) / noise > limits.prior:
-        return cause, moment, lag
-    if not allowed[0] <= middle <= allowed[1]:
-        word = 'behind' if middle > 0 else 'ahead'
-        return (f'is {abs(middle):.2f} s {word}, expected {allowed[0]:g} to {allowed[1]:g} s',
-                None, lambda t: np.full(len(t), middle))
-    return None
+    drift, moment = slope * (at[-1] - at[0]), 0.5 * (at[split - 1] + at[split])
+    models = (
+        (after - before, f'steps by {after - before:.2f} s: its lag is {before:.2f} s before and '
+         f'{after:.2f} s after', moment, lambda t: np.where(t < moment, before, after)),
+        (drift, f'drifts by {slope:.2%}: its lag is {start:.2f} s at first and '
+         f'{start + drift:.2f} s at the end', None, lambda t: start + slope * (t - at[0])))
+    rests = [np.abs(lags - late(at)).sum() for *_, late in models]
+    change, *result = models[int(np.argmin(rests))]
+    if abs(change) > limits.step \
+            and usual - min(rests) > limits.prior * max(min(rests) / n, limits.step / 10):
+        return result
+    if allowed[0] <= middle <= allowed[1]:
+        return None
+    return [f'is {abs(middle):.2f} s {"behind" if middle > 0 else "ahead"}, expected '
+            f'{allowed[0]:g} to {allowed[1]:g} s', None, lambda t: np.full(len(t), middle)]
 
 
 def window_lags(t: np.ndarray, late: np.ndarray, early: np.ndarray, limits: RecordingLimits,
@@ -198,31 +160,24 @@ def window_lags(t: np.ndarray, late: np.ndarray, early: np.ndarray, limits: Reco
         times (W,) of the motion in these windows [s], and shifts (W,) [s].
 
     """
-    period = float(t[1] - t[0])
+    period, at, lags = float(t[1] - t[0]), [-np.inf], list[float]()
     length, reach, apart = (round(x / period) for x in (
         limits.window, limits.lag_reach, 1 / limits.edge))
-    at, lags = [], []
     for first in range(0, len(t) - length + 1, length // OVERLAP):
-        begin = max(0, first - reach)
-        wide, own = early[begin:first + length + reach], late[first:first + length]
-        if gaps[first:first + length].any():
-            continue
-        views = np.lib.stride_tricks.sliding_window_view(wide, length)
+        part, begin = slice(first, first + length), max(0, first - reach)
+        own = late[part] - late[part].mean()
+        views = np.lib.stride_tricks.sliding_window_view(early[begin:part.stop + reach], length)
         views = views - views.mean(axis=1, keepdims=True)
-        own = own - own.mean()
         alike = views @ own / (np.sqrt((views**2).sum(axis=1) * (own**2).sum()) + 1e-12)
         k = int(np.argmax(alike))
-        far = np.abs(np.arange(len(alike)) - k) > apart
         # Evidence against no correlation, or against the best distant shift.
-        other = max(0.0, alike[far].max(initial=0.0))
-        count = limits.edge * limits.window
-        if not 0 < k < len(alike) - 1 or alike[k] < 0 or 0.5 * count * np.log(
-                (1 - other**2) / (1 - alike[k]**2 + 1e-12)) < limits.prior:
-            continue
-        a, b, c = alike[k - 1:k + 2]
-        moment = np.average(t[first:first + length], weights=own**2)
-        if at and moment < at[-1] + limits.window / OVERLAP:
-            continue        # the same motion as in the window before
-        at.append(moment)
-        lags.append(period * (first - begin - k - 0.5 * (a - c) / min(a - 2 * b + c, -1e-12)))
-    return np.array(at), np.array(lags)
+        other = alike[np.abs(np.arange(len(alike)) - k) > apart].max(initial=0.0)
+        evidence = 0.5 * limits.edge * limits.window * np.log(
+            (1 - other**2) / (1 - min(alike[k], 1 - 1e-9)**2))
+        moment = np.average(t[part], weights=own**2)
+        if evidence > limits.prior and 0 < k < len(alike) - 1 and not gaps[part].any() \
+                and moment > at[-1] + limits.window / OVERLAP:
+            a, b, c = alike[k - 1:k + 2]
+            at.append(moment)
+            lags.append(period * (first - begin - k - 0.5 * (a - c) / min(a - 2 * b + c, -1e-12)))
+    return np.array(at[1:]), np.array(lags)

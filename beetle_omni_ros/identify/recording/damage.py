@@ -3,7 +3,9 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from beetle_omni_ros.identify.gap.bags import Recording
+from beetle_omni_ros.identify.gap.bags import NEEDED, Recording
+
+IMU, POSE, JOINTS, COMMAND = NEEDED
 
 
 @dataclass(frozen=True)
@@ -50,9 +52,7 @@ def changed(recording: Recording, topic: str, times=None, values=None,
         keep: mask or indices of the kept messages, applied last.
 
     """
-    new = {'times': times, 'values': values, 'received': None}
-    parts = {name: dict(getattr(recording, name)) for name in new}
-    for name, part in parts.items():
-        if topic in part:
-            part[topic] = (part[topic] if new[name] is None else new[name])[keep]
-    return replace(recording, **parts)
+    def part(old, new=None):
+        return old | {topic: (old[topic] if new is None else new)[keep]} if topic in old else old
+    return replace(recording, times=part(recording.times, times), received=part(
+        recording.received), values=part(recording.values, values))

@@ -28,7 +28,6 @@ class RecordingLimits(ParameterFile, file='recording.yaml'):
     risen: float = limit(unit='m', doc='Height above the ground from which the robot flies.')
     frozen_command: float = limit(
         unit='rad', doc='Motion by the command that an encoder must show within the lag.')
-    unit_length: float = limit(unit='1', doc='Largest deviation of a quaternion norm from 1.')
     gain: float = limit(unit='1', doc='Largest ratio of two measurements of one motion.')
     thrust_gain: float = limit(unit='1', doc='Largest ratio of thrusts and specific force.')
     edge: float = limit(unit='Hz', doc='Low-pass edge of comparisons of two sensors.')

@@ -7,16 +7,9 @@ from scipy.ndimage import median_filter
 
 from beetle_omni_ros.identify.gap.bags import Recording
 from beetle_omni_ros.identify.gap.series import matrices
-from beetle_omni_ros.identify.recording.damage import changed, Damage
+from beetle_omni_ros.identify.recording.damage import changed, COMMAND, Damage, IMU, JOINTS, POSE
 from beetle_omni_ros.identify.recording.limits import RecordingLimits
-from beetle_omni_ros.identify.recording.signals import (
-    COMMAND,
-    IMU,
-    JOINTS,
-    POSE,
-    series_of,
-    white_noise,
-)
+from beetle_omni_ros.identify.recording.signals import series_of, white_noise
 
 NEIGHBOURS = 7          # readings of a running median
 # Topic, first column, names of columns, unit. The rows have the order of ``scatter``.
@@ -35,7 +28,7 @@ def reading_damages(recording: Recording, limits: RecordingLimits,
 
     Topics with wrong stamps (``unclocked``) are ignored.
     """
-    return _first(sensor.norm() or sensor.repeated() or sensor.outliers() for sensor in (
+    return _first(sensor.lost() or sensor.repeated() or sensor.outliers() for sensor in (
         _Sensor(recording, k, limits) for k, (topic, *_) in enumerate(SENSORS)
         if topic != JOINTS and topic not in unclocked))
 
@@ -75,28 +68,14 @@ class _Sensor:
             repair = lambda r: changed(r, topic, keep=np.isin(r.times[topic], good))  # noqa: E731
         return Damage(self.recording.name, topic, cause, at, fix=fix, repair=repair)
 
-    def norm(self):
-        """Quaternions whose norm is not 1."""
-        if not self.turned:
-            return None
-        norm, few = np.linalg.norm(self.raw, axis=1), self.limits.few
-        zero = norm < 0.5 * np.median(norm)
-        if zero.any():
-            return self.damage(f'{int(zero.sum())} of {len(zero)} orientations are zero '
-                               'quaternions: the body was not tracked', self.t[np.argmax(zero)],
-                               zero if zero.mean() < few else None)
-        off = np.abs(norm - 1) > self.limits.unit_length
-        if off.mean() < few:
-            return None
-
-        def normalised(recording):
-            values = recording.values[POSE].copy()
-            values[:, 3:] /= np.linalg.norm(values[:, 3:], axis=1, keepdims=True)
-            return changed(recording, POSE, values=values)
-        return Damage(self.recording.name, POSE, 'the orientation is no unit quaternion: its norm '
-                      f'is {np.median(norm[off]):.3g}, expected 1',
-                      None if off.mean() > 1 - few else self.t[np.argmax(off)], fix='normalise',
-                      repair=normalised)
+    def lost(self):
+        """Quaternions without a direction."""
+        size = np.abs(self.raw).sum(axis=1)
+        zero = size < 0.1 * np.median(size)
+        return self.damage(f'{int(zero.sum())} of {len(zero)} orientations are zero quaternions: '
+                           'the body was not tracked', self.t[np.argmax(zero)],
+                           zero if zero.mean() < self.limits.few else None) \
+            if self.turned and zero.any() else None
 
     def repeated(self):
         """Equal readings one after the other: clipped, stale, frozen."""

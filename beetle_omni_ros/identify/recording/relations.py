@@ -5,7 +5,7 @@ A mistake is a linear map of the columns of one topic, as a unit, an order, a si
 is. Its inverse undoes it, in the comparison and in a repair.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from itertools import permutations, product
@@ -14,14 +14,8 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
-from beetle_omni_ros.identify.recording.signals import (
-    COMMAND,
-    GRAVITY,
-    IMU,
-    JOINTS,
-    POSE,
-    Signals,
-)
+from beetle_omni_ros.identify.recording.damage import COMMAND, IMU, JOINTS, POSE
+from beetle_omni_ros.identify.recording.signals import GRAVITY, Signals
 
 
 @dataclass(frozen=True)
@@ -92,107 +86,97 @@ ANGLES = {180 / np.pi: 'in degrees, not radians', 2048 / np.pi: 'in encoder coun
 THRUSTS = {1e3: 'in millinewtons, not N', 1e3 / 9.80665: 'in grams, not N',
            1 / 9.80665: 'in kilograms, not N', 5.0: 'in percent of the largest thrust, not N',
            0.05: 'in parts of the largest thrust, not N'}
-# Topic, relations, columns before and after, what, factor -> unit.
+# Topic, relations, columns before, of and after it, what, factor -> unit.
 UNITS = (
-    (IMU, TURN, 3, 0, 'angular velocity', {
+    (IMU, TURN, 3, 3, 0, 'angular velocity', {
         180 / np.pi: 'in degrees per second, not rad/s',
         np.pi / 180: 'turned into radians twice'}),
-    (IMU, PUSH, 0, 3, 'linear acceleration', {
+    (IMU, PUSH, 0, 3, 3, 'linear acceleration', {
         1 / 9.80665: 'in units of g, not m/s^2', 1e3 / 9.80665: 'in milli-g, not m/s^2',
         100.0: 'in cm/s^2, not m/s^2', 1e3: 'in mm/s^2, not m/s^2'}),
-    (POSE, MOVE, 0, 4, 'position', {
+    (POSE, MOVE, 0, 3, 4, 'position', {
         1e3: 'in millimetres, not metres', 100.0: 'in centimetres, not metres',
         1e-3: 'in kilometres, not metres', 1 / 0.3048: 'in feet, not metres',
         1 / 0.0254: 'in inches, not metres'}),
-    (JOINTS, TILT + LIFT, 0, 0, 'joint angle', ANGLES),
-    (COMMAND, TILT, 0, 4, 'tilt', ANGLES), (COMMAND, LIFT, 4, 0, 'thrust', THRUSTS))
+    (JOINTS, TILT + LIFT, 0, 4, 0, 'joint angle', ANGLES),
+    (COMMAND, TILT, 0, 4, 4, 'tilt', ANGLES), (COMMAND, LIFT, 4, 4, 0, 'thrust', THRUSTS))
 SIGNED = [np.array(signs)[:, None] * np.eye(3)[list(order)]
           for order in permutations(range(3)) for signs in product((1.0, -1.0), repeat=3)][1:]
 TURNS = [axes for axes in SIGNED if np.linalg.det(axes) > 0]
 UPS = {tuple(axes[:, 2]): axes for axes in TURNS if axes[2, 2] < 1}     # any heading
 SIGNS = [np.diag(signs) for signs in product((1.0, -1.0), repeat=4)][1:]
 ORDERS = [np.eye(4)[list(order)] for order in permutations(range(4))][1:]
-ONE = np.eye(4)
-QUATERNIONS = {'as (w, x, y, z)': ONE[[3, 0, 1, 2]],
-               'as the inverse, world seen from the body': np.diag([-1.0, -1, -1, 1]),
-               'as (w, x, y, z) of the inverse': ONE[[3, 0, 1, 2]] @ np.diag([-1.0, -1, -1, 1])}
+I3, I4 = np.eye(3), np.eye(4)
+MIRRORS = [np.diag(np.where(np.arange(3) == k, -1.0, 1.0)) for k in range(3)]
+
+
+def _body(axes):
+    """(4, 4) map of a quaternion xyzw to its product with a rotation of the body."""
+    return np.stack([(q * Rotation.from_matrix(axes)).as_quat() for q in BASIS], axis=1)
+
+
+def _world(axes):
+    """The same with a rotation of the world."""
+    return np.stack([(Rotation.from_matrix(axes) * q).as_quat() for q in BASIS], axis=1)
+
+
+BASIS = Rotation.from_quat(I4)
+# Topic, relations, matrices, blocks of the map from right to recorded columns, text, repair.
+AXES = (
+    (IMU, TURN + PUSH, SIGNED, lambda a: (a, a), "the IMU's {}", 'turn the axes back'),
+    (IMU, TURN, SIGNED, lambda a: (I3, a), 'angular velocity: {}', 'exchange the axes'),
+    (IMU, PUSH, SIGNED, lambda a: (a, I3),
+     'linear acceleration (+9.81 m/s^2 upwards at rest, REP-145): {}', 'exchange the axes'),
+    (POSE, MOVE, SIGNED, lambda a: (a, I4), 'the axes of positions against the orientation: {}',
+     'exchange the axes of positions'),
+    (POSE, SPIN, TURNS, lambda a: (I3, _body(a)), "the body's {}", ''),
+    (POSE, SPIN, UPS.values(), lambda a: (a, _world(a)), '{up} points up, expected z up', ''),
+    (POSE, SPIN, [a for a in TURNS if a[2, 2] < 1], lambda a: (a, block_diag(a, 1.0)),
+     "{up} points up, expected z up, and the body's {}", ''),
+    (POSE, SPIN, MIRRORS, lambda a: (a, block_diag(-a, 1.0)), "the world's {}", ''),
+    (POSE, SPIN, [I4[[3, 0, 1, 2]]], lambda a: (I3, a), 'the quaternion is stored as (w, x, y, z),'
+     ' expected (x, y, z, w)', 'reorder the quaternion'),
+    (POSE, SPIN, [np.diag([-1.0, -1, -1, 1])], lambda a: (I3, a), 'the quaternion is stored as the'
+     ' inverse, world seen from the body, expected the body seen from the world', 'invert it'),
+    (POSE, SPIN, [I4[[3, 0, 1, 2]] * [-1, -1, -1, 1]], lambda a: (I3, a), 'the quaternion is '
+     'stored as the inverse in the order (w, x, y, z), expected (x, y, z, w)', 'reorder it'),
+    (JOINTS, TILT + LIFT, SIGNS, lambda a: (a,), 'joints turn against their commands: the sign of '
+     'the encoder is reversed: {}', 'reverse the sign'),
+    (COMMAND, TILT, SIGNS, lambda a: (a, I4), 'joints turn against their commands: the sign of '
+     'the command is reversed: {}', 'reverse the sign'),
+    (JOINTS, TILT + LIFT, ORDERS, lambda a: (a,), 'joints are swapped: {}', 'exchange the joints'),
+    (COMMAND, TILT, ORDERS, lambda a: (a, I4), 'tilt commands are swapped: {}',
+     'exchange the commands'),
+    (COMMAND, LIFT, ORDERS, lambda a: (I4, a), 'the order of the thrusts is another one: {}', ''))
 
 
 @cache
 def mistakes() -> tuple[Mistake, ...]:
     """All known mistakes."""
-    return (*_units(), *_axes(), Mistake(
+    units = [Mistake(topic, touches, f'{what} is {factor:.4g} times what others show: {words}?',
+                     block_diag(np.eye(before), np.eye(width) / factor, np.eye(after)),
+                     '' if 'counts' in words else f'scale the {what}')
+             for topic, touches, before, width, after, what, units in UNITS
+             for factor, words in units.items()]
+    axes = [Mistake(topic, touches, text.format(_how(a), up=_up(a)), block_diag(*blocks(a)).T, fix)
+            for topic, touches, matrices, blocks, text, fix in AXES for a in matrices]
+    return (*units, *axes, Mistake(
         IMU, MOVE, 'linear acceleration is without gravity, which a sensor at rest measures: the '
         'driver takes gravity off', np.zeros((1, 1)), part=GRAVITY))
 
 
-def _units() -> Iterator[Mistake]:
-    for topic, touches, before, after, what, units in UNITS:
-        width = {IMU: 3, POSE: 3, JOINTS: 4, COMMAND: 4}[topic]
-        for factor, words in units.items():
-            yield Mistake(topic, touches, f'{what} is {factor:.4g} times what others show: '
-                          f'{words}?', block_diag(np.eye(before), np.eye(width) / factor,
-                                                  np.eye(after)),
-                          '' if 'counts' in words else f'scale the {what}')
+def _how(a):
+    """Text such as 'axes are turned: x is y, y is -x', or '1 is 2, 2 is 1' of joints."""
+    names = 'xyz' if len(a) == 3 else '1234'
+    parts = ', '.join(f'{names[k]} is {"-" * int(row.min() < 0)}{names[np.argmax(np.abs(row))]}'
+                      for k, row in enumerate(a) if row[k] < 1)
+    if len(a) == 4:
+        return parts
+    kind = 'turned' if np.linalg.det(a) > 0 else 'left-handed, swapped or of the wrong sign'
+    return 'the opposite sign' if (a == -I3).all() else f'axes are {kind}: {parts}'
 
 
-def _axes() -> Iterator[Mistake]:
-    """Axes, signs, orders: each matrix is the map from right to recorded columns."""
-    for a in SIGNED:
-        yield from (
-            _axis(IMU, TURN + PUSH, "the IMU's", a, (a, a), 'turn the axes back'),
-            _axis(IMU, TURN, 'angular velocity:', a, (np.eye(3), a), 'exchange the axes'),
-            _axis(IMU, PUSH, 'linear acceleration (+9.81 m/s^2 upwards at rest, REP-145):', a,
-                  (a, np.eye(3)), 'exchange the axes'),
-            _axis(POSE, MOVE, 'the axes of positions against the orientation:', a, (a, ONE),
-                  'exchange the axes of positions'))
-    for a in TURNS:
-        yield _axis(POSE, SPIN, "the body's", a, (np.eye(3), _turn(a, after=True)))
-        if a[2, 2] < 1:
-            yield _axis(POSE, SPIN, f"{_up(a)}, and the body's", a, (a, block_diag(a, 1.0)))
-    for a in UPS.values():
-        yield Mistake(POSE, SPIN, _up(a), block_diag(a, _turn(a, after=False)).T)
-    for k in range(3):
-        flip = np.diag(np.where(np.arange(3) == k, -1.0, 1.0))
-        yield _axis(POSE, SPIN, "the world's", flip, (flip, block_diag(-flip, 1.0)))
-    for text, order in QUATERNIONS.items():
-        yield Mistake(POSE, SPIN, f'the quaternion is stored {text}; expected (x, y, z, w), the '
-                      'body seen from the world', block_diag(np.eye(3), order.T),
-                      'reorder the quaternion')
-    for a in SIGNS:
-        names = ', '.join(f'gimbal{k + 1}' for k in range(4) if a[k, k] < 0)
-        for topic, touches, rest, what in ((JOINTS, TILT + LIFT, 0, 'encoder'),
-                                           (COMMAND, TILT, 4, 'command')):
-            yield Mistake(topic, touches, f'{names} turns against its command: the sign of the '
-                          f'{what} is reversed', block_diag(a, np.eye(rest)), 'reverse the sign')
-    for a in ORDERS:
-        moved = ', '.join(f'{k + 1} is {np.argmax(row) + 1}' for k, row in enumerate(a)
-                          if not row[k])
-        yield Mistake(JOINTS, TILT + LIFT, f'joints are swapped: gimbal {moved}', a.T,
-                      'exchange the joints')
-        yield Mistake(COMMAND, TILT, f'tilt commands are swapped: gimbal {moved}',
-                      block_diag(a.T, ONE), 'exchange the commands')
-        yield Mistake(COMMAND, LIFT, f'the order of the thrusts is another one: rotor {moved}',
-                      block_diag(ONE, a.T))
-
-
-def _axis(topic, touches, whose, axes, blocks, fix=''):
-    """A mistake with turned or mirrored axes (3, 3)."""
-    parts = ', '.join(f'{"xyz"[k]} is {"-" * int(row.min() < 0)}{"xyz"[np.argmax(np.abs(row))]}'
-                      for k, row in enumerate(axes))
-    how = 'the opposite sign' if (axes == -np.eye(3)).all() else f'axes are turned: {parts}' \
-        if np.linalg.det(axes) > 0 else \
-        f'axes are left-handed, swapped or of the wrong sign: {parts}'
-    return Mistake(topic, touches, f'{whose} {how}', block_diag(*blocks).T, fix)
-
-
-def _up(axes):
-    k = int(np.argmax(np.abs(axes[:, 2])))
-    return f'the {"-" * int(axes[k, 2] < 0)}{"xyz"[k]} axis points up, expected z up'
-
-
-def _turn(axes, after):
-    """(4, 4) map of a quaternion xyzw to its product with a rotation of the body or the world."""
-    unit = Rotation.from_quat(ONE)
-    turn = Rotation.from_matrix(axes)
-    return np.stack([(q * turn if after else turn * q).as_quat() for q in unit], axis=1)
+def _up(a):
+    """The upward axis."""
+    k = int(np.argmax(np.abs(a[:, 2])))
+    return f'the {"-" * int(a[k, 2] < 0)}{"xyzw"[k]} axis'

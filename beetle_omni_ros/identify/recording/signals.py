@@ -5,12 +5,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.signal import lfilter
 
-from beetle_omni_ros.identify.gap.bags import NEEDED, Recording
+from beetle_omni_ros.identify.gap.bags import Recording
 from beetle_omni_ros.identify.gap.series import aligned, low_pass, matrices
+from beetle_omni_ros.identify.recording.damage import COMMAND, IMU, JOINTS, POSE
 from beetle_omni_ros.identify.recording.limits import RecordingLimits
 from beetle_omni_ros.robot.parameters import RobotParameters
 
-IMU, POSE, JOINTS, COMMAND, GRAVITY = 'imu/data_raw', 'mocap/pose', 'joint_states', 'command', 'g'
+GRAVITY = 'gravity'     # [m/s^2] that the accelerometer measures
 THINNED = 4             # points of the fine grid for each point of the coarse one
 
 
@@ -70,7 +71,7 @@ class Signals:
 def signals_of(recording: Recording, robot: RobotParameters,
                limits: RecordingLimits) -> Signals | None:
     """Smooth all topics with the same filter; None if they have too little time in common."""
-    series = {topic: series_of(recording, topic) for topic in NEEDED}
+    series = {topic: series_of(recording, topic) for topic in (IMU, POSE, JOINTS, COMMAND)}
     if min(len(t) for t, _ in series.values()) < 2:
         return None
     begin = max(t[0] for t, _ in series.values())
