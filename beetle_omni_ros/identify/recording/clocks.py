@@ -81,7 +81,7 @@ def relative_ages(recording: Recording,
 def _age(recording, topic, ages, limits):
     """Offset, step or drift of a topic's clock against the times of recording."""
     at, lags = ages.get(topic, ((), ()))
-    judged = judge(at, lags, limits.clock_offset, limits)
+    judged = judge(at, lags, limits.clock_offset, limits.clock_step, limits)
     if not judged:
         return None
     cause, moment, late_at = judged
@@ -101,18 +101,18 @@ def lag_damage(name: str, relation: Relation, signals: Signals,
     """A lag of two motions that is out of range, steps or drifts."""
     late, early = (np.linalg.norm(x, axis=1) for x in relation.pair(signals))
     at, lags = window_lags(signals.t, late, early, limits, signals.silent)
-    judged = judge(at, lags, getattr(limits, relation.lag), limits)
+    judged = judge(at, lags, getattr(limits, relation.lag), limits.lag_step, limits)
     return Damage(name, relation.late, f'the clock of {relation.late} or of {relation.early} '
                   f'{judged[0]}, by {relation.words}', judged[1]) if judged else None
 
 
-def judge(at: np.ndarray, lags: np.ndarray, allowed: np.ndarray,
+def judge(at: np.ndarray, lags: np.ndarray, allowed: np.ndarray, least: float,
           limits: RecordingLimits) -> list | None:
     """
     Whether lags (n,) [s] at times (n,) are out of range, step or drift; None if they are valid.
 
     Step and drift are compared with a constant lag by the likelihood of Laplace's distribution,
-    which bears single wrong lags. They must also exceed the change ``limits.step``.
+    which bears single wrong lags. They must also exceed the change ``least`` [s].
 
     Returns:
         cause in words, time of a step or None, function from times to lags.
@@ -135,8 +135,8 @@ def judge(at: np.ndarray, lags: np.ndarray, allowed: np.ndarray,
          f'{start + drift:.2f} s at the end', None, lambda t: start + slope * (t - at[0])))
     rests = [np.abs(lags - late(at)).sum() for *_, late in models]
     change, *result = models[int(np.argmin(rests))]
-    if abs(change) > limits.step \
-            and usual - min(rests) > limits.prior * max(min(rests) / n, limits.step / 10):
+    if abs(change) > least \
+            and usual - min(rests) > limits.prior * max(min(rests) / n, least / 10):
         return result
     if allowed[0] <= middle <= allowed[1]:
         return None

@@ -20,7 +20,8 @@ class RecordingLimits(ParameterFile, file='recording.yaml'):
         unit='s', doc='Range of the age of messages relative to other topics.')
     sensor_lag: np.ndarray = between(unit='s', doc='Range of the lag of MoCap behind the IMU.')
     servo_lag: np.ndarray = between(unit='s', doc='Range of the lag of encoders behind commands.')
-    step: float = limit(unit='s', doc='Largest change of an age or a lag within a recording.')
+    clock_step: float = limit(unit='s', doc='Largest change of an age within a recording.')
+    lag_step: float = limit(unit='s', doc='Largest change of a lag within a recording.')
     lag_reach: float = limit(unit='s', doc='Largest tried lag.')
     scatter: np.ndarray = parameter(shape=(5,), unit='',
         doc='Largest white noise of specific force [m/s^2], rate [rad/s], MoCap position [m] and '
