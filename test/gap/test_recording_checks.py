@@ -1,7 +1,9 @@
 """Damaged recordings are refused with topic, cause and time."""
 
 from copy import deepcopy
+from dataclasses import fields
 from functools import cache
+import re
 import warnings
 
 from flown_once import flight
@@ -13,10 +15,12 @@ from scipy.spatial.transform import Rotation, Slerp
 from beetle_omni_ros.identify.gap.bags import read_recording
 from beetle_omni_ros.identify.gap.ingest import prepare, UnusableFlight
 from beetle_omni_ros.identify.gap.parameters import GapParameters
-from beetle_omni_ros.identify.recording.check import damages, repaired
+from beetle_omni_ros.identify.recording.check import repaired
+from beetle_omni_ros.identify.recording.damage import changed
 from beetle_omni_ros.identify.recording.limits import RecordingLimits
-from beetle_omni_ros.identify.recording.readings import reading_damages
+from beetle_omni_ros.identify.recording.readings import sensor_damages
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.resources import share_path
 
 ROBOT = RobotParameters.load()
 
@@ -44,13 +48,6 @@ def late_half(made, topic):
 def columns(made, topic, first, last, change):
     """Change some columns of a topic's values."""
     made.values[topic][:, first:last] = change(made.values[topic][:, first:last].copy())
-    return made
-
-
-def kept(made, topic, keep):
-    """Only some messages of a topic."""
-    for part in (made.times, made.values, made.received):
-        part[topic] = part[topic][keep]
     return made
 
 
@@ -103,7 +100,8 @@ def noisy(topic, count, deviation):
 
 
 def twice(topic):
-    return lambda made: kept(made, topic, np.repeat(np.arange(len(made.times[topic])), 2))
+    return lambda made: changed(
+        made, topic, keep=np.repeat(np.arange(len(made.times[topic])), 2))
 
 
 def turned(topic, columns_, rotation, late=False):
@@ -179,19 +177,19 @@ def without_gravity(made):
 
 def stamped(topic, change):
     """All stamps of a topic are changed."""
-    def changed(made):
+    def restamped(made):
         made.times[topic] = change(made.times[topic])
         return made
-    return changed
+    return restamped
 
 
 def silent_clock(change):
     """Times of recording that follow the damaged stamps: only the motion shows the fault."""
-    def changed(made):
+    def unreceived(made):
         made = change(made)
         made.received = {}
         return made
-    return changed
+    return unreceived
 
 
 QUARTER = Rotation.from_euler('z', 90, degrees=True)
@@ -201,7 +199,6 @@ KINDS = {
     'quaternion w first': (of(POSE, 3, 7, lambda v: v[:, [3, 0, 1, 2]]), POSE, ['(w, x, y, z)'],
                            None),
     'quaternion inverse': (of(POSE, 3, 7, lambda v: v * [-1, -1, -1, 1]), POSE, ['inverse'], None),
-    'quaternion scaled': (of(POSE, 3, 7, lambda v: 2 * v), POSE, ['norm'], None),
     'zero quaternions': (spiked(POSE, slice(400, None, 500), slice(3, 7), 0.0), POSE,
                          ['zero quaternion'], 4.0),
     'millimetres': (of(POSE, 0, 3, lambda v: 1e3 * v), POSE, ['millimetres'], None),
@@ -213,7 +210,7 @@ KINDS = {
     'MoCap body turned on the way': (flipped_from_half, POSE, ['turned', 'jumps'], HALF),
     'MoCap frozen': (frozen(POSE, 10, 13.5), POSE, ['frozen'], 10.0),
     'marker flips': (flips, POSE, ['markers'], 3.0),
-    'MoCap interleaved': (interleaved, POSE, ['sources', 'interleaved'], 0.0),
+    'MoCap interleaved': (interleaved, POSE, ['sources', 'interleaved'], None),
     'MoCap clock back': (shifted(POSE, -0.3), POSE, ['clock'], HALF),
     'MoCap clock back, recorded so': (silent_clock(shifted(POSE, -0.3)), POSE, ['clock'], HALF),
     'MoCap clock drifts': (drifting, POSE, ['drift'], None),
@@ -225,8 +222,6 @@ KINDS = {
     'commands early': (silent_clock(stamped(COMMAND, lambda t: t - 0.5)), JOINTS, ['clock'], None),
     'stamps of zero': (stamped(IMU, lambda t: 0 * t), IMU, ['do not advance'], None),
     'stamps in milliseconds': (stamped(IMU, lambda t: 1000 * t), IMU, ['apart'], None),
-    'out of order': (reordered, POSE, ['out of order'], 0.1),
-    'recorded twice': (twice(IMU), IMU, ['twice'], 0.0),
     'degrees per second': (of(IMU, 3, 6, np.rad2deg), IMU, ['degrees per second'], None),
     'acceleration in g': (of(IMU, 0, 3, lambda v: v / 9.80665), IMU, ['units of g'], None),
     'gravity taken off': (without_gravity, IMU, ['without gravity'], None),
@@ -271,9 +266,56 @@ def test_damage_is_refused_with_topic_cause_and_time(kind):
         assert right[0].at_s == pytest.approx(at, abs=2.0 if 'recorded so' not in kind else 4.5)
 
 
-def test_a_sound_recording_has_no_damage():
-    assert damages(recording(), ROBOT) == []
-    assert damages(silent_clock(lambda made: made)(recording()), ROBOT) == []
+@pytest.mark.parametrize(('change', 'words'), [
+    (lambda made: made, ''), (silent_clock(lambda made: made), ''), (reordered, 'out of order'),
+    (twice(IMU), 'twice'), (of(POSE, 3, 7, lambda v: 2 * v), 'unit quaternions')])
+def test_what_is_harmless_is_used_and_stated(change, words):
+    sound, made = prepare(recording(), ROBOT, P), prepare(change(recording()), ROBOT, P)
+    assert not words and not made.findings or any(words in text for text in made.findings)
+    assert made.duration == pytest.approx(sound.duration, abs=0.05)
+    assert np.allclose(sound.imu[:999], made.imu[-len(sound.imu):][:999]) or not made.findings
+
+
+def rested(before, after):
+    """A recording with rests [s] on the ground, in which neither MoCap nor encoders change."""
+    made = recording()
+    for topic, t in made.times.items():
+        values, received = made.values[topic], made.received[topic]
+        if not len(t):
+            continue
+        for first, k, span in ((t[0] - before, 0, before), (t[-1] + 0.005, -1, after)):
+            more = first + np.arange(0, span - 0.004, np.median(np.diff(t)))
+            rest = np.tile(values[k], (len(more), 1))
+            if topic == COMMAND:
+                rest[:, 4:] = 0.0
+            if topic == POSE:
+                rest[:, :3] = values[0, :3]
+            order = slice(None, None, 1 if k else -1)
+            for part, new in ((made.times, more), (made.values, rest),
+                              (made.received, more + np.median(received - t))):
+                part[topic] = np.concatenate([part[topic], new][order])
+    return made
+
+
+@pytest.mark.parametrize(('before', 'after'), [(60.0, 60.0), (300.0, 220.0)])
+def test_rests_on_the_ground_are_neither_damage_nor_flight(before, after):
+    # 24 s of flight in a bag of two, and of nine minutes.
+    flown_part, whole = prepare(recording(), ROBOT, P), prepare(rested(before, after), ROBOT, P)
+    assert whole.start == pytest.approx(flown_part.start, abs=0.1)
+    assert whole.duration == pytest.approx(flown_part.duration, abs=1.0)
+    silent = prepare(silent_clock(lambda made: made)(rested(before, after)), ROBOT, P)
+    assert silent.duration == pytest.approx(flown_part.duration, abs=1.0)
+    damaged = frozen(POSE, before + 10, before + 13.5)(rested(before, after))
+    with pytest.raises(UnusableFlight, match='frozen') as error:
+        prepare(damaged, ROBOT, P)
+    assert error.value.problems[0].at_s == pytest.approx(before + 10, abs=0.1)
+
+
+def test_each_number_is_a_range_a_specification_or_statistical():
+    text = share_path('params/recording.yaml').read_text()
+    kinds = re.findall(r'^\w+:.*# \[[^]]*\] (physical|sensor|statistical): ', text, re.MULTILINE)
+    assert len(kinds) == len(fields(RecordingLimits))
+    assert kinds.count('statistical') <= 12
 
 
 def joint_step(size, lag, end, frozen_from=np.inf):
@@ -288,7 +330,7 @@ def joint_step(size, lag, end, frozen_from=np.inf):
     count = 2 * np.pi / 4096
     reading = count * np.round((0.1 + size * np.interp(after, t, turned)) / count)
     columns(made, JOINTS, 1, 2, lambda v: reading[:, None])
-    return kept(made, JOINTS, made.times[JOINTS] < at + end)
+    return changed(made, JOINTS, keep=made.times[JOINTS] < at + end)
 
 
 @pytest.mark.parametrize('seed', range(6))
@@ -298,19 +340,18 @@ def test_a_joint_that_rests_until_its_command_arrives_is_not_frozen(seed):
     rng, limits = np.random.default_rng(seed), RecordingLimits.load()
     size, lag = rng.choice([-1, 1]) * rng.uniform(0.27, 0.35), rng.uniform(0, 0.3)
     for end in (rng.uniform(0, lag), rng.uniform(lag, 1.0), 10.0):
-        found = reading_damages(joint_step(size, lag, end), limits, ROBOT)
+        found = sensor_damages(joint_step(size, lag, end), limits)
         assert not found, (size, lag, end, found[0].text)
     # Frozen at any time before the step, it is found once every valid servo would have turned.
     held = joint_step(size, lag, limits.servo_lag[1] + 0.1, frozen_from=0.0)
-    damage, = reading_damages(held, limits, ROBOT)
+    damage, = sensor_damages(held, limits)
     assert damage.topic == JOINTS and 'gimbal2 is frozen' in damage.cause
 
 
 @pytest.mark.parametrize('kind', ['quaternion w first', 'millimetres', 'degrees per second',
                                   'gravity downwards', 'joints swapped', 'joints in degrees',
                                   'MoCap clock of another computer', 'MoCap clock back',
-                                  'quaternion scaled', 'IMU spike', 'recorded twice', 'IMU stale',
-                                  'IMU upside down', 'out of order', 'marker flips'])
+                                  'IMU spike', 'IMU stale', 'IMU upside down', 'marker flips'])
 def test_a_repair_restores_the_sound_recording(kind):
     sound = recording()
     fixed, done, left = repaired(KINDS[kind][0](recording()), ROBOT)

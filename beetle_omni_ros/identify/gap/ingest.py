@@ -11,7 +11,9 @@ from beetle_omni_ros.identify.gap.bags import NEEDED, OPTIONAL, read_recording, 
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.series import aligned, shortest_flight
 from beetle_omni_ros.identify.recording.check import damages, repaired
+from beetle_omni_ros.identify.recording.clocks import begin_of
 from beetle_omni_ros.identify.recording.damage import Damage
+from beetle_omni_ros.identify.recording.flown import flown
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.bag import bag_files
@@ -108,19 +110,26 @@ def prepare(recording: Recording, robot: RobotParameters, p: GapParameters,
                            for topic in missing)
         raise UnusableFlight(f'{name}: missing or nearly empty: {counts}', [
             Damage(name, topic, f'{len(recording.times[topic])} messages') for topic in missing])
+    part = flown(recording, robot, p)
+    if part is None:
+        raise _unusable(name, 'command', 'the robot does not fly: commanded thrust is never above '
+                        f'{p.lifted:g} of its weight')
+    origin = begin_of(recording)
+    recording, lead = part
     findings = list(recording.warnings)
     if fix:
-        recording, done, wrong = repaired(recording, robot)
+        recording, done, wrong = repaired(recording, robot, origin)
         findings += done
     else:
-        wrong = damages(recording, robot)
+        wrong = damages(recording, robot, origin)
     if wrong:
         raise UnusableFlight(wrong[0].text, wrong)
     series = {topic: _in_order(name, topic, recording, findings) for topic in recording.times}
     t, battery = series['battery_state']
     series['battery_state'] = t, np.column_stack([battery[:, 0], _drawn(t, battery[:, 1])])
-    begin, end = _flown(name, recording, series, robot, p)
-    begin, end = _without_gaps(name, series, begin, end, p, findings)
+    t = series['command'][0]
+    begin, end = t[0] + lead, t[-1]
+    begin, end = _without_gaps(name, series, begin, end, p, findings, origin)
     least = max(p.least_duration, shortest_flight(p))
     if end - begin < least:
         raise _unusable(name, 'all topics', f'{max(end - begin, 0.0):.1f} s of usable flight, '
@@ -131,6 +140,9 @@ def prepare(recording: Recording, robot: RobotParameters, p: GapParameters,
         cut[topic] = t[keep] - begin, values[keep]
     pose = cut['mocap/pose'][1].copy()
     norm = np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
+    if abs(np.median(norm) - 1) > 0.01:
+        findings.append(f'{name}: mocap/pose: orientations of norm {np.median(norm):.3g}, '
+                        'expected unit quaternions; normalised')
     pose[:, 3:] = aligned(pose[:, 3:] / np.where(norm > 1e-6, norm, 1.0))
     flight = Flight(name, begin, end - begin, *cut['imu/data_raw'], cut['mocap/pose'][0], pose,
                     *cut['joint_states'], *cut['command'], *cut['battery_state'],
@@ -153,6 +165,8 @@ def _in_order(name, topic, recording, findings):
     if not fine.all():
         findings.append(f'{name}: {topic}: {int((~fine).sum())} messages hold no numbers')
         t, values = t[fine], values[fine]
+    if back := int((np.diff(t) < 0).sum()):
+        findings.append(f'{name}: {topic}: {back} messages are out of order; sorted by stamp')
     t, first = np.unique(t, return_index=True)
     lost = len(values) - len(first)
     if lost > 2:
@@ -169,27 +183,7 @@ def _drawn(t, current):
     return np.abs(cumulative_trapezoid(current, t, initial=0)) / 3600
 
 
-def _flown(name, recording, series, robot, p):
-    """First and last time of the usable flight."""
-    t, command = series['command']
-    lifted = command[:, 4:].sum(axis=1) > p.lifted * robot.mass * robot.gravity
-    if lifted.mean() < 0.2:
-        raise _unusable(name, 'command', 'the robot does not fly: commanded thrust is above '
-                        f'{p.lifted:g} of its weight in {lifted.mean():.0%} of the time')
-    begin = t[np.argmax(lifted)]
-    height, when = series['mocap/pose'][1][:, 2], series['mocap/pose'][0]
-    if begin > when[0] + 0.3:       # the take-off was recorded
-        risen = when[(when > begin) & (height > height[0] + 0.15)]
-        begin = (risen[0] if len(risen) else begin) + p.settle
-        flying = [at for at, state in recording.states if state.startswith('flying')]
-        if flying and when[0] - 1 < flying[0] < when[-1]:
-            begin = max(begin, flying[0])
-    else:
-        begin = begin + 0.1
-    return begin, t[len(lifted) - 1 - np.argmax(lifted[::-1])]
-
-
-def _without_gaps(name, series, begin, end, p, findings):
+def _without_gaps(name, series, begin, end, p, findings, origin):
     """The longest piece without a long gap in any topic."""
     breaks, lost, longest = [], 0.0, (0.0, '', 0.0)
     for topic in NEEDED:
@@ -200,7 +194,7 @@ def _without_gaps(name, series, begin, end, p, findings):
         inside = t[(t >= begin) & (t <= end)]
         for k in np.flatnonzero(np.diff(inside) > p.longest_gap):
             breaks.append((inside[k], inside[k + 1]))
-            silence, at_s = inside[k + 1] - inside[k], inside[k] - series['imu/data_raw'][0][0]
+            silence, at_s = inside[k + 1] - inside[k], inside[k] - origin
             lost, longest = lost + silence, max(longest, (silence, topic, at_s))
             findings.append(f'{name}: {topic}: silent for {silence:.2f} s, from {at_s:.1f} s on')
     if lost > p.most_lost * max(end - begin, 1e-9) and lost > 1.0:

@@ -3,15 +3,9 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-import numpy as np
+from beetle_omni_ros.identify.gap.bags import NEEDED, Recording
 
-from beetle_omni_ros.identify.gap.bags import Recording
-
-MOST_CERTAIN = 0.999    # largest stated probability
-CERTAIN = 0.99          # least probability of a cause for a repair
-PRIOR = 6.0             # log odds against each deviation from a convention
-FLOOR = 1e-4            # least relative variance of the difference of two sensors
-Repair = Callable[[Recording], Recording]
+IMU, POSE, JOINTS, COMMAND = NEEDED
 
 
 @dataclass(frozen=True)
@@ -34,9 +28,9 @@ class Damage:
     topic: str
     cause: str
     at_s: float | None = None
-    sure: float = MOST_CERTAIN
+    sure: float = 0.99
     fix: str | None = None
-    repair: Repair | None = None
+    repair: Callable[[Recording], Recording] | None = None
 
     @property
     def text(self) -> str:
@@ -46,7 +40,7 @@ class Damage:
 
 
 def changed(recording: Recording, topic: str, times=None, values=None,
-            keep=None) -> Recording:
+            keep=slice(None)) -> Recording:
     """
     Copy of a recording with one topic changed.
 
@@ -55,27 +49,10 @@ def changed(recording: Recording, topic: str, times=None, values=None,
         topic: topic to change.
         times: (N,) new stamps [s], or None.
         values: (N, width) new values, or None.
-        keep: (N,) mask or indices of the kept messages, applied last; or None.
+        keep: mask or indices of the kept messages, applied last.
 
     """
-    result = replace(recording, times=dict(recording.times), values=dict(recording.values),
-                     received=dict(recording.received))
-    if times is not None:
-        result.times[topic] = times
-    if values is not None:
-        result.values[topic] = values
-    if keep is not None:
-        for part in (result.times, result.values, result.received):
-            if topic in part:
-                part[topic] = part[topic][keep]
-    return result
-
-
-def columns_changed(first: int, last: int, change: Callable[..., np.ndarray],
-                    topic: str = 'mocap/pose') -> Repair:
-    """Repair of the columns ``first`` to ``last`` of a topic."""
-    def repair(recording):
-        values = recording.values[topic].copy()
-        values[:, first:last] = change(values[:, first:last])
-        return changed(recording, topic, values=values)
-    return repair
+    def part(old, new=None):
+        return old | {topic: (old[topic] if new is None else new)[keep]} if topic in old else old
+    return replace(recording, times=part(recording.times, times), received=part(
+        recording.received), values=part(recording.values, values))

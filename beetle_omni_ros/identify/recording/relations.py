@@ -1,0 +1,182 @@
+"""
+The checks as data: signals that must agree, and the mistakes that make them disagree.
+
+A mistake is a linear map of the columns of one topic, as a unit, an order, a sign or a rotation
+is. Its inverse undoes it, in the comparison and in a repair.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from itertools import permutations, product
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.spatial.transform import Rotation
+
+from beetle_omni_ros.identify.recording.damage import COMMAND, IMU, JOINTS, POSE
+from beetle_omni_ros.identify.recording.signals import GRAVITY, Signals
+
+
+@dataclass(frozen=True)
+class Relation:
+    """
+    Two measurements of the same motion.
+
+    Attributes:
+        late, early: topics of the later and of the earlier signal.
+        words: what both signals show.
+        pair: both signals, (N, n) each.
+        noise: (topic, a column, order of derivative) of the noise of both.
+        gain: name of the limit of their ratio.
+        lag: name of the limits of the lag of the later one [s]; none without a check.
+        certain: whether a contradiction is a damage even if no mistake explains it. With thrusts
+            it is not, because the robot file may be wrong.
+
+    """
+
+    late: str
+    early: str
+    words: str
+    pair: Callable[[Signals], tuple[np.ndarray, np.ndarray]]
+    noise: tuple[tuple[str, int, int], ...]
+    gain: str
+    lag: str = ''
+    certain: bool = True
+
+
+RELATIONS = {
+    'turning': Relation(POSE, IMU, 'rotation of the pose and gyroscope', Signals.turning,
+                        ((IMU, 3, 0), (POSE, 3, 1)), 'gain', 'sensor_lag'),
+    'pushing': Relation(POSE, IMU, 'motion of the pose and accelerometer', Signals.pushing,
+                        ((IMU, 0, 0), (POSE, 0, 2)), 'gain'),
+    'tilting': Relation(JOINTS, COMMAND, 'encoders and tilt commands', Signals.tilting,
+                        ((JOINTS, 0, 0),), 'gain', 'servo_lag'),
+    'lifting': Relation(IMU, COMMAND, 'accelerometer and thrust commands', Signals.lifting,
+                        ((IMU, 0, 0),), 'thrust_gain', certain=False)}
+
+
+@dataclass(frozen=True, eq=False)
+class Mistake:
+    """
+    One way to record a topic wrongly.
+
+    Attributes:
+        topic: damaged topic.
+        touches: names of the relations that it changes.
+        text: cause in words.
+        undo: (width, width) map from recorded to right columns.
+        fix: description of the repair; empty without one.
+        part: key of the changed :class:`Signals`, if not ``topic``.
+
+    """
+
+    topic: str
+    touches: tuple[str, ...]
+    text: str
+    undo: np.ndarray
+    fix: str = ''
+    part: str = ''
+
+
+TURN, PUSH, TILT, LIFT = ('turning',), ('pushing', 'lifting'), ('tilting',), ('lifting',)
+MOVE, SPIN = ('pushing',), ('turning', 'pushing')
+ANGLES = {180 / np.pi: 'in degrees, not radians', 2048 / np.pi: 'in encoder counts, not radians',
+          np.pi / 180: 'turned into radians twice', 1 / (2 * np.pi): 'in turns, not radians'}
+THRUSTS = {1e3: 'in millinewtons, not N', 1e3 / 9.80665: 'in grams, not N',
+           1 / 9.80665: 'in kilograms, not N', 5.0: 'in percent of the largest thrust, not N',
+           0.05: 'in parts of the largest thrust, not N'}
+# Topic, relations, columns before, of and after it, what, factor -> unit.
+UNITS = (
+    (IMU, TURN, 3, 3, 0, 'angular velocity', {
+        180 / np.pi: 'in degrees per second, not rad/s',
+        np.pi / 180: 'turned into radians twice'}),
+    (IMU, PUSH, 0, 3, 3, 'linear acceleration', {
+        1 / 9.80665: 'in units of g, not m/s^2', 1e3 / 9.80665: 'in milli-g, not m/s^2',
+        100.0: 'in cm/s^2, not m/s^2', 1e3: 'in mm/s^2, not m/s^2'}),
+    (POSE, MOVE, 0, 3, 4, 'position', {
+        1e3: 'in millimetres, not metres', 100.0: 'in centimetres, not metres',
+        1e-3: 'in kilometres, not metres', 1 / 0.3048: 'in feet, not metres',
+        1 / 0.0254: 'in inches, not metres'}),
+    (JOINTS, TILT + LIFT, 0, 4, 0, 'joint angle', ANGLES),
+    (COMMAND, TILT, 0, 4, 4, 'tilt', ANGLES), (COMMAND, LIFT, 4, 4, 0, 'thrust', THRUSTS))
+SIGNED = [np.array(signs)[:, None] * np.eye(3)[list(order)]
+          for order in permutations(range(3)) for signs in product((1.0, -1.0), repeat=3)][1:]
+TURNS = [axes for axes in SIGNED if np.linalg.det(axes) > 0]
+UPS = {tuple(axes[:, 2]): axes for axes in TURNS if axes[2, 2] < 1}     # any heading
+SIGNS = [np.diag(signs) for signs in product((1.0, -1.0), repeat=4)][1:]
+ORDERS = [np.eye(4)[list(order)] for order in permutations(range(4))][1:]
+I3, I4 = np.eye(3), np.eye(4)
+MIRRORS = [np.diag(np.where(np.arange(3) == k, -1.0, 1.0)) for k in range(3)]
+
+
+def _body(axes):
+    """(4, 4) map of a quaternion xyzw to its product with a rotation of the body."""
+    return np.stack([(q * Rotation.from_matrix(axes)).as_quat() for q in BASIS], axis=1)
+
+
+def _world(axes):
+    """The same with a rotation of the world."""
+    return np.stack([(Rotation.from_matrix(axes) * q).as_quat() for q in BASIS], axis=1)
+
+
+BASIS = Rotation.from_quat(I4)
+# Topic, relations, matrices, blocks of the map from right to recorded columns, text, repair.
+AXES = (
+    (IMU, TURN + PUSH, SIGNED, lambda a: (a, a), "the IMU's {}", 'turn the axes back'),
+    (IMU, TURN, SIGNED, lambda a: (I3, a), 'angular velocity: {}', 'exchange the axes'),
+    (IMU, PUSH, SIGNED, lambda a: (a, I3),
+     'linear acceleration (+9.81 m/s^2 upwards at rest, REP-145): {}', 'exchange the axes'),
+    (POSE, MOVE, SIGNED, lambda a: (a, I4), 'the axes of positions against the orientation: {}',
+     'exchange the axes of positions'),
+    (POSE, SPIN, TURNS, lambda a: (I3, _body(a)), "the body's {}", ''),
+    (POSE, SPIN, UPS.values(), lambda a: (a, _world(a)), '{up} points up, expected z up', ''),
+    (POSE, SPIN, [a for a in TURNS if a[2, 2] < 1], lambda a: (a, block_diag(a, 1.0)),
+     "{up} points up, expected z up, and the body's {}", ''),
+    (POSE, SPIN, MIRRORS, lambda a: (a, block_diag(-a, 1.0)), "the world's {}", ''),
+    (POSE, SPIN, [I4[[3, 0, 1, 2]]], lambda a: (I3, a), 'the quaternion is stored as (w, x, y, z),'
+     ' expected (x, y, z, w)', 'reorder the quaternion'),
+    (POSE, SPIN, [np.diag([-1.0, -1, -1, 1])], lambda a: (I3, a), 'the quaternion is stored as the'
+     ' inverse, world seen from the body, expected the body seen from the world', 'invert it'),
+    (POSE, SPIN, [I4[[3, 0, 1, 2]] * [-1, -1, -1, 1]], lambda a: (I3, a), 'the quaternion is '
+     'stored as the inverse in the order (w, x, y, z), expected (x, y, z, w)', 'reorder it'),
+    (JOINTS, TILT + LIFT, SIGNS, lambda a: (a,), 'joints turn against their commands: the sign of '
+     'the encoder is reversed: {}', 'reverse the sign'),
+    (COMMAND, TILT, SIGNS, lambda a: (a, I4), 'joints turn against their commands: the sign of '
+     'the command is reversed: {}', 'reverse the sign'),
+    (JOINTS, TILT + LIFT, ORDERS, lambda a: (a,), 'joints are swapped: {}', 'exchange the joints'),
+    (COMMAND, TILT, ORDERS, lambda a: (a, I4), 'tilt commands are swapped: {}',
+     'exchange the commands'),
+    (COMMAND, LIFT, ORDERS, lambda a: (I4, a), 'the order of the thrusts is another one: {}', ''))
+
+
+@cache
+def mistakes() -> tuple[Mistake, ...]:
+    """All known mistakes."""
+    units = [Mistake(topic, touches, f'{what} is {factor:.4g} times what others show: {words}?',
+                     block_diag(np.eye(before), np.eye(width) / factor, np.eye(after)),
+                     '' if 'counts' in words else f'scale the {what}')
+             for topic, touches, before, width, after, what, units in UNITS
+             for factor, words in units.items()]
+    axes = [Mistake(topic, touches, text.format(_how(a), up=_up(a)), block_diag(*blocks(a)).T, fix)
+            for topic, touches, matrices, blocks, text, fix in AXES for a in matrices]
+    return (*units, *axes, Mistake(
+        IMU, MOVE, 'linear acceleration is without gravity, which a sensor at rest measures: the '
+        'driver takes gravity off', np.zeros((1, 1)), part=GRAVITY))
+
+
+def _how(a):
+    """Text such as 'axes are turned: x is y, y is -x', or '1 is 2, 2 is 1' of joints."""
+    names = 'xyz' if len(a) == 3 else '1234'
+    parts = ', '.join(f'{names[k]} is {"-" * int(row.min() < 0)}{names[np.argmax(np.abs(row))]}'
+                      for k, row in enumerate(a) if row[k] < 1)
+    if len(a) == 4:
+        return parts
+    kind = 'turned' if np.linalg.det(a) > 0 else 'left-handed, swapped or of the wrong sign'
+    return 'the opposite sign' if (a == -I3).all() else f'axes are {kind}: {parts}'
+
+
+def _up(a):
+    """The upward axis."""
+    k = int(np.argmax(np.abs(a[:, 2])))
+    return f'the {"-" * int(a[k, 2] < 0)}{"xyzw"[k]} axis'
