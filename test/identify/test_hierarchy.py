@@ -131,6 +131,13 @@ def bent(problem):
     return model
 
 
+def test_left_out_blocks_are_predicted_no_better_than_fitted_ones():
+    problem = Linear(4)
+    problem.y[:, ::11] += 6 * SIGMA         # the same loss for both
+    fit = problem.fit()
+    assert fit.held.sum() > fit.chi2
+
+
 def test_the_gradient_of_loss_and_prior_vanishes_at_the_solution():
     problem = Linear(3)
     model = bent(problem)

@@ -165,9 +165,9 @@ def solve(model: Model, base: np.ndarray, s: np.ndarray, x: np.ndarray, groups: 
 
     def at(x):
         theta = np.clip(base + s @ x, low, high)
-        residuals, slopes = model(theta, active)
-        own, ratio = zip(*map(robust, residuals), strict=True)
-        return theta, own, [j * r for j, r in zip(slopes, ratio, strict=True)]
+        raw = model(theta, active)
+        own, ratio = zip(*map(robust, raw[0]), strict=True)
+        return theta, own, [j * r for j, r in zip(raw[1], ratio, strict=True)], raw
 
     def normal(slopes, residuals):
         return (sum(part.T @ (j @ j.T) @ part for part, j in zip(s, slopes, strict=True)),
@@ -194,11 +194,10 @@ def solve(model: Model, base: np.ndarray, s: np.ndarray, x: np.ndarray, groups: 
             damping *= 8
             if damping > 1e5:
                 break
-    theta, residuals, slopes = now
-    return _judged(x, s, theta, residuals, slopes, groups, blocks, memory)
+    return _judged(x, s, *now, groups, blocks, memory)
 
 
-def _judged(x, s, theta, residuals, slopes, groups, blocks, memory):
+def _judged(x, s, theta, residuals, slopes, raw, groups, blocks, memory):
     """The fit with its curvature, its scatter and the prediction of each block by the others."""
     count = 1 + max(int(block.max(initial=0)) for block in blocks)
     size = len(x)
@@ -215,10 +214,9 @@ def _judged(x, s, theta, residuals, slopes, groups, blocks, memory):
     deviations = np.array([-np.linalg.solve(information - h, gradient - g)
                            for h, g in zip(parts, scores, strict=True)]).reshape(count, size)
     held = np.zeros(count)
-    for part, j, r, block in zip(s, slopes, residuals, blocks, strict=True):
+    for part, r, j, block in zip(s, *raw, blocks, strict=True):
         moved = j.T @ (part @ deviations.T) if size else np.zeros((len(r), count))
-        for b in range(count):
-            held[b] += (robust(r[block == b] + moved[block == b, b])[0]**2).sum()
+        held += np.bincount(block, robust(r + moved[np.arange(len(r)), block])[0]**2, count)
     ratio, slow = 1.0, np.array([_slow(g) for g in series.values()])
     if size:
         inverse = np.linalg.inv(information)
