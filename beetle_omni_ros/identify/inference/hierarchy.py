@@ -194,7 +194,8 @@ def solve(model: Model, base: np.ndarray, s: np.ndarray, x: np.ndarray, groups: 
             damping *= 8
             if damping > 1e5:
                 break
-    return _judged(x, s, *now, groups, blocks, memory)
+    theta, residuals, slopes, raw = now
+    return _judged(x, s, theta, residuals, slopes, raw, groups, blocks, memory)
 
 
 def _judged(x, s, theta, residuals, slopes, raw, groups, blocks, memory):
