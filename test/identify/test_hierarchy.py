@@ -7,7 +7,8 @@ from scipy.signal import lfilter
 from scipy.special import huber
 from scipy.stats import multivariate_normal
 
-from beetle_omni_ros.identify.inference.hierarchy import design, HUBER, solve, Spread, WIDTH
+from beetle_omni_ros.identify.inference.hierarchy import design, solve, Spread, WIDTH
+from beetle_omni_ros.identify.inference.robust import HUBER
 
 JOINTS, LOGS = (1, 2, 3, 1, 2, 3), (0, 0, 0, 1, 1, 1)
 LABELS = {'joint': JOINTS, 'log': LOGS}

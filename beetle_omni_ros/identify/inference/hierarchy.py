@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import t
 
-HUBER = 3.0         # standard deviations from which the loss is linear
+from beetle_omni_ros.identify.inference.robust import huber
+
 CONVERGED = 1e-4    # decrease of the cost, relative to the number of samples
 WIDTH = 1.96        # standard deviations of a 95 % interval
 SLOWEST = 4         # cosines of slow noise
@@ -61,14 +62,6 @@ def design(spreads: Sequence[Spread], labels: dict[str, Sequence], active: np.nd
             column[:, p] = scale * member
             columns.append(column)
     return np.stack(columns, axis=-1) if columns else np.zeros((count, len(spreads), 0))
-
-
-def robust(white: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals whose sum of squares is Huber's loss, and their derivative."""
-    size = np.abs(white)
-    far = size > HUBER
-    root = np.sqrt(np.maximum(2 * HUBER * size - HUBER**2, HUBER**2))
-    return np.where(far, root * np.sign(white), white), np.where(far, HUBER / root, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +159,7 @@ def solve(model: Model, base: np.ndarray, s: np.ndarray, x: np.ndarray, groups: 
     def at(x):
         theta = np.clip(base + s @ x, low, high)
         raw = model(theta, active)
-        own, ratio = zip(*map(robust, raw[0]), strict=True)
+        own, ratio = zip(*map(huber, raw[0]), strict=True)
         return theta, own, [j * r for j, r in zip(raw[1], ratio, strict=True)], raw
 
     def normal(slopes, residuals):
@@ -217,7 +210,7 @@ def _judged(x, s, theta, residuals, slopes, raw, groups, blocks, memory):
     held = np.zeros(count)
     for part, r, j, block in zip(s, *raw, blocks, strict=True):
         moved = j.T @ (part @ deviations.T) if size else np.zeros((len(r), count))
-        held += np.bincount(block, robust(r + moved[np.arange(len(r)), block])[0]**2, count)
+        held += np.bincount(block, huber(r + moved[np.arange(len(r)), block])[0]**2, count)
     ratio, slow = 1.0, np.array([_slow(g) for g in series.values()])
     if size:
         inverse = np.linalg.inv(information)

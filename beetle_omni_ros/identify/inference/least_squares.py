@@ -3,7 +3,7 @@ Nonlinear least squares with priors for many small problems at once.
 
 The chi2 of a problem is the sum of squared whitened residuals and of its prior's residuals. The
 method is Levenberg-Marquardt within bounds. A robust loss is applied to the residual
-(:func:`huber`).
+(:func:`robust.huber`).
 """
 
 from collections.abc import Callable
@@ -12,8 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from beetle_omni_ros.identify.inference.prior import Prior
-
-HUBER = 3.0         # standard deviations from which the loss is linear
 
 
 @dataclass(frozen=True)
@@ -35,13 +33,6 @@ class Steps:
     factors: tuple[float, float] = (0.2, 5.0)
     more: float = 3.0
     failed: float = 30.0
-
-
-def huber(white: np.ndarray) -> np.ndarray:
-    """Residuals whose sum of squares is Huber's loss."""
-    size = np.abs(white)
-    clipped = np.sqrt(np.maximum(2 * HUBER * size - HUBER**2, 0)) * np.sign(white)
-    return np.where(size > HUBER, clipped, white)
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ the command times a gain of each window of time.
 import numpy as np
 from scipy.stats import t as student
 
-from beetle_omni_ros.identify.inference.least_squares import huber, minimise
+from beetle_omni_ros.identify.inference.least_squares import minimise
 from beetle_omni_ros.identify.inference.prior import Prior
-from beetle_omni_ros.identify.inference.robust import consecutive, scatter
+from beetle_omni_ros.identify.inference.robust import consecutive, huber, scatter
 from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.rotor.log import RotorLog
 
@@ -111,7 +111,7 @@ def _fitted(log, base, rest, reason):
                          for dead, row in zip(points[:, 2], lagged, strict=True)])
 
     def residual(points, _):
-        return huber((thrust - model(points)) / noise) * log.fresh
+        return huber((thrust - model(points)) / noise)[0] * log.fresh
 
     def slopes(points, start, free):
         moved = residual((points[:, None] + STEP * np.eye(count)).reshape(-1, count), None)
