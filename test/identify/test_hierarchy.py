@@ -132,6 +132,17 @@ def bent(problem):
     return model
 
 
+def test_units_of_one_recording_may_have_different_rates():
+    problem = Linear(5)
+    every = [1, 2, 1, 3, 1, 2]
+    fit = solve(lambda theta, active: tuple([part[..., ::k] for part, k in zip(
+        parts, every, strict=True)] for parts in problem(theta, active)), problem.base,
+        design(SPREADS, LABELS, ALL), np.zeros(problem.fit().x.shape), LOGS,
+        [problem.block[::k] for k in every], -BOUND, BOUND)
+    error = (fit.theta - problem.truth) / np.sqrt(np.diagonal(fit.spread(), axis1=1, axis2=2))
+    assert fit.converged and np.sqrt(np.mean(error**2)) < 2
+
+
 def test_left_out_blocks_are_predicted_no_better_than_fitted_ones():
     problem = Linear(4)
     problem.y[:, ::11] += 6 * SIGMA         # the same loss for both
@@ -143,6 +154,9 @@ def test_the_gradient_of_loss_and_prior_vanishes_at_the_solution():
     problem = Linear(3)
     model = bent(problem)
     fit = problem.fit(model=model)
+    assert fit.converged and not solve(
+        model, problem.base, fit.s, 0 * fit.x, LOGS, [problem.block] * len(JOINTS), -BOUND, BOUND,
+        iterations=1).converged
 
     def cost(x):
         residuals, _ = model(problem.base + fit.s @ x, ALL)

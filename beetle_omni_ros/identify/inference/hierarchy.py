@@ -8,7 +8,7 @@ Laplace's approximation (MacKay 2003, chapter 28): a parameter that the data do 
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import t
@@ -79,6 +79,7 @@ class Fit:
         deviations: (blocks, X) change of x without each block.
         inflation: variance of the gradient over that of independent residuals, >= 1.
         slow: (recordings, SLOWEST, X) slowest changes of the gradient over each recording.
+        converged: whether the last step changed the cost by less than CONVERGED a sample.
 
     """
 
@@ -91,6 +92,7 @@ class Fit:
     deviations: np.ndarray
     inflation: float
     slow: np.ndarray
+    converged: bool = False
 
     def evidence(self, inflation: float) -> float:
         """Logarithm of the evidence [nat], without constants, for an inflated noise."""
@@ -146,7 +148,8 @@ def solve(model: Model, base: np.ndarray, s: np.ndarray, x: np.ndarray, groups: 
         base: (U, P) values at x = 0.
         s: (U, P, X) design.
         x: (X,) start.
-        groups: recording of each unit; units of one recording have their samples together.
+        groups: recording of each unit; units of one recording with equally many samples have them
+            together.
         blocks: (n_u,) number of the block of each sample, from 0, for each unit.
         low: (P,) lower bounds of theta; a value beyond is clipped.
         high: (P,) upper bounds.
@@ -170,7 +173,7 @@ def solve(model: Model, base: np.ndarray, s: np.ndarray, x: np.ndarray, groups: 
         return sum(r @ r for r in residuals) + x @ x
 
     damping, now = 0.01, at(x)
-    value, samples = cost(x, now[1]), sum(map(len, now[1]))
+    value, samples, converged = cost(x, now[1]), sum(map(len, now[1])), True
     for _ in range(iterations if x.size else 0):
         h, g = normal(now[2], now[1])
         h, g = h + np.eye(len(x)), g + x
@@ -187,8 +190,11 @@ def solve(model: Model, base: np.ndarray, s: np.ndarray, x: np.ndarray, groups: 
             damping *= 8
             if damping > 1e5:
                 break
+    else:
+        converged = not x.size
     theta, residuals, slopes, raw = now
-    return _judged(x, s, theta, residuals, slopes, raw, groups, blocks, memory)
+    return replace(_judged(x, s, theta, residuals, slopes, raw, groups, blocks, memory),
+                   converged=converged)
 
 
 def _judged(x, s, theta, residuals, slopes, raw, groups, blocks, memory):
@@ -196,9 +202,11 @@ def _judged(x, s, theta, residuals, slopes, raw, groups, blocks, memory):
     count = 1 + max(int(block.max(initial=0)) for block in blocks)
     size = len(x)
     parts, scores = np.zeros((count, size, size)), np.zeros((count, size))
-    series = {group: np.zeros((len(r), size)) for group, r in zip(groups, residuals, strict=True)}
+    # Units of one recording with other rates have their own samples.
+    series = {(group, len(r)): np.zeros((len(r), size))
+              for group, r in zip(groups, residuals, strict=True)}
     for part, j, r, group, block in zip(s, slopes, residuals, groups, blocks, strict=True):
-        series[group] += (j * r).T @ part
+        series[group, len(r)] += (j * r).T @ part
         for b in range(count):
             own = j[:, block == b]
             parts[b] += part.T @ (own @ own.T) @ part
@@ -215,7 +223,7 @@ def _judged(x, s, theta, residuals, slopes, raw, groups, blocks, memory):
     if size:
         inverse = np.linalg.inv(information)
         spread = sum(_long_run(g, memory[group] if isinstance(memory, dict) else memory)
-                     for group, g in series.items())
+                     for (group, _), g in series.items())
         ratio = np.trace(inverse @ spread) / max(np.trace(inverse @ (information - np.eye(size))),
                                                  1e-9)
     return Fit(x, s, theta, float(sum(r @ r for r in residuals)), information, held, deviations,
