@@ -1,6 +1,5 @@
 """Inference against independent references; it does not depend on the robot."""
 
-
 import numpy as np
 import pytest
 from scipy.signal import lfilter
