@@ -81,8 +81,6 @@ class RotorLogParameters:
     blocks: int = parameter(doc='Largest number of blocks of a surface.', low=5, high=1000)
     least_packs: int = parameter(doc='Least number of packs that serve as blocks.', low=3,
                                  high=100)
-    simpler: float = parameter(doc='Largest ratio of the errors with more terms and without.',
-                               unit='1', low=0, high=1)
     gain_window: float = parameter(doc='Time with one gain between thrust and command.',
                                    unit='s', low=0.05, high=60)
     gain_scatter: float = parameter(doc='Largest scatter of this gain.', unit='1', low=0, high=10)

@@ -22,6 +22,14 @@ def sweep(duration=10.0, periods=(1.8, 2.6), amplitudes=(1.0, 1.7), rate=100.0):
     return t, amplitude * np.sin(phase)
 
 
+def trapezoid(phase, travel=3.5, speed=7.0, hold=1.0, duration=3.7, rate=200.0):
+    """Times (N,) [s] and ramps with holds (N,) [rad], from ``phase`` [s] after a ramp's start."""
+    t, ramp = np.arange(0.0, duration, 1 / rate), travel / speed
+    corners = np.cumsum([0.0, ramp, hold, ramp, hold])
+    return t, np.interp((t + phase) % corners[-1], corners,
+                        travel * np.array([-0.5, 0.5, 0.5, -0.5, -0.5]))
+
+
 def servo(t, command, **values):
     """Positions (N,) [rad] of :func:`_moved`; most logs differ in the noise alone."""
     return _moved(t.tobytes(), command.tobytes(), **values)
@@ -30,7 +38,7 @@ def servo(t, command, **values):
 @cache
 def _moved(t, command, *, frequency=47.0, damping=0.63, delay=0.015, coulomb=0.0, stiction=0.0,
           backlash=0.0, velocity_limit=np.inf, torque_limit=np.inf, offset=0.0, gain=0.0,
-          cosine=0.0):
+          cosine=0.0, rough=0.0):
     """Positions (N,) [rad] of a servo that holds each command from its logged time on."""
     t, command = np.frombuffer(t), np.frombuffer(command)
     # It has been moving before the log: a straight run-up of a second.
@@ -51,8 +59,9 @@ def _moved(t, command, *, frequency=47.0, damping=0.63, delay=0.015, coulomb=0.0
         # the limit is that of the motor's torque, which also brakes
         push = frequency**2 * (wanted + offset - q) - 2 * damping * frequency * v
         v += STEP * min(max(push, -frequency**2 * torque_limit), frequency**2 * torque_limit)
-        grip = STEP * frequency**2 * (coulomb + stiction * np.exp(-(v / FADING)**2)
-                                      if stiction else coulomb)
+        here = coulomb * (1 + rough * np.sin(3 * q)) if rough else coulomb
+        grip = STEP * frequency**2 * (here + stiction * np.exp(-(v / FADING)**2)
+                                      if stiction else here)
         v = 0.0 if abs(v) <= grip else v - grip * (1 if v > 0 else -1)
         v = min(max(v, -velocity_limit), velocity_limit)
         q += STEP * v

@@ -7,7 +7,8 @@ from scipy.signal import lfilter
 from scipy.special import huber
 from scipy.stats import multivariate_normal
 
-from beetle_omni_ros.identify.inference.hierarchy import design, HUBER, solve, Spread, WIDTH
+from beetle_omni_ros.identify.inference.hierarchy import design, solve, Spread, WIDTH
+from beetle_omni_ros.identify.inference.robust import HUBER
 
 JOINTS, LOGS = (1, 2, 3, 1, 2, 3), (0, 0, 0, 1, 1, 1)
 LABELS = {'joint': JOINTS, 'log': LOGS}
@@ -131,10 +132,31 @@ def bent(problem):
     return model
 
 
+def test_units_of_one_recording_may_have_different_rates():
+    problem = Linear(5)
+    every = [1, 2, 1, 3, 1, 2]
+    fit = solve(lambda theta, active: tuple([part[..., ::k] for part, k in zip(
+        parts, every, strict=True)] for parts in problem(theta, active)), problem.base,
+        design(SPREADS, LABELS, ALL), np.zeros(problem.fit().x.shape), LOGS,
+        [problem.block[::k] for k in every], -BOUND, BOUND)
+    error = (fit.theta - problem.truth) / np.sqrt(np.diagonal(fit.spread(), axis1=1, axis2=2))
+    assert fit.converged and np.sqrt(np.mean(error**2)) < 2
+
+
+def test_left_out_blocks_are_predicted_no_better_than_fitted_ones():
+    problem = Linear(4)
+    problem.y[:, ::11] += 6 * SIGMA         # the same loss for both
+    fit = problem.fit()
+    assert fit.held.sum() > fit.chi2
+
+
 def test_the_gradient_of_loss_and_prior_vanishes_at_the_solution():
     problem = Linear(3)
     model = bent(problem)
     fit = problem.fit(model=model)
+    assert fit.converged and not solve(
+        model, problem.base, fit.s, 0 * fit.x, LOGS, [problem.block] * len(JOINTS), -BOUND, BOUND,
+        iterations=1).converged
 
     def cost(x):
         residuals, _ = model(problem.base + fit.s @ x, ALL)

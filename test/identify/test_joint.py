@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from servo_logs import COUNT, log_of, sweep
+from servo_logs import COUNT, log_of, sweep, trapezoid
 
 from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.servo.joint import identify, interval, joint_results
@@ -77,6 +77,24 @@ def test_only_a_slow_log_confounds_delay_and_bandwidth():
     for a, b in zip(slow, fast, strict=True):
         widths = [np.ptp(joint['terms']['delay']['interval']) for joint in (a, b)]
         assert widths[0] > 1.5 * widths[1]
+
+
+@pytest.mark.parametrize('seed', [5, 8])
+def test_ramps_and_holds_show_no_error_of_the_encoder(seed):
+    """Friction changes with the angle; few angles and directions take it for an encoder's."""
+    rng = np.random.default_rng(seed)
+    t, command = trapezoid(rng.uniform(0, 3))
+    log = log_of(t, command, [
+        {'frequency': 57 * np.exp(0.08 * rng.normal()), 'damping': 0.55, 'delay': 0.023,
+         'coulomb': band, 'rough': rng.uniform(-0.8, 0.8), 'offset': 0.006 * rng.normal()}
+        for band in (0.014, 0.045, 0.011, 0.010)], seed, every=4, late=0.05)
+    one = identify([log], ROBOT)
+    assert 'joint_encoder_error' not in one.chosen.entries
+    for joint in joint_results(one, [], ROBOT)['joints']:
+        beaten = joint['line']['heldout_rms_rad'] < joint['heldout_rms_rad']
+        assert joint['best'] == ('line' if beaten else 'servo')
+        assert any('A line' in text for text in joint['text']) == beaten
+        assert joint['holds_for']['angle_rad'] == pytest.approx([-1.75, 1.75], abs=0.1)
 
 
 def test_samples_of_the_validation_part_are_not_used_by_the_fit():

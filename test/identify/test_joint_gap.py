@@ -16,6 +16,7 @@ from beetle_omni_ros.identify.servo.log import JointLog, read_joint_log
 from beetle_omni_ros.identify.servo.model import simulate
 from beetle_omni_ros.identify.servo.robot import file_sets, own_delay
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.servo import play
 
 REAL = sorted((Path(__file__).resolve().parents[3] / 'shared' / 'data').glob('joint_*.csv'))
 SHIPPED = RobotParameters.load()
@@ -207,13 +208,7 @@ def line_errors(log, joint, halves):
 
     def one(delay, half):
         x = log.command_at(joint, t - delay)
-        if half:
-            shown = np.empty_like(x)
-            last = x[0]
-            for k, value in enumerate(x):
-                last = shown[k] = min(max(last, value - half), value + half)
-            x = shown
-        a = np.stack([x, np.ones_like(x)], axis=1)
+        a = np.stack([play(x, half), np.ones_like(x)], axis=1)
         solution = np.linalg.lstsq(a[fitted], read[fitted], rcond=None)[0]
         error = a @ solution - read
         return np.mean(error[fitted]**2), np.sqrt(np.mean(error[~fitted]**2))

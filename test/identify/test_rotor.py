@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rotor_logs import bench, HEADER, RATIO, SERIES, series, stand, SURFACE, write
+from rotor_logs import bench, HEADER, PACKS, RATIO, SERIES, series, stand, SURFACE, write
 
 from beetle_omni_ros.identify.inference.robust import interval
 from beetle_omni_ros.identify.measured import rotor_values, write_measured
@@ -131,6 +131,16 @@ def test_the_written_robot_file_gives_the_surface(tmp_path):
         thrust = np.linspace(2, found.thrust_limit(voltage), 20)
         duty = found.duty(thrust, voltage)
         assert np.abs(thrust_of(model, duty / 50 - 1, voltage) - thrust).max() < 0.5
+
+
+def test_a_written_map_holds_for_a_pack_below_those_of_the_stand(tmp_path):
+    rows = stand(np.random.default_rng(0))
+    lowest = rows[:, 5] == PACKS[0]
+    written(tmp_path, rotor_results(identified(tmp_path, rows[~lowest], STAND)))
+    found = ThrustMap(RobotParameters.load(tmp_path / 'robot.yaml').rotors)
+    for pulse, voltage in rows[lowest & (rows[:, 0] > 1200)][:, [0, 3]]:
+        true = np.polyval([*SURFACE[::-1], 0], (pulse / 1000 - 1) * voltage)
+        assert found.thrust(pulse / 20, voltage) == pytest.approx(true, abs=0.5)
 
 
 @real

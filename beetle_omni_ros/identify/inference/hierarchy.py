@@ -8,12 +8,13 @@ Laplace's approximation (MacKay 2003, chapter 28): a parameter that the data do 
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import t
 
-HUBER = 3.0         # standard deviations from which the loss is linear
+from beetle_omni_ros.identify.inference.robust import huber
+
 CONVERGED = 1e-4    # decrease of the cost, relative to the number of samples
 WIDTH = 1.96        # standard deviations of a 95 % interval
 SLOWEST = 4         # cosines of slow noise
@@ -63,14 +64,6 @@ def design(spreads: Sequence[Spread], labels: dict[str, Sequence], active: np.nd
     return np.stack(columns, axis=-1) if columns else np.zeros((count, len(spreads), 0))
 
 
-def robust(white: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals whose sum of squares is Huber's loss, and their derivative."""
-    size = np.abs(white)
-    far = size > HUBER
-    root = np.sqrt(np.maximum(2 * HUBER * size - HUBER**2, HUBER**2))
-    return np.where(far, root * np.sign(white), white), np.where(far, HUBER / root, 1.0)
-
-
 @dataclass(frozen=True, eq=False)
 class Fit:
     """
@@ -86,6 +79,7 @@ class Fit:
         deviations: (blocks, X) change of x without each block.
         inflation: variance of the gradient over that of independent residuals, >= 1.
         slow: (recordings, SLOWEST, X) slowest changes of the gradient over each recording.
+        converged: whether the last step changed the cost by less than CONVERGED a sample.
 
     """
 
@@ -98,6 +92,7 @@ class Fit:
     deviations: np.ndarray
     inflation: float
     slow: np.ndarray
+    converged: bool = False
 
     def evidence(self, inflation: float) -> float:
         """Logarithm of the evidence [nat], without constants, for an inflated noise."""
@@ -153,7 +148,8 @@ def solve(model: Model, base: np.ndarray, s: np.ndarray, x: np.ndarray, groups: 
         base: (U, P) values at x = 0.
         s: (U, P, X) design.
         x: (X,) start.
-        groups: recording of each unit; units of one recording have their samples together.
+        groups: recording of each unit; units of one recording with equally many samples have them
+            together.
         blocks: (n_u,) number of the block of each sample, from 0, for each unit.
         low: (P,) lower bounds of theta; a value beyond is clipped.
         high: (P,) upper bounds.
@@ -165,9 +161,9 @@ def solve(model: Model, base: np.ndarray, s: np.ndarray, x: np.ndarray, groups: 
 
     def at(x):
         theta = np.clip(base + s @ x, low, high)
-        residuals, slopes = model(theta, active)
-        own, ratio = zip(*map(robust, residuals), strict=True)
-        return theta, own, [j * r for j, r in zip(slopes, ratio, strict=True)]
+        raw = model(theta, active)
+        own, ratio = zip(*map(huber, raw[0]), strict=True)
+        return theta, own, [j * r for j, r in zip(raw[1], ratio, strict=True)], raw
 
     def normal(slopes, residuals):
         return (sum(part.T @ (j @ j.T) @ part for part, j in zip(s, slopes, strict=True)),
@@ -177,7 +173,7 @@ def solve(model: Model, base: np.ndarray, s: np.ndarray, x: np.ndarray, groups: 
         return sum(r @ r for r in residuals) + x @ x
 
     damping, now = 0.01, at(x)
-    value, samples = cost(x, now[1]), sum(map(len, now[1]))
+    value, samples, converged = cost(x, now[1]), sum(map(len, now[1])), True
     for _ in range(iterations if x.size else 0):
         h, g = normal(now[2], now[1])
         h, g = h + np.eye(len(x)), g + x
@@ -194,18 +190,23 @@ def solve(model: Model, base: np.ndarray, s: np.ndarray, x: np.ndarray, groups: 
             damping *= 8
             if damping > 1e5:
                 break
-    theta, residuals, slopes = now
-    return _judged(x, s, theta, residuals, slopes, groups, blocks, memory)
+    else:
+        converged = not x.size
+    theta, residuals, slopes, raw = now
+    return replace(_judged(x, s, theta, residuals, slopes, raw, groups, blocks, memory),
+                   converged=converged)
 
 
-def _judged(x, s, theta, residuals, slopes, groups, blocks, memory):
+def _judged(x, s, theta, residuals, slopes, raw, groups, blocks, memory):
     """The fit with its curvature, its scatter and the prediction of each block by the others."""
     count = 1 + max(int(block.max(initial=0)) for block in blocks)
     size = len(x)
     parts, scores = np.zeros((count, size, size)), np.zeros((count, size))
-    series = {group: np.zeros((len(r), size)) for group, r in zip(groups, residuals, strict=True)}
+    # Units of one recording with other rates have their own samples.
+    series = {(group, len(r)): np.zeros((len(r), size))
+              for group, r in zip(groups, residuals, strict=True)}
     for part, j, r, group, block in zip(s, slopes, residuals, groups, blocks, strict=True):
-        series[group] += (j * r).T @ part
+        series[group, len(r)] += (j * r).T @ part
         for b in range(count):
             own = j[:, block == b]
             parts[b] += part.T @ (own @ own.T) @ part
@@ -215,15 +216,14 @@ def _judged(x, s, theta, residuals, slopes, groups, blocks, memory):
     deviations = np.array([-np.linalg.solve(information - h, gradient - g)
                            for h, g in zip(parts, scores, strict=True)]).reshape(count, size)
     held = np.zeros(count)
-    for part, j, r, block in zip(s, slopes, residuals, blocks, strict=True):
+    for part, r, j, block in zip(s, *raw, blocks, strict=True):
         moved = j.T @ (part @ deviations.T) if size else np.zeros((len(r), count))
-        for b in range(count):
-            held[b] += (robust(r[block == b] + moved[block == b, b])[0]**2).sum()
+        held += np.bincount(block, huber(r + moved[np.arange(len(r)), block])[0]**2, count)
     ratio, slow = 1.0, np.array([_slow(g) for g in series.values()])
     if size:
         inverse = np.linalg.inv(information)
         spread = sum(_long_run(g, memory[group] if isinstance(memory, dict) else memory)
-                     for group, g in series.items())
+                     for (group, _), g in series.items())
         ratio = np.trace(inverse @ spread) / max(np.trace(inverse @ (information - np.eye(size))),
                                                  1e-9)
     return Fit(x, s, theta, float(sum(r @ r for r in residuals)), information, held, deviations,

@@ -39,17 +39,10 @@ class Prior:
         inside = (off > -self.below) & (off < self.above)
         return np.where(inside, 0.0, 1 / np.asarray(self.deviation)) + 1 / self.inner
 
-    def cost(self, x):
-        """Sum of the squares of :meth:`residual` along the last axis."""
-        return (self.residual(x)**2).sum(axis=-1)
-
     def within(self, x, deviations: float):
         """``x``, or the nearest value within so many standard deviations."""
         reach = deviations * self.deviation
         return np.clip(x, self.centre - self.below - reach, self.centre + self.above + reach)
-
-
-UNKNOWN = Prior(np.inf)
 
 
 def together(priors: dict[str, Prior], values: dict[str, float], names: list[str],

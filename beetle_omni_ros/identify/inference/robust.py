@@ -5,9 +5,16 @@ from collections.abc import Callable
 import numpy as np
 from scipy.stats import t as student
 
-from beetle_omni_ros.identify.inference.least_squares import HUBER
-
+HUBER = 3.0                 # standard deviations from which the loss is linear
 SIGMA_OF_MEDIAN = 1.4826    # standard deviation over the median of the size, normal distribution
+
+
+def huber(white: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals whose sum of squares is Huber's loss, and their derivative."""
+    size = np.abs(white)
+    far = size > HUBER
+    root = np.sqrt(np.maximum(2 * HUBER * size - HUBER**2, HUBER**2))
+    return np.where(far, root * np.sign(white), white), np.where(far, HUBER / root, 1.0)
 
 
 def scale_of(residual: np.ndarray) -> float:

@@ -7,11 +7,11 @@ the command times a gain of each window of time.
 """
 
 import numpy as np
+from scipy.optimize import least_squares
 from scipy.stats import t as student
 
-from beetle_omni_ros.identify.inference.least_squares import huber, minimise
 from beetle_omni_ros.identify.inference.prior import Prior
-from beetle_omni_ros.identify.inference.robust import consecutive, scatter
+from beetle_omni_ros.identify.inference.robust import consecutive, huber, scatter
 from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.rotor.log import RotorLog
 
@@ -111,7 +111,7 @@ def _fitted(log, base, rest, reason):
                          for dead, row in zip(points[:, 2], lagged, strict=True)])
 
     def residual(points, _):
-        return huber((thrust - model(points)) / noise) * log.fresh
+        return huber((thrust - model(points)) / noise)[0] * log.fresh
 
     def slopes(points, start, free):
         moved = residual((points[:, None] + STEP * np.eye(count)).reshape(-1, count), None)
@@ -119,9 +119,23 @@ def _fitted(log, base, rest, reason):
 
     def solve(points, fixed):
         free = ~np.isin(np.arange(count), fixed)
-        fits = minimise(points, np.tile(free, (len(points), 1)), low, high, residual,
-                        lambda here, _, start: slopes(here, start, free), weak, 60)
-        best = fits.points[[np.argmin(fits.chi2)]]
+
+        def full(part):
+            point = points[:1].copy()
+            point[0, free] = part
+            return point
+
+        def errors(part):
+            return np.append(residual(full(part), None), weak.residual(full(part))[0, free])
+
+        def derivatives(part):
+            point = full(part)
+            moved = slopes(point, residual(point, None), free)[0, free]
+            return np.vstack([moved.T, np.diag(weak.slope(point)[0, free])])
+
+        fits = [least_squares(errors, start, derivatives, (low[free], high[free]), x_scale='jac',
+                              max_nfev=60) for start in np.clip(points, low, high)[:, free]]
+        best = full(min(fits, key=lambda one: one.cost).x)
         error = residual(best, None)
         return best, scatter(slopes(best, error, free)[0], error[0], weak.slope(best[0]), blocks)
 

@@ -20,6 +20,7 @@ FORMS: tuple[tuple[tuple[int, int], ...], ...] = (
     ((1, 0), (2, 0), (3, 0), (2, 1), (3, 1)))   # powers of u and of the duty
 GROUPS = 5              # of rows with neighbouring voltages, if packs are not labelled
 MAP_ROWS = 5            # of a robot file
+BELOW = 0.1             # share by which its lowest voltage is below the measured ones
 GRID = (1 - np.cos(np.linspace(0, np.pi, 101)[1:])) / 2     # dense at the ends, as errors are
 Rows = dict[str, np.ndarray]
 
@@ -81,7 +82,7 @@ def settled_rows(logs: Sequence[RotorLog]) -> Rows | None:
 
 
 def fit_surface(rows: Rows, name: str) -> Surface:
-    """Fit thrust or torque; more terms only if they predict voltages left out better."""
+    """Fit thrust or torque by the form that predicts voltages left out best."""
     values, best, least = rows[name], FORMS[0], np.inf
     for form in FORMS:
         x, error = terms(form, rows['duty'], rows['voltage']), np.empty(len(values))
@@ -89,7 +90,7 @@ def fit_surface(rows: Rows, name: str) -> Surface:
             out = rows['group'] == group
             error[out] = values[out] - x[out] @ linear(x[~out], values[~out])
         left_out = np.sqrt(np.mean(means(error, rows['step'])**2))
-        if left_out < shipped().rotor.simpler * least:
+        if left_out < least:
             best, least = form, left_out
     x = terms(best, rows['duty'], rows['voltage'])
     every = jackknife(lambda m: linear(x[m], values[m]), rows['block'])
@@ -144,14 +145,17 @@ def temperature_drift(rows: Rows, thrust: Surface) -> dict | None:
 
 def map_rows(rows: Rows, thrust: Surface) -> list[dict]:
     """
-    Rows of a robot file's map: cubics of the duty in thrust at voltages within the measured range.
+    Rows of a robot file's map: cubics of the duty in thrust at measured voltages and below.
+
+    A pack of a flight falls below those of a stand. Its u is smaller, so that u is in the range.
 
     A row ends at the largest measured duty, mean voltage or thrust, whichever it reaches first.
     """
     top, u = rows['duty'].max(), (rows['duty'] * rows['voltage']).max()
     most = means(rows['thrust'], rows['step']).max()
     running, found = rows['voltage'][rows['duty'] > 0.01], []
-    for voltage in np.linspace(running.max(), running.min(), MAP_ROWS):
+    for voltage in np.linspace(
+            running.max(), (1 - BELOW) * running.min(), MAP_ROWS):
         duty = GRID * min(top, u / voltage)
         levels = thrust.at(duty, voltage)
         cubics = np.array([np.polyfit(level / 10, 50 + 50 * duty, 3, w=np.maximum(

@@ -7,10 +7,12 @@ one type share their values, and each has its own deviation. Two logs differ in 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
+from scipy.cluster.vq import kmeans2
 from scipy.stats import chi2
 
 from beetle_omni_ros.identify.inference.hierarchy import design, Fit, solve
@@ -28,6 +30,8 @@ from beetle_omni_ros.robot.effects import CATALOGUE
 
 LOGARITHMIC = np.array([term.logarithmic for term in TERMS.values()])
 STEP = np.where(LOGARITHMIC, 0.01, 2e-4)      # of the derivatives
+LATE = 0.03         # [s] of a reading behind its command, about
+MOMENTS = np.linspace(-0.4, 0.0, 9)     # [s] of commands that determine the kind of motion
 # Starts of terms whose chi2 has several minima, or no slope at zero.
 STARTS = ({'natural_frequency': 45.0, 'damping_ratio': 0.65, 'delay': 0.012,
            'coulomb_friction': 0.012, 'backlash': 0.002},
@@ -53,6 +57,25 @@ def mask(entries: Sequence[str]) -> np.ndarray:
     """(P,) terms of catalogue entries."""
     names = {name for entry in entries for name in ENTRIES[entry]}
     return np.array([name in names for name in NAMES])
+
+
+def kinds_of_motion(parts: Sequence[tuple], count: int) -> list[np.ndarray]:
+    """
+    Kind (n,) of the commanded motion at the rows of each (log, joint, rows).
+
+    Kinds are clusters of angle, rate, change of rate, and mean rate before, which tells a turn
+    from a rest. Blocks of time would repeat: a term that is wrong elsewhere predicts the next
+    period of a sine, but not the way down from the way up.
+    """
+    features = []
+    for log, joint, rows in parts:
+        angle = log.command_at(joint, log.read_t[rows][:, None] - LATE + MOMENTS)
+        rate = np.diff(angle)
+        features.append(np.stack([angle[:, -1], rate[:, -1], rate[:, -1] - rate[:, -2],
+                                  np.sqrt((rate**2).mean(axis=1))], axis=1))
+    every = np.concatenate(features)
+    label = kmeans2(every / (every.std(axis=0) + 1e-9), count, minit='++', seed=0)[1]
+    return np.split(label, np.cumsum([len(rows) for *_, rows in parts])[:-1])
 
 
 @dataclass(frozen=True)
@@ -90,17 +113,17 @@ class Servos:
             self.spreads[INDEX['delay']] = replace(delay, groups={'log': delay.groups['log']})
         self.labels: dict[str, Sequence] = {'joint': [number for *_, number in self.units],
                        'log': [k for k, *_ in self.units], 'unit': self.units}
-        self.rows, self.blocks = [], []
+        self.rows = []
         self._parts = [log.first(fitted) for log in self.logs]
         for log in self.logs:
             settled = log.t >= log.t[0] + p.settling
             rows = np.flatnonzero(log.fresh & settled & (np.arange(len(log.t))
                                                          < int(round(fitted * len(log.t)))))
             self.rows.append(rows)
-            self.blocks.append(np.arange(len(rows)) * p.blocks // max(len(rows), 1))
         self.low = LOW.copy()
         self.sigma = np.full(len(self.units), p.first_noise)
-        self._blocks = [self.blocks[k] for k, *_ in self.units]
+        self._blocks = kinds_of_motion([(self.logs[k], j, self.rows[k]) for k, j, _ in self.units],
+                                       p.blocks)
         self.inflation = 1.0
         self.memory = {k: round(p.memory / float(np.median(np.diff(log.read_t[log.fresh]))))
                        for k, log in enumerate(self.logs)}
@@ -265,18 +288,20 @@ class Found:
 
 
 def select(servos: Servos, always: Sequence[str], allowed: Sequence[str], least: float = 0.0,
-           named: bool = False) -> Found:
+           named: bool = False, after: Mapping[str, str] = MappingProxyType({})) -> Found:
     """
     Add the entries that raise the evidence, largest gain first, and remove those that do not.
+
+    An entry must also improve the prediction of left-out kinds of motion in total.
 
     Args:
         servos: logs and base values.
         always: entries of every model.
         allowed: further entries.
         least: least gain of evidence [nat] of an entry.
-        named: whether an entry must also change some joint's fit by an encoder count (RMS) and
-            improve the prediction of left-out blocks in total. An entry of each joint stays at the
-            base where it does not change the fit.
+        named: whether an entry must also change some joint's fit by an encoder count (RMS). An
+            entry of each joint stays at the base where it does not change the fit.
+        after: entry -> the entry that it presupposes.
 
     """
     candidates = [name for name in servos.candidates() if name in {*always, *allowed}]
@@ -285,12 +310,13 @@ def select(servos: Servos, always: Sequence[str], allowed: Sequence[str], least:
     chosen = servos.fit(always, starts=(full, *STARTS) if always else (full,))
 
     def worth(more, fewer):
-        return gain(more) >= gain(fewer) + least and (
-            not named or more.fit.held.sum() < fewer.fit.held.sum())
+        return (gain(more) >= gain(fewer) + least
+                and more.fit.held.sum() < fewer.fit.held.sum())
 
     while True:
         trials = {name: servos.fit([*chosen.entries, name], starts=(chosen, full))
-                  for name in candidates if name not in chosen.entries}
+                  for name in candidates if name not in chosen.entries
+                  and after.get(name) in (None, *chosen.entries)}
         better = [trial for trial in trials.values() if worth(trial, chosen)]
         if not better:
             break
@@ -298,7 +324,8 @@ def select(servos: Servos, always: Sequence[str], allowed: Sequence[str], least:
     while True:
         without = {name: servos.fit([other for other in chosen.entries if other != name],
                                     starts=(chosen, full), still=chosen.still)
-                   for name in chosen.entries if name not in always}
+                   for name in chosen.entries
+                   if name not in {*always, *map(after.get, chosen.entries)}}
         useless = [name for name, fewer in without.items() if not worth(chosen, fewer)
                    or named and not servos.visible(chosen, fewer).any()]
         if useless:

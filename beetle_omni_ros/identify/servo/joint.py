@@ -28,6 +28,9 @@ from beetle_omni_ros.identify.servo.robot import catalogue_values, file_sets, he
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 ALWAYS = tuple(ENTRIES)[:3]     # gains, delay and friction, which every servo has
+# An error that changes with the angle presupposes a constant one, as a slope does an intercept.
+AFTER = {'joint_encoder_error': 'joint_offset', 'joint_load': 'joint_offset'}
+DELAYS = np.arange(0.0, 0.12, 5e-4)     # [s] of a line
 RATE = 100.0        # [Hz] of a proposed log
 
 
@@ -48,7 +51,8 @@ def identify(logs: Sequence[JointLog], robot: RobotParameters,
 
     The model with the largest evidence predicts best; the robot file is the centre of the prior.
     """
-    return select(Servos(logs, file_sets(robot), fitted, one_delay), ALWAYS, list(ENTRIES))
+    return select(Servos(logs, file_sets(robot), fitted, one_delay), ALWAYS, list(ENTRIES),
+                  after=AFTER)
 
 
 def interval(found: Found, trial: Trial, unit: int, name: str) -> tuple[float, float]:
@@ -64,6 +68,26 @@ def interval(found: Found, trial: Trial, unit: int, name: str) -> tuple[float, f
     ends = trial.fit.theta[unit, p] + width * np.array([-1, 1])
     low, high = np.exp(ends) if LOGARITHMIC[p] else ends
     return max(float(low), TERMS[name].low), min(float(high), TERMS[name].high)
+
+
+def line(log: JointLog, joint: int, rows: np.ndarray) -> dict:
+    """
+    Fit readings = (1 + gain) command(t - delay) + offset to some rows of a joint.
+
+    The competitor of the servo model: 3 numbers without friction and bandwidth.
+    """
+    rest = np.setdiff1d(np.flatnonzero(log.fresh), np.arange(rows[-1] + 1))
+    best: tuple = (np.inf,)
+    for delay in DELAYS:
+        late, after = (np.stack([log.command_at(joint, log.read_t[part] - delay),
+                                 np.ones(len(part))], axis=1) for part in (rows, rest))
+        fitted = np.linalg.lstsq(late, log.measured[joint, rows], rcond=None)[0]
+        size = np.mean((late @ fitted - log.measured[joint, rows])**2)
+        if size < best[0]:
+            best = size, delay, fitted, np.mean((after @ fitted - log.measured[joint, rest])**2)
+    _, delay, (slope, offset), error = best
+    return {'gain': float(slope - 1), 'offset_rad': float(offset), 'delay_s': float(delay),
+            'heldout_rms_rad': float(np.sqrt(error))}
 
 
 def joint_results(found: Found, validations: Sequence[JointLog], robot: RobotParameters) -> dict:
@@ -85,12 +109,14 @@ def _joint(found, unit, validations, robot, plan):
     known = [(other, other.joints.index(number) if number in other.joints else None)
              for other in validations]
     derived = catalogue_values(values, robot)
-    traded = inseparable(found, unit)
+    traded, straight = inseparable(found, unit), line(log, index, found.servos.rows[0])
+    heldout = error_rms(log, index, values, part=last)
     return {
-        'joint': number,
+        'joint': number, 'line': straight, 'holds_for': log.first(shipped().servo.fitted).motion(
+            index), 'best': 'servo' if heldout <= straight['heldout_rms_rad'] else 'line',
         'published_rms_rad': error_rms(log, index, file, is_held),
         'fit_rms_rad': error_rms(log, index, values, part=first),
-        'heldout_rms_rad': error_rms(log, index, values, part=last),
+        'heldout_rms_rad': heldout,
         'validation_rms_rad': [None if k is None else error_rms(other, k, values)
                                for other, k in known],
         'published_heldout_rms_rad': error_rms(log, index, file, is_held, part=last),
@@ -98,7 +124,7 @@ def _joint(found, unit, validations, robot, plan):
             None if k is None else error_rms(other, k, file, is_held) for other, k in known],
         'terms': _terms(found, unit),
         'traded': traded,
-        'text': sentences(found, unit, traded, plan),
+        'text': sentences(found, unit, traded, plan) + beaten(heldout, straight),
         'experiment': {'frequency_Hz': plan.frequency, 'amplitude_rad': plan.amplitude,
                        'duration_s': shipped().servo.sine_time, 'delay_half_width_s': plan.delay,
                        'natural_frequency_half_width_rad_s': plan.natural_frequency},
@@ -186,6 +212,16 @@ def sentences(found: Found, unit: int, traded: list[list[str]], plan: Plan) -> l
         text.append(f'Not reached in this log: {" and ".join(TERMS[n].words for n in unmet)}; '
                     f'predictions use {used} as in the robot file.')
     return text
+
+
+def beaten(heldout: float, straight: dict) -> list[str]:
+    """A sentence if the line predicts the held-out part better than the servo model."""
+    error = straight['heldout_rms_rad']
+    return [] if heldout <= error else [
+        f'A line (gain {1 + straight["gain"]:.3f}, offset {1e3 * straight["offset_rad"]:.1f} '
+        f'mrad, delay {1e3 * straight["delay_s"]:.1f} ms) predicts the held-out part better, '
+        f'{1e3 * error:.1f} instead of {1e3 * heldout:.1f} mrad: the fitted part does not '
+        'determine the servo for that motion. Log all its angles, in both directions, twice.']
 
 
 def _range(name, ends):

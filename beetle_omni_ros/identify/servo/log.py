@@ -113,6 +113,16 @@ class JointLog:
         """Step of the encoder [rad]: the smallest change of a reading."""
         return quantum(self.measured)
 
+    def motion(self, joint: int) -> dict[str, list[float]]:
+        """Ranges of a joint's angle [rad], and of rate and acceleration over 50 ms."""
+        span = max(1, int(round(0.05 / self.period)))
+        ranges = {}
+        values = self.measured[joint, ::span]
+        for name in ('angle_rad', 'rate_rad_s', 'acceleration_rad_s2'):
+            ranges[name] = [float(values.min()), float(values.max())]
+            values = np.diff(values) / (span * self.period)
+        return ranges
+
     def command_speed(self) -> np.ndarray:
         """(n,) speed of each command that 1 % of the samples exceed [rad/s]."""
         return np.quantile(np.abs(np.gradient(self.command, self.t, axis=1)), 0.99, axis=1)

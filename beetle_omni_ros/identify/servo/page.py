@@ -30,19 +30,26 @@ def grids(results: dict, brief: bool = False) -> list[Grid]:
         ('robot file, held-out part', 'published_heldout_rms_rad'),
         ('identified, fitted part', 'fit_rms_rad'),
         ('identified, held-out part', 'heldout_rms_rad'))]
+    rows.append(['line (gain, offset, delay), held-out part',
+                 *(_milli(joint['line']['heldout_rms_rad']) for joint in joints)])
     for k, name in enumerate(results['meta']['validate']):
         for text, key in (('robot file', 'published_validation_rms_rad'),
                           ('identified', 'validation_rms_rad')):
             rows.append([f'{text}, {name}', *(_milli(joint[key][k]) for joint in joints)])
     errors = Grid('Prediction error, RMS [mrad]', header, rows)
+    motion = Grid('Motion of the fitted part, for which the model holds', header, [
+        [text, *('{:.3g}..{:.3g}'.format(*joint['holds_for'][key]) for joint in joints)]
+        for text, key in (('angle [rad]', 'angle_rad'), ('rate [rad/s]', 'rate_rad_s'),
+                          ('acceleration [rad/s^2]', 'acceleration_rad_s2'))])
     names = [name for name in joints[0]['terms'] if not brief
              or any(joint['terms'][name]['kept'] for joint in joints)]
     rows = [[f'{name} [{_unit(joints[0]["terms"][name]["unit"])}]',
              *(_value(joint['terms'][name]) for joint in joints)] for name in names]
     unused = frozenset(k for k, name in enumerate(names)
                        if not any(joint['terms'][name]['kept'] for joint in joints))
-    return [errors, Grid('Terms with 95 % interval; in brackets: not in the model, did not '
-                         'improve the prediction of held-out data', header, rows, unused)]
+    return [errors, motion, Grid(
+        'Terms with 95 % interval; in brackets: not in the model, did not improve the prediction '
+        'of other motion', header, rows, unused)]
 
 
 def _milli(value):
