@@ -5,11 +5,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.integrate import quad
+from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
-from beetle_omni_ros.identify.flights.command import table_results
+from beetle_omni_ros.identify.flights.command import body_keys, table_results
 from beetle_omni_ros.identify.flights.evidence import Judge, normal
+from beetle_omni_ros.identify.flights.motion import turning, wander
+from beetle_omni_ros.identify.flights.residual import TableFlight
 from beetle_omni_ros.identify.flights.spectrum import EDGES, spectrum
+from beetle_omni_ros.identify.flights.table import Format, read_flight
+from beetle_omni_ros.identify.gap.body import BodyModel
+from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys
+from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
 
@@ -90,39 +97,57 @@ def test_noise_of_a_flexible_fit_is_not_too_small():
     assert np.mean(variances) == pytest.approx(0.01, rel=0.15)
 
 
-def write_flight(path, seed, scale=1.0, drag=0.0, sag=True, seconds=34.0):
+def write_flight(path, seed, scale=1.0, drag=0.0, sag=True, seconds=34.0, late=0.0, bias=0.0,
+                 wander=0.002):
     """
     A flight in the columns of NanoBench, from equations of its own.
 
-    Thrust by motor voltage with a lag of 60 ms, level attitude, prescribed motion.
+    The motion is prescribed; attitude and commands are those that it needs. Thrust by motor
+    voltage with a lag of 60 ms. MoCap is ``late`` (a number or (N,)) [s], and the accelerometer
+    has a vertical ``bias`` [m/s^2] and a random walk of ``wander`` a sample.
     """
     rng = np.random.default_rng(seed)
-    t = np.arange(0, seconds, 0.01)
-    slow = sum(rng.normal() * np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) for f in (
-        0.3, 0.7, 1.1, 1.9)) * 0.02
+    t = np.arange(-1, seconds + 1, 0.01)        # derivatives at the ends are cut off
+    height = sum(rng.normal() * np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) / f**2 for f in (
+        0.3, 0.7, 1.1, 1.9)) * 0.005
+    p = np.stack([np.sin(0.9 * t + seed) / 0.9, np.cos(0.7 * t) / 0.7, 1 + height], axis=1)
+    v = np.gradient(p, 0.01, axis=0)
+    need = 0.0319 * (np.gradient(v, 0.01, axis=0) + [0, 0, 9.81])
+    thrust, up = need, np.zeros_like(need)
+    for _ in range(20):     # thrust carries the weight, the acceleration and the drag
+        size = np.linalg.norm(thrust, axis=1, keepdims=True)
+        up = thrust / size
+        in_plane = v - up * (up * v).sum(axis=1, keepdims=True)
+        thrust = need + drag * np.sqrt(size / (0.0319 * 9.81)) * in_plane
+    left = np.cross(up, [1, 0.3, 0])
+    left /= np.linalg.norm(left, axis=1, keepdims=True)
+    matrix = np.stack([np.cross(left, up), left, up], axis=2)
+    q = Rotation.from_matrix(matrix)
+    rates = np.pad((q[:-2].inv() * q[2:]).as_rotvec() / 0.02, ((1, 1), (0, 0)), mode='edge')
+    inertia = np.array([16.571710e-6, 16.655602e-6, 29.261652e-6])
+    torque = inertia * np.gradient(rates, 0.01, axis=0) + np.cross(rates, inertia * rates)
+    arm, ratio = 0.03253, 0.00596
+    wrench = np.array([[1, 1, 1, 1], [-arm, -arm, arm, arm], [-arm, arm, arm, -arm],
+                       [-ratio, ratio, -ratio, ratio]])
+    lagged = np.linalg.solve(wrench, np.concatenate([
+        np.linalg.norm(thrust, axis=1)[None], torque.T])).T / scale
+    force = lagged + 0.06 * np.gradient(lagged, 0.01, axis=0)
     volts = 4.0 - 0.5 * t / seconds - 0.05 * rng.random()
-    duty = np.clip(2.75 / volts * (1 + slow), 0, 0.97)
-    motor = duty * (volts if sag else 3.7)
-    force = 4 * (-0.01483 + 0.04724 * motor - 0.01847 * motor**2 + 0.005961 * motor**3)
-    lagged = np.empty_like(force)
-    lagged[0] = force[0]
-    for k in range(1, len(t)):
-        lagged[k] = lagged[k - 1] + (1 - np.exp(-0.01 / 0.06)) * (force[k] - lagged[k - 1])
-    v = np.stack([np.cos(0.9 * t + seed), np.sin(0.7 * t), 0 * t], axis=1)
-    p = np.cumsum(v, axis=0) * 0.01 + [0, 0, 1]
-    p[t < 1, 2] = 0
-    hover = 0.0319 * 9.81 / 4
-    speed = np.sqrt(scale * lagged / 4 / hover)
-    specific = np.zeros((len(t), 3))
-    specific[:, 2] = scale * lagged / 0.0319
-    specific -= (drag * speed / 0.0319)[:, None] * v
+    grid = np.linspace(0, 5, 5001)
+    motor = np.interp(force, -0.01483 + 0.04724 * grid - 0.01847 * grid**2 + 0.005961 * grid**3,
+                      grid)
+    duty = motor / (volts[:, None] if sag else 3.7)
+    specific = np.einsum('nji,nj->ni', matrix, need) / 0.0319 + [0, 0, bias]
     # coloured noise: white and a slow wander
     noise = rng.normal(size=(len(t), 3)) * 0.05 + np.cumsum(
-        rng.normal(size=(len(t), 3)), axis=0) * 0.002
-    rates = rng.normal(size=(len(t), 3)) * 0.01
+        rng.normal(size=(len(t), 3)), axis=0) * wander
+    p[t < 1, 2] = 0
+    seen = np.concatenate([p, q.as_quat() * np.sign(q.as_quat()[:, 3:])], axis=1)
+    seen = np.stack([np.interp(t - np.broadcast_to(late, len(t)), t, column)
+                     for column in seen.T], axis=1)
     columns = np.column_stack([
-        t, p, np.tile([0, 0, 0, 1], (len(t), 1)), specific + noise, rates,
-        np.tile(duty[:, None] * 65535, 4), volts, p, np.zeros((len(t), 2))])
+        t, seen, specific + noise, rates + rng.normal(size=(len(t), 3)) * 0.01,
+        duty * 65535, volts, p, np.zeros((len(t), 2))])[100:-100]
     np.savetxt(path, columns, delimiter=',', header=HEADER, comments='', fmt='%.7g')
     return path
 
@@ -158,6 +183,45 @@ def test_a_file_that_ignores_the_voltage_is_told_so(tmp_path):
     result = table_results(flights, [], 'nanobench', robot, apply=tmp_path / 'corrected.yaml')
     assert 'voltage_sag' in named(result)
     assert 'voltage_sag' in (tmp_path / 'corrected.yaml').read_text()
+
+
+def test_mocap_shows_a_bias_of_the_accelerometer_whatever_the_thrust_is(tmp_path):
+    path = write_flight(tmp_path / 'a.csv', 40, scale=0.8, bias=0.3, wander=3e-4, late=0.03)
+    model, form = RobotParameters.load(ROBOT), Format.load('nanobench')
+    body = BodyModel(model, {**all_keys(model), **extra_keys()}, (0.0, 0.0))
+    flight = TableFlight(read_flight(path, form), model, body, body_keys(model))
+    key = 'imu_accelerometer_bias.bias[2]'
+    at = flight.channels.index('acceleration_z')
+    for value in (0.0, 0.3):
+        found = flight.linear({key: value}, [key])
+        mean = found.residual[flight.mask[:, at], at].mean()
+        assert mean == pytest.approx(0.3 - value, abs=0.03)
+        assert np.allclose(found.slopes[:, at], -1)
+
+
+@pytest.mark.parametrize('late', [0.04, -0.08])
+def test_a_late_clock_of_mocap_is_measured_and_taken_out(tmp_path, late):
+    path = write_flight(tmp_path / 'a.csv', 50, seconds=20, late=late)
+    model, form = RobotParameters.load(ROBOT), Format.load('nanobench')
+    table = read_flight(path, form)
+    seen, felt = turning(table.values['quaternion'], 0.01), table.values['angular_velocity']
+    found, deviation = wander(seen, felt, np.ones(len(table), dtype=bool), 0.01)
+    assert found == pytest.approx(late, abs=0.004) and deviation < 0.015
+    flight = TableFlight(table, model, None, body_keys(model))
+    away = flight._seen[200:-200, 3:] - flight._measured[200:-200, -3:]
+    assert not flight.apart and away.std() < 0.2 * felt.std()
+
+
+def test_a_clock_that_wanders_takes_out_the_pair_and_not_the_flight(tmp_path):
+    away = np.repeat(np.random.default_rng(5).normal(size=18) * 0.12, 200)
+    paths = [write_flight(tmp_path / f'{k}.csv', 60 + k, scale=0.8, late=late)
+             for k, late in enumerate((away, 0.02))]
+    result = table_results(paths[:1], [], 'nanobench', ROBOT)
+    assert result['groups']['force']['used'] and not result['groups']['rate']['used']
+    assert 'wander by' in result['groups']['acceleration']['reason']
+    both = table_results(paths, [], 'nanobench', ROBOT)
+    assert both['groups']['acceleration']['used'] and 'thrust_coefficient' in named(both)
+    assert [text.split(':')[0] for text in both['findings']] == ['0.csv']
 
 
 def test_what_a_format_lacks_is_listed_with_its_reason(tmp_path):

@@ -12,7 +12,7 @@ from rich.console import Console
 from beetle_omni_ros import __version__
 from beetle_omni_ros.identify.flights.engine import Engine, Solution
 from beetle_omni_ros.identify.flights.priors import entries_of, keys_of, spread
-from beetle_omni_ros.identify.flights.residual import TableFlight
+from beetle_omni_ros.identify.flights.residual import COMPARED, GROUPS, TableFlight
 from beetle_omni_ros.identify.flights.table import Format, read_flight
 from beetle_omni_ros.identify.gap.apply import write_corrected
 from beetle_omni_ros.identify.gap.body import BodyModel
@@ -36,7 +36,8 @@ TORQUES = ('inertia', 'centre_of_mass', 'rotor_thrust_coefficient', 'torque_coef
 EXPLAINED = 0.5         # share of the angular acceleration: below, errors exceed what is explained
 FEEDBACK = ('the commands explain less than half of the angular acceleration: a controller that '
             'feeds back what the model lacks would be taken for the robot')
-CLOCK = 'compares two clocks, of which the format states no common one'
+# Entries of the comparison of IMU and MoCap.
+SENSORS = ('imu_gyroscope_bias', 'mocap_misalignment')
 
 
 def table_results(runs: Sequence[Path], holdout: Sequence[Path], form: str,
@@ -98,13 +99,15 @@ def table_results(runs: Sequence[Path], holdout: Sequence[Path], form: str,
 
 def body_keys(robot: RobotParameters) -> dict[str, Key]:
     """Keys that the flights of a table may have."""
-    return keys_of(robot, {*FORCES, *TORQUES})
+    return keys_of(robot, {*FORCES, *TORQUES, *SENSORS})
 
 
 def _engine(flights, robot, declared, alpha, progress):
     """Engine of the flights with the entries that their channels and signals can show."""
     torque = any(name.startswith('torque') for name in flights[0].channels)
     names = set(FORCES) | set(TORQUES if torque else ())
+    if any(name.startswith(COMPARED) for name in flights[0].channels):
+        names |= set(SENSORS)
     if 'position' not in declared.signals:
         names -= {'ground_effect'}
     if not {'position', 'velocity'} & set(declared.signals):
@@ -120,15 +123,18 @@ def _engine(flights, robot, declared, alpha, progress):
     spreads = {name: spread(robot, key, tolerance.get(name, 0.0), declared.clock_deviation)
                for name, key in keys.items()}
     positive = frozenset(name for name, key in keys.items() if key.ends_at_none)
-    # A mass is weighed and sensors have data sheets; maps of thrust differ by half.
-    far = frozenset(name for name, key in keys.items() if key.effect not in ('mass', 'inertia')
-                    and CATALOGUE[key.effect].layer not in ('sensor', 'timing'))
+    # A mass is weighed, air is still and sensors have data sheets; maps of thrust differ by half.
+    far = frozenset(name for name, key in keys.items() if key.effect not in (
+        'mass', 'inertia', 'wind') and CATALOGUE[key.effect].layer not in ('sensor', 'timing'))
     return Engine(flights, list(keys), spreads, entries_of(keys), positive, far, alpha,
                   progress), keys
 
 
 def _judged(flights, judging, robot, declared, alpha, progress):
     usable = [flight for flight in flights if flight.usable]
+    if all(flight.apart for flight in usable):
+        for flight in [*flights, *judging]:
+            flight.without(COMPARED, flight.apart)
     groups = _groups(flights[0] if not usable else usable[0], declared)
     if not usable:
         return _result('bad_data', groups, summary=(
@@ -140,12 +146,14 @@ def _judged(flights, judging, robot, declared, alpha, progress):
                                  f"{', '.join(flight.channels)}, expected those of "
                                  f"{usable[0].name}: {', '.join(usable[0].channels)}")
     findings = [f'{flight.name}: not used, no block of commands and measurements in the air'
-                for flight in [*flights, *judging] if not flight.usable]
+                for flight in [*flights, *judging] if not flight.usable] + [
+        f'{flight.name}: {flight.apart}, so they are not compared'
+        for flight in [*flights, *judging] if flight.apart]
     engine, keys = _engine(usable, robot, declared, alpha, progress)
     solution = engine.run()
     if groups['torque']['used'] and engine.explained(solution, 'torque') < EXPLAINED:
         for flight in [*usable, *judging]:
-            flight.without('torque', FEEDBACK)
+            flight.without(('torque',), FEEDBACK)
         groups = _groups(usable[0], declared)
         engine, keys = _engine(usable, robot, declared, alpha, progress)
         solution = engine.run()
@@ -183,23 +191,13 @@ def _result(verdict, groups, summary, **more):
 def _groups(flight, declared):
     """Each group of channels: whether it is used, and why not."""
     groups = {}
-    for group in ('force', 'torque'):
+    for group in GROUPS:
         own = {c: why for c, why in flight.reasons.items() if c.startswith(group)}
         used = [c for c, why in own.items() if not why]
         unused = sorted({why for why in own.values() if why})
         groups[group] = {'used': bool(used), 'channels': used,
                          **({'reason': '; '.join(unused)} if unused else {})}
     signals = declared.signals
-    clocks = {signals[name].clock for name in ('position', 'specific_force') if name in signals}
-    why = 'no position' if 'position' not in signals else 'no accelerometer' \
-        if 'specific_force' not in signals else CLOCK if len(clocks) > 1 else \
-        'not compared for tables'
-    groups['acceleration'] = {'used': False, 'channels': [], 'reason': why}
-    why = 'no quaternion' if 'quaternion' not in signals else 'no gyroscope' \
-        if 'angular_velocity' not in signals else CLOCK if len(
-            {signals[n].clock for n in ('quaternion', 'angular_velocity')}) > 1 else \
-        'not compared for tables'
-    groups['rate'] = {'used': False, 'channels': [], 'reason': why}
     groups['joint'] = {'used': False, 'channels': [],
                        'reason': 'not compared for tables' if 'tilt' in signals
                        else 'the rotors do not tilt'}

@@ -362,7 +362,7 @@ class Engine:
         rows = []
         for c, name in enumerate(self.channels):
             here = [flight.mask[:, c] for flight in self.flights]
-            found = np.concatenate([(g[m, c].reshape(m.sum(), -1) @ weights)
+            found = np.concatenate([g[m, c].reshape(m.sum(), len(weights)) @ weights
                                     for g, m in zip(self.generic, here, strict=True)])
             size = np.sqrt(np.mean(np.concatenate([r[m, c] for r, m in zip(
                 raw, here, strict=True)])**2))

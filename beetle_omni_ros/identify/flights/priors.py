@@ -24,7 +24,9 @@ SIZE = {'N': (1, 0), 'N s/m': (1, 0), 'N s^2/m^2': (1, 0), 'N m': (1, 1), 'N m s
 # Standard deviations between the flights of one vehicle, by key.
 FLIGHT = {'thrust_coefficient.scale': 0.017, 'rotor_thrust_coefficient.scale': 0.01,
           'imu_accelerometer_bias.bias': 0.05,
-          'imu_misalignment.rotation': 0.002, 'rotor_dead_time.delay': 0.002}
+          'imu_gyroscope_bias.bias': 0.004, 'imu_misalignment.rotation': 0.002,
+          'mocap_misalignment.rotation': 0.002, 'rotor_dead_time.delay': 0.002}
+AIR = 0.3               # [m/s] moves in a hall; its force is that of a typical drag
 FLIGHT_OFFSET = 0.0033          # share of the arm: centre of mass, repeats of one vehicle
 
 
@@ -76,7 +78,10 @@ def spread(robot: RobotParameters, key: Key, tolerance: float, stamps: float) ->
             np.linalg.norm(robot.rotors.positions[:, :2], axis=1).mean())
     if plain == 'rotor_dead_time.delay':
         flight = max(flight, stamps)
-    return Spread(tolerance or 0.5 * key.smallest * size, key.typical * size, flight)
+    typical = key.typical
+    if plain == 'wind.force':
+        typical = AIR * CATALOGUE['rotor_drag'].parameters['coefficient'].typical
+    return Spread(tolerance or 0.5 * key.smallest * size, typical * size, flight)
 
 
 def entries_of(keys: dict[str, Key]) -> list[Entry]:

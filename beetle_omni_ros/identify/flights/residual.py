@@ -2,8 +2,9 @@
 Residuals of a flight that was read from a table, with their slopes.
 
 Two groups of channels compare the measurements with the body equations: specific force along
-the body's axes, and angular acceleration about them. Without quaternion,
-the attitude follows from the direction of the measured acceleration.
+the body's axes, and angular acceleration about them. Two compare the IMU with MoCap: specific
+force (acceleration) and angular velocity (rate), up to the frequency up to which their clocks
+agree. Without quaternion, the attitude follows from the direction of the measured acceleration.
 """
 
 from __future__ import annotations
@@ -14,21 +15,34 @@ import numpy as np
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
+from beetle_omni_ros.identify.flights.motion import (
+    along,
+    derivative,
+    filled,
+    poses,
+    rising,
+    slow,
+    turning,
+)
 from beetle_omni_ros.identify.flights.spectrum import blocks_of
 from beetle_omni_ros.identify.flights.table import Table
 from beetle_omni_ros.identify.gap.body import BodyModel
-from beetle_omni_ros.identify.gap.keys import Key
+from beetle_omni_ros.identify.gap.keys import Key, names_of
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 
-CHANNELS = ('force_x', 'force_y', 'force_z', 'torque_x', 'torque_y', 'torque_z')
+COMPARED = ('acceleration', 'rate')
+GROUPS = ('force', 'torque', *COMPARED)
+CHANNELS = tuple(f'{group}_{axis}' for group in GROUPS for axis in 'xyz')
 FAR = 100.0             # [m] height without position, at which the ground has no effect
 AIRBORNE = 0.15         # [m] above the first position, one rotor diameter: no contact
 MEMORY = 2.0            # rotor time constants after which a lost command is forgotten
-BRIDGED = 0.06          # [s] gaps of inputs that interpolation bridges, about a rotor lag
 FULL = 0.995            # share of full duty from which a command is saturated
 PHASE = 0.1             # [rad] error by wrong stamps up to which a frequency counts
-SMOOTH = 0.05           # [s] moving average of positions before their derivative
+SLOWEST = 0.25          # [Hz] clocks that do not agree up to here are not compared
+# Signal -> what the comparison of MoCap and IMU lacks without it.
+NEEDED = {'position': 'position', 'quaternion': 'quaternion', 'specific_force': 'accelerometer',
+          'angular_velocity': 'gyroscope'}
 DELAYS = ('rotor_dead_time.delay', 'command_latency.delay')
 
 
@@ -58,6 +72,7 @@ class TableFlight:
         channels: names of the channels that can be formed.
         mask: (N, C) samples that count.
         reasons: channel -> why it is not used; '' if it is used.
+        apart: why IMU and MoCap of this flight are not compared although both are there, or ''.
 
     """
 
@@ -74,10 +89,11 @@ class TableFlight:
         table, n = self.table, len(self.table)
         self.name, self.period = table.name, table.period
         self._t = np.arange(n) * self.period
-        stamps = table.format.clock_deviation
-        self.highest = PHASE / (2 * np.pi * stamps) if stamps else np.inf
+        self.highest = _highest(table.format.clock_deviation)
         self._command, known = self._commands()
         self._inputs, measured, reasons = self._states()
+        self._seen, felt, more = self._compared()
+        measured, reasons = np.concatenate([measured, felt], axis=1), [*reasons, *more]
         chosen = [k for k, why in enumerate(reasons) if not why]
         self.channels = tuple(CHANNELS[k] for k in chosen)
         self.reasons = dict(zip(CHANNELS, reasons, strict=True))
@@ -98,41 +114,28 @@ class TableFlight:
         """(N, 4) duty, or thrust [N], and (N,) whether it and its past are known."""
         values = self.table.values
         name = 'duty' if 'duty' in values else 'thrust'
-        filled, known = _filled(values[name], self.period)
+        command, known = filled(values[name], self.period)
         if name == 'duty':
             known &= values[name].max(axis=1, initial=0, where=np.isfinite(values[name])) < FULL
-            volts, _ = _filled(values['voltage'], self.period) if 'voltage' in values else (
+            volts, _ = filled(values['voltage'], self.period) if 'voltage' in values else (
                 None, None)
-            self._volts = np.full(len(filled), self._motor.nominal_voltage) if volts is None \
+            self._volts = np.full(len(command), self._motor.nominal_voltage) if volts is None \
                 else volts[:, 0]
         past = int(round(MEMORY * self.robot.rotors.time_constant / self.period))
         lost = np.convolve(~known, np.ones(past + 1))[:len(known)] > 0
-        return filled, ~lost
+        return command, ~lost
 
     def _states(self):
         """Inputs of the body equations, (N, 6) measurements, and why a channel lacks one."""
         v, n, h = self.table.values, len(self.table), self.period
         reasons = [''] * 6
-        if 'position' in v:
-            position, _ = _filled(v['position'], h)
-        else:
-            position = np.tile([0.0, 0.0, FAR], (n, 1))
-        if 'velocity' in v:
-            velocity, _ = _filled(v['velocity'], h)
-        else:
-            width = max(int(round(SMOOTH / h)), 1)
-            kernel = np.ones(width) / width
-            padded = np.pad(position, ((width, width), (0, 0)), mode='edge')
-            smooth = np.stack([np.convolve(c, kernel, 'same') for c in padded.T], axis=1)
-            velocity = np.gradient(smooth, h, axis=0)[width:-width]
+        position, quaternion, self._wander = poses(self.table, FAR)
+        velocity = filled(v['velocity'], h)[0] if 'velocity' in v else rising(position, h)
         acceleration = v.get('acceleration')
-        if 'quaternion' in v:
-            quaternion, _ = _filled(_signed(v['quaternion']), h)
-            quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
-        elif acceleration is not None:
-            quaternion = _along(acceleration + [0, 0, self.robot.gravity],
-                                v['attitude'][:, 2] if 'attitude' in v else np.zeros(n))
-        else:
+        if quaternion is None and acceleration is not None:
+            quaternion = along(acceleration + [0, 0, self.robot.gravity],
+                               v['attitude'][:, 2] if 'attitude' in v else np.zeros(n))
+        elif quaternion is None:
             quaternion = np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))
         rotation = Rotation.from_quat(quaternion).as_matrix()
         if 'velocity' in v and self.table.format.signals['velocity'].frame == 'body':
@@ -149,18 +152,43 @@ class TableFlight:
             if not np.isfinite(force[:, k]).any():
                 reasons[k] = 'no specific force or acceleration along this axis'
         if 'angular_velocity' in v:
-            rate, _ = _filled(v['angular_velocity'], h)
-            turning = _derivative(v['angular_velocity'], h)
+            rate, _ = filled(v['angular_velocity'], h)
+            turned = derivative(v['angular_velocity'], h)
         else:
-            rate, turning = np.zeros((n, 3)), np.full((n, 3), np.nan)
+            rate, turned = np.zeros((n, 3)), np.full((n, 3), np.nan)
             reasons[3:] = ['no gyroscope'] * 3
-        tilt = _filled(v['tilt'], h)[0] if 'tilt' in v else np.zeros((n, 4))
+        tilt = filled(v['tilt'], h)[0] if 'tilt' in v else np.zeros((n, 4))
         inputs = {'velocity': velocity, 'quaternion': quaternion, 'rate': rate, 'tilt': tilt,
                   'thrust': np.zeros((n, 4)), 'tilt_rate': np.gradient(tilt, h, axis=0),
                   'tilt_acceleration': np.zeros((n, 4)), 'thrust_rate': np.zeros((n, 4)),
                   'position': position, 'voltage': np.ones(n), 'charge': np.zeros(n),
                   'modules': np.zeros(n)}
-        return inputs, np.concatenate([force, turning], axis=1), reasons
+        return inputs, np.concatenate([force, turned], axis=1), reasons
+
+    def _compared(self):
+        """(N, 6) specific force and rate by MoCap, the same by the IMU, and why one lacks."""
+        v, inputs, n = self.table.values, self._inputs, len(self._t)
+        reasons = [next((f'no {NEEDED[s]}' for s in need if s not in v), '') for need in (
+            ('position', 'quaternion', 'specific_force'), ('quaternion', 'angular_velocity'))]
+        limit = _highest(self._wander)
+        self.apart = '' if limit >= SLOWEST or all(reasons) else (
+            f'the clocks of MoCap and IMU wander by {1e3 * self._wander:.0f} ms' if np.isfinite(
+                self._wander) else 'MoCap and IMU show no common motion')
+        rotation = Rotation.from_quat(inputs['quaternion']).as_matrix()
+        up = rising(rising(inputs['position'], self.period), self.period)
+        seen = np.concatenate([
+            np.einsum('nji,nj->ni', rotation, up + [0, 0, self.robot.gravity]),
+            turning(inputs['quaternion'], self.period)], axis=1)
+        felt = np.concatenate([v.get(name, np.full((n, 3), np.nan)) for name in (
+            'specific_force', 'angular_velocity')], axis=1)
+        there = np.isfinite(felt) & ~np.repeat([bool(self.apart or why) for why in reasons], 3)
+        for name in ('position', 'quaternion'):
+            if name in v:
+                there &= filled(v[name], self.period)[1][:, None]
+        felt = np.where(there, slow(filled(felt, self.period)[0], self.period, limit), np.nan)
+        axes = [reasons[k // 3] or ('' if self.apart or there[:, k].any() else (
+            'not recorded along this axis')) for k in range(6)]
+        return slow(seen, self.period, limit), felt, axes
 
     def _flying(self):
         """(N,) whether the robot is in the air."""
@@ -200,11 +228,11 @@ class TableFlight:
         """Whether it has a block of samples in the air."""
         return bool(self.channels) and len(blocks_of(self.mask, self.period)) > 0
 
-    def without(self, group: str, reason: str) -> None:
-        """Leave a group of channels out, for this ``reason``."""
-        keep = [k for k, name in enumerate(self.channels) if not name.startswith(group)]
+    def without(self, groups: tuple[str, ...], reason: str) -> None:
+        """Leave groups of channels out, for this ``reason``."""
+        keep = [k for k, name in enumerate(self.channels) if not name.startswith(groups)]
         for name in self.channels:
-            if name.startswith(group):
+            if name.startswith(groups):
                 self.reasons[name] = reason
         self.mask, self._measured = self.mask[:, keep], self._measured[:, keep]
         self._chosen = [self._chosen[k] for k in keep]
@@ -219,27 +247,30 @@ class TableFlight:
         return inputs, theta
 
     def _sensed(self, out, theta):
-        """What the IMU reads: misalignment, then bias."""
-        rotation = np.array([theta.get(f'imu_misalignment.rotation[{k}]', 0.0) for k in range(3)])
-        bias = np.array([theta.get(f'imu_accelerometer_bias.bias[{k}]', 0.0) for k in range(3)])
-        force, turning = out[:, :3], out[:, 3:]
-        if rotation.any():
-            matrix = Rotation.from_rotvec(rotation).as_matrix()
-            force, turning = force @ matrix, turning @ matrix
-        return np.concatenate([force + bias, turning], axis=1)
+        """What the IMU reads by the body equations and by MoCap: misalignment, then bias."""
+        imu, mocap, force, rate = (
+            np.array([self.keys[name].base + theta.get(name, 0.0) for name in names_of(*key)])
+            for key in (('imu_misalignment', 'rotation'), ('mocap_misalignment', 'rotation'),
+                        ('imu_accelerometer_bias', 'bias'), ('imu_gyroscope_bias', 'bias')))
+        matrix = Rotation.from_rotvec(imu).as_matrix()
+        # what MoCap states of its axes is turned back into the body
+        seen = Rotation.from_rotvec(mocap).as_matrix().T @ matrix
+        return np.concatenate([
+            out[:, :3] @ matrix + force, out[:, 3:] @ matrix, self._seen[:, :3] @ seen + force,
+            self._seen[:, 3:] @ seen + rate], axis=1)
 
     def linear(self, theta: dict[str, float], names: list[str]) -> Linear:
         """Residual and its slopes at deviations ``theta``."""
         inputs, body_theta = self._at(theta)
         now = self._sensed(self.body(inputs, body_theta), theta)
-        slopes = np.zeros((len(now), 6, len(names)))
+        slopes = np.zeros((len(now), len(CHANNELS), len(names)))
         # the voltage of a table with duty is no term of the body equations
         outside = {'voltage_sag.exponent'} if 'duty' in self.table.values else set()
         exact = [name for name in names if self.keys[name].body and name not in outside]
         if exact:
             own = self.body.derivatives(inputs, body_theta, tuple(exact))
             for k, name in enumerate(exact):
-                slopes[:, :, names.index(name)] = -own[:, :, k]
+                slopes[:, :6, names.index(name)] = -own[:, :, k]
         for k, name in enumerate(names):
             if name in exact:
                 continue
@@ -269,46 +300,6 @@ class TableFlight:
         return self._sensed(self.body(inputs, body_theta), theta)
 
 
-def _filled(values, period):
-    """Values (N, n) with linear interpolation of missing ones, and (N,) where it is short."""
-    t, filled = np.arange(len(values)), np.array(values)
-    known = np.ones(len(values), dtype=bool)
-    for k, column in enumerate(values.T):
-        there = np.flatnonzero(np.isfinite(column))
-        if not len(there):
-            filled[:, k] = 0.0
-            continue
-        filled[:, k] = np.interp(t, there, column[there])
-        after = np.clip(np.searchsorted(there, t), 0, len(there) - 1)
-        before = np.clip(np.searchsorted(there, t, side='right') - 1, 0, None)
-        gap = there[after] - there[before]
-        known &= (gap * period <= BRIDGED) & (t >= there[0]) & (t <= there[-1])
-    return filled, known
-
-
-def _derivative(values, period):
-    """Fourth-order central differences (N, n), NaN beside missing samples and at the ends."""
-    out = np.full(values.shape, np.nan)
-    out[2:-2] = (8 * (values[3:-1] - values[1:-3]) - (values[4:] - values[:-4])) / (12 * period)
-    return out
-
-
-def _signed(quaternion):
-    """Quaternions (N, 4) with continuous signs."""
-    out = np.array(quaternion)
-    there = np.flatnonzero(np.isfinite(out).all(axis=1))
-    flips = np.sign((out[there[1:]] * out[there[:-1]]).sum(axis=1))
-    flips[flips == 0] = 1
-    out[there] *= np.concatenate([[1.0], np.cumprod(flips)])[:, None]
-    return out
-
-
-def _along(thrust, yaw):
-    """Quaternions (N, 4) whose z axis is along a vector (N, 3) in world, with this yaw (N,)."""
-    z = thrust / np.linalg.norm(thrust, axis=1, keepdims=True)
-    heading = np.stack([np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))], axis=1)
-    y = np.cross(z, heading)
-    y /= np.linalg.norm(y, axis=1, keepdims=True)
-    matrix = np.stack([np.cross(y, z), y, z], axis=2)
-    matrix[~np.isfinite(matrix).all(axis=(1, 2))] = np.eye(3)
-    return Rotation.from_matrix(matrix).as_quat()
+def _highest(deviation):
+    """Frequency [Hz] up to which stamps with this deviation [s] turn the phase too little."""
+    return PHASE / (2 * np.pi * deviation) if deviation else np.inf

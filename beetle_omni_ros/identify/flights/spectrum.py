@@ -142,7 +142,7 @@ def blocks_of(mask: np.ndarray, period: float) -> np.ndarray:
     length = there[-1] + 1 - there[0]
     count = max(int(length * period / BLOCK), 1)
     rows = there[0] + np.arange(count * (length // count)).reshape(count, -1)
-    return rows[mask[rows].mean(axis=(1, 2)) >= LEAST]
+    return rows[mask[rows].any(axis=2).mean(axis=1) >= LEAST]
 
 
 def spectrum(residual: np.ndarray, slopes: np.ndarray, mask: np.ndarray, period: float,
