@@ -20,7 +20,8 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
 
-REAL = Path(__file__).parents[3] / 'shared/data/flights'
+REAL = Path(__file__).parents[1] / 'data/nanobench'
+BESIDE = Path(__file__).parents[3] / 'shared/data/flights'
 ROBOT = share_path('params/crazyflie.yaml')
 HEADER = ('t,px,py,pz,qx,qy,qz,qw,fx,fy,fz,wx,wy,wz,pwm1,pwm2,pwm3,pwm4,vbat,sp_x,sp_y,sp_z,'
           'des_roll,des_pitch')
@@ -262,13 +263,21 @@ def test_duty_needs_a_robot_with_a_motor_map(tmp_path):
         table_results([flight], [], 'nanobench', None)
 
 
-@pytest.mark.skipif(not REAL.is_dir(), reason='the real flights are not beside the repository')
 @pytest.mark.timeout(600)
 def test_real_flights_name_thrust_and_drag_and_never_an_inertia():
-    flights = [REAL / f'nano_{name}.csv.gz' for name in (
-        'B2_circle_fast_rep3', 'B7_oval_slow_rep3', 'B5_helix_fast_rep2')]
-    result = table_results(flights, [REAL / 'nano_B8_star_fast_rep3.csv.gz'], 'nanobench', ROBOT)
+    result = table_results(sorted(REAL.glob('*.csv.gz')), [], 'nanobench', ROBOT)
     assert {'thrust_coefficient', 'rotor_drag'} <= named(result)
-    assert not {'inertia', 'torque_coefficient', 'joint_offset'} & named(result)
-    assert not result['groups']['rate']['used']
+    assert not {'inertia', 'torque_coefficient', 'wind'} & named(result)
+    assert result['groups']['acceleration']['used'] and result['groups']['rate']['used']
+    found = {effect['names'][0]: effect['parameters'] for effect in result['effects']}
+    assert 0.009 < found['rotor_drag']['coefficient']['value'] < 0.015
     assert result['closure'] > 0.8
+
+
+@pytest.mark.skipif(not BESIDE.is_dir(), reason='further flights are not beside the repository')
+@pytest.mark.xfail(strict=True, reason=(
+    'two short flights of circles: with twice the inertia the commands explain more than half of '
+    'the angular acceleration, so that the torques are used'))
+def test_short_real_flights_name_no_inertia():
+    flights = [BESIDE / f'nano_B2_circle_{name}_rep1.csv.gz' for name in ('slow', 'fast')]
+    assert 'inertia' not in named(table_results(flights, [], 'nanobench', ROBOT))
