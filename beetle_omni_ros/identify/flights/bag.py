@@ -12,13 +12,10 @@ Four groups of channels are compared on one grid:
 
 from __future__ import annotations
 
-from functools import cached_property
-
 import numpy as np
 
 from beetle_omni_ros.identify.flights.residual import Linear
 from beetle_omni_ros.identify.flights.spectrum import blocks_of
-from beetle_omni_ros.identify.gap.keys import LIMITS
 from beetle_omni_ros.identify.gap.residual import BOTH_SIDES, CHANNELS, FlightModel
 from beetle_omni_ros.identify.gap.series import low_pass, matrices, THIN, within
 
@@ -89,23 +86,8 @@ class BagFlight(FlightModel):
             result['J'] = self._joints([theta])[0]
         return result
 
-    def _smooth_joints(self, series):
+    def _of_joints(self, series):
         return within(self._fine, series, 0)[::THIN]
-
-    def _joints(self, sets):
-        first, count = self._starts[0], self._length * len(self._starts)
-        keep, self.filters['J'] = self.filters['J'], self._smooth_joints
-        try:
-            return super()._joints(sets)
-        finally:
-            self.filters['J'] = keep
-
-    def _joint_slopes(self, theta, names):
-        keep, self.filters['J'] = self.filters['J'], self._smooth_joints
-        try:
-            return super()._joint_slopes(theta, names)
-        finally:
-            self.filters['J'] = keep
 
     def linear(self, theta, names):
         """Residual and its slopes at deviations ``theta``."""

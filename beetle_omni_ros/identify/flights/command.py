@@ -137,7 +137,7 @@ def _judged(flights, judging, robot, declared, alpha, progress):
             flight.without(COMPARED, flight.apart)
     groups = _groups(flights[0] if not usable else usable[0], declared)
     if not usable:
-        return _result('bad_data', groups, summary=(
+        return result_of('bad_data', groups, summary=(
             f'No flight can be used: {flights[0].name} has no block of commands and measurements '
             'in the air.'), false_alarm_probability=None)
     for flight in [*usable, *judging]:
@@ -158,7 +158,7 @@ def _judged(flights, judging, robot, declared, alpha, progress):
         engine, keys = _engine(usable, robot, declared, alpha, progress)
         solution = engine.run()
     progress('judging')
-    named = _named(engine, solution, alpha)
+    named = named_of(engine, solution, alpha)
     sets = [[solution.entries[j] for j in members] for _, members in named]
     error = exp(min(0.0, -solution.e_value))
     verdict = 'not_decidable'
@@ -168,21 +168,22 @@ def _judged(flights, judging, robot, declared, alpha, progress):
         verdict = 'named' if largest == 1 else 'named_set' if largest < CROWD else 'not_decidable'
     elif null >= 1 - alpha:
         verdict = 'no_gap'
-    effects = [_effect(solution, engine, keys, k, members) for k, members in named]
-    gap = _gaps(engine, solution, [k for k, _ in named],
+    effects = [effect_of(solution, engine, keys, k, members) for k, members in named]
+    gap = gaps_of(engine, solution, [k for k, _ in named],
                 [flight for flight in judging if flight.usable] or usable)
     unclear = [[entry.name for entry in members] for members in sets if len(members) > 1]
-    return _result(
+    return result_of(
         verdict, groups, effects=effects if verdict != 'not_decidable' else [],
         partial=effects if verdict == 'not_decidable' else [],
-        candidates=_candidates(solution, named), where=_where(engine, solution),
+        candidates=candidates_of(solution, named), where=where_of(engine, solution),
         false_alarm_probability=error, held_out=bool(judging), findings=findings, **gap,
         next_experiment=separating_experiment(unclear[0]) if unclear else None,
-        summary=_summary(verdict, sets, error, solution))
+        summary=summary_of(verdict, sets, error, solution))
 
 
-def _result(verdict, groups, summary, **more):
-    base = {'verdict': verdict, 'effects': [], 'partial': [], 'where': [], 'closure': None,
+def result_of(verdict: str, groups: dict, summary: str, **more) -> dict:
+    """Results that are written as JSON."""
+    base: dict = {'verdict': verdict, 'effects': [], 'partial': [], 'where': [], 'closure': None,
             'gap_before': None, 'gap_after': None, 'noise_floor': None, 'candidates': [],
             'next_experiment': None, 'groups': groups, 'summary': summary, 'findings': []}
     return base | more
@@ -204,7 +205,7 @@ def _groups(flight, declared):
     return groups
 
 
-def _named(engine: Engine, solution: Solution, alpha: float) -> list[tuple[int, list[int]]]:
+def named_of(engine: Engine, solution: Solution, alpha: float) -> list[tuple[int, list[int]]]:
     """
     Entries of the best set that the flights need, with those that could stand in their place.
 
@@ -228,20 +229,24 @@ def _named(engine: Engine, solution: Solution, alpha: float) -> list[tuple[int, 
     return [(k, members) for _, k, members in sorted(named)]
 
 
-def _effect(solution, engine, keys, k, members):
+def effect_of(solution: Solution, engine: Engine, keys: dict[str, Key], k: int,
+              members: list[int], starts: dict[str, dict[str, float]] | None = None) -> dict:
+    """Names, sizes and evidence of a named entry; ``starts`` as of :class:`BagFlight`."""
     best = solution.posteriors[solution.best]
     index = sorted(i for j in solution.best for i in engine.indices((j,)))
     entry, found = solution.entries[k], {}
     for parameter, spec in CATALOGUE[entry.name].parameters.items():
-        own = [name for name in entry.keys if keys[name].parameter == parameter]
+        own = [(name, key, part) for name in entry.keys
+               for key, part in (starts or {}).get(name, {name: 1.0}).items()
+               if keys[key].parameter == parameter]
         values, spans = [], []
-        for name in own:
-            key, at = keys[name], index.index(engine.index[name])
-            middle, half = best.estimate[at], 1.96 * best.deviation[at]
+        for name, of, part in own:
+            key, at = keys[of], index.index(engine.index[name])
+            middle, half = best.estimate[at] * part, 1.96 * best.deviation[at] * abs(part)
             values.append(key.value(float(middle)))
             spans.append([max(key.value(float(middle - half)), spec.low),
                           min(key.value(float(middle + half)), spec.high)])
-        base = [keys[name].base for name in own]
+        base = [keys[of].base for _, of, _ in own]
         if own:
             found[parameter] = {
                 'value': values if len(own) > 1 else values[0], 'unit': spec.unit,
@@ -249,7 +254,7 @@ def _effect(solution, engine, keys, k, members):
                 'file': base if len(own) > 1 else base[0]}
     gain = engine.gain(solution.judge, solution.best, tuple(sorted(set(solution.best) - {k})))
     names = list(dict.fromkeys(solution.entries[j].name for j in members))
-    result = {'names': names, 'parameters': found, 'layer': CATALOGUE[entry.name].layer,
+    result: dict = {'names': names, 'parameters': found, 'layer': CATALOGUE[entry.name].layer,
               'evidence': {'ln_bayes_factor': gain, 'delta_bic': 2 * gain,
                            'constancy': -solution.unsteady.get(k, 0.0)}}
     if entry.member is not None:
@@ -257,7 +262,8 @@ def _effect(solution, engine, keys, k, members):
     return result
 
 
-def _candidates(solution, named):
+def candidates_of(solution: Solution, named: list[tuple[int, list[int]]]) -> list[dict]:
+    """Evidence of each entry alone, the largest first."""
     taken = {k for k, _ in named}
     rows = []
     for k, entry in enumerate(solution.entries):
@@ -271,23 +277,22 @@ def _candidates(solution, named):
     return sorted(rows, key=lambda row: -(row['evidence']['delta_bic'] or 0.0))
 
 
-def _where(engine, solution):
+def where_of(engine, solution):
     """Channels by the RMS of the generic discrepancy, which no entry explains."""
     rows = [{'channel': channel, 'regime': 'flight', 'excess': before, 'discrepancy_rms': rms}
             for channel, before, rms in engine.disagreement(solution)]
     return sorted(rows, key=lambda row: -row['excess'])
 
 
-def _gaps(engine, solution, named, flights):
-    """Errors over the noise floor of the file, of the corrected file, and closure."""
-    before, after, floor = engine.errors(solution, named, flights)
-    excess = before**2 - floor**2
-    closure = 1 - max(after**2 - floor**2, 0.0) / excess if excess > 0.05 * floor**2 else None
+def gaps_of(engine: Engine, solution: Solution, named: list[int], flights: list) -> dict:
+    """Errors over the noise floor without and with the named effects, and closure."""
+    before, after, floor, closure = engine.errors(solution, named, flights)
     return {'gap_before': before / floor, 'gap_after': after / floor, 'noise_floor': 1.0,
             'closure': closure}
 
 
-def _summary(verdict, sets, error, solution):
+def summary_of(verdict: str, sets: list[list], error: float, solution: Solution) -> str:
+    """The verdict as one sentence."""
     names = ' and '.join(' or '.join(dict.fromkeys(e.name.replace('_', ' ') for e in members))
                          for members in sets)
     chance = f'probability of a false alarm {error:.1g}' if error >= 1e-6 else \

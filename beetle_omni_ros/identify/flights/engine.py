@@ -89,8 +89,8 @@ class Engine:
     def __init__(self, flights: Sequence, names: list[str], spreads: dict[str, Spread],
                  entries: list[Entry], positive: frozenset[str] = frozenset(),
                  far: frozenset[str] = frozenset(), alpha: float = 0.05,
-                 curved: frozenset[str] = frozenset(),
-                 progress: Callable[[str], None] = lambda text: None):
+                 progress: Callable[[str], None] = lambda text: None,
+                 curved: frozenset[str] = frozenset()):
         self.flights, self.names, self.entries = list(flights), list(names), list(entries)
         self.narrow, self.typical, self.flight = (np.array(
             [getattr(spreads[name], kind) for name in names])
@@ -129,19 +129,21 @@ class Engine:
         theta = np.zeros(len(self.names))
         etas = np.zeros((len(self.flights), len(self.names)))
         self._learn(spectra := self._spectra(theta, etas))
-        self.filters = [whitening(np.diagonal(s.noise, axis1=1, axis2=2), f.period)
-                        for s, f in zip(spectra, self.flights, strict=True)]
+        self.power = [np.diagonal(s.noise[s.band], axis1=1, axis2=2).mean(axis=0)
+                      for s in spectra]
+        self.filters = [self._filter(s, s.noise) for s in spectra]
+        self.common = self._filter(max(spectra, key=lambda s: s.band[-1]), pooled(spectra))
+        noise: list[np.ndarray] = []
         for turn in range(ROUNDS):
             self.progress(f'linearising, {turn + 1} of {ROUNDS}')
             for flight, eta in zip(self.flights, etas, strict=True):
                 flight.settle(dict(zip(self.names, (theta + eta)[:self.known], strict=False)))
             spectra = self._spectra(theta, etas)
             self.narrow[self.known:] = self.start[self.known:]
-            if turn:
-                for each, before in zip(spectra, known, strict=True):
-                    each.noise = before
-            self._learn(spectra, 2 if turn else 5)
-            known = [each.noise for each in spectra]
+            for each, before in zip(spectra, noise, strict=False):
+                each.noise = before
+            self._learn(spectra, 2 if turn else 5)      # again from the noise before
+            noise = [each.noise for each in spectra]
             self.progress(f'weighing effects, {turn + 1} of {ROUNDS}')
             solution = self._steady(spectra)
             etas = np.array([solution.equations.of_flight(k, solution.theta)[:len(self.names)]
@@ -275,14 +277,21 @@ class Engine:
             # without the generic discrepancy, which predicts what feedback leaves
             x = solution.equations.of_flight(k, solution.theta)[:len(self.names)]
             x[:self.known] += solution.theta[:self.known]
+            # a fit of feedback makes the robot heavier; the inertia is that of the file
+            x[[k for k, name in enumerate(self.names) if name.startswith('inertia.')]] = 0.0
             moving = found.band > 0
             left += (((found.residual + found.slopes @ x) / np.sqrt(np.diagonal(
                 found.noise, axis1=1, axis2=2))[found.band])[:, moving][:, :, own]**2).sum()
             measured = spectrum(flight.linear({}, []).measured, np.zeros((*flight.mask.shape, 0)),
-                                flight.mask, flight.period, found.floor, flight.highest)
+                                flight.mask, flight.period, found.floor, flight.highest,
+                                self.filters[k], self.groups)
             total += ((measured.residual / np.sqrt(np.diagonal(
                 found.noise, axis1=1, axis2=2))[found.band])[:, moving][:, :, own]**2).sum()
         return 1 - left / total
+
+    def _filter(self, spectrum, noise):
+        power = np.diagonal(noise, axis1=1, axis2=2)[:spectrum.band[-1] + 1]
+        return whitening(power, self.flights[0].period)
 
     def _split(self, spectra, banned, entry=None):
         """
@@ -319,42 +328,6 @@ class Engine:
             own = self.known + (np.arange(copies)[:, None] * len(keys) + np.arange(count)).ravel()
             solution.unsteady[k] = judge.posterior(own).gain
 
-    def remainder(self, solution: Solution) -> tuple[float, np.ndarray, int]:
-        """
-        Whether the generic discrepancy predicts flights on which it was not fitted.
-
-        Returns:
-            mean gain of a block over its standard error, (C,) RMS of the predicted discrepancy in
-            the units of the channels, and the number of blocks.
-
-        """
-        parts = [(k, s, None) for k, s in enumerate(solution.spectra)]
-        if len(parts) == 1:
-            spectrum, half = solution.spectra[0], len(solution.spectra[0].residual) // 2
-            parts = [(0, spectrum.blocks(rows), rows)
-                     for rows in (slice(0, half), slice(half, None))]
-        prior = self.narrow.copy()
-        own = self.indices(solution.best)
-        prior[own] = np.hypot(prior[own], np.maximum(
-            9 * self.typical[own], np.abs(solution.theta[own])))
-        known, gains, squares, count = self.known, [], 0.0, 0
-        for held, (flight, spectrum, _) in enumerate(parts):
-            rest = normal([s for k, (_, s, _) in enumerate(parts) if k != held], self.names,
-                          self.flight)
-            with_it = np.linalg.solve(rest.info + np.diag(prior**-2), rest.right)
-            without = np.zeros(len(prior))
-            without[:known] = np.linalg.solve(
-                rest.info[:known, :known] + np.diag(prior[:known]**-2), rest.right[:known])
-            move, test = with_it - without, normal([spectrum], self.names, self.flight)
-            gains.append((test.scores - test.slopes @ without) @ move
-                         - 0.5 * np.einsum('i,bij,j->b', move, test.slopes, move))
-            phi, mask = self.generic[flight], self.flights[flight].mask
-            squares += ((phi.reshape(*phi.shape[:2], -1) @ with_it[known:])**2 * mask).sum(axis=0)
-            count += mask.sum(axis=0)
-        gains = np.concatenate(gains)
-        error = gains.std(ddof=1) / np.sqrt(len(gains))
-        return float(gains.mean() / error), np.sqrt(squares / np.maximum(count, 1)), len(gains)
-
     def disagreement(self, solution: Solution) -> list[tuple[str, float, float]]:
         """Channel, RMS of the file's residual over the noise, RMS of the discrepancy."""
         weights = solution.equations.of_generic(solution.theta)
@@ -366,45 +339,51 @@ class Engine:
                                     for g, m in zip(self.generic, here, strict=True)])
             size = np.sqrt(np.mean(np.concatenate([r[m, c] for r, m in zip(
                 raw, here, strict=True)])**2))
-            noise = np.sqrt(np.mean([np.mean(s.noise[s.band][:, c, c]) for s in solution.spectra]))
+            noise = np.sqrt(np.mean([power[c] for power in self.power]))
             rows.append((name, float(size / noise), float(found.std())))
         return rows
 
     def errors(self, solution: Solution, named: Sequence[int], flights: Sequence
-               ) -> tuple[float, float, float]:
+               ) -> tuple[float, float, float, float | None]:
         """
-        Whitened RMS of flights with the file, with the named entries, and with everything.
+        Whitened RMS of flights without and with the named entries, and of a fit; closure.
 
+        Tolerances of the robot are as fitted, so that they count neither before nor after. The
+        last fit adapts everything to these flights, within the priors.
         The flights' own deviations are fitted within their priors in each case. The noise is that
         of the fitted flights.
         """
-        keep = self.flights, self.generic
-        self.flights = list(flights)
+        keep = self.flights, self.generic, self.filters
+        self.flights, self.filters = list(flights), [self.common] * len(flights)
         self.generic = discrepancies(self.flights)
         zeros = np.zeros((len(flights), len(self.names)))
         theta = np.concatenate([solution.theta[:self.known],
                                 np.zeros(len(self.names) - self.known)])
         spectra = self._spectra(theta, zeros)
-        self.flights, self.generic = keep
+        self.flights, self.generic, self.filters = keep
         noise, total, count = pooled(solution.spectra), np.zeros(3), 0
-        some = np.zeros(len(theta))
-        some[self.indices(named)] = theta[self.indices(named)]
+        less = theta.copy()
+        less[self.indices(named)] = 0.0
+        every = np.hypot(self.narrow, self.flight)
+        every[self.indices(named)] += 9 * self.typical[self.indices(named)]
         for each in spectra:
             each.noise = noise
             g, h = (part.sum(axis=(0, 1)) for part in each.grams())
             r2 = each.power()
-            for k, point in enumerate((np.zeros(len(theta)), some, None)):
-                own = np.flatnonzero(self.flight > 0) if point is not None else slice(None)
-                prior = self.flight[own]**-2 if point is not None else \
-                    np.hypot(self._wide(), self.flight)**-2
-                start = np.zeros(len(theta)) if point is None else point
+            for k, (start, free) in enumerate((
+                    (less, self.flight), (theta, self.flight), (theta, every))):
+                own = np.flatnonzero(free > 0)
                 left = h - g @ start
-                move = np.linalg.solve(g[own][:, own] + np.diag(prior), left[own])
+                move = np.linalg.solve(g[own][:, own] + np.diag(free[own]**-2), left[own])
                 value = r2 - 2 * h @ start + start @ g @ start
                 total[k] += value - 2 * left[own] @ move + move @ g[own][:, own] @ move
             count += each.residual.size
-        before, after, floor = np.sqrt(np.maximum(total, 0.0) / count)
-        return float(before), float(after), float(floor)
+        total = np.maximum(total, 1e-9 * count)
+        # chi2 that is left of the difference, if the flights show a difference at all
+        closure = 1 - max(total[1] - total[2], 0.0) / (total[0] - total[2]) \
+            if total[0] - total[1] > 2 * log(1 / self.alpha) else None
+        before, after, floor = np.sqrt(total / count)
+        return float(before), float(after), float(floor), closure
 
     def _judge(self, equations, wide=None, named=(), form=(), size=()):
         """Judge of all known keys, and of deviations of bands with priors ``form``, ``size``."""

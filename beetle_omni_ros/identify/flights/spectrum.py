@@ -11,15 +11,17 @@ not make the noise look small.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.fft import dct
 from scipy.signal import fftconvolve
 
 BLOCK = 8.0         # [s] of a block: longer than the memory of a flight controller
-EDGES = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 25.0)  # [Hz] of the bands; the first is the mean alone
+# [Hz] of the bands; the first is the mean alone
+EDGES = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 25.0)
 MANY = 4            # times as many coefficients as keys: the variance of the fit is negligible
+WARM = 0.5          # [s] after a gap of this length that do not count
 TAPS = 1.0          # [s] length of a whitening filter
 LEAST = 0.25         # share of a block that must count
 
@@ -61,11 +63,6 @@ class Spectrum:
             self._kept = self._grams()
         return self._kept
 
-    def blocks(self, rows: slice) -> Spectrum:
-        """The spectrum of some blocks."""
-        return replace(self, residual=self.residual[rows], slopes=self.slopes[rows], _kept=None,
-                       _parts=[])
-
     def power(self) -> float:
         """Sum of squares of the whitened residual."""
         inverse = np.linalg.inv(self.noise)[self.band]
@@ -85,8 +82,9 @@ class Spectrum:
                 noise = self.noise[k][np.ix_(channels, channels)]
                 root = np.linalg.inv(np.linalg.cholesky(noise))
                 s = root @ slopes[:, own]
-                r = self.residual[:, own, channels] @ root.T
-                s, r = s.reshape(blocks, -1, len(keys)), r.reshape(blocks, -1)
+                r = self.residual[:, own][..., channels] @ root.T
+                rows = s.shape[1] * s.shape[2]
+                s, r = s.reshape(blocks, rows, len(keys)), r.reshape(blocks, rows)
                 info[:, k, keys[:, None], keys] += s.transpose(0, 2, 1) @ s
                 right[:, k, keys] -= (s.transpose(0, 2, 1) @ r[..., None])[..., 0]
         return info, right
@@ -118,19 +116,21 @@ class Spectrum:
             of_keys = covariance[np.ix_(keys, keys)]
             totals, counts = [], []
             for own in self._bands():
-                j = slopes[:, own].reshape(-1, len(channels), len(keys))
-                e = self.residual[:, own, channels].reshape(len(j), -1) + j @ x[keys]
+                j, e = slopes[:, own], self.residual[:, own][..., channels]
+                count = e.shape[0] * e.shape[1]
+                j = j.reshape(count, len(channels), len(keys))
+                e = e.reshape(count, len(channels)) + j @ x[keys]
                 total = e.T @ e
                 if len(j) < MANY * len(keys):
-                    w = (j.reshape(-1, len(keys)) @ of_keys).reshape(j.shape)
+                    w = j @ of_keys
                     total = total + np.einsum('nck,ndk->cd', w, j, optimize=True)
                 totals.append(total)
                 counts.append(len(j))
             if self.level:
                 totals, counts = [sum(totals)] * len(totals), [sum(counts)] * len(counts)
             for k, (total, size) in enumerate(zip(totals, counts, strict=True)):
-                at = np.ix_([k], channels, channels)
-                self.noise[at] = (total + weight * prior[at][0]) / (size + weight) \
+                at = np.ix_(channels, channels)
+                self.noise[k][at] = (total + weight * prior[k][at]) / (size + weight) \
                     + np.diag(self.floor[channels]**2)
 
 
@@ -158,21 +158,13 @@ def spectrum(residual: np.ndarray, slopes: np.ndarray, mask: np.ndarray, period:
         period: of the samples [s].
         floor: (C,) smallest standard deviation of a sample's noise.
         highest: largest frequency that counts [Hz].
+        filters: (C, L) whitening filters; None: the noise differs between bands.
+        groups: indices of the channels with common noise; None: all.
 
     """
     groups = groups or [np.arange(residual.shape[1])]
     if filters is not None:
-        residual, slopes, mask = residual.copy(), slopes.copy(), mask.copy()
-        warm = int(0.5 / period)
-        for c in range(residual.shape[1]):
-            there = mask[:, c]
-            r, s = residual[:, c] * there, slopes[:, c] * there[:, None]
-            used = np.flatnonzero(np.abs(s).max(axis=0) > 0)
-            residual[:, c] = fftconvolve(r, filters[c])[:len(r)]
-            slopes[:, c, used] = fftconvolve(s[:, used], filters[c][:, None], axes=0)[:len(r)]
-            lost = np.convolve(~there, np.ones(warm))[:len(there)] > 0
-            lost[:warm] = True
-            mask[:, c] &= ~lost
+        residual, slopes, mask = _whitened(residual, slopes, mask, filters, int(WARM / period))
     rows = blocks_of(mask, period)
     weight, size = mask[rows], rows.shape[1]
     frequency = np.arange(size) / (2 * size * period)
@@ -187,9 +179,38 @@ def spectrum(residual: np.ndarray, slopes: np.ndarray, mask: np.ndarray, period:
     return Spectrum(coefficients, derivatives, band, noise, floor, groups, filters is not None)
 
 
+def _whitened(residual, slopes, mask, filters, warm):
+    """
+    Filtered residual and slopes, and what counts of them.
+
+    Missing samples are interpolated in both, so that the linear model stays exact. What follows
+    the begin or a long gap does not count.
+    """
+    residual, slopes, mask = residual.copy(), slopes.copy(), mask.copy()
+    t = np.arange(len(mask))
+    for c in range(mask.shape[1]):
+        there = np.flatnonzero(mask[:, c])
+        if not len(there):
+            continue
+        right = np.clip(np.searchsorted(there, t), 0, len(there) - 1)
+        left = np.clip(np.searchsorted(there, t, side='right') - 1, 0, None)
+        left, right = there[left], there[right]
+        part = np.clip((t - left) / np.maximum(right - left, 1), 0, 1)
+        used = np.flatnonzero(np.abs(slopes[:, c]).max(axis=0) > 0)
+        both = np.column_stack([residual[:, c], slopes[:, c, used]])
+        both = both[left] + part[:, None] * (both[right] - both[left])
+        both = fftconvolve(both, filters[c][:, None], axes=0)[:len(t)]
+        residual[:, c], slopes[:, c, used] = both[:, 0], both[:, 1:]
+        gap = np.convolve(~mask[:, c], np.ones(warm))[:len(t)] >= warm
+        lost = np.convolve(gap, np.ones(warm + 1))[:len(t)] > 0
+        lost[:there[0] + warm] = True
+        mask[:, c] &= ~lost
+    return residual, slopes, mask
+
+
 def whitening(power: np.ndarray, period: float) -> np.ndarray:
     """
-    Causal filters (C, L) that make noise white, of its power (bands, C) in each band.
+    Causal filters (C, L) that make noise white, of its power (bands, C) in the used bands.
 
     The filter is the minimum phase one, by the cepstrum. In a closed loop commands depend on past
     noise, and only innovations are independent of it.
@@ -197,7 +218,8 @@ def whitening(power: np.ndarray, period: float) -> np.ndarray:
     n = 4096
     frequency = np.fft.rfftfreq(n, period)
     top = 0.5 / period
-    edges = [e for e in EDGES if e < top] + [top]
+    edges = [e for e in EDGES[:len(power)] if e < top]
+    edges = edges + [min(EDGES[len(edges)], top)] if len(edges) < len(power) else edges
     middle = np.sqrt(np.maximum(edges[1:-1], 1e-9) * np.array(edges[2:]))
     middle = np.concatenate([[edges[1] / 2], middle])
     taps = int(TAPS / period)

@@ -122,14 +122,14 @@ def analyse(fitted: list[Flight], judging: list[Flight], robot: RobotParameters,
     """
     a = Analysis(held_out=bool(judging))
     a.keys = {**all_keys(robot), **extra_keys()}
-    body = BodyModel(robot, a.keys, _modules(robot))
+    body = BodyModel(robot, a.keys, tilting_modules(robot))
     models = [FlightModel(flight, robot, body, a.keys, p) for flight in fitted]
     others = [FlightModel(flight, robot, body, a.keys, p) for flight in judging]
     a.models = models, others or models
     coarse = float(np.median([m.signals.position_noise for m in models])) > p.coarse_noise
     if coarse:
         a.findings.append('sensors are noisy: latencies within their usual range are not named')
-    priors = tolerances(p, coarse, _swing(robot))
+    priors = tolerances(p, coarse, swing_of(robot))
     if robot.multibody is None or 'module_reaction' in robot.effects:
         del priors['modules.share']
     a.problem = Problem(models, a.keys, priors, p, others)
@@ -162,7 +162,8 @@ def _find(a, progress):
     _falsify(a, search.wide)
 
 
-def _modules(robot):
+def tilting_modules(robot: RobotParameters) -> tuple[float, float]:
+    """Inertia about the joint [kg m^2] and mass moment [kg m] of a module of the file."""
     if robot.multibody is None:
         return 0.0, 0.0
     module = robot.multibody.module
@@ -170,9 +171,9 @@ def _modules(robot):
     return float(module.inertia[0] + module.mass * depth**2), float(module.mass * depth)
 
 
-def _swing(robot):
+def swing_of(robot: RobotParameters) -> float:
     """Logarithm of the ratio of a module's inertia about its joint and the servo's inertia."""
-    inertia = _modules(robot)[0]
+    inertia = tilting_modules(robot)[0]
     return float(np.log(max(inertia / robot.joints.inertia, 1.0))) if inertia else 0.0
 
 

@@ -66,7 +66,7 @@ def candidates(keys: dict[str, Key], models: list[FlightModel]) -> list[Candidat
             result += [Candidate(name, own[:1], label=f'{name} (inertia)'),
                        Candidate(name, own, label=name)]
         else:
-            starts = _limit_starts(keys[own[0]], effect, models) if effect.limit else effect.starts
+            starts = limit_starts(keys[own[0]], effect, models) if effect.limit else effect.starts
             if effect.starts and not starts:
                 continue
             result += [Candidate(name, own, {f'{name}.{part}': x for part, x in form.items()},
@@ -75,7 +75,7 @@ def candidates(keys: dict[str, Key], models: list[FlightModel]) -> list[Candidat
     return result
 
 
-def _limit_starts(key, effect, models):
+def limit_starts(key, effect, models):
     """Starts at which a limit begins to act in these flights."""
     what, below = effect.limit
     most = max(float({

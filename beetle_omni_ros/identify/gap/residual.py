@@ -161,8 +161,11 @@ class FlightModel:
             runs = self._servos([sets[k] for k in members], sets[members[0]])
             for k, run in zip(members, runs, strict=True):
                 read = self.signals.joints(sets[k])[3][first:first + count]
-                residuals[k] = self.filters['J'](read - run.reshape(-1, 4))
+                residuals[k] = self._of_joints(read - run.reshape(-1, 4))
         return residuals
+
+    def _of_joints(self, series):
+        return self.filters['J'](series)
 
     def smooth_tilts(self, theta: dict[str, float]) -> None:
         """
@@ -206,7 +209,7 @@ class FlightModel:
         rate, slopes = np.gradient(runs[0], self.p.grid, axis=1), {}
         for name, h, run in zip(moved, sizes, runs[1:], strict=True):
             slope = rate * SHIFTS.get(name, 0.0) - (run - runs[0]) / h
-            slopes[name] = self.filters['J'](slope.reshape(-1, 4))
+            slopes[name] = self._of_joints(slope.reshape(-1, 4))
         return [slopes[source] * (np.arange(4) == self.keys[name].index)
                 if source != name else slopes[name]
                 for name, source in zip(names, sources, strict=True)]

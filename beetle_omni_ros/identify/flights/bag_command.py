@@ -1,0 +1,162 @@
+"""
+Bags judged by the flight engine, beside :mod:`beetle_omni_ros.identify.gap.command`.
+
+It has no verdict ``unknown`` and no page yet, so that ``beetle_omni gap`` does not use it.
+``benchmarks/gap_campaign.py --workflow new=beetle_omni_ros.identify.flights.bag_command:run_bags``
+compares both on the same flights.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import exp
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from beetle_omni_ros.identify.flights.bag import BagFlight
+from beetle_omni_ros.identify.flights.command import (
+    candidates_of,
+    CROWD,
+    effect_of,
+    gaps_of,
+    headline,
+    named_of,
+    result_of,
+    summary_of,
+    where_of,
+)
+from beetle_omni_ros.identify.flights.engine import Engine
+from beetle_omni_ros.identify.flights.priors import entries_of, Entry, Spread, spread
+from beetle_omni_ros.identify.gap.analysis import swing_of, tilting_modules
+from beetle_omni_ros.identify.gap.apply import write_corrected
+from beetle_omni_ros.identify.gap.body import BodyModel
+from beetle_omni_ros.identify.gap.candidates import limit_starts
+from beetle_omni_ros.identify.gap.ingest import load_flight, UnusableFlight
+from beetle_omni_ros.identify.gap.keys import (
+    all_keys,
+    extra_keys,
+    LIMITS,
+    THRUST_BUS,
+    TILT_BUS,
+    tolerances,
+)
+from beetle_omni_ros.identify.gap.parameters import GapParameters
+from beetle_omni_ros.robot.effects import CATALOGUE
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.runs.files import write_json
+
+ALPHA = 0.05
+NONE = {'force': {'used': True, 'channels': []}}
+# Deviations at which effects without a slope at zero begin; those of limits follow from flights.
+STARTS = {'joint_friction': ((0.003, 0.003), (0.008, 0.008), (0.02, 0.02)),
+          'joint_backlash': ((0.005,), (0.02,), (0.05,))}
+
+
+def run_bags(runs: Sequence[Path], holdout: Sequence[Path] = (), robot: Path | None = None,
+             apply: Path | None = None, json_path: Path | None = None, page: Path | None = None,
+             console: Console | None = None) -> int:
+    """
+    Find differences between model and bags; arguments and status of :func:`run_gap`.
+
+    Raises:
+        BagError, ParameterError: a run or a file is unusable.
+
+    """
+    model, p = RobotParameters.load(robot), GapParameters.load()
+    try:
+        flights, judging = ([load_flight(path, model, p) for path in paths]
+                            for paths in (runs, holdout))
+    except UnusableFlight as error:
+        write_json(json_path, result_of('bad_data', {}, str(error)))
+        return 3
+    result = judged(flights, judging, model, p)
+    write_json(json_path, result)
+    if apply and result['effects']:
+        write_corrected(apply, result, model, robot)
+    if console:
+        console.print(headline(result), result['summary'])
+    return 0
+
+
+def judged(flights: Sequence, judging: Sequence, robot: RobotParameters, p: GapParameters,
+           alpha: float = ALPHA) -> dict:
+    """Results of checked flights; ``judging`` is held out."""
+    keys = {**all_keys(robot), **extra_keys()}
+    body = BodyModel(robot, keys, tilting_modules(robot))
+    every = [BagFlight(flight, robot, body, keys, p) for flight in [*flights, *judging]]
+    models, others = every[:len(flights)], every[len(flights):]
+    if robot.multibody is not None:
+        _choose_modules(models, every)
+    starts = _starts(keys, models)
+    for model in every:
+        model.starts = starts
+    names, spreads, entries = _priors(robot, keys, p, starts)
+    positive = frozenset({*starts, *(n for n in names if n not in starts
+                                     and keys[n].ends_at_none)})
+    far = frozenset(n for n in names if n not in starts and keys[n].effect in CATALOGUE
+                    and keys[n].effect not in ('mass', 'inertia')
+                    and CATALOGUE[keys[n].effect].layer not in ('sensor', 'timing'))
+    engine = Engine(models, names, spreads, entries, positive, far, alpha,
+                    curved=frozenset(starts))
+    solution = engine.run()
+    found = named_of(engine, solution, alpha)
+    sets = [[solution.entries[j] for j in members] for _, members in found]
+    error = exp(min(0.0, -solution.e_value))
+    crowd = max((len({e.name for e in members}) for members in sets), default=0)
+    verdict = 'not_decidable' if crowd >= CROWD else 'named_set' if crowd > 1 else \
+        'named' if sets else 'no_gap' if solution.e_value < 0 else 'not_decidable'
+    effects = [effect_of(solution, engine, keys, k, members, starts) for k, members in found]
+    for model in others:
+        model.settle(dict(zip(names, solution.theta, strict=False)))
+    return result_of(
+        verdict, NONE, summary_of(verdict, sets, error, solution),
+        effects=effects if verdict != 'not_decidable' else [],
+        partial=effects if verdict == 'not_decidable' else [],
+        candidates=candidates_of(solution, found), where=where_of(engine, solution),
+        false_alarm_probability=error, held_out=bool(judging),
+        **gaps_of(engine, solution, [k for k, _ in found], others or models))
+
+
+def _choose_modules(models, every):
+    """Use the file's tilting modules if the servos agree better with them."""
+    costs = []
+    for share in (0.0, 1.0):
+        for model in models:
+            model.modules = share
+        residuals = [model.residual({}, 'BJ') for model in models]
+        costs.append(sum(float(np.log((r**2).mean(axis=0)).sum())
+                         for groups in residuals for r in groups.values()))
+    for model in every:
+        model.modules = float(np.argmin(costs))
+
+
+def _starts(keys, models):
+    """Name of a start -> deviations of the keys of its effect."""
+    result = {}
+    for name in LIMITS:
+        effect = CATALOGUE[name]
+        own = [key for key in keys.values() if key.effect == name and not key.form]
+        values = limit_starts(own[0], effect, models) if effect.limit else STARTS[name]
+        for k, start in enumerate(values):
+            result[f'{name}@{k}'] = dict(zip([key.name for key in own], start, strict=True))
+    return result
+
+
+def _priors(robot, keys, p, starts):
+    """Names of the keys, their spreads, and the entries."""
+    fitted = {n: key for n, key in keys.items() if not key.form and key.effect not in LIMITS
+              and (n != 'modules.share' or robot.multibody is not None)}
+    tolerance = {n: float(np.max(prior.deviation)) for n, prior in tolerances(p).items()}
+    tolerance |= {TILT_BUS: p.bus_near[0], THRUST_BUS: p.bus_near[0],
+                  'imu_filter_lag.delay': p.imu_averaging,
+                  'swing.ratio': p.tolerance_swing + swing_of(robot)}
+    spreads = {n: spread(robot, key, tolerance.get(n, 0.0), 0.0)
+               if key.effect in CATALOGUE else Spread(tolerance[n], key.typical, 0.0)
+               for n, key in fitted.items()}
+    entries = entries_of({n: key for n, key in fitted.items() if key.effect in CATALOGUE})
+    spreads |= {n: Spread(0.03, 1.0, 0.0) for n in starts}
+    entries += [Entry(n.partition('@')[0], (n,), None,
+                      CATALOGUE[n.partition('@')[0]].channels == 'B') for n in starts]
+    return [*fitted, *starts], spreads, entries

@@ -1,0 +1,55 @@
+"""Bags under the flight engine, flown by the independent simulator."""
+
+from gap_data.cases import Case
+from gap_data.make import make_case
+import numpy as np
+import pytest
+
+from beetle_omni_ros.identify.flights.bag import BagFlight
+from beetle_omni_ros.identify.flights.bag_command import judged
+from beetle_omni_ros.identify.gap.body import BodyModel
+from beetle_omni_ros.identify.gap.ingest import load_flight
+from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys
+from beetle_omni_ros.identify.gap.parameters import GapParameters
+from beetle_omni_ros.robot.parameters import RobotParameters
+
+P, ROBOT = GapParameters.load(), RobotParameters.load()
+
+
+def flights(folder, seed, *effects, **more):
+    case = Case('singles' if effects else 'none', 'hard', seed, effects, duration=40.0,
+                gust=True, multibody=True, tolerance=True, command_age=0.01, **more)
+    made = make_case(case, folder / 'flights', folder / 'sealed')
+    return [load_flight(made / name, ROBOT, P) for name in ('fit_1', 'fit_2', 'holdout_1')]
+
+
+def names(result):
+    return [name for effect in result['effects'] for name in effect['names']]
+
+
+def test_feedback_of_gusts_in_a_smooth_task_is_no_effect(tmp_path):
+    result = judged(flights(tmp_path, 5, course='lemniscate')[:2], [], ROBOT, P)
+    assert names(result) == [] and result['false_alarm_probability'] > 0.05
+
+
+def test_a_hidden_effect_is_named_with_its_size_and_explains_the_flight_that_judges(tmp_path):
+    made = flights(tmp_path, 6, ('rotor_drag', 0.6, 'plain'))
+    result = judged(made[:2], made[2:], ROBOT, P)
+    assert result['verdict'] == 'named' and names(result) == ['rotor_drag']
+    found = result['effects'][0]['parameters']['coefficient']
+    assert found['interval'][0] < 0.6 < found['interval'][1]
+    assert found['value'] == pytest.approx(0.6, rel=0.2)
+    assert result['closure'] > 0.8
+
+
+def test_slopes_agree_with_differences_of_the_residual(tmp_path):
+    keys = {**all_keys(ROBOT), **extra_keys()}
+    made = BagFlight(flights(tmp_path, 7)[0], ROBOT, BodyModel(ROBOT, keys, (0.0, 0.0)), keys, P)
+    some = ['mass.mass', 'imu_misalignment.rotation[1]', 'mocap_time_offset.delay',
+            'joint_command_latency.delay', 'rotor_lag.time_constant']
+    linear = made.linear({}, some)
+    for k, name in enumerate(some):
+        step = 0.3 * keys[name].smallest
+        ahead, behind = (made.linear({name: s * step}, []).residual for s in (1, -1))
+        slope = (ahead - behind) / (2 * step)
+        assert np.abs(slope - linear.slopes[..., k]).max() < 0.1 * np.abs(slope).max()
