@@ -115,6 +115,8 @@ def prepare(recording: Recording, robot: RobotParameters, p: GapParameters,
         raise _unusable(name, 'command', 'the robot does not fly: commanded thrust is never above '
                         f'{p.lifted:g} of its weight')
     origin = begin_of(recording)
+    stamps = part[0].times['battery_state']
+    before = _drawn_until(recording, stamps[np.isfinite(stamps)][:1])
     recording, lead = part
     findings = list(recording.warnings)
     if fix:
@@ -126,7 +128,8 @@ def prepare(recording: Recording, robot: RobotParameters, p: GapParameters,
         raise UnusableFlight(wrong[0].text, wrong)
     series = {topic: _in_order(name, topic, recording, findings) for topic in recording.times}
     t, battery = series['battery_state']
-    series['battery_state'] = t, np.column_stack([battery[:, 0], _drawn(t, battery[:, 1])])
+    series['battery_state'] = t, np.column_stack(
+        [battery[:, 0], before + _drawn(t, battery[:, 1])])
     t = series['command'][0]
     begin, end = t[0] + lead, t[-1]
     begin, end = _without_gaps(name, series, begin, end, p, findings, origin)
@@ -172,6 +175,14 @@ def _in_order(name, topic, recording, findings):
     if lost > 2:
         findings.append(f'{name}: {topic}: {lost} stamps occur twice')
     return t, values[first]
+
+
+def _drawn_until(recording, first):
+    """Charge [A h] that was drawn before the flight, whose first stamp is ``first`` (1,) [s]."""
+    t, values = recording.times['battery_state'], recording.values['battery_state']
+    fine = np.isfinite(t)
+    t, rows = np.unique(t[fine], return_index=True)
+    return np.interp(first, t, _drawn(t, values[fine][rows, 1]))[0] if len(first) else 0.0
 
 
 def _drawn(t, current):
