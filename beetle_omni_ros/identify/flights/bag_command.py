@@ -72,6 +72,8 @@ def run_bags(runs: Sequence[Path], holdout: Sequence[Path] = (), robot: Path | N
         write_json(json_path, result_of('bad_data', {}, str(error)))
         return 3
     result = judged(flights, judging, model, p)
+    result['meta'] = {'runs': [str(r) for r in runs], 'holdout': [str(h) for h in holdout],
+                      'robot': str(robot) if robot else 'params/robot.yaml'}
     write_json(json_path, result)
     if apply and result['effects']:
         write_corrected(apply, result, model, robot)
