@@ -1,12 +1,11 @@
 """
-Flights as cosine coefficients of blocks, whitened by the noise of each frequency band.
+Flights as cosine coefficients of blocks, of residuals that a causal filter has whitened.
 
 A flight is cut into blocks, and each block of each channel is transformed by an orthonormal DCT.
-Coefficients of one band share a covariance over the channels, which are the noise of this flight.
-A sample that does not count is zero in the residual and in its slopes, so the linear model stays
-exact. The covariance is a maximum of the marginal likelihood (expectation maximisation): the
-squared residual of a fit of everything plus the variance of that fit, so that a flexible fit does
-not make the noise look small.
+First, each band of frequency has a covariance of the channels. It is a maximum of the marginal
+likelihood (expectation maximisation): the squared residual of a fit of everything plus the
+variance of that fit, so that a flexible fit does not make the noise look small. The filters
+follow from it. The filtered coefficients of all bands then share one covariance.
 """
 
 from __future__ import annotations
