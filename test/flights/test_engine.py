@@ -71,7 +71,7 @@ def test_evidence_of_one_key_agrees_with_quadrature(positive):
     posterior = judge.posterior((0,))
     # the widened deviation of the estimate, from its posterior
     slab = np.hypot(narrow[0], typical[0])
-    sigma = (posterior.deviation[0]**-2 - slab**-2)**-0.5
+    sigma = (1 / posterior.covariance[0, 0] - slab**-2)**-0.5
     assert sigma >= info**-0.5 * (1 - 1e-9)
     low, factor = (0.0, 2.0) if positive else (-0.5, 1.0)
 

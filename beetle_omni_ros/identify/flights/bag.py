@@ -19,8 +19,12 @@ from beetle_omni_ros.identify.flights.spectrum import blocks_of
 from beetle_omni_ros.identify.gap.residual import BOTH_SIDES, CHANNELS, FlightModel
 from beetle_omni_ros.identify.gap.series import low_pass, matrices, THIN, within
 
+LEAST = 0.1             # smallest share of a start to which its keys may fall in one step
 WIDEST = 16.0           # [Hz] low-pass edge of joint angles, of which every second one counts
 POSES = 8.0             # [Hz] the same of MoCap, whose noise grows with the square of frequency
+# [Hz] largest frequency of each group: above 8 Hz the filters of readings and tilts differ, and a
+# fit takes the difference for a larger mass of the tilting modules
+FASTEST = {'B': 8.0, 'A': POSES, 'W': POSES, 'J': WIDEST}
 
 
 class BagFlight(FlightModel):
@@ -35,12 +39,12 @@ class BagFlight(FlightModel):
     """
 
     channels = tuple(name for group in 'BAWJ' for name in CHANNELS[group])
-    highest = np.inf
+    highest = np.repeat([FASTEST[group] for group in 'BAWJ'], [6, 3, 3, 4])
     usable = True
 
     def __init__(self, flight, robot, body, keys, p):
         super().__init__(flight, robot, body, keys, p)
-        self.starts = {}
+        self.starts, self.tangents = {}, {}
         self.name, self.period = flight.name, THIN * p.grid
         self.reasons = dict.fromkeys(self.channels, '')
         first, count = self._starts[0], self._length * len(self._starts)
@@ -91,19 +95,26 @@ class BagFlight(FlightModel):
 
     def linear(self, theta, names):
         """Residual and its slopes at deviations ``theta``."""
-        theta, own = self._real(theta)
+        given = theta
+        theta, own = self._real(given)
         now = self.residual(theta)
         residual = np.concatenate([now[group] for group in 'BAWJ'], axis=1)
         slopes = np.zeros((*residual.shape, len(names)))
         place = {'B': slice(0, 6), 'A': slice(6, 9), 'W': slice(9, 12), 'J': slice(12, 16)}
         self._secants(slopes, theta, own, now, names, place)
-        every, names = names, [name for name in names if name not in self.starts]
-        where = {name: k for k, name in enumerate(every)}
+        # tangent of a start that acts -> its key
+        moved = {name: self.tangents[name][1] for name in names
+                 if name in self.tangents and self.tangents[name][0] in own}
+        every = list(names)
+        names = list(dict.fromkeys([name for name in every if name not in self.starts
+                                    and name not in self.tangents] + [*moved.values()]))
+        found = np.zeros((*residual.shape, len(names)))
+        where = {name: k for k, name in enumerate(names)}
         body = [name for name in names if self.keys[name].body]
         if body:
             exact = self._body.derivatives(self._thinned(theta), theta, tuple(body))
             for k, name in enumerate(body):
-                slopes[:, place['B'], where[name]] = -exact[:, :, k]
+                found[:, place['B'], where[name]] = -exact[:, :, k]
         for name in names:
             key = self.keys[name]
             groups = '' if key.body else key.groups.replace('J', '')
@@ -113,24 +124,45 @@ class BagFlight(FlightModel):
                 both = key.parameter == BOTH_SIDES
                 behind = self._residual({**theta, name: here - h}, groups) if both else now
                 for group in groups:
-                    slopes[:, place[group], where[name]] = (ahead[group] - behind[group]) / (
+                    found[:, place[group], where[name]] = (ahead[group] - behind[group]) / (
                         2 * h if both else h)
         turning = [name for name in names if 'J' in self.keys[name].groups]
         for name, slope in zip(turning, self._joint_slopes(theta, turning), strict=True):
-            slopes[:, place['J'], where[name]] = slope
+            found[:, place['J'], where[name]] = slope
+        for k, name in enumerate(every):
+            if name in moved:
+                part = self.starts[self.tangents[name][0]][moved[name]]
+                slopes[:, :, k] = part * found[:, :, where[moved[name]]]
+            elif name in where:
+                slopes[:, :, k] = found[:, :, where[name]]
         return Linear(residual, slopes, residual)
 
     def _real(self, theta):
         """Deviations of real keys, and factor of each start that acts."""
         own = {name: value for name, value in theta.items() if name in self.starts and value}
         theta = {name: value for name, value in theta.items()
-                 if name not in self.starts and value}
+                 if name not in self.starts and name not in self.tangents and value}
         return self._started(theta, own), own
 
     def _started(self, theta, own):
         return {**theta, **{key: theta.get(key, 0.0) + factor * part
                             for name, factor in own.items()
                             for key, part in self.starts[name].items()}}
+
+    def restart(self, theta: dict[str, float]) -> dict[str, float]:
+        """
+        Move the starts that act in ``theta`` to their fitted values.
+
+        All flights share the starts. Where a start acts, its factor becomes one, and its tangents
+        become zero.
+        """
+        new = {name: 1.0 for name in self.starts if theta.get(name)}
+        for tangent, (name, key) in self.tangents.items():
+            if name in new:
+                factor = max(theta[name] + theta.get(tangent, 0.0), LEAST * theta[name])
+                self.starts[name][key] *= max(factor, LEAST)
+                new[tangent] = 0.0
+        return new
 
     def _secants(self, slopes, theta, own, now, names, place):
         """Slopes from no effect to the start, or to the deviation where it acts."""

@@ -92,16 +92,17 @@ def judged(flights: Sequence, judging: Sequence, robot: RobotParameters, p: GapP
     if robot.multibody is not None:
         _choose_modules(models, every)
     starts = _starts(keys, models)
+    tangents = {f'{name}~{key}': (name, key) for name, start in starts.items() for key in start}
     for model in every:
-        model.starts = starts
-    names, spreads, entries = _priors(robot, keys, p, starts)
-    positive = frozenset({*starts, *(n for n in names if n not in starts
-                                     and keys[n].ends_at_none)})
-    far = frozenset(n for n in names if n not in starts and keys[n].effect in CATALOGUE
+        model.starts, model.tangents = starts, tangents
+    coarse = float(np.median([m.signals.position_noise for m in models])) > p.coarse_noise
+    names, spreads, entries = _priors(robot, keys, p, starts, coarse)
+    positive = frozenset({*starts, *(n for n in names if n in keys and keys[n].ends_at_none)})
+    far = frozenset(n for n in names if n in keys and keys[n].effect in CATALOGUE
                     and keys[n].effect not in ('mass', 'inertia')
                     and CATALOGUE[keys[n].effect].layer not in ('sensor', 'timing'))
     engine = Engine(models, names, spreads, entries, positive, far, alpha,
-                    curved=frozenset(starts))
+                    curved=frozenset({*starts, *tangents}))
     solution = engine.run()
     found = named_of(engine, solution, alpha)
     sets = [[solution.entries[j] for j in members] for _, members in found]
@@ -146,19 +147,23 @@ def _starts(keys, models):
     return result
 
 
-def _priors(robot, keys, p, starts):
-    """Names of the keys, their spreads, and the entries."""
+def _priors(robot, keys, p, starts, coarse):
+    """Names of the keys, their spreads, and the entries; ``coarse`` sensors are also late."""
     fitted = {n: key for n, key in keys.items() if not key.form and key.effect not in LIMITS
               and (n != 'modules.share' or robot.multibody is not None)}
     tolerance = {n: float(np.max(prior.deviation)) for n, prior in tolerances(p).items()}
-    tolerance |= {TILT_BUS: p.bus_near[0], THRUST_BUS: p.bus_near[0],
-                  'imu_filter_lag.delay': p.imu_averaging,
+    imu, encoders = p.coarse_latency if coarse else (p.imu_averaging, p.tolerance_delay)
+    tolerance |= {TILT_BUS: p.bus_near[coarse], THRUST_BUS: p.bus_near[coarse],
+                  'imu_filter_lag.delay': imu, 'joint_feedback_delay.delay': encoders,
                   'swing.ratio': p.tolerance_swing + swing_of(robot)}
     spreads = {n: spread(robot, key, tolerance.get(n, 0.0), 0.0)
                if key.effect in CATALOGUE else Spread(tolerance[n], key.typical, 0.0)
                for n, key in fitted.items()}
     entries = entries_of({n: key for n, key in fitted.items() if key.effect in CATALOGUE})
-    spreads |= {n: Spread(0.03, 1.0, 0.0) for n in starts}
-    entries += [Entry(n.partition('@')[0], (n,), None,
-                      CATALOGUE[n.partition('@')[0]].channels == 'B') for n in starts]
-    return [*fitted, *starts], spreads, entries
+    for start, own in starts.items():
+        tangents = [f'{start}~{key}' for key in own]
+        spreads[start] = Spread(0.03, 1.0, 0.0)
+        spreads |= {name: Spread(0.001, 0.3, 0.0) for name in tangents}
+        name = start.partition('@')[0]
+        entries.append(Entry(name, (start, *tangents), None, CATALOGUE[name].channels == 'B'))
+    return [*spreads], spreads, entries

@@ -235,18 +235,24 @@ def effect_of(solution: Solution, engine: Engine, keys: dict[str, Key], k: int,
     best = solution.posteriors[solution.best]
     index = sorted(i for j in solution.best for i in engine.indices((j,)))
     entry, found = solution.entries[k], {}
+    # key -> row that makes its deviation of the fitted ones
+    rows: dict[str, np.ndarray] = {}
+    for name in entry.keys:
+        start, _, tangent = name.partition('~')
+        for key, part in (starts or {}).get(start, {name: 1.0}).items():
+            if not tangent or tangent == key:
+                rows.setdefault(key, np.zeros(len(index)))[index.index(engine.index[name])] += part
     for parameter, spec in CATALOGUE[entry.name].parameters.items():
-        own = [(name, key, part) for name in entry.keys
-               for key, part in (starts or {}).get(name, {name: 1.0}).items()
-               if keys[key].parameter == parameter]
+        own = [name for name in rows if keys[name].parameter == parameter]
         values, spans = [], []
-        for name, of, part in own:
-            key, at = keys[of], index.index(engine.index[name])
-            middle, half = best.estimate[at] * part, 1.96 * best.deviation[at] * abs(part)
-            values.append(key.value(float(middle)))
-            spans.append([max(key.value(float(middle - half)), spec.low),
-                          min(key.value(float(middle + half)), spec.high)])
-        base = [keys[of].base for _, of, _ in own]
+        for name in own:
+            key, row = keys[name], rows[name]
+            middle = float(row @ best.estimate)
+            half = 1.96 * float(row @ best.covariance @ row)**0.5
+            values.append(key.value(middle))
+            spans.append([max(key.value(middle - half), spec.low),
+                          min(key.value(middle + half), spec.high)])
+        base = [keys[name].base for name in own]
         if own:
             found[parameter] = {
                 'value': values if len(own) > 1 else values[0], 'unit': spec.unit,

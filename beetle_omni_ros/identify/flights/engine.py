@@ -99,8 +99,10 @@ class Engine:
         self.index = {name: k for k, name in enumerate(names)}
         self._generic()
         self.filters = [None] * len(self.flights)
-        body = np.array([c.split('_')[0] in ('force', 'torque') for c in self.channels])
-        self.groups = [g for g in (np.flatnonzero(body), np.flatnonzero(~body)) if len(g)]
+        kinds = [c.split('_')[0] for c in self.channels]
+        kinds = ['body' if kind in ('force', 'torque') else kind for kind in kinds]
+        self.groups = [np.array([k for k, own in enumerate(kinds) if own == kind])
+                       for kind in dict.fromkeys(kinds)]
         self.owner = np.zeros(self.known, dtype=int)
         for k, entry in enumerate(self.entries):
             self.owner[[self.index[key] for key in entry.keys]] = k
@@ -152,6 +154,11 @@ class Engine:
             theta[:self.known][self.curved] = 0.0
             own = self.indices(solution.best)
             theta[own] = solution.theta[own]
+            if self.curved.any() and turn < ROUNDS - 1:
+                moved = self.flights[0].restart(dict(zip(self.names, theta[:self.known],
+                                                         strict=False)))
+                for name, value in moved.items():
+                    theta[self.index[name]] = value
             etas[:, :self.known][:, self.curved] = 0.0
         return solution
 
@@ -185,7 +192,7 @@ class Engine:
             floor = np.array([FLOORS[c.split('_')[0]] for c in flight.channels])
             slopes = np.concatenate([linear.slopes, -phi.reshape(*residual.shape, -1)], axis=2)
             found = spectrum(residual, slopes, flight.mask, flight.period, floor,
-                             flight.highest, own, self.groups)
+                             flight.highest, self.groups, own)
             spectra.append(found)
         return spectra
 
@@ -280,11 +287,12 @@ class Engine:
             # a fit of feedback makes the robot heavier; the inertia is that of the file
             x[[k for k, name in enumerate(self.names) if name.startswith('inertia.')]] = 0.0
             moving = found.band > 0
+            moving[found.counts[0]:] = False
             left += (((found.residual + found.slopes @ x) / np.sqrt(np.diagonal(
                 found.noise, axis1=1, axis2=2))[found.band])[:, moving][:, :, own]**2).sum()
             measured = spectrum(flight.linear({}, []).measured, np.zeros((*flight.mask.shape, 0)),
                                 flight.mask, flight.period, found.floor, flight.highest,
-                                self.filters[k], self.groups)
+                                self.groups, self.filters[k])
             total += ((measured.residual / np.sqrt(np.diagonal(
                 found.noise, axis1=1, axis2=2))[found.band])[:, moving][:, :, own]**2).sum()
         return 1 - left / total
@@ -377,7 +385,7 @@ class Engine:
                 move = np.linalg.solve(g[own][:, own] + np.diag(free[own]**-2), left[own])
                 value = r2 - 2 * h @ start + start @ g @ start
                 total[k] += value - 2 * left[own] @ move + move @ g[own][:, own] @ move
-            count += each.residual.size
+            count += each.size
         total = np.maximum(total, 1e-9 * count)
         # chi2 that is left of the difference, if the flights show a difference at all
         closure = 1 - max(total[1] - total[2], 0.0) / (total[0] - total[2]) \

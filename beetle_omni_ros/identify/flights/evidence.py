@@ -145,14 +145,14 @@ class Posterior:
         gain: ln of the evidence over that of the empty set [nat].
         theta: (K,) mean of all keys.
         estimate: (d,) posterior mean of the set's keys.
-        deviation: (d,) their posterior standard deviation, widened by the blocks.
+        covariance: (d, d) their posterior covariance, widened by the blocks.
 
     """
 
     gain: float
     theta: np.ndarray
     estimate: np.ndarray
-    deviation: np.ndarray
+    covariance: np.ndarray
 
 
 class Judge:
@@ -188,11 +188,10 @@ class Judge:
         index = tuple(sorted(chosen))
         if index not in self._kept:
             if not index:
-                return Posterior(0.0, self.mean, np.zeros(0), np.zeros(0))
+                return Posterior(0.0, self.mean, np.zeros(0), np.zeros((0, 0)))
             c, estimate, wide, slab, _, theta = self._profile(index)
             total = np.linalg.inv(np.linalg.inv(wide) + np.diag(slab**-2))
-            self._kept[index] = Posterior(self.gain(index, ()), theta, theta[c],
-                                          np.sqrt(np.diag(total)))
+            self._kept[index] = Posterior(self.gain(index, ()), theta, theta[c], total)
         return self._kept[index]
 
     def gain(self, one: Sequence[int], other: Sequence[int]) -> float:

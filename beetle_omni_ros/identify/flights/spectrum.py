@@ -36,6 +36,8 @@ class Spectrum:
         band: (F,) band of each frequency.
         noise: (bands, C, C) covariance of the coefficients of each band.
         floor: (C,) smallest standard deviation of a sample's noise.
+        groups: indices of the channels with common noise.
+        counts: number of frequencies that count, of each group.
 
     """
 
@@ -45,6 +47,7 @@ class Spectrum:
     noise: np.ndarray
     floor: np.ndarray
     groups: list[np.ndarray]
+    counts: list[int]
     level: bool = False
     _kept: tuple | None = None
     _parts: list = field(default_factory=list)
@@ -64,20 +67,30 @@ class Spectrum:
 
     def power(self) -> float:
         """Sum of squares of the whitened residual."""
-        inverse = np.linalg.inv(self.noise)[self.band]
-        return float(np.einsum('bfc,fcd,bfd->', self.residual, inverse, self.residual))
+        total = 0.0
+        for channels, count in zip(self.groups, self.counts, strict=True):
+            own = self.residual[:, :count][..., channels]
+            inverse = np.linalg.inv(self.noise[:, channels[:, None], channels])
+            total += np.einsum('bfc,fcd,bfd->', own, inverse[self.band[:count]], own)
+        return float(total)
 
-    def _bands(self):
-        """Range of frequencies of each band."""
-        edges = np.searchsorted(self.band, np.arange(len(self.noise) + 1))
+    @property
+    def size(self) -> int:
+        """Number of coefficients that count."""
+        return len(self.residual) * sum(count * len(channels) for channels, count in zip(
+            self.groups, self.counts, strict=True))
+
+    def _bands(self, count):
+        """Range of frequencies of each band, of the first ``count`` frequencies."""
+        edges = np.minimum(np.searchsorted(self.band, np.arange(len(self.noise) + 1)), count)
         return [slice(a, b) for a, b in zip(edges, edges[1:], strict=False)]
 
     def _grams(self):
         blocks, _, _, count = self.slopes.shape
         bands = len(self.noise)
         info, right = np.zeros((blocks, bands, count, count)), np.zeros((blocks, bands, count))
-        for channels, keys, slopes in self.parts:
-            for k, own in enumerate(self._bands()):
+        for (channels, keys, slopes), most in zip(self.parts, self.counts, strict=True):
+            for k, own in enumerate(self._bands(most)):
                 noise = self.noise[k][np.ix_(channels, channels)]
                 root = np.linalg.inv(np.linalg.cholesky(noise))
                 s = root @ slopes[:, own]
@@ -111,10 +124,10 @@ class Spectrum:
 
         """
         self._kept = None
-        for channels, keys, slopes in self.parts:
+        for (channels, keys, slopes), most in zip(self.parts, self.counts, strict=True):
             of_keys = covariance[np.ix_(keys, keys)]
             totals, counts = [], []
-            for own in self._bands():
+            for own in self._bands(most):
                 j, e = slopes[:, own], self.residual[:, own][..., channels]
                 count = e.shape[0] * e.shape[1]
                 j = j.reshape(count, len(channels), len(keys))
@@ -145,8 +158,8 @@ def blocks_of(mask: np.ndarray, period: float) -> np.ndarray:
 
 
 def spectrum(residual: np.ndarray, slopes: np.ndarray, mask: np.ndarray, period: float,
-             floor: np.ndarray, highest: float, filters: np.ndarray | None = None,
-             groups: list[np.ndarray] | None = None) -> Spectrum:
+             floor: np.ndarray, highest: np.ndarray | float, groups: list[np.ndarray],
+             filters: np.ndarray | None = None) -> Spectrum:
     """
     Cosine coefficients of a flight that has blocks.
 
@@ -156,18 +169,18 @@ def spectrum(residual: np.ndarray, slopes: np.ndarray, mask: np.ndarray, period:
         mask: (N, C) samples that count.
         period: of the samples [s].
         floor: (C,) smallest standard deviation of a sample's noise.
-        highest: largest frequency that counts [Hz].
+        highest: largest frequency that counts [Hz], of all channels or (C,), one value a group.
+        groups: indices of the channels with common noise.
         filters: (C, L) whitening filters; None: the noise differs between bands.
-        groups: indices of the channels with common noise; None: all.
 
     """
-    groups = groups or [np.arange(residual.shape[1])]
     if filters is not None:
         residual, slopes, mask = _whitened(residual, slopes, mask, filters, int(WARM / period))
     rows = blocks_of(mask, period)
     weight, size = mask[rows], rows.shape[1]
     frequency = np.arange(size) / (2 * size * period)
-    used = frequency <= min(EDGES[-1], highest)
+    highest = np.broadcast_to(highest, len(floor))
+    used = frequency <= min(EDGES[-1], highest.max())
     coefficients = dct(residual[rows] * weight, axis=1, norm='ortho')[:, used]
     derivatives = dct(slopes[rows] * weight[..., None], axis=1, norm='ortho')[:, used]
     band = np.searchsorted(EDGES, frequency[used], side='left')
@@ -175,7 +188,9 @@ def spectrum(residual: np.ndarray, slopes: np.ndarray, mask: np.ndarray, period:
     for k in np.unique(band):
         own = coefficients[:, band == k].reshape(-1, coefficients.shape[2])
         noise[k] += np.diag((own**2).mean(axis=0))
-    return Spectrum(coefficients, derivatives, band, noise, floor, groups, filters is not None)
+    counts = [int((frequency[used] <= highest[channels[0]]).sum()) for channels in groups]
+    return Spectrum(coefficients, derivatives, band, noise, floor, groups, counts,
+                    filters is not None)
 
 
 def _whitened(residual, slopes, mask, filters, warm):

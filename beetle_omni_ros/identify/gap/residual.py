@@ -203,12 +203,15 @@ class FlightModel:
                    if self.keys[name].effect == 'servo' else name for name in names]
         moved = list(dict.fromkeys(sources))
         sizes = [self.keys[name].step for name in moved]
-        sets = [theta, *({**theta, name: theta.get(name, 0.0) + h}
-                         for name, h in zip(moved, sizes, strict=True))]
+        # Central differences: gains, loads and inertia scaled by one factor leave the motion
+        # unchanged, and with one-sided differences their slopes would not add up to zero.
+        sets = [theta, *({**theta, name: theta.get(name, 0.0) + side * h}
+                         for side in (1, -1) for name, h in zip(moved, sizes, strict=True))]
         runs = self._servos(sets, theta)
         rate, slopes = np.gradient(runs[0], self.p.grid, axis=1), {}
-        for name, h, run in zip(moved, sizes, runs[1:], strict=True):
-            slope = rate * SHIFTS.get(name, 0.0) - (run - runs[0]) / h
+        ahead, behind = runs[1:].reshape(2, len(moved), *runs[0].shape)
+        for name, change in zip(moved, ahead - behind, strict=True):
+            slope = rate * SHIFTS.get(name, 0.0) - change / (2 * self.keys[name].step)
             slopes[name] = self._of_joints(slope.reshape(-1, 4))
         return [slopes[source] * (np.arange(4) == self.keys[name].index)
                 if source != name else slopes[name]
