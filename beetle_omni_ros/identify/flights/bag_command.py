@@ -9,6 +9,7 @@ compares both on the same flights.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from math import exp
 from pathlib import Path
 
@@ -28,7 +29,7 @@ from beetle_omni_ros.identify.flights.command import (
     where_of,
 )
 from beetle_omni_ros.identify.flights.engine import Engine
-from beetle_omni_ros.identify.flights.priors import entries_of, Entry, Spread, spread
+from beetle_omni_ros.identify.flights.priors import entries_of, Entry, Spread, spread, VARYING
 from beetle_omni_ros.identify.gap.analysis import swing_of, tilting_modules
 from beetle_omni_ros.identify.gap.apply import write_corrected
 from beetle_omni_ros.identify.gap.body import BodyModel
@@ -101,7 +102,10 @@ def judged(flights: Sequence, judging: Sequence, robot: RobotParameters, p: GapP
     far = frozenset(n for n in names if n in keys and keys[n].effect in CATALOGUE
                     and keys[n].effect not in ('mass', 'inertia')
                     and CATALOGUE[keys[n].effect].layer not in ('sensor', 'timing'))
-    engine = Engine(models, names, spreads, entries, positive, far, alpha,
+    varying = {n: VARYING[n.partition('[')[0]] for n in names if n.partition('[')[0] in VARYING}
+    if len(models) > 1:
+        spreads |= {n: replace(spreads[n], flight=0.0) for n in varying}
+    engine = Engine(models, names, spreads, entries, positive, far, alpha, varying=varying,
                     curved=frozenset({*starts, *tangents}))
     solution = engine.run()
     found = named_of(engine, solution, alpha)
@@ -153,7 +157,7 @@ def _priors(robot, keys, p, starts, coarse):
               and (n != 'modules.share' or robot.multibody is not None)}
     tolerance = {n: float(np.max(prior.deviation)) for n, prior in tolerances(p).items()}
     imu, encoders = p.coarse_latency if coarse else (p.imu_averaging, p.tolerance_delay)
-    tolerance |= {TILT_BUS: p.bus_near[coarse], THRUST_BUS: p.bus_near[coarse],
+    tolerance |= {TILT_BUS: p.bus_near[int(coarse)], THRUST_BUS: p.bus_near[int(coarse)],
                   'imu_filter_lag.delay': imu, 'joint_feedback_delay.delay': encoders,
                   'swing.ratio': p.tolerance_swing + swing_of(robot)}
     spreads = {n: spread(robot, key, tolerance.get(n, 0.0), 0.0)

@@ -217,6 +217,8 @@ def named_of(engine: Engine, solution: Solution, alpha: float) -> list[tuple[int
     best, gain = solution.best, engine.gain
     named = []
     for k in best:
+        if solution.entries[k].varying:
+            continue
         rest = set(best) - {k}
         needed = gain(solution.judge, best, tuple(sorted(rest)))
         if needed < log(1 / alpha):
@@ -224,7 +226,9 @@ def named_of(engine: Engine, solution: Solution, alpha: float) -> list[tuple[int
         rivals = [(gain(solution.judge, tuple(sorted(rest | {j})), best), j)
                   for j in range(len(solution.entries))
                   if j not in best and j not in solution.banned]
-        members = [k, *(j for less, j in sorted(rivals, reverse=True) if less > log(alpha))]
+        members = [k, *(j for less, j in sorted(rivals, reverse=True) if less > log(alpha)
+                        and not (solution.entries[j].varying
+                                 and solution.entries[j].name == solution.entries[k].name))]
         named.append((-needed, k, members))
     return [(k, members) for _, k, members in sorted(named)]
 

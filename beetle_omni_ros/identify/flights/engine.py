@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 from math import comb, log
 
@@ -24,6 +24,7 @@ FREE = 100.0            # typical deviations that known effects may have while n
                         # so that the noise holds nothing that they explain
 ROUNDS = 3              # linearisations
 FORM = 0.1              # relative error of an entry by its form
+SAME = 0.04             # share of a typical difference between flights by which one value varies
 MOST = 8                # entries of a set
 FLOORS = {'force': 0.02, 'torque': 0.05, 'acceleration': 0.02, 'rate': 0.004, 'joint': 0.0005}
 RELEVANT = 0.01         # of hover thrust and of weight: smallest relevant discrepancy
@@ -90,8 +91,11 @@ class Engine:
                  entries: list[Entry], positive: frozenset[str] = frozenset(),
                  far: frozenset[str] = frozenset(), alpha: float = 0.05,
                  progress: Callable[[str], None] = lambda text: None,
-                 curved: frozenset[str] = frozenset()):
+                 curved: frozenset[str] = frozenset(), varying: dict[str, float] | None = None):
         self.flights, self.names, self.entries = list(flights), list(names), list(entries)
+        self.real = len(names)
+        spreads = {**spreads, **self._repeat(spreads, varying or {})}
+        names = self.names
         self.narrow, self.typical, self.flight = (np.array(
             [getattr(spreads[name], kind) for name in names])
             for kind in ('narrow', 'typical', 'flight'))
@@ -109,6 +113,37 @@ class Engine:
         self.progress, self.alpha = progress, alpha
         self.far = np.array([name in far for name in self.names[:self.known]])
         self.curved = np.array([name in curved for name in self.names[:self.known]])
+
+    def _repeat(self, spreads, varying):
+        """
+        Entries of what may differ from flight to flight, with a key for each flight.
+
+        A key of a sensor either has one value in all flights, or one value a flight. The second
+        is an entry beside the first, so that a difference between flights is not named.
+        """
+        # (flight, index of the key, index of its value in this flight)
+        self.repeats: list[tuple[int, int, int]] = []
+        more = {}
+        if len(self.flights) < 2:
+            return more
+        for entry in [e for e in self.entries if set(e.keys) <= set(varying)]:
+            own = []
+            for k in range(len(self.flights)):
+                for key in entry.keys:
+                    own.append(f'{key}#{k}')
+                    self.repeats.append((k, self.names.index(key), len(self.names)))
+                    self.names.append(own[-1])
+                    more[own[-1]] = Spread(SAME * varying[key], varying[key], 0.0)
+            self.entries.append(replace(entry, keys=tuple(own), varying=True))
+        return more
+
+    def _at(self, k, theta):
+        """(R,) values of the real keys in flight k at all keys (K,)."""
+        values = theta[:self.real].copy()
+        for flight, key, own in self.repeats:
+            if flight == k:
+                values[key] += theta[own]
+        return values
 
     def _generic(self):
         """Keys of the generic discrepancy: weights of features, by rotors and by world forces."""
@@ -138,8 +173,8 @@ class Engine:
         noise: list[np.ndarray] = []
         for turn in range(ROUNDS):
             self.progress(f'linearising, {turn + 1} of {ROUNDS}')
-            for flight, eta in zip(self.flights, etas, strict=True):
-                flight.settle(dict(zip(self.names, (theta + eta)[:self.known], strict=False)))
+            for k, (flight, eta) in enumerate(zip(self.flights, etas, strict=True)):
+                flight.settle(dict(zip(self.names, self._at(k, theta + eta), strict=False)))
             spectra = self._spectra(theta, etas)
             self.narrow[self.known:] = self.start[self.known:]
             for each, before in zip(spectra, noise, strict=False):
@@ -180,17 +215,23 @@ class Engine:
                 return solution
             banned[worst] = solution.unsteady[worst]
 
-    def _spectra(self, theta, etas):
+    def _spectra(self, theta, etas, fitted=True):
+        """Spectra of the flights; the keys of each flight are those of the ``fitted`` ones."""
         spectra = []
-        for flight, eta, phi, own in zip(self.flights, etas, self.generic, self.filters,
-                                         strict=True):
-            at = (theta + eta)[:self.known]
+        for k, (flight, eta, phi, own) in enumerate(zip(
+                self.flights, etas, self.generic, self.filters, strict=True)):
+            at = self._at(k if fitted else -1, theta + eta)
             linear = flight.linear(dict(zip(self.names, at, strict=False)),
-                                   self.names[:self.known])
+                                   self.names[:self.real])
             # linear about the robot file
             residual = linear.residual - linear.slopes @ at
+            slopes = np.zeros((*residual.shape, len(self.names)))
+            slopes[:, :, :self.real] = linear.slopes
+            for at_flight, key, column in self.repeats:
+                if fitted and at_flight == k:
+                    slopes[:, :, column] = linear.slopes[:, :, key]
+            slopes[:, :, self.known:] = -phi.reshape(*residual.shape, -1)
             floor = np.array([FLOORS[c.split('_')[0]] for c in flight.channels])
-            slopes = np.concatenate([linear.slopes, -phi.reshape(*residual.shape, -1)], axis=2)
             found = spectrum(residual, slopes, flight.mask, flight.period, floor,
                              flight.highest, self.groups, own)
             spectra.append(found)
@@ -246,7 +287,8 @@ class Engine:
         # of the variants of an entry, the one that explains most alone
         variants: dict[tuple, int] = {}
         for k in (k for k in range(count) if k not in banned):
-            same = self.entries[k].name, self.entries[k].member
+            entry = self.entries[k]
+            same = entry.name, entry.member, entry.varying
             if same not in variants or weight((k,)) > weight((variants[same],)):
                 variants[same] = k
         allowed = list(variants.values())
@@ -367,24 +409,30 @@ class Engine:
         zeros = np.zeros((len(flights), len(self.names)))
         theta = np.concatenate([solution.theta[:self.known],
                                 np.zeros(len(self.names) - self.known)])
-        spectra = self._spectra(theta, zeros)
+        fitted = self.flights == keep[0]
+        spectra = self._spectra(theta, zeros, fitted)
         self.flights, self.generic, self.filters = keep
         noise, total, count = pooled(solution.spectra), np.zeros(3), 0
         less = theta.copy()
         less[self.indices(named)] = 0.0
-        every = np.hypot(self.narrow, self.flight)
+        own = self.flight.copy()
+        varied = set() if fitted else set(self.indices(solution.best))
+        for _, key, column in self.repeats:
+            if column in varied:
+                own[key] = self.typical[column]
+        every = np.hypot(self.narrow, own)
         every[self.indices(named)] += 9 * self.typical[self.indices(named)]
         for each in spectra:
             each.noise = noise
             g, h = (part.sum(axis=(0, 1)) for part in each.grams())
             r2 = each.power()
             for k, (start, free) in enumerate((
-                    (less, self.flight), (theta, self.flight), (theta, every))):
-                own = np.flatnonzero(free > 0)
+                    (less, own), (theta, own), (theta, every))):
+                at = np.flatnonzero(free > 0)
                 left = h - g @ start
-                move = np.linalg.solve(g[own][:, own] + np.diag(free[own]**-2), left[own])
+                move = np.linalg.solve(g[at][:, at] + np.diag(free[at]**-2), left[at])
                 value = r2 - 2 * h @ start + start @ g @ start
-                total[k] += value - 2 * left[own] @ move + move @ g[own][:, own] @ move
+                total[k] += value - 2 * left[at] @ move + move @ g[at][:, at] @ move
             count += each.size
         total = np.maximum(total, 1e-9 * count)
         # chi2 that is left of the difference, if the flights show a difference at all

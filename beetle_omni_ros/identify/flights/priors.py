@@ -26,6 +26,11 @@ FLIGHT = {'thrust_coefficient.scale': 0.017, 'rotor_thrust_coefficient.scale': 0
           'imu_accelerometer_bias.bias': 0.05,
           'imu_gyroscope_bias.bias': 0.004, 'imu_misalignment.rotation': 0.002,
           'mocap_misalignment.rotation': 0.002, 'rotor_dead_time.delay': 0.002}
+# Typical differences of sensors between the flights of a laboratory.
+VARYING = {'mocap_time_offset.delay': 0.008, 'imu_filter_lag.delay': 0.008,
+           'joint_feedback_delay.delay': 0.008, 'imu_accelerometer_bias.bias': 0.1,
+           'imu_gyroscope_bias.bias': 0.008, 'imu_misalignment.rotation': 0.005,
+           'mocap_misalignment.rotation': 0.005}
 AIR = 0.3               # [m/s] moves in a hall; its force is that of a typical drag
 FLIGHT_OFFSET = 0.0033          # share of the arm: centre of mass, repeats of one vehicle
 
@@ -47,10 +52,13 @@ class Entry:
     keys: tuple[str, ...]
     member: int | None = None
     of_body: bool = True        # acts on forces and torques alone
+    varying: bool = False       # differs from flight to flight, with keys for each flight
 
     @property
     def label(self) -> str:
         """Name with the number of the rotor."""
+        if self.varying:
+            return f'{self.name} by flight'
         return self.name if self.member is None else f'{self.name}[{self.member}]'
 
 
