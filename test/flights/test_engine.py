@@ -32,7 +32,7 @@ def linear_flight(rng, theta, count=3200, period=0.01, keys=3):
     slopes = rng.normal(size=(count, 2, keys))
     residual = -slopes @ theta + 0.1 * rng.normal(size=(count, 2))
     found = spectrum(residual, slopes, np.ones((count, 2), dtype=bool), period,
-                     np.full(2, 1e-6), np.inf)
+                     np.full(2, 1e-6), np.inf, [np.arange(2)])
     found.noise[:] = 0.01 * np.eye(2)
     return found
 
@@ -65,13 +65,13 @@ def test_evidence_of_one_key_agrees_with_quadrature(positive):
     rng = np.random.default_rng(2)
     found = normal([linear_flight(rng, np.array([0.004]), keys=1)], ['a'], np.zeros(1))
     narrow, typical = np.array([0.001]), np.array([0.02])
-    judge = Judge(found, narrow, typical, np.array([positive]), np.zeros(1, dtype=int), 0.05,
+    bounds = np.array([[0.0 if positive else -np.inf, np.inf]])
+    judge = Judge(found, narrow, typical, bounds, np.array([False]), np.zeros(1, dtype=int), 0.05,
                   np.array([False]))         # no mixture of widths
     info, estimate = found.info[0, 0], found.right[0] / found.info[0, 0]
     posterior = judge.posterior((0,))
-    # the widened deviation of the estimate, from its posterior
     slab = np.hypot(narrow[0], typical[0])
-    sigma = (1 / posterior.covariance[0, 0] - slab**-2)**-0.5
+    sigma = judge._profile((0,))[2][0, 0]**0.5       # widened by the blocks
     assert sigma >= info**-0.5 * (1 - 1e-9)
     low, factor = (0.0, 2.0) if positive else (-0.5, 1.0)
 

@@ -49,6 +49,7 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.files import write_json
 
 ALPHA = 0.05
+LATE = 0.012, 0.024          # [s] latencies at which the tilting modules are decided, too
 NONE = {'force': {'used': True, 'channels': []}}
 # Deviations at which effects without a slope at zero begin; those of limits follow from flights.
 STARTS = {'joint_friction': ((0.003, 0.003), (0.008, 0.008), (0.02, 0.02)),
@@ -98,14 +99,17 @@ def judged(flights: Sequence, judging: Sequence, robot: RobotParameters, p: GapP
         model.starts, model.tangents = starts, tangents
     coarse = float(np.median([m.signals.position_noise for m in models])) > p.coarse_noise
     names, spreads, entries = _priors(robot, keys, p, starts, coarse)
-    positive = frozenset({*starts, *(n for n in names if n in keys and keys[n].ends_at_none)})
+    kept = _limits(robot, p, coarse)
+    bounds = {n: (0.0, np.inf) for n in (*starts, *(
+        n for n in names if n in keys and keys[n].ends_at_none))} | kept
     far = frozenset(n for n in names if n in keys and keys[n].effect in CATALOGUE
                     and keys[n].effect not in ('mass', 'inertia')
                     and CATALOGUE[keys[n].effect].layer not in ('sensor', 'timing'))
     varying = {n: VARYING[n.partition('[')[0]] for n in names if n.partition('[')[0] in VARYING}
     if len(models) > 1:
         spreads |= {n: replace(spreads[n], flight=0.0) for n in varying}
-    engine = Engine(models, names, spreads, entries, positive, far, alpha, varying=varying,
+    engine = Engine(models, names, spreads, entries, bounds, far, alpha, varying=varying,
+                    kept=frozenset(kept),
                     curved=frozenset({*starts, *tangents}))
     solution = engine.run()
     found = named_of(engine, solution, alpha)
@@ -127,14 +131,14 @@ def judged(flights: Sequence, judging: Sequence, robot: RobotParameters, p: GapP
 
 
 def _choose_modules(models, every):
-    """Use the file's tilting modules if the servos agree better with them."""
+    """Use the file's tilting modules if the servos agree better with them, at any latency."""
     costs = []
     for share in (0.0, 1.0):
         for model in models:
             model.modules = share
-        residuals = [model.residual({}, 'BJ') for model in models]
-        costs.append(sum(float(np.log((r**2).mean(axis=0)).sum())
-                         for groups in residuals for r in groups.values()))
+        costs.append(min(sum(float(np.log((r**2).mean(axis=0)).sum()) for model in models
+                             for r in model.residual(late, 'BJ').values())
+                         for late in ({}, *({'command_latency.delay': d} for d in LATE))))
     for model in every:
         model.modules = float(np.argmin(costs))
 
@@ -149,6 +153,15 @@ def _starts(keys, models):
         for k, start in enumerate(values):
             result[f'{name}@{k}'] = dict(zip([key.name for key in own], start, strict=True))
     return result
+
+
+def _limits(robot, p, coarse):
+    """Limits of tolerances, beyond which a deviation is a finding."""
+    imu, encoders = p.coarse_latency if coarse else (p.imu_averaging, None)
+    bus = -p.command_delay, p.command_delay_range / 2
+    limits = {TILT_BUS: bus, THRUST_BUS: bus, 'imu_filter_lag.delay': (0.0, imu),
+              'swing.ratio': (-p.tolerance_swing, swing_of(robot) + p.tolerance_swing)}
+    return limits | ({'joint_feedback_delay.delay': (0.0, encoders)} if coarse else {})
 
 
 def _priors(robot, keys, p, starts, coarse):

@@ -122,11 +122,11 @@ def _engine(flights, robot, declared, alpha, progress):
                  for key, prior in tolerances(GapParameters.load()).items()}
     spreads = {name: spread(robot, key, tolerance.get(name, 0.0), declared.clock_deviation)
                for name, key in keys.items()}
-    positive = frozenset(name for name, key in keys.items() if key.ends_at_none)
+    bounds = {name: (0.0, np.inf) for name, key in keys.items() if key.ends_at_none}
     # A mass is weighed, air is still and sensors have data sheets; maps of thrust differ by half.
     far = frozenset(name for name, key in keys.items() if key.effect not in (
         'mass', 'inertia', 'wind') and CATALOGUE[key.effect].layer not in ('sensor', 'timing'))
-    return Engine(flights, list(keys), spreads, entries_of(keys), positive, far, alpha,
+    return Engine(flights, list(keys), spreads, entries_of(keys), bounds, far, alpha,
                   progress), keys
 
 
@@ -236,7 +236,7 @@ def named_of(engine: Engine, solution: Solution, alpha: float) -> list[tuple[int
 def effect_of(solution: Solution, engine: Engine, keys: dict[str, Key], k: int,
               members: list[int], starts: dict[str, dict[str, float]] | None = None) -> dict:
     """Names, sizes and evidence of a named entry; ``starts`` as of :class:`BagFlight`."""
-    best = solution.posteriors[solution.best]
+    best = solution.posterior
     index = sorted(i for j in solution.best for i in engine.indices((j,)))
     entry, found = solution.entries[k], {}
     # key -> row that makes its deviation of the fitted ones
@@ -277,13 +277,13 @@ def candidates_of(solution: Solution, named: list[tuple[int, list[int]]]) -> lis
     taken = {k for k, _ in named}
     rows = []
     for k, entry in enumerate(solution.entries):
-        alone = solution.posteriors.get((k,))
+        alone = solution.gains.get((k,))
         if alone is not None or k in solution.banned:
             rows.append({'name': entry.name, 'accepted': k in taken,
                          **({'rotor': entry.member} if entry.member else {}),
                          'reason': 'value differs between frequencies' if k in solution.banned
                          else '', 'evidence': {'delta_bic': None if alone is None
-                                               else 2 * alone.gain}})
+                                               else 2 * alone}})
     return sorted(rows, key=lambda row: -(row['evidence']['delta_bic'] or 0.0))
 
 

@@ -33,7 +33,7 @@ def discrepancies(flights: Sequence) -> list[np.ndarray]:
     """
     features = [_features(flight.motion, flight.time) for flight in flights]
     mean = np.concatenate(features).mean(axis=0)
-    return [_acting(flight.robot, flight.motion, own - mean, flight.channels)
+    return [acting(flight.robot, flight.motion, own - mean, flight.channels)
             for flight, own in zip(flights, features, strict=True)]
 
 
@@ -54,7 +54,9 @@ def _features(motion, time):
     return np.concatenate([plain, waves], axis=1)
 
 
-def _acting(robot: RobotParameters, motion, features, channels):
+def acting(robot: RobotParameters, motion: dict[str, np.ndarray], features: np.ndarray,
+           channels: Sequence[str]) -> np.ndarray:
+    """Slopes (N, C, 7, P) of the channels by weights of ``features`` (N, P); velocity first."""
     rotation = Rotation.from_quat(motion['quaternion']).as_matrix()
     acting = np.zeros((len(features), 6, 7))
     for i in range(4):

@@ -23,9 +23,10 @@ from beetle_omni_ros.identify.flights.spectrum import (
 FREE = 100.0            # typical deviations that known effects may have while noise is learned,
                         # so that the noise holds nothing that they explain
 ROUNDS = 3              # linearisations
-FORM = 0.1              # relative error of an entry by its form
+FORM = 0.25             # relative error of an entry by its form
 SAME = 0.04             # share of a typical difference between flights by which one value varies
 MOST = 8                # entries of a set
+PAIRED = 20             # entries whose pairs are all weighed; others follow from the best set
 FLOORS = {'force': 0.02, 'torque': 0.05, 'acceleration': 0.02, 'rate': 0.004, 'joint': 0.0005}
 RELEVANT = 0.01         # of hover thrust and of weight: smallest relevant discrepancy
 GROUPS = (0.0, 0.5, 2.0)    # [Hz] lower ends of the groups of bands of the test of constancy
@@ -39,30 +40,37 @@ class Solution:
     Attributes:
         names: keys.
         entries: catalogue entries.
-        posteriors: set of indices of entries -> evidence and estimate.
+        gains: set of indices of entries -> ln of its evidence over that of the empty set.
         best: most probable set.
-        theta: (K,) mean of the keys with the best set.
+        posterior: its evidence and estimate.
         unsteady: named entry -> gain of one value for each group of bands over one value [nat].
         banned: entry that was excluded for this -> its gain.
+        by_band: key of an excluded entry and its further value in each band (bands,).
 
     """
 
     names: list[str]
     entries: list[Entry]
-    posteriors: dict[tuple[int, ...], Posterior]
+    gains: dict[tuple[int, ...], float]
     best: tuple[int, ...]
-    theta: np.ndarray
+    posterior: Posterior
     equations: Normal
     judge: Judge
     spectra: list[Spectrum] = field(default_factory=list)
     unsteady: dict[int, float] = field(default_factory=dict)
     banned: dict[int, float] = field(default_factory=dict)
+    by_band: list[tuple[int, np.ndarray]] = field(default_factory=list)
+
+    @property
+    def theta(self) -> np.ndarray:
+        """(K,) mean of the keys with the best set."""
+        return self.posterior.theta
 
     @property
     def e_value(self) -> float:
         """Ln of the evidence of any set over the empty one, averaged over their prior."""
-        total = [log_prior(len(c), len(self.entries)) + p.gain
-                 for c, p in self.posteriors.items() if c]
+        total = [log_prior(len(c), len(self.entries)) + gain
+                 for c, gain in self.gains.items() if c]
         return float(np.logaddexp.reduce(total) - log(0.5))
 
 
@@ -80,7 +88,8 @@ class Engine:
         names: (K,) keys.
         spreads: their priors.
         entries: catalogue entries that may be named.
-        positive: keys that cannot be negative.
+        bounds: smallest and largest value of a key.
+        kept: keys of tolerances that have bounds.
         far: keys whose deviation may be many times typical.
         alpha: accepted probability of a false alarm.
         progress: gets a short text at each stage.
@@ -88,10 +97,11 @@ class Engine:
     """
 
     def __init__(self, flights: Sequence, names: list[str], spreads: dict[str, Spread],
-                 entries: list[Entry], positive: frozenset[str] = frozenset(),
+                 entries: list[Entry], bounds: dict[str, tuple[float, float]] | None = None,
                  far: frozenset[str] = frozenset(), alpha: float = 0.05,
                  progress: Callable[[str], None] = lambda text: None,
-                 curved: frozenset[str] = frozenset(), varying: dict[str, float] | None = None):
+                 curved: frozenset[str] = frozenset(), varying: dict[str, float] | None = None,
+                 kept: frozenset[str] = frozenset()):
         self.flights, self.names, self.entries = list(flights), list(names), list(entries)
         self.real = len(names)
         spreads = {**spreads, **self._repeat(spreads, varying or {})}
@@ -99,10 +109,12 @@ class Engine:
         self.narrow, self.typical, self.flight = (np.array(
             [getattr(spreads[name], kind) for name in names])
             for kind in ('narrow', 'typical', 'flight'))
-        self.positive = np.array([name in positive for name in names])
+        self.bounds = np.array([(bounds or {}).get(name, (-np.inf, np.inf)) for name in names])
+        self.kept = np.array([name in kept for name in names])
         self.index = {name: k for k, name in enumerate(names)}
         self._generic()
         self.filters = [None] * len(self.flights)
+        self._last: dict = {}       # flight -> point and linear model
         kinds = [c.split('_')[0] for c in self.channels]
         kinds = ['body' if kind in ('force', 'torque') else kind for kind in kinds]
         self.groups = [np.array([k for k, own in enumerate(kinds) if own == kind])
@@ -159,12 +171,12 @@ class Engine:
         self.start = self.narrow.copy()
         self.typical = np.concatenate([self.typical, np.zeros(size)])
         self.flight = np.concatenate([self.flight, np.zeros(size)])
-        self.positive = np.concatenate([self.positive, np.zeros(size, dtype=bool)])
 
     def run(self) -> Solution:
         """Relinearise, learn the noise and search, several times."""
         theta = np.zeros(len(self.names))
         etas = np.zeros((len(self.flights), len(self.names)))
+        self._settle(theta, etas)
         self._learn(spectra := self._spectra(theta, etas))
         self.power = [np.diagonal(s.noise[s.band], axis1=1, axis2=2).mean(axis=0)
                       for s in spectra]
@@ -172,30 +184,37 @@ class Engine:
         self.common = self._filter(max(spectra, key=lambda s: s.band[-1]), pooled(spectra))
         noise: list[np.ndarray] = []
         for turn in range(ROUNDS):
-            self.progress(f'linearising, {turn + 1} of {ROUNDS}')
-            for k, (flight, eta) in enumerate(zip(self.flights, etas, strict=True)):
-                flight.settle(dict(zip(self.names, self._at(k, theta + eta), strict=False)))
+            self.progress(f'linearising, {turn + 1}')
+            self._settle(theta, etas)
             spectra = self._spectra(theta, etas)
             self.narrow[self.known:] = self.start[self.known:]
             for each, before in zip(spectra, noise, strict=False):
                 each.noise = before
             self._learn(spectra, 2 if turn else 5)      # again from the noise before
             noise = [each.noise for each in spectra]
-            self.progress(f'weighing effects, {turn + 1} of {ROUNDS}')
+            self.progress(f'weighing effects, {turn + 1}')
             solution = self._steady(spectra)
             etas = np.array([solution.equations.of_flight(k, solution.theta)[:len(self.names)]
                              for k in range(len(spectra))])
-            theta[:self.known] = solution.theta[:self.known]
-            theta[:self.known][self.curved] = 0.0
-            own = self.indices(solution.best)
-            theta[own] = solution.theta[own]
-            if self.curved.any() and turn < ROUNDS - 1:
-                moved = self.flights[0].restart(dict(zip(self.names, theta[:self.known],
-                                                         strict=False)))
-                for name, value in moved.items():
-                    theta[self.index[name]] = value
             etas[:, :self.known][:, self.curved] = 0.0
+            theta = self._next(solution)
+            if turn == ROUNDS - 1:
+                break
+            if self.curved.any():
+                starts = self.flights[0].restart(dict(zip(self.names, theta[:self.known],
+                                                          strict=False)))
+                for name, value in starts.items():
+                    theta[self.index[name]] = value
         return solution
+
+    def _next(self, solution):
+        """(K,) point of the next linearisation: no starts but those of the best set."""
+        theta = np.zeros(len(self.names))
+        theta[:self.known] = solution.theta[:self.known]
+        theta[:self.known][self.curved] = 0.0
+        own = self.indices(solution.best)
+        theta[own] = solution.theta[own]
+        return theta
 
     def _steady(self, spectra):
         """
@@ -221,8 +240,7 @@ class Engine:
         for k, (flight, eta, phi, own) in enumerate(zip(
                 self.flights, etas, self.generic, self.filters, strict=True)):
             at = self._at(k if fitted else -1, theta + eta)
-            linear = flight.linear(dict(zip(self.names, at, strict=False)),
-                                   self.names[:self.real])
+            linear = self._linear(flight, at)
             # linear about the robot file
             residual = linear.residual - linear.slopes @ at
             slopes = np.zeros((*residual.shape, len(self.names)))
@@ -236,6 +254,21 @@ class Engine:
                              flight.highest, self.groups, own)
             spectra.append(found)
         return spectra
+
+    def _linear(self, flight, at):
+        """Linear model of a flight at real keys; the last one is kept."""
+        point, linear = self._last.get(flight, (None, None))
+        if point is None or not np.array_equal(point, at):
+            linear = flight.linear(dict(zip(self.names, at, strict=False)),
+                                   self.names[:self.real])
+            self._last[flight] = at, linear
+        return linear
+
+    def _settle(self, theta, etas):
+        for k, (flight, eta) in enumerate(zip(self.flights, etas, strict=True)):
+            at = self._at(k, theta + eta)
+            if not np.array_equal(self._last.get(flight, (None, None))[0], at):
+                flight.settle(dict(zip(self.names, at, strict=False)))
 
     def _wide(self):
         """(K,) prior deviations of a fit in which every key may be far from the file."""
@@ -274,26 +307,27 @@ class Engine:
         equations, keys, copies, _ = self._split(spectra, banned)
         wide = np.tile(self.typical[keys], copies)
         judge = self._judge(equations, form=wide, size=wide)
-        posteriors: dict[tuple[int, ...], Posterior] = {}
-        count = len(self.entries)
+        gains: dict[tuple[int, ...], float] = {}
+        total = len(self.entries)
 
         def weight(chosen):
-            if chosen not in posteriors:
-                posteriors[chosen] = judge.posterior(self.indices(chosen))
-            return log_prior(len(chosen), count) + posteriors[chosen].gain
+            if chosen not in gains:
+                gains[chosen] = judge.gain(self.indices(chosen), ())
+            return log_prior(len(chosen), total) + gains[chosen]
 
         best: tuple[int, ...] = ()
         top = weight(best)
         # of the variants of an entry, the one that explains most alone
         variants: dict[tuple, int] = {}
-        for k in (k for k in range(count) if k not in banned):
+        for k in (k for k in range(total) if k not in banned):
             entry = self.entries[k]
             same = entry.name, entry.member, entry.varying
             if same not in variants or weight((k,)) > weight((variants[same],)):
                 variants[same] = k
         allowed = list(variants.values())
         singles: list[tuple[int, ...]] = [(k,) for k in allowed]
-        for chosen in (*singles, *combinations(allowed, 2)):
+        strong = sorted(sorted(allowed, key=lambda k: weight((k,)))[-PAIRED:])
+        for chosen in (*singles, *combinations(strong, 2)):
             value = weight(chosen)
             if value > top:
                 best, top = chosen, value
@@ -309,14 +343,18 @@ class Engine:
             best = chosen
             visited.add(best)
         weight(best)
-        return Solution(self.names, self.entries, posteriors, best, posteriors[best].theta,
-                        equations, judge, spectra)
+        posterior = judge.posterior(self.indices(best))
+        bands = self._bands_of_groups()
+        own = posterior.theta[self.known:].reshape(copies, len(keys))
+        unsteady = [(int(key), own[bands, j]) for j, key in enumerate(keys)]
+        return Solution(self.names, self.entries, gains, best, posterior, equations, judge,
+                        spectra, by_band=unsteady)
 
     def gain(self, judge: Judge, one: tuple[int, ...], other: tuple[int, ...]) -> float:
         """Ln of the probability of one set of entries over that of another."""
-        count = len(self.entries)
+        total = len(self.entries)
         return judge.gain(self.indices(one), self.indices(other)) \
-            + log_prior(len(one), count) - log_prior(len(other), count)
+            + log_prior(len(one), total) - log_prior(len(other), total)
 
     def explained(self, solution: Solution, group: str) -> float:
         """Share of the variance of a group's measurements that the fit predicts, by motion."""
@@ -343,6 +381,11 @@ class Engine:
         power = np.diagonal(noise, axis1=1, axis2=2)[:spectrum.band[-1] + 1]
         return whitening(power, self.flights[0].period)
 
+    @staticmethod
+    def _bands_of_groups():
+        """(bands,) group of each band."""
+        return np.array([0, *np.searchsorted(GROUPS, EDGES[:-1], side='right') - 1])
+
     def _split(self, spectra, banned, entry=None):
         """
         Normal equations with separate values for the groups of bands, and their judge.
@@ -350,7 +393,7 @@ class Engine:
         Excluded entries have a value of typical size in each group always: what feedback makes of
         them must not be explained by others. ``entry`` has a deviation by the error of its form.
         """
-        bands = np.array([0, *np.searchsorted(GROUPS, EDGES[:-1], side='right') - 1])
+        bands = self._bands_of_groups()
         copies = int(bands.max()) + 1
         own = np.array(self.indices((entry,)) if entry is not None else [], dtype=int)
         free = np.array(self.indices(tuple(banned)), dtype=int)
@@ -450,6 +493,7 @@ class Engine:
         flat = np.zeros(more, dtype=bool)
         return Judge(equations, np.concatenate([narrow, form]),
                      np.concatenate([self.typical[:self.known], size]),
-                     np.concatenate([self.positive[:self.known], flat]),
+                     np.concatenate([self.bounds, np.tile([-np.inf, np.inf], (more, 1))]),
+                     np.concatenate([self.kept, flat]),
                      np.concatenate([self.owner, np.full(more, len(self.entries))]),
                      self.alpha / len(self.entries), np.concatenate([self.far, flat]))

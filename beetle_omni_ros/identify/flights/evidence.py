@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from math import exp, inf, log, log1p, pi, sqrt
 
 import numpy as np
 from scipy.special import log_ndtr
@@ -36,6 +37,8 @@ class Normal:
         info: (K, K) information of the data.
         right: (K,) right side.
         scores: (B, K) and slopes (B, K, K): score of a block at theta is scores - slopes theta.
+        noise: (K, K) covariance of the sum of the scores by the noise alone. It is smaller than
+            the information where deviations of flights or a discrepancy limit what is known.
 
     """
 
@@ -44,6 +47,7 @@ class Normal:
     right: np.ndarray
     scores: np.ndarray
     slopes: np.ndarray
+    noise: np.ndarray
     flights: list[tuple] = field(default_factory=list, repr=False)
     eliminated: tuple[np.ndarray, np.ndarray] | None = None
 
@@ -86,7 +90,7 @@ def normal(spectra: Sequence[Spectrum], names: list[str], flight: np.ndarray,
     further = copies * len(split)
     size = count + further
     own = np.flatnonzero(flight > 0)
-    info, right = np.zeros((size, size)), np.zeros(size)
+    info, right, noise = np.zeros((size, size)), np.zeros(size), np.zeros((size, size))
     scores, slopes, flights = [], [], []
     for each in spectra:
         g, h = each.grams()
@@ -110,9 +114,10 @@ def normal(spectra: Sequence[Spectrum], names: list[str], flight: np.ndarray,
         slopes.append(gs - project @ ge - coupling @ b)
         info += gs.sum(axis=0) - left.T @ inner @ left
         right += hs.sum(axis=0) - left.T @ a
+        noise += gs.sum(axis=0) - left.T @ inner @ left - project * flight[own]**-2 @ project.T
         flights.append((own, inner, left, right_e))
     whole = Normal(list(names), info, right, np.concatenate(scores), np.concatenate(slopes),
-                   flights)
+                   noise, flights)
     return whole if generic is None else _without(whole, count, generic)
 
 
@@ -132,8 +137,11 @@ def _without(whole, count, generic):
     scores = s[:, keep] - g[:, keep][:, :, w] @ a - (s[:, w] - g[:, w][:, :, w] @ a) @ project.T
     slopes = g[:, keep][:, :, keep] - g[:, keep][:, :, w] @ b \
         - project @ (g[:, w][:, :, keep] - g[:, w][:, :, w] @ b)
-    return Normal(whole.names[:count - len(generic)], info, right, scores, slopes, whole.flights,
-                  (a, b))
+    n = whole.noise
+    noise = n[np.ix_(keep, keep)] - project @ n[w][:, keep] - n[keep][:, w] @ project.T \
+        + project @ n[np.ix_(w, w)] @ project.T
+    return Normal(whole.names[:count - len(generic)], info, right, scores, slopes, noise,
+                  whole.flights, (a, b))
 
 
 @dataclass(eq=False)
@@ -163,7 +171,8 @@ class Judge:
         equations: normal equations.
         narrow: (K,) standard deviations that every key has.
         typical: (K,) what a candidate adds.
-        positive: (K,) keys that cannot be negative.
+        bounds: (K, 2) smallest and largest possible values.
+        kept: (K,) keys of tolerances with bounds, which are part of every comparison.
         owner: (K,) index of the entry of each key.
         level: probability at which the widening by few blocks holds.
         far: (K,) keys whose deviation may be much larger than typical; not those of sensors.
@@ -171,9 +180,12 @@ class Judge:
     """
 
     def __init__(self, equations: Normal, narrow: np.ndarray, typical: np.ndarray,
-                 positive: np.ndarray, owner: np.ndarray, level: float, far: np.ndarray):
+                 bounds: np.ndarray, kept: np.ndarray, owner: np.ndarray, level: float,
+                 far: np.ndarray):
         self.equations, self.narrow, self.typical = equations, narrow, typical
-        self.positive = positive
+        self.bounds, self.kept = bounds.tolist(), kept
+        self.bounded = np.isfinite(bounds).any(axis=1)
+        self.always = tuple(np.flatnonzero(kept))
         self.covariance = np.linalg.inv(equations.info + np.diag(narrow**-2))
         self.mean = self.covariance @ equations.right
         self.blocks = len(equations.scores)
@@ -187,11 +199,13 @@ class Judge:
         """Evidence of the set of keys ``chosen`` (indices) over the empty set."""
         index = tuple(sorted(chosen))
         if index not in self._kept:
-            if not index:
-                return Posterior(0.0, self.mean, np.zeros(0), np.zeros((0, 0)))
-            c, estimate, wide, slab, _, theta = self._profile(index)
-            total = np.linalg.inv(np.linalg.inv(wide) + np.diag(slab**-2))
-            self._kept[index] = Posterior(self.gain(index, ()), theta, theta[c], total)
+            c, estimate, wide, direction, slab = self._profile(index)
+            free = np.isin(c, index)
+            _, mean, total = self._bounded(c, estimate, wide,
+                                           np.where(free, slab, self.narrow[c]), free)
+            theta = self.mean + direction @ (mean - self.mean[c])
+            self._kept[index] = Posterior(self.gain(index, ()), theta, mean[free],
+                                          total[np.ix_(free, free)])
         return self._kept[index]
 
     def gain(self, one: Sequence[int], other: Sequence[int]) -> float:
@@ -201,25 +215,25 @@ class Judge:
         Both are judged with the covariance of a fit of both together, so that the comparison of
         two sets with common keys depends on the others alone.
         """
-        if not {*one, *other}:
+        if set(one) == set(other):
             return 0.0
-        c, estimate, wide, slab, price, _ = self._profile(tuple(sorted({*one, *other})))
+        c, estimate, wide, _, slab = self._profile(tuple(sorted({*one, *other})))
         total = 0.0
         for chosen, sign in ((one, 1.0), (other, -1.0)):
             free = np.isin(c, list(chosen))
             prior = np.where(free, slab, self.narrow[c])
-            value = _log_density(estimate, wide, prior) \
-                - price * len(np.unique(self.owner[c[free & self.far[c]]]))
-            value += sum(self._orthant(estimate, wide, prior, k)
-                         for k in np.flatnonzero(self.positive[c]))
-            total += sign * value
+            total += sign * (self._bounded(c, estimate, wide, prior, free)[0] - log(3) * len(
+                np.unique(self.owner[c[free & self.far[c]]])))
         return float(total)
 
     def _profile(self, index):
-        """Keys, estimate, its covariance, prior deviations, price of an entry, mean of all."""
+        """Keys, estimate and its covariance, change of all keys by them, prior deviations."""
         if index in self._profiles:
             return self._profiles[index]
-        c = np.array(index, dtype=int)
+        c = np.array(sorted({*index, *self.always}), dtype=int)
+        if not len(c):
+            none = np.zeros(0)
+            return c, none, np.zeros((0, 0)), np.zeros((len(self.mean), 0)), none
         own = np.linalg.inv(self.covariance[np.ix_(c, c)])
         direction = self.covariance[:, c] @ own                     # (K, d)
         info = own - np.diag(self.narrow[c]**-2)
@@ -232,7 +246,7 @@ class Judge:
         fitted = np.linalg.solve(info + np.diag(slab**-2), score)
         theta = self.mean + direction @ (fitted - self.mean[c])
         wide = self.widened(direction, info, theta)
-        self._profiles[index] = c, estimate, wide, slab, np.log(3), theta
+        self._profiles[index] = c, estimate, wide, direction, slab
         return self._profiles[index]
 
     def _scales(self, c, estimate):
@@ -242,7 +256,7 @@ class Judge:
         The prior of a candidate is a mixture of three normal ones, 1, 3 and 9 times typical. Its
         term that reaches the estimate is used, a lower bound; its weight costs ln 3.
         """
-        ratio = np.abs(estimate) / self.typical[c]
+        ratio = np.abs(estimate) / np.maximum(self.typical[c], 1e-12)
         group = np.zeros(len(c), dtype=int)
         for owner in np.unique(self.owner[c]):
             own = self.owner[c] == owner
@@ -251,20 +265,63 @@ class Judge:
         return 3.0**group
 
     def widened(self, direction, info, theta):
-        """(d, d) covariance of a profile, widened where blocks scatter more than their noise."""
+        """
+        (d, d) covariance of a profile, widened where blocks scatter more than their noise.
+
+        Only the part of the covariance is widened that the noise causes. The part by deviations
+        of flights and by other keys is known from their priors.
+        """
         scores = (self.equations.scores - self.equations.slopes @ theta) @ direction
         scatter = scores.T @ scores * self.blocks / max(self.blocks - 1, 1)
-        values, vectors = np.linalg.eigh(info)
-        root = vectors @ np.diag(values**-0.5) @ vectors.T
-        ratio, axes = np.linalg.eigh(root @ scatter @ root)
-        return self.student * root @ axes @ np.diag(np.maximum(ratio, 1.0)) @ axes.T @ root
+        noise = direction.T @ self.equations.noise @ direction
+        values, vectors = np.linalg.eigh(0.5 * (noise + noise.T))
+        values = np.maximum(values, 1e-9 * max(values.max(), 1e-300))
+        root, less = (vectors * values**p @ vectors.T for p in (0.5, -0.5))
+        ratio, axes = np.linalg.eigh(less @ scatter @ less)
+        more = root @ (axes * (self.student * np.maximum(ratio, 1.0) - 1.0) @ axes.T) @ root
+        inverse = np.linalg.inv(info)
+        return inverse + inverse @ more @ inverse
 
-    @staticmethod
-    def _orthant(estimate, covariance, prior, k):
-        """Ln of twice the probability that key k is positive, for a prior on one side."""
-        total = np.linalg.inv(np.linalg.inv(covariance) + np.diag(prior**-2))
-        mean = total @ np.linalg.solve(covariance, estimate)
-        return np.log(2) + log_ndtr(mean[k] / np.sqrt(total[k, k]))
+    def _bounded(self, c, estimate, wide, prior, free):
+        """
+        Ln of the density of an estimate, and mean and covariance of its keys within their bounds.
+
+        The priors are normal and end at the bounds. The bounds of one key after the other cut the
+        posterior, which stays normal with the mean and the covariance of what remains. The limits
+        of a tolerance do not hold for a candidate.
+        """
+        if not len(c):
+            return 0.0, estimate, wide
+        value = _log_density(estimate, wide, prior)
+        informed = np.linalg.inv(wide)
+        total = np.linalg.inv(informed + np.diag(prior**-2))
+        mean = total @ (informed @ estimate)
+        for k in np.flatnonzero(self.bounded[c] & ~(free & self.kept[c])):
+            (low, high), size = self.bounds[c[k]], float(prior[k])
+            deviation, middle = sqrt(total[k, k]), float(mean[k])
+            chance, shift, left = _within((low - middle) / deviation, (high - middle) / deviation)
+            value += chance - _within(low / size, high / size)[0]
+            change = total[:, k] / total[k, k]
+            mean = mean + change * (shift * deviation)
+            total = total - change[:, None] * (total[k] * (1 - left))
+        return value, mean, total
+
+
+def _within(low: float, high: float) -> tuple[float, float, float]:
+    """Ln of the probability that a standard normal is between limits; its mean, variance there."""
+    if low + high > 0:
+        chance, mean, variance = _within(-high, -low)
+        return chance, -mean, variance
+    upper = float(log_ndtr(high))
+    less = float(log_ndtr(low)) - upper if low > -inf else -inf
+    chance = upper + log1p(-exp(min(less, -1e-12)))
+    mean = edge = 0.0
+    for sign, x in ((1, low), (-1, high)):
+        if abs(x) < inf:
+            density = sign * exp(-0.5 * x * x - 0.5 * log(2 * pi) - chance)
+            mean += density
+            edge += x * density
+    return chance, mean, min(max(1 + edge - mean * mean, 1e-6), 1.0)
 
 
 def _log_density(x, covariance, prior):
