@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
+from threadpoolctl import threadpool_limits
 
 from beetle_omni_ros.identify.flights.bag_verdict import judged
 from beetle_omni_ros.identify.flights.page import gap_page
@@ -86,7 +87,8 @@ def gap_results(runs: Sequence[Path], holdout: Sequence[Path] = (), robot: Path 
         html = gap_log_page(apart, result, [*grids(result), *change_grids(result['changes'])],
                             model) if page else ''
     else:
-        with console.status('reading') as status:
+        # On small matrices, several threads only take more CPU time.
+        with console.status('reading') as status, threadpool_limits(1):
             result = _tables(runs, holdout, model, p, form, alpha, status.update) if form \
                 else _bags(runs, holdout, model, p, fix, alpha, status.update)
         result['meta'] |= {'runs': [str(r) for r in runs], 'holdout': [str(h) for h in holdout],

@@ -24,6 +24,8 @@ def result_of(verdict: str, groups: dict, reason: str = '', **more) -> dict:
     """
     Results with all fixed keys.
 
+    Flights that do not show most of the catalogue decide nothing.
+
     Args:
         verdict: a key of :data:`~beetle_omni_ros.identify.flights.text.WORDS`.
         groups: each group of channels: ``used``, ``channels``, and ``reason`` if not.
@@ -37,6 +39,10 @@ def result_of(verdict: str, groups: dict, reason: str = '', **more) -> dict:
         'candidates': [], 'hidden': [], 'tolerances': {}, 'false_alarm_probability': None,
         'held_out': False, 'groups': groups, 'bad_data': [], 'findings': [],
         'next_experiment': None, 'meta': {'version': __version__}} | more
+    seen = {row['name'] for row in result['candidates']} - set(result['hidden'])
+    if verdict == 'no_gap' and len(result['hidden']) > len(seen):
+        result |= {'verdict': (verdict := 'not_decidable'), 'reason': (
+            'most known effects would not have been detected at their typical size')}
     unclear = [effect['names'] for effect in [*result['effects'], *result['partial']]
                if len(effect['names']) > 1]
     if verdict == 'not_decidable':
