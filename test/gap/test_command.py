@@ -17,7 +17,7 @@ from rich.console import Console
 import beetle_omni_ros
 from beetle_omni_ros import cli
 from beetle_omni_ros.cli import spread
-from beetle_omni_ros.identify.flights.command import gap_results, run_gap
+from beetle_omni_ros.identify.gap.command import gap_results, run_gap
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.bag import names_of, read_messages

@@ -1,9 +1,9 @@
 """
-Flights of bags as the engine of :mod:`beetle_omni_ros.identify.flights` reads them.
+`beetle_omni gap`, and flights of bags as the engine of ``identify.flights`` reads them.
 
 - ``bags``, ``ingest``: read and check recordings.
 - ``keys``, ``signals``, ``body``, ``servo``, ``residual``: parameters and signals of a flight.
-- ``apply``: robot file with the named effects.
+- ``apply``, ``command``: robot file with the named effects; from recordings to all outputs.
 
 Recurring names:
 
