@@ -127,7 +127,7 @@ def own_gap():
         plant = folder / 'secret.yaml'
         plant.write_text('extends: robot.yaml\neffects: {mass: {mass: 3.3}}\n')
         for seed in (1, 2):
-            bo.simulate('nmpc', TASK, plant=plant, seed=seed, bag=folder / f'flight{seed}')
+            bo.simulate('nmpc', 'random8', plant=plant, seed=seed, bag=folder / f'flight{seed}')
         found = bo.find_gap([folder / 'flight1'], holdout=[folder / 'flight2'])
     drawn, (left, right) = figure(2)
     bars = [found['gap_before'], found['gap_after'], found['noise_floor']]

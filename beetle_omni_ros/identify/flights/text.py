@@ -13,7 +13,7 @@ WORDS = {'no_gap': 'no gap', 'named': 'named', 'named_set': 'one of a set',
 MOST_NAMED = 6          # entries of a list in a sentence
 LOPSIDED = 0.2          # asymmetry of an interval from which a sentence states both ends
 SPELLED = {'imu': 'IMU', 'mocap': 'MoCap'}
-SHOWN = 8               # candidates in the terminal
+SHOWN = 6               # channels and candidates in the terminal
 LEAST_CHANCE = 1e-6     # below, a probability is not stated as a number
 
 
@@ -124,9 +124,11 @@ def _list(value):
 
 
 def grids(result: dict, most: int = SHOWN) -> list[Grid]:
-    """Tables of damages, effects, gap, channels, groups, and up to ``most`` candidates."""
+    """Tables of damages, effects, gap, ``most`` channels, groups and ``most`` candidates."""
+    groups = result.get('groups', {})
+    every = most < len(groups) or not all(group['used'] for group in groups.values())
     tables = [_damages(result['bad_data']), _effects(result), _gap(result),
-              _channels(result['where']), _groups(result.get('groups', {})),
+              _channels(result['where'][:most]), _groups(groups if every else {}),
               evidence(result['candidates'], most)]
     return [grid for grid in tables if grid.rows]
 
