@@ -40,7 +40,7 @@ def gap_page(result: dict, damaged: tuple[Recording, dict] | None = None) -> str
     with matplotlib.rc_context(STYLE):
         picture = svg(_damage(*damaged), 'damaged readings') if damaged else svg(
             picture_of(result), 'disagreement and sizes') if result['where'] else ''
-    return page('Gap', _about(result['meta']), grids(result, 0), notes, sections,
+    return page('Gap', _about(result['meta']), grids(result, brief=False), notes, sections,
                 head(result, picture))
 
 

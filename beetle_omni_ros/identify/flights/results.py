@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from math import log
 
 import numpy as np
@@ -45,10 +46,11 @@ def result_of(verdict: str, groups: dict, reason: str = '', **more) -> dict:
             'most known effects would not have been detected at their typical size')}
     unclear = [effect['names'] for effect in [*result['effects'], *result['partial']]
                if len(effect['names']) > 1]
-    if verdict == 'not_decidable':
-        unclear += [result['hidden']] if result['hidden'] else []
-    if unclear and result['next_experiment'] is None:
+    if unclear:
         result['next_experiment'] = separating_experiment(unclear[0])
+    elif verdict == 'not_decidable' and result['hidden']:
+        result['next_experiment'] = Counter(
+            CATALOGUE[name].excited_by for name in result['hidden']).most_common(1)[0][0]
     return result | {'summary': summary(result)}
 
 

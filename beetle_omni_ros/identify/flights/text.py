@@ -123,13 +123,19 @@ def _list(value):
     return value if isinstance(value, list) else [value]
 
 
-def grids(result: dict, most: int = SHOWN) -> list[Grid]:
-    """Tables of damages, effects, gap, ``most`` channels, groups and ``most`` candidates."""
-    groups = result.get('groups', {})
-    every = most < len(groups) or not all(group['used'] for group in groups.values())
-    tables = [_damages(result['bad_data']), _effects(result), _gap(result),
-              _channels(result['where'][:most]), _groups(groups if every else {}),
-              evidence(result['candidates'], most)]
+def grids(result: dict, brief: bool = True) -> list[Grid]:
+    """
+    Tables of damages, effects, gap, channels, groups and candidates.
+
+    ``brief``: the largest rows, and groups only if one is not compared. Otherwise all but the
+    candidates, which have a section of the page.
+    """
+    groups, where = result.get('groups', {}), result['where']
+    if brief:
+        where = where[:SHOWN]
+        groups = {} if all(group['used'] for group in groups.values()) else groups
+    tables = [_damages(result['bad_data']), _effects(result), _gap(result), _channels(where),
+              _groups(groups), evidence(result['candidates'], SHOWN if brief else 0)]
     return [grid for grid in tables if grid.rows]
 
 
