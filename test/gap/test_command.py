@@ -75,6 +75,7 @@ def test_the_json_has_the_fixed_keys(made):
         assert key in results
     assert all(group['used'] for group in results['groups'].values())
     assert {'channel', 'regime', 'excess'} <= set(results['where'][0])
+    assert {'flight', 'rotate', 'tilted'} <= {row['regime'] for row in results['where']}
     names = {row['name'] for row in results['candidates']}
     assert {'wind', 'mass', 'rotor_drag', 'joint_command_latency'} <= names
     assert 'delta_bic' in results['effects'][0]['evidence']

@@ -8,7 +8,7 @@ import matplotlib
 from matplotlib.figure import Figure
 import numpy as np
 
-from beetle_omni_ros.identify.flights.text import evidence, grids, headline, label
+from beetle_omni_ros.identify.flights.text import evidence, grids, headline, label, whole
 from beetle_omni_ros.identify.gap.bags import Recording
 from beetle_omni_ros.identify.recording.clocks import begin_of
 from beetle_omni_ros.pages.figures import COLOURS, FAINT, INK, legend, panels, STYLE, svg
@@ -60,7 +60,7 @@ def head(result: dict, picture: str = '') -> str:
 def picture_of(result: dict) -> Figure:
     """Disagreement by channel before and after, and the sizes of the effects with intervals."""
     sizes = _sizes(result['effects'] or result['partial'])
-    rows = sorted(result['where'], key=lambda row: row['channel'])[::-1]
+    rows = sorted(whole(result), key=lambda row: row['channel'])[::-1]
     figure, axes = panels(1, 2 if sizes else 1, height=HEIGHT * max(len(rows), len(sizes)) + 0.6)
     place = np.arange(len(rows))
     for key, shift, colour, text in (('excess', 0.18, BEFORE, 'robot file'),

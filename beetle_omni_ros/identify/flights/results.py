@@ -18,6 +18,7 @@ from beetle_omni_ros.robot.effects import CATALOGUE, separating_experiment
 
 ALPHA = 0.05            # probability of a false alarm that is accepted
 CROWD = 4               # members of a set from which the flights do not decide
+LEAST_TIME = 1.0        # [s] in a regime, of which an RMS is stated
 Starts = dict[str, dict[str, float]]
 
 
@@ -200,10 +201,12 @@ def hidden_of(solution: Solution, alpha: float) -> list[str]:
 
 def where_of(engine: Engine, solution: Solution) -> list[dict]:
     """
-    Disagreement by channel, largest first: of the robot file, and of the fit without discrepancy.
+    Disagreement of the robot file by channel and regime of the flight, largest first.
 
-    ``excess`` and ``excess_after`` are RMS of the whitened residual over the noise. ``rms``,
-    ``rms_after`` and ``discrepancy_rms``, of what repeats and is in no entry, have a unit.
+    ``excess``: RMS of the whitened residual over the noise; of a regime, in proportion to the
+    RMS there. Rows of the regime 'flight' are about all samples, with ``excess_after`` of the fit
+    without discrepancy, and ``rms``, ``rms_after`` and ``discrepancy_rms`` of what repeats and is
+    in no entry, with a unit.
     """
     known, count, whitened, raw = engine.known, len(engine.names), [], []
     for k, (flight, found) in enumerate(zip(engine.flights, solution.spectra, strict=True)):
@@ -217,13 +220,32 @@ def where_of(engine: Engine, solution: Solution) -> list[dict]:
                     for at in ({}, dict(zip(engine.names[:known], x[:known], strict=True)))])
     excess, rms = (np.sqrt([np.nanmean(np.concatenate(parts)**2, axis=0)
                             for parts in zip(*own, strict=True)]) for own in (whitened, raw))
-    return sorted((
+    rows: list[dict] = [
         {'channel': name, 'regime': 'flight', 'excess': float(excess[0, c]),
          'excess_after': float(excess[1, c]), 'rms': float(rms[0, c]),
          'rms_after': float(rms[1, c]), 'discrepancy_rms': discrepancy,
          'unit': UNITS[name.partition('_')[0]]}
-        for c, (name, _, discrepancy) in enumerate(engine.disagreement(solution))),
-        key=lambda row: -row['excess'])
+        for c, (name, _, discrepancy) in enumerate(engine.disagreement(solution))]
+    before = np.concatenate([parts[0] for parts in raw])
+    regime = np.concatenate([regimes_of(flight.motion) for flight in engine.flights])
+    for c, name in enumerate(engine.channels):
+        for text in np.unique(regime):
+            there = before[regime == text, c]
+            there = there[np.isfinite(there)]
+            if len(there) * engine.flights[0].period >= LEAST_TIME:
+                rows.append({'channel': name, 'regime': str(text), 'excess': float(
+                    excess[0, c] * np.sqrt(np.mean(there**2)) / rms[0, c])})
+    return sorted(rows, key=lambda row: -row['excess'])
+
+
+def regimes_of(motion: dict[str, np.ndarray]) -> np.ndarray:
+    """(N,) regime of each sample: rotate, near ground, translate, tilted or hover."""
+    regime = np.full(len(motion['velocity']), 'hover', dtype=object)
+    regime[np.abs(motion['tilt']).max(axis=1) > 1.0] = 'tilted'
+    regime[np.linalg.norm(motion['velocity'], axis=1) > 0.4] = 'translate'
+    regime[motion['position'][:, 2] < 0.6] = 'near ground'
+    regime[np.linalg.norm(motion['rate'], axis=1) > 0.8] = 'rotate'
+    return regime
 
 
 def numbers_of(engine: Engine, solution: Solution, named: list[int], flights: list) -> dict:

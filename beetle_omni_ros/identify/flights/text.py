@@ -130,13 +130,18 @@ def grids(result: dict, brief: bool = True) -> list[Grid]:
     ``brief``: the largest rows, and groups only if one is not compared. Otherwise all but the
     candidates, which have a section of the page.
     """
-    groups, where = result.get('groups', {}), result['where']
+    groups, where = result.get('groups', {}), whole(result)
     if brief:
         where = where[:SHOWN]
         groups = {} if all(group['used'] for group in groups.values()) else groups
     tables = [_damages(result['bad_data']), _effects(result), _gap(result), _channels(where),
               _groups(groups), evidence(result['candidates'], SHOWN if brief else 0)]
     return [grid for grid in tables if grid.rows]
+
+
+def whole(result: dict) -> list[dict]:
+    """Channels with errors before and after, over whole flights or logs."""
+    return [row for row in result['where'] if 'excess_after' in row]
 
 
 def _effects(result):
@@ -164,8 +169,8 @@ def _gap(result):
     if not result['effects']:
         del rows[1]
     return Grid(f'Error over noise floor on {flown(result)}', ['model', 'error'], rows,
-                note='1 is the error of a fit of everything to the same data. Tolerances are as '
-                     'fitted.')
+                note='1 is the error of the most flexible fit to the same data.' + (
+                    '' if 'joints' in result else ' Tolerances are as fitted.'))
 
 
 def _channels(where):
@@ -195,9 +200,8 @@ def evidence(rows: list[dict], most: int) -> Grid:
     shown = [[label(row), _cell(_half(row['evidence']['delta_bic'])),
               *([_cell(row['expected_ln_bayes_factor'])] if typical else []),
               'accepted' if row['accepted'] else row['reason']] for row in rows[:most]]
-    note = 'ln B: evidence for the entry alone.'
-    if typical:
-        note += ' typical: what an effect of typical size would have in the mean.'
+    note = 'ln B: evidence for the entry alone. typical: what an effect of typical size would ' \
+        'have in the mean.' if typical else 'ln B: evidence beside the accepted entries.'
     return Grid('Candidates', ['entry', 'ln B', *(['typical'] if typical else []), 'decision'],
                 shown, note=note)
 
